@@ -71,7 +71,7 @@ def step_work(scene: Scene, stage: Stage, view: View) -> Work:
     state = TrainState(scene, seed=0)
 
     def work() -> None:
-        result = differentiate(stage, state.scene, view, probed=True)
+        result = differentiate(stage, state.scene, view, with_absgrad=True)
         update(stage, state, result.gradients, iterations=1000)
 
     return work

@@ -62,7 +62,7 @@ def works_of(count: int, device: torch.device, folder: Path) -> tuple[Works, Wor
         statistics = ScreenStatistics.zeros(count, device=device)
         statistics.view_count.fill_(1)
         # Every tenth Gaussian is split or cloned.
-        statistics.gradient_sum[:, ::10] = statistics.pull_sum[:, ::10] = 1
+        statistics.gradient_sum[:, ::10] = statistics.absgrad_sum[:, ::10] = 1
         grown = TrainState(scene, seed=0)
         grown.optimizer.moments, grown.statistics["primary"] = dict(state.optimizer.moments), statistics
         dataset: Any = SimpleNamespace(train=[view])

@@ -43,9 +43,9 @@ def true_corners(scene: Path) -> NDArray[np.float64]:
     return np.stack([center - u + v, center + u + v, center + u - v, center - u - v])
 
 
-def whole_views(eyes: Sequence[NumpyCamera], corners: NDArray[np.float64]) -> list[int]:
+def whole_views(cameras: Sequence[NumpyCamera], corners: NDArray[np.float64]) -> list[int]:
     """Views that show the whole pane, with a little room beside the photograph."""
-    return [number for number, eye in enumerate(eyes) if eye.holds(corners, 0.2).all()]
+    return [number for number, camera in enumerate(cameras) if camera.holds(corners, 0.2).all()]
 
 
 def save(page: MarkingPage, path: Path) -> None:
@@ -68,14 +68,14 @@ def draw(scene: Path, output: Path) -> None:
         copy = Path(folder) / scene.name
         shutil.copytree(scene, copy, ignore=shutil.ignore_patterns("panes", "masks", "planes.json", "annot*", "gt"))
         with marking_page(copy, width=SIZE[0], height=SIZE[1]) as page:
-            eyes, corners = page.server.session.eyes, true_corners(scene)
-            first, second, third = whole_views(eyes, corners)[:: APART + 1][:3]
-            page.mark(first, eyes[first].project(corners))
+            cameras, corners = page.server.session.cameras, true_corners(scene)
+            first, second, third = whole_views(cameras, corners)[:: APART + 1][:3]
+            page.mark(first, cameras[first].project(corners))
             page.show(second)
             save(page, output / "annotate-second.png")
-            page.mark(second, eyes[second].project(corners))
-            page.mark(third, eyes[third].project(corners))
-            left = eyes[third].project(corners)
+            page.mark(second, cameras[second].project(corners))
+            page.mark(third, cameras[third].project(corners))
+            left = cameras[third].project(corners)
             post = 0.62 * left[[0, 1, 2, 3]] + 0.38 * left[[1, 0, 3, 2]]
             page.cut(third, np.stack([post[0], post[1], post[2], post[3]]))
             save(page, output / "annotate-cut.png")

@@ -195,12 +195,12 @@ FARTHEST_OUTSIDE = 1e5
 """Pixels beyond which a point of a stroke is as good as at infinity."""
 
 
-def seen_outline(eye: NumpyCamera, corners: Array) -> Array:
+def seen_outline(camera: NumpyCamera, corners: Array) -> Array:
     """[P, 2] the outline of a polygon [K, 3] in a view, cut off where it passes the camera; empty if it is behind.
 
     It reaches far beside the photograph there, which keeps its edges straight: 1 / `NEAR` focal lengths at most.
     """
-    return eye.pixels(_before_camera(eye.in_camera(corners)))
+    return camera.pixels(_before_camera(camera.in_camera(corners)))
 
 
 def _before_camera(points: Array) -> Array:
@@ -233,15 +233,15 @@ def filled(outline: Array, size: tuple[int, int]) -> Mask:
     return inside
 
 
-def depths(eye: NumpyCamera, corners: Array) -> Array:
+def depths(camera: NumpyCamera, corners: Array) -> Array:
     """[H, W] camera z at which each pixel's ray meets the plane of a polygon; infinite where it does not."""
     center = corners.mean(axis=0)
     normal = np.linalg.svd(corners - center)[2][2]
-    x, y = np.meshgrid(np.arange(int(eye.size[0])) + 0.5, np.arange(int(eye.size[1])) + 0.5)
-    rays = eye.rays(np.stack([x, y], axis=-1))
+    x, y = np.meshgrid(np.arange(int(camera.size[0])) + 0.5, np.arange(int(camera.size[1])) + 0.5)
+    rays = camera.rays(np.stack([x, y], axis=-1))
     slopes = rays @ normal
-    away = float((center - eye.center) @ normal) / np.where(np.abs(slopes) < 1e-9, 1e-9, slopes)
-    return np.where(away > 0, away * (rays @ eye.rotation[2]), np.inf)
+    away = float((center - camera.center) @ normal) / np.where(np.abs(slopes) < 1e-9, 1e-9, slopes)
+    return np.where(away > 0, away * (rays @ camera.rotation[2]), np.inf)
 
 
 def with_strokes(mask: Mask, strokes: Sequence[Stroke]) -> Mask:

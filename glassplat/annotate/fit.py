@@ -189,7 +189,7 @@ class PaneFit:
     information: Array
 
     @property
-    def doubt(self) -> float:
+    def uncertainty(self) -> float:
         """Degrees by which the plane may be tilted, one standard deviation along its least certain axis."""
         return tilt_deviation(self.information)
 
@@ -203,34 +203,34 @@ def tilt_deviation(information: Array) -> float:
     return 90.0 if least <= np.degrees(1) ** -2 * 1e-4 else min(float(np.degrees(1 / np.sqrt(least))), 90.0)
 
 
-def fitted_pane(marks: Marks, eyes: Sequence[NumpyCamera], shape: Shape) -> PaneFit:
+def fitted_pane(marks: Marks, cameras: Sequence[NumpyCamera], shape: Shape) -> PaneFit:
     """The outline that lies closest to all marks; single marks that are far off count little.
 
     Args:
         marks: corners and edges, in numbered views.
-        eyes: the cameras of all views.
+        cameras: the cameras of all views.
         shape: a rectangle (of four corners), or any polygon.
 
     Raises:
         TooFewMarksError: a corner of too few is known from two places; the message says what to mark.
     """
-    fits = [_fitted(marks, eyes, start) for start in _starts(marks, eyes, shape)]
+    fits = [_fitted(marks, cameras, start) for start in _starts(marks, cameras, shape)]
     _, fitted = min(fits, key=lambda fit: fit[0])
-    away = mark_residuals(marks, eyes, fitted)
-    jacobian = _jacobian(marks, eyes, fitted)
+    away = mark_residuals(marks, cameras, fitted)
+    jacobian = _jacobian(marks, cameras, fitted)
     spread = max(1.0, float(np.sqrt((away**2).sum() / max(len(away) - fitted.freedom, 1))))
-    pixels = _pixel_distances(marks, eyes, fitted)
+    pixels = _pixel_distances(marks, cameras, fitted)
     largest = {view: max(one for number, one in pixels if number == view) for view in marks.views()}
     error = float(np.sqrt(np.mean([one**2 for _, one in pixels])))
     return PaneFit(fitted, error, largest, jacobian.T @ jacobian / spread**2)
 
 
-def _fitted(marks: Marks, eyes: Sequence[NumpyCamera], begun: PaneShape) -> tuple[float, PaneShape]:
+def _fitted(marks: Marks, cameras: Sequence[NumpyCamera], begun: PaneShape) -> tuple[float, PaneShape]:
     """Fit a shape to marks from where it begins; also return the residuals."""
     from scipy.optimize import least_squares
 
     def residuals(step: Array) -> Array:
-        return mark_residuals(marks, eyes, begun.stepped(step))
+        return mark_residuals(marks, cameras, begun.stepped(step))
 
     step, cost = np.zeros(begun.freedom), np.inf
     for loss in ("soft_l1", "cauchy"):  # The second lets go of what is far off, and would stay there if it came first.
@@ -239,42 +239,44 @@ def _fitted(marks: Marks, eyes: Sequence[NumpyCamera], begun: PaneShape) -> tupl
     return cost, begun.stepped(step)
 
 
-def mark_residuals(marks: Marks, eyes: Sequence[NumpyCamera], shape: PaneShape) -> Array:
+def mark_residuals(marks: Marks, cameras: Sequence[NumpyCamera], shape: PaneShape) -> Array:
     """[R] distances of all marks from the shape, in accuracies; two for a corner, one for each pixel on an edge."""
-    parts = [away / (ACCURACY * eyes[view].diagonal) for view, away in _distances(marks, eyes, shape)]
+    parts = [away / (ACCURACY * cameras[view].diagonal) for view, away in _distances(marks, cameras, shape)]
     return np.concatenate(parts)
 
 
-def corner_information(eye: NumpyCamera, shape: PaneShape) -> Array:
+def corner_information(camera: NumpyCamera, shape: PaneShape) -> Array:
     """[F, F] what marking every corner that a view holds would add to a fit's information."""
-    held = eye.holds(shape.corners())
-    marks = Marks([{0: pixel} if seen else {} for pixel, seen in zip(eye.project(shape.corners()), held, strict=True)])
+    held = camera.holds(shape.corners())
+    marks = Marks(
+        [{0: pixel} if seen else {} for pixel, seen in zip(camera.project(shape.corners()), held, strict=True)]
+    )
     if not held.any():
         return np.zeros((shape.freedom, shape.freedom))
-    jacobian = _jacobian(marks, [eye], shape)
+    jacobian = _jacobian(marks, [camera], shape)
     return jacobian.T @ jacobian
 
 
-def _jacobian(marks: Marks, eyes: Sequence[NumpyCamera], shape: PaneShape) -> Array:
+def _jacobian(marks: Marks, cameras: Sequence[NumpyCamera], shape: PaneShape) -> Array:
     """[R, F] by central differences."""
     columns = []
     for axis in np.eye(shape.freedom):
         ahead, behind = (
-            mark_residuals(marks, eyes, shape.stepped(sign * DERIVATIVE_STEP * axis)) for sign in (1.0, -1.0)
+            mark_residuals(marks, cameras, shape.stepped(sign * DERIVATIVE_STEP * axis)) for sign in (1.0, -1.0)
         )
         columns.append((ahead - behind) / (2 * DERIVATIVE_STEP))
     return np.stack(columns, axis=1)
 
 
-def _distances(marks: Marks, eyes: Sequence[NumpyCamera], shape: PaneShape) -> list[tuple[int, Array]]:
+def _distances(marks: Marks, cameras: Sequence[NumpyCamera], shape: PaneShape) -> list[tuple[int, Array]]:
     """The view and the distances, in pixels, of each mark: [2] of a corner, [2] across an edge."""
     corners = shape.corners()
     found = []
     for number, places in enumerate(marks.corners):
-        found += [(view, eyes[view].project(corners[number]) - place) for view, place in places.items()]
+        found += [(view, cameras[view].project(corners[number]) - place) for view, place in places.items()]
     for number, places in enumerate(marks.edges):
         ends = corners[[number, (number + 1) % len(corners)]]
-        found += [(view, _across(eyes[view].project(ends), place)) for view, place in places.items()]
+        found += [(view, _across(cameras[view].project(ends), place)) for view, place in places.items()]
     return found
 
 
@@ -286,11 +288,11 @@ def _across(line: Array, places: Array) -> Array:
     return np.asarray((along[0] * away[:, 1] - along[1] * away[:, 0]) / length)
 
 
-def _pixel_distances(marks: Marks, eyes: Sequence[NumpyCamera], shape: PaneShape) -> list[tuple[int, float]]:
-    return [(view, float(np.linalg.norm(away))) for view, away in _distances(marks, eyes, shape)]
+def _pixel_distances(marks: Marks, cameras: Sequence[NumpyCamera], shape: PaneShape) -> list[tuple[int, float]]:
+    return [(view, float(np.linalg.norm(away))) for view, away in _distances(marks, cameras, shape)]
 
 
-def _starts(marks: Marks, eyes: Sequence[NumpyCamera], shape: Shape) -> list[PaneShape]:
+def _starts(marks: Marks, cameras: Sequence[NumpyCamera], shape: Shape) -> list[PaneShape]:
     """Outlines to begin with, one at least.
 
     An edge or a corner of one view only says nothing about the plane, but how far a pane goes: other starts are the
@@ -299,16 +301,16 @@ def _starts(marks: Marks, eyes: Sequence[NumpyCamera], shape: Shape) -> list[Pan
     Raises:
         TooFewMarksError: the marks leave the plane open.
     """
-    starts = [polygon_pane(_first_corners(marks, eyes))]
+    starts = [polygon_pane(_first_corners(marks, cameras))]
     firm, loose = _seen_again(marks.edges)
     if loose:
-        pane = fitted_pane(replace(marks, edges=firm), eyes, shape).shape
-        starts.append(polygon_pane(_cut_by_edges(marks, eyes, pane, loose)))
+        pane = fitted_pane(replace(marks, edges=firm), cameras, shape).shape
+        starts.append(polygon_pane(_cut_by_edges(marks, cameras, pane, loose)))
     firm, loose = _seen_again(marks.corners)
     if loose:
         with suppress(ValueError):  # Without these corners, or stretched to a wrong one, it may be no pane.
-            pane = fitted_pane(replace(marks, corners=firm), eyes, shape).shape
-            starts.append(polygon_pane(_stretched_to_corners(marks, eyes, pane, loose)))
+            pane = fitted_pane(replace(marks, corners=firm), cameras, shape).shape
+            starts.append(polygon_pane(_stretched_to_corners(marks, cameras, pane, loose)))
     return [rectangle_pane(start) if shape == "rectangle" and len(marks.corners) == 4 else start for start in starts]
 
 
@@ -318,14 +320,14 @@ def _seen_again(marks: Sequence[Mapping[int, Array]]) -> tuple[list[Mapping[int,
     return [{} if number in loose else places for number, places in enumerate(marks)], loose
 
 
-def _stretched_to_corners(marks: Marks, eyes: Sequence[NumpyCamera], pane: PaneShape, loose: Sequence[int]) -> Array:
+def _stretched_to_corners(marks: Marks, cameras: Sequence[NumpyCamera], pane: PaneShape, loose: Sequence[int]) -> Array:
     """[K, 3] the corners of a pane, some of which are moved to where one view shows them.
 
     Of four corners the one that lies across stays, and those between keep the directions of their sides.
     """
     corners = pane.corners()
     for number in loose:
-        place = _on_plane(marks, number, eyes, corners.mean(axis=0), pane.frame[2])
+        place = _on_plane(marks, number, cameras, corners.mean(axis=0), pane.frame[2])
         if place is None:
             continue
         if len(corners) == 4:
@@ -337,11 +339,11 @@ def _stretched_to_corners(marks: Marks, eyes: Sequence[NumpyCamera], pane: PaneS
     return corners
 
 
-def _cut_by_edges(marks: Marks, eyes: Sequence[NumpyCamera], pane: PaneShape, loose: Sequence[int]) -> Array:
+def _cut_by_edges(marks: Marks, cameras: Sequence[NumpyCamera], pane: PaneShape, loose: Sequence[int]) -> Array:
     """[K, 3] the corners of a pane, some edges of which are moved to where one view shows them."""
     corners = pane.corners()
     for number in loose:
-        corners = _cut_at(corners, number, _line_on_plane(marks.edges[number], eyes, pane))
+        corners = _cut_at(corners, number, _line_on_plane(marks.edges[number], cameras, pane))
     return corners
 
 
@@ -356,11 +358,11 @@ def _cut_at(corners: Array, edge: int, line: tuple[Array, Array] | None) -> Arra
 
 
 def _line_on_plane(
-    places: Mapping[int, Array], eyes: Sequence[NumpyCamera], pane: PaneShape
+    places: Mapping[int, Array], cameras: Sequence[NumpyCamera], pane: PaneShape
 ) -> tuple[Array, Array] | None:
     """Intersections of an edge's two sight lines, seen in one view, with a pane's plane; None if they diverge."""
     ((view, ends),) = places.items()
-    rays, normal, center = eyes[view].rays(np.asarray(ends)), pane.frame[2], eyes[view].center
+    rays, normal, center = cameras[view].rays(np.asarray(ends)), pane.frame[2], cameras[view].center
     heights, slopes = (pane.corners().mean(axis=0) - center) @ normal, rays @ normal
     if (slopes * heights <= 1e-3 * abs(heights)).any():
         return None
@@ -368,15 +370,15 @@ def _line_on_plane(
     return first, second
 
 
-def _first_corners(marks: Marks, eyes: Sequence[NumpyCamera]) -> Array:
+def _first_corners(marks: Marks, cameras: Sequence[NumpyCamera]) -> Array:
     """[K, 3] every corner: triangulated, where two edges meet, on the plane of the others, or completing them.
 
     Raises:
         TooFewMarksError: fewer than three are known from two places.
     """
-    lines = [_edge_line(places, eyes) for places in marks.edges] + [None] * (len(marks.corners) - len(marks.edges))
+    lines = [_edge_line(places, cameras) for places in marks.edges] + [None] * (len(marks.corners) - len(marks.edges))
     known = [
-        _triangulated(places, eyes) if len(places) > 1 else _meeting(lines[number - 1], lines[number])
+        _triangulated(places, cameras) if len(places) > 1 else _meeting(lines[number - 1], lines[number])
         for number, places in enumerate(marks.corners)
     ]
     points = [point for point in known if point is not None]
@@ -385,7 +387,7 @@ def _first_corners(marks: Marks, eyes: Sequence[NumpyCamera]) -> Array:
         raise TooFewMarksError(_missing(marks, len(points)))
     plane = polygon_pane(np.stack(spanning))
     completed = [
-        point if point is not None else _on_plane(marks, number, eyes, plane.center, plane.frame[2])
+        point if point is not None else _on_plane(marks, number, cameras, plane.center, plane.frame[2])
         for number, point in enumerate(known)
     ]
     return np.stack(_with_line_ends(completed, lines, marks))
@@ -402,30 +404,30 @@ def _missing(marks: Marks, known: int) -> str:
     )
 
 
-def _triangulated(places: Mapping[int, Array], eyes: Sequence[NumpyCamera]) -> Array | None:
+def _triangulated(places: Mapping[int, Array], cameras: Sequence[NumpyCamera]) -> Array | None:
     """[3] the point nearest to all sight lines; None where they are too parallel."""
-    centers = np.stack([eyes[view].center for view in places])
-    rays = np.stack([eyes[view].rays(np.asarray(place)) for view, place in places.items()])
+    centers = np.stack([cameras[view].center for view in places])
+    rays = np.stack([cameras[view].rays(np.asarray(place)) for view, place in places.items()])
     if np.arccos(np.clip((rays @ rays.T).min(), -1, 1)) < LEAST_PARALLAX:
         return None
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     return np.linalg.solve(across.sum(axis=0), np.einsum("vij,vj->i", across, centers))
 
 
-def _edge_line(places: Mapping[int, Array], eyes: Sequence[NumpyCamera]) -> tuple[Array, Array] | None:
+def _edge_line(places: Mapping[int, Array], cameras: Sequence[NumpyCamera]) -> tuple[Array, Array] | None:
     """Two points of an edge in space, where the planes of sight through it meet, as far out as the marks lie."""
     if len(places) < 2:
         return None
-    rays = {view: eyes[view].rays(np.asarray(place)) for view, place in places.items()}
+    rays = {view: cameras[view].rays(np.asarray(place)) for view, place in places.items()}
     normals = np.stack([np.cross(*ends) for ends in rays.values()])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     _, sizes, axes = np.linalg.svd(normals)
     if len(normals) < 2 or sizes[1] < LEAST_PARALLAX * sizes[0]:
         return None
-    offsets = np.array([normal @ eyes[view].center for normal, view in zip(normals, places, strict=True)])
+    offsets = np.array([normal @ cameras[view].center for normal, view in zip(normals, places, strict=True)])
     point, direction = np.linalg.lstsq(normals, offsets, rcond=1e-9)[0], axes[2]
     view = next(iter(places))
-    first, second = (_nearest_on_line(point, direction, eyes[view].center, ray) for ray in rays[view])
+    first, second = (_nearest_on_line(point, direction, cameras[view].center, ray) for ray in rays[view])
     return first, second
 
 
@@ -449,13 +451,13 @@ def _meeting(before: tuple[Array, Array] | None, after: tuple[Array, Array] | No
     return np.asarray((first + second) / 2)
 
 
-def _on_plane(marks: Marks, number: int, eyes: Sequence[NumpyCamera], center: Array, normal: Array) -> Array | None:
+def _on_plane(marks: Marks, number: int, cameras: Sequence[NumpyCamera], center: Array, normal: Array) -> Array | None:
     """[3] where the one sight line on a corner meets the plane of the others; None where nothing was marked."""
     for view, place in marks.corners[number].items():
-        ray = eyes[view].rays(np.asarray(place))
+        ray = cameras[view].rays(np.asarray(place))
         slope = ray @ normal
         if abs(slope) > 1e-3:
-            return np.asarray(eyes[view].center + ray * ((center - eyes[view].center) @ normal) / slope)
+            return np.asarray(cameras[view].center + ray * ((center - cameras[view].center) @ normal) / slope)
     return None
 
 

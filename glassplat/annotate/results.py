@@ -108,7 +108,7 @@ RECORD = "annotated.json"
 MIRROR_REFLECTANCE = 0.999
 
 
-def write_results(root: Path, views: Sequence[View], eyes: Sequence[NumpyCamera], panes: Solved) -> list[str]:
+def write_results(root: Path, views: Sequence[View], cameras: Sequence[NumpyCamera], panes: Solved) -> list[str]:
     """Writes a mask for every photograph with a mark, and all planes; returns the masks' names.
 
     A mask tells of every pane what of it a photograph shows, also of panes that were not marked in this one.
@@ -120,17 +120,17 @@ def write_results(root: Path, views: Sequence[View], eyes: Sequence[NumpyCamera]
     folder = root / PANE_FOLDER
     earlier = earlier_masks(root)
     marked = set().union(*(pane.views() for pane, _ in panes))
-    shown = [(view, eye) for view, eye in zip(views, eyes, strict=True) if view.name in marked]
+    shown = [(view, camera) for view, camera in zip(views, cameras, strict=True) if view.name in marked]
     names = {view.name: PurePosixPath(view.name).with_suffix(".png").as_posix() for view, _ in shown}
     if len(set(names.values())) < len(names):
         names = {name: f"{name}.png" for name in names}
-    for view, eye in shown:
-        write_image(folder / names[view.name], in_photograph(view, pane_labels(view.name, eye, panes)))
+    for view, camera in shown:
+        write_image(folder / names[view.name], in_photograph(view, pane_labels(view.name, camera, panes)))
     for path in set(earlier) - {folder / name for name in names.values()}:
         path.unlink(missing_ok=True)
     with atomic_write(folder / RECORD) as temporary:
         temporary.write_text(json.dumps(sorted(names.values()), indent=1), encoding="utf-8")
-    write_planes(root / PLANES, planes_of(panes, eyes))
+    write_planes(root / PLANES, planes_of(panes, cameras))
     return sorted(names.values())
 
 
@@ -171,14 +171,14 @@ def earlier_masks(root: Path) -> list[Path]:
     return [folder / name for name in plain]
 
 
-def pane_labels(name: str, eye: NumpyCamera, panes: Solved) -> Labels:
+def pane_labels(name: str, camera: NumpyCamera, panes: Solved) -> Labels:
     """[H, W] label of the nearest pane at each pixel of a view, without what stands before it."""
-    width, height = int(eye.size[0]), int(eye.size[1])
+    width, height = int(camera.size[0]), int(camera.size[1])
     labels, nearest = np.zeros((height, width), dtype=np.uint8), np.full((height, width), np.inf)
     for pane, fit in panes:
         corners = fit.shape.corners()
-        outline = filled(seen_outline(eye, corners), (width, height))
-        depth = np.where(outline, depths(eye, corners), np.inf)
+        outline = filled(seen_outline(camera, corners), (width, height))
+        depth = np.where(outline, depths(camera, corners), np.inf)
         first = depth < nearest
         shown = with_strokes(outline, pane.strokes.get(name, ()))
         labels[first] = np.where(shown, pane.label, labels)[first]
@@ -208,9 +208,9 @@ def in_photograph(view: View, labels: Labels) -> Labels:
     return found
 
 
-def planes_of(panes: Solved, eyes: Sequence[NumpyCamera]) -> Planes:
+def planes_of(panes: Solved, cameras: Sequence[NumpyCamera]) -> Planes:
     """A rectangle around each outline, its normal towards most cameras."""
-    rows = [_rectangle(fit, eyes) for _, fit in panes]
+    rows = [_rectangle(fit, cameras) for _, fit in panes]
     centers, normals, tangents, half_sizes = (
         torch.tensor(np.stack(column), dtype=torch.float32) for column in zip(*rows, strict=True)
     )
@@ -227,11 +227,11 @@ def planes_of(panes: Solved, eyes: Sequence[NumpyCamera]) -> Planes:
     )
 
 
-def _rectangle(fit: PaneFit, eyes: Sequence[NumpyCamera]) -> tuple[NDArray[np.float64], ...]:
+def _rectangle(fit: PaneFit, cameras: Sequence[NumpyCamera]) -> tuple[NDArray[np.float64], ...]:
     """Centre, normal, tangent and half sizes."""
     corners, axes = fit.shape.corners(), fit.shape.frame
     middle = corners.mean(axis=0)
     flat = min_area_rectangle((corners - middle) @ axes[:2].T)
-    facing = np.sign([(eye.center - middle) @ axes[2] for eye in eyes]).sum()
+    facing = np.sign([(camera.center - middle) @ axes[2] for camera in cameras]).sum()
     normal = axes[2] if facing >= 0 else -axes[2]
     return middle + flat.center @ axes[:2], normal, flat.axis @ axes[:2], flat.half_sizes

@@ -44,44 +44,44 @@ LEAST_CORNERS = 3
 OFFERED = 3
 
 
-def settling_views(fit: PaneFit, eyes: Sequence[NumpyCamera], marked: Collection[int]) -> list[tuple[int, float]]:
-    """Views that would make a plane surest if their corners were marked, with the doubt in degrees after that."""
+def settling_views(fit: PaneFit, cameras: Sequence[NumpyCamera], marked: Collection[int]) -> list[tuple[int, float]]:
+    """Views that would make a plane surest if their corners were marked, with the uncertainty in degrees after that."""
     corners = fit.shape.corners()
     found = []
-    for number, eye in enumerate(eyes):
-        if number in marked or eye.holds(corners, MARGIN).sum() < min(LEAST_CORNERS, len(corners)):
+    for number, camera in enumerate(cameras):
+        if number in marked or camera.holds(corners, MARGIN).sum() < min(LEAST_CORNERS, len(corners)):
             continue
-        found.append((number, tilt_deviation(fit.information + corner_information(eye, fit.shape))))
+        found.append((number, tilt_deviation(fit.information + corner_information(camera, fit.shape))))
     return sorted(found, key=lambda pair: pair[1])[:OFFERED]
 
 
-def second_views(outline: Array, view: int, eyes: Sequence[NumpyCamera], points: Array) -> list[int]:
+def second_views(outline: Array, view: int, cameras: Sequence[NumpyCamera], points: Array) -> list[int]:
     """Views that show what one view shows inside of an outline [K, 2], from another place; the best first.
 
     The measured points [P, 3] inside of the outline tell, wherever they lie.
     """
-    eye = eyes[view]
-    inside = filled(outline, (int(eye.size[0]), int(eye.size[1])))
-    held = eye.holds(points)
-    column, row = np.floor(eye.project(points[held])).astype(np.int64).T
+    camera = cameras[view]
+    inside = filled(outline, (int(camera.size[0]), int(camera.size[1])))
+    held = camera.holds(points)
+    column, row = np.floor(camera.project(points[held])).astype(np.int64).T
     through = points[held][inside[row, column]]
     if not len(through):
         through = points[held] if held.any() else points
     if not len(through):
-        return [number for number in range(len(eyes)) if number != view][:OFFERED]
-    worth = {number: _worth(through, eye, other) for number, other in enumerate(eyes) if number != view}
+        return [number for number in range(len(cameras)) if number != view][:OFFERED]
+    worth = {number: _worth(through, camera, other) for number, other in enumerate(cameras) if number != view}
     best = sorted(worth, key=lambda number: -worth[number])
     return [number for number in best if worth[number] > 0][:OFFERED]
 
 
-def first_view(eyes: Sequence[NumpyCamera], points: Array) -> int:
+def first_view(cameras: Sequence[NumpyCamera], points: Array) -> int:
     """The view that shows most of what was measured."""
-    return int(np.argmax([eye.holds(points).sum() for eye in eyes])) if len(points) else 0
+    return int(np.argmax([camera.holds(points).sum() for camera in cameras])) if len(points) else 0
 
 
-def _worth(points: Array, eye: NumpyCamera, other: NumpyCamera) -> float:
+def _worth(points: Array, camera: NumpyCamera, other: NumpyCamera) -> float:
     """Share of the points that another view holds, times how different its sight of them is."""
-    one, two = (points - camera.center for camera in (eye, other))
+    one, two = (points - one.center for one in (camera, other))
     cosine = (one * two).sum(1) / (np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1))
     angle = float(np.median(np.arccos(np.clip(cosine, -1, 1))))
     return float(other.holds(points).mean()) * min(angle, WANTED_ANGLE)
@@ -192,13 +192,13 @@ class Session:
     Attributes:
         root: the capture's folder.
         views: all views, by name.
-        eyes: their cameras.
+        cameras: their cameras.
     """
 
     def __init__(self, dataset: Dataset) -> None:
         self.root = dataset.root
         self.views: tuple[View, ...] = tuple(sorted((*dataset.train, *dataset.test), key=lambda view: view.name))
-        self.eyes = [NumpyCamera.of(view.camera) for view in self.views]
+        self.cameras = [NumpyCamera.of(view.camera) for view in self.views]
         points = dataset.points.positions.double().numpy() if dataset.measured_points else np.zeros((0, 3))
         self._points: Array = points[:: max(1, len(points) // POINTS_USED)]
         self._numbers = {view.name: number for number, view in enumerate(self.views)}
@@ -221,7 +221,7 @@ class Session:
             "views": [
                 {"name": view.name, "width": view.camera.width, "height": view.camera.height} for view in self.views
             ],
-            "first": first_view(self.eyes, self._points),
+            "first": first_view(self.cameras, self._points),
             **self._current(),
         }
 
@@ -303,7 +303,7 @@ class Session:
         if len(marks.corners) < 3 or not marks.views():
             return SolvedPane(pane, None, "mark the corners, one after the other round the pane")
         try:
-            return SolvedPane(pane, fitted_pane(marks, self.eyes, pane.shape))
+            return SolvedPane(pane, fitted_pane(marks, self.cameras, pane.shape))
         except TooFewMarksError as error:
             return SolvedPane(pane, None, str(error))
         except ValueError as error:
@@ -319,8 +319,11 @@ class Session:
         solved = [(one.pane, one.fit) for one in panes if one.fit is not None]
         if not solved:
             raise InputError("no pane is known yet; mark the same corners in two photographs")
-        written = write_results(self.root, self.views, self.eyes, solved)
-        return {"masks": written, "planes": [{"label": pane.label, "doubt": fit.doubt} for pane, fit in solved]}
+        written = write_results(self.root, self.views, self.cameras, solved)
+        return {
+            "masks": written,
+            "planes": [{"label": pane.label, "uncertainty": fit.uncertainty} for pane, fit in solved],
+        }
 
     def _answer(self, solved: SolvedPane) -> dict[str, Any]:
         """Record of a pane for the page."""
@@ -335,30 +338,30 @@ class Session:
                 "lines": self._sight_lines(marks),
             }
         corners = fit.shape.corners()
-        advice = settling_views(fit, self.eyes, marks.views())
+        advice = settling_views(fit, self.cameras, marks.views())
         return {
             "label": pane.label,
             "solved": True,
             "message": self._judgement(pane, fit, marks),
             "error": fit.error,
-            "doubt": fit.doubt,
+            "uncertainty": fit.uncertainty,
             "errors": fit.errors,
-            "outlines": [np.round(seen_outline(eye, corners), 2).tolist() for eye in self.eyes],
-            "corners": [_places(eye, corners) for eye in self.eyes],
-            "next": [{"view": number, "doubt": doubt} for number, doubt in advice],
+            "outlines": [np.round(seen_outline(camera, corners), 2).tolist() for camera in self.cameras],
+            "corners": [_places(camera, corners) for camera in self.cameras],
+            "next": [{"view": number, "uncertainty": uncertainty} for number, uncertainty in advice],
         }
 
     def _judgement(self, pane: MarkedPane, fit: PaneFit, marks: Marks) -> str:
         """A warning about a fit, or nothing."""
         worst = max(fit.errors, key=fit.errors.__getitem__)
         if pane.shape == "rectangle" and len(marks.corners) == 4 and fit.error > 2:
-            free = fitted_pane(marks, self.eyes, "polygon")
+            free = fitted_pane(marks, self.cameras, "polygon")
             if fit.error > POOR_RECTANGLE * max(free.error, 1.0):
                 return (
                     f"the corners do not form a rectangle ({fit.error:.1f} pixels off, {free.error:.1f} without that "
                     "demand): check them, or choose polygon"
                 )
-        if fit.errors[worst] > 0.01 * self.eyes[worst].diagonal:
+        if fit.errors[worst] > 0.01 * self.cameras[worst].diagonal:
             return f"the marks in {self.views[worst].name} are {fit.errors[worst]:.0f} pixels off: check them"
         return ""
 
@@ -367,44 +370,44 @@ class Session:
         if not views:
             return []
         outline = np.array([places[views[0]] for places in marks.corners if views[0] in places]).reshape(-1, 2)
-        found = second_views(outline, views[0], self.eyes, self._points)
+        found = second_views(outline, views[0], self.cameras, self._points)
         return [number for number in found if number not in views[1:]]
 
     def _sight_lines(self, marks: Marks) -> list[list[Any]]:
         """For each corner that is marked in one view only: where it may lie in each view, a segment, or None."""
         lines = []
         for places in marks.corners:
-            segments: list[Any] = [None] * len(self.eyes)
+            segments: list[Any] = [None] * len(self.cameras)
             if len(places) == 1:
                 ((view, place),) = places.items()
                 segments = [
-                    None if number == view else self._sight_line(view, place, eye)
-                    for number, eye in enumerate(self.eyes)
+                    None if number == view else self._sight_line(view, place, camera)
+                    for number, camera in enumerate(self.cameras)
                 ]
             lines.append(segments)
         return lines
 
-    def _sight_line(self, view: int, place: Array, eye: NumpyCamera) -> list[list[float]] | None:
+    def _sight_line(self, view: int, place: Array, camera: NumpyCamera) -> list[list[float]] | None:
         """The part of a sight line, from near to far, as another view sees it."""
-        source = self.eyes[view]
+        source = self.cameras[view]
         far = self._reach()
         ends = source.center + source.rays(place) * np.geomspace(0.01 * far, 10 * far, 60)[:, None]
-        ends = ends[eye.in_camera(ends)[:, 2] > 0.005 * far]
+        ends = ends[camera.in_camera(ends)[:, 2] > 0.005 * far]
         if len(ends) < 2:
             return None
-        return np.round(eye.project(ends[[0, -1]]), 1).tolist()
+        return np.round(camera.project(ends[[0, -1]]), 1).tolist()
 
     def _reach(self) -> float:
         """Rough distance of the scene from the cameras."""
-        centers = np.stack([eye.center for eye in self.eyes])
+        centers = np.stack([camera.center for camera in self.cameras])
         things = self._points if len(self._points) else centers
         return max(float(np.median(np.linalg.norm(things - centers.mean(axis=0), axis=1))), 1e-6)
 
 
-def _places(eye: NumpyCamera, corners: Array) -> list[list[float] | None]:
+def _places(camera: NumpyCamera, corners: Array) -> list[list[float] | None]:
     """The pixels of corners; None for those behind the camera."""
-    places = np.round(eye.project(corners), 2).tolist()
-    return [place if depth > 0 else None for place, depth in zip(places, eye.in_camera(corners)[:, 2], strict=True)]
+    places = np.round(camera.project(corners), 2).tolist()
+    return [place if depth > 0 else None for place, depth in zip(places, camera.in_camera(corners)[:, 2], strict=True)]
 
 
 def opened_session(root: Path) -> Session:

@@ -96,13 +96,13 @@ def evidence_of_masks(views: Sequence[View]) -> AxesEvidence | None:
         for sightings in _sightings(annotated).values()
         if len(sightings) >= LEAST_SIGHTINGS
     ]
-    told = [(count, mine, other) for count, mine, other in shares if mine is not None and other is not None]
-    if not told:
+    known = [(count, mine, other) for count, mine, other in shares if mine is not None and other is not None]
+    if not known:
         return None
-    total = sum(count for count, _, _ in told)
+    total = sum(count for count, _, _ in known)
     return AxesEvidence(
-        sum(count * mine for count, mine, _ in told) / total,
-        sum(count * other for count, _, other in told) / total,
+        sum(count * mine for count, mine, _ in known) / total,
+        sum(count * other for count, _, other in known) / total,
         "masks",
     )
 

@@ -179,11 +179,11 @@ def _describe_scene(scene: Scene, finding: Finding) -> None:
     _look_at(scene.primary, finding)
     planes = scene.planes
     if len(planes):
-        told = (
+        descriptions = (
             f"{label}{' (mirror)' if label in planes.mirrors else f' (R0 {float(reflectance):.3f})'}"
             for label, reflectance in zip(planes.labels, planes.base_reflectances, strict=True)
         )
-        finding.facts["panes"] = ", ".join(told)
+        finding.facts["panes"] = ", ".join(descriptions)
     if len(scene.photographer):
         finding.facts["photographer"] = f"{len(scene.photographer)} Gaussians, which panes show in photographs only"
     if not scene.environment.is_empty:

@@ -79,7 +79,7 @@ class Plan:
 
 
 class Pace:
-    """The speed of this sitting over its last minute, or since the last long work, and the time left by it."""
+    """The speed of this session over its last minute, or since the last long work, and the time left by it."""
 
     def __init__(self, plan: Plan, clock: Callable[[], float] = time.monotonic) -> None:
         self._plan, self._clock = plan, clock
@@ -223,7 +223,7 @@ class StepBar:
     def step(self, standing: Standing) -> None:
         """Shows a step."""
         if not self._begun:
-            # The speed is that of this sitting, not of the steps before it.
+            # The speed is that of this session, not of the steps before it.
             fields = {"loss": standing.loss, "count": standing.count, "left": standing.left, "saved": ""}
             self._bar.add_task(standing.stage, total=standing.iterations, completed=standing.step - 1, **fields)  # type: ignore[arg-type]
             self._bar.start()

@@ -180,8 +180,8 @@ def write_clean(command: Clean, console: Console) -> None:
     """Writes the clean scene, and says what went."""
     model = command.file.opened(command.scene, command.device)
     tidy, found = model.cleaned(command.rules)
-    told = ", ".join(f"{count} {rule}" for rule, count in found.items() if count) or "no floaters"
-    say(console, f"{len(tidy.scene.primary)} of {len(model.scene.primary)} Gaussians stay; found {told}")
+    summary = ", ".join(f"{count} {rule}" for rule, count in found.items() if count) or "no floaters"
+    say(console, f"{len(tidy.scene.primary)} of {len(model.scene.primary)} Gaussians stay; found {summary}")
     if command.scale is not None:
         *points, metres = command.scale
         factor = metres / math.dist(points[:3], points[3:])

@@ -364,9 +364,9 @@ def _settings_line(results: Mapping[str, Any]) -> str:
 def _cards(results: Mapping[str, Any]) -> str:
     cards = []
     for name, metric in metrics.shown_metrics(results).items():
-        told = metric.meaning if results[name] is not None else results.get(f"{name}_reason") or ""
+        explanation = metric.meaning if results[name] is not None else results.get(f"{name}_reason") or ""
         value = _formatted(results[name], metric.pattern)
-        cards.append(f'<div title="{_escaped(told)}"><b>{value}</b><span>{metric.label}</span></div>')
+        cards.append(f'<div title="{_escaped(explanation)}"><b>{value}</b><span>{metric.label}</span></div>')
     return f'<div class="cards">{"".join(cards)}</div>'
 
 

@@ -65,8 +65,8 @@ def write_tensors(path: Path | str, tensors: Mapping[str, Tensor], header: Mappi
 
 def system_error(text: str) -> OSError:
     """The error of the operating system that a library tells in words, with the number that says what helps."""
-    if told := re.search(r"\(os error (\d+)\)", text):  # As libraries in Rust have it, on Windows with its own numbers.
-        return OSError(int(told[1]), text, None, int(told[1]))
+    if match := re.search(r"\(os error (\d+)\)", text):  # As libraries in Rust have it, on Windows with its own numbers.
+        return OSError(int(match[1]), text, None, int(match[1]))
     number = next((number for number in errno.errorcode if os.strerror(number) in text), None)
     return OSError(text) if number is None else OSError(number, text)
 
@@ -114,8 +114,8 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _file_identity(path: Path) -> tuple[int, int]:
-    told = path.stat()
-    return told.st_ino, told.st_mtime_ns
+    status = path.stat()
+    return status.st_ino, status.st_mtime_ns
 
 
 @contextmanager

@@ -74,8 +74,8 @@ class _GradientConflict(torch.autograd.Function):
         ctx: Any, transmission: Tensor, reflection: Tensor, hit: Tensor, strength: Tensor | None, cell: int
     ) -> Tensor:
         height, width = hit.shape
-        told = hit if strength is None else strength
-        images = (tensor.detach().contiguous() for tensor in (transmission, reflection, hit, told))
+        shown_mask = hit if strength is None else strength
+        images = (tensor.detach().contiguous() for tensor in (transmission, reflection, hit, shown_mask))
         # A ring of zeros around the derivatives spares the backward pass all questions about the border.
         slopes = transmission.new_zeros(2, height + 2, 3 * (width + 2))
         sums = torch.zeros(-(-(height - 2) // cell), dtype=torch.float64, device=hit.device)

@@ -22,12 +22,12 @@ CHUNK = 1024
 class Sums(NamedTuple):
     """Sums for each of N Gaussians, in two rows: over all views, and over those that see it directly.
 
-    gradient_sum [2, N]: norms of the gradient of the centre; pull_sum [2, N]: of the probe's; view_count [2, N]: how
-    many views; max_radius [N]: largest radius, as a share of the longer image side.
+    gradient_sum [2, N]: norms of the gradient of the centre; absgrad_sum [2, N]: of its absolute gradient; view_count
+    [2, N]: how many views; max_radius [N]: largest radius, as a share of the longer image side.
     """
 
     gradient_sum: Tensor
-    pull_sum: Tensor
+    absgrad_sum: Tensor
     view_count: Tensor
     max_radius: Tensor
 
@@ -35,13 +35,13 @@ class Sums(NamedTuple):
 class Views(NamedTuple):
     """Views of one image size, and the gradients of a loss in them.
 
-    v_means2d, v_probe, radii [C, N, 2]: gradients of centres and probe, and half extents, in pixels, 0 where a view
-    does not see the Gaussian. weight: what a view counts, a number or a scalar for all or [C, N] for each Gaussian.
+    v_means2d, v_absgrad, radii [C, N, 2]: gradients of centres, absolute ones, and half extents, in pixels, 0 where a
+    view does not see the Gaussian. weight: what a view counts, a scalar for all or [C, N] for each Gaussian.
     direct: whether the views see the Gaussians themselves, and not their mirror images.
     """
 
     v_means2d: Tensor
-    v_probe: Tensor
+    v_absgrad: Tensor
     radii: Tensor
     width: int
     height: int
@@ -66,8 +66,8 @@ def add_views(sums: Sums, views: Views) -> None:
     """
     cameras, count, _ = views.radii.shape
     expected: dict[str, tuple[Tensor, tuple[int, ...]]] = {"max_radius": (sums.max_radius, (count,))}
-    expected |= {name: (getattr(sums, name), (2, count)) for name in ("gradient_sum", "pull_sum", "view_count")}
-    expected |= {name: (getattr(views, name), (cameras, count, 2)) for name in ("v_means2d", "v_probe", "radii")}
+    expected |= {name: (getattr(sums, name), (2, count)) for name in ("gradient_sum", "absgrad_sum", "view_count")}
+    expected |= {name: (getattr(views, name), (cameras, count, 2)) for name in ("v_means2d", "v_absgrad", "radii")}
     if isinstance(views.weight, Tensor):
         expected["weight"] = (views.weight, (cameras, count) if views.weight.dim() else ())
     check_tensors(expected)
@@ -91,24 +91,24 @@ def add_views_kernel(real: type) -> Kernel:
 
     @kernel("screen_statistics", real)
     def add(  # type: ignore[no-untyped-def]
-        gradient_sum, pull_sum, view_count, max_radius, v_means2d, v_probe, radii, weight, width, height, rows
+        gradient_sum, absgrad_sum, view_count, max_radius, v_means2d, v_absgrad, radii, weight, width, height, rows
     ):  # fmt: skip
         cameras, count = radii.shape[0], radii.shape[1]
         right, down, longer = half * real(width), half * real(height), real(max(width, height))
         for chunk in prange((count + CHUNK - 1) // CHUNK):
             for n in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-                gradient = pull = views = radius = zero
+                gradient = absgrad = views = radius = zero
                 for c in range(cameras):
                     if radii[c, n, 0] > zero and radii[c, n, 1] > zero:
                         x, y = right * v_means2d[c, n, 0], down * v_means2d[c, n, 1]
                         gradient += math.sqrt(x * x + y * y)
-                        x, y = right * v_probe[c, n, 0], down * v_probe[c, n, 1]
-                        pull += math.sqrt(x * x + y * y)
+                        x, y = right * v_absgrad[c, n, 0], down * v_absgrad[c, n, 1]
+                        absgrad += math.sqrt(x * x + y * y)
                         views += weight[c, n] if weight.size > 1 else weight[0, 0]
                         radius = max(radius, radii[c, n, 0], radii[c, n, 1])
                 for row in range(rows):
                     gradient_sum[row, n] += gradient
-                    pull_sum[row, n] += pull
+                    absgrad_sum[row, n] += absgrad
                     view_count[row, n] += views
                 max_radius[n] = max(max_radius[n], radius / longer)
 

@@ -39,7 +39,7 @@ from glassplat.training.losses import (
     strength_outside,
     weighted,
 )
-from glassplat.training.options import PUBLISHED_ITERATIONS, GaussianRates, Rate, Rhythm
+from glassplat.training.options import PUBLISHED_ITERATIONS, GaussianRates, Intervals, Rate
 from glassplat.training.stage import Action, Every, Stage
 
 if TYPE_CHECKING:
@@ -80,7 +80,9 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         post_steps=population.post_steps,
         densify_until=population.densify_until,
     )
-    beat = Every(recipe.rhythm.beat, 0.0, recipe.schedule.stop, recipe.rhythm.least, skip_multiples_of=3)
+    propagate_at = Every(
+        recipe.intervals.opacity, 0.0, recipe.schedule.stop, recipe.intervals.least, skip_multiples_of=3
+    )
     renderer = Deferred(recipe.background or BLACK, depth=recipe.consistency_weight != 0)
     guidance = weighted(
         LossTerm("outside", recipe.outside_weight, strength_outside),
@@ -96,9 +98,9 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         rates=recipe.rates.of("primary", held) | recipe.reflection_rates.of(),
         actions=(
             *_edits(recipe, population),
-            # Before the resets: it looks at what is seen, also at the beats that it leaves to them.
-            _propagate(recipe, beat, renderer),
-            GrowShAfterPropagation(Every(recipe.rhythm.sh)),
+            # Before the resets: it looks at what is seen, also at the steps that it leaves to them.
+            _propagate(recipe, propagate_at, renderer),
+            GrowShAfterPropagation(Every(recipe.intervals.sh)),
             *_resets(recipe, population),
             RefineEnvironment(doublings(recipe.first_texels, recipe.texels), recipe.texels),
         ),
@@ -119,7 +121,7 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
 
 def _matte_stages(recipe: DeferredRecipe, primitive: Primitive, seed: int, iterations: int) -> tuple[Stage, ...]:
     """Those of a run that is too short for normals to spread: as in `splat`."""
-    usual = Rhythm()
+    usual = Intervals()
     plain = SplatRecipe(
         primitive=primitive,
         sh_degree=recipe.sh_degree,
@@ -127,7 +129,7 @@ def _matte_stages(recipe: DeferredRecipe, primitive: Primitive, seed: int, itera
         view_dependence_weight=recipe.view_dependence_weight,
         background=recipe.background,
         rates=_rates_of_splat(recipe),
-        rhythm=replace(recipe.rhythm, beat=usual.beat, least=usual.least),
+        intervals=replace(recipe.intervals, opacity=usual.opacity, least=usual.least),
         strategy=recipe.strategy,
         densify=recipe.densify,
         mcmc=recipe.mcmc,
@@ -139,13 +141,15 @@ def _matte_stages(recipe: DeferredRecipe, primitive: Primitive, seed: int, itera
 def _rates_of_splat(recipe: DeferredRecipe) -> GaussianRates:
     """The learning rates where nothing reflects that higher ones would spoil."""
     return (
-        replace(recipe.rates, short_run_power=GaussianRates().short_run_power) if recipe.hurry_matte else recipe.rates
+        replace(recipe.rates, short_run_power=GaussianRates().short_run_power)
+        if recipe.raise_rates_matte
+        else recipe.rates
     )
 
 
 def _regular(recipe: DeferredRecipe, population: Population) -> tuple[Action, ...]:
     """Actions of the bootstrap, as in `splat`: a scene has to look right before mirrors can be recognised."""
-    return (GrowSh(Every(recipe.rhythm.sh)), *population.resets) if recipe.search.begin_found else ()
+    return (GrowSh(Every(recipe.intervals.sh)), *population.resets) if recipe.search.begin_found else ()
 
 
 def first_reflections(recipe: DeferredRecipe) -> BeginReflections:
@@ -176,20 +180,20 @@ def _resets(recipe: DeferredRecipe, population: Population) -> tuple[ResetOpacit
     return tuple(ResetRaised.instead_of(reset) for reset in population.resets)
 
 
-def _propagate(recipe: DeferredRecipe, beat: Every, renderer: Deferred) -> Propagate:
+def _propagate(recipe: DeferredRecipe, when: Every, renderer: Deferred) -> Propagate:
     return Propagate(
-        beat,
+        when,
         recipe.propagation,
         recipe.schedule,
         renderer,
         matte_rates=_matte_rates(recipe),
-        hurries_found=recipe.hurry_found,
+        raises_rates_found=recipe.raise_rates_found,
     )
 
 
 def _matte_rates(recipe: DeferredRecipe) -> dict[str, Rate]:
     """Factors that bring the learning rates to those of `splat`, where no normals can be spoiled."""
-    if not recipe.hurry_matte:
+    if not recipe.raise_rates_matte:
         return {}
     missing = GaussianRates().short_run_power - recipe.rates.short_run_power
     return {
@@ -233,7 +237,7 @@ def traced_stages_of(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHE
         return corrections_learnt(recipe, _matte_stages(recipe.distant(), recipe.primitive, seed, iterations))
     known = recipe.distant().stages(seed, iterations)
     if recipe.harmonics_from_start:
-        known = tuple(_with_harmonics(stage, Every(recipe.rhythm.sh)) for stage in known)
+        known = tuple(_with_harmonics(stage, Every(recipe.intervals.sh)) for stage in known)
     bootstrap, distant, refinement = known
     if recipe.primitive == "disc":
         distant, refinement = _rendered(recipe, distant), _rendered(recipe, refinement)
@@ -290,6 +294,6 @@ def _surroundings_actions(recipe: TracedRecipe) -> list[Action]:
     return [
         Densify(options.densify, "surroundings"),
         PruneIdle(options.densify, "surroundings", mirrored_contributions),
-        GrowSh(Every(recipe.rhythm.sh), "surroundings"),
+        GrowSh(Every(recipe.intervals.sh), "surroundings"),
         *([reset] if options.reset else []),
     ]

@@ -24,6 +24,7 @@ from glassplat.training.options import (
     PUBLISHED_ITERATIONS,
     DefaultDensify,
     GaussianRates,
+    Intervals,
     McmcDensify,
     MirrorSearch,
     NormalPropagation,
@@ -31,7 +32,6 @@ from glassplat.training.options import (
     PoseRefinement,
     PropagationSchedule,
     ReflectionRates,
-    Rhythm,
     Strategy,
     SurroundingsOptions,
     SurroundingsStart,
@@ -76,15 +76,16 @@ class GlossyOptions:
         schedule: when they do.
         least_iterations: of the shortest run in which anything reflects. A shorter one would be over before the colours
             have learnt what the reflections leave to them; it trains like one of `splat`.
-        hurry_matte: raise the learning rates to those of `splat` for the rest of a run in which nothing was found that
-            reflects, and for all of one that is too short to look for it.
-        hurry_found: so that `hurry_matte` counts after propagation where something reflects, too; before, high rates
-            would spoil its normals.
+        raise_rates_matte: raise the learning rates to those of `splat` for the rest of a run in which nothing was found
+            that reflects, and for all of one that is too short to look for it.
+        raise_rates_found: raise them after propagation where something reflects, too; before, high rates would spoil
+            its normals.
         propagation_interval: steps between densifications while normals spread; None keeps `densify.interval`.
-        rates: learning rates of the Gaussians; in short runs they rise before and after normals spread (`hurry_matte`,
-            `hurry_found`), but not meanwhile: that costs a mirror ball its normals (lab/training.md).
+        rates: learning rates of the Gaussians; in short runs they rise before and after normals spread
+            (`raise_rates_matte`, `raise_rates_found`), not meanwhile: that costs a mirror ball its normals
+            (lab/training.md).
         reflection_rates: learning rates of strength and environment.
-        rhythm: when opacities are reset and the SH degree grows.
+        intervals: when opacities are reset and the SH degree grows.
         strategy: what decides how many Gaussians there are and where; `densify` or `mcmc` holds its options.
         densify: when and how Gaussians are added and pruned under `default`.
         mcmc: when and how Gaussians are relocated and added under `mcmc`.
@@ -110,12 +111,12 @@ class GlossyOptions:
     propagation: Internal[NormalPropagation] = field(default_factory=NormalPropagation)
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
     least_iterations: Several = 6000
-    hurry_matte: Internal[bool] = True
-    hurry_found: Internal[bool] = True
+    raise_rates_matte: Internal[bool] = True
+    raise_rates_found: Internal[bool] = True
     propagation_interval: Internal[Several | None] = None
     rates: GaussianRates = field(default_factory=partial(GaussianRates, short_run_power=0.0))
     reflection_rates: Internal[ReflectionRates] = field(default_factory=ReflectionRates)
-    rhythm: Rhythm = field(default_factory=lambda: Rhythm(beat=0.005, least=150))
+    intervals: Intervals = field(default_factory=lambda: Intervals(opacity=0.005, least=150))
     strategy: Annotated[Strategy, ESSENTIAL] = "default"
     densify: DefaultDensify = field(default_factory=DefaultDensify)
     mcmc: McmcDensify = field(default_factory=McmcDensify)
@@ -160,13 +161,13 @@ class DeferredRecipe(GlossyOptions):
                 end="fixed", stop=24_000 / DEFERRED_CODE_ITERATIONS, pause=200, last_reset=False
             ),
             least_iterations=1,
-            hurry_matte=False,
-            hurry_found=False,
+            raise_rates_matte=False,
+            raise_rates_found=False,
             propagation_interval=500,
             rates=GaussianRates(decay=30_000 / DEFERRED_CODE_ITERATIONS, short_run_power=0.0),
             reflection_rates=ReflectionRates(strength=6e-3),
-            rhythm=Rhythm(
-                beat=1000 / DEFERRED_CODE_ITERATIONS,
+            intervals=Intervals(
+                opacity=1000 / DEFERRED_CODE_ITERATIONS,
                 least=150,
                 reset_stop=29_000 / DEFERRED_CODE_ITERATIONS,
                 sh=1000 / DEFERRED_CODE_ITERATIONS,
@@ -233,7 +234,7 @@ class TracedRecipe(GlossyOptions):
     surroundings: SurroundingsOptions = field(default_factory=SurroundingsOptions)
     normals_throughout: Internal[bool] = False
     bootstrap: Share = 0.25
-    rhythm: Rhythm = field(default_factory=lambda: Rhythm(beat=0.0214, least=150))
+    intervals: Intervals = field(default_factory=lambda: Intervals(opacity=0.0214, least=150))
 
     @classmethod
     def paper(cls) -> TracedRecipe:
@@ -275,12 +276,12 @@ class TracedRecipe(GlossyOptions):
             schedule=PropagationSchedule(
                 end="fixed", stop=18_000 / TRACED_CODE_ITERATIONS, pause=200, last_reset=False
             ),
-            hurry_matte=False,
-            hurry_found=False,
+            raise_rates_matte=False,
+            raise_rates_found=False,
             rates=plain,
             reflection_rates=ReflectionRates(strength=1e-2),
-            rhythm=Rhythm(
-                beat=1000 / TRACED_CODE_ITERATIONS,
+            intervals=Intervals(
+                opacity=1000 / TRACED_CODE_ITERATIONS,
                 least=150,
                 reset_stop=21_000 / TRACED_CODE_ITERATIONS,
                 sh=1000 / TRACED_CODE_ITERATIONS,

@@ -317,14 +317,14 @@ class Propagate:
     Where none has been found, the run goes on like one of `splat`, and the log says what may help.
 
     Attributes:
-        when: the beats at which it happens; whether to go on is asked at those that it skips, too.
+        when: the intervals at which it happens; whether to go on is asked at those that it skips, too.
         propagation: what it does.
         schedule: when it ends.
         renderer: that of the stage; its frames have a layer `base`.
         matte_rates: factors on learning rates after the end where nothing reflective was found, by dotted parameter
             name; of them the value for a run of this length is taken.
         search: what tells how much reflects.
-        hurries_found: they count after the end where something was found, too.
+        raises_rates_found: they count after the end where something was found, too.
     """
 
     when: Every
@@ -333,12 +333,12 @@ class Propagate:
     renderer: Renderer
     matte_rates: Mapping[str, Rate] = field(default_factory=dict)
     search: Search = field(default_factory=Search)
-    hurries_found: bool = False
+    raises_rates_found: bool = False
     name: str = "propagate normals"
 
     def due(self, clock: Clock) -> bool:
         """Return whether to act after this step."""
-        return self._beats.due(clock) or clock.step == self._last(clock)
+        return self._all_intervals.due(clock) or clock.step == self._last(clock)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state`, until propagation has ended."""
@@ -359,16 +359,18 @@ class Propagate:
         return True
 
     @property
-    def _beats(self) -> Every:
+    def _all_intervals(self) -> Every:
         """All of them."""
         return replace(self.when, skip_multiples_of=None)
 
-    def _hurry(self, state: TrainState, clock: Clock) -> None:
+    def _raise_rates(self, state: TrainState, clock: Clock) -> None:
         """Learns faster where there is no normal that this would spoil."""
-        state.optimizer.hurried = {name: rate.at(0.0, 1.0, clock.iterations) for name, rate in self.matte_rates.items()}
+        state.optimizer.raised_rates = {
+            name: rate.at(0.0, 1.0, clock.iterations) for name, rate in self.matte_rates.items()
+        }
 
     def _first(self, clock: Clock) -> int:
-        """The first beat that is left to a reset.
+        """The first step that is left to a reset.
 
         Before it, what random points became is still in the way everywhere; made opaque, it hides the surfaces.
         """
@@ -391,7 +393,7 @@ class Propagate:
     def _looks_matte(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Return whether nothing reflects nor turns with the view; keeps the record.
 
-        That is asked before opacities are raised for the first time, and at the beats after a reset. At others,
+        That is asked before opacities are raised for the first time, and one interval after a reset. At others,
         whatever stands in the way turns with the view.
         """
         if state.records[MOST] >= FOUND:
@@ -404,8 +406,8 @@ class Propagate:
         """Notes the end and says what was found."""
         state.records[ENDED] = clock.step
         share = max(self.search.reflective(state.scene, dataset.train), state.records.get(MOST, 0.0))
-        if share < FOUND or self.hurries_found:
-            self._hurry(state, clock)
+        if share < FOUND or self.raises_rates_found:
+            self._raise_rates(state, clock)
         if share >= FOUND:
             log.info(
                 "step %d: normal propagation has ended, %.0f %% of what is seen is reflection", clock.step, 100 * share

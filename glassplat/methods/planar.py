@@ -444,7 +444,7 @@ def stages_of(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERA
         renderer=Splat(recipe.background or BLACK, depth=False),
         losses=(image_term(recipe.ssim_weight), *population.terms),
         rates=recipe.rates.of("primary", recipe.view_dependence_weight),
-        actions=(*population.edits, GrowSh(Every(recipe.rhythm.sh)), *_early_resets(recipe, population)),
+        actions=(*population.edits, GrowSh(Every(recipe.intervals.sh)), *_early_resets(recipe, population)),
         post_steps=population.post_steps,
         densify_until=population.densify_until,
     )
@@ -482,7 +482,7 @@ def _adjustment(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> Stage:
         rates=_gaussian_rates(recipe) | plane_rates(),
         actions=(
             *population.edits,
-            GrowSh(Every(recipe.rhythm.sh)),
+            GrowSh(Every(recipe.intervals.sh)),
             Densify(recipe.densify, part="glass"),
             *_missing(recipe, recipe.stage_shares[0] / sum(recipe.stage_shares) + ADJUSTED_AFTER),
             *_early_resets(recipe, population),
@@ -497,7 +497,9 @@ def _adjustment(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> Stage:
 def _joint(recipe: PlanarRecipe, share: float) -> Stage:
     """Stage 3: everything learns, opacities are perturbed, planes move slowly."""
     population = planar_population(recipe)
-    beat = Every(recipe.rhythm.beat, 0.0, recipe.perturbation.stop, recipe.rhythm.least, skip_multiples_of=3)
+    perturb_at = Every(
+        recipe.intervals.opacity, 0.0, recipe.perturbation.stop, recipe.intervals.least, skip_multiples_of=3
+    )
     return Stage(
         name="3 joint optimisation",
         share=share,
@@ -510,12 +512,12 @@ def _joint(recipe: PlanarRecipe, share: float) -> Stage:
             *_turns(recipe),
             *_missing(recipe, _joint_start(recipe) + JOINED_AFTER),
             *population.edits,
-            GrowSh(Every(recipe.rhythm.sh)),
+            GrowSh(Every(recipe.intervals.sh)),
             Densify(recipe.densify, part="glass"),
             *population.resets,
             *_clearing(recipe),
             *((FillUnseen(),) if recipe.seed_reflections else ()),
-            PerturbOpacity(beat, recipe.perturbation.amplitude, recipe.perturbation.bounds),
+            PerturbOpacity(perturb_at, recipe.perturbation.amplitude, recipe.perturbation.bounds),
         ),
         post_steps=(*_glass_post_steps(recipe), *population.post_steps),
         densify_until=recipe.densify.stop,

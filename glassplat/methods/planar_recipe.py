@@ -24,11 +24,11 @@ from glassplat.training.options import (
     PUBLISHED_ITERATIONS,
     DefaultDensify,
     GaussianRates,
+    Intervals,
     McmcDensify,
     PhotoExposure,
     Photographer,
     PoseRefinement,
-    Rhythm,
     Strategy,
 )
 
@@ -63,7 +63,7 @@ class ReflectionWeights:
 class Perturbation:
     """Perturbation of the opacity of what lies behind a pane: times and amount (Section III-C3).
 
-    It happens at the beats of `Rhythm` that do not reset the opacities.
+    It happens at the intervals of `Intervals.opacity` that do not reset the opacities.
 
     Attributes:
         amplitude: half width of the uniform noise on the opacity; 0 switches it off.
@@ -113,12 +113,12 @@ class PlanarRecipe:
             not, Gaussians are drawn to the mean, and the mean not to them.
         rates: learning rates of the Gaussians.
         plane_fit: how planes are found from masks.
-        rhythm: when opacities are reset and the SH degree grows.
+        intervals: when opacities are reset and the SH degree grows.
         strategy: what decides how many primary Gaussians there are and where: densification, or MCMC (Eq. 20), under
             which the set grows in the joint stage only, and opacities are reset once before it.
         early_growth: under `mcmc`, let the set grow from the first stage on, and reset no opacities, as in the paper.
             Many Gaussians then build the reflected room behind the panes, and no pruning removes it later.
-        early_resets: reset opacities in the first two stages too, at the beats of the third, as in the paper.
+        early_resets: reset opacities in the first two stages too, at the intervals of the third, as in the paper.
         densify_by: the views by which primary Gaussians are densified: those that show them directly, or their mirror
             images where none does, each counting by what panes leave of it; or all views and mirror images alike.
         densify: when and how Gaussians are added and pruned under `default`.
@@ -152,7 +152,7 @@ class PlanarRecipe:
     perturbation: Perturbation = field(default_factory=Perturbation)
     rates: GaussianRates = field(default_factory=GaussianRates)
     plane_fit: PlaneFit = field(default_factory=PlaneFit)
-    rhythm: Rhythm = field(default_factory=Rhythm)
+    intervals: Intervals = field(default_factory=Intervals)
     strategy: Annotated[Strategy, ESSENTIAL] = "default"
     early_growth: Internal[bool] = False
     early_resets: Internal[bool] = False
@@ -182,7 +182,7 @@ class PlanarRecipe:
             plane_fit=PlaneFit(glass_reflectance=0.2),
             perturbation=Perturbation(stop=29 / 30, bounds=(1e-6, 1 - 1e-6)),
             rates=GaussianRates(short_run_power=0.0),
-            rhythm=Rhythm(averaged_passes=0.0),
+            intervals=Intervals(averaged_passes=0.0),
             early_growth=True,
             early_resets=True,
             densify_by="all",

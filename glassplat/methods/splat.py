@@ -43,7 +43,7 @@ def stages_of(recipe: SplatRecipe, seed: int, iterations: int = PUBLISHED_ITERAT
         renderer=_bare(recipe),
         losses=(image_term(recipe.ssim_weight), *population.terms),
         rates=recipe.rates.of("primary", recipe.view_dependence_weight),
-        actions=(*_missing(recipe), *population.edits, GrowSh(Every(recipe.rhythm.sh)), *population.resets),
+        actions=(*_missing(recipe), *population.edits, GrowSh(Every(recipe.intervals.sh)), *population.resets),
         post_steps=population.post_steps,
         densify_until=population.densify_until,
     )
@@ -80,10 +80,10 @@ def population_of(recipe: SplatRecipe | PlanarRecipe | DeferredRecipe, mcmc: Mcm
     if recipe.strategy == "mcmc":
         population = mcmc_population(mcmc or recipe.mcmc, recipe.rates.of("primary")["primary.means"])
     else:
-        population = default_population(recipe.densify, recipe.rhythm)
-    if recipe.rhythm.averaged_passes == 0:
+        population = default_population(recipe.densify, recipe.intervals)
+    if recipe.intervals.averaged_passes == 0:
         return population
-    return replace(population, post_steps=(*population.post_steps, AverageLast(recipe.rhythm.averaged_passes)))
+    return replace(population, post_steps=(*population.post_steps, AverageLast(recipe.intervals.averaged_passes)))
 
 
 def terms_by_start(options: DiscTerms) -> tuple[tuple[float, LossTerm], ...]:

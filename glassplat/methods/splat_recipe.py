@@ -10,10 +10,10 @@ from glassplat.training.options import (
     PUBLISHED_ITERATIONS,
     DefaultDensify,
     GaussianRates,
+    Intervals,
     McmcDensify,
     PhotoExposure,
     PoseRefinement,
-    Rhythm,
     Strategy,
 )
 
@@ -54,7 +54,7 @@ class SplatRecipe:
         view_dependence_weight: of the squares of the spherical harmonics beyond the constant one.
         background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
         rates: learning rates.
-        rhythm: when opacities are reset and the SH degree grows.
+        intervals: when opacities are reset and the SH degree grows.
         strategy: what decides how many Gaussians there are and where; `densify` or `mcmc` holds its options.
         densify: when and how Gaussians are added and pruned under `default`.
         mcmc: when and how Gaussians are relocated and added under `mcmc`.
@@ -73,7 +73,7 @@ class SplatRecipe:
     view_dependence_weight: NotNegative = 0.0
     background: Annotated[Color | None, ESSENTIAL] = None
     rates: GaussianRates = field(default_factory=GaussianRates)
-    rhythm: Rhythm = field(default_factory=Rhythm)
+    intervals: Intervals = field(default_factory=Intervals)
     strategy: Annotated[Strategy, ESSENTIAL] = "default"
     densify: DefaultDensify = field(default_factory=DefaultDensify)
     mcmc: McmcDensify = field(default_factory=McmcDensify)
@@ -87,7 +87,7 @@ class SplatRecipe:
         """As published: 3DGS, or 3DGS-MCMC with that strategy, or 2DGS with discs (docs/splat.md)."""
         return cls(
             rates=GaussianRates(short_run_power=0.0),
-            rhythm=Rhythm(averaged_passes=0.0),
+            intervals=Intervals(averaged_passes=0.0),
             seed_unexplained=False,
             densify=DefaultDensify.published(),
             mcmc=McmcDensify.published(),

@@ -82,9 +82,9 @@ class Model:
 
     def _repr_html_(self) -> str:
         """A small picture from a photograph's camera that shows the panes well, for notebooks."""
-        told = html.escape(repr(self))
+        text = html.escape(repr(self))
         if not self.cameras:
-            return f"<p>{told}</p>"
+            return f"<p>{text}</p>"
         names = tuple(self.cameras)
         name = names[best_view(self.scene.planes, tuple(self.cameras.values()))]
         camera = self.cameras[name]
@@ -93,7 +93,7 @@ class Model:
         file = io.BytesIO()
         Image.fromarray((255 * self.image(small)).round().byte().numpy()).save(file, "JPEG", quality=90)
         picture = base64.b64encode(file.getvalue()).decode()
-        return f'<p>{told}</p><img src="data:image/jpeg;base64,{picture}" alt="{html.escape(name)}">'
+        return f'<p>{text}</p><img src="data:image/jpeg;base64,{picture}" alt="{html.escape(name)}">'
 
     def show(self) -> Viewer:
         """Shows it in the browser as `glassplat view` does, at the `address` of what it returns, until its `stop()`.

@@ -189,7 +189,7 @@ class Run:
             self.state = self._ranks.shared(self.state, settings.device)
             with run_directory.open_log(directory.log, self.state.step) as log:
                 self._session = TrainingSession(self.state, self._ranks, Record(directory.checkpoint, log, self._every))
-                yield from self._session.told(RunBegun(self.state.step, settings.iterations, anew))
+                yield from self._session.deliver(RunBegun(self.state.step, settings.iterations, anew))
                 with self._dataset.memory.spooled(directory.path):
                     yield from self._session.trained(self._stages, self._dataset, settings.iterations)
             self._export()
@@ -320,7 +320,7 @@ class TrainingSession:
             self._ranks.asked = lambda: self._stop.requested
             messages = train(stages, dataset, self._state, iterations, ranks=self._ranks)
             for message in self._saved_where_it_fails(messages, check_photographs):
-                yield from self.told(message)
+                yield from self.deliver(message)
                 if isinstance(message, StepDone):
                     yield from self._saved_in_time(message, iterations)
 
@@ -346,7 +346,7 @@ class TrainingSession:
         is_time = self._record is not None and self._is_time(self._record.every)
         if is_ending or is_last or is_time:
             self.save()
-            yield from self.told(CheckpointWritten(message.step))
+            yield from self.deliver(CheckpointWritten(message.step))
         if is_ending and not is_last:
             self._stop.end()
         self._stepped = time.perf_counter()
@@ -362,7 +362,7 @@ class TrainingSession:
             self._longest = max(self._longest, now - self._stepped)
         return now - self._saved + min(self._longest + self._writing, every / 2) >= every
 
-    def told(self, message: Message) -> Generator[Message, None, None]:
+    def deliver(self, message: Message) -> Generator[Message, None, None]:
         """Passes a message on; should nobody be there any more to hear it, what was trained is saved first."""
         try:
             if self._record is not None:
@@ -509,7 +509,7 @@ class Training:
 
     @property
     def seconds(self) -> float:
-        """Time spent training, over all sittings, up to the last checkpoint."""
+        """Time spent training, over all sessions, up to the last checkpoint."""
         return self.state.seconds
 
     @property

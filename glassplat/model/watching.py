@@ -160,10 +160,10 @@ class WatchedTraining:
                 self._is_save_asked = False
                 try:
                     self._training.save()
-                    told = "saved"
+                    outcome = "saved"
                 except Exception as error:  # noqa: BLE001 - Whatever it is, the training does not end by a click.
-                    told = f"not saved: {error}"
-                viewer.refresh(f"{self._status(message)}, {told}")
+                    outcome = f"not saved: {error}"
+                viewer.refresh(f"{self._status(message)}, {outcome}")
             if self._is_paused and not viewer.loop.serve():
                 viewer.loop.wait(PAUSE_SECONDS)
 

@@ -53,7 +53,7 @@ def report_masks(label: int, plane: FramedPlanes, views: Sequence[PaneView]) -> 
     """Logs how well each mask of a pane fits the others on its plane, and warns of those that do not, by name."""
     meeting, overlap = meeting_of_each(plane, views), agreement_of_each(plane.planes, views)
     found = [f"{view.name} {_percent(share)}" for view, share in zip(views, meeting, strict=True)]
-    areas = ", ".join(f"{told} ({area:.2f})" for told, area in zip(found, overlap, strict=True))
+    areas = ", ".join(f"{name} ({area:.2f})" for name, area in zip(found, overlap, strict=True))
     log.debug("pane %d: outlines of the masks that meet those of the others (and overlap): %s", label, areas)
     log.info(
         "pane %d: %d masks, which overlap by %.2f to %.2f on its plane", label, len(views), min(overlap), max(overlap)
@@ -112,7 +112,7 @@ def _without_shared_edges(view: PaneView) -> PaneView:
 
 LEAST_APART = 0.01
 """Distance between annotated cameras below which nothing is tried, in scene extents."""
-SOME_DOUBT, MOST_DOUBT = 2.5, 5.0
+UNSURE, VERY_UNSURE = 2.5, 5.0
 """Degrees by which a plane may be turned without its masks telling before more masks are asked for, and before it is
 refused. Of 27 panes 24 come to at most 1.5. Beyond, the little that masks say misleads: a mirror that came to 3.6,
 small and marked in four photographs from nearly one place, was off by 29."""
@@ -266,7 +266,7 @@ def _found_pane(
     if all(other is view for other, view in zip(filled, views, strict=True)):
         return found
     whole = _fitted_pane(label, clouds, filled, extent=extent, options=options)
-    if whole.fault is not None or _doubt(whole.plane, whole.evidence) > SOME_DOUBT:
+    if whole.fault is not None or _tilt_degrees(whole.plane, whole.evidence) > UNSURE:
         return found
     if found.fault is None and _loss(whole, found.plane) <= MOST_LOSS:
         return found
@@ -402,7 +402,7 @@ def _finished(pane: _Found, options: PlaneFit, unmarked: Sequence[tuple[str, Cam
     try:
         if pane.fault is not None:
             raise pane.fault
-        if not pane.is_settled and (reason := _reason_for_doubt(pane)):
+        if not pane.is_settled and (reason := _reason_to_distrust(pane)):
             worth_marking = _worth_marking(views, unmarked)
             log.warning("pane %d: %s; annotate it from places farther apart%s", pane.label, reason, worth_marking)
         report_masks(pane.label, pane.plane, views)
@@ -415,12 +415,12 @@ def _finished(pane: _Found, options: PlaneFit, unmarked: Sequence[tuple[str, Cam
         ) from error
 
 
-def _reason_for_doubt(pane: _Found) -> str:
+def _reason_to_distrust(pane: _Found) -> str:
     """The reason to doubt a pane's own plane, for a message; empty if there is none."""
     if pane.has_few:
         return "two annotated views alone often leave its plane off by tens of degrees"
-    doubt = _doubt(pane.plane, pane.evidence)
-    return f"{_left_open(doubt, pane.evidence)}, and may be off by far more" if doubt > SOME_DOUBT else ""
+    degrees = _tilt_degrees(pane.plane, pane.evidence)
+    return f"{_left_open(degrees, pane.evidence)}, and may be off by far more" if degrees > UNSURE else ""
 
 
 MOST_NAMED = 3
@@ -432,15 +432,15 @@ WELL_INSIDE = 0.2
 def _worth_marking(views: Sequence[PaneView], unmarked: Sequence[tuple[str, Camera]]) -> str:
     """Names of photographs without masks that should show the pane well from elsewhere, for a message."""
     middle = _seen_middle(views)
-    eyes = [view.center for view in views]
+    centers = [view.center for view in views]
     names: list[str] = []
     cameras = [(name, NumpyCamera.of(camera)) for name, camera in unmarked]
     held = [(name, camera.center) for name, camera in cameras if camera.holds(middle, margin=-WELL_INSIDE)]
     while held and len(names) < MOST_NAMED:
-        apart = [min(_turn(middle, eye, other) for other in eyes) for _, eye in held]
-        name, eye = held.pop(int(np.argmax(apart)))
+        apart = [min(_turn(middle, center, other) for other in centers) for _, center in held]
+        name, center = held.pop(int(np.argmax(apart)))
         names.append(name)
-        eyes.append(eye)
+        centers.append(center)
     return f": {', '.join(names)} should show it well" if names else ""
 
 
@@ -456,9 +456,9 @@ def _seen_middle(views: Sequence[PaneView]) -> Array:
     return np.asarray(np.linalg.lstsq(system, right, rcond=None)[0])
 
 
-def _turn(middle: Array, eye: Array, other: Array) -> float:
+def _turn(middle: Array, center: Array, other: Array) -> float:
     """Radians between the directions in which two cameras see a point."""
-    first, second = eye - middle, other - middle
+    first, second = center - middle, other - middle
     return float(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second))
 
 
@@ -473,8 +473,8 @@ def _check_views(label: int, views: Sequence[PaneView], extent: float) -> None:
 
 
 def _check_places(label: int, views: Sequence[PaneView], extent: float) -> None:
-    eyes = np.stack([view.center for view in views])
-    apart = float(np.linalg.norm(eyes - eyes[0], axis=1).max())
+    centers = np.stack([view.center for view in views])
+    apart = float(np.linalg.norm(centers - centers[0], axis=1).max())
     if apart < LEAST_APART * extent:
         raise PlaneFitError(
             f"pane {label}: its {len(views)} annotated views were taken from places at most {apart:.3g} apart in a "
@@ -502,12 +502,12 @@ def _check_outlines(found: FramedPlanes, objective: Objective) -> None:
 
 
 def _check_certainty(found: FramedPlanes, objective: Objective) -> None:
-    degrees = _doubt(found, objective)
-    if degrees > MOST_DOUBT:
+    degrees = _tilt_degrees(found, objective)
+    if degrees > VERY_UNSURE:
         raise _UndecidedError(_left_open(degrees, objective))
 
 
-def _doubt(found: FramedPlanes, objective: Objective) -> float:
+def _tilt_degrees(found: FramedPlanes, objective: Objective) -> float:
     """Degrees by which a plane may be turned before its masks tell."""
     return float(np.degrees(tilt_uncertainty(found, objective, MIDDLE)[0]))
 
@@ -530,9 +530,9 @@ def _check_agreement(plane: PlaneEquations, views: Sequence[PaneView], least: fl
 
 
 def _pane(plane: PlaneEquations, views: Sequence[PaneView], margin: float) -> _Pane:
-    eyes = np.stack([view.center for view in views])
+    centers = np.stack([view.center for view in views])
     normal = plane.normals[0]
-    if (np.sign(plane.distances(eyes)[0])).sum() < 0:
+    if (np.sign(plane.distances(centers)[0])).sum() < 0:
         normal = -normal
     axes = np.linalg.svd(normal[None])[2][1:]
     rectangle = pane_rectangle(plane, views, axes)

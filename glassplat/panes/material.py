@@ -102,13 +102,13 @@ class JudgedPane(NamedTuple):
 class Photograph(NamedTuple):
     """A photograph reduced to what tells mirrors from glass.
 
-    camera: of its size; pixels [H, W, 3] in [0, 1], at the scene's exposure; told [H, W] bool, which of them count;
+    camera: of its size; pixels [H, W, 3] in [0, 1], at the scene's exposure; valid [H, W] bool, which of them count;
     labels [H, W] of panes, None where it is not annotated.
     """
 
     camera: Camera
     pixels: Tensor
-    told: Tensor
+    valid: Tensor
     labels: Tensor | None
 
 
@@ -125,13 +125,13 @@ def reduced_photograph(scene: Scene, view: View) -> Photograph:
     size = (max(round(factor * camera.height), 1), max(round(factor * camera.width), 1))
     pixels = scene.exposures.undone(view.photo.to(device).float() / 255, view.name)
     pixels = torch.nn.functional.interpolate(pixels.movedim(-1, 0)[None], size, mode="area")[0].movedim(0, -1)
-    told = torch.ones_like(pixels[..., 0]) if view.ignored is None else 1.0 - view.ignored.to(device).float()
+    valid = torch.ones_like(pixels[..., 0]) if view.ignored is None else 1.0 - view.ignored.to(device).float()
     if view.ignored is not None:
-        told = torch.nn.functional.interpolate(told[None, None], size, mode="area")[0, 0]
+        valid = torch.nn.functional.interpolate(valid[None, None], size, mode="area")[0, 0]
     labels = None if view.pane_labels is None else view.pane_labels.to(device)
     if labels is not None:
         labels = torch.nn.functional.interpolate(labels[None, None].float(), size, mode="nearest-exact")[0, 0]
-    return Photograph(camera.resized(size[1], size[0]), pixels, told == 1, labels)
+    return Photograph(camera.resized(size[1], size[0]), pixels, valid == 1, labels)
 
 
 def judged_pane(scene: Scene, label: int, photographs: Sequence[Photograph]) -> JudgedPane:
@@ -179,7 +179,7 @@ def degrees_between(normal: Tensor, other: Tensor) -> float:
 @torch.no_grad()
 def pane_shown(scene: Scene, photograph: Photograph, mirrored: MirroredImage) -> Tensor:
     """[H, W] bool: the pixels that show the inner part of the scene's only pane, and count."""
-    shown = mirrored.seen & photograph.told
+    shown = mirrored.seen & photograph.valid
     return shown if photograph.labels is None else shown & (photograph.labels == scene.planes.labels[0])
 
 
@@ -538,7 +538,7 @@ def _lamps_among(scene: Scene, photographs: Sequence[Photograph]) -> Tensor:
     clipped, direct, bright, mirrored = scene.primary.means.new_zeros(4, len(scene.primary))
     for photograph in photographs:
         strength = Planar(nearest_only=True)(scene, photograph.camera).layers["strength"]
-        past, through = photograph.told & (strength <= 0), photograph.told & (strength > 0)
+        past, through = photograph.valid & (strength <= 0), photograph.valid & (strength > 0)
         darkest = photograph.pixels.amin(dim=-1)
         shown = gathered(scene, photograph.camera, torch.stack([past & (darkest > CLIPPED), past], dim=-1).float())
         enough = linear_from_srgb(darkest.clamp(0, 1)) > LEAST_GAIN * strength
@@ -589,7 +589,7 @@ def _gains_of(scene: Scene, seen: Sequence[LitPixels], photographs: Sequence[Pho
         behind = linear_from_srgb(layers["transmission"].clamp(0, 1))
         radiance = (linear_from_srgb(photograph.pixels.clamp(0, 1)) - (1 - strength) * behind) / strength
         values = torch.stack([radiance.clamp(min=0), linear_from_srgb(layers["reflection"].clamp(min=0))]).mean(dim=-1)
-        sums = gathered_mirrored(scene, photograph.camera, (values * (lit & photograph.told)).movedim(0, -1))
+        sums = gathered_mirrored(scene, photograph.camera, (values * (lit & photograph.valid)).movedim(0, -1))
         left, had = left + sums[:, 0], had + sums[:, 1]
     gains = (left / had.clamp(min=1e-6)).clamp(1, MOST_GAIN)
     return torch.where(had > 0, gains, 1)

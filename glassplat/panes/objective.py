@@ -157,8 +157,8 @@ def planes_through_masks(views: Sequence[PaneView], count: int, rng: np.random.G
         count: number of planes.
         rng: source of randomness.
     """
-    eyes = np.stack([view.center for view in views])
-    apart = float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).mean())
+    centers = np.stack([view.center for view in views])
+    apart = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean())
     depths = apart * np.exp(rng.uniform(np.log(NEAREST), np.log(FARTHEST), count))
     source = rng.integers(len(views), size=count)
     rays = np.empty((count, 3))
@@ -172,7 +172,7 @@ def planes_through_masks(views: Sequence[PaneView], count: int, rng: np.random.G
     towards = -np.einsum("hd,hd->h", normals, rays) / np.linalg.norm(rays, axis=1)
     normals *= np.where(towards < 0, -1, 1)[:, None]
     usable = np.abs(towards) > MOST_OBLIQUE
-    points = eyes[source] + depths[:, None] * rays
+    points = centers[source] + depths[:, None] * rays
     return PlaneEquations(normals[usable], np.einsum("hd,hd->h", normals, points)[usable])
 
 
@@ -289,8 +289,8 @@ class Objective:
 
     def reach(self, planes: PlaneEquations) -> Array:
         """[H] median distance of the cameras from the middle of the pane."""
-        eyes = np.stack([view.center for view in self.views])
-        away: Array = np.median(np.linalg.norm(self.anchors(planes)[:, None] - eyes, axis=2), axis=1)
+        centers = np.stack([view.center for view in self.views])
+        away: Array = np.median(np.linalg.norm(self.anchors(planes)[:, None] - centers, axis=2), axis=1)
         return away
 
     def terms(self, planes: FramedPlanes, tolerance: float, *, edges: int = EDGES) -> Terms:

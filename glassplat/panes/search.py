@@ -90,7 +90,7 @@ def _quadratic(
     """The cost [H] of planes, and its Gauss-Newton matrix [H, 4, 4] and gradient [H, 4] (halved)."""
     here, moved_residuals = _nearby(planes, objective, tolerance, anchors, scales)
     jacobian = (moved_residuals - here.residuals) / STEP
-    weighted = jacobian * _pull(here)
+    weighted = jacobian * _loss_weights(here)
     return here.cost, _products(weighted, jacobian), np.einsum("ahm,hm->ha", weighted, here.residuals)
 
 
@@ -107,7 +107,7 @@ def _nearby(
     return Terms(residuals[0], terms.weights[:count], terms.rest[:count]), residuals[1:]
 
 
-def _pull(terms: Terms) -> Array:
+def _loss_weights(terms: Terms) -> Array:
     """[H, M] weights with which least squares have the slope of the Geman-McClure loss."""
     weights: Array = terms.weights / (1 + terms.residuals**2) ** 2
     return weights
@@ -140,7 +140,7 @@ def tilt_uncertainty(planes: FramedPlanes, objective: Evidence, tolerance: float
     here, residuals = _nearby(planes, objective, tolerance, anchors, scales)
     # Where an edge comes into an image, or leaves it, a residual jumps from zero or to it, which is no slope.
     jacobian = np.where((residuals == 0) == (here.residuals == 0), residuals - here.residuals, 0) / STEP
-    hessian = _products(jacobian * _pull(here), jacobian)
+    hessian = _products(jacobian * _loss_weights(here), jacobian)
     turns = np.linalg.inv(hessian + SMALLEST_CURVATURE * np.eye(4))[:, :2, :2]
     widest: Array = np.sqrt(NOTICEABLE * np.linalg.eigvalsh(turns)[:, -1])
     return widest

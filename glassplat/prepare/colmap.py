@@ -219,8 +219,8 @@ class FeatureDatabase:
 
     def _focal(self, key: tuple[str, int, int]) -> float | None:
         """Median focal length in the photographs of one camera; None if none has one."""
-        told = [one.focal for one in self.photographs if _camera_key(one) == key and one.focal is not None]
-        return float(np.median(told)) if told else None
+        focals = [one.focal for one in self.photographs if _camera_key(one) == key and one.focal is not None]
+        return float(np.median(focals)) if focals else None
 
 
 @contextmanager

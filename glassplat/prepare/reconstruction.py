@@ -110,8 +110,8 @@ def best_solution(
             enough = least if attempt.features == MANY else max(ENOUGH, least)
             if best.registered >= enough * len(photographs):
                 break
-            told = f"{best.registered} of {len(photographs)} photographs were placed; trying again with {attempt.name}"
-            listen(Note(told))
+            note = f"{best.registered} of {len(photographs)} photographs were placed; trying again with {attempt.name}"
+            listen(Note(note))
         database = _matched(photographs, work, attempt.features, settings, listen)
         models = placed(
             database.path,

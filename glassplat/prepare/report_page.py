@@ -47,9 +47,9 @@ def plan(views: Sequence[View], points: PointCloud, behind: NDArray[np.bool_], p
         behind: [N] which of them lie behind panes.
         planes: panes, if any are known.
     """
-    eyes = [NumpyCamera.of(view.camera) for view in views]
-    axes = _from_above(eyes)
-    centers = np.stack([eye.center for eye in eyes]) @ axes.T
+    cameras = [NumpyCamera.of(view.camera) for view in views]
+    axes = _from_above(cameras)
+    centers = np.stack([camera.center for camera in cameras]) @ axes.T
     places = points.positions.cpu().double().numpy() @ axes.T
     panes = [] if planes is None else [corners @ axes.T for corners in _corners(planes)]
     on_page = _fitting(places, np.concatenate([centers, *panes]))
@@ -58,20 +58,20 @@ def plan(views: Sequence[View], points: PointCloud, behind: NDArray[np.bool_], p
         *_points(on_page(places), colors, behind),
         *(_line(on_page(pane[[0, 1, 2, 3, 0]]), "#ffd24a", 2) for pane in panes),
         _line(on_page(centers), "#3a76b8", 1),
-        *_headings(eyes, axes, on_page),
+        *_headings(cameras, axes, on_page),
     ]
     width, height = SIZE
     return f'<svg width="{width}" height="{height}" viewBox="0 0 {width} {height}">{"".join(drawn)}</svg>'
 
 
-def _from_above(eyes: Sequence[NumpyCamera]) -> Array:
+def _from_above(cameras: Sequence[NumpyCamera]) -> Array:
     """[2, 3] to the right and down in the plan, of world points; down is where cameras look on average."""
-    up = -np.mean([eye.rotation[1] for eye in eyes], axis=0)
+    up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
     up /= max(float(np.linalg.norm(up)), 1e-9)
-    ahead = np.mean([eye.rotation[2] for eye in eyes], axis=0)
+    ahead = np.mean([camera.rotation[2] for camera in cameras], axis=0)
     ahead -= up * (ahead @ up)
     if np.linalg.norm(ahead) < 1e-3:  # They look all around.
-        ahead = np.cross(up, eyes[0].rotation[0])
+        ahead = np.cross(up, cameras[0].rotation[0])
     ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
     return np.stack([np.cross(ahead, up), -ahead])
 
@@ -115,11 +115,11 @@ def _line(pixels: Array, color: str, width: float) -> str:
     return f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="{width}"/>'
 
 
-def _headings(eyes: Sequence[NumpyCamera], axes: Array, on_page: Callable[[Array], Array]) -> list[str]:
+def _headings(cameras: Sequence[NumpyCamera], axes: Array, on_page: Callable[[Array], Array]) -> list[str]:
     strokes = []
-    for eye in eyes:
-        begin = on_page((eye.center @ axes.T)[None])[0]
-        heading = axes @ eye.rotation[2]
+    for camera in cameras:
+        begin = on_page((camera.center @ axes.T)[None])[0]
+        heading = axes @ camera.rotation[2]
         strokes.append(_line(np.stack([begin, begin + HEADING * heading]), "#7cc0ff", 1.5))
         strokes.append(f'<circle cx="{begin[0]:.1f}" cy="{begin[1]:.1f}" r="2.6" fill="#5aa9ff"/>')
     return strokes

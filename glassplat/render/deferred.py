@@ -189,7 +189,7 @@ class Surface:
         alpha: [H, W] coverage.
         background: colour behind everything, sRGB.
         direct: [N] bool, which Gaussians reach a pixel.
-        screen: the record of the pass, if it was probed.
+        screen: the record of the pass, if it was with_absgrad.
         extra: further layers, of discs those that say how thin the surface is.
     """
 
@@ -227,23 +227,23 @@ def seen_surface(
     *,
     background: tuple[float, float, float],
     depth: bool = True,
-    probed: bool = False,
+    with_absgrad: bool = False,
 ) -> Surface:
     """Blends the surfaces of the primary Gaussians, which have a `logit_strength`: ellipsoids or discs.
 
     Without `depth`, ellipsoids have none; it costs them one more channel.
     """
     if scene.primary.are_discs:
-        return _seen_discs(scene, camera, background, probed)
-    return _seen_ellipsoids(scene, camera, background, depth, probed)
+        return _seen_discs(scene, camera, background, with_absgrad)
+    return _seen_ellipsoids(scene, camera, background, depth, with_absgrad)
 
 
 def _seen_ellipsoids(
-    scene: Scene, camera: Camera, background: tuple[float, float, float], deep: bool, probed: bool
+    scene: Scene, camera: Camera, background: tuple[float, float, float], deep: bool, with_absgrad: bool
 ) -> Surface:
     """Depths are those of the centres."""
     projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
-    screen = (screen_pass("primary", projected),) if probed else ()
+    screen = (screen_pass("primary", projected),) if with_absgrad else ()
     extra = projected.depths[0, :, None] if deep else None
     channels = ellipsoid_channels(scene.primary, projected, camera, extra)
     result = blended_ellipsoids(projected, channels[None], camera, screen=screen)
@@ -263,11 +263,11 @@ def _seen_ellipsoids(
     )
 
 
-def _seen_discs(scene: Scene, camera: Camera, background: tuple[float, float, float], probed: bool) -> Surface:
+def _seen_discs(scene: Scene, camera: Camera, background: tuple[float, float, float], with_absgrad: bool) -> Surface:
     """Depths are those of the places where rays meet the discs."""
     near = NEAR_PER_EXTENT * scene.extent
     projected = projected_discs(scene.primary, camera, near=near)
-    screen = (screen_pass("primary", projected),) if probed else ()
+    screen = (screen_pass("primary", projected),) if with_absgrad else ()
     strengths = torch.sigmoid(scene.primary.channels["logit_strength"])[None, :, None]
     channels = torch.cat([projected.colors, projected.normals, strengths], dim=-1)
     blended = blended_discs(projected, channels, camera, near=near, screen=screen)
@@ -364,7 +364,7 @@ class Deferred:
     environment: bool = False
     least_strength: float = 0.0
 
-    def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
+    def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are.
 
         Raises:
@@ -372,7 +372,7 @@ class Deferred:
         """
         check_reflective(scene)
         camera = camera.to(scene.primary.means.device)
-        surface = seen_surface(scene, camera, background=self.background, depth=self.depth, probed=probed)
+        surface = seen_surface(scene, camera, background=self.background, depth=self.depth, with_absgrad=with_absgrad)
         shaded = shaded_pixels(scene, camera, surface.image, surface.alpha, self.background, self.least_strength)
         layers = surface.layers(shaded.base) | {"reflection": shaded.reflection}
         if self.environment:

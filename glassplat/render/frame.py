@@ -24,13 +24,13 @@ from glassplat.scene.scene import Scene
 class ScreenPass:
     """Screen positions of the Gaussians of one scene part, in one rasterisation pass.
 
-    The gradients of a loss with respect to `means2d` and `probe` are the statistics that densification collects;
+    The gradients of a loss with respect to `means2d` and `absgrad` are the statistics that densification collects;
     ask for them with `torch.autograd.grad`.
 
     Attributes:
         part: name of the scene part, as in `Scene.gaussian_sets`.
         means2d: [C, N, 2] projected centres, pixels; part of the autograd graph.
-        probe: [C, N, 2] that `composite` got; its gradient is how strongly single pixels pull at the centres.
+        absgrad: [C, N, 2] given to `composite`; its gradient is the absolute gradient of the centres (AbsGS).
         radii: [C, N, 2] half extents in pixels; 0 where not visible.
         weight: how much of what is drawn there is left in the image, of the whole pass or [C, N] of each Gaussian: 1
             but for what is seen in or through a pane.
@@ -39,7 +39,7 @@ class ScreenPass:
 
     part: str
     means2d: Tensor
-    probe: Tensor
+    absgrad: Tensor
     radii: Tensor
     weight: float | Tensor = 1.0
     direct: bool = True
@@ -51,11 +51,11 @@ class SpacePass:
 
     Attributes:
         part: name of the scene part, as in `Scene.gaussian_sets`.
-        probe: [N, 2] that `trace` got; its gradient tells how far away Gaussians were met.
+        contributions: [N, 2] given to `trace`; its gradient tells how far away Gaussians were met.
     """
 
     part: str
-    probe: Tensor
+    contributions: Tensor
 
 
 @dataclass(frozen=True)
@@ -67,8 +67,8 @@ class Frame:
         layers: further images by name, [H, W] or [H, W, 3]; a renderer's docstring lists its own.
         direct: [N] bool, which primary Gaussians reach a pixel themselves; None where the renderer does not say.
         mirrored: [N] bool, which ones reach a pixel as mirror images; None where nothing is mirrored.
-        screen: one record per rasterised part and pass of a probed frame.
-        space: one record per traced part of a probed frame.
+        screen: one record per rasterised part and pass, if asked for `with_absgrad`.
+        space: one record per traced part, if asked for `with_absgrad`.
     """
 
     rgb: Tensor
@@ -100,13 +100,13 @@ Drawing = Callable[[Scene, Camera], Frame]
 class Renderer(Protocol):
     """Anything that turns a scene and a camera into a frame."""
 
-    def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
+    def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
         """Renders `scene` from `camera`; differentiable in every tensor of the scene.
 
         Args:
             scene: what is there.
             camera: from where it is seen.
-            probed: also prepare `Frame.screen`, the statistics of densification; they make the backward pass slower.
+            with_absgrad: also prepare the statistics of densification, `Frame.screen`; the backward pass is slower.
         """
         ...
 
@@ -205,15 +205,15 @@ def shown(projected: Projected | ProjectedDiscs) -> Tensor:
 
 
 def screen_pass(part: str, projected: Projected | ProjectedDiscs, *, direct: bool = True) -> ScreenPass:
-    """The record of a projected scene part, with a probe that asks for a gradient."""
-    probe = torch.zeros_like(projected.means2d).requires_grad_()
-    return ScreenPass(part, projected.means2d, probe, projected.radii, direct=direct)
+    """The record of a projected scene part, with an `absgrad` that asks for a gradient."""
+    absgrad = torch.zeros_like(projected.means2d).requires_grad_()
+    return ScreenPass(part, projected.means2d, absgrad, projected.radii, direct=direct)
 
 
-def joined_probe(screen: Sequence[ScreenPass]) -> Tensor | None:
-    """The probe [C, G, 2] that `composite` wants for the parts in this order; None where nothing is probed."""
-    probes = [record.probe for record in screen]
-    return torch.cat(probes, dim=1) if len(probes) > 1 else next(iter(probes), None)
+def joined_absgrad(screen: Sequence[ScreenPass]) -> Tensor | None:
+    """The absgrad [C, G, 2] that `composite` wants for the parts in this order; None where nothing is with_absgrad."""
+    absgrads = [record.absgrad for record in screen]
+    return torch.cat(absgrads, dim=1) if len(absgrads) > 1 else next(iter(absgrads), None)
 
 
 def over_background(image: Tensor, alpha: Tensor, background: tuple[float, ...]) -> Tensor:

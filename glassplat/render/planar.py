@@ -25,7 +25,7 @@ from glassplat.render.frame import (
     check_colored,
     check_ellipsoids,
     check_numbers,
-    joined_probe,
+    joined_absgrad,
     joined_splats,
     over_background,
     project_gaussians,
@@ -121,7 +121,7 @@ class Planar:
         photographer: whether panes show the scene's photographer: not, so that the image is what nobody disturbs; in
             the image and its reflection, as photographs do, for training; or in a layer `photographed` [H, W, 3] beside
             the image without.
-        tells_mirrored: whether the records of a probed frame tell mirror images from what is seen directly, and how
+        tells_mirrored: whether the records in `Frame.screen` tell mirror images from what is seen directly, and how
             much is left of either; if not, all of them count alike.
     """
 
@@ -136,7 +136,7 @@ class Planar:
     photographer: Shown = "absent"
     tells_mirrored: bool = True
 
-    def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
+    def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are.
 
         Raises:
@@ -145,7 +145,7 @@ class Planar:
         check_panes(scene)
         camera = camera.to(scene.primary.means.device)
         rectangles = panes_in_camera(scene.planes, camera)
-        first = self._first_pass(scene, camera, rectangles, probed)
+        first = self._first_pass(scene, camera, rectangles, with_absgrad)
         layers = {"without_panes": first.image, "depth": first.depth, "alpha": first.alpha, "mask": first.mask}
         hits = nearest_hits(rectangles, camera, first.mask)
         layers["pane"] = hits.pane
@@ -157,14 +157,14 @@ class Planar:
             layers |= {"transmission": first.image, "reflection": torch.zeros_like(first.image)}
             layers |= {"strength": nothing, "share": nothing}
             return Frame(first.image, layers, first.direct, None, first.screen)
-        second = self._second_pass(scene, camera, seen, probed, first.total)
+        second = self._second_pass(scene, camera, seen, with_absgrad, first.total)
         masks = self._visibilities(scene, camera, seen, first)
         result = self._glazed(first, seen, masks, second, camera)
         if self.photographer == "beside" and len(scene.photographer):
             with_body = replace(self, photographer="present")._second_pass(scene, camera, seen, False, first.total)
             layers["photographed"] = self._glazed(first, seen, masks, with_body, camera).rgb
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
-        screen = self._screen(first, second, hits, result) if probed else ()
+        screen = self._screen(first, second, hits, result) if with_absgrad else ()
         return Frame(result.rgb, layers, first.direct, second.mirrored, screen)
 
     def check(self, scene: Scene) -> None:
@@ -199,7 +199,7 @@ class Planar:
             "intensity": self.intensity,
         }
 
-    def _first_pass(self, scene: Scene, camera: Camera, rectangles: Panes, probed: bool) -> FirstPass:
+    def _first_pass(self, scene: Scene, camera: Camera, rectangles: Panes, with_absgrad: bool) -> FirstPass:
         near, total = NEAR_PER_EXTENT * scene.extent, GradientSum()
         primary = project_gaussians(scene.primary, camera, near=near, total=total)
         glass = project_gaussians(scene.glass, camera, near=near)
@@ -211,7 +211,7 @@ class Planar:
         if self.deviation:
             hit = nearest_hits(rectangles, camera).pane >= 0
             deviation = Deviation(DEPTH_CHANNEL, hit.to(channels.dtype)[None], self.deviation_depth_gradient)
-        screen = (screen_pass("primary", primary), screen_pass("glass", glass)) if probed else ()
+        screen = (screen_pass("primary", primary), screen_pass("glass", glass)) if with_absgrad else ()
         result = composite(
             splats,
             channels,
@@ -219,7 +219,7 @@ class Planar:
             marks=marks,
             num_primary=len(scene.primary),
             deviation=deviation,
-            probe=joined_probe(screen),
+            absgrad=joined_absgrad(screen),
         )
         alpha = result.alpha.squeeze(0)
         # Squeezed, because the gradient of an indexed image is a whole one of zeros first.
@@ -238,7 +238,7 @@ class Planar:
         )
 
     def _second_pass(
-        self, scene: Scene, camera: Camera, seen: SeenPanes, probed: bool, total: GradientSum
+        self, scene: Scene, camera: Camera, seen: SeenPanes, with_absgrad: bool, total: GradientSum
     ) -> SecondPass:
         primary = scene.primary
         if self.reflection_gradient == "planes":
@@ -248,7 +248,7 @@ class Planar:
         gain = torch.expm1(primary.channels["log_intensity"])[None].expand(len(seen.planes), -1)
         channels = join_channels(projected.colors, gain)
         mirrored = [projected]
-        screen: tuple[ScreenPass, ...] = (screen_pass("primary", projected, direct=False),) if probed else ()
+        screen: tuple[ScreenPass, ...] = (screen_pass("primary", projected, direct=False),) if with_absgrad else ()
         if self.photographer == "present" and len(scene.photographer):
             body = project_photographer(scene, camera, seen, near=NEAR_PER_EXTENT * scene.extent)
             # A body is as bright as it is: an intensity of its own would be a second factor on its colours.
@@ -256,10 +256,10 @@ class Planar:
             channels = torch.cat([channels, plain], dim=1)
             mirrored.append(body)
             # No view shows it directly, so that mirror images are what it is densified by.
-            screen += (screen_pass("photographer", body),) if probed else ()
+            screen += (screen_pass("photographer", body),) if with_absgrad else ()
         splats = joined_splats(*mirrored)
         bins = bin_tiles(splats, camera.width, camera.height, seen.tiles)
-        result = composite(splats, channels, bins, probe=joined_probe(screen))
+        result = composite(splats, channels, bins, absgrad=joined_absgrad(screen))
         reflections = over_background(result.image, result.alpha, (*self.background, 0.0))
         return SecondPass(reflections, shown(projected), screen)
 

@@ -117,7 +117,7 @@ def rasterization(
         torch.cat([shown, depths], dim=-1) if channels is None else channels,
         bins,
         chunk=min(channel_chunk, MOST_CHANNELS),
-        absgrad=absgrad,
+        with_absgrad=absgrad,
     )
     image = _finished(image, alpha, backgrounds, render_mode)
     return image, alpha, _meta(splats, width, height)
@@ -213,13 +213,15 @@ def _inverse(symmetric: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return c / determinant, -b / determinant, a / determinant
 
 
-def _blended(splats: Splats, channels: Tensor, bins: TileBins, *, chunk: int, absgrad: bool) -> tuple[Tensor, Tensor]:
+def _blended(
+    splats: Splats, channels: Tensor, bins: TileBins, *, chunk: int, with_absgrad: bool
+) -> tuple[Tensor, Tensor]:
     """Images [C, H, W, D] and their coverage [C, H, W, 1]."""
     means2d = splats.means2d
-    probe = torch.zeros_like(means2d, requires_grad=True) if absgrad and means2d.requires_grad else None
-    if probe is not None:
-        probe.register_hook(lambda gradient: setattr(means2d, "absgrad", gradient))
-    parts = [composite(splats, part.contiguous(), bins, probe=probe) for part in channels.split(chunk, dim=-1)]
+    absgrad = torch.zeros_like(means2d, requires_grad=True) if with_absgrad and means2d.requires_grad else None
+    if absgrad is not None:
+        absgrad.register_hook(lambda gradient: setattr(means2d, "absgrad", gradient))
+    parts = [composite(splats, part.contiguous(), bins, absgrad=absgrad) for part in channels.split(chunk, dim=-1)]
     return torch.cat([part.image for part in parts], dim=-1), parts[0].alpha[..., None]
 
 

@@ -23,7 +23,7 @@ from glassplat.render.frame import (
     ScreenPass,
     camera_batch,
     check_colored,
-    joined_probe,
+    joined_absgrad,
     joined_splats,
     over_background,
     project_gaussians,
@@ -63,11 +63,11 @@ def blended_discs(
         channels: values to blend.
         camera: image size.
         near: as for `projected_discs`.
-        screen: the record whose probe to feed, if any.
+        screen: the record whose absgrad to feed, if any.
     """
     discs = Discs(projected.means2d, projected.maps, projected.opacities, projected.depths, projected.outlines)
     bins = bin_tiles(projected.outlines, camera.width, camera.height)
-    return composite_discs(discs, channels, bins, near=near, probe=joined_probe(screen))
+    return composite_discs(discs, channels, bins, near=near, absgrad=joined_absgrad(screen))
 
 
 def disc_layers(blended: BlendedDiscs, extent: float) -> dict[str, Tensor]:
@@ -115,7 +115,7 @@ def blended_ellipsoids(
     """Blends channels [1, N, D] of ellipsoids over the pixels of a camera; arguments as of `blended_discs`."""
     splats = joined_splats(projected)
     bins = bin_tiles(splats, camera.width, camera.height)
-    return composite(splats, channels, bins, probe=joined_probe(screen))
+    return composite(splats, channels, bins, absgrad=joined_absgrad(screen))
 
 
 def with_normals(renderer: Renderer) -> Drawing:
@@ -168,16 +168,16 @@ class Splat:
     depth: bool = True
     normal: bool = True
 
-    def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
+    def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are."""
         camera = camera.to(scene.primary.means.device)
         if scene.primary.are_discs:
-            return self._discs(scene, camera, probed)
+            return self._discs(scene, camera, with_absgrad)
         projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
         channels = projected.colors
         if self.depth:
             channels = torch.cat([channels, projected.depths[..., None]], dim=-1)
-        screen = (screen_pass("primary", projected),) if probed else ()
+        screen = (screen_pass("primary", projected),) if with_absgrad else ()
         result = blended_ellipsoids(projected, channels, camera, screen=screen)
         # As a batch of one and split, because the gradient of an indexed image is a whole one of zeros first.
         color, *depth = result.image.squeeze(0).split((3, 1) if self.depth else 3, dim=-1)
@@ -188,13 +188,13 @@ class Splat:
         rgb = over_background(color, alpha, self.background)
         return Frame(rgb, layers, direct=shown(projected), screen=screen)
 
-    def _discs(self, scene: Scene, camera: Camera, probed: bool) -> Frame:
+    def _discs(self, scene: Scene, camera: Camera, with_absgrad: bool) -> Frame:
         near = NEAR_PER_EXTENT * scene.extent
         projected = projected_discs(scene.primary, camera, near=near)
         channels = projected.colors
         if self.normal:
             channels = torch.cat([channels, projected.normals], dim=-1)
-        screen = (screen_pass("primary", projected),) if probed else ()
+        screen = (screen_pass("primary", projected),) if with_absgrad else ()
         blended = blended_discs(projected, channels, camera, near=near, screen=screen)
         layers = disc_layers(blended, scene.extent)
         if self.normal:

@@ -74,7 +74,7 @@ class Traced:
     joint: bool = True
     surroundings: bool = False
 
-    def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
+    def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are.
 
         Raises:
@@ -82,10 +82,10 @@ class Traced:
         """
         check_mirrored(scene)
         camera = camera.to(scene.primary.means.device)
-        surface = seen_surface(scene, camera, background=self.background, probed=probed)
+        surface = seen_surface(scene, camera, background=self.background, with_absgrad=with_absgrad)
         part = scene.surroundings
-        probe = part.means.new_zeros(len(part), 2).requires_grad_() if probed and len(part) else None
-        rgb, reflection = self._shaded(scene, camera, surface, probe)
+        contributions = part.means.new_zeros(len(part), 2).requires_grad_() if with_absgrad and len(part) else None
+        rgb, reflection = self._shaded(scene, camera, surface, contributions)
         layers = surface.layers(surface.base) | {"reflection": reflection}
         if self.surroundings:
             layers["surroundings"] = self.behind(scene, camera)
@@ -94,10 +94,12 @@ class Traced:
             layers=layers,
             direct=surface.direct,
             screen=surface.screen,
-            space=() if probe is None else (SpacePass("surroundings", probe),),
+            space=() if contributions is None else (SpacePass("surroundings", contributions),),
         )
 
-    def _shaded(self, scene: Scene, camera: Camera, surface: Surface, probe: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _shaded(
+        self, scene: Scene, camera: Camera, surface: Surface, contributions: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
         """The image and what it mirrors, [H, W, 3] each (Eq. 5)."""
         rgb, reflection = self._distant(scene, camera, surface)
         if not len(scene.surroundings):
@@ -107,7 +109,7 @@ class Traced:
         if not self.joint:
             places, directions = places.detach(), directions.detach()
         near = START_PER_EXTENT * scene.extent
-        colors = traced_colors(scene, places, directions, near, self.background, probe)
+        colors = traced_colors(scene, places, directions, near, self.background, contributions)
         strength = surface.strength[chosen][:, None]
         mixed = (1 - strength) * surface.base[chosen] + strength * colors
         return rgb.index_put(chosen, mixed), reflection.index_put(chosen, colors)
@@ -155,24 +157,26 @@ def traced_colors(
     directions: Tensor,
     near: float,
     background: tuple[float, float, float],
-    probe: Tensor | None = None,
+    contributions: Tensor | None = None,
 ) -> Tensor:
     """Colours [R, 3] of the surroundings along rays, from `near` lengths of their directions on.
 
     Behind them is the scene's environment, or without one the background.
     """
-    found = traced_surroundings(scene.surroundings, origins, directions, near, probe)
+    found = traced_surroundings(scene.surroundings, origins, directions, near, contributions)
     if scene.environment.is_empty:
         return over_background(found.colors, found.alphas, background)
     return found.colors + (1 - found.alphas)[:, None] * torch.sigmoid(cube_lookup(scene.environment.raw, directions))
 
 
 def traced_surroundings(
-    part: Gaussians, origins: Tensor, directions: Tensor, near: float, probe: Tensor | None = None
+    part: Gaussians, origins: Tensor, directions: Tensor, near: float, contributions: Tensor | None = None
 ) -> Found:
     """Trace rays [R, 3] through a set of Gaussians."""
     raw = RawGaussians(part.means, part.quats, part.log_scales, part.logit_opacities, part.sh)
-    return trace(raw, Rays(origins, directions), sh_degree=part.active_sh_degree, near=near, probe=probe)
+    return trace(
+        raw, Rays(origins, directions), sh_degree=part.active_sh_degree, near=near, contributions=contributions
+    )
 
 
 def mirrored_contributions(scene: Scene, camera: Camera) -> Tensor:

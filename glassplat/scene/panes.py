@@ -253,16 +253,16 @@ def behind_panes(points: Tensor, planes: Planes, cameras: Sequence[Camera]) -> T
     return found
 
 
-def crosses_pane(points: Tensor, planes: Planes, eye: Tensor) -> Tensor:
-    """[N] bool: whether the segment from `eye` to the point crosses any of the panes."""
+def crosses_pane(points: Tensor, planes: Planes, camera_center: Tensor) -> Tensor:
+    """[N] bool: whether the segment from `camera_center` to the point crosses any of the panes."""
     normals = planes.normals
-    eye_distance = ((eye - planes.centers) * normals).sum(-1)
+    camera_distance = ((camera_center - planes.centers) * normals).sum(-1)
     distances = points @ normals.T - (planes.centers * normals).sum(-1)
-    behind = eye_distance * distances < 0
-    share = torch.where(behind, eye_distance / (eye_distance - distances), 0)
+    behind = camera_distance * distances < 0
+    share = torch.where(behind, camera_distance / (camera_distance - distances), 0)
     inside = behind
     for axis, half in zip(planes.axes(), planes.half_sizes.T, strict=True):
-        start = ((eye - planes.centers) * axis).sum(-1)
+        start = ((camera_center - planes.centers) * axis).sum(-1)
         end = points @ axis.T - (planes.centers * axis).sum(-1)
         inside = inside & ((start + share * (end - start)).abs() <= half)
     return inside.any(dim=1)

@@ -36,7 +36,7 @@ from glassplat.training.densify import (
 )
 from glassplat.training.losses import LossTerm, mean_opacity, mean_scale, of_all, residual, weighted
 from glassplat.training.messages import Working
-from glassplat.training.options import DefaultDensify, McmcDensify, Rate, Rhythm
+from glassplat.training.options import DefaultDensify, Intervals, McmcDensify, Rate
 from glassplat.training.stage import Action, Clock, Every, PostStep, TrainState, Work
 
 log = logging.getLogger("glassplat.training")
@@ -123,7 +123,7 @@ class Densify:
             self.densifier,
             cap=limit_of(self.densifier, dataset),
             gradient_threshold=self.densifier.gradient_threshold * factor,
-            pull_threshold=self.densifier.pull_threshold * factor,
+            absgrad_threshold=self.densifier.absgrad_threshold * factor,
         )
         edited, moments = densified(
             densifier,
@@ -362,9 +362,9 @@ class Population:
         return gaussians_from_points(points, sh_degree=sh_degree, opacity=self.opacity, spread=self.spread)
 
 
-def default_population(densifier: DefaultDensify, rhythm: Rhythm) -> Population:
+def default_population(densifier: DefaultDensify, intervals: Intervals) -> Population:
     """3DGS: clone, split, prune, and reset the opacities; and what adds to no view is removed in the end."""
-    reset = ResetOpacity(Every(rhythm.beat, 0.0, rhythm.reset_stop, rhythm.least, only_multiples_of=3))
+    reset = ResetOpacity(Every(intervals.opacity, 0.0, intervals.reset_stop, intervals.least, only_multiples_of=3))
     edits = (Densify(densifier), PruneIdle(densifier))
     return Population(edits=edits, resets=(reset,), densify_until=densifier.stop)
 

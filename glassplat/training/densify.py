@@ -319,7 +319,7 @@ class ScreenStatistics:
 
     Attributes:
         gradient_sum: [2, N] sum over views of the norm of the loss gradient with respect to the centre on screen.
-        pull_sum: [2, N] the same of what single pixels contribute to that gradient, added up without signs.
+        absgrad_sum: [2, N] the same of what single pixels contribute to that gradient, added up without signs.
         view_count: [2, N] number of views that saw the Gaussian; one in or through a pane counts by how much of what is
             drawn is left in the image. Gradients are smaller by as much; counted as a full view, a weak reflection
             would look as if it needed no more detail.
@@ -327,19 +327,19 @@ class ScreenStatistics:
     """
 
     gradient_sum: Tensor
-    pull_sum: Tensor
+    absgrad_sum: Tensor
     view_count: Tensor
     max_radius: Tensor
 
     @staticmethod
     def zeros(count: int, *, device: torch.device | str = "cpu") -> ScreenStatistics:
         """Statistics of `count` Gaussians that no view has seen."""
-        gradients, pulls, views = torch.zeros(3, 2, count, device=device)
-        return ScreenStatistics(gradients, pulls, views, torch.zeros(count, device=device))
+        gradients, absgrads, views = torch.zeros(3, 2, count, device=device)
+        return ScreenStatistics(gradients, absgrads, views, torch.zeros(count, device=device))
 
     def add(self, views: Views) -> None:
         """Adds the views of one training step, in place."""
-        add_views(Sums(self.gradient_sum, self.pull_sum, self.view_count, self.max_radius), views)
+        add_views(Sums(self.gradient_sum, self.absgrad_sum, self.view_count, self.max_radius), views)
 
     @torch.no_grad()
     def add_in_space(self, means_gradient: Tensor, met: Tensor) -> None:
@@ -355,14 +355,18 @@ class ScreenStatistics:
         """
         weights, products = met.unbind(dim=1)
         norms = means_gradient.norm(dim=-1)
-        pulls = 0.5 * torch.where(weights > 0, products / weights, 0) * norms
-        for total, added in ((self.gradient_sum, pulls), (self.pull_sum, pulls), (self.view_count, norms > 0)):
+        equivalents = 0.5 * torch.where(weights > 0, products / weights, 0) * norms
+        for total, added in (
+            (self.gradient_sum, equivalents),
+            (self.absgrad_sum, equivalents),
+            (self.view_count, norms > 0),
+        ):
             total += added
 
     @property
     def sums(self) -> tuple[Tensor, Tensor, Tensor]:
         """All statistics that add up over views; the largest radius does not."""
-        return self.gradient_sum, self.pull_sum, self.view_count
+        return self.gradient_sum, self.absgrad_sum, self.view_count
 
     def include(self, other: ScreenStatistics) -> None:
         """Adds what other views have shown of the same Gaussians, in place."""
@@ -376,9 +380,9 @@ class ScreenStatistics:
         return self._mean(self.gradient_sum)
 
     @property
-    def mean_pull(self) -> Tensor:
-        """[N] mean pull of single pixels over the views that saw the Gaussian, as `mean_gradient`."""
-        return self._mean(self.pull_sum)
+    def mean_absgrad(self) -> Tensor:
+        """[N] mean norm of the absolute gradient over the views that saw the Gaussian, as `mean_gradient`."""
+        return self._mean(self.absgrad_sum)
 
     def _mean(self, total: Tensor) -> Tensor:
         over_all, over_direct = total / self.view_count.clamp(min=1)
@@ -433,8 +437,8 @@ def _growth(
 ) -> Edit:
     large = gaussians.log_scales.amax(dim=1) > math.log(options.dense_fraction * extent)
     needs = statistics.mean_gradient / options.gradient_threshold
-    if options.split_by == "pull":
-        needs = torch.where(large, statistics.mean_pull / options.pull_threshold, needs)
+    if options.split_by == "absgrad":
+        needs = torch.where(large, statistics.mean_absgrad / options.absgrad_threshold, needs)
     chosen = _within_cap(options, needs)
     halved = split(gaussians, (chosen & large).nonzero().squeeze(1), generator=generator)
     # What was not split moved forward by as many rows as were split before it.

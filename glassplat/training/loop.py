@@ -40,8 +40,8 @@ WHERE_TO_LOOK = (
 
 
 class Differentiated(NamedTuple):
-    """One view's losses and their gradients; of each pass on screen those of its centres and of its probe, of each in
-    space that of its probe. `visible` is the frame's.
+    """One view's losses and their gradients. Of each pass on screen there are those of its centres and of `absgrad`, of
+    each pass in space those of `contributions`. `visible` is the frame's.
     """
 
     losses: dict[str, float]
@@ -129,7 +129,7 @@ def advance(
     visibility: VisibilityCheck,
 ) -> Iterator[Message]:
     """One optimisation step of some views, and the actions that are due after it."""
-    found = step_of(stage, state, views, ranks, probed=state.step < stage.densify_until * iterations)
+    found = step_of(stage, state, views, ranks, with_absgrad=state.step < stage.densify_until * iterations)
     visibility.note(found.visible, state.step, len(views))
     state.is_whole = False
     update(stage, state, found.gradients, iterations, views=len(views))
@@ -159,10 +159,10 @@ def advance(
         ranks.settle(state)
 
 
-def step_of(stage: Stage, state: TrainState, views: Sequence[View], ranks: Ranks, *, probed: bool) -> Step:
+def step_of(stage: Stage, state: TrainState, views: Sequence[View], ranks: Ranks, *, with_absgrad: bool) -> Step:
     """Differentiate the views of a step, of which this rank renders its own; the scene is not changed yet."""
     own = views[ranks.rank :: ranks.count]
-    results = [differentiate(stage, state.scene, view, probed=probed) for view in own]
+    results = [differentiate(stage, state.scene, view, with_absgrad=with_absgrad) for view in own]
     if len(views) == ranks.count == 1:
         check_losses(results[0].losses, state.step + 1, views[0])
         collect(state.statistics, results[0], views[0])
@@ -170,12 +170,12 @@ def step_of(stage: Stage, state: TrainState, views: Sequence[View], ranks: Ranks
     statistics: dict[str, ScreenStatistics] = {}
     for view, result in zip(own, results, strict=True):
         collect(statistics, result, view)
-    told = ranks.exchange((list(statistics), [(r.losses, set(r.gradients), r.visible is None) for r in results]))
+    exchanged = ranks.exchange((list(statistics), [(r.losses, set(r.gradients), r.visible is None) for r in results]))
     # Rank r has the views r, r + count, ...
-    of_views = [told[i % ranks.count][1][i // ranks.count] for i in range(len(views))]
+    of_views = [exchanged[i % ranks.count][1][i // ranks.count] for i in range(len(views))]
     for number, (view, (losses, _, _)) in enumerate(zip(views, of_views, strict=True), 1):
         check_losses(losses, state.step + number, view)
-    parts = dict.fromkeys(part for known, _ in told for part in known)
+    parts = dict.fromkeys(part for known, _ in exchanged for part in known)
     names = [name for name in state.scene.parameters() if any(name in learning for _, learning, _ in of_views)]
     step = totals(state.scene, results, {part: statistics.get(part) for part in parts}, names, ranks)
     gradients = {name: gradient / len(views) for name, gradient in step.gradients.items()}
@@ -284,10 +284,10 @@ def order_of_views(count: int, seed: int, number: int) -> list[int]:
     return order
 
 
-def differentiate(stage: Stage, scene: Scene, view: View, *, probed: bool) -> Differentiated:
+def differentiate(stage: Stage, scene: Scene, view: View, *, with_absgrad: bool) -> Differentiated:
     """Renders a view and returns the weighted losses with the gradients of all that learns.
 
-    Those on screen come only if the view is `probed`.
+    Those of passes come only `with_absgrad`.
     """
     leaves = {
         name: tensor.detach().requires_grad_()
@@ -296,19 +296,19 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, probed: bool) -> Di
     }
     learning = scene.with_parameters(leaves)
     view = seen_from(view, learning)
-    frame = stage.renderer(learning, view.camera, probed=probed)
+    frame = stage.renderer(learning, view.camera, with_absgrad=with_absgrad)
     terms, weights = loss_terms(stage, frame, view, learning)
     tracked = [record for record in frame.screen if record.means2d.requires_grad and record.means2d.numel() > 0]
-    centers, probes = [record.means2d for record in tracked], [record.probe for record in tracked]
+    centers, absgrads = [record.means2d for record in tracked], [record.absgrad for record in tracked]
     values = torch.stack([*terms.values()]) * weights
     # Of their sum, and not of the terms with the weights as `grad_outputs`: to check these, PyTorch imports SymPy.
     sums = [values.sum()] if values.requires_grad else []
-    inputs = ([*leaves.values()], centers, probes, [record.probe for record in frame.space])
+    inputs = ([*leaves.values()], centers, absgrads, [record.contributions for record in frame.space])
     found = iter(torch.autograd.grad(sums, [*itertools.chain(*inputs)], allow_unused=True))
-    v_leaves, v_centers, v_probes, v_met = ([*itertools.islice(found, len(some))] for some in inputs)
+    v_leaves, v_centers, v_absgrads, v_met = ([*itertools.islice(found, len(some))] for some in inputs)
     gradients = {name: g for name, g in zip(leaves, v_leaves, strict=True) if g is not None}
-    pulls = zip(tracked, v_centers, v_probes, strict=True)
-    screen = [(s, v_means, v_probe) for s, v_means, v_probe in pulls if v_means is not None and v_probe is not None]
+    passes = zip(tracked, v_centers, v_absgrads, strict=True)
+    screen = [(record, v_means, v) for record, v_means, v in passes if v_means is not None and v is not None]
     space = [(record, met) for record, met in zip(frame.space, v_met, strict=True) if met is not None]
     losses = dict(zip(terms, values.tolist(), strict=True))
     return Differentiated(losses, gradients, screen, space, frame.visible)
@@ -343,9 +343,9 @@ def update(
 def collect(statistics: dict[str, ScreenStatistics], result: Differentiated, view: View) -> None:
     """Adds a view's gradients on screen, and in space of what rays met, to the statistics that densification reads."""
     size = view.camera.width, view.camera.height
-    for record, v_means, v_probe in result.screen:
+    for record, v_means, v_absgrad in result.screen:
         known = statistics_of(statistics, record.part, v_means.shape[1], v_means.device)
-        known.add(Views(v_means, v_probe, record.radii, *size, record.weight, record.direct))
+        known.add(Views(v_means, v_absgrad, record.radii, *size, record.weight, record.direct))
     for traced, met in result.space:
         gradient = result.gradients.get(f"{traced.part}.means")
         if gradient is not None:

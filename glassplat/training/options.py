@@ -134,24 +134,24 @@ Strategy = Literal["default", "mcmc"]
 
 
 @dataclass(frozen=True)
-class Rhythm:
+class Intervals:
     """Schedule of the perturbation of opacities, of the SH degree, and of the end of a run.
 
     Times are shares of the run (3DGS: of 30,000 iterations).
 
-    Every third beat resets the opacities, as in 3DGS; `planar` perturbs them at the other two, so that
-    the two never meet (TR-Gaussians, Section III-C3).
+    Every third interval ends in a reset of the opacities, as in 3DGS. `planar` perturbs them after the other two, so
+    that the two never meet (TR-Gaussians, Section III-C3).
 
     Attributes:
-        beat: distance between beats, as a share of the run.
-        least: fewest iterations between beats; what a beat disturbs needs as many to recover.
+        opacity: between changes of the opacities, as a share of the run.
+        least: fewest iterations between them; the scene needs as many to recover.
         reset_stop: share of the run after which no reset happens; the `mcmc` strategy has none.
         sh: distance between rises of the SH degree, as a share of the run.
         averaged_passes: passes over the views at the end of the run of which the scene becomes the mean; 0 keeps the
             last step.
     """
 
-    beat: Internal[PositiveShare] = 1 / 30
+    opacity: Internal[PositiveShare] = 1 / 30
     least: Internal[Several] = 250
     reset_stop: Internal[Share] = 0.45
     sh: Internal[PositiveShare] = 1 / 30
@@ -162,12 +162,13 @@ class Rhythm:
 class DefaultDensify:
     """Options for adding and removing Gaussians as in 3DGS, with the criterion of AbsGS (arXiv 2404.10484) for splits.
 
-    A small Gaussian whose mean screen gradient exceeds a threshold is cloned; a large one at which single pixels pull
-    more than another threshold is split in two. Where a large Gaussian smears detail, pixels pull it to all sides;
-    3DGS, which looks at the gradient here too, lets it be. Nearly transparent ones are removed.
+    A small Gaussian whose mean screen gradient exceeds a threshold is cloned. A large one whose mean absolute gradient,
+    summed over pixels without their signs, exceeds another threshold is split in two. Where a large Gaussian smears
+    detail, the gradients of its pixels cancel, and 3DGS, which looks at their sum here too, lets it be.
+    Nearly transparent ones are removed.
 
     Attributes:
-        split_by: what tells that a large Gaussian is too large: the `pull` of single pixels, or as in 3DGS the
+        split_by: what tells that a large Gaussian is too large: the absolute gradient `absgrad`, or as in 3DGS the
             `gradient` that clones small ones.
         interval: steps between densifications.
         whole_passes: wait at least for about one pass over the views, twice the interval at the most, so that
@@ -177,7 +178,7 @@ class DefaultDensify:
         stop: share of the run after which it ends.
         gradient_threshold: mean gradient norm, in normalised device coordinates, above which a small Gaussian is
             cloned.
-        pull_threshold: mean pull of single pixels, in the same unit, above which a large Gaussian is split by `pull`.
+        absgrad_threshold: mean absolute gradient, in the same unit, above which a large Gaussian is split.
         dense_fraction: Gaussians whose longest axis is above this share of the scene extent are
             split, smaller ones cloned.
         prune_opacity: Gaussians less opaque than this are removed.
@@ -196,14 +197,14 @@ class DefaultDensify:
             perturbs nothing any longer, and at the end.
     """
 
-    split_by: Internal[Literal["pull", "gradient"]] = "pull"
+    split_by: Internal[Literal["absgrad", "gradient"]] = "absgrad"
     interval: Internal[Several] = 100
     whole_passes: Internal[bool] = True
     adapt_to_size: Internal[bool] = True
     start: Internal[Share] = 500 / 30_000
     stop: Share = 15_000 / 30_000
     gradient_threshold: Positive = 2e-4
-    pull_threshold: Positive = 1.2e-3
+    absgrad_threshold: Positive = 1.2e-3
     dense_fraction: Internal[Positive] = 0.01
     prune_opacity: Share = 0.005
     prune_large_start: Internal[Share] = 1.0
@@ -364,13 +365,13 @@ Texels = Annotated[int, Range(1, 2048)]
 
 @dataclass(frozen=True)
 class PropagationSchedule:
-    """Schedule of propagation: at the intervals of `Rhythm`, but for those that reset opacities.
+    """Schedule of propagation: at the intervals of `Intervals.opacity`, but for those that reset opacities.
 
     Attributes:
         end: `settled` ends it when what reflects has stopped growing (the paper's criterion), `fixed` at `stop`.
         stop: share of the run after which nothing is propagated any more.
-        patience: beats without growth after which it counts as settled; a strength needs some hundred steps to be seen,
-            however short the run. None is needed where nothing reflects nor looks as if it did.
+        patience: intervals without growth after which it counts as settled; a strength needs some hundred steps to be
+            seen, however short the run. None is needed where nothing reflects nor looks as if it did.
         pause: steps for which raised opacities are held.
         last_reset: after the end, reset opacities only if they have been raised since the last time; if not, regular
             resets go on as if nothing had been propagated.

@@ -204,7 +204,7 @@ def fingerprint(state: TrainState) -> int:
         for name, t in tensors.items()
     }
     optimizer = state.optimizer
-    return zlib.crc32(repr((sums, state.records, optimizer.paused, optimizer.hurried, optimizer.updates)).encode())
+    return zlib.crc32(repr((sums, state.records, optimizer.paused, optimizer.raised_rates, optimizer.updates)).encode())
 
 
 def join() -> Ranks:

@@ -37,13 +37,13 @@ class Optimizer:
         moments: first and second moment of each parameter.
         updates: by how many views each parameter was stepped, for the bias correction.
         paused: for how many more views a parameter is left as it is.
-        hurried: by what the rate of a parameter is multiplied from now on; 1 where nothing is said.
+        raised_rates: by what the rate of a parameter is multiplied from now on; 1 where nothing is said.
     """
 
     moments: Moments = field(default_factory=dict)
     updates: dict[str, int] = field(default_factory=dict)
     paused: dict[str, int] = field(default_factory=dict)
-    hurried: dict[str, float] = field(default_factory=dict)
+    raised_rates: dict[str, float] = field(default_factory=dict)
 
     def step(
         self,
@@ -76,7 +76,7 @@ class Optimizer:
         """The next step of a parameter, which so many views have asked for; counts them."""
         moments = self.moments_of(name, parameter)
         self.updates[name] = self.updates.get(name, 0) + views
-        factor = math.sqrt(views) * self.hurried.get(name, 1.0)
+        factor = math.sqrt(views) * self.raised_rates.get(name, 1.0)
         lr = rate if factor == 1 else rate * factor
         return Update(parameter, gradient, *moments, lr=lr, step=self.updates[name] / views, decay=decay)
 
@@ -129,7 +129,7 @@ class TrainState:
         step: iterations done.
         optimizer: Adam's moments.
         statistics: screen gradients collected for densification, by scene part.
-        seconds: time spent training so far, over all sittings.
+        seconds: time spent training so far, over all sessions.
         records: numbers that an action keeps from one turn to the next, and which setup was carried out last, by name.
         means: running means of the parameters over the last steps of the run, see `AverageLast`.
         method: the name of what is trained, so that a checkpoint tells whose it is; None where nobody said.

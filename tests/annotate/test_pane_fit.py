@@ -23,17 +23,17 @@ from tests.panes.pane_scene import EYES, FRONT, SIDE, Pane, camera_from
 U, V = np.array([-1.0, 1, 1, -1]), np.array([-1.0, -1, 1, 1])
 
 
-def eyes_on(pane: Pane, places: Sequence[Sequence[float]] = EYES) -> list[NumpyCamera]:
+def cameras_on(pane: Pane, places: Sequence[Sequence[float]] = EYES) -> list[NumpyCamera]:
     return [NumpyCamera.of(camera_from(place, pane.center)) for place in places]
 
 
-def corner_marks(pane: Pane, eyes: Sequence[NumpyCamera], *, noise: float = 0.0, seed: int = 0) -> Marks:
+def corner_marks(pane: Pane, cameras: Sequence[NumpyCamera], *, noise: float = 0.0, seed: int = 0) -> Marks:
     """Every corner marked in every view."""
     rng = np.random.default_rng(seed)
     corners = pane.at(U, V)
     return Marks(
         [
-            {view: eye.project(corner) + noise * rng.standard_normal(2) for view, eye in enumerate(eyes)}
+            {view: camera.project(corner) + noise * rng.standard_normal(2) for view, camera in enumerate(cameras)}
             for corner in corners
         ]
     )
@@ -47,8 +47,8 @@ def normal_off(frame: np.ndarray, pane: Pane) -> float:
 @pytest.mark.parametrize("pane", [FRONT, SIDE], ids=["front", "side"])
 @pytest.mark.parametrize("shape", ["rectangle", "polygon"])
 def test_exact_marks_give_the_pane(pane: Pane, shape: str) -> None:
-    eyes = eyes_on(pane)
-    fit = fitted_pane(corner_marks(pane, eyes), eyes, shape)  # type: ignore[arg-type]
+    cameras = cameras_on(pane)
+    fit = fitted_pane(corner_marks(pane, cameras), cameras, shape)  # type: ignore[arg-type]
     np.testing.assert_allclose(fit.shape.corners(), pane.at(U, V), atol=1e-4)
     assert fit.error < 1e-2 and normal_off(fit.shape.frame, pane) < 1e-2
     np.testing.assert_allclose(fit.shape.frame @ fit.shape.frame.T, np.eye(3), atol=1e-9)
@@ -56,72 +56,74 @@ def test_exact_marks_give_the_pane(pane: Pane, shape: str) -> None:
 
 @pytest.mark.parametrize("count", [2, 3])
 def test_the_error_of_the_plane_is_as_large_as_the_doubt_says(count: int) -> None:
-    eyes = eyes_on(FRONT, EYES[:count])
-    fits = [fitted_pane(corner_marks(FRONT, eyes, noise=0.37, seed=seed), eyes, "rectangle") for seed in range(30)]
+    cameras = cameras_on(FRONT, EYES[:count])
+    fits = [
+        fitted_pane(corner_marks(FRONT, cameras, noise=0.37, seed=seed), cameras, "rectangle") for seed in range(30)
+    ]
     errors = np.array([normal_off(fit.shape.frame, FRONT) for fit in fits])
-    doubt = np.median([fit.doubt for fit in fits])
-    assert 0.3 * doubt < np.sqrt((errors**2).mean()) < 2 * doubt
+    uncertainty = np.median([fit.uncertainty for fit in fits])
+    assert 0.3 * uncertainty < np.sqrt((errors**2).mean()) < 2 * uncertainty
 
 
 def test_another_view_lowers_the_doubt_as_foretold() -> None:
-    eyes = eyes_on(FRONT)
-    two = fitted_pane(corner_marks(FRONT, eyes[:2], noise=0.2), eyes[:2], "rectangle")
-    three = fitted_pane(corner_marks(FRONT, eyes, noise=0.2), eyes, "rectangle")
-    foretold = tilt_deviation(two.information + corner_information(eyes[2], two.shape))
-    assert three.doubt < two.doubt
-    assert foretold == pytest.approx(three.doubt, rel=0.3)
+    cameras = cameras_on(FRONT)
+    two = fitted_pane(corner_marks(FRONT, cameras[:2], noise=0.2), cameras[:2], "rectangle")
+    three = fitted_pane(corner_marks(FRONT, cameras, noise=0.2), cameras, "rectangle")
+    foretold = tilt_deviation(two.information + corner_information(cameras[2], two.shape))
+    assert three.uncertainty < two.uncertainty
+    assert foretold == pytest.approx(three.uncertainty, rel=0.3)
 
 
 def test_a_corner_outside_of_the_image_may_be_marked() -> None:
     wide = FRONT.larger(2.5)
-    eyes = eyes_on(wide)
-    assert not all(eye.holds(wide.at(U, V)).all() for eye in eyes)
-    fit = fitted_pane(corner_marks(wide, eyes), eyes, "rectangle")
+    cameras = cameras_on(wide)
+    assert not all(camera.holds(wide.at(U, V)).all() for camera in cameras)
+    fit = fitted_pane(corner_marks(wide, cameras), cameras, "rectangle")
     np.testing.assert_allclose(fit.shape.corners(), wide.at(U, V), atol=1e-3)
 
 
 @pytest.mark.parametrize("shape", ["rectangle", "polygon"])
 def test_one_wrong_mark_moves_the_plane_little(shape: str) -> None:
-    eyes = eyes_on(FRONT, [*EYES, (0.6, 0.7, -0.5)])
-    marks = corner_marks(FRONT, eyes)
+    cameras = cameras_on(FRONT, [*EYES, (0.6, 0.7, -0.5)])
+    marks = corner_marks(FRONT, cameras)
     marks.corners[1][2] = marks.corners[1][2] + 30.0
-    fit = fitted_pane(marks, eyes, shape)  # type: ignore[arg-type]
+    fit = fitted_pane(marks, cameras, shape)  # type: ignore[arg-type]
     assert normal_off(fit.shape.frame, FRONT) < 0.5
     assert max(fit.errors, key=fit.errors.__getitem__) == 2
 
 
 def test_a_corner_that_one_view_shows_is_enough_beside_three_others() -> None:
-    eyes = eyes_on(FRONT)
-    marks = corner_marks(FRONT, eyes)
+    cameras = cameras_on(FRONT)
+    marks = corner_marks(FRONT, cameras)
     kept = {1: marks.corners[3][1]}
-    fit = fitted_pane(Marks([*marks.corners[:3], kept]), eyes, "polygon")
+    fit = fitted_pane(Marks([*marks.corners[:3], kept]), cameras, "polygon")
     np.testing.assert_allclose(fit.shape.corners(), FRONT.at(U, V), atol=1e-3)
-    hidden = fitted_pane(Marks([*marks.corners[:3], {}]), eyes, "rectangle")
+    hidden = fitted_pane(Marks([*marks.corners[:3], {}]), cameras, "rectangle")
     np.testing.assert_allclose(hidden.shape.corners(), FRONT.at(U, V), atol=1e-3)
 
 
-def edge_marks(pane: Pane, eyes: Sequence[NumpyCamera], edges: Sequence[int], reach: float = 0.7) -> Marks:
+def edge_marks(pane: Pane, cameras: Sequence[NumpyCamera], edges: Sequence[int], reach: float = 0.7) -> Marks:
     """Two points on some edges in every view, without any corner."""
     corners = pane.at(U, V)
     found: list[dict[int, np.ndarray]] = [{} for _ in range(4)]
     for number in edges:
         one, other = corners[number], corners[(number + 1) % 4]
         ends = np.stack([one + (1 - reach) * (other - one), one + reach * (other - one)])
-        found[number] = {view: eye.project(ends) for view, eye in enumerate(eyes)}
+        found[number] = {view: camera.project(ends) for view, camera in enumerate(cameras)}
     return Marks([{}, {}, {}, {}], found)
 
 
 def test_all_edges_without_a_corner_give_the_pane() -> None:
-    eyes = eyes_on(FRONT)
-    fit = fitted_pane(edge_marks(FRONT, eyes, range(4)), eyes, "rectangle")
+    cameras = cameras_on(FRONT)
+    fit = fitted_pane(edge_marks(FRONT, cameras, range(4)), cameras, "rectangle")
     np.testing.assert_allclose(fit.shape.corners(), FRONT.at(U, V), atol=1e-3)
 
 
 def test_two_edges_give_the_plane_and_as_much_of_the_pane_as_was_marked() -> None:
-    eyes = eyes_on(FRONT)
-    fit = fitted_pane(edge_marks(FRONT, eyes, (1, 3)), eyes, "rectangle")
+    cameras = cameras_on(FRONT)
+    fit = fitted_pane(edge_marks(FRONT, cameras, (1, 3)), cameras, "rectangle")
     assert normal_off(fit.shape.frame, FRONT) < 0.1
-    assert fit.doubt < 5
+    assert fit.uncertainty < 5
     sizes = np.linalg.norm(np.diff(fit.shape.corners()[:3], axis=0), axis=1)
     assert sizes[0] == pytest.approx(1.6, rel=0.02)
 
@@ -130,7 +132,7 @@ def test_where_a_long_front_ends_may_be_marked_in_one_photograph_only() -> None:
     """As on a walk along a facade: no photograph beside the one that shows its near end does so too."""
     front = Pane(np.array([0.0, 0, 0]), np.array([0.0, 0, 1.0]), np.array([1.0, 0, 0]), (7.0, 1.7))
     walk = {-1.5: -5.5, -2.5: -6.5, -4.0: -7.0, 1.5: -4.0, 5.5: 2.5}
-    eyes = [
+    cameras = [
         NumpyCamera.of(camera_from((x, 0.2, 5.0 - 0.2 * x), np.array([target, 0, 0]))) for x, target in walk.items()
     ]
     corners = front.at(U, V)
@@ -139,7 +141,7 @@ def test_where_a_long_front_ends_may_be_marked_in_one_photograph_only() -> None:
 
     def seen(view: int, begin: int, end: int, piece: Sequence[float] = (0.0, 1.0)) -> np.ndarray:
         ends = [corners[begin] + share * (corners[end] - corners[begin]) for share in piece]
-        return np.stack([eyes[view].project(one) + 0.3 * rng.standard_normal(2) for one in ends])
+        return np.stack([cameras[view].project(one) + 0.3 * rng.standard_normal(2) for one in ends])
 
     edges: list[dict[int, np.ndarray]] = [
         {view: seen(view, 0, 1, piece) for view, piece in pieces.items()},
@@ -147,45 +149,45 @@ def test_where_a_long_front_ends_may_be_marked_in_one_photograph_only() -> None:
         {view: seen(view, 3, 2, piece) for view, piece in pieces.items()},
         {view: seen(view, 3, 0) for view in (0, 2)},
     ]
-    places: list[dict[int, np.ndarray]] = [{}, {}, {}, {view: eyes[view].project(corners[3]) for view in (0, 1, 2)}]
-    fit = fitted_pane(Marks(places, edges), eyes, "rectangle")
-    assert normal_off(fit.shape.frame, front) < 2 * fit.doubt < 4
+    places: list[dict[int, np.ndarray]] = [{}, {}, {}, {view: cameras[view].project(corners[3]) for view in (0, 1, 2)}]
+    fit = fitted_pane(Marks(places, edges), cameras, "rectangle")
+    assert normal_off(fit.shape.frame, front) < 2 * fit.uncertainty < 4
     np.testing.assert_allclose(fit.shape.corners(), corners, atol=0.5)
 
 
 def test_a_corner_in_one_photograph_says_how_far_a_pane_goes() -> None:
     """Three sides are marked in every photograph, the fourth by one corner in one of them, far from the first guess."""
     wide = replace(FRONT, half_sizes=(2.5, 0.8))
-    eyes, corners = eyes_on(wide), wide.at(U, V)
+    cameras, corners = cameras_on(wide), wide.at(U, V)
     rng = np.random.default_rng(0)
 
     def seen(begin: int, end: int, piece: Sequence[float]) -> dict[int, np.ndarray]:
         ends = [corners[begin] + reach * (corners[end] - corners[begin]) for reach in piece]
         return {
-            view: np.stack([eye.project(one) + 3 * rng.standard_normal(2) for one in ends])
-            for view, eye in enumerate(eyes)
+            view: np.stack([camera.project(one) + 3 * rng.standard_normal(2) for one in ends])
+            for view, camera in enumerate(cameras)
         }
 
     edges = [seen(0, 1, (0.0, 1.0)), seen(1, 2, (0.0, 0.1)), {}, seen(3, 0, (0.9, 1.0))]
-    fit = fitted_pane(Marks([{}, {}, {0: eyes[0].project(corners[2])}, {}], edges), eyes, "rectangle")
+    fit = fitted_pane(Marks([{}, {}, {0: cameras[0].project(corners[2])}, {}], edges), cameras, "rectangle")
     np.testing.assert_allclose(fit.shape.corners()[2], corners[2], atol=0.1)
     assert fit.error < 4
 
 
 @pytest.mark.parametrize("elsewhere", [0, 1, 3])
 def test_a_corner_marked_at_another_one_is_fitted_badly_and_not_refused(elsewhere: int) -> None:
-    eyes = eyes_on(FRONT)
-    places = list(corner_marks(FRONT, eyes).corners)
+    cameras = cameras_on(FRONT)
+    places = list(corner_marks(FRONT, cameras).corners)
     places[2] = {0: places[elsewhere][0]}
-    fit = fitted_pane(Marks(places), eyes, "rectangle")
-    assert fit.error > 10 and fit.doubt > 10
+    fit = fitted_pane(Marks(places), cameras, "rectangle")
+    assert fit.error > 10 and fit.uncertainty > 10
 
 
 def test_edges_of_five_corners_are_fitted_too() -> None:
-    eyes = eyes_on(FRONT)
+    cameras = cameras_on(FRONT)
     outline = FRONT.at(np.array([-1, 1, 1, 0.2, -1.0]), np.array([-1, -1, 1, 0.4, 1.0]))
-    marks = Marks([{view: eye.project(corner) for view, eye in enumerate(eyes)} for corner in outline])
-    fit = fitted_pane(marks, eyes, "rectangle")  # Five corners are no rectangle.
+    marks = Marks([{view: camera.project(corner) for view, camera in enumerate(cameras)} for corner in outline])
+    fit = fitted_pane(marks, cameras, "rectangle")  # Five corners are no rectangle.
     np.testing.assert_allclose(fit.shape.corners(), outline, atol=1e-3)
 
 
@@ -198,8 +200,8 @@ def test_edges_of_five_corners_are_fitted_too() -> None:
     ],
 )
 def test_too_few_marks_say_what_is_missing(kept: dict[int, int], expected: str) -> None:
-    eyes = eyes_on(FRONT)
-    marks = corner_marks(FRONT, eyes)
+    cameras = cameras_on(FRONT)
+    marks = corner_marks(FRONT, cameras)
     some = Marks(
         [
             {view: place for view, place in places.items() if number < kept.get(view, 0)}
@@ -207,13 +209,13 @@ def test_too_few_marks_say_what_is_missing(kept: dict[int, int], expected: str) 
         ]
     )
     with pytest.raises(TooFewMarksError, match=expected):
-        fitted_pane(some, eyes, "rectangle")
+        fitted_pane(some, cameras, "rectangle")
 
 
 def test_views_from_one_place_are_not_enough() -> None:
-    eyes = eyes_on(FRONT, [EYES[0], EYES[0]])
+    cameras = cameras_on(FRONT, [EYES[0], EYES[0]])
     with pytest.raises(TooFewMarksError, match="taken farther apart"):
-        fitted_pane(corner_marks(FRONT, eyes), eyes, "rectangle")
+        fitted_pane(corner_marks(FRONT, cameras), cameras, "rectangle")
 
 
 def test_the_rectangle_of_a_polygon_keeps_its_order_and_hand() -> None:

@@ -94,37 +94,39 @@ def test_without_a_pane_nothing_is_written(room: Path) -> None:
 
 def test_the_nearer_pane_hides_the_farther_one(room: Path) -> None:
     behind = Pane(FRONT.center + np.array([0.3, 0.0, 0.5]), FRONT.normal, FRONT.tangent, (0.8, 0.5))
-    eyes = [NumpyCamera.of(camera_from(place, FRONT.center)) for place in PLACES]
+    cameras = [NumpyCamera.of(camera_from(place, FRONT.center)) for place in PLACES]
     panes = []
     for label, pane in enumerate((behind, FRONT), start=1):
         corners = pane.at(np.array([-1.0, 1, 1, -1]), np.array([-1.0, -1, 1, 1]))
-        places = [{name: eye.project(c).tolist() for name, eye in zip(NAMES, eyes, strict=True)} for c in corners]
+        places = [
+            {name: camera.project(c).tolist() for name, camera in zip(NAMES, cameras, strict=True)} for c in corners
+        ]
         (marked,) = parsed_document(marked_document(label=label, corners=places), "here")
         numbers = {name: number for number, name in enumerate(NAMES)}
-        panes.append((marked, fitted_pane(marked.marks(numbers), eyes, "rectangle")))
+        panes.append((marked, fitted_pane(marked.marks(numbers), cameras, "rectangle")))
     for order in (panes, panes[::-1]):
-        labels = pane_labels(NAMES[1], eyes[1], order)
+        labels = pane_labels(NAMES[1], cameras[1], order)
         truth = label_image(camera_from(PLACES[1], FRONT.center), [behind, FRONT]).numpy()
         assert (labels != truth).mean() < 0.002
 
 
 def test_an_outline_that_passes_the_camera_is_cut_off() -> None:
-    eye = NumpyCamera.of(camera_from((0.0, 0.0, 0.0), np.array([0.0, 0.0, 1.0])))
+    camera = NumpyCamera.of(camera_from((0.0, 0.0, 0.0), np.array([0.0, 0.0, 1.0])))
     floor = np.array([[-5.0, 1, -5], [5, 1, -5], [5, 1, 5], [-5, 1, 5]])
-    mask = filled(seen_outline(eye, floor), (300, 220))
+    mask = filled(seen_outline(camera, floor), (300, 220))
     horizon = 110 + 240 * 1 / 5
     rows = np.flatnonzero(mask.any(axis=1))
     assert rows.min() == pytest.approx(horizon, abs=2) and rows.max() == 219
     behind = floor - [0, 0, 10]
-    assert not filled(seen_outline(eye, behind), (300, 220)).any()
+    assert not filled(seen_outline(camera, behind), (300, 220)).any()
 
 
 def test_an_outline_that_passes_the_camera_keeps_its_edges_straight() -> None:
-    eye = NumpyCamera.of(camera_from((0.0, 0.0, 0.0), np.array([0.0, 0.0, 1.0])))
+    camera = NumpyCamera.of(camera_from((0.0, 0.0, 0.0), np.array([0.0, 0.0, 1.0])))
     wall = np.array([[-2.0, -1, 6], [2.5, -1, -20], [2.5, 1, -20], [-2, 1, 6]])
-    mask = filled(seen_outline(eye, wall), (300, 220))
+    mask = filled(seen_outline(camera, wall), (300, 220))
     x, y = np.meshgrid(np.arange(300) + 0.5, np.arange(220) + 0.5)
-    rays = eye.rays(np.stack([x, y], axis=-1))
+    rays = camera.rays(np.stack([x, y], axis=-1))
     normal = np.cross(wall[1] - wall[0], wall[3] - wall[0])
     met = rays * (wall[0] @ normal / (rays @ normal))[..., None]
     truth = (np.abs(met[..., 1]) < 1) & (met[..., 0] > -2) & (met[..., 2] > 0)
@@ -188,6 +190,6 @@ def test_the_suggested_photograph_lowers_the_doubt(room: Path) -> None:
     session = opened_session(room)
     two = saved(session, marked_document((0, 2)))["panes"][0]
     best = two["next"][0]
-    assert best["doubt"] < two["doubt"]
+    assert best["uncertainty"] < two["uncertainty"]
     three = saved(session, marked_document((0, 2, best["view"])))["panes"][0]
-    assert three["doubt"] == pytest.approx(best["doubt"], rel=0.3)
+    assert three["uncertainty"] == pytest.approx(best["uncertainty"], rel=0.3)

@@ -48,7 +48,7 @@ WRONG = [
     ["splat", "--densify.cap", "-5"],
     ["splat", "--cap", LARGE],
     ["splat", "--densify.stop", "1.5"],
-    ["splat", "--rhythm.averaged-passes", "-1"],
+    ["splat", "--intervals.averaged-passes", "-1"],
     ["deferred", "--texels", "0"],
     ["deferred", "--texels", LARGE],
     ["deferred", "--region", "0", "0", "0", "-1"],
@@ -165,7 +165,9 @@ def test_the_help_of_the_method_is_named_beside_an_unknown_option(capsys: pytest
         assert capsys.readouterr().err.endswith(f"glassplat train {method} --help-advanced\n")
 
 
-@pytest.mark.parametrize("option", [["--rhythm.beat", "0.1"], ["--densify.split-by", "pull"], ["--blend", "srgb"]])
+@pytest.mark.parametrize(
+    "option", [["--intervals.opacity", "0.1"], ["--densify.split-by", "absgrad"], ["--blend", "srgb"]]
+)
 def test_what_a_preset_decides_is_no_option(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stopped:
         main(["train", "planar", "--data", str(SCENE), "--output", "y", *option])

@@ -66,7 +66,7 @@ def test_lines_come_soon_at_first_and_then_every_few_seconds() -> None:
     assert lines[-1] == f"step {shown[-1]} of 1000: loss 0.2500, 1020 Gaussians, {left} left"
 
 
-def test_the_time_left_is_that_of_this_sitting_and_its_last_minute() -> None:
+def test_the_time_left_is_that_of_this_session_and_its_last_minute() -> None:
     lines = lines_of([RunBegun(899, 1000), *(step(number) for number in range(900, 1000))], 6.0)
     assert lines[0] == "going on from step 899 of 1000"
     assert lines[-1].endswith(f"{in_words(6 * (1000 - int(lines[-1].split()[1])))} left")

@@ -15,7 +15,7 @@ from glassplat.kernels.records import Deviation, Splats, TileBins
 from glassplat.kernels.tiles import bin_tiles
 
 MakeSplats = Callable[..., Splats]
-INPUTS = ("means2d", "conics", "opacities", "channels", "marks", "probe")
+INPUTS = ("means2d", "conics", "opacities", "channels", "marks", "absgrad")
 
 
 class Blend(NamedTuple):
@@ -26,17 +26,17 @@ class Blend(NamedTuple):
     marks: Tensor
     num_primary: int
     bins: TileBins
-    probe: Tensor
+    absgrad: Tensor
     deviation: Deviation | None = None
 
     def __call__(self, function: Callable[..., Composite]) -> Composite:
         return function(
             self.splats, self.channels, self.bins,
-            marks=self.marks, num_primary=self.num_primary, deviation=self.deviation, probe=self.probe,
+            marks=self.marks, num_primary=self.num_primary, deviation=self.deviation, absgrad=self.absgrad,
         )  # fmt: skip
 
     def inputs(self) -> list[Tensor]:
-        return [*self.splats[:3], self.channels, self.marks, self.probe]
+        return [*self.splats[:3], self.channels, self.marks, self.absgrad]
 
 
 def blend(splats: Splats, size: tuple[int, int], *, channels: int = 3, glass: int = 0, seed: int = 1) -> Blend:
@@ -61,9 +61,9 @@ def deviating(case: Blend, channel: int, *, through_mean: bool) -> Blend:
 def with_gradients(case: Blend, function: Callable[..., Composite], seed: int = 2) -> dict[str, Tensor]:
     """Outputs and, for random cotangents, the gradients of all inputs."""
     inputs = [tensor.detach().requires_grad_() for tensor in case.inputs()]
-    means2d, conics, opacities, channels, marks, probe = inputs
+    means2d, conics, opacities, channels, marks, absgrad = inputs
     splats = case.splats._replace(means2d=means2d, conics=conics, opacities=opacities)
-    outputs = case._replace(splats=splats, channels=channels, marks=marks, probe=probe)(function)
+    outputs = case._replace(splats=splats, channels=channels, marks=marks, absgrad=absgrad)(function)
     generator = torch.Generator().manual_seed(seed)
     cotangents = [torch.randn(o.shape, generator=generator, dtype=torch.float64).to(o.dtype) for o in outputs]
     # The twin does not touch inputs that reach no pixel; the added zero gives them a gradient of zero.
@@ -235,33 +235,36 @@ def test_gradients_match_finite_differences(random_splats: MakeSplats) -> None:
     assert torch.autograd.gradcheck(weighted, inputs, eps=1e-7, atol=1e-6, rtol=1e-6)
 
 
-def test_pulls_of_pixels_add_up_without_their_signs(random_splats: MakeSplats) -> None:
+def test_gradients_of_pixels_add_up_without_their_signs(random_splats: MakeSplats) -> None:
     size = (11, 9)
     splats = random_splats((1, 12), size, opacities=(0.3, 0.8), sigmas=(2.0, 6.0), seed=5)
     case = blend(splats, size, glass=4)
-    means2d, probe = case.splats.means2d.requires_grad_(), case.probe.requires_grad_()
-    outputs = case._replace(splats=splats._replace(means2d=means2d), probe=probe)(composite)
+    means2d, absgrad = case.splats.means2d.requires_grad_(), case.absgrad.requires_grad_()
+    outputs = case._replace(splats=splats._replace(means2d=means2d), absgrad=absgrad)(composite)
     values = outputs.image.sum(-1) + 2 * outputs.mask
     total = torch.zeros_like(means2d)
     for pixel in values.flatten():
         total += torch.autograd.grad(pixel, means2d, retain_graph=True)[0].abs()
-    (found,) = torch.autograd.grad(values.sum(), probe, retain_graph=True)
+    (found,) = torch.autograd.grad(values.sum(), absgrad, retain_graph=True)
     (signed,) = torch.autograd.grad(values.sum(), means2d)
     torch.testing.assert_close(found, total)
     assert bool((found > 1.5 * signed.abs()).any())
 
 
-def test_the_value_of_the_probe_changes_nothing(random_splats: MakeSplats) -> None:
+def test_the_value_of_absgrad_changes_nothing(random_splats: MakeSplats) -> None:
     size = (40, 33)
     case = blend(random_splats((2, 60), size, dtype=torch.float32), size, glass=20)
-    plain, probed = with_gradients(case, composite), with_gradients(case._replace(probe=case.probe + 3), composite)
-    assert all(torch.equal(plain[name], probed[name]) for name in plain)
+    plain, with_absgrad = (
+        with_gradients(case, composite),
+        with_gradients(case._replace(absgrad=case.absgrad + 3), composite),
+    )
+    assert all(torch.equal(plain[name], with_absgrad[name]) for name in plain)
 
 
-def test_asking_for_the_probe_changes_no_other_gradient(random_splats: MakeSplats) -> None:
+def test_asking_for_absgrad_changes_no_other_gradient(random_splats: MakeSplats) -> None:
     case = blend(random_splats((1, 30), (20, 20), dtype=torch.float32), (20, 20))
     channels = case.channels.requires_grad_()
-    asked = torch.autograd.grad(case._replace(probe=case.probe.requires_grad_())(composite).image.sum(), channels)
+    asked = torch.autograd.grad(case._replace(absgrad=case.absgrad.requires_grad_())(composite).image.sum(), channels)
     plain = torch.autograd.grad(composite(case.splats, channels, case.bins).image.sum(), channels)
     assert torch.equal(asked[0], plain[0])
 
@@ -379,8 +382,8 @@ def test_wrong_inputs_are_named(random_splats: MakeSplats) -> None:
         composite(splats, channels, bins, num_primary=6)
     with pytest.raises(ValueError, match=r"D in 1\.\.32"):
         composite(splats, torch.zeros(1, 5, 33, dtype=torch.float64), bins)
-    with pytest.raises(ValueError, match=r"probe has shape \(1, 4, 2\); expected \(1, 5, 2\)"):
-        composite(splats, channels, bins, marks=case.marks, num_primary=3, probe=case.probe[:, 1:])
+    with pytest.raises(ValueError, match=r"absgrad has shape \(1, 4, 2\); expected \(1, 5, 2\)"):
+        composite(splats, channels, bins, marks=case.marks, num_primary=3, absgrad=case.absgrad[:, 1:])
     with pytest.raises(TypeError, match=r"channels is torch\.float32 and means2d is torch\.float64"):
         composite(splats, channels.float(), bins)
     fewer = Splats(*(tensor[:, :4] for tensor in splats))

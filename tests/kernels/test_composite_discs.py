@@ -22,7 +22,7 @@ from glassplat.kernels.trace import build_bvh, shapes_of, trace
 from tests.kernels.gaussians_and_cameras import draw
 
 NEAR = 0.3
-INPUTS = ("means2d", "maps", "opacities", "depths", "channels", "probe")
+INPUTS = ("means2d", "maps", "opacities", "depths", "channels", "absgrad")
 
 
 class Case(NamedTuple):
@@ -31,20 +31,20 @@ class Case(NamedTuple):
     discs: Discs
     channels: Tensor
     bins: TileBins
-    probe: Tensor
+    absgrad: Tensor
     low_pass: float = LOW_PASS
 
     def __call__(self, function: Callable[..., BlendedDiscs]) -> BlendedDiscs:
         return function(
-            self.discs, self.channels, self.bins, near=NEAR, low_pass=self.low_pass, probe=self.probe
+            self.discs, self.channels, self.bins, near=NEAR, low_pass=self.low_pass, absgrad=self.absgrad
         )  # fmt: skip
 
     def inputs(self) -> list[Tensor]:
-        return [*self.discs[:4], self.channels, self.probe]
+        return [*self.discs[:4], self.channels, self.absgrad]
 
     def with_inputs(self, *tensors: Tensor) -> Case:
         discs = Discs(*tensors[:4], self.discs.outlines)
-        return self._replace(discs=discs, channels=tensors[4], probe=tensors[5])
+        return self._replace(discs=discs, channels=tensors[4], absgrad=tensors[5])
 
 
 def scattered(
@@ -143,7 +143,7 @@ def test_gradients_match_finite_differences(low_pass: float) -> None:
     cotangents = [draw(*output.shape, seed=30 + i) for i, output in enumerate(case(composite_discs))]
 
     def weighted(*tensors: Tensor) -> Tensor:
-        outputs = case.with_inputs(*tensors, case.probe)(composite_discs)
+        outputs = case.with_inputs(*tensors, case.absgrad)(composite_discs)
         return torch.stack([(o * c).sum() for o, c in zip(outputs, cotangents, strict=True)])
 
     inputs = [tensor.detach().clone().requires_grad_() for tensor in case.inputs()[:5]]
@@ -253,15 +253,15 @@ def test_what_lies_before_the_near_plane_is_not_seen() -> None:
     assert_close(found, with_gradients(case, twin), 1e-10)
 
 
-def test_pulls_of_pixels_add_up_without_their_signs() -> None:
+def test_gradients_of_pixels_add_up_without_their_signs() -> None:
     case = case_of(scattered(12, size=-0.8), cameras_of(1, (11, 9)), channels=1)
-    means2d, probe = case.discs.means2d.detach().requires_grad_(), case.probe.requires_grad_()
-    outputs = case._replace(discs=case.discs._replace(means2d=means2d), probe=probe)(composite_discs)
+    means2d, absgrad = case.discs.means2d.detach().requires_grad_(), case.absgrad.requires_grad_()
+    outputs = case._replace(discs=case.discs._replace(means2d=means2d), absgrad=absgrad)(composite_discs)
     values = outputs.image.sum(-1) + outputs.depth
     total = torch.zeros_like(means2d)
     for pixel in values.flatten():
         total += torch.autograd.grad(pixel, means2d, retain_graph=True)[0].abs()
-    (found,) = torch.autograd.grad(values.sum(), probe, retain_graph=True)
+    (found,) = torch.autograd.grad(values.sum(), absgrad, retain_graph=True)
     torch.testing.assert_close(found, total)
 
 
@@ -324,8 +324,8 @@ def test_wrong_inputs_are_named() -> None:
     case = case_of(scattered(5), cameras_of(1, (20, 20)))
     with pytest.raises(ValueError, match=r"D in 1\.\.32"):
         composite_discs(case.discs, torch.zeros(1, 5, 33, dtype=torch.float64), case.bins, near=NEAR)
-    with pytest.raises(ValueError, match=r"probe has shape \(1, 4, 2\); expected \(1, 5, 2\)"):
-        composite_discs(case.discs, case.channels, case.bins, near=NEAR, probe=case.probe[:, 1:])
+    with pytest.raises(ValueError, match=r"absgrad has shape \(1, 4, 2\); expected \(1, 5, 2\)"):
+        composite_discs(case.discs, case.channels, case.bins, near=NEAR, absgrad=case.absgrad[:, 1:])
     with pytest.raises(TypeError, match=r"channels is torch\.float32 and means2d is torch\.float64"):
         composite_discs(case.discs, case.channels.float(), case.bins, near=NEAR)
     with pytest.raises(ValueError, match="near is -1"):

@@ -15,7 +15,7 @@ def add_views_in_torch(sums: Sums, views: Views) -> None:
     """The definition of `add_views`, for tensors that are checked."""
     visible = (views.radii > 0).all(dim=-1)
     rows = slice(None) if views.direct else slice(0, 1)
-    for total, gradient in ((sums.gradient_sum, views.v_means2d), (sums.pull_sum, views.v_probe)):
+    for total, gradient in ((sums.gradient_sum, views.v_means2d), (sums.absgrad_sum, views.v_absgrad)):
         across, down = gradient[..., 0] * (views.width / 2), gradient[..., 1] * (views.height / 2)
         total[rows] += torch.where(visible, torch.hypot(across, down), 0).sum(dim=0)
     sums.view_count[rows] += (views.weight * visible.to(views.radii.dtype)).sum(dim=0)
@@ -29,9 +29,9 @@ def no_views(count: int, dtype: torch.dtype = torch.float32) -> Sums:
 
 def some_views(cameras: int, count: int, dtype: torch.dtype = torch.float32, *, weighted: bool, direct: bool) -> Views:
     generator = torch.Generator().manual_seed(0)
-    v_means, v_probe, radii = torch.randn(3, cameras, count, 2, generator=generator, dtype=torch.float64).to(dtype)
+    v_means, v_absgrad, radii = torch.randn(3, cameras, count, 2, generator=generator, dtype=torch.float64).to(dtype)
     weight = torch.rand(cameras, count, generator=generator, dtype=torch.float64).to(dtype) if weighted else 0.3
-    return Views(v_means, v_probe, 9 * radii, 40, 30, weight, direct)
+    return Views(v_means, v_absgrad, 9 * radii, 40, 30, weight, direct)
 
 
 def added(views: Views, dtype: torch.dtype = torch.float32) -> Sums:
@@ -45,7 +45,7 @@ def test_visible_views_count_in_device_coordinates() -> None:
     radii = torch.tensor([[[4.0, 2], [1, 1], [0, 0]], [[8, 40], [0, 3], [0, 0]]])
     sums = added(Views(gradient, 2 * gradient, radii, width=400, height=200))
     assert sums.gradient_sum.tolist() == [[3 * 200 + 1 * 100, 100, 0]] * 2
-    assert sums.pull_sum.tolist() == [[2 * (3 * 200 + 1 * 100), 200, 0]] * 2
+    assert sums.absgrad_sum.tolist() == [[2 * (3 * 200 + 1 * 100), 200, 0]] * 2
     assert sums.view_count.tolist() == [[2, 1, 0]] * 2
     assert sums.max_radius.tolist() == pytest.approx([0.1, 1 / 400, 0])
 
@@ -86,7 +86,7 @@ def test_the_number_of_threads_changes_no_bit() -> None:
     ("change", "error", "message"),
     [
         ({"radii": torch.zeros(1, 3, 2)}, ValueError, r"max_radius has shape \(4,\); expected \(3,\)"),
-        ({"v_probe": torch.zeros(2, 4, 2)}, ValueError, r"v_probe has shape \(2, 4, 2\); expected \(1, 4, 2\)"),
+        ({"v_absgrad": torch.zeros(2, 4, 2)}, ValueError, r"v_absgrad has shape \(2, 4, 2\); expected \(1, 4, 2\)"),
         ({"weight": torch.zeros(4)}, ValueError, r"weight has shape \(4,\); expected \(1, 4\)"),
         ({"radii": torch.zeros(1, 4, 2).double()}, TypeError, "radii is torch.float64"),
     ],

@@ -45,10 +45,10 @@ def traced(gaussians: RawGaussians, rays: Rays, *, sh_degree: int = 3, near: flo
 
 def with_gradients(function: Callable[..., Traced], gaussians: RawGaussians, rays: Rays, degree: int) -> list[Tensor]:
     """Everything that comes back, and the gradients of a random sum of it."""
-    probe = torch.zeros_like(gaussians.means[:, :2])
-    leaves = [tensor.detach().clone().requires_grad_() for tensor in (*gaussians, *rays, probe)]
+    contributions = torch.zeros_like(gaussians.means[:, :2])
+    leaves = [tensor.detach().clone().requires_grad_() for tensor in (*gaussians, *rays, contributions)]
     own, own_rays = RawGaussians(*leaves[:5]), Rays(*leaves[5:7])
-    found = function(own, own_rays, bvh_of(own), sh_degree=degree, near=0.05, probe=leaves[7])
+    found = function(own, own_rays, bvh_of(own), sh_degree=degree, near=0.05, contributions=leaves[7])
     generator = torch.Generator().manual_seed(3)
     weights = [torch.randn(x.shape, generator=generator, dtype=torch.float64).to(x) for x in found[:3]]
     total = torch.stack([(weight * value).sum() for weight, value in zip(weights, found, strict=False)]).sum()
@@ -96,11 +96,11 @@ def test_gradients_match_finite_differences(scales: int) -> None:
 
 
 @pytest.mark.parametrize("scales", [DISCS, ELLIPSOIDS])
-def test_the_gradient_of_the_probe_is_what_gaussians_add_to_rays(scales: int) -> None:
+def test_the_gradient_of_contributions_is_what_gaussians_add_to_rays(scales: int) -> None:
     gaussians, rays = cloud(60, scales, size=-0.7), rays_around(50)
-    probe = torch.zeros(60, 2, dtype=torch.float64, requires_grad=True)
-    found = trace(gaussians, rays, bvh_of(gaussians), sh_degree=0, near=0.0, probe=probe)
-    (met,) = torch.autograd.grad(found.alphas.square().sum(), probe)
+    contributions = torch.zeros(60, 2, dtype=torch.float64, requires_grad=True)
+    found = trace(gaussians, rays, bvh_of(gaussians), sh_degree=0, near=0.0, contributions=contributions)
+    (met,) = torch.autograd.grad(found.alphas.square().sum(), contributions)
     assert int((met[:, 0] > 0).sum()) > 20 and bool((met[met[:, 0] == 0] == 0).all())
     torch.testing.assert_close(met.sum(dim=0), torch.stack([found.alphas.sum(), found.depths.sum()]))
 

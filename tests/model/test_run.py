@@ -414,9 +414,9 @@ def test_a_state_in_the_middle_of_a_change_is_not_saved(tmp_path: Path) -> None:
     [
         (RECIPE, replace(SETTINGS, iterations=13), "iterations was 12 and is 13"),
         (
-            replace(RECIPE, rhythm=replace(RECIPE.rhythm, sh=0.5), sh_degree=2),
+            replace(RECIPE, intervals=replace(RECIPE.intervals, sh=0.5), sh_degree=2),
             replace(SETTINGS, seed=3),
-            f"seed was 0 and is 3, sh_degree was 1 and is 2, rhythm.sh was {RECIPE.rhythm.sh} and is 0.5",
+            f"seed was 0 and is 3, sh_degree was 1 and is 2, intervals.sh was {RECIPE.intervals.sh} and is 0.5",
         ),
         (DeferredRecipe(), SETTINGS, "method was splat and is deferred"),
     ],

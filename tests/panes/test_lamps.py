@@ -105,7 +105,7 @@ def test_nothing_is_taken_for_a_lamp_that_need_not_be_one(
 
 def test_ignored_pixels_make_no_lamp() -> None:
     photographs = photographs_of(scene_of(wall(4.0), shining(panel(LAMP))))
-    hidden = [one._replace(told=torch.zeros_like(one.told)) for one in photographs]
+    hidden = [one._replace(valid=torch.zeros_like(one.valid)) for one in photographs]
     first = scene_of(wall(4.0), panel(LAMP), panel(IMAGE))
     assert mirrored_lamps(first, first.planes, hidden) is None
 

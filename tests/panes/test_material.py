@@ -141,7 +141,7 @@ def test_photographs_are_reduced_with_all_that_belongs_to_them() -> None:
     assert found.camera.fx == pytest.approx(camera.fx / 4)
     torch.testing.assert_close(found.pixels, torch.full((150, 200, 3), 0.2))
     assert found.labels is not None and (found.labels[:, :100] == 1).all() and (found.labels[:, 100:] == 0).all()
-    assert not found.told[:2].any() and found.told[2:].all()
+    assert not found.valid[:2].any() and found.valid[2:].all()
 
 
 def test_a_view_without_a_mask_tells_as_well() -> None:

@@ -164,7 +164,7 @@ def test_while_planes_are_adjusted_the_photographer_learns_and_the_room_does_not
 
 
 def test_mirror_images_of_the_photographer_are_recorded_for_densification() -> None:
-    frame = PRESENT(photographed(), CAMERA, probed=True)
+    frame = PRESENT(photographed(), CAMERA, with_absgrad=True)
     records = [record for record in frame.screen if record.part == "photographer"]
     assert len(records) == 1 and records[0].direct and float(records[0].radii.max()) > 0
     assert 0 < float(torch.as_tensor(records[0].weight)) < 1

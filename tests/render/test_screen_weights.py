@@ -17,7 +17,7 @@ CAMERA = camera_at(0.0, 0.0, -0.2)
 
 
 def primary_and_mirrored(scene: Scene, camera: Camera) -> tuple[ScreenPass, ScreenPass]:
-    screen = Planar(blend="srgb")(scene, camera, probed=True).screen
+    screen = Planar(blend="srgb")(scene, camera, with_absgrad=True).screen
     assert [(record.part, record.direct) for record in screen] == [
         ("primary", True),
         ("glass", True),
@@ -50,5 +50,5 @@ def test_a_mirror_counts_for_what_it_shows() -> None:
     torch.testing.assert_close(torch.as_tensor(direct.weight)[0, hidden], 1 - covered)
 
 
-def test_what_is_not_probed_has_no_record() -> None:
+def test_without_absgrad_there_is_no_record() -> None:
     assert Planar()(showcase(), CAMERA).screen == ()

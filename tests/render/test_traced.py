@@ -123,9 +123,9 @@ def test_densification_is_told_how_far_away_rays_meet_things() -> None:
         sh=torch.zeros(3, 1, 3, dtype=torch.float64),
         channels={},
     )
-    probe = torch.zeros(3, 2, dtype=torch.float64, requires_grad=True)
-    found = traced_surroundings(small, origins, directions, 0.0, probe)
-    weights, products = torch.autograd.grad(found.colors.sum(), probe)[0].unbind(dim=1)
+    contributions = torch.zeros(3, 2, dtype=torch.float64, requires_grad=True)
+    found = traced_surroundings(small, origins, directions, 0.0, contributions)
+    weights, products = torch.autograd.grad(found.colors.sum(), contributions)[0].unbind(dim=1)
     torch.testing.assert_close(weights[1:], torch.tensor([1.0, 0.0], dtype=torch.float64))
     torch.testing.assert_close(products[:2] / weights[:2], torch.tensor([2.0, 2.5], dtype=torch.float64))
 
@@ -227,12 +227,12 @@ def test_where_no_ray_is_traced_the_environment_alone_is_mirrored() -> None:
     torch.testing.assert_close(some.rgb[seen], distant.rgb[seen], atol=1e-6, rtol=0)
 
 
-def test_a_probed_frame_says_how_far_away_the_surroundings_were_met() -> None:
+def test_a_frame_with_absgrad_says_how_far_away_the_surroundings_were_met() -> None:
     scene, camera = glossy(), camera_at(0.0, 0.0, 0.0)
     assert Traced()(scene, camera).space == ()
-    frame = Traced()(scene, camera, probed=True)
+    frame = Traced()(scene, camera, with_absgrad=True)
     (record,) = frame.space
-    weights, products = torch.autograd.grad(frame.rgb.sum(), record.probe)[0].unbind(dim=1)
+    weights, products = torch.autograd.grad(frame.rgb.sum(), record.contributions)[0].unbind(dim=1)
     # Things are three units before the camera, and the surroundings one and a half behind it.
     expected = (scene.surroundings.means - torch.tensor([0.0, 0.0, 3.0])).norm(dim=1)
     met = weights > 0.02  # And not grazed at one end.
@@ -255,7 +255,9 @@ def test_a_view_of_nothing_reflects_nothing() -> None:
     scene = glossy()
     away = replace(camera_at(0.0, 0.0, 0.0), cam_from_world=torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double())
     for each in (scene, lit(scene)):
-        frame = Traced(background=(0.2, 0.3, 0.4))(each, replace(away, cam_from_world=away.cam_from_world), probed=True)
+        frame = Traced(background=(0.2, 0.3, 0.4))(
+            each, replace(away, cam_from_world=away.cam_from_world), with_absgrad=True
+        )
         assert bool(frame.rgb.isfinite().all()) and int(frame.layers["reflection"].count_nonzero()) == 0
-        (met,) = torch.autograd.grad(frame.rgb.sum(), frame.space[0].probe)
+        (met,) = torch.autograd.grad(frame.rgb.sum(), frame.space[0].contributions)
         assert int(met.count_nonzero()) == 0

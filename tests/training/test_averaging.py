@@ -13,7 +13,7 @@ from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import train
 from glassplat.training.messages import StepDone
-from glassplat.training.options import Rhythm
+from glassplat.training.options import Intervals
 from glassplat.training.stage import AverageLast, Clock, Stage, TrainState
 from tests.training.tiny_capture import tiny_capture
 
@@ -22,7 +22,7 @@ ITERATIONS, LAST = 40, 4
 
 
 def stages(passes: float) -> tuple[Stage, ...]:
-    recipe = SplatRecipe(sh_degree=1, rhythm=Rhythm(averaged_passes=passes))
+    recipe = SplatRecipe(sh_degree=1, intervals=Intervals(averaged_passes=passes))
     return tuple(replace(stage, actions=()) for stage in recipe.stages(seed=0))
 
 

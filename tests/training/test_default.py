@@ -24,11 +24,11 @@ def make_gaussians(scales: list[float], opacities: list[float] | None = None) ->
     )
 
 
-def seen(gradients: list[float], pulls: list[float] | None = None, radius: float = 0.01) -> ScreenStatistics:
-    """What one view saw; pixels pull six times as strongly as the gradient says unless given."""
+def seen(gradients: list[float], absgrads: list[float] | None = None, radius: float = 0.01) -> ScreenStatistics:
+    """What one view saw; the absolute gradient is six times the gradient unless given."""
     count = len(gradients)
-    pulls = pulls or [6 * gradient for gradient in gradients]
-    sums = (torch.tensor(values).expand(2, -1) for values in (gradients, pulls, [1.0] * count))
+    absgrads = absgrads or [6 * gradient for gradient in gradients]
+    sums = (torch.tensor(values).expand(2, -1) for values in (gradients, absgrads, [1.0] * count))
     return ScreenStatistics(*sums, torch.full((count,), radius))
 
 
@@ -46,7 +46,7 @@ def test_mirror_images_count_only_for_what_is_not_seen_directly() -> None:
     assert statistics.view_count.tolist() == [[2.5, 0.5], [2, 0]]
     # The first one is seen twice directly, the second only in the mirror.
     assert statistics.mean_gradient.tolist() == pytest.approx([6, 3])
-    assert statistics.mean_pull.tolist() == pytest.approx([12, 6])
+    assert statistics.mean_absgrad.tolist() == pytest.approx([12, 6])
 
 
 def test_statistics_do_not_depend_on_the_resolution() -> None:
@@ -67,9 +67,9 @@ def test_small_ones_are_cloned_large_ones_split_and_the_rest_kept() -> None:
     assert torch.equal(after.means[5], gaussians.means[0])
 
 
-def test_pixels_that_pull_against_each_other_split_what_is_large_only() -> None:
+def test_pixels_whose_gradients_cancel_split_what_is_large_only() -> None:
     gaussians = make_gaussians([0.001, 0.5, 0.5])
-    after = edited(DefaultDensify(), gaussians, seen([0.0, 0.0, 1e-3], pulls=[1e-2, 1e-2, 1e-4]))
+    after = edited(DefaultDensify(), gaussians, seen([0.0, 0.0, 1e-3], absgrads=[1e-2, 1e-2, 1e-4]))
     assert after.log_scales[:, 0].exp().tolist() == pytest.approx([0.001, 0.5, 0.5 / 1.6, 0.5 / 1.6])
 
 

@@ -27,11 +27,11 @@ from glassplat.training.loop import train
 from glassplat.training.messages import ActionDone, Message, StepDone
 from glassplat.training.options import (
     GaussianRates,
+    Intervals,
     MirrorSearch,
     NormalPropagation,
     PropagationSchedule,
     Rate,
-    Rhythm,
     Strategy,
 )
 from glassplat.training.stage import Clock, Every, TrainState
@@ -45,7 +45,7 @@ RECIPE = DeferredRecipe(
     first_texels=2,
     search=MirrorSearch(begin_found=False),
     region=(0.0, 0.0, 3.5, 1.0),
-    rhythm=Rhythm(beat=0.1, least=2, sh=0.1),
+    intervals=Intervals(opacity=0.1, least=2, sh=0.1),
     schedule=PropagationSchedule(end="fixed", stop=0.7, pause=2),
 )
 
@@ -190,16 +190,16 @@ class Told(Search):
 
 
 def propagated(
-    search: Search, schedule: PropagationSchedule, beats: int = 10, *, hurries_found: bool = False
+    search: Search, schedule: PropagationSchedule, intervals: int = 10, *, raises_rates_found: bool = False
 ) -> tuple[TrainState, list[int]]:
-    """A state after so many beats of ten steps, of a run of a hundred, and when normals were propagated."""
+    """A state after so many intervals of ten steps, of a run of a hundred, and when normals were propagated."""
     state, done = fresh_state(), []
     when = Every(0.1, stop=schedule.stop, skip_multiples_of=3)
     action = Propagate(
-        when, NormalPropagation(), schedule, Deferred(), {"primary.sh": Rate(3.0)}, search, hurries_found
+        when, NormalPropagation(), schedule, Deferred(), {"primary.sh": Rate(3.0)}, search, raises_rates_found
     )
-    for beat in range(1, beats + 1):
-        clock = Clock(10 * beat, 100, 5)
+    for interval in range(1, intervals + 1):
+        clock = Clock(10 * interval, 100, 5)
         if action.due(clock) and action.apply(state, tiny_capture(), clock):
             done.append(clock.step)
     return state, done
@@ -238,7 +238,7 @@ def test_propagation_ends_when_no_more_reflectors_are_found(
     schedule = PropagationSchedule(end=end, stop=0.9, patience=2)
     state, done = propagated(Told(reflects=tuple(shares), turns=turns), schedule)
     assert state.records[ENDED] == ended
-    # From the first reset on, at the beats that resets leave, until the end.
+    # From the first reset on, at the intervals that resets leave, until the end.
     assert done == [step for step in (40, 50, 70, 80) if step < ended]
 
 
@@ -250,13 +250,13 @@ def test_propagation_ends_when_no_more_reflectors_are_found(
         (0.004, 0.3, "30 % of what is seen .* --iterations"),
     ],
 )
-def test_where_nothing_reflects_the_run_hurries_on_and_says_so(
+def test_where_nothing_reflects_the_rates_rise_and_the_log_says_so(
     share: float, turns: float, said: str | None, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level("INFO", logger="glassplat.training"):
         state, _ = propagated(Told(reflects=(share,), turns=turns), PropagationSchedule(patience=2))
     warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert state.optimizer.hurried == ({} if said is None else {"primary.sh": 3.0})
+    assert state.optimizer.raised_rates == ({} if said is None else {"primary.sh": 3.0})
     assert len(warnings) == (said is not None)
     if said is not None:
         assert re.search(rf"nothing reflective was found.*{said}", warnings[0])
@@ -264,13 +264,15 @@ def test_where_nothing_reflects_the_run_hurries_on_and_says_so(
         assert "40 % of what is seen is reflection" in caplog.messages[-1]
 
 
-@pytest.mark.parametrize("recipe", [DeferredRecipe(), TracedRecipe(), TracedRecipe(hurry_found=False)])
-def test_where_something_reflects_the_rest_of_the_run_hurries_if_that_is_asked_for(
+@pytest.mark.parametrize("recipe", [DeferredRecipe(), TracedRecipe(), TracedRecipe(raise_rates_found=False)])
+def test_where_something_reflects_the_rates_rise_if_that_is_asked_for(
     recipe: DeferredRecipe | TracedRecipe,
 ) -> None:
     (action,) = (action for action in recipe.stages(seed=0)[1].actions if isinstance(action, Propagate))
-    state, _ = propagated(Told(reflects=(0.4,)), PropagationSchedule(patience=2), hurries_found=action.hurries_found)
-    assert state.optimizer.hurried == ({"primary.sh": 3.0} if recipe.hurry_found else {})
+    state, _ = propagated(
+        Told(reflects=(0.4,)), PropagationSchedule(patience=2), raises_rates_found=action.raises_rates_found
+    )
+    assert state.optimizer.raised_rates == ({"primary.sh": 3.0} if recipe.raise_rates_found else {})
     assert state.records[ENDED] > 10
 
 
@@ -296,7 +298,7 @@ def test_a_run_too_short_for_normals_is_one_of_splat_and_says_so(
     strategy: Strategy, iterations: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     # Of the opacity resets, the first falls into the longer run.
-    choices: dict[str, Any] = {"sh_degree": 1, "strategy": strategy, "rhythm": Rhythm(reset_stop=1.0)}
+    choices: dict[str, Any] = {"sh_degree": 1, "strategy": strategy, "intervals": Intervals(reset_stop=1.0)}
     matte = DeferredRecipe(**choices, least_iterations=iterations + 1, region=(0.0, 0.0, 3.5, 1.0))
     plain = scene_after(SplatRecipe(**choices), iterations, tmp_path / "splat")
     assert not caplog.records
@@ -324,14 +326,16 @@ def test_the_rates_of_a_short_run_are_splats_unless_published_ones_are_asked_for
         return recipe.stages(0, 3000)[0].rates
 
     assert rates(DeferredRecipe()) == rates(SplatRecipe())
-    assert rates(DeferredRecipe(hurry_matte=False)) == rates(SplatRecipe(rates=GaussianRates(short_run_power=0.0)))
+    assert rates(DeferredRecipe(raise_rates_matte=False)) == rates(
+        SplatRecipe(rates=GaussianRates(short_run_power=0.0))
+    )
 
 
-def test_a_hurried_parameter_moves_as_much_faster_also_when_resumed(tmp_path: Path) -> None:
+def test_a_parameter_with_a_raised_rate_moves_as_much_faster_also_when_resumed(tmp_path: Path) -> None:
     steps = []
-    for hurried in ({}, {"primary.means": 3.0}):
+    for raised_rates in ({}, {"primary.means": 3.0}):
         state = fresh_state()
-        state.optimizer.hurried = dict(hurried)
+        state.optimizer.raised_rates = dict(raised_rates)
         save_checkpoint(tmp_path / "checkpoint.safetensors", state)
         resumed = load_checkpoint(tmp_path / "checkpoint.safetensors")
         before = resumed.scene.primary.means.clone()

@@ -48,7 +48,7 @@ def test_terms_count_from_their_share_of_the_run_on() -> None:
 
 
 def short(recipe: SplatRecipe) -> SplatRecipe:
-    return replace(recipe, rhythm=replace(recipe.rhythm, beat=8 / 60, least=2, sh=0.1))
+    return replace(recipe, intervals=replace(recipe.intervals, opacity=8 / 60, least=2, sh=0.1))
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])

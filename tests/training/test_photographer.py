@@ -168,7 +168,7 @@ def planar_stages() -> tuple[Stage, ...]:
         state.scene = replace(state.scene, planes=truth.planes, glass=truth.glass)
 
     densify = replace(PlanarRecipe().densify, interval=8, start=0.0, stop=1.0, whole_passes=False)
-    densify = replace(densify, gradient_threshold=1e-8, pull_threshold=1e-8)
+    densify = replace(densify, gradient_threshold=1e-8, absgrad_threshold=1e-8)
     recipe = PlanarRecipe(sh_degree=1, stage_shares=(0.2, 0.3, 0.5), photographer=LEARNED, densify=densify)
     return tuple(
         replace(s, setup=replace(s.setup, after=place_true_planes)) if isinstance(s.setup, AddPhotographer) else s

@@ -83,7 +83,7 @@ def test_the_preset_gives_defaults_that_options_override(method: str, monkeypatc
 @pytest.mark.parametrize("method", RECIPES)
 def test_a_short_run_of_a_preset_learns(method: str, strategy: Any) -> None:
     recipe = replace(recipe_of(method, "paper"), strategy=strategy, sh_degree=1)
-    recipe = replace(recipe, rhythm=replace(recipe.rhythm, beat=8 / 60, least=2, sh=0.1))
+    recipe = replace(recipe, intervals=replace(recipe.intervals, opacity=8 / 60, least=2, sh=0.1))
     if method == "deferred":
         recipe = replace(recipe, texels=8, first_texels=8, schedule=replace(recipe.schedule, stop=0.9))
     if method == "traced":
@@ -132,11 +132,15 @@ def moments(stages: tuple[Stage, ...], kind: type, iterations: int) -> list[list
 
 def test_large_gaussians_are_split_by_the_gradient_if_asked() -> None:
     gaussians = make_gaussians([0.5, 0.5])
-    # Pixels pull at the first without moving it, and the second moves without much pull.
-    statistics = seen([1e-5, 1e-3], pulls=[1e-2, 1.1e-3])
-    pulled, moved = (edited(DefaultDensify(split_by=by), gaussians, statistics) for by in ("pull", "gradient"))
-    assert len(pulled) == len(moved) == 3
-    assert torch.equal(pulled.means[0], gaussians.means[1]) and torch.equal(moved.means[0], gaussians.means[0])
+    # The gradients of the first cancel; the second has a gradient and a small absolute one.
+    statistics = seen([1e-5, 1e-3], absgrads=[1e-2, 1.1e-3])
+    by_absgrad, by_gradient = (
+        edited(DefaultDensify(split_by=by), gaussians, statistics) for by in ("absgrad", "gradient")
+    )
+    assert len(by_absgrad) == len(by_gradient) == 3
+    assert torch.equal(by_absgrad.means[0], gaussians.means[1]) and torch.equal(
+        by_gradient.means[0], gaussians.means[0]
+    )
 
 
 def test_densification_can_keep_its_interval_whatever_the_views() -> None:
@@ -252,14 +256,14 @@ def test_the_mean_depth_can_learn_from_the_deviation() -> None:
         recipe = PlanarRecipe(moving_mean=moving, ssim_weight=0.0, weights=weights)
         stage = recipe.stages(0)[-1]
         stage = replace(stage, losses=tuple(term for term in stage.losses if term.name == "depth"))
-        gradients.append(differentiate(stage, scene, view, probed=False).gradients["primary.means"])
+        gradients.append(differentiate(stage, scene, view, with_absgrad=False).gradients["primary.means"])
     assert bool(gradients[0].any()) and not torch.allclose(*gradients)
 
 
 def test_all_views_and_mirror_images_can_count_alike() -> None:
     view, scene = tiny_capture().train[0], true_scene()
     direct, alike = (
-        PlanarRecipe(densify_by=by).stages(0)[-1].renderer(scene, view.camera, probed=True).screen
+        PlanarRecipe(densify_by=by).stages(0)[-1].renderer(scene, view.camera, with_absgrad=True).screen
         for by in ("direct", "all")
     )
     assert [record.direct for record in direct] == [True, True, False]
@@ -289,7 +293,9 @@ def test_a_region_is_looked_for_only_if_asked(monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_matte_scene_keeps_the_published_rates_if_asked() -> None:
     def factors(asked: bool) -> Any:
-        (action,) = [a for a in DeferredRecipe(hurry_matte=asked).stages(0)[1].actions if isinstance(a, Propagate)]
+        (action,) = [
+            a for a in DeferredRecipe(raise_rates_matte=asked).stages(0)[1].actions if isinstance(a, Propagate)
+        ]
         return action.matte_rates
 
     assert factors(True) and not factors(False)

@@ -20,7 +20,7 @@ from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import differentiate, train
 from glassplat.training.losses import PhotometricLoss
 from glassplat.training.messages import ActionDone, Message, StepDone
-from glassplat.training.options import McmcDensify, Rhythm
+from glassplat.training.options import Intervals, McmcDensify
 from glassplat.training.stage import AverageLast, Clock, Stage, TrainState, stage_starts
 from tests.training.tiny_capture import tiny_capture, true_scene
 
@@ -132,7 +132,7 @@ def test_the_regularisers_reach_the_gaussians() -> None:
     (stage,) = RECIPES[0].stages(seed=0)
     scene, view = fresh_state(RECIPES[0]).scene, tiny_capture().train[0]
     plain = replace(stage, losses=tuple(term for term in stage.losses if term.name not in ("opacity", "scale")))
-    gradients = [differentiate(s, scene, view, probed=False).gradients for s in (stage, plain)]
+    gradients = [differentiate(s, scene, view, with_absgrad=False).gradients for s in (stage, plain)]
     opacities, scales = torch.sigmoid(scene.primary.logit_opacities), scene.primary.log_scales.exp()
     shown = in_front(scene, view)
     expected = {
@@ -160,7 +160,7 @@ def test_the_noise_moves_what_the_view_shows(visible: list[bool] | None) -> None
 def test_a_step_hands_on_what_its_view_shows() -> None:
     (stage,) = RECIPES[0].stages(seed=0)
     scene, view = fresh_state(RECIPES[0]).scene, tiny_capture().train[0]
-    visible = differentiate(stage, scene, view, probed=False).visible
+    visible = differentiate(stage, scene, view, with_absgrad=False).visible
     assert visible is not None and torch.equal(visible, in_front(scene, view))
     assert visible.any() and not visible.all()
 
@@ -204,7 +204,7 @@ def test_relocation_keeps_its_share_of_the_run() -> None:
 
 def test_weights_and_noise_of_zero_are_left_out() -> None:
     bare = McmcDensify(noise_rate=0.0, opacity_weight=0.0, scale_weight=0.0)
-    (stage,) = SplatRecipe(strategy="mcmc", mcmc=bare, rhythm=Rhythm(averaged_passes=0)).stages(seed=0)
+    (stage,) = SplatRecipe(strategy="mcmc", mcmc=bare, intervals=Intervals(averaged_passes=0)).stages(seed=0)
     assert not stage.post_steps and {term.name for term in stage.losses} == {"photometric"}
 
 

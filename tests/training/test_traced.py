@@ -25,9 +25,9 @@ from glassplat.training.loop import differentiate, train
 from glassplat.training.messages import ActionDone, Message, StageEntered, StepDone
 from glassplat.training.options import (
     DefaultDensify,
+    Intervals,
     MirrorSearch,
     PropagationSchedule,
-    Rhythm,
     SurroundingsOptions,
     SurroundingsStart,
 )
@@ -49,7 +49,7 @@ RECIPE = TracedRecipe(
     texels=4,
     first_texels=2,
     region=(0.0, 0.0, 3.5, 1.0),
-    rhythm=Rhythm(beat=0.1, least=2, sh=0.1),
+    intervals=Intervals(opacity=0.1, least=2, sh=0.1),
     schedule=PropagationSchedule(end="fixed", stop=0.7, pause=2),
 )
 PAPER = replace(RECIPE, mirrors="surroundings")
@@ -188,12 +188,12 @@ def test_a_step_gathers_gradients_of_what_rays_met() -> None:
     strong = {"logit_strength": torch.full((len(state.scene.primary),), 1.0)}
     state.scene = replace(state.scene, primary=replace(state.scene.primary, channels=strong))
     stage = RECIPE.stages(0)[2]
-    result = differentiate(stage, state.scene, tiny_capture().train[0], probed=True)
+    result = differentiate(stage, state.scene, tiny_capture().train[0], with_absgrad=True)
     ((record, met),) = result.space
     assert record.part == "surroundings"
     reached = result.gradients["surroundings.means"].any(dim=1)
     assert bool(reached.any()) and bool((met[reached] > 0).all())
-    assert not differentiate(stage, state.scene, tiny_capture().train[0], probed=False).space
+    assert not differentiate(stage, state.scene, tiny_capture().train[0], with_absgrad=False).space
 
 
 def test_what_reflections_never_show_is_pruned() -> None:
@@ -272,7 +272,7 @@ def test_normals_of_discs_can_learn_from_the_first_step_on() -> None:
     scene = fresh_state(recipe).scene
     # Depths count where most of a pixel is covered.
     scene = scene.with_parameters({"primary.logit_opacities": torch.full((len(scene.primary),), 3.0)})
-    found = differentiate(recipe.stages(0)[0], scene, tiny_capture().train[0], probed=False)
+    found = differentiate(recipe.stages(0)[0], scene, tiny_capture().train[0], with_absgrad=False)
     assert found.losses["consistency"] > 0 and bool(found.gradients["primary.quats"].any())
 
 
@@ -311,7 +311,7 @@ def test_what_is_too_faint_to_be_drawn_learns_to_reflect_an_environment() -> Non
 def learns_to_reflect(stage: Stage, scene: Scene) -> bool:
     """Return whether the photograph alone, without the prices on strength, gives strengths a gradient."""
     photometric = replace(stage, losses=stage.losses[:1])
-    found = differentiate(photometric, scene, tiny_capture().train[0], probed=False)
+    found = differentiate(photometric, scene, tiny_capture().train[0], with_absgrad=False)
     return "primary.logit_strength" in found.gradients and bool(found.gradients["primary.logit_strength"].any())
 
 

@@ -112,7 +112,7 @@ def test_collecting_screen_gradients_changes_no_other_gradient() -> None:
     state = fresh_state()
     run(state, planar_stages(), 20, until=12)
     results = [
-        differentiate(planar_stages()[-1], state.scene, tiny_capture().train[0], probed=p) for p in (True, False)
+        differentiate(planar_stages()[-1], state.scene, tiny_capture().train[0], with_absgrad=p) for p in (True, False)
     ]
     assert len(results[0].screen) == 3
     assert not results[1].screen

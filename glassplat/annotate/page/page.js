@@ -173,10 +173,10 @@ const counted = (number, noun) => `${number} ${noun}${number === 1 ? "" : "s"}`;
 function judgement(answer) {
   if (!answer) return [];
   if (!answer.solved) return [[answer.message, "poor"]];
-  const lines = [[`marks fit to ${answer.error.toFixed(1)} pixels; the plane is sure to ${degrees(answer.doubt)}`, answer.doubt < SURE ? "good" : "poor"]];
+  const lines = [[`marks fit to ${answer.error.toFixed(1)} pixels; the plane is sure to ${degrees(answer.uncertainty)}`, answer.uncertainty < SURE ? "good" : "poor"]];
   if (answer.message) lines.push([answer.message, "poor"]);
   const best = answer.next[0];
-  if (best && answer.doubt > 0.3) lines.push([`marking ${capture.views[best.view].name} would make it ${degrees(best.doubt)}`, ""]);
+  if (best && answer.uncertainty > 0.3) lines.push([`marking ${capture.views[best.view].name} would make it ${degrees(best.uncertainty)}`, ""]);
   return lines;
 }
 
@@ -348,7 +348,7 @@ async function write() {
   try {
     await settled();
     const { masks, planes } = await ask("/results", {});
-    const unsure = planes.filter((plane) => plane.doubt >= SURE).map((plane) => `pane ${plane.label} (${degrees(plane.doubt)})`);
+    const unsure = planes.filter((plane) => plane.uncertainty >= SURE).map((plane) => `pane ${plane.label} (${degrees(plane.uncertainty)})`);
     const warning = unsure.length ? `; still unsure, mark more: ${unsure.join(", ")}` : "";
     tell(`written: ${counted(masks.length, "mask")}, ${counted(planes.length, "plane")}${warning}`, unsure.length > 0);
     document.body.dataset.written = `${masks.length} ${planes.length}`;

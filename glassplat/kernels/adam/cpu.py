@@ -25,18 +25,18 @@ def adam(flat: Sequence[Update], betas: tuple[float, float], eps: float) -> None
     """Takes the updates, whose tensors are flat."""
     real = REAL_OF[flat[0].parameter.dtype]
     table, step_sizes, roots = [], [], []
-    pulls: list[float] = []
+    decays_of: list[float] = []
     for update in flat:
         step_correction, root = update.corrections(betas)
         columns = 1 if update.decay is None else len(update.decay)
         rates = update.lr.tolist() if isinstance(update.lr, Tensor) else [update.lr] * columns
         table.append([*(tensor.data_ptr() for tensor in update[:4]), update.parameter.numel(), len(rates)])
         step_sizes += [rate * step_correction for rate in rates]
-        pulls += [0.0] * len(rates) if update.decay is None else update.decay.tolist()
+        decays_of += [0.0] * len(rates) if update.decay is None else update.decay.tolist()
         roots.append(root)
     # 1 - 0.999 loses half of its digits in single precision, so the gains are rounded from the double.
     decays, gains = tuple(real(b) for b in betas), tuple(real(1 - b) for b in betas)
-    columns_of = np.array([step_sizes, pulls]).astype(real)
+    columns_of = np.array([step_sizes, decays_of]).astype(real)
     adam_step(real)(np.array(table), columns_of, np.array(roots, real), decays, gains, real(eps))
 
 
@@ -72,9 +72,9 @@ def adam_step(real: type) -> Kernel:
             p, g = at(table[k, PARAMETER], first, size), at(table[k, GRADIENT], first, size)
             m, v = at(table[k, FIRST], first, size), at(table[k, SECOND], first, size)
             for i in range(size):
-                pull = g[i] + decays[i] * p[i]
-                mean = betas[0] * m[i] + gains[0] * pull
-                square = betas[1] * v[i] + gains[1] * pull * pull
+                gradient = g[i] + decays[i] * p[i]
+                mean = betas[0] * m[i] + gains[0] * gradient
+                square = betas[1] * v[i] + gains[1] * gradient * gradient
                 m[i], v[i] = mean, square
                 p[i] -= rates[i] * mean / (math.sqrt(square) * root + eps)
 

@@ -47,8 +47,8 @@ def primary_count(num_primary: int | None, splats: Splats) -> int:
     return num_primary
 
 
-PROBE = 7
-"""Which argument of the operation the probe is."""
+ABSGRAD = 7
+"""Which argument of the operation `absgrad` is."""
 
 
 class Composite(NamedTuple):
@@ -67,7 +67,7 @@ class Composite(NamedTuple):
 def composite(
     splats: Splats, channels: Tensor, bins: TileBins,
     *, marks: Tensor | None = None, num_primary: int | None = None, deviation: Deviation | None = None,
-    probe: Tensor | None = None,
+    absgrad: Tensor | None = None,
 ) -> Composite:  # fmt: skip
     """Blends depth-sorted splats over each pixel (3DGS; TR-Gaussians, Eqs. 2, 4, 7 and 13).
 
@@ -92,9 +92,9 @@ def composite(
         marks: [C, G - num_primary] what a glass splat adds to the mask, in [0, 1]; needed where there is glass.
         num_primary: how many splats are primary; all of them by default.
         deviation: the channel z whose deviation to compute, and where; the mean is a constant unless it says so.
-        probe: [C, G, 2], any values; they change nothing. Its gradient is how strongly single pixels pull at the
-            centres: |v_x| and |v_y|, summed over the pixels, of which the gradient of `means2d` is the sum
-            with signs (AbsGS, arXiv 2404.10484, Eq. 8). Pixels that pull against each other show here only.
+        absgrad: [C, G, 2], any values; they change nothing. Its gradient is the absolute gradient of the centres: |v_x|
+            and |v_y|, summed over the pixels, of which the gradient of `means2d` is the sum with signs (AbsGS,
+            arXiv 2404.10484, Eq. 8). Pixels that disagree cancel there and show here.
 
     Raises:
         TypeError: tensors are not all float32 or all float64.
@@ -121,12 +121,14 @@ def composite(
         expected["deviation.where"] = (deviation.where, (cameras, bins.height, bins.width))
         if not 0 <= deviation.channel < channels.shape[2]:
             raise ValueError(f"deviation.channel is {deviation.channel}, but there are {channels.shape[2]} channels")
-    if probe is not None:
-        expected["probe"] = (probe, (cameras, count, 2))
+    if absgrad is not None:
+        expected["absgrad"] = (absgrad, (cameras, count, 2))
     check_tensors(expected)
-    needing = [tensor for tensor in (*splats[:3], channels, marks, probe) if tensor is not None]
+    needing = [tensor for tensor in (*splats[:3], channels, marks, absgrad) if tensor is not None]
     needs_gradients = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in needing)
-    return Composite(*_Composite.apply(*splats, channels, marks, probe, bins, num_primary, deviation, needs_gradients))
+    return Composite(
+        *_Composite.apply(*splats, channels, marks, absgrad, bins, num_primary, deviation, needs_gradients)
+    )
 
 
 class _Composite(torch.autograd.Function):
@@ -148,11 +150,12 @@ class _Composite(torch.autograd.Function):
     def backward(ctx: Any, *v_outputs: Tensor) -> tuple[Tensor | None, ...]:
         *fields, channels, marks = ctx.saved_tensors
         kernels = kernels_for("composite", channels.device)
-        v_means, v_conics, v_opacities, v_channels, v_marks, v_probe = kernels.composite_gradients(
+        v_means, v_conics, v_opacities, v_channels, v_marks, v_absgrad = kernels.composite_gradients(
             Splats(*fields), channels, ctx.bins, ctx.saved, v_outputs,
-            marks=marks, num_primary=ctx.num_primary, deviation=ctx.deviation, probed=ctx.needs_input_grad[PROBE],
+            marks=marks, num_primary=ctx.num_primary, deviation=ctx.deviation,
+            with_absgrad=ctx.needs_input_grad[ABSGRAD],
         )  # fmt: skip
-        return v_means, v_conics, v_opacities, None, None, v_channels, v_marks, v_probe, None, None, None, None
+        return v_means, v_conics, v_opacities, None, None, v_channels, v_marks, v_absgrad, None, None, None, None
 
 
 class BlendedDiscs(NamedTuple):
@@ -173,7 +176,7 @@ class BlendedDiscs(NamedTuple):
 
 def composite_discs(
     discs: Discs, channels: Tensor, bins: TileBins,
-    *, near: float, low_pass: float = LOW_PASS, probe: Tensor | None = None,
+    *, near: float, low_pass: float = LOW_PASS, absgrad: Tensor | None = None,
 ) -> BlendedDiscs:  # fmt: skip
     """Blends discs over each pixel, in the order of their centres' depths (2DGS, Eqs. 8 to 13).
 
@@ -197,24 +200,24 @@ def composite_discs(
         bins: the outlines of the same discs sorted into tiles, from `bin_tiles`.
         near: of `project_discs`.
         low_pass: standard deviation in pixels of the falloff around the centre; 0 leaves it out.
-        probe: [C, G, 2], any values, as in `composite`; its gradient is that of `means2d` with the parts of single
+        absgrad: [C, G, 2], any values, as in `composite`; its gradient is that of `means2d` with the parts of single
             pixels added up without their signs.
 
     Raises:
         TypeError: tensors are not all float32 or all float64.
         ValueError: shapes disagree, a number is out of range, or tensors are on different devices.
     """
-    _check(discs, channels, bins, probe)
+    _check(discs, channels, bins, absgrad)
     if not near >= 0 or not low_pass >= 0:
         raise ValueError(f"near is {near} and low_pass {low_pass}; expected numbers of at least 0")
-    needing = [tensor for tensor in (*discs[:4], channels, probe) if tensor is not None]
+    needing = [tensor for tensor in (*discs[:4], channels, absgrad) if tensor is not None]
     needs_gradients = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in needing)
     return BlendedDiscs(
-        *_CompositeDiscs.apply(*discs[:4], channels, probe, discs.outlines, bins, near, low_pass, needs_gradients)
+        *_CompositeDiscs.apply(*discs[:4], channels, absgrad, discs.outlines, bins, near, low_pass, needs_gradients)
     )
 
 
-def _check(discs: Discs, channels: Tensor, bins: TileBins, probe: Tensor | None) -> None:
+def _check(discs: Discs, channels: Tensor, bins: TileBins, absgrad: Tensor | None) -> None:
     cameras, count = discs.opacities.shape
     check_bins(channels, bins, cameras, count, "the outlines of these very discs")
     expected = {
@@ -226,8 +229,8 @@ def _check(discs: Discs, channels: Tensor, bins: TileBins, probe: Tensor | None)
         "outlines.means2d": (discs.outlines.means2d, (cameras, count, 2)),
         "outlines.conics": (discs.outlines.conics, (cameras, count, 3)),
     }
-    if probe is not None:
-        expected["probe"] = (probe, (cameras, count, 2))
+    if absgrad is not None:
+        expected["absgrad"] = (absgrad, (cameras, count, 2))
     check_tensors(expected)
 
 
@@ -240,7 +243,7 @@ class _CompositeDiscs(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means2d: Tensor, maps: Tensor, opacities: Tensor, depths: Tensor, channels: Tensor,
-        probe: Tensor | None, outlines: Splats, bins: TileBins, near: float, low_pass: float, needs_gradients: bool,
+        absgrad: Tensor | None, outlines: Splats, bins: TileBins, near: float, low_pass: float, needs_gradients: bool,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         tensors = tuple(tensor.detach().contiguous() for tensor in (means2d, maps, opacities, depths, channels))
         plain = _discs(tensors, Splats(*(tensor.detach().contiguous() for tensor in outlines)))
@@ -259,7 +262,7 @@ class _CompositeDiscs(torch.autograd.Function):
         outlines, bins, saved, near, low_pass = ctx.rest
         found = kernels_for("composite", channels.device).composite_discs_gradients(
             _discs(ctx.saved_tensors, outlines), channels, bins, saved, [v.contiguous() for v in v_outputs],
-            near=near, low_pass=low_pass, probed=ctx.needs_input_grad[5],
+            near=near, low_pass=low_pass, with_absgrad=ctx.needs_input_grad[5],
         )  # fmt: skip
         return (*found, None, None, None, None, None)
 

@@ -436,11 +436,11 @@ def composite(
 
 def composite_gradients(
     splats: Splats, channels: Tensor, bins: TileBins, saved: Saved, v_outputs: Sequence[Tensor],
-    *, marks: Tensor, num_primary: int, deviation: Deviation | None, probed: bool,
+    *, marks: Tensor, num_primary: int, deviation: Deviation | None, with_absgrad: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]:  # fmt: skip
     """Gradients of means2d, conics, opacities, channels and marks, given those of image, alpha, mask and deviation.
 
-    Last the probe's, where `probed`.
+    Last that of `absgrad`, where `with_absgrad`.
     """
     real = REAL_OF[channels.dtype]
     cameras, count, num_channels = channels.shape
@@ -450,14 +450,14 @@ def composite_gradients(
     if deviation:
         channel, through_mean = deviation.channel, deviation.through_mean
         v_deviation = v_deviation * deviation.where
-    composite_backward(real, probed)(
+    composite_backward(real, with_absgrad)(
         cameras * count, num_primary < count, num_channels, bins.width, bins.height, channel, through_mean,
         bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.active.numpy(), *saved,
         *(tile.flat(v) for v in (*v_images, v_deviation)), rows,
     )  # fmt: skip
-    v_means, v_conics, v_opacities, v_values, v_probe = sum_pair_rows(rows, bins, splats, num_channels, probed)
+    v_means, v_conics, v_opacities, v_values, v_absgrad = sum_pair_rows(rows, bins, splats, num_channels, with_absgrad)
     v_marks = torch.zeros_like(marks)
     if num_primary < count:
         v_marks.copy_(v_values[:, num_primary:, 0])
         v_values[:, num_primary:] = 0
-    return v_means, v_conics, v_opacities, v_values, v_marks, v_probe if probed else None
+    return v_means, v_conics, v_opacities, v_values, v_marks, v_absgrad if with_absgrad else None

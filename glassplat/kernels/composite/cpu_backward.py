@@ -44,7 +44,7 @@ LEAN = PAIR_VALUES + tile.GROUP
 """Column of a pair's row that is free where there are no more than four channels."""
 
 
-def _unblend(real: type, probed: bool, of_glass: bool) -> Scalar:
+def _unblend(real: type, with_absgrad: bool, of_glass: bool) -> Scalar:
     full, load = vector_kind(real, tile.LANES)
     x_centers, y_centers = tile.pixel_centers(real)
     exp2, dot_more, sided = tile.exp2_of(real), _dot_more(real), _sided(real)
@@ -64,7 +64,7 @@ def _unblend(real: type, probed: bool, of_glass: bool) -> Scalar:
         """
         none, most = full(zero), full(alpha_max)
         g, g_x, g_y, g_xx, g_xy, g_yy = none, none, none, none, none, none
-        pull_x, pull_y, s0, s1, s2, s3, lean = none, none, none, none, none, none, none
+        absgrad_x, absgrad_y, s0, s1, s2, s3, lean = none, none, none, none, none, none, none
         while blocks != 0:
             b = lowest_bit(blocks)
             blocks &= blocks - 1
@@ -106,11 +106,11 @@ def _unblend(real: type, probed: bool, of_glass: bool) -> Scalar:
             gain_x, gain_y = gain * dx, gain * dy
             g, g_x, g_y = g + gain, g_x + gain_x, g_y + gain_y
             g_xx, g_xy, g_yy = g_xx + gain_x * dx, g_xy + gain_x * dy, g_yy + gain_y * dy
-            if probed:
+            if with_absgrad:
                 across = item(batch, splat + FORM_XY)
-                pull_x = pull_x + absolute(gain_x * (two * item(batch, splat + FORM_XX)) + gain_y * across)
-                pull_y = pull_y + absolute(gain_y * (two * item(batch, splat + FORM_YY)) + gain_x * across)
-        sums = (g, g_x, g_y, g_xx, g_xy, g_yy, pull_x, pull_y, s0, s1, s2, s3, lean, none, none, none)
+                absgrad_x = absgrad_x + absolute(gain_x * (two * item(batch, splat + FORM_XX)) + gain_y * across)
+                absgrad_y = absgrad_y + absolute(gain_y * (two * item(batch, splat + FORM_YY)) + gain_x * across)
+        sums = (g, g_x, g_y, g_xx, g_xy, g_yy, absgrad_x, absgrad_y, s0, s1, s2, s3, lean, none, none, none)
         store(row, row_at, sums_of(sums))
 
     return unblend
@@ -286,17 +286,17 @@ def _begin(real: type) -> Scalar:
 
 
 @functools.cache
-def composite_backward(real: type, probed: bool) -> Kernel:
+def composite_backward(real: type, with_absgrad: bool) -> Kernel:
     """Builds the kernel that fills one row of sums per pair, given the final state of each tile."""
     fetch = tile.fetch_of(real)
-    unblend_primary, unblend_glass = _unblend(real, probed, False), _unblend(real, probed, True)
+    unblend_primary, unblend_glass = _unblend(real, with_absgrad, False), _unblend(real, with_absgrad, True)
     begin, sum_more = _begin(real), _sum_more(real)
     load_gradients, load_deviation = _load_gradients(real), _load_deviation(real)
     zero = real(0.0)
     LANES, PIXELS, STATE, CHUNK, GLASS = tile.LANES, tile.PIXELS, tile.STATE, tile.CHUNK, tile.GLASS
     ORDER, REACHED, TILES = tile.ORDER, (1 << tile.BLOCKS) - 1, tile.TILES
 
-    @kernel("composite_backward_probed" if probed else "composite_backward", real)
+    @kernel("composite_backward_absgrad" if with_absgrad else "composite_backward", real)
     def backward(
         num_splats, with_glass, num_channels, image_width, height, channel, through_mean,
         pair_splats, tile_offsets, active, packed, pairs, state, spread,

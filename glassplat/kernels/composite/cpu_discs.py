@@ -343,8 +343,8 @@ T_AT, BEHIND, COVERED, WEIGHT, V_DEPTH, V_MEDIAN, V_DISTORTION, V_IMAGE = (plane
 
 # Columns of a pair's row, sums over its pixels: gradients of both numerators and of e, times dx, times dy and alone;
 # those of the falloff around the centre, times dx and dy; of the logarithm of the coverage; of the centre's depth; the
-# probe's; and from PAIR_VALUES on those of the channels.
-UP, VP, E, AROUND, G, V_Z, PULL, PAIR_VALUES = 0, 3, 6, 9, 11, 12, 13, 16
+# absolute gradient's; and from PAIR_VALUES on those of the channels.
+UP, VP, E, AROUND, G, V_Z, ABSGRAD, PAIR_VALUES = 0, 3, 6, 9, 11, 12, 13, 16
 
 
 def _value_of(real: type) -> Scalar:
@@ -389,7 +389,7 @@ def _unblend(real: type) -> Scalar:
         order, depth, inverse_depth = item(batch, splat + ORDER), item(batch, splat + Z), item(batch, splat + INVERSE_Z)
         up_x, up_y, up_1, vp_x, vp_y, vp_1 = none, none, none, none, none, none
         e_x, e_y, e_1, around_x, around_y = none, none, none, none, none
-        g, g_depth, pull_x, pull_y = none, none, none, none
+        g, g_depth, absgrad_x, absgrad_y = none, none, none, none
         while blocks != 0:
             b = lowest_bit(blocks)
             blocks &= blocks - 1
@@ -426,10 +426,11 @@ def _unblend(real: type) -> Scalar:
             e_x, e_y, e_1 = e_x + v_e * dx, e_y + v_e * dy, e_1 + v_e
             around_x, around_y = around_x + v_around * dx, around_y + v_around * dy
             slope_x, slope_y = meet_slopes(found, v_up, v_vp, v_e)
-            pull_x = pull_x + absolute(slope_x + v_around * dx)
-            pull_y = pull_y + absolute(slope_y + v_around * dy)
+            absgrad_x = absgrad_x + absolute(slope_x + v_around * dx)
+            absgrad_y = absgrad_y + absolute(slope_y + v_around * dy)
         sums = (
-            up_x, up_y, up_1, vp_x, vp_y, vp_1, e_x, e_y, e_1, around_x, around_y, g, g_depth, pull_x, pull_y, none
+            up_x, up_y, up_1, vp_x, vp_y, vp_1, e_x, e_y, e_1, around_x, around_y, g, g_depth, absgrad_x, absgrad_y,
+            none,
         )  # fmt: skip
         store(row, row_at, sums_of(sums))
 
@@ -566,9 +567,9 @@ def composite_discs(
 
 def composite_discs_gradients(
     discs: Discs, channels: Tensor, bins: TileBins, saved: Saved, v_outputs: Sequence[Tensor],
-    *, near: float, low_pass: float, probed: bool,
+    *, near: float, low_pass: float, with_absgrad: bool,
 ) -> tuple[Tensor | None, ...]:  # fmt: skip
-    """Gradients of means2d, maps, opacities, depths, channels and probe; the last where `probed`."""
+    """Gradients of means2d, maps, opacities, depths, channels and absgrad; the last where `with_absgrad`."""
     (cameras, count, num_channels), real = channels.shape, REAL_OF[channels.dtype]
     # Of tiles that are not active nothing is written.
     width = tile.LANES * ((PAIR_VALUES + 4 * tile.groups_of(num_channels) + tile.LANES - 1) // tile.LANES)
@@ -585,7 +586,7 @@ def composite_discs_gradients(
         discs.opacities.numpy().reshape(-1),
         *(tensor.numpy().reshape(cameras * count, *tensor.shape[2:]) for tensor in found),
     )  # fmt: skip
-    return (*found[:5], found[5] if probed else None)
+    return (*found[:5], found[5] if with_absgrad else None)
 
 
 def _real_options(real: type, near: float, low_pass: float) -> tuple[Any, Any]:
@@ -600,7 +601,7 @@ def sum_disc_rows(real: type) -> Kernel:
     zero, LANES = real(0.0), tile.LANES
 
     @kernel("sum_disc_rows", real)
-    def sum_rows(rows, slots, offsets, maps, opacities, v_means, v_maps, v_opacities, v_depths, v_channels, v_probe):
+    def sum_rows(rows, slots, offsets, maps, opacities, v_means, v_maps, v_opacities, v_depths, v_channels, v_absgrad):
         count, width = offsets.size - 1, rows.size // max(1, slots.size)
         num_chunks = (count + SPLATS - 1) // SPLATS
         stride = even_stride(num_chunks)
@@ -625,7 +626,7 @@ def sum_disc_rows(real: type) -> Kernel:
                         v_means[s, j] -= total[VP + 2] * maps[s, 2 + j]
                         v_means[s, j] -= total[E + 2] * maps[s, 4 + j]
                     v_means[s, j] -= total[AROUND + j]
-                    v_probe[s, j] = total[PULL + j]
+                    v_absgrad[s, j] = total[ABSGRAD + j]
                 if total[G] != zero:
                     v_opacities[s] = total[G] / opacities[s]
                 v_depths[s] = total[V_Z]

@@ -264,8 +264,8 @@ SPLATS = 512
 """Splats per task."""
 
 # Columns of a pair's row: the sum of g = v_alpha alpha over its pixels, and of g times powers of the offset from the
-# mean; of |g| times the slope of the exponent to base 2, the probe's; and the gradients of its values.
-G, G_X, G_Y, G_XX, G_XY, G_YY, PULL_X, PULL_Y, PAIR_VALUES = range(9)
+# mean; of |g| times the slope of the exponent to base 2, that of `absgrad`; and the gradients of its values.
+G, G_X, G_Y, G_XX, G_XY, G_YY, ABSGRAD_X, ABSGRAD_Y, PAIR_VALUES = range(9)
 
 
 def new_pair_rows(bins: TileBins, num_values: int, real: type) -> NDArray[Any]:
@@ -288,20 +288,20 @@ def _pairs_of_active_tiles(bins: TileBins) -> int:
 
 
 def sum_pair_rows(
-    rows: NDArray[Any], bins: TileBins, splats: Splats, num_values: int, probed: bool
+    rows: NDArray[Any], bins: TileBins, splats: Splats, num_values: int, with_absgrad: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Gradients of means2d, conics, opacities, values [C, G, num_values] and probe [C, G, 2 or 0]: sums over tiles."""
-    probe_width = 2 if probed else 0
+    """Sums over tiles: gradients of means2d, conics, opacities, values [C, G, num_values], absgrad [C, G, 2 or 0]."""
+    absgrad_width = 2 if with_absgrad else 0
     shape = tuple(splats.opacities.shape)
-    widths = ((2,), (3,), (), (num_values,), (probe_width,))
-    v_means, v_conics, v_opacities, v_values, v_probe = (splats.opacities.new_empty(*shape, *w) for w in widths)
+    widths = ((2,), (3,), (), (num_values,), (absgrad_width,))
+    v_means, v_conics, v_opacities, v_values, v_absgrad = (splats.opacities.new_empty(*shape, *w) for w in widths)
     _sum_rows(REAL_OF[splats.means2d.dtype])(
         rows, bins.pair_slots.numpy(), bins.splat_offsets.numpy(),
         splats.conics.numpy().reshape(-1, 3), splats.opacities.numpy().reshape(-1),
         v_means.numpy().reshape(-1, 2), v_conics.numpy().reshape(-1, 3), v_opacities.numpy().reshape(-1),
-        v_values.numpy().reshape(-1, num_values), v_probe.numpy().reshape(v_opacities.numel(), probe_width),
+        v_values.numpy().reshape(-1, num_values), v_absgrad.numpy().reshape(v_opacities.numel(), absgrad_width),
     )  # fmt: skip
-    return v_means, v_conics, v_opacities, v_values, v_probe
+    return v_means, v_conics, v_opacities, v_values, v_absgrad
 
 
 @functools.cache
@@ -310,7 +310,7 @@ def _sum_rows(real: type) -> Kernel:
     zero, half, nats = real(0.0), real(0.5), real(math.log(2.0))
 
     @kernel("sum_pair_rows", real)
-    def sum_rows(rows, slots, offsets, conics, opacities, v_means, v_conics, v_opacities, v_values, v_probe):
+    def sum_rows(rows, slots, offsets, conics, opacities, v_means, v_conics, v_opacities, v_values, v_absgrad):
         count, width = offsets.size - 1, rows.size // max(1, slots.size)
         num_chunks = (count + SPLATS - 1) // SPLATS
         stride = even_stride(num_chunks)
@@ -318,7 +318,7 @@ def _sum_rows(real: type) -> Kernel:
             chunk = task * stride % num_chunks
             begin, end = chunk * SPLATS, min(count, (chunk + 1) * SPLATS)
             v_means[begin:end], v_conics[begin:end], v_opacities[begin:end] = zero, zero, zero
-            v_values[begin:end], v_probe[begin:end] = zero, zero
+            v_values[begin:end], v_absgrad[begin:end] = zero, zero
             total = np.empty(width, real)
             for s in range(begin, end):
                 first, last = offsets[s], offsets[s + 1]
@@ -341,7 +341,7 @@ def _sum_rows(real: type) -> Kernel:
                     v_conics[s, 1] = -total[G_XY]
                     v_conics[s, 2] = -half * total[G_YY]
                     v_opacities[s] = total[G] / opacities[s]
-                for d in range(v_probe.shape[1]):
-                    v_probe[s, d] = nats * total[PULL_X + d]
+                for d in range(v_absgrad.shape[1]):
+                    v_absgrad[s, d] = nats * total[ABSGRAD_X + d]
 
     return sum_rows

@@ -16,7 +16,13 @@ from torch import Tensor
 
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.composite.cpu_tile import joined_cameras, place
-from glassplat.kernels.composite.cuda_backward import PULLS, THREADS, WARPS, composite_backward, composite_pulls
+from glassplat.kernels.composite.cuda_backward import (
+    EXTRAS,
+    THREADS,
+    WARPS,
+    composite_backward,
+    composite_cotangents,
+)
 from glassplat.kernels.composite.cuda_discs import composite_discs, composite_discs_gradients
 from glassplat.kernels.composite.cuda_tile import (
     ALIGNMENT,
@@ -103,7 +109,7 @@ def composite(
 
 def composite_gradients(
     splats: Splats, channels: Tensor, bins: TileBins, saved: Saved, v_outputs: Sequence[Tensor],
-    *, marks: Tensor, num_primary: int, deviation: Deviation | None, probed: bool,
+    *, marks: Tensor, num_primary: int, deviation: Deviation | None, with_absgrad: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]:  # fmt: skip
     """As `glassplat.kernels.composite.cpu.composite_gradients`."""
     real, (_, count, num_channels), tiles = REAL_OF[channels.dtype], channels.shape, len(bins.active)
@@ -114,24 +120,24 @@ def composite_gradients(
         channel, v_spread = deviation.channel, v_deviation * deviation.where
         if deviation.through_mean:
             v_image, v_alpha = through_mean(v_image, v_alpha, v_spread, saved, channel)
-    pulls = channels.new_empty(tiles, num_channels + PULLS, PIXELS)
-    composite_pulls(real, num_channels)(
+    v_pixels = channels.new_empty(tiles, num_channels + EXTRAS, PIXELS)
+    composite_cotangents(real, num_channels)(
         tiles, PIXELS, channel, bins.active, saved.final, saved.center, image, mask, deviated,
-        *(v.contiguous() for v in (v_image, v_alpha, v_mask, v_deviation, v_spread)), pulls,
+        *(v.contiguous() for v in (v_image, v_alpha, v_mask, v_deviation, v_spread)), v_pixels,
     )  # fmt: skip
-    rows = new_pair_rows(bins, channels, probed)
-    composite_backward(real, num_channels, probed)(
+    rows = new_pair_rows(bins, channels, with_absgrad)
+    composite_backward(real, num_channels, with_absgrad)(
         blocks_for(len(saved.bucket_tiles), WARPS), THREADS, *joined_cameras((*splats[:3], channels)), marks,
         count, num_primary, channel, bins.width, bins.height, bins.pair_splats, bins.tile_offsets, bins.active,
         saved.last.view(-1), saved.looked_at, saved.bucket_tiles, saved.kept.view(-1), saved.kept_spread.view(-1),
-        pulls.view(-1), rows,
+        v_pixels.view(-1), rows,
     )  # fmt: skip
-    v_means, v_conics, v_opacities, v_values, v_probe = sum_pair_rows(rows, bins, splats, num_channels)
+    v_means, v_conics, v_opacities, v_values, v_absgrad = sum_pair_rows(rows, bins, splats, num_channels)
     v_marks = torch.zeros_like(marks)
     if num_primary < count:
         v_marks.copy_(v_values[:, num_primary:, 0])
         v_values[:, num_primary:] = 0
-    return v_means, v_conics, v_opacities, v_values, v_marks, v_probe if probed else None
+    return v_means, v_conics, v_opacities, v_values, v_marks, v_absgrad if with_absgrad else None
 
 
 def through_mean(

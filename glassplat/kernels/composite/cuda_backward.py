@@ -31,26 +31,26 @@ BEHIND, LAST, T_GLASS, BEHIND_GLASS, LAST_GLASS, STATES = (*(at(i * SLOTS) for i
 """Where what follows the transmittances begins in shared memory: what lies behind each pixel, and the last lane whose
 splat it blended; all three of glass; and the end."""
 
-PULLS = 5
-"""Planes of a tile's pulls beyond those of its channels."""
+EXTRAS = 5
+"""Planes of a tile's pixel gradients beyond those of its channels."""
 
 
 @cache
-def composite_pulls(real: type, num_channels: int = 4) -> Kernel:
-    """Gathers, tile by tile, what each pixel's gradients pull at [A, D + 5, 256]: one plane per channel, then the
+def composite_cotangents(real: type, num_channels: int = 4) -> Kernel:
+    """Gathers, tile by tile, the gradients of each pixel [A, D + 5, 256]: one plane per channel, then the
     gradients of the mask and of the deviation, the mean that the latter is measured from, and what the pixel gathered
     in all and of glass, each part times its gradient.
     """
-    shown, spread, middle, total, total_glass = range(num_channels, num_channels + PULLS)
+    shown, spread, middle, total, total_glass = range(num_channels, num_channels + EXTRAS)
 
     @kernel(
-        f"composite_pulls_{num_channels}",
+        f"composite_cotangents_{num_channels}",
         real,
         "int int1 real3 real3 real4 real3 real3 real4 real3 real3 real3 real3 real3",
     )
     def gather(
         channel, active, final, center, image, mask, deviation,
-        v_image, v_alpha, v_mask, v_deviation, v_spread, pulls,
+        v_image, v_alpha, v_mask, v_deviation, v_spread, v_pixels,
     ):  # fmt: skip
         n, pixel = cuda.blockIdx.x, cuda.threadIdx.x
         camera, x0, y0, columns, rows = place(active[n], v_image.shape[2], v_image.shape[1])
@@ -61,15 +61,15 @@ def composite_pulls(real: type, num_channels: int = 4) -> Kernel:
         # alpha = 1 - T: its gradient acts like something behind every splat.
         of_glass = v_mask[camera, y, x] * mask[camera, y, x]
         gathered = of_glass - v_alpha[camera, y, x] * final[n, 0, pixel]
-        pulls[n, shown, pixel], pulls[n, total_glass, pixel] = v_mask[camera, y, x], of_glass
+        v_pixels[n, shown, pixel], v_pixels[n, total_glass, pixel] = v_mask[camera, y, x], of_glass
         if channel >= 0:
             gathered += v_deviation[camera, y, x] * deviation[camera, y, x]
-            pulls[n, spread, pixel], pulls[n, middle, pixel] = v_spread[camera, y, x], center[camera, y, x]
+            v_pixels[n, spread, pixel], v_pixels[n, middle, pixel] = v_spread[camera, y, x], center[camera, y, x]
         for d in range(num_channels):
             v = v_image[camera, y, x, d]
             gathered += v * image[camera, y, x, d]
-            pulls[n, d, pixel] = v
-        pulls[n, total, pixel] = gathered
+            v_pixels[n, d, pixel] = v
+        v_pixels[n, total, pixel] = gathered
 
     return gather
 
@@ -82,28 +82,28 @@ def _enter(real: type, num_channels: int) -> Scalar:
 
     @inlined
     def enter(
-        mine, pulled, had, had_spread, lasts, channel, has_glass, pulls, kept, kept_spread, state,
+        mine, v_at, had, had_spread, lasts, channel, has_glass, v_pixels, kept, kept_spread, state,
     ):  # fmt: skip
         """Puts what a pixel is before a bucket's first pair into shared memory."""
-        behind = pulls[at(pulled + total)]
+        behind = v_pixels[at(v_at + total)]
         for d in range(num_channels):
-            behind -= pulls[at(pulled + d * PIXELS)] * kept[at(had + PIXELS + d * PIXELS)]
-        if channel >= 0 and pulls[at(pulled + spread)] != zero:
-            behind -= pulls[at(pulled + spread)] * kept_spread[at(had_spread)]
+            behind -= v_pixels[at(v_at + d * PIXELS)] * kept[at(had + PIXELS + d * PIXELS)]
+        if channel >= 0 and v_pixels[at(v_at + spread)] != zero:
+            behind -= v_pixels[at(v_at + spread)] * kept_spread[at(had_spread)]
         if has_glass:
-            of_glass = pulls[at(pulled + shown)] * kept[at(had + kept_shown)]
+            of_glass = v_pixels[at(v_at + shown)] * kept[at(had + kept_shown)]
             behind -= of_glass
             state[mine + glass_ts], state[mine + glass_lasts] = kept[at(had + kept_t)], lasts[1]
-            state[mine + glass_behinds] = pulls[at(pulled + total_glass)] - of_glass
+            state[mine + glass_behinds] = v_pixels[at(v_at + total_glass)] - of_glass
         state[mine], state[mine + behinds], state[mine + last] = kept[at(had)], behind, lasts[0]
 
     return enter
 
 
-def _write(num_channels: int, probed: bool) -> Scalar:
+def _write(num_channels: int, with_absgrad: bool) -> Scalar:
     @inlined
     def write(
-        out, pair, g_x, g_y, g_xx, g_xy, g_yy, g_0, v_value, channel, v_apart, glass, v_mark, pull_x, pull_y
+        out, pair, g_x, g_y, g_xx, g_xy, g_yy, g_0, v_value, channel, v_apart, glass, v_mark, absgrad_x, absgrad_y
     ):  # fmt: skip
         """Fills the gradient row of a pair; the mark's gradient takes the place of the first channel's."""
         out[pair, 0], out[pair, 1], out[pair, 2] = g_x, g_y, g_xx
@@ -114,19 +114,19 @@ def _write(num_channels: int, probed: bool) -> Scalar:
             out[pair, MOMENTS + channel] += v_apart
         if glass:
             out[pair, MOMENTS] = v_mark
-        if probed:
-            out[pair, MOMENTS + num_channels], out[pair, MOMENTS + num_channels + 1] = pull_x, pull_y
+        if with_absgrad:
+            out[pair, MOMENTS + num_channels], out[pair, MOMENTS + num_channels + 1] = absgrad_x, absgrad_y
 
     return write
 
 
 def _planes(num_channels: int) -> tuple[int, ...]:
     """Offset of the planes for a tile's gradients beyond those of its channels."""
-    return tuple(PIXELS * (num_channels + i) for i in range(PULLS))
+    return tuple(PIXELS * (num_channels + i) for i in range(EXTRAS))
 
 
 @cache
-def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -> Kernel:
+def composite_backward(real: type, num_channels: int = 4, with_absgrad: bool = True) -> Kernel:
     """Fills one gradient row per pair that any pixel blended; all rows start at zero."""
     load, coverage = tile_steps(real)
     reciprocal = reciprocal_maths(real)
@@ -134,16 +134,16 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
     alpha_min, alpha_max = real(ALPHA_MIN), real(ALPHA_MAX)
     behinds, lasts, glass_lasts, glass_state, above = BEHIND, LAST, LAST_GLASS, 3 * SLOTS, BUCKET // TILE
     shown, spread, middle, _, _ = _planes(num_channels)
-    enter, write = _enter(real, num_channels), _write(num_channels, probed)
+    enter, write = _enter(real, num_channels), _write(num_channels, with_absgrad)
 
     @kernel(
-        f"composite_backward_{num_channels}{'_probed' if probed else ''}",
+        f"composite_backward_{num_channels}{'_absgrad' if with_absgrad else ''}",
         real,
         "real2 real2 real1 real2 real2 int int int int int int1 long1 int1 int1 int1 int1 real1 real1 real1 real2",
     )
     def backward(
         means, conics, opacities, channels, marks, splats_per_camera, num_primary, channel, width, height,
-        pair_splats, tile_offsets, active, last, looked_at, bucket_tiles, kept, kept_spread, pulls, out,
+        pair_splats, tile_offsets, active, last, looked_at, bucket_tiles, kept, kept_spread, v_pixels, out,
     ):  # fmt: skip
         state = cuda.shared.array(STATES, real)
         geometry = cuda.local.array((1, COLUMNS), real)
@@ -161,7 +161,7 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
         camera, x0, y0, _, rows = place(active[n], width, height)
         first_glass, has_glass = camera * splats_per_camera + num_primary, num_primary < splats_per_camera
         planes = num_channels + 3 if has_glass else num_channels + 1
-        entry, tile_pulls, tile_last = bucket * planes * PIXELS, n * (num_channels + PULLS) * PIXELS, n * 2 * PIXELS
+        entry, tile_pixels, tile_last = bucket * planes * PIXELS, n * (num_channels + EXTRAS) * PIXELS, n * 2 * PIXELS
         for pixel in range(lane, PIXELS, BUCKET):
             # A pixel that had stopped before stored nothing, and no lane will look at it.
             own_last, own_glass = last[at(tile_last + pixel)] - first, last[at(tile_last + PIXELS + pixel)] - first
@@ -169,12 +169,12 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
                 state[at(warp * PIXELS + pixel) + lasts] = state[at(warp * PIXELS + pixel) + glass_lasts] = -one
                 continue
             enter(
-                at(warp * PIXELS + pixel), tile_pulls + pixel, entry + pixel, bucket * PIXELS + pixel,
-                (real(own_last), real(own_glass)), channel, has_glass, pulls, kept, kept_spread, state,
+                at(warp * PIXELS + pixel), tile_pixels + pixel, entry + pixel, bucket * PIXELS + pixel,
+                (real(own_last), real(own_glass)), channel, has_glass, v_pixels, kept, kept_spread, state,
             )  # fmt: skip
         order, place_in_bucket = first + lane, real(np.int32(lane))
         inside, glass, mark, apart = order < looked_at[n], False, zero, zero
-        xx, xy, yy, pull_x, pull_y, reached = zero, zero, zero, zero, zero, np.int32(0)
+        xx, xy, yy, absgrad_x, absgrad_y, reached = zero, zero, zero, zero, zero, np.int32(0)
         if inside:
             s = pair_splats[start + order]
             reached = load(geometry, 0, s, means, conics, opacities, x0, y0, rows)
@@ -190,7 +190,7 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
         g_x, g_y, g_xx, g_xy, g_yy, g_0, v_mark, v_apart = zero, zero, zero, zero, zero, zero, zero, zero
         # A pixel's number counts from ABOVE rows above the tile, so that before a lane's first pixel and after its last
         # one it is in rows that no splat reaches; so is a splat that is not there.
-        reached, own_pulls = np.int32(reached << above), tile_pulls - above * TILE
+        reached, own_pixels = np.int32(reached << above), tile_pixels - above * TILE
         own_state = np.int32(warp * PIXELS + (glass_state if glass else 0) - above * TILE)
         p, end = np.int32(above * TILE - lane), np.int32(above * TILE + PIXELS + BUCKET - 1 - lane)
         while p < end:
@@ -205,14 +205,14 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
                 covered, mine = coverage(geometry, 0, x, y), at(own_state + p)
                 if covered >= alpha_min and place_in_bucket <= state[mine + lasts]:
                     a = min(covered, alpha_max)
-                    # In 32 bits, which hold the places of any pulls that a GPU's memory does (16 GiB).
-                    pulled, inverse = at(np.uint32(own_pulls + p)), reciprocal(one - a)
+                    # In 32 bits, which hold the places of any gradients that a GPU's memory does (16 GiB).
+                    v_at, inverse = at(np.uint32(own_pixels + p)), reciprocal(one - a)
                     if glass:
                         t_glass, of_all = state[mine], mine - at(glass_state)
-                        pull = pulls[pulled + at(shown)] * state[of_all] * t_glass
-                        weight = a * pull
+                        v_pixel = v_pixels[v_at + at(shown)] * state[of_all] * t_glass
+                        weight = a * v_pixel
                         of_glass = state[mine + behinds] - weight * mark
-                        gain = (pull * mark - of_glass * inverse) * a
+                        gain = (v_pixel * mark - of_glass * inverse) * a
                         v_mark += weight
                         state[mine], state[mine + behinds] = t_glass - a * t_glass, of_glass
                         state[of_all + behinds] -= weight * mark
@@ -220,14 +220,14 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
                         t, dot = state[mine], zero
                         weight = a * t
                         for d in range(num_channels):
-                            pull = pulls[pulled + at(d * PIXELS)]
-                            dot += pull * value[d]
-                            v_value[d] += weight * pull
+                            v_pixel = v_pixels[v_at + at(d * PIXELS)]
+                            dot += v_pixel * value[d]
+                            v_value[d] += weight * v_pixel
                         if channel >= 0:
-                            difference, pull = apart - pulls[pulled + at(middle)], pulls[pulled + at(spread)]
-                            dot += pull * abs(difference)
-                            if abs(difference) > on_mean * abs(pulls[pulled + at(middle)]):
-                                v_apart += weight * pull if difference > zero else -weight * pull
+                            difference, v_pixel = apart - v_pixels[v_at + at(middle)], v_pixels[v_at + at(spread)]
+                            dot += v_pixel * abs(difference)
+                            if abs(difference) > on_mean * abs(v_pixels[v_at + at(middle)]):
+                                v_apart += weight * v_pixel if difference > zero else -weight * v_pixel
                         behind = state[mine + behinds] - weight * dot
                         gain = (t * dot - behind * inverse) * a
                         state[mine], state[mine + behinds] = t - weight, behind
@@ -236,14 +236,14 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
                         gain_x, gain_y = gain * dx, gain * dy
                         g_0, g_x, g_y = g_0 + gain, g_x + gain_x, g_y + gain_y
                         g_xx, g_xy, g_yy = g_xx + gain_x * dx, g_xy + gain_x * dy, g_yy + gain_y * dy
-                        if probed:
-                            pull_x += abs(xx * gain_x + xy * gain_y)
-                            pull_y += abs(xy * gain_x + yy * gain_y)
+                        if with_absgrad:
+                            absgrad_x += abs(xx * gain_x + xy * gain_y)
+                            absgrad_y += abs(xy * gain_x + yy * gain_y)
             p = np.int32(p + 1)
         if inside:
             write(
                 out, start + order, g_x, g_y, g_xx, g_xy, g_yy, g_0, v_value, channel, v_apart,
-                glass, v_mark, pull_x, pull_y,
+                glass, v_mark, absgrad_x, absgrad_y,
             )  # fmt: skip
 
     return backward

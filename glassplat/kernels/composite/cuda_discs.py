@@ -105,16 +105,16 @@ BEHIND, BLENDED, MIDDLE, STATES = at(SLOTS), at(2 * SLOTS), at(3 * SLOTS), 4 * S
 """Where what follows the transmittances begins in shared memory: what lies behind each pixel, the last lane whose disc
 it blended and the one whose depth is its median; and the end."""
 
-# Planes of a tile's pulls beyond those of its channels.
-V_DEPTH, V_MEDIAN, V_DISTORTION, GATHERED, PULL_FIRST, PULL_COVERED, PULL_TOTAL, PULL_SQUARES, PULLS = range(9)
+# Planes of a tile's pixel gradients beyond those of its channels.
+V_DEPTH, V_MEDIAN, V_DISTORTION, GATHERED, SAVED_FIRST, SAVED_COVERED, SAVED_TOTAL, SAVED_SQUARES, EXTRAS = range(9)
 
 # Columns of a pair's row, as on the CPU; the channels' follow.
-UP, VP, E, AROUND, G, G_Z, PULL, MOMENTS = 0, 3, 6, 9, 11, 12, 13, 15
+UP, VP, E, AROUND, G, G_Z, ABSGRAD, MOMENTS = 0, 3, 6, 9, 11, 12, 13, 15
 
 
 @cache
 def composite_discs_pulls(real: type, num_channels: int = 6) -> Kernel:
-    """Gathers, tile by tile, what each pixel's gradients pull at [A, D + 8, 256]: one plane per channel, then those
+    """Gathers, tile by tile, the gradients of each pixel [A, D + 8, 256]: one plane per channel, then those
     that the constants name. What the pixel gathered in all holds each part times its gradient.
     """
     zero, one, two = real(0.0), real(1.0), real(2.0)
@@ -124,7 +124,7 @@ def composite_discs_pulls(real: type, num_channels: int = 6) -> Kernel:
         real,
         "int1 real3 real4 real3 real4 real3 real3 real3 real3 real3",
     )
-    def gather(active, finals, image, depth, v_image, v_alpha, v_depth, v_median, v_distortion, pulls):
+    def gather(active, finals, image, depth, v_image, v_alpha, v_depth, v_median, v_distortion, v_pixels):
         n, pixel = cuda.blockIdx.x, cuda.threadIdx.x
         camera, x0, y0, columns, rows = place(active[n], v_image.shape[2], v_image.shape[1])
         column, row = pixel % TILE, pixel // TILE
@@ -140,13 +140,15 @@ def composite_discs_pulls(real: type, num_channels: int = 6) -> Kernel:
         for d in range(num_channels):
             v = v_image[camera, y, x, d]
             gathered += v * image[camera, y, x, d]
-            pulls[n, d, pixel] = v
-        pulls[n, num_channels + V_DEPTH, pixel] = v_depth[camera, y, x]
-        pulls[n, num_channels + V_MEDIAN, pixel] = v_median[camera, y, x]
-        pulls[n, num_channels + V_DISTORTION, pixel], pulls[n, num_channels + GATHERED, pixel] = v_spread, gathered
-        pulls[n, num_channels + PULL_FIRST, pixel] = finals[n, FIRST, pixel]
-        pulls[n, num_channels + PULL_COVERED, pixel] = covered
-        pulls[n, num_channels + PULL_TOTAL, pixel], pulls[n, num_channels + PULL_SQUARES, pixel] = total, squares
+            v_pixels[n, d, pixel] = v
+        v_pixels[n, num_channels + V_DEPTH, pixel] = v_depth[camera, y, x]
+        v_pixels[n, num_channels + V_MEDIAN, pixel] = v_median[camera, y, x]
+        v_pixels[n, num_channels + V_DISTORTION, pixel] = v_spread
+        v_pixels[n, num_channels + GATHERED, pixel] = gathered
+        v_pixels[n, num_channels + SAVED_FIRST, pixel] = finals[n, FIRST, pixel]
+        v_pixels[n, num_channels + SAVED_COVERED, pixel] = covered
+        v_pixels[n, num_channels + SAVED_TOTAL, pixel] = total
+        v_pixels[n, num_channels + SAVED_SQUARES, pixel] = squares
 
     return gather
 
@@ -156,20 +158,20 @@ def _enter(real: type, num_channels: int) -> Scalar:
     one, two, behinds = real(1.0), real(2.0), BEHIND
     of_depth, of_spread, gathered = (PIXELS * (num_channels + plane) for plane in (V_DEPTH, V_DISTORTION, GATHERED))
     of_covered, of_total, of_squares = (
-        PIXELS * (num_channels + plane) for plane in (PULL_COVERED, PULL_TOTAL, PULL_SQUARES)
+        PIXELS * (num_channels + plane) for plane in (SAVED_COVERED, SAVED_TOTAL, SAVED_SQUARES)
     )
 
     @inlined
-    def enter(mine, pulled, had, pulls, kept, state):
+    def enter(mine, v_at, had, v_pixels, kept, state):
         t = kept[at(had + KEPT_T * PIXELS)]
-        behind = pulls[at(pulled + gathered)]
-        behind -= pulls[at(pulled + of_depth)] * kept[at(had + KEPT_DEPTH * PIXELS)]
-        spread = pulls[at(pulled + of_covered)] * kept[at(had + KEPT_SQUARES * PIXELS)]
-        spread -= two * pulls[at(pulled + of_total)] * kept[at(had + KEPT_TOTAL * PIXELS)]
-        spread += pulls[at(pulled + of_squares)] * (one - t)
-        behind -= pulls[at(pulled + of_spread)] * spread
+        behind = v_pixels[at(v_at + gathered)]
+        behind -= v_pixels[at(v_at + of_depth)] * kept[at(had + KEPT_DEPTH * PIXELS)]
+        spread = v_pixels[at(v_at + of_covered)] * kept[at(had + KEPT_SQUARES * PIXELS)]
+        spread -= two * v_pixels[at(v_at + of_total)] * kept[at(had + KEPT_TOTAL * PIXELS)]
+        spread += v_pixels[at(v_at + of_squares)] * (one - t)
+        behind -= v_pixels[at(v_at + of_spread)] * spread
         for d in range(num_channels):
-            behind -= pulls[at(pulled + d * PIXELS)] * kept[at(had + (KEPT_VALUES + d) * PIXELS)]
+            behind -= v_pixels[at(v_at + d * PIXELS)] * kept[at(had + (KEPT_VALUES + d) * PIXELS)]
         state[mine], state[mine + behinds] = t, behind
 
     return enter
@@ -183,7 +185,7 @@ def composite_discs_backward(real: type, num_channels: int = 6) -> Kernel:
     zero, one, two, alpha_max, endless = real(0.0), real(1.0), real(2.0), real(ALPHA_MAX), real(np.inf)
     behinds, lasts, middles = BEHIND, BLENDED, MIDDLE
     of_depth, of_median, of_spread, _, of_first, of_covered, of_total, of_squares = (
-        at(PIXELS * (num_channels + plane)) for plane in range(PULLS)
+        at(PIXELS * (num_channels + plane)) for plane in range(EXTRAS)
     )
 
     @kernel(
@@ -193,7 +195,7 @@ def composite_discs_backward(real: type, num_channels: int = 6) -> Kernel:
     )
     def backward(
         means, maps, opacities, depths, centers, conics, channels, near, sharpness, width, height,
-        pair_splats, tile_offsets, active, orders, looked_at, bucket_tiles, kept, pulls, out,
+        pair_splats, tile_offsets, active, orders, looked_at, bucket_tiles, kept, v_pixels, out,
     ):  # fmt: skip
         state = cuda.shared.array(STATES, real)
         geometry = cuda.local.array((1, COLUMNS), real)
@@ -209,7 +211,7 @@ def composite_discs_backward(real: type, num_channels: int = 6) -> Kernel:
         if first >= looked_at[n]:
             return
         _, x0, y0, _, rows = place(active[n], width, height)
-        entry, tile_pulls = bucket * (KEPT_VALUES + num_channels) * PIXELS, n * (num_channels + PULLS) * PIXELS
+        entry, tile_pixels = bucket * (KEPT_VALUES + num_channels) * PIXELS, n * (num_channels + EXTRAS) * PIXELS
         tile_orders = n * ORDERS * PIXELS
         for pixel in range(lane, PIXELS, BUCKET):
             mine = at(warp * PIXELS + pixel)
@@ -218,7 +220,7 @@ def composite_discs_backward(real: type, num_channels: int = 6) -> Kernel:
             state[mine + middles] = real(orders[at(tile_orders + MEDIAN * PIXELS + pixel)] - first)
             # A pixel that had stopped before stored nothing, and no lane will look at it.
             if own_last >= 0:
-                enter(mine, tile_pulls + pixel, entry + pixel, pulls, kept, state)
+                enter(mine, tile_pixels + pixel, entry + pixel, v_pixels, kept, state)
         order, tile, own = first + lane, np.uint32(n), real(np.int32(lane))
         inside, reached = order < looked_at[n], np.int32(0)
         for d in range(num_channels):
@@ -236,8 +238,8 @@ def composite_discs_backward(real: type, num_channels: int = 6) -> Kernel:
         if sharpness < endless:
             around = -sharpness
         up_x, up_y, up_1, vp_x, vp_y, vp_1, e_x, e_y, e_1 = zero, zero, zero, zero, zero, zero, zero, zero, zero
-        around_x, around_y, g, g_depth, pull_x, pull_y = zero, zero, zero, zero, zero, zero
-        own_pulls, step = at(tile) * at((num_channels + PULLS) * PIXELS), np.int32(0)
+        around_x, around_y, g, g_depth, absgrad_x, absgrad_y = zero, zero, zero, zero, zero, zero
+        own_pixels, step = at(tile) * at((num_channels + EXTRAS) * PIXELS), np.int32(0)
         while step < PIXELS + BUCKET - 1:
             # The lanes of a warp wait for each other; the simulator knows no warps, but blocks.
             if SIMULATED:
@@ -251,21 +253,21 @@ def composite_discs_backward(real: type, num_channels: int = 6) -> Kernel:
                 x, y, mine = real(np.int32(p & (TILE - 1))), real(np.int32(p >> 4)), at(warp * PIXELS + p)
                 (dx, dy), (u, v, inverse), e, covered, on_disc = cover(geometry, 0, x, y, near, sharpness)
                 if covered > zero and own <= state[mine + lasts]:
-                    pulled, t, a = own_pulls + at(np.uint32(p)), state[mine], min(covered, alpha_max)
+                    v_at, t, a = own_pixels + at(np.uint32(p)), state[mine], min(covered, alpha_max)
                     weight, worth = a * t, zero
                     for d in range(num_channels):
-                        pull = pulls[pulled + at(d * PIXELS)]
-                        worth += pull * value[d]
-                        v_value[d] += weight * pull
-                    z, apart = inverse * depth, e * inverse_depth - pulls[pulled + of_first]
-                    lean = apart * pulls[pulled + of_covered] - two * pulls[pulled + of_total]
-                    v_spread = pulls[pulled + of_spread]
-                    worth += pulls[pulled + of_depth] * z + v_spread * (lean * apart + pulls[pulled + of_squares])
-                    v_z = weight * pulls[pulled + of_depth]
+                        v_pixel = v_pixels[v_at + at(d * PIXELS)]
+                        worth += v_pixel * value[d]
+                        v_value[d] += weight * v_pixel
+                    z, apart = inverse * depth, e * inverse_depth - v_pixels[v_at + of_first]
+                    lean = apart * v_pixels[v_at + of_covered] - two * v_pixels[v_at + of_total]
+                    v_spread = v_pixels[v_at + of_spread]
+                    worth += v_pixels[v_at + of_depth] * z + v_spread * (lean * apart + v_pixels[v_at + of_squares])
+                    v_z = weight * v_pixels[v_at + of_depth]
                     if own == state[mine + middles]:
-                        v_z += pulls[pulled + of_median]
+                        v_z += v_pixels[v_at + of_median]
                     # The derivative of a square is twice as steep: `lean` holds the sum of distances but for half.
-                    v_inverse = weight * v_spread * two * (lean + pulls[pulled + of_total])
+                    v_inverse = weight * v_spread * two * (lean + v_pixels[v_at + of_total])
                     behind = state[mine + behinds] - weight * worth
                     gain = (t * worth - behind * reciprocal(one - a)) * a if covered < alpha_max else zero
                     state[mine], state[mine + behinds] = t - weight, behind
@@ -278,18 +280,18 @@ def composite_discs_backward(real: type, num_channels: int = 6) -> Kernel:
                         vp_x, vp_y, vp_1 = vp_x + v_vp * dx, vp_y + v_vp * dy, vp_1 + v_vp
                         e_x, e_y, e_1 = e_x + v_e * dx, e_y + v_e * dy, e_1 + v_e
                         slope_x, slope_y = meet_slopes(found, v_up, v_vp, v_e)
-                        pull_x, pull_y = pull_x + abs(slope_x), pull_y + abs(slope_y)
+                        absgrad_x, absgrad_y = absgrad_x + abs(slope_x), absgrad_y + abs(slope_y)
                     else:
                         moved_x, moved_y = gain * around * dx, gain * around * dy
                         around_x, around_y = around_x + moved_x, around_y + moved_y
-                        pull_x, pull_y = pull_x + abs(moved_x), pull_y + abs(moved_y)
+                        absgrad_x, absgrad_y = absgrad_x + abs(moved_x), absgrad_y + abs(moved_y)
         if inside:
             row = start + order
             out[row, UP], out[row, UP + 1], out[row, UP + 2] = up_x, up_y, up_1
             out[row, VP], out[row, VP + 1], out[row, VP + 2] = vp_x, vp_y, vp_1
             out[row, E], out[row, E + 1], out[row, E + 2] = e_x, e_y, e_1
             out[row, AROUND], out[row, AROUND + 1], out[row, G], out[row, G_Z] = around_x, around_y, g, g_depth
-            out[row, PULL], out[row, PULL + 1] = pull_x, pull_y
+            out[row, ABSGRAD], out[row, ABSGRAD + 1] = absgrad_x, absgrad_y
             for d in range(num_channels):
                 out[row, MOMENTS + d] = v_value[d]
 
@@ -343,30 +345,30 @@ def composite_discs(
 
 def composite_discs_gradients(
     discs: Discs, channels: Tensor, bins: TileBins, saved: Saved, v_outputs: Sequence[Tensor],
-    *, near: float, low_pass: float, probed: bool,
+    *, near: float, low_pass: float, with_absgrad: bool,
 ) -> tuple[Tensor | None, ...]:  # fmt: skip
     """As `glassplat.kernels.composite.cpu_discs.composite_discs_gradients`."""
     real, (cameras, count, num_channels) = REAL_OF[channels.dtype], channels.shape
     tiles, size = len(bins.active), cameras * count
-    pulls = channels.new_empty(tiles, num_channels + PULLS, PIXELS)
+    v_pixels = channels.new_empty(tiles, num_channels + EXTRAS, PIXELS)
     composite_discs_pulls(real, num_channels)(
-        tiles, PIXELS, bins.active, saved.finals, *saved.outputs, *v_outputs, pulls
+        tiles, PIXELS, bins.active, saved.finals, *saved.outputs, *v_outputs, v_pixels
     )  # fmt: skip
     rows = channels.new_zeros(len(bins.pair_splats), MOMENTS + num_channels)
     composite_discs_backward(real, num_channels)(
         blocks_for(len(saved.bucket_tiles), WARPS), THREADS,
         *joined_cameras((*discs[:4], *discs.outlines[:2], channels)),
         near, _sharpness(low_pass), bins.width, bins.height, bins.pair_splats, bins.tile_offsets, bins.active,
-        saved.orders.view(-1), saved.looked_at, saved.bucket_tiles, saved.kept.view(-1), pulls.view(-1), rows,
+        saved.orders.view(-1), saved.looked_at, saved.bucket_tiles, saved.kept.view(-1), v_pixels.view(-1), rows,
     )  # fmt: skip
     sums = channels.new_empty(size, MOMENTS + num_channels)
     sum_disc_rows(real)(
         blocks_for(sums.numel(), SUM_THREADS), SUM_THREADS, rows, bins.pair_slots, bins.splat_offsets, sums
     )  # fmt: skip
-    return _from_sums(sums, discs, num_channels, probed)
+    return _from_sums(sums, discs, num_channels, with_absgrad)
 
 
-def _from_sums(sums: Tensor, discs: Discs, num_channels: int, probed: bool) -> tuple[Tensor | None, ...]:
+def _from_sums(sums: Tensor, discs: Discs, num_channels: int, with_absgrad: bool) -> tuple[Tensor | None, ...]:
     """Gradients of each disc from the sums over its pixels; what no pixel shows stays zero, finite or not."""
     leading, size = discs.opacities.shape, sums.shape[0]
     by_row = sums[:, :AROUND].unflatten(1, (3, 3))
@@ -377,7 +379,7 @@ def _from_sums(sums: Tensor, discs: Discs, num_channels: int, probed: bool) -> t
     v_opacities = torch.where(gained != 0, gained / opacities, 0)
     found = (v_means, v_maps.reshape(size, MAP), v_opacities, sums[:, G_Z], sums[:, MOMENTS:])
     shaped = [tensor.reshape(*leading, *tensor.shape[1:]) for tensor in found]
-    return (*shaped, sums[:, PULL:MOMENTS].reshape(*leading, 2) if probed else None)
+    return (*shaped, sums[:, ABSGRAD:MOMENTS].reshape(*leading, 2) if with_absgrad else None)
 
 
 def _sharpness(low_pass: float) -> float:

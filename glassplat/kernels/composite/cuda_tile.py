@@ -2,7 +2,7 @@
 
 A row of a (tile, splat) pair holds sums over a tile's pixels: of g dx, g dy, g dx^2, g dx dy, g dy^2 and g, with g the
 gradient of the exponent of the splat's falloff and (dx, dy) the offset from its centre, then one value per channel, and
-the two of the probe if there is one. All of these add up over tiles; what they mean for mean, conic and opacity is
+the two of `absgrad` if it is asked for. All of these add up over tiles; what they mean for mean, conic and opacity is
 worked out once per splat.
 """
 
@@ -75,15 +75,15 @@ THREADS = 256
 MOMENTS = 6
 
 
-def new_pair_rows(bins: TileBins, channels: Tensor, probed: bool) -> Tensor:
-    """One gradient row per pair [P, 6 + D, + 2 if probed], all zero: a tile fills those of pairs that it blended."""
-    return channels.new_zeros(len(bins.pair_splats), MOMENTS + channels.shape[2] + (2 if probed else 0))
+def new_pair_rows(bins: TileBins, channels: Tensor, with_absgrad: bool) -> Tensor:
+    """One gradient row per pair [P, 6 + D, + 2 of absgrad], all zero: a tile fills those of pairs that it blended."""
+    return channels.new_zeros(len(bins.pair_splats), MOMENTS + channels.shape[2] + (2 if with_absgrad else 0))
 
 
 def sum_pair_rows(
     rows: Tensor, bins: TileBins, splats: Splats, num_values: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Gradients of means2d, conics, opacities, values [C, G, num_values] and probe [C, G, 2 or 0]: sums over tiles."""
+    """Sums over tiles: gradients of means2d, conics, opacities, values [C, G, num_values], absgrad [C, G, 2 or 0]."""
     shape, width = tuple(splats.opacities.shape), rows.shape[1]
     count = shape[0] * shape[1]
     found = [rows.new_empty(count, *rest) for rest in ((2,), (3,), (), (num_values,), (width - MOMENTS - num_values,))]
@@ -91,8 +91,8 @@ def sum_pair_rows(
         blocks_for(count * width, THREADS), THREADS, rows, bins.pair_slots, bins.splat_offsets,
         splats.conics.view(-1, 3), splats.opacities.view(-1), *found,
     )  # fmt: skip
-    v_means, v_conics, v_opacities, v_values, v_probe = (tensor.view(*shape, *tensor.shape[1:]) for tensor in found)
-    return v_means, v_conics, v_opacities, v_values, v_probe
+    v_means, v_conics, v_opacities, v_values, v_absgrad = (tensor.view(*shape, *tensor.shape[1:]) for tensor in found)
+    return v_means, v_conics, v_opacities, v_values, v_absgrad
 
 
 @cache
@@ -101,7 +101,7 @@ def sum_rows(real: type) -> Kernel:
     zero, half = real(0.0), real(0.5)
 
     @kernel("sum_pair_rows", real, "real2 int1 long1 real2 real1 real2 real2 real1 real2 real2")
-    def sum_up(rows, slots, offsets, conics, opacities, v_means, v_conics, v_opacities, v_values, v_probe):
+    def sum_up(rows, slots, offsets, conics, opacities, v_means, v_conics, v_opacities, v_values, v_absgrad):
         i, width = cuda.grid(1), rows.shape[1]
         s, column = i // width, i % width
         if s >= opacities.size:
@@ -121,6 +121,6 @@ def sum_rows(real: type) -> Kernel:
         elif column < MOMENTS + v_values.shape[1]:
             v_values[s, column - MOMENTS] = total
         else:
-            v_probe[s, column - MOMENTS - v_values.shape[1]] = total
+            v_absgrad[s, column - MOMENTS - v_values.shape[1]] = total
 
     return sum_up

@@ -19,7 +19,7 @@ TILE = 16
 def composite(
     splats: Splats, channels: Tensor, bins: TileBins,
     *, marks: Tensor | None = None, num_primary: int | None = None, deviation: Deviation | None = None,
-    probe: Tensor | None = None,
+    absgrad: Tensor | None = None,
 ) -> Composite:  # fmt: skip
     """See `glassplat.kernels.composite.composite`. Of the bins, only the image size and active tiles are used."""
     num_primary = splats.opacities.shape[1] if num_primary is None else num_primary
@@ -32,7 +32,7 @@ def composite(
             bins,
             None if marks is None else marks[c],
             num_primary,
-            None if probe is None else probe[c],
+            None if absgrad is None else absgrad[c],
         )
         images.append(image * active[c, ..., None])
         alphas.append(alpha * active[c])
@@ -59,7 +59,7 @@ def _spread(weights: dict[int, Tensor], values: Tensor, total: Tensor, alpha: Te
 
 
 def _camera_composite(
-    splats: Splats, channels: Tensor, bins: TileBins, marks: Tensor | None, num_primary: int, probe: Tensor | None
+    splats: Splats, channels: Tensor, bins: TileBins, marks: Tensor | None, num_primary: int, absgrad: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, dict[int, Tensor]]:
     """Image, alpha, mask and the weight [H, W] of every primary splat."""
     transmittance = splats.means2d.new_ones(bins.height, bins.width)
@@ -67,7 +67,7 @@ def _camera_composite(
     mask, glass_transmittance = torch.zeros_like(transmittance), torch.ones_like(transmittance)
     running = glass_running = torch.ones_like(transmittance, dtype=torch.bool)
     weights = {}
-    for index, alpha in alphas_front_to_back(splats, bins, probe):
+    for index, alpha in alphas_front_to_back(splats, bins, absgrad):
         if index < num_primary:
             after = transmittance * (1 - alpha)
             running = running & (after >= TRANSMITTANCE_MIN)
@@ -84,8 +84,8 @@ def _camera_composite(
     return image, 1 - transmittance, mask, weights
 
 
-def alphas_front_to_back(splats: Splats, bins: TileBins, probe: Tensor | None = None) -> Iterator[tuple[int, Tensor]]:
-    """Index and coverage [H, W] of every splat of one camera that is drawn, nearest first; `probe` [G, 2]."""
+def alphas_front_to_back(splats: Splats, bins: TileBins, absgrad: Tensor | None = None) -> Iterator[tuple[int, Tensor]]:
+    """Index and coverage [H, W] of every splat of one camera that is drawn, nearest first; `absgrad` [G, 2]."""
     like = splats.means2d
     x = torch.arange(bins.width, dtype=like.dtype) + 0.5
     y = torch.arange(bins.height, dtype=like.dtype)[:, None] + 0.5
@@ -96,8 +96,8 @@ def alphas_front_to_back(splats: Splats, bins: TileBins, probe: Tensor | None = 
         if not bool((splats.radii[index] > 0).all() & (xx > 0) & (determinant > 0)):
             continue
         dx, dy = x - splats.means2d[index, 0], y - splats.means2d[index, 1]
-        if probe is not None:
-            moves = _MovePerPixel.apply(probe[index], bins.height, bins.width)
+        if absgrad is not None:
+            moves = _MovePerPixel.apply(absgrad[index], bins.height, bins.width)
             dx, dy = dx - moves[..., 0], dy - moves[..., 1]
         q = xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy
         coverage = splats.opacities[index] * torch.exp(-0.5 * q)
@@ -108,8 +108,8 @@ class _MovePerPixel(torch.autograd.Function):
     """A move [H, W, 2] of a splat's centre for each pixel on its own, all zero; the gradient is summed unsigned."""
 
     @staticmethod
-    def forward(ctx: Any, probe: Tensor, height: int, width: int) -> Tensor:
-        return probe.new_zeros(height, width, 2)
+    def forward(ctx: Any, absgrad: Tensor, height: int, width: int) -> Tensor:
+        return absgrad.new_zeros(height, width, 2)
 
     @staticmethod
     def backward(ctx: Any, v_moves: Tensor) -> tuple[Tensor, None, None]:
@@ -139,14 +139,14 @@ class _Layer(NamedTuple):
 
 def composite_discs(
     discs: Discs, channels: Tensor, bins: TileBins,
-    *, near: float, low_pass: float = LOW_PASS, probe: Tensor | None = None,
+    *, near: float, low_pass: float = LOW_PASS, absgrad: Tensor | None = None,
 ) -> BlendedDiscs:  # fmt: skip
     """See `glassplat.kernels.composite.composite_discs`. Of the bins, only image size and active tiles count."""
     active = active_pixels(bins)
     blended = []
     for c in range(bins.num_cameras):
         own = Discs(discs.means2d[c], discs.maps[c], discs.opacities[c], discs.depths[c], discs.outlines)
-        found = _camera(own, channels[c], bins, near, low_pass, None if probe is None else probe[c])
+        found = _camera(own, channels[c], bins, near, low_pass, None if absgrad is None else absgrad[c])
         blended.append([torch.where(_over(active[c], x), x, torch.zeros_like(x)) for x in found])
     return BlendedDiscs(*(torch.stack(tensors) for tensors in zip(*blended, strict=True)))
 
@@ -156,7 +156,7 @@ def _over(mask: Tensor, value: Tensor) -> Tensor:
 
 
 def _camera(
-    discs: Discs, channels: Tensor, bins: TileBins, near: float, low_pass: float, probe: Tensor | None
+    discs: Discs, channels: Tensor, bins: TileBins, near: float, low_pass: float, absgrad: Tensor | None
 ) -> tuple[Tensor, ...]:
     """Image, alpha, depth, median and distortion of one camera."""
     transmittance = discs.means2d.new_ones(bins.height, bins.width)
@@ -167,7 +167,7 @@ def _camera(
     for index in torch.argsort(discs.depths, stable=True).tolist():
         if not bool(discs.opacities[index] > 0):
             continue
-        layer = _layer(discs, index, bins, near, low_pass, probe)
+        layer = _layer(discs, index, bins, near, low_pass, absgrad)
         after = transmittance * (1 - layer.alpha)
         running = running & (after >= TRANSMITTANCE_MIN)
         weight = torch.where(running, layer.alpha * transmittance, 0)
@@ -181,14 +181,14 @@ def _camera(
     return image, 1 - transmittance, depth, median, distortion
 
 
-def _layer(discs: Discs, index: int, bins: TileBins, near: float, low_pass: float, probe: Tensor | None) -> _Layer:
+def _layer(discs: Discs, index: int, bins: TileBins, near: float, low_pass: float, absgrad: Tensor | None) -> _Layer:
     """Coverage and depth of a disc; where it does not cover, the depth is that of its centre."""
     like = discs.means2d
     x = torch.arange(bins.width, dtype=like.dtype) + 0.5
     y = torch.arange(bins.height, dtype=like.dtype)[:, None] + 0.5
     dx, dy = x - like[index, 0], y - like[index, 1]
-    if probe is not None:
-        moves = _MovePerPixel.apply(probe[index], bins.height, bins.width)
+    if absgrad is not None:
+        moves = _MovePerPixel.apply(absgrad[index], bins.height, bins.width)
         dx, dy = dx - moves[..., 0], dy - moves[..., 1]
     u_x, u_y, v_x, v_y, w_x, w_y = discs.maps[index]
     e = 1 + w_x * dx + w_y * dy

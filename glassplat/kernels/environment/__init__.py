@@ -21,12 +21,12 @@ def surface_channels(
     log_scales: Tensor,
     means: Tensor,
     logit_strengths: Tensor,
-    eye: Tensor,
+    camera_center: Tensor,
     extra: Tensor | None = None,
 ) -> Tensor:
     """Colour, normal and reflection strength of each Gaussian, side by side (3DGS-DR, Section 3.1).
 
-    The normal is the Gaussian's shortest axis, the first of equally short ones, turned towards the eye. Which axis it
+    The normal is the Gaussian's shortest axis, the first of equally short ones, turned towards the camera. Which axis
     is and on which side count as constants. It is 0 where a quaternion is 0 or not finite.
 
     Differentiable in `colors`, `quats`, `logit_strengths` and `extra`; the length of a quaternion has no effect, and
@@ -39,7 +39,7 @@ def surface_channels(
         log_scales: [N, 3] logarithm of the standard deviation along each axis.
         means: [N, 3] centres, world units.
         logit_strengths: [N] logit of the reflection strength.
-        eye: [3] camera centre in the world.
+        camera_center: [3] camera centre in the world.
         extra: [N, E] more channels.
 
     Returns:
@@ -60,12 +60,12 @@ def surface_channels(
             "log_scales": (log_scales, (count, 3)),
             "means": (means, (count, 3)),
             "logit_strengths": (logit_strengths, (count,)),
-            "eye": (eye, (3,)),
+            "camera_center": (camera_center, (3,)),
             "extra": (extra, (count, *extra.shape[1:2])),
         }
     )
     channels: Tensor = _SurfaceChannels.apply(
-        colors, radii, quats, log_scales, means, logit_strengths, eye, extra
+        colors, radii, quats, log_scales, means, logit_strengths, camera_center, extra
     )  # fmt: skip
     return channels
 

@@ -59,10 +59,10 @@ def surface_channels_forward(real: type) -> Kernel:
     describe, zero = surface_maths(real).describe, real(0.0)
 
     @kernel("surface_channels_forward", real)
-    def forward(colors, radii, quats, log_scales, means, logit_strengths, eye, extra, channels):
+    def forward(colors, radii, quats, log_scales, means, logit_strengths, camera_center, extra, channels):
         for i in prange(radii.shape[0]):
             if radii[i, 0] > zero:
-                describe(i, colors, quats, log_scales, means, logit_strengths, eye, extra, channels)
+                describe(i, colors, quats, log_scales, means, logit_strengths, camera_center, extra, channels)
             else:
                 channels[i] = zero
 

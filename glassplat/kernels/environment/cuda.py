@@ -53,10 +53,10 @@ def surface_channels_forward(real: type) -> Kernel:
     describe, zero = surface_maths(real).describe, real(0.0)
 
     @kernel("surface_channels_forward", real, "real2 real2 real2 real2 real2 real1 real1 real2 real2")
-    def forward(colors, radii, quats, log_scales, means, logit_strengths, eye, extra, channels):
+    def forward(colors, radii, quats, log_scales, means, logit_strengths, camera_center, extra, channels):
         i = cuda.grid(1)
         if i < radii.shape[0] and radii[i, 0] > zero:
-            describe(i, colors, quats, log_scales, means, logit_strengths, eye, extra, channels)
+            describe(i, colors, quats, log_scales, means, logit_strengths, camera_center, extra, channels)
 
     return forward
 

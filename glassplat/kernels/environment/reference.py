@@ -19,7 +19,7 @@ def surface_channels(
     log_scales: Tensor,
     means: Tensor,
     logit_strengths: Tensor,
-    eye: Tensor,
+    camera_center: Tensor,
     extra: Tensor | None = None,
 ) -> Tensor:
     """See `glassplat.kernels.environment.surface_channels`."""
@@ -28,7 +28,7 @@ def surface_channels(
     shortest = log_scales.detach().argmin(dim=-1)
     axes = rotations(torch.where(usable, quats, torch.ones_like(quats)))
     normals = axes.gather(-1, shortest[:, None, None].expand(-1, 3, 1))[..., 0]
-    away = ((eye - means).detach() * normals.detach()).sum(-1, keepdim=True) < 0
+    away = ((camera_center - means).detach() * normals.detach()).sum(-1, keepdim=True) < 0
     normals = torch.where(usable, torch.where(away, -normals, normals), 0)
     parts = [colors, normals, torch.sigmoid(logit_strengths)[:, None], *([] if extra is None else [extra])]
     return torch.where(radii[:, :1] > 0, torch.cat(parts, dim=-1), 0)

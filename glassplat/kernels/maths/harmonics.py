@@ -109,11 +109,11 @@ def channel_with(take: Callable[..., Any]) -> Callable[..., Any]:
     return channel
 
 
-def color_gradient_with(real: type, put: Callable[..., Any], pull: Callable[..., Any]) -> Callable[..., Any]:
+def color_gradient_with(real: type, put: Callable[..., Any], v_basis: Callable[..., Any]) -> Callable[..., Any]:
     """The adjoint of three colours, of numbers or of vectors; it returns the gradient of the direction.
 
     `put(g_sh, at, k, b, g)` takes the gradient of coefficient k, whose harmonic is b, for gradients g of the colours;
-    `pull(sh, n, k, g)` is the gradient of that harmonic.
+    `v_basis(sh, n, k, g)` is the gradient of that harmonic.
     """
     first, second, third = _direction_gradients(real)
 
@@ -125,14 +125,20 @@ def color_gradient_with(real: type, put: Callable[..., Any], pull: Callable[...,
             put(g_sh, at, 1, b[1], g)
             put(g_sh, at, 2, b[2], g)
             put(g_sh, at, 3, b[3], g)
-            gx, gy, gz = first(pull(sh, n, 1, g), pull(sh, n, 2, g), pull(sh, n, 3, g))
+            gx, gy, gz = first(v_basis(sh, n, 1, g), v_basis(sh, n, 2, g), v_basis(sh, n, 3, g))
         if degree > 1:
             put(g_sh, at, 4, b[4], g)
             put(g_sh, at, 5, b[5], g)
             put(g_sh, at, 6, b[6], g)
             put(g_sh, at, 7, b[7], g)
             put(g_sh, at, 8, b[8], g)
-            h = (pull(sh, n, 4, g), pull(sh, n, 5, g), pull(sh, n, 6, g), pull(sh, n, 7, g), pull(sh, n, 8, g))
+            h = (
+                v_basis(sh, n, 4, g),
+                v_basis(sh, n, 5, g),
+                v_basis(sh, n, 6, g),
+                v_basis(sh, n, 7, g),
+                v_basis(sh, n, 8, g),
+            )
             more = second(x, y, z, h)
             gx, gy, gz = gx + more[0], gy + more[1], gz + more[2]
         if degree > 2:
@@ -143,8 +149,8 @@ def color_gradient_with(real: type, put: Callable[..., Any], pull: Callable[...,
             put(g_sh, at, 13, b[13], g)
             put(g_sh, at, 14, b[14], g)
             put(g_sh, at, 15, b[15], g)
-            low = (pull(sh, n, 9, g), pull(sh, n, 10, g), pull(sh, n, 11, g), pull(sh, n, 12, g))
-            high = (pull(sh, n, 13, g), pull(sh, n, 14, g), pull(sh, n, 15, g))
+            low = (v_basis(sh, n, 9, g), v_basis(sh, n, 10, g), v_basis(sh, n, 11, g), v_basis(sh, n, 12, g))
+            high = (v_basis(sh, n, 13, g), v_basis(sh, n, 14, g), v_basis(sh, n, 15, g))
             more = third(x, y, z, low, high)
             gx, gy, gz = gx + more[0], gy + more[1], gz + more[2]
         return gx, gy, gz
@@ -177,10 +183,10 @@ def _color_gradient(real: type, basis: Callable[..., Any]) -> Callable[..., Any]
         g_sh[n, k, 2] += b * g[2]
 
     @inlined
-    def pull(sh, n, k, g):
+    def v_basis(sh, n, k, g):
         return sh[n, k, 0] * g[0] + sh[n, k, 1] * g[1] + sh[n, k, 2] * g[2]
 
-    adjoint = color_gradient_with(real, add, pull)
+    adjoint = color_gradient_with(real, add, v_basis)
 
     @inlined
     def color_gradient(sh, n, degree, x, y, z, g, g_sh):

@@ -52,14 +52,14 @@ def _facing(real: type) -> tuple[Scalar, Scalar]:
         )
 
     @inlined
-    def normal_of(i, quats, log_scales, means, eye):  # type: ignore[no-untyped-def]
+    def normal_of(i, quats, log_scales, means, camera_center):  # type: ignore[no-untyped-def]
         quat, inverse_norm = unit_quat(quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3])
         if not (is_finite(inverse_norm) and inverse_norm > zero):
             return zero, zero, zero
         first, second, third = rotation(quat)
         shortest = shortest_axis(log_scales[i, 0], log_scales[i, 1], log_scales[i, 2])
         axis = chosen(shortest, first, second, third)
-        towards = eye[0] - means[i, 0], eye[1] - means[i, 1], eye[2] - means[i, 2]
+        towards = camera_center[0] - means[i, 0], camera_center[1] - means[i, 1], camera_center[2] - means[i, 2]
         side = -one if dot(towards, axis) < zero else one
         return side * axis[0], side * axis[1], side * axis[2]
 
@@ -88,8 +88,8 @@ def surface_maths(real: type) -> SurfaceMaths:
     sigmoid, one = shape_maths(real).sigmoid, real(1.0)
 
     @inlined
-    def describe(i, colors, quats, log_scales, means, logit_strengths, eye, extra, channels):  # type: ignore[no-untyped-def]
-        normal = normal_of(i, quats, log_scales, means, eye)
+    def describe(i, colors, quats, log_scales, means, logit_strengths, camera_center, extra, channels):  # type: ignore[no-untyped-def]
+        normal = normal_of(i, quats, log_scales, means, camera_center)
         for d in range(3):
             channels[i, d], channels[i, NORMAL_AT + d] = colors[i, d], normal[d]
         channels[i, STRENGTH_AT] = sigmoid(logit_strengths[i])

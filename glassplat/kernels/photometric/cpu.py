@@ -45,25 +45,25 @@ ENTERED = 0  # One row of image, photograph, sum of squares and product,
 BLURRED = ENTERED + 4 * STRIDE  # a plane of each after the blur along the row,
 RESULTS = BLURRED + 4 * PLANE  # four rows of each after the blur down the columns,
 SLOPES = RESULTS + 4 * TOGETHER * STRIDE  # one row of similarity and three slopes,
-PULLS = SLOPES + 4 * STRIDE  # and a plane of each slope after the blur along the row.
-SCRATCH = PULLS + 3 * PLANE
+BLURRED_SLOPES = SLOPES + 4 * STRIDE  # and a plane of each slope after the blur along the row.
+SCRATCH = BLURRED_SLOPES + 3 * PLANE
 
 
 def photometric(image: Tensor, target: Tensor, *, with_gradient: bool) -> tuple[Tensor, Tensor, Tensor]:
     """Mean L1, mean similarity, and the gradient [H, W, 3] of the similarity's sum (empty unless asked for)."""
     height, width, _ = image.shape
-    pull = image.new_empty(image.shape if with_gradient else (0, 0, CHANNELS))
+    ssim_gradient = image.new_empty(image.shape if with_gradient else (0, 0, CHANNELS))
     sums = np.zeros((-(-height // ROWS) * -(-width * CHANNELS // COLUMNS), 2), np.float64)
-    _forward(REAL_OF[image.dtype])(_rows(image), _rows(target), _rows(pull), sums)
+    _forward(REAL_OF[image.dtype])(_rows(image), _rows(target), _rows(ssim_gradient), sums)
     l1, ssim = (torch.tensor(total / image.numel(), dtype=image.dtype) for total in sums.sum(axis=0))
-    return l1, ssim, pull
+    return l1, ssim, ssim_gradient
 
 
-def photometric_gradient(image: Tensor, target: Tensor, pull: Tensor, v_l1: Tensor, v_ssim: Tensor) -> Tensor:
+def photometric_gradient(image: Tensor, target: Tensor, ssim_gradient: Tensor, v_l1: Tensor, v_ssim: Tensor) -> Tensor:
     """Gradient of the image, given what the forward pass found."""
     real, v_image = REAL_OF[image.dtype], torch.empty_like(image)
     weights = (real(v.item() / image.numel()) for v in (v_l1, v_ssim))
-    _backward(real)(_rows(image), _rows(target), _rows(pull), *weights, _rows(v_image))
+    _backward(real)(_rows(image), _rows(target), _rows(ssim_gradient), *weights, _rows(v_image))
     return v_image
 
 
@@ -156,7 +156,7 @@ def _spread_slopes(real: type) -> Scalar:
     def spread_slopes(scratch, inside, left, rest, row):
         """Blurs the row of slopes into row `row` of the planes; beyond the image, `rest` columns on, there are none."""
         for plane in range(3):
-            at, to = SLOPES + (plane & 3) * STRIDE, PULLS + (plane & 3) * PLANE + (row & 31) * STRIDE
+            at, to = SLOPES + (plane & 3) * STRIDE, BLURRED_SLOPES + (plane & 3) * PLANE + (row & 31) * STRIDE
             if inside:
                 for j in range(MARGIN if left == 0 else 0):
                     scratch[at + j] = zero
@@ -171,11 +171,11 @@ def _spread_slopes(real: type) -> Scalar:
     return spread_slopes
 
 
-def _pull_row(real: type) -> Scalar:
+def _ssim_gradient_row(real: type) -> Scalar:
     brightness, two = _brightness(real), real(2.0)
 
     @inlined
-    def pull_row(scratch, row, image, target, out):
+    def ssim_gradient_row(scratch, row, image, target, out):
         """The gradient of one row, from one of the four rows at `RESULTS`."""
         at = RESULTS + (row & 3) * STRIDE
         for j in range(out.size):
@@ -183,7 +183,7 @@ def _pull_row(real: type) -> Scalar:
             by_product = scratch[at + 2 * TOGETHER * STRIDE + j]
             out[j] = scratch[at + j] + two * image[j] * by_squares + brightness(target[j]) * by_product
 
-    return pull_row
+    return ssim_gradient_row
 
 
 @inlined
@@ -199,7 +199,7 @@ def _scroll(scratch, first, planes, count):
 @functools.cache
 def _forward(real: type) -> Kernel:
     enter, blur_down, compare_row = _enter(real), _blur_down(real), _compare_row(real)
-    spread_slopes, pull_row, scroll = _spread_slopes(real), _pull_row(real), _scroll
+    spread_slopes, ssim_gradient_row, scroll = _spread_slopes(real), _ssim_gradient_row(real), _scroll
     zero = real(0.0)
 
     @inlined
@@ -219,10 +219,10 @@ def _forward(real: type) -> Kernel:
         return total
 
     @kernel("photometric_forward", real)
-    def forward(image, target, pull, sums):
+    def forward(image, target, ssim_gradient, sums):
         height, width = image.shape
         columns = (width + COLUMNS - 1) // COLUMNS
-        reach = RADIUS if pull.size > 0 else 0
+        reach = RADIUS if ssim_gradient.size > 0 else 0
         for tile in prange(sums.shape[0]):
             scratch: NDArray[Any] = np.empty(SCRATCH, real)
             top, left = tile // columns * ROWS, tile % columns * COLUMNS
@@ -250,10 +250,12 @@ def _forward(real: type) -> Kernel:
                 for i in range(GROUP):
                     y = begin + i - 2 * RADIUS
                     if i % TOGETHER == 0 and top - TOGETHER < y < bottom:
-                        blur_down(scratch, PULLS, i, 3, COLUMNS)
+                        blur_down(scratch, BLURRED_SLOPES, i, 3, COLUMNS)
                     if top <= y < bottom:
-                        pull_row(scratch, i, image[y, left:right], target[y, left:right], pull[y, left:right])
-                scroll(scratch, PULLS, 3, COLUMNS)
+                        ssim_gradient_row(
+                            scratch, i, image[y, left:right], target[y, left:right], ssim_gradient[y, left:right]
+                        )
+                scroll(scratch, BLURRED_SLOPES, 3, COLUMNS)
             sums[tile, 0], sums[tile, 1] = l1, ssim
 
     return forward
@@ -264,11 +266,11 @@ def _backward(real: type) -> Kernel:
     brightness, zero = _brightness(real), real(0.0)
 
     @kernel("photometric_backward", real)
-    def backward(image, target, pull, v_l1, v_ssim, v_image):
+    def backward(image, target, ssim_gradient, v_l1, v_ssim, v_image):
         for y in prange(image.shape[0]):
             for j in range(image.shape[1]):
                 difference = image[y, j] - brightness(target[y, j])
                 sign = v_l1 if difference > zero else (-v_l1 if difference < zero else zero)
-                v_image[y, j] = sign + v_ssim * pull[y, j]
+                v_image[y, j] = sign + v_ssim * ssim_gradient[y, j]
 
     return backward

@@ -163,8 +163,8 @@ def photometric_backward(real: type) -> Kernel:
             blur(blurred_product, t, TILE),
         )
         a, b = image[y, x, channel], real(target[y, x, channel]) / white
-        pull = mean + two * a * square + b * product
+        ssim_gradient = mean + two * a * square + b * product
         sign = weights[0] if a > b else (-weights[0] if a < b else zero)
-        v_image[y, x, channel] = sign + weights[1] * pull
+        v_image[y, x, channel] = sign + weights[1] * ssim_gradient
 
     return backward

@@ -308,11 +308,11 @@ def color_gradient_of(real: type) -> Step:
         store(table, at + (3 * k + 2) * LANES, b * g[2])
 
     @inlined
-    def pull(table, at, k, g):
+    def v_basis(table, at, k, g):
         begin = at + 3 * k * LANES
         return load(table, begin) * g[0] + load(table, begin + LANES) * g[1] + load(table, begin + 2 * LANES) * g[2]
 
-    adjoint = color_gradient_with(real, put, pull)
+    adjoint = color_gradient_with(real, put, v_basis)
 
     @inlined
     def color_gradient(table, at, columns, degree, lens, c):

@@ -285,24 +285,25 @@ def add_views_kernel(real: type) -> Kernel:
 
     @kernel("screen_statistics", real, "real2 real2 real2 real1 real3 real3 real3 real2 real real real int")
     def add(
-        gradient_sum, pull_sum, view_count, max_radius, v_means2d, v_probe, radii, weight, factor, width, height, rows
+        gradient_sum, absgrad_sum, view_count, max_radius, v_means2d, v_absgrad, radii, weight, factor, width, height,
+        rows,
     ):  # fmt: skip
         n = cuda.grid(1)
         if n >= max_radius.size:
             return
         right, down, longer = half * width, half * height, max(width, height)
-        gradient, pull, seen, radius = zero, zero, zero, zero
+        gradient, absgrad, seen, radius = zero, zero, zero, zero
         for c in range(radii.shape[0]):
             if radii[c, n, 0] > zero and radii[c, n, 1] > zero:
                 x, y = right * v_means2d[c, n, 0], down * v_means2d[c, n, 1]
                 gradient += math.sqrt(x * x + y * y)
-                x, y = right * v_probe[c, n, 0], down * v_probe[c, n, 1]
-                pull += math.sqrt(x * x + y * y)
+                x, y = right * v_absgrad[c, n, 0], down * v_absgrad[c, n, 1]
+                absgrad += math.sqrt(x * x + y * y)
                 seen += weight[c, n] if weight.size > 1 else weight[0, 0] if weight.size == 1 else factor
                 radius = max(radius, radii[c, n, 0], radii[c, n, 1])
         for row in range(rows):
             gradient_sum[row, n] += gradient
-            pull_sum[row, n] += pull
+            absgrad_sum[row, n] += absgrad
             view_count[row, n] += seen
         max_radius[n] = max(max_radius[n], radius / longer)
 

@@ -81,7 +81,7 @@ def build_bvh(shapes: Shapes, *, flat: bool) -> Bvh:
 
 def trace(
     gaussians: RawGaussians, rays: Rays, bvh: Bvh | None = None,
-    *, sh_degree: int, near: float, probe: Tensor | None = None,
+    *, sh_degree: int, near: float, contributions: Tensor | None = None,
 ) -> Traced:  # fmt: skip
     """Blends what each ray meets, nearest first (EnvGS, Section 4.2 and Eq. 2).
 
@@ -105,21 +105,23 @@ def trace(
         sh_degree: highest degree of the spherical harmonics to evaluate; `gaussians.sh` may hold more, or none at all,
             which makes all colours zero.
         near: smallest distance of a hit, in lengths of the ray's direction, at least 0.
-        probe: [N, 2], any values; they change nothing. Its gradient is what each Gaussian adds to the rays, whatever
-            the objective: the sums of its blending weights, and of these times the distances in world units.
+        contributions: [N, 2], any values; they change nothing. Its gradient is what each Gaussian adds to the rays,
+            whatever the objective: the sums of its blending weights, and of these times the distances in world units.
 
     Raises:
         ValueError: a shape, the degree or `near` is out of range, or the hierarchy is of other Gaussians.
         TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
-    _check(gaussians, rays, bvh, sh_degree, near, probe)
+    _check(gaussians, rays, bvh, sh_degree, near, contributions)
     shapes, flat = shapes_of(gaussians), gaussians.log_scales.shape[1] == FLAT
     bvh = build_bvh(shapes, flat=flat) if bvh is None else bvh
-    return Traced(*_Trace.apply(*shapes, *rays, probe, bvh, flat, sh_degree if gaussians.sh.shape[1] else -1, near))
+    return Traced(
+        *_Trace.apply(*shapes, *rays, contributions, bvh, flat, sh_degree if gaussians.sh.shape[1] else -1, near)
+    )
 
 
 def _check(
-    gaussians: RawGaussians, rays: Rays, bvh: Bvh | None, sh_degree: int, near: float, probe: Tensor | None
+    gaussians: RawGaussians, rays: Rays, bvh: Bvh | None, sh_degree: int, near: float, contributions: Tensor | None
 ) -> None:
     count, num_rays = gaussians.means.shape[0], rays.origins.shape[0]
     coefficients = gaussians.sh.shape[1] if gaussians.sh.dim() == 3 else 0
@@ -135,8 +137,8 @@ def _check(
     }
     if bvh is not None:
         expected["boxes"] = (bvh.boxes, tuple(bvh.boxes.shape))
-    if probe is not None:
-        expected["probe"] = (probe, (count, 2))
+    if contributions is not None:
+        expected["contributions"] = (contributions, (count, 2))
     check_tensors(expected)
     if bvh is not None and bvh.order.shape[0] != count:
         raise ValueError(
@@ -153,7 +155,7 @@ class _Trace(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, frames: Tensor, opacities: Tensor, sh: Tensor, origins: Tensor, directions: Tensor,
-        probe: Tensor | None, bvh: Bvh, flat: bool, degree: int, near: float,
+        contributions: Tensor | None, bvh: Bvh, flat: bool, degree: int, near: float,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         tensors = [tensor.detach().contiguous() for tensor in (means, frames, opacities, sh, origins, directions)]
         kernels = kernels_for("trace", means.device)

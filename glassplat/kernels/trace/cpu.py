@@ -31,13 +31,13 @@ from glassplat.kernels.trace.bvh import hilbert_codes, leaf_fitting, level_offse
 from glassplat.kernels.trace.cpu_traversal import arrays_of, next_hits_maths, packed_leaves
 from glassplat.kernels.trace.steps import (
     CHUNK,
+    CONTRIBUTION_AT,
     FRAME_AT,
     GEOMETRY,
     OPACITY_AT,
-    PROBE_AT,
     STACK,
     WIDTH,
-    color_pull,
+    color_backward,
     coverage_maths,
     ray_reader,
     shape_of,
@@ -96,7 +96,7 @@ def trace_gradients(
     shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tensor], outputs: Sequence[Tensor],
     cotangents: Sequence[Tensor], *, flat: bool, degree: int, near: float,
 ) -> tuple[Tensor, ...]:  # fmt: skip
-    """Gradients of means, frames, opacities, sh, origins, directions and probe; `outputs` are those of `trace`."""
+    """Gradients of means, frames, opacities, sh, origins, directions, contributions; `outputs` are those of `trace`."""
     means, sh, hits, kept = shapes[0], shapes[3], outputs[3], outputs[4]
     real, count = REAL_OF[means.dtype], means.shape[0]
     hit_offsets = torch.cat([hits.new_zeros(1, dtype=torch.int64), hits.cumsum(0)])
@@ -123,8 +123,8 @@ def trace_gradients(
         owners.numpy(), rows, sh_rows, *(tensor.numpy() for tensor in v_rays),
     )  # fmt: skip
     sums, v_sh = _summed(rows, sh_rows, owners, count, real)
-    v_means, v_frames, v_opacities, v_probe = sums.tensor_split((FRAME_AT, OPACITY_AT, PROBE_AT), dim=1)
-    return v_means, v_frames.reshape(-1, 3, 3), v_opacities[:, 0], v_sh, *v_rays, v_probe
+    v_means, v_frames, v_opacities, v_contributions = sums.tensor_split((FRAME_AT, OPACITY_AT, CONTRIBUTION_AT), dim=1)
+    return v_means, v_frames.reshape(-1, 3, 3), v_opacities[:, 0], v_sh, *v_rays, v_contributions
 
 
 def _summed(rows: NDArray[Any], sh_rows: NDArray[Any], owners: Tensor, count: int, real: type) -> tuple[Tensor, Tensor]:
@@ -178,13 +178,13 @@ def trace_collect(real: type, flat: bool) -> Kernel:
     return collect
 
 
-def _pull(real: type, flat: bool) -> Scalar:
+def _hit_gradients(real: type, flat: bool) -> Scalar:
     """Adds one hit's gradients to its Gaussian's row and to its ray."""
     meet_gradient, half, most = ray_hit_maths(real, flat).meet_gradient, real(0.5), real(ALPHA_MAX)
     zero = real(0.0)
 
     @inlined
-    def pull(offset, d, frame, hit, opacity, v_alpha, v_t, row, v_origin, v_direction):
+    def add_gradients(offset, d, frame, hit, opacity, v_alpha, v_t, row, v_origin, v_direction):
         t, q, covered = hit
         v_covered = v_alpha if covered < most else zero
         row[OPACITY_AT] += v_covered * covered / opacity
@@ -197,14 +197,14 @@ def _pull(real: type, flat: bool) -> Scalar:
             v_origin[j] += v_o[j]
             v_direction[j] += v_d[j]
 
-    return pull
+    return add_gradients
 
 
 @cache
 def trace_backward(real: type, flat: bool) -> Kernel:
     """Fills each block's rows and their owners, and the gradients of the rays, which are zero beforehand."""
-    coverage, pull = coverage_maths(real, blend_maths(real).exp2), _pull(real, flat)
-    meet, pull_color = ray_hit_maths(real, flat).meet, color_pull(real)
+    coverage, add_gradients = coverage_maths(real, blend_maths(real).exp2), _hit_gradients(real, flat)
+    meet, hit_color_gradient = ray_hit_maths(real, flat).meet, color_backward(real)
     zero, half, one, nowhere = real(0.0), real(0.5), real(1.0), real("inf")
 
     @kernel("trace_backward_discs" if flat else "trace_backward_ellipsoids", real)
@@ -247,17 +247,17 @@ def trace_backward(real: type, flat: bool) -> Kernel:
                     value = zero
                     if degree >= 0:
                         own_sh, v_sh = sh[g : g + 1], sh_rows[row : row + 1]
-                        value, by_unit = pull_color(own_sh, degree, unit, v_colors, r, weight, v_sh)
+                        value, by_unit = hit_color_gradient(own_sh, degree, unit, v_colors, r, weight, v_sh)
                         for j in range(3):
                             v_unit[j] += by_unit[j]
                     distance = t * length
                     value += v_depths[r] * distance
                     behind -= weight * value
-                    rows[row, PROBE_AT] += weight
-                    rows[row, PROBE_AT + 1] += weight * distance
+                    rows[row, CONTRIBUTION_AT] += weight
+                    rows[row, CONTRIBUTION_AT + 1] += weight * distance
                     v_alpha, v_t = left * value + (end - behind) / (one - alpha), weight * v_depths[r]
                     v_length += v_t * t
-                    pull(
+                    add_gradients(
                         offset, d, frame, (t, q, covered), opacities[g], v_alpha, v_t * length, rows[row],
                         v_origins[r], v_directions[r],
                     )  # fmt: skip

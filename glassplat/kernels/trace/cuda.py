@@ -32,16 +32,16 @@ from glassplat.kernels.trace import reach
 from glassplat.kernels.trace.bvh import curve_cells, curve_place, leaf_fitting, level_offsets
 from glassplat.kernels.trace.steps import (
     CHUNK,
+    CONTRIBUTION_AT,
     FRAME_AT,
     GEOMETRY,
     LEVEL_BITS,
     NODE,
     OPACITY_AT,
-    PROBE_AT,
     SLACK,
     STACK,
     WIDTH,
-    color_pull,
+    color_backward,
     coverage_maths,
     insert,
     ray_reader,
@@ -222,7 +222,7 @@ class Hits(NamedTuple):
     offsets [R + 1] int64: where each ray's hits begin.
     met, rays [H] int32: the Gaussian and the ray of a hit.
     alphas, weights [H]: what it covers, and its blending weight.
-    pulls [H]: gradient of the objective with respect to its squared distance in deviations.
+    v_squares [H]: gradient of the objective with respect to its squared distance in deviations.
     """
 
     offsets: Tensor
@@ -230,24 +230,24 @@ class Hits(NamedTuple):
     rays: Tensor
     alphas: Tensor
     weights: Tensor
-    pulls: Tensor
+    v_squares: Tensor
 
 
 @cache
-def trace_pull_rays(real: type, flat: bool) -> Kernel:
-    """Fills rays, weights and pulls of hits, and the gradients of origins and directions, zero where nothing is met."""
-    ray, pull_color = ray_reader(real), color_pull(real)
+def trace_ray_gradients(real: type, flat: bool) -> Kernel:
+    """Fills rays, weights and v_squares of hits, and the gradients of origins and directions, zero without hits."""
+    ray, hit_color_gradient = ray_reader(real), color_backward(real)
     meet, meet_gradient = ray_hit_maths(real, flat)
     zero, half, one, most, nowhere = real(0.0), real(0.5), real(1.0), real(ALPHA_MAX), real("inf")
 
     @kernel(
-        "trace_pull_rays_of_discs" if flat else "trace_pull_rays_of_ellipsoids",
+        "trace_gradients_of_rays_discs" if flat else "trace_gradients_of_rays_ellipsoids",
         real,
         "real2 real3 real3 real2 real2 int long1 int1 int1 real1 real1 real1 "
         "real2 real1 real1 real2 real1 real1 real2 real2",
     )
-    def pull(
-        means, frames, sh, origins, directions, degree, starts, met, hit_rays, met_alphas, weights, pulls,
+    def ray_gradients(
+        means, frames, sh, origins, directions, degree, starts, met, hit_rays, met_alphas, weights, v_squares,
         colors, alphas, depths, v_colors, v_alphas, v_depths, v_origins, v_directions,
     ):  # fmt: skip
         # Nobody reads it, and the compiler leaves it out.
@@ -271,7 +271,7 @@ def trace_pull_rays(real: type, flat: bool) -> Kernel:
             # On the threshold, another fusing of products and sums may find a disc seen from its edge.
             if t < nowhere:
                 if degree >= 0:
-                    value, v_unit = pull_color(sh[g : g + 1], degree, unit, v_colors, r, weight, v_sh)
+                    value, v_unit = hit_color_gradient(sh[g : g + 1], degree, unit, v_colors, r, weight, v_sh)
                     by_unit = by_unit[0] + v_unit[0], by_unit[1] + v_unit[1], by_unit[2] + v_unit[2]
                 value += v_depths[r] * (t * length)
                 behind -= weight * value
@@ -282,7 +282,7 @@ def trace_pull_rays(real: type, flat: bool) -> Kernel:
                 v_o, v_d, _ = meet_gradient(offset, d, frame, t, q, v_t * length, v_squared)
                 by_origin = by_origin[0] + v_o[0], by_origin[1] + v_o[1], by_origin[2] + v_o[2]
                 by_direction = by_direction[0] + v_d[0], by_direction[1] + v_d[1], by_direction[2] + v_d[2]
-            hit_rays[place], weights[place], pulls[place] = r, weight, v_squared
+            hit_rays[place], weights[place], v_squares[place] = r, weight, v_squared
             left *= one - alpha
         along = unit[0] * by_unit[0] + unit[1] * by_unit[1] + unit[2] * by_unit[2]
         v_origins[r, 0], v_origins[r, 1], v_origins[r, 2] = by_origin
@@ -290,19 +290,19 @@ def trace_pull_rays(real: type, flat: bool) -> Kernel:
         v_directions[r, 1] = by_direction[1] + v_length * unit[1] + (by_unit[1] - unit[1] * along) / length
         v_directions[r, 2] = by_direction[2] + v_length * unit[2] + (by_unit[2] - unit[2] * along) / length
 
-    return pull
+    return ray_gradients
 
 
 @cache
-def trace_pull_gaussians(real: type, flat: bool) -> Kernel:
+def trace_gaussian_gradients(real: type, flat: bool) -> Kernel:
     """Fills the gradients of Gaussians that rays meet, one block of one warp for each; the others' are zero before."""
-    ray, pull_color = ray_reader(real), color_pull(real)
+    ray, hit_color_gradient = ray_reader(real), color_backward(real)
     meet, meet_gradient = ray_hit_maths(real, flat)
     zero, two, nowhere = real(0.0), real(2.0), real("inf")
 
     @inlined
     def fill(row, offset, d, frame, length, weight, v_depth, v_squared, opacity):
-        """The gradients of one hit's mean, frame and opacity, and what it adds to the probe."""
+        """The gradients of one hit's mean, frame and opacity, and what it adds to the contributions."""
         t, q, _ = meet(offset, d, frame)
         if not t < nowhere:
             for j in range(GEOMETRY):
@@ -315,17 +315,17 @@ def trace_pull_gaussians(real: type, flat: bool) -> Kernel:
         row[FRAME_AT + 3], row[FRAME_AT + 4], row[FRAME_AT + 5] = v_frame[1]
         row[FRAME_AT + 6], row[FRAME_AT + 7], row[FRAME_AT + 8] = v_frame[2]
         row[OPACITY_AT] = -two * v_squared / opacity
-        row[PROBE_AT], row[PROBE_AT + 1] = weight, weight * (t * length)
+        row[CONTRIBUTION_AT], row[CONTRIBUTION_AT + 1] = weight, weight * (t * length)
 
     @kernel(
-        "trace_pull_discs" if flat else "trace_pull_ellipsoids",
+        "trace_gradients_discs" if flat else "trace_gradients_ellipsoids",
         real,
         "real2 real3 real1 real3 real2 real2 int long1 long1 int1 real1 real1 real2 real1 real2 real3 real1 real3 "
         "real2",
     )
-    def pull(
-        means, frames, opacities, sh, origins, directions, degree, order, starts, hit_rays, weights, pulls,
-        v_colors, v_depths, v_means, v_frames, v_opacities, v_sh, v_probe,
+    def gaussian_gradients(
+        means, frames, opacities, sh, origins, directions, degree, order, starts, hit_rays, weights, v_squares,
+        v_colors, v_depths, v_means, v_frames, v_opacities, v_sh, v_contributions,
     ):  # fmt: skip
         rows = cuda.shared.array((WARP, GEOMETRY), real)
         harmonics = cuda.shared.array((WARP, STRIDE, 3), real)
@@ -341,13 +341,13 @@ def trace_pull_gaussians(real: type, flat: bool) -> Kernel:
                 r, weight = hit_rays[hit], weights[hit]
                 o, d, _, length, _ = ray(origins, directions, r)
                 offset, frame = shape_of(means, frames, g, o)
-                fill(rows[lane], offset, d, frame, length, weight, v_depths[r], pulls[hit], opacities[g])
+                fill(rows[lane], offset, d, frame, length, weight, v_depths[r], v_squares[hit], opacities[g])
                 if degree >= 0:
                     for k in range(HARMONICS):
                         for j in range(3):
                             harmonics[lane, k, j] = zero
                     unit = d[0] / length, d[1] / length, d[2] / length
-                    pull_color(sh[g : g + 1], degree, unit, v_colors, r, weight, harmonics[lane : lane + 1])
+                    hit_color_gradient(sh[g : g + 1], degree, unit, v_colors, r, weight, harmonics[lane : lane + 1])
             cuda.syncthreads()
             for i in range(min(WARP, end - first)):
                 if lane < GEOMETRY:
@@ -364,13 +364,13 @@ def trace_pull_gaussians(real: type, flat: bool) -> Kernel:
         elif lane == OPACITY_AT:
             v_opacities[g] = geometry
         elif lane < GEOMETRY:
-            v_probe[g, lane - PROBE_AT] = geometry
+            v_contributions[g, lane - CONTRIBUTION_AT] = geometry
         if lane < used:
             v_sh[g, lane // 3, lane % 3] = first_color
         if lane + WARP < used:
             v_sh[g, (lane + WARP) // 3, (lane + WARP) % 3] = second_color
 
-    return pull
+    return gaussian_gradients
 
 
 def trace(
@@ -409,20 +409,20 @@ def trace_gradients(
     collect = _search(shapes, rays, bvh, flat)
     collect(-1, near, hits.offsets, hits.met, hits.alphas, *outputs[4:], None, None, None, None)
     v_rays = [torch.zeros_like(ray) for ray in rays]
-    means_and_frames, pulled = shapes[:2], (*outputs[:3], *cotangents)
-    trace_pull_rays(real, flat)(
-        blocks_for(num_rays, THREADS), THREADS, *means_and_frames, sh, *rays, degree, *hits, *pulled, *v_rays
+    means_and_frames, saved = shapes[:2], (*outputs[:3], *cotangents)
+    trace_ray_gradients(real, flat)(
+        blocks_for(num_rays, THREADS), THREADS, *means_and_frames, sh, *rays, degree, *hits, *saved, *v_rays
     )
     by_gaussian, order = torch.sort(hits.met, stable=True)
     starts = torch.searchsorted(by_gaussian, torch.arange(count + 1, dtype=torch.int32, device=means.device))
     found = tuple(torch.zeros_like(tensor) for tensor in shapes)
-    v_probe = means.new_zeros(count, 2)
+    v_contributions = means.new_zeros(count, 2)
     v_colors, _, v_depths = cotangents
-    trace_pull_gaussians(real, flat)(
-        count, WARP, *shapes, *rays, degree, order, starts, hits.rays, hits.weights, hits.pulls, v_colors, v_depths,
-        *found, v_probe,
+    trace_gaussian_gradients(real, flat)(
+        count, WARP, *shapes, *rays, degree, order, starts, hits.rays, hits.weights, hits.v_squares, v_colors, v_depths,
+        *found, v_contributions,
     )  # fmt: skip
-    return (*found, *v_rays, v_probe)
+    return (*found, *v_rays, v_contributions)
 
 
 def _search(shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tensor], flat: bool) -> Callable[..., None]:

@@ -21,11 +21,11 @@ class _Hits(NamedTuple):
     alpha: Tensor
 
 
-class _Probe(torch.autograd.Function):
-    """Hands alphas on; the gradient of a probe [N, 2] is `sums` [N, 2], whatever that of the alphas."""
+class _Contributions(torch.autograd.Function):
+    """Hands alphas on; the gradient of `contributions` [N, 2] is `sums` [N, 2], whatever that of the alphas."""
 
     @staticmethod
-    def forward(ctx: Any, alphas: Tensor, probe: Tensor, sums: Tensor) -> Tensor:
+    def forward(ctx: Any, alphas: Tensor, contributions: Tensor, sums: Tensor) -> Tensor:
         ctx.save_for_backward(sums)
         return alphas.clone()
 
@@ -35,7 +35,13 @@ class _Probe(torch.autograd.Function):
 
 
 def trace(
-    gaussians: RawGaussians, rays: Rays, bvh: Bvh | None, *, sh_degree: int, near: float, probe: Tensor | None = None
+    gaussians: RawGaussians,
+    rays: Rays,
+    bvh: Bvh | None,
+    *,
+    sh_degree: int,
+    near: float,
+    contributions: Tensor | None = None,
 ) -> Traced:
     """Traces rays; see `glassplat.kernels.trace.trace`. The hierarchy is not looked at."""
     flat = gaussians.log_scales.shape[1] == FLAT
@@ -58,10 +64,10 @@ def trace(
     colors = _colors(shapes.sh, directions / length, sh_degree)
     colors = colors.gather(1, order[..., None].expand(-1, -1, 3))
     alphas = weights.sum(1)
-    if probe is not None:
+    if contributions is not None:
         added = torch.stack([weights, weights * t], dim=-1).detach()
-        sums = torch.zeros_like(probe).index_add(0, order.flatten(), added.flatten(0, 1))
-        alphas = _Probe.apply(alphas, probe, sums)
+        sums = torch.zeros_like(contributions).index_add(0, order.flatten(), added.flatten(0, 1))
+        alphas = _Contributions.apply(alphas, contributions, sums)
     return Traced((weights[..., None] * colors).sum(1), alphas, (weights * t).sum(1), blended.sum(1, dtype=torch.int32))
 
 

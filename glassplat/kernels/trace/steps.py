@@ -23,8 +23,8 @@ SLACK = 1e-5
 """Share by which boxes begin earlier and end later, so that rounding loses no hit."""
 LARGEST_INVERSE = 1e15
 """In place of 1 / 0 in the direction of a ray of length 1: for all that are not too short to be squared in float32."""
-FRAME_AT, OPACITY_AT, PROBE_AT, GEOMETRY = 3, 12, 13, 15
-"""Columns of a row: gradients of mean (3), frame (9), opacity and probe (2); harmonics have rows of their own."""
+FRAME_AT, OPACITY_AT, CONTRIBUTION_AT, GEOMETRY = 3, 12, 13, 15
+"""Columns of a row: gradients of mean (3), frame (9), opacity, contributions (2); harmonics have rows of their own."""
 
 
 def ray_reader(real: type) -> Scalar:
@@ -80,7 +80,7 @@ def coverage_maths(real: type, exp2: Scalar) -> Scalar:
     return coverage
 
 
-def color_pull(real: type) -> Scalar:
+def color_backward(real: type) -> Scalar:
     """The value of a hit's colour to the objective and the gradient of the unit direction; adds that of harmonics.
 
     `sh` and `v_sh` are of one Gaussian, [1, K, 3].
@@ -89,7 +89,7 @@ def color_pull(real: type) -> Scalar:
     zero, half = real(0.0), real(0.5)
 
     @inlined
-    def pull(sh, degree, unit, v_colors, r, weight, v_sh):  # type: ignore[no-untyped-def]
+    def backward(sh, degree, unit, v_colors, r, weight, v_sh):  # type: ignore[no-untyped-def]
         x, y, z = unit[0], unit[1], unit[2]
         red, green, blue = color(sh, 0, degree, x, y, z)
         red, green, blue = red + half, green + half, blue + half
@@ -99,7 +99,7 @@ def color_pull(real: type) -> Scalar:
         v_unit = color_gradient(sh, 0, degree, x, y, z, (weight * v_red, weight * v_green, weight * v_blue), v_sh)
         return v_red * red + v_green * green + v_blue * blue, v_unit
 
-    return pull
+    return backward
 
 
 @inlined

@@ -37,7 +37,7 @@ def test_the_kernel_compiles_and_fits(kernel) -> None:
 def test_every_operation_has_its_kernels() -> None:
     names = {kernel.name.rsplit("_", 1)[0] for kernel in KERNELS}
     both_ways = {"project", "composite", "blend_panes", "photometric", "cube_lookup"}
-    traced = {f"trace_{step}_{kind}" for step in ("forward", "pull") for kind in ("discs", "ellipsoids")}
+    traced = {f"trace_{step}_{kind}" for step in ("forward", "gradients") for kind in ("discs", "ellipsoids")}
     both_ways |= {"shade_environment", "surface_channels", "project_discs", "composite_discs"}
     expected = {f"{name}_{way}" for name in both_ways for way in ("forward", "backward")} | {"adam", "pane_hits"}
     expected |= traced | {"count_tiles", "emit_tiles", "hilbert_places", "fit_leaves", "fit_level"}
@@ -95,7 +95,7 @@ def agree(pattern: Tree, other: Tree, known: dict[str, Tree]) -> bool:
 
 
 @pytest.mark.filterwarnings("ignore::numba.core.errors.NumbaPerformanceWarning")
-@pytest.mark.parametrize("other", ["composite_deviation_float32", "composite_backward_4_probed_float32"])
+@pytest.mark.parametrize("other", ["composite_deviation_float32", "composite_backward_4_absgrad_float32"])
 def test_every_pass_computes_the_same_coverage(other: str) -> None:
     first, second = (exponent_of(ptx_of(NAMED[name], [(8, 9)])[0]) for name in ("composite_forward_4_float32", other))
     assert agree(first, second, {}), (first, second)

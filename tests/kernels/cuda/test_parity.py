@@ -170,7 +170,7 @@ Size = tuple[int, int]
 
 
 def blended(
-    splats: Splats, channels: Tensor, marks: Tensor, probe: Tensor, deviation: Deviation | None, own: bool, size: Size
+    splats: Splats, channels: Tensor, marks: Tensor, absgrad: Tensor, deviation: Deviation | None, own: bool, size: Size
 ) -> list[Tensor]:
     """Image, alpha, mask and deviation of all cameras with glass; the last camera's first tile is left out."""
     binning, blending = (tiles_operation, composite_operation) if own else (tiles_twin, composite_twin)
@@ -178,7 +178,7 @@ def blended(
     mask = torch.ones(splats.depths.shape[0], *tiles_operation.tile_grid(*size), dtype=torch.bool)
     mask[-1, 0, 0] = False
     bins = binning.bin_tiles(splats, *size, mask.to(channels.device))
-    options = {"marks": marks, "num_primary": primary, "deviation": deviation, "probe": probe}
+    options = {"marks": marks, "num_primary": primary, "deviation": deviation, "absgrad": absgrad}
     return list(blending.composite(splats, channels, bins, **options))
 
 
@@ -193,19 +193,19 @@ def check_composite(splats: Splats, glass: int, mean: bool | None, size: Size) -
         # Where one splat alone is blended, it lies at the mean, and rounding decides on which side.
         everywhere = Deviation(3, torch.ones_like(where), mean)
         where = where * (blended(splats, channels, marks, None, everywhere, False, size)[3].detach() > 1e-6)
-    probe = torch.zeros(cameras, count, 2, dtype=dtype, requires_grad=True)
-    own_splats, own_channels, own_marks, own_probe = map(on_device, (splats, channels, marks, probe))
+    absgrad = torch.zeros(cameras, count, 2, dtype=dtype, requires_grad=True)
+    own_splats, own_channels, own_marks, own_absgrad = map(on_device, (splats, channels, marks, absgrad))
     request = None if mean is None else Deviation(3, where, mean)
     own_request = None if mean is None else Deviation(3, where.to(DEVICE), mean)
     found = blended(
-        own_splats, own_channels, own_marks, own_probe, own_request, (tiles_operation, composite_operation), size
+        own_splats, own_channels, own_marks, own_absgrad, own_request, (tiles_operation, composite_operation), size
     )
-    expected = blended(splats, channels, marks, probe, request, False, size)
+    expected = blended(splats, channels, marks, absgrad, request, False, size)
     for value, want in zip(found, expected, strict=True):
         close(value, want)
     outputs = 3 if mean is None else 4
-    own = [*own_splats[:3], own_channels, own_marks, own_probe]
-    check_gradients(found[:outputs], expected[:outputs], own, [*splats[:3], channels, marks, probe])
+    own = [*own_splats[:3], own_channels, own_marks, own_absgrad]
+    check_gradients(found[:outputs], expected[:outputs], own, [*splats[:3], channels, marks, absgrad])
 
 
 @pytest.mark.parametrize(
@@ -295,7 +295,7 @@ def test_pane_hits(masked: bool, dtype: torch.dtype) -> None:
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_screen_statistics(weight: str, dtype: torch.dtype) -> None:
     cameras, count = 2, many(9, 3000)
-    v_means, v_probe, radii = (draw(cameras, count, 2, seed=seed).to(dtype) for seed in (1, 2, 3))
+    v_means, v_absgrad, radii = (draw(cameras, count, 2, seed=seed).to(dtype) for seed in (1, 2, 3))
     weights = {
         "number": 0.7,
         "scalar": torch.tensor(0.7, dtype=dtype),
@@ -304,7 +304,7 @@ def test_screen_statistics(weight: str, dtype: torch.dtype) -> None:
     expected = Sums(*torch.zeros(3, 2, count, dtype=dtype), torch.zeros(count, dtype=dtype))
     found = on_device(expected)
     for direct in (True, False):
-        views = Views(v_means, v_probe, radii, 40, 30, weights[weight], direct)
+        views = Views(v_means, v_absgrad, radii, 40, 30, weights[weight], direct)
         # In the simulator, tensors on the "device" are the CPU's, whose kernel the operation would take.
         kernels_for("project", DEVICE).add_views(found, on_device(views))
         add_views_in_torch(expected, views)

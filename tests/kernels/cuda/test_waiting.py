@@ -40,7 +40,7 @@ def step(recipe: PlanarRecipe | SplatRecipe, stage: int, scene: Scene, view: Vie
     for _ in range(2):
         waits.places.clear()
         with waits:
-            result = differentiate(chosen, state.scene, view, probed=True)
+            result = differentiate(chosen, state.scene, view, with_absgrad=True)
             update(chosen, state, result.gradients, iterations=100)
             collect(state.statistics, result, view)
     return waits.places
@@ -115,7 +115,9 @@ def test_the_cuda_kernels_wait_where_the_stand_in_says() -> None:
 
 def test_what_is_left_out_on_a_gpu_gives_the_same_statistics(monkeypatch: pytest.MonkeyPatch) -> None:
     def differentiated() -> tuple[dict[str, float], dict[str, Tensor], list[Tensor]]:
-        found = differentiate(PlanarRecipe().stages(seed=0)[2], true_scene(), tiny_capture().train[0], probed=True)
+        found = differentiate(
+            PlanarRecipe().stages(seed=0)[2], true_scene(), tiny_capture().train[0], with_absgrad=True
+        )
         return found.losses, found.gradients, [torch.as_tensor(record.weight) for record, *_ in found.screen]
 
     own = differentiated()
