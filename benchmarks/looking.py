@@ -19,7 +19,7 @@ from benchmarks.methods import doublings, thread_count
 from benchmarks.scene import bench_camera, bench_scene
 from benchmarks.table import Table
 from glassplat.render.planar import Planar
-from glassplat.viewer.drawing import Wish, drawn
+from glassplat.viewer.drawing import Wish, draw_picture
 from glassplat.viewer.render_loop import Picture, RenderLoop, RenderThread
 from glassplat.viewer.server import COARSE_QUALITY, SHARP_QUALITY
 
@@ -97,7 +97,7 @@ class Looker:
 
     def _draw(self, wish: Wish, rows: int) -> Picture:
         self._drawing = wish
-        return drawn(self._scene, self._renderer, wish, rows)
+        return draw_picture(self._scene, self._renderer, wish, rows)
 
     def _show(self, client: int, picture: Picture, is_full: bool) -> None:
         """Packs the picture as viser does."""

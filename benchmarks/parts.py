@@ -22,7 +22,7 @@ from benchmarks.table import Table
 from glassplat.captures.dataset import load_dataset
 from glassplat.cli.train import DEMO_DOWNSCALE, SCENE
 from glassplat.kernels.backend.cpu import Kernel
-from glassplat.methods.recipe import RECIPES, photo_background, recipe_of, settled
+from glassplat.methods.recipe import RECIPES, photo_background, recipe_of, resolve_background
 from glassplat.training.loop import train
 from glassplat.training.messages import Message, StageEntered, StepDone
 from glassplat.training.stage import TrainState
@@ -108,7 +108,7 @@ def main() -> None:
     torch.set_num_threads(1)
     recipe = recipe_of(arguments.method)
     dataset = load_dataset(arguments.data, downscale=arguments.downscale, background=photo_background(recipe))
-    recipe = settled(recipe, dataset)
+    recipe = resolve_background(recipe, dataset)
     state = TrainState(recipe.initialise(dataset), seed=0)
     stages = recipe.stages(state.seed, arguments.iterations)
     costs = costs_of(train(stages, dataset, state, arguments.iterations))

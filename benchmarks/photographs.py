@@ -101,7 +101,7 @@ def measure(folder: Path, memory: float, downscale: float, seconds: float) -> No
     state = TrainState(recipe.initialise(dataset), seed=0)
     begun, told = time.perf_counter(), 0
     first: tuple[int, float, float, float] | None = None
-    with known.spooled(folder), photographs_read(dataset) as check:
+    with known.spool_to(folder), photographs_read(dataset) as check:
         for message in train(recipe.stages(0), dataset, state, 1_000_000):
             check()
             if not isinstance(message, StepDone):

@@ -19,7 +19,7 @@ from benchmarks.timing import clocks_of
 from glassplat.captures.dataset import Dataset, load_dataset
 from glassplat.cli.runs import open_run
 from glassplat.cli.train import SCENE
-from glassplat.methods.recipe import photo_background, settled
+from glassplat.methods.recipe import photo_background, resolve_background
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.training.checkpoint import load_checkpoint
 from glassplat.training.loop import train
@@ -38,7 +38,7 @@ def first_steps(capture: Path) -> Begin:
 
     def begin() -> tuple[Any, Dataset, TrainState, int]:
         dataset = load_dataset(capture, background=photo_background(SplatRecipe()))
-        recipe = settled(SplatRecipe(), dataset)
+        recipe = resolve_background(SplatRecipe(), dataset)
         return recipe, dataset, TrainState(recipe.initialise(dataset), seed=0), ITERATIONS
 
     return begin

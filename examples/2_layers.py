@@ -33,7 +33,7 @@ def main(run: tyro.conf.Positional[Path], output: Path = Path("pictures"), frame
 
     # A camera is where one wants it.
     for index, camera in enumerate(model.orbit(frames)):
-        save(output / f"orbit_{index:03d}.png", model.image(camera.resized(480, 320)))
+        save(output / f"orbit_{index:03d}.png", model.image(camera.resize(480, 320)))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ def main(run: tyro.conf.Positional[Path], output: Path = Path("edited")) -> None
         "without_glass": model.without_glass(),
         "mirror": model.with_mirrors(pane),
         "faint": model.with_reflectance(pane, 0.02),
-        "moved": model.shifted(pane, 0.02 * model.scene.extent).tilted(pane, 5),
+        "moved": model.shift_pane(pane, 0.02 * model.scene.extent).tilt_pane(pane, 5),
     }
     name = next(iter(model.cameras))
     for edit, edited in edits.items():

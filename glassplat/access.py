@@ -49,7 +49,7 @@ class Access:
         Raises:
             RefusedError: the header `Host` is none of `LOCAL_NAMES`, and only this computer is served.
         """
-        if not host or (self._is_local and _split(host)[0] not in LOCAL_NAMES):
+        if not host or (self._is_local and _split_host(host)[0] not in LOCAL_NAMES):
             raise RefusedError(HTTPStatus.FORBIDDEN, "this page is served to this computer only")
 
     def check_origin(self, origin: str | None, host: str) -> None:
@@ -109,10 +109,10 @@ def is_local(host: str) -> bool:
 
 def cookie_name(host: str) -> str:
     """The cookie's name, by the port that the browser sees: it sends the cookies of a host to all its ports."""
-    return f"glassplat_{_split(host)[1] or 80}"
+    return f"glassplat_{_split_host(host)[1] or 80}"
 
 
-def _split(host: str) -> tuple[str, str]:
+def _split_host(host: str) -> tuple[str, str]:
     """Name and port of a header `Host`."""
     name, colon, port = host.lower().rpartition(":")
     return (name, port) if colon and port.isdecimal() and port.isascii() else (host.lower(), "")

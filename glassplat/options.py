@@ -132,7 +132,7 @@ class OptionError(InputError):
     """A value that its field does not take; the name is that of the field, with those of the fields it lies in."""
 
     def __init__(self, name: str, value: Any, expected: str) -> None:
-        super().__init__(f"{name or 'the value'} is {shown(value)}; expected {expected}")
+        super().__init__(f"{name or 'the value'} is {short_repr(value)}; expected {expected}")
         self.name, self.value, self.expected = name, value, expected
 
 
@@ -143,9 +143,9 @@ def check_options(options: Any) -> None:
         InputError: a value is out of range, or values contradict; names the option as it is typed.
     """
     try:
-        checked(type(options), options, "")
+        check_value(type(options), options, "")
     except OptionError as error:
-        raise InputError(f"{as_typed(error.name)} is {shown(error.value)}; expected {error.expected}") from error
+        raise InputError(f"{as_typed(error.name)} is {short_repr(error.value)}; expected {error.expected}") from error
 
 
 def options_from_json(kind: type, value: Any) -> Any:
@@ -154,7 +154,7 @@ def options_from_json(kind: type, value: Any) -> Any:
     Raises:
         InputError: not an object, an unknown field, or a value of a wrong type or out of range; names the field.
     """
-    return checked(kind, value, "")
+    return check_value(kind, value, "")
 
 
 def as_typed(name: str) -> str:
@@ -162,7 +162,7 @@ def as_typed(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
-def checked(hint: Any, value: Any, name: str) -> Any:
+def check_value(hint: Any, value: Any, name: str) -> Any:
     """The value in the type of its annotation, if it is as that demands.
 
     Args:
@@ -173,7 +173,7 @@ def checked(hint: Any, value: Any, name: str) -> Any:
     Raises:
         OptionError: it is not.
     """
-    hint, requirements = unwrapped(hint)
+    hint, requirements = unwrap_annotation(hint)
     result = _in_type(hint, value, name, requirements)
     for requirement in requirements:
         if result is not None and not requirement.allows(result):
@@ -181,7 +181,7 @@ def checked(hint: Any, value: Any, name: str) -> Any:
     return result
 
 
-def unwrapped(hint: Any) -> tuple[Any, tuple[Requirement, ...]]:
+def unwrap_annotation(hint: Any) -> tuple[Any, tuple[Requirement, ...]]:
     """An annotation without its metadata, and what of them is a requirement."""
     if typing.get_origin(hint) is not typing.Annotated:
         return hint, ()
@@ -200,11 +200,13 @@ def _structure(hint: Any) -> str:
     if origin is typing.Literal:
         return f"one of {', '.join(map(str, inner))}"
     if origin in UNIONS:
-        return " or ".join("None" if option is type(None) else expectation(*unwrapped(option)) for option in inner)
+        return " or ".join(
+            "None" if option is type(None) else expectation(*unwrap_annotation(option)) for option in inner
+        )
     if origin is tuple:
         if inner[-1] is ...:
-            return f"any number of values, each {expectation(*unwrapped(inner[0]))}"
-        kinds = dict.fromkeys(expectation(*unwrapped(part)) for part in inner)
+            return f"any number of values, each {expectation(*unwrap_annotation(inner[0]))}"
+        kinds = dict.fromkeys(expectation(*unwrap_annotation(part)) for part in inner)
         return f"{len(inner)} values, " + (
             f"each {next(iter(kinds))}" if len(kinds) == 1 else f"out of: {'; '.join(kinds)}"
         )
@@ -258,7 +260,9 @@ def _fields(kind: type, value: Any, name: str) -> Any:
     missing = [field.name for field in fields(kind) if _is_needed(field) and field.name not in value]
     if missing:
         raise InputError(f"fields {missing} of {name or 'the options'} are missing")
-    values = {key: checked(hints[key], value[key], inner_name(name, key, hints[key])) for key in known if key in value}
+    values = {
+        key: check_value(hints[key], value[key], inner_name(name, key, hints[key])) for key in known if key in value
+    }
     made = kind(**values)
     contradiction = made.contradiction() if hasattr(made, "contradiction") else None
     if contradiction:
@@ -283,13 +287,13 @@ def _alternative(hint: Any, value: Any, name: str) -> Any:
     options = [option for option in typing.get_args(hint) if option is not type(None)]
     if len(options) == 1:
         try:
-            return checked(options[0], value, name)
+            return check_value(options[0], value, name)
         except OptionError as error:
             # Of a field inside of the value there is more to say than of the value.
             raise OptionError(error.name, error.value, f"{error.expected}, or None") from error
     for option in options:
         try:
-            return checked(option, value, name)
+            return check_value(option, value, name)
         except InputError:
             continue
     raise OptionError(name, value, expectation(hint))
@@ -308,7 +312,7 @@ def _tuple(hint: Any, value: Any, name: str) -> tuple[Any, ...]:
         raise OptionError(name, value, _structure(hint))
     kinds = inner[:1] * len(value) if inner[-1] is ... else inner
     try:
-        return tuple(checked(kind, element, name) for kind, element in zip(kinds, value, strict=True))
+        return tuple(check_value(kind, element, name) for kind, element in zip(kinds, value, strict=True))
     except OptionError as error:
         raise OptionError(name, value, _structure(hint)) from error
 
@@ -317,13 +321,13 @@ def _dict(hint: Any, value: Any, name: str) -> dict[Any, Any]:
     keys, values = typing.get_args(hint)
     if not isinstance(value, Mapping):
         raise OptionError(name, value, _structure(hint))
-    return {checked(keys, key, name): checked(values, element, name) for key, element in value.items()}
+    return {check_value(keys, key, name): check_value(values, element, name) for key, element in value.items()}
 
 
 CONTAINERS: dict[Any, Callable[[Any, Any, str], Any]] = {typing.Literal: _literal, tuple: _tuple, dict: _dict}
 
 
-def shown(value: Any) -> str:
+def short_repr(value: Any) -> str:
     """A value for a message, cut short."""
     try:
         text = repr(value) if isinstance(value, str) else str(value)

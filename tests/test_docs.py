@@ -68,7 +68,7 @@ def test_the_readme_shows_how_to_start() -> None:
 
 @pytest.mark.parametrize("arguments", commands("glassplat"), ids=" ".join)
 def test_the_command_line_takes_every_command_shown(arguments: list[str]) -> None:
-    assert type(main.parsed(arguments)).__name__.startswith(main.COMMANDS[arguments[0]].kind)
+    assert type(main.parse_arguments(arguments)).__name__.startswith(main.COMMANDS[arguments[0]].kind)
 
 
 @pytest.mark.parametrize("arguments", commands("make"), ids=" ".join)

@@ -79,7 +79,7 @@ def test_the_commands_of_the_notebook_exist() -> None:
     calls = [shlex.split(line)[1:] for line in lines]
     assert [call[0] for call in calls] == ["--version", "demo", "export"]
     for call in calls[1:]:
-        assert type(main.parsed(call)).__name__.startswith(main.COMMANDS[call[0]].kind)
+        assert type(main.parse_arguments(call)).__name__.startswith(main.COMMANDS[call[0]].kind)
 
 
 def test_the_notebook_shows_layers_of_its_run(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:

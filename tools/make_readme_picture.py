@@ -16,8 +16,8 @@ from typing import Any
 
 from glassplat.cli.runs import open_run
 from glassplat.evaluate.evaluate import timed_render
-from glassplat.evaluate.metrics import quantized
-from glassplat.evaluate.report import TITLE_HEIGHT, Panel, composed
+from glassplat.evaluate.metrics import quantize
+from glassplat.evaluate.report import TITLE_HEIGHT, Panel, compose_sheet
 from glassplat.files.images import write_image
 from glassplat.render.layers import layer_image
 
@@ -57,11 +57,11 @@ def main() -> None:
     if view is None:
         raise SystemExit(f"no test view {arguments.view!r}; there are {[v.name for v in stored.dataset.test]}")
     frame, _ = timed_render(stored.renderer, stored.scene, view)
-    panels = [Panel("photograph", view.photo), Panel("render", quantized(frame.rgb))]
+    panels = [Panel("photograph", view.photo), Panel("render", quantize(frame.rgb))]
     for layer in (layer for layer in PARTS if layer in frame.layers):
-        panels.append(Panel(PARTS[layer], quantized(layer_image(frame, layer))))
+        panels.append(Panel(PARTS[layer], quantize(layer_image(frame, layer))))
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    write_image(arguments.output, composed([panels], "", "")[TITLE_HEIGHT:])
+    write_image(arguments.output, compose_sheet([panels], "", "")[TITLE_HEIGHT:])
 
 
 if __name__ == "__main__":

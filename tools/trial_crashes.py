@@ -291,7 +291,7 @@ def save_marks(room: Path, log: Path) -> None:
     with log.open("w") as lines:
         for number in range(20):
             place = float(100 * int(log.name[-1]) + number)
-            known = session.described()
+            known = session.describe()
             label = next(
                 label for label in range(1, 65) if label not in [p["label"] for p in known["document"]["panes"]]
             )

@@ -150,7 +150,7 @@ def training(draw: random.Random) -> tuple[str, Callable[[], None]]:
     points = tiny_capture().points
     if kind == "8x8":
         views = [
-            changed(view, camera=view.camera.resized(8, 8), photo=view.photo[:8, :8].contiguous()) for view in views
+            changed(view, camera=view.camera.resize(8, 8), photo=view.photo[:8, :8].contiguous()) for view in views
         ]
     elif kind == "one":
         views = views[:1]

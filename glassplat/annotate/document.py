@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from glassplat.annotate.fit import Marks, Shape
-from glassplat.files.records import ByName, Choice, Field, Items, Number, Optional, Whole, checked, read_json
+from glassplat.files.records import ByName, Choice, Field, Items, Number, Optional, Whole, check_fields, read_json
 from glassplat.files.writing import atomic_write
 from glassplat.scene.camera import NumpyCamera
 
@@ -41,7 +41,7 @@ class Record:
 
     def read(self, value: Any, where: str) -> dict[str, Any]:
         """The object's fields."""
-        return checked(value, self.fields, where)
+        return check_fields(value, self.fields, where)
 
 
 STROKE = Record(
@@ -98,8 +98,8 @@ class MarkedPane:
 
     def marks(self, numbers: Mapping[str, int]) -> Marks:
         """Its corners and edges by the numbers of views; those in photographs that are gone are left out."""
-        corners = [_numbered(places, numbers) for places in self.corners]
-        edges = [_numbered(places, numbers) for places in self.edges[: len(corners)]]
+        corners = [_number_places(places, numbers) for places in self.corners]
+        edges = [_number_places(places, numbers) for places in self.edges[: len(corners)]]
         return Marks(corners, edges)
 
     def views(self) -> set[str]:
@@ -108,7 +108,7 @@ class MarkedPane:
         return marked | {name for name, strokes in self.strokes.items() if strokes}
 
 
-def _numbered(places: Mapping[str, Any], numbers: Mapping[str, int]) -> dict[int, Any]:
+def _number_places(places: Mapping[str, Any], numbers: Mapping[str, int]) -> dict[int, Any]:
     return {numbers[name]: np.array(place, dtype=np.float64) for name, place in places.items() if name in numbers}
 
 
@@ -118,7 +118,7 @@ def parsed_document(value: Any, where: str) -> tuple[MarkedPane, ...]:
     Raises:
         ValueError: it is no such document, or larger than anybody marks; names `where` it came from.
     """
-    panes = tuple(_pane(entry) for entry in checked(value, DOCUMENT, where)["panes"])
+    panes = tuple(_pane(entry) for entry in check_fields(value, DOCUMENT, where)["panes"])
     labels = [pane.label for pane in panes]
     if len(set(labels)) != len(labels):
         raise ValueError(f"{where} has the labels {labels}; expected every label once")
@@ -163,7 +163,7 @@ def version_of(value: Any) -> str:
 
 
 @contextmanager
-def held(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path) -> Iterator[None]:
     """Keeps other programs from saving marks of a capture meanwhile, where its file system has locks."""
     try:
         import fcntl
@@ -215,7 +215,7 @@ def _before_camera(points: Array) -> Array:
     return np.array(kept).reshape(-1, 3)
 
 
-def filled(outline: Array, size: tuple[int, int]) -> Mask:
+def fill_polygon(outline: Array, size: tuple[int, int]) -> Mask:
     """[H, W] the pixels whose centres a polygon [P, 2] holds; `size` is width and height."""
     width, height = size
     if len(outline) < 3:
@@ -248,16 +248,16 @@ def with_strokes(mask: Mask, strokes: Sequence[Stroke]) -> Mask:
     """A mask after its strokes: cut takes pixels out, keep brings back those that the mask had at first."""
     found = mask.copy()
     for stroke in strokes:
-        covered = painted(stroke, (mask.shape[1], mask.shape[0]))
+        covered = rasterise_stroke(stroke, (mask.shape[1], mask.shape[0]))
         found = found & ~covered if stroke.effect == "cut" else found | (covered & mask)
     return found
 
 
-def painted(stroke: Stroke, size: tuple[int, int]) -> Mask:
+def rasterise_stroke(stroke: Stroke, size: tuple[int, int]) -> Mask:
     """[H, W] what a stroke covers."""
     places = np.array(stroke.points, dtype=np.float64).reshape(-1, 2)
     if stroke.kind == "polygon":
-        return filled(places, size)
+        return fill_polygon(places, size)
     picture = Image.new("1", size)
     pencil = ImageDraw.Draw(picture)
     path = [tuple(place) for place in np.clip(places, -FARTHEST_OUTSIDE, FARTHEST_OUTSIDE)]

@@ -35,7 +35,7 @@ class PaneShape(Protocol):
         """[K, 3] in the world, in order round the outline."""
         ...
 
-    def stepped(self, step: Array) -> PaneShape:
+    def apply_step(self, step: Array) -> PaneShape:
         """The shape after a step."""
         ...
 
@@ -62,10 +62,10 @@ class RectanglePane:
         """[4, 3]."""
         return np.asarray(self.center + (RECTANGLE * self.half_sizes) @ self.axes[:2])
 
-    def stepped(self, step: Array) -> RectanglePane:
+    def apply_step(self, step: Array) -> RectanglePane:
         """Shifts are in units of the longer half side, sides grow by factors."""
         return RectanglePane(
-            axes=_turned(self.axes, step[:3]),
+            axes=_turn_axes(self.axes, step[:3]),
             center=self.center + self.half_sizes.max() * step[3:6] @ self.axes,
             half_sizes=self.half_sizes * np.exp(np.clip(step[6:8], -1, 1)),
         )
@@ -94,12 +94,12 @@ class PolygonPane:
         """[K, 3]."""
         return np.asarray(self.center + self.places @ self.axes[:2])
 
-    def stepped(self, step: Array) -> PolygonPane:
+    def apply_step(self, step: Array) -> PolygonPane:
         """Lengths are in units of the polygon's reach."""
         reach = float(np.linalg.norm(self.places, axis=1).max())
         return replace(
             self,
-            axes=_turned(self.axes, np.append(step[:2], 0.0)),
+            axes=_turn_axes(self.axes, np.append(step[:2], 0.0)),
             center=self.center + reach * step[2] * self.axes[2],
             places=self.places + reach * step[3:].reshape(-1, 2),
         )
@@ -133,7 +133,7 @@ def rectangle_pane(polygon: PolygonPane) -> RectanglePane:
     return RectanglePane(axes, polygon.center + polygon.places.mean(axis=0) @ polygon.axes[:2], half_sizes)
 
 
-def _turned(axes: Array, angles: Array) -> Array:
+def _turn_axes(axes: Array, angles: Array) -> Array:
     """Axes turned about themselves by small angles, radians."""
     from scipy.spatial.transform import Rotation
 
@@ -203,7 +203,7 @@ def tilt_deviation(information: Array) -> float:
     return 90.0 if least <= np.degrees(1) ** -2 * 1e-4 else min(float(np.degrees(1 / np.sqrt(least))), 90.0)
 
 
-def fitted_pane(marks: Marks, cameras: Sequence[NumpyCamera], shape: Shape) -> PaneFit:
+def fit_pane(marks: Marks, cameras: Sequence[NumpyCamera], shape: Shape) -> PaneFit:
     """The outline that lies closest to all marks; single marks that are far off count little.
 
     Args:
@@ -214,7 +214,7 @@ def fitted_pane(marks: Marks, cameras: Sequence[NumpyCamera], shape: Shape) -> P
     Raises:
         TooFewMarksError: a corner of too few is known from two places; the message says what to mark.
     """
-    fits = [_fitted(marks, cameras, start) for start in _starts(marks, cameras, shape)]
+    fits = [_fit_from(marks, cameras, start) for start in _starts(marks, cameras, shape)]
     _, fitted = min(fits, key=lambda fit: fit[0])
     away = mark_residuals(marks, cameras, fitted)
     jacobian = _jacobian(marks, cameras, fitted)
@@ -225,18 +225,18 @@ def fitted_pane(marks: Marks, cameras: Sequence[NumpyCamera], shape: Shape) -> P
     return PaneFit(fitted, error, largest, jacobian.T @ jacobian / spread**2)
 
 
-def _fitted(marks: Marks, cameras: Sequence[NumpyCamera], begun: PaneShape) -> tuple[float, PaneShape]:
+def _fit_from(marks: Marks, cameras: Sequence[NumpyCamera], begun: PaneShape) -> tuple[float, PaneShape]:
     """Fit a shape to marks from where it begins; also return the residuals."""
     from scipy.optimize import least_squares
 
     def residuals(step: Array) -> Array:
-        return mark_residuals(marks, cameras, begun.stepped(step))
+        return mark_residuals(marks, cameras, begun.apply_step(step))
 
     step, cost = np.zeros(begun.freedom), np.inf
     for loss in ("soft_l1", "cauchy"):  # The second lets go of what is far off, and would stay there if it came first.
         found = least_squares(residuals, step, loss=loss, f_scale=OUTLIER, x_scale="jac", max_nfev=100)
         step, cost = found.x, float(found.cost)
-    return cost, begun.stepped(step)
+    return cost, begun.apply_step(step)
 
 
 def mark_residuals(marks: Marks, cameras: Sequence[NumpyCamera], shape: PaneShape) -> Array:
@@ -262,7 +262,7 @@ def _jacobian(marks: Marks, cameras: Sequence[NumpyCamera], shape: PaneShape) ->
     columns = []
     for axis in np.eye(shape.freedom):
         ahead, behind = (
-            mark_residuals(marks, cameras, shape.stepped(sign * DERIVATIVE_STEP * axis)) for sign in (1.0, -1.0)
+            mark_residuals(marks, cameras, shape.apply_step(sign * DERIVATIVE_STEP * axis)) for sign in (1.0, -1.0)
         )
         columns.append((ahead - behind) / (2 * DERIVATIVE_STEP))
     return np.stack(columns, axis=1)
@@ -304,12 +304,12 @@ def _starts(marks: Marks, cameras: Sequence[NumpyCamera], shape: Shape) -> list[
     starts = [polygon_pane(_first_corners(marks, cameras))]
     firm, loose = _seen_again(marks.edges)
     if loose:
-        pane = fitted_pane(replace(marks, edges=firm), cameras, shape).shape
+        pane = fit_pane(replace(marks, edges=firm), cameras, shape).shape
         starts.append(polygon_pane(_cut_by_edges(marks, cameras, pane, loose)))
     firm, loose = _seen_again(marks.corners)
     if loose:
         with suppress(ValueError):  # Without these corners, or stretched to a wrong one, it may be no pane.
-            pane = fitted_pane(replace(marks, corners=firm), cameras, shape).shape
+            pane = fit_pane(replace(marks, corners=firm), cameras, shape).shape
             starts.append(polygon_pane(_stretched_to_corners(marks, cameras, pane, loose)))
     return [rectangle_pane(start) if shape == "rectangle" and len(marks.corners) == 4 else start for start in starts]
 
@@ -378,7 +378,7 @@ def _first_corners(marks: Marks, cameras: Sequence[NumpyCamera]) -> Array:
     """
     lines = [_edge_line(places, cameras) for places in marks.edges] + [None] * (len(marks.corners) - len(marks.edges))
     known = [
-        _triangulated(places, cameras) if len(places) > 1 else _meeting(lines[number - 1], lines[number])
+        _triangulate(places, cameras) if len(places) > 1 else _meeting(lines[number - 1], lines[number])
         for number, places in enumerate(marks.corners)
     ]
     points = [point for point in known if point is not None]
@@ -404,7 +404,7 @@ def _missing(marks: Marks, known: int) -> str:
     )
 
 
-def _triangulated(places: Mapping[int, Array], cameras: Sequence[NumpyCamera]) -> Array | None:
+def _triangulate(places: Mapping[int, Array], cameras: Sequence[NumpyCamera]) -> Array | None:
     """[3] the point nearest to all sight lines; None where they are too parallel."""
     centers = np.stack([cameras[view].center for view in places])
     rays = np.stack([cameras[view].rays(np.asarray(place)) for view, place in places.items()])

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from glassplat.annotate.document import MarkedPane, depths, filled, seen_outline, with_strokes
+from glassplat.annotate.document import MarkedPane, depths, fill_polygon, seen_outline, with_strokes
 from glassplat.annotate.fit import PaneFit
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.masks import PANE_FOLDER, PLANES
@@ -39,7 +39,7 @@ SMALLEST = 0.01
 """Of the outline's area: smaller pieces are specks."""
 
 
-def grabbed(photo: NDArray[np.uint8], outline: Array) -> list[Array]:
+def grab_outlines(photo: NDArray[np.uint8], outline: Array) -> list[Array]:
     """Outlines of the thing within a rough one.
 
     Args:
@@ -58,7 +58,7 @@ def grabbed(photo: NDArray[np.uint8], outline: Array) -> list[Array]:
     scale = min(1.0, LONGEST / max(part.shape[:2]))
     small = cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     factor = np.array([small.shape[1], small.shape[0]]) / (high - low)
-    inside = filled((outline - low) * factor, (small.shape[1], small.shape[0]))
+    inside = fill_polygon((outline - low) * factor, (small.shape[1], small.shape[0]))
     if not inside.any():
         raise InputError("the outline holds nothing of the photograph; draw it round what stands before the pane")
     if inside.all():
@@ -177,7 +177,7 @@ def pane_labels(name: str, camera: NumpyCamera, panes: Solved) -> Labels:
     labels, nearest = np.zeros((height, width), dtype=np.uint8), np.full((height, width), np.inf)
     for pane, fit in panes:
         corners = fit.shape.corners()
-        outline = filled(seen_outline(camera, corners), (width, height))
+        outline = fill_polygon(seen_outline(camera, corners), (width, height))
         depth = np.where(outline, depths(camera, corners), np.inf)
         first = depth < nearest
         shown = with_strokes(outline, pane.strokes.get(name, ()))

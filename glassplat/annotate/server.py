@@ -113,7 +113,7 @@ class PageHandler(BaseHTTPRequestHandler):
             name, kind = PAGE_FILES[path]
             self._send((resources.files("glassplat.annotate") / "page" / name).read_bytes(), kind)
         elif path == "/capture":
-            self._send_json(self.server.session.described())
+            self._send_json(self.server.session.describe())
         elif path.startswith("/photo/"):
             self._send_picture(path.removeprefix("/photo/"), SHOWN)
         elif path.startswith("/thumbnail/"):

@@ -18,20 +18,20 @@ from glassplat.annotate.document import (
     MOST_PANES,
     PLACE,
     MarkedPane,
-    filled,
-    held,
+    fill_polygon,
+    lock_folder,
     parsed_document,
     read_document,
     seen_outline,
     version_of,
     write_document,
 )
-from glassplat.annotate.fit import Marks, PaneFit, TooFewMarksError, corner_information, fitted_pane, tilt_deviation
-from glassplat.annotate.results import check_own_masks, grabbed, write_results
+from glassplat.annotate.fit import Marks, PaneFit, TooFewMarksError, corner_information, fit_pane, tilt_deviation
+from glassplat.annotate.results import check_own_masks, grab_outlines, write_results
 from glassplat.captures.dataset import Dataset, load_dataset
 from glassplat.captures.view import View
 from glassplat.errors import InputError, input_checked
-from glassplat.files.records import Field, Items, Text, Whole, checked
+from glassplat.files.records import Field, Items, Text, Whole, check_fields
 from glassplat.files.writing import check_folder
 from glassplat.scene.camera import NumpyCamera
 
@@ -61,7 +61,7 @@ def second_views(outline: Array, view: int, cameras: Sequence[NumpyCamera], poin
     The measured points [P, 3] inside of the outline tell, wherever they lie.
     """
     camera = cameras[view]
-    inside = filled(outline, (int(camera.size[0]), int(camera.size[1])))
+    inside = fill_polygon(outline, (int(camera.size[0]), int(camera.size[1])))
     held = camera.holds(points)
     column, row = np.floor(camera.project(points[held])).astype(np.int64).T
     through = points[held][inside[row, column]]
@@ -104,7 +104,7 @@ class Merged(NamedTuple):
     renamed: dict[int, int]
 
 
-def merged(base: Any, theirs: Any, ours: Any) -> Merged:
+def merge_documents(base: Any, theirs: Any, ours: Any) -> Merged:
     """Puts together what two sides have made of one document.
 
     A pane that one side has changed or added is as that side has it. One that both have changed stays as they
@@ -214,7 +214,7 @@ class Session:
         """Marks as JSON."""
         return self._document
 
-    def described(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, Any]:
         """The capture for the page."""
         return {
             "name": self.root.resolve().name,
@@ -257,15 +257,15 @@ class Session:
             ValueError: it is no document.
             OSError: it cannot be saved.
         """
-        fields = checked(asked, {"version": Text()}, "what the page saves")
+        fields = check_fields(asked, {"version": Text()}, "what the page saves")
         document = asked.get("document")
         panes = parsed_document(document, "the document of the page")
-        with self._lock, held(self.root):
+        with self._lock, lock_folder(self.root):
             there = read_document(self.root)
             if version_of(there) != fields["version"]:
                 base = self._versions.get(fields["version"], {"version": 1, "panes": []})
                 self._remember(there)
-                raise ChangedElsewhereError(merged(base, there, document), version_of(there))
+                raise ChangedElsewhereError(merge_documents(base, there, document), version_of(there))
             write_document(self.root, document)
             self._remember(document)
         return {"panes": [self._answer(self.solve(pane)) for pane in panes], "version": version_of(document)}
@@ -290,11 +290,11 @@ class Session:
             ValueError: it is no such outline.
             InputError: OpenCV is missing, or the outline holds nothing of the photograph.
         """
-        fields = checked(asked, GRABBED, "the outline of the page")
+        fields = check_fields(asked, GRABBED, "the outline of the page")
         if fields["view"] >= len(self.views) or not 3 <= len(fields["points"]) <= MOST_GRABBED:
             raise ValueError(f"expected 3 to {MOST_GRABBED} points in one of {len(self.views)} views")
         photo = np.asarray(self.views[fields["view"]].read_photo().numpy())
-        found = grabbed(photo, np.array(fields["points"], dtype=np.float64))
+        found = grab_outlines(photo, np.array(fields["points"], dtype=np.float64))
         return {"outlines": [np.round(outline, 2).tolist() for outline in found]}
 
     def solve(self, pane: MarkedPane) -> SolvedPane:
@@ -303,7 +303,7 @@ class Session:
         if len(marks.corners) < 3 or not marks.views():
             return SolvedPane(pane, None, "mark the corners, one after the other round the pane")
         try:
-            return SolvedPane(pane, fitted_pane(marks, self.cameras, pane.shape))
+            return SolvedPane(pane, fit_pane(marks, self.cameras, pane.shape))
         except TooFewMarksError as error:
             return SolvedPane(pane, None, str(error))
         except ValueError as error:
@@ -355,7 +355,7 @@ class Session:
         """A warning about a fit, or nothing."""
         worst = max(fit.errors, key=fit.errors.__getitem__)
         if pane.shape == "rectangle" and len(marks.corners) == 4 and fit.error > 2:
-            free = fitted_pane(marks, self.cameras, "polygon")
+            free = fit_pane(marks, self.cameras, "polygon")
             if fit.error > POOR_RECTANGLE * max(free.error, 1.0):
                 return (
                     f"the corners do not form a rectangle ({fit.error:.1f} pixels off, {free.error:.1f} without that "

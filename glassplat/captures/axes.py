@@ -79,7 +79,7 @@ def evidence_of_points(cameras: Sequence[Camera], points: Tensor) -> AxesEvidenc
     some_points = points[_indices(len(points), MOST_POINTS)].double()
     return AxesEvidence(
         _share_of_points(some_cameras, some_points),
-        _share_of_points([flipped(camera) for camera in some_cameras], some_points),
+        _share_of_points([flip_axes(camera) for camera in some_cameras], some_points),
         "points",
     )
 
@@ -92,7 +92,7 @@ def evidence_of_masks(views: Sequence[View]) -> AxesEvidence | None:
     """
     annotated = _spread([view for view in views if view.is_annotated], MOST_MASKS)
     shares = [
-        (len(sightings), _share_of_masks(sightings), _share_of_masks([_turned(s) for s in sightings]))
+        (len(sightings), _share_of_masks(sightings), _share_of_masks([_flip_sighting(s) for s in sightings]))
         for sightings in _sightings(annotated).values()
         if len(sightings) >= LEAST_SIGHTINGS
     ]
@@ -107,7 +107,7 @@ def evidence_of_masks(views: Sequence[View]) -> AxesEvidence | None:
     )
 
 
-def flipped(camera: Camera) -> Camera:
+def flip_axes(camera: Camera) -> Camera:
     """The same camera with y and z turned round: what OpenGL axes are to OpenCV axes, and back."""
     turn = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=camera.cam_from_world.dtype))
     return replace(camera, cam_from_world=turn @ camera.cam_from_world)
@@ -148,8 +148,8 @@ def _sightings(views: Sequence[View]) -> dict[int, list[_Sighting]]:
     return found
 
 
-def _turned(sighting: _Sighting) -> _Sighting:
-    return sighting._replace(camera=flipped(sighting.camera))
+def _flip_sighting(sighting: _Sighting) -> _Sighting:
+    return sighting._replace(camera=flip_axes(sighting.camera))
 
 
 def _share_of_masks(sightings: Sequence[_Sighting]) -> float | None:

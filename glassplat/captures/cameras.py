@@ -140,7 +140,7 @@ class Lens:
         """Along x and y, pixels; of a panorama there are none."""
         return self.parameters[0], self.parameters[PARAMETER_COUNTS[self.model].focal - 1]
 
-    def rescaled(self, width: int, height: int) -> Lens:
+    def rescale(self, width: int, height: int) -> Lens:
         """The lens of the same photograph at another size."""
         scale_x, scale_y = width / self.width, height / self.height
         counts, scaled = PARAMETER_COUNTS[self.model], list(self.parameters)
@@ -180,7 +180,7 @@ class PixelMap:
     def photo(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """[H, W, 3] of the file to [height, width, 3]; bilinear undistortion, area-averaging reduction."""
         if self.lens is not None:
-            pixels = undistorted(pixels, self.lens.as_colmap())
+            pixels = undistort(pixels, self.lens.as_colmap())
         return area_resize(pixels, self.width, self.height)
 
     def labels(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -275,7 +275,7 @@ def lens_for_image(lens: Lens, size: tuple[int, int], name: str) -> Lens:
             f"{name} is {width}x{height} pixels large, but its camera {lens.width}x{lens.height}; expected the "
             "same size or a scaled copy; photographs rotated or cropped after calibration cannot be used"
         )
-    return lens.rescaled(width, height)
+    return lens.rescale(width, height)
 
 
 def _skew(expected: float, side: int, rounding: float) -> float:
@@ -314,7 +314,7 @@ def _is_pinhole(model: str, parameters: tuple[float, ...]) -> bool:
     return model in PERSPECTIVE and not any(parameters[counts.focal + counts.middle :])
 
 
-def undistorted(pixels: NDArray[np.uint8], lens: Any) -> NDArray[np.uint8]:
+def undistort(pixels: NDArray[np.uint8], lens: Any) -> NDArray[np.uint8]:
     """[H, W, 3] as the pinhole camera of `pycolmap.undistort_camera` shows it, which may have another size.
 
     Args:

@@ -23,7 +23,7 @@ from glassplat.captures.cameras import MODEL_OF_ID, PARAMETER_COUNTS, Lens, make
 from glassplat.captures.capture import Capture, RawPoints, Shot
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.records import reading
-from glassplat.options import shown
+from glassplat.options import short_repr
 
 UNIT_TOLERANCE = 1e-2
 """How far the length of a quaternion may be from one, as rounding in a text file."""
@@ -191,7 +191,7 @@ def _at_least(count: int, fields: list[str]) -> list[str]:
     """
     if len(fields) < count:
         line = " ".join(fields)
-        raise ValueError(f"the line {shown(line)}; expected at least {count} values, separated by spaces")
+        raise ValueError(f"the line {short_repr(line)}; expected at least {count} values, separated by spaces")
     return fields
 
 

@@ -195,7 +195,7 @@ def dataset_of(
         )
         for shot in shots
     ]
-    train, test, split = _split(_in_one_memory([p.view for p in prepared], memory), capture)
+    train, test, split = _split_views(_in_one_memory([p.view for p in prepared], memory), capture)
     points, point_warnings = _points(capture, train)
     extent = _extent(train)
     measured = capture.points is not None
@@ -252,7 +252,7 @@ def _any_transparent(shots: Sequence[Shot]) -> bool:
         return any(is_transparent(shot.image_path) for shot in shots)
 
 
-def _split(views: list[View], capture: Capture) -> tuple[tuple[View, ...], tuple[View, ...], str]:
+def _split_views(views: list[View], capture: Capture) -> tuple[tuple[View, ...], tuple[View, ...], str]:
     """Training views, test views (both by name) and how they were chosen."""
     if capture.test_shots is None:
         held_out = {view.name for view in views[::TEST_EVERY]}
@@ -335,7 +335,7 @@ def with_corrected_cameras(dataset: Dataset, scene: Scene) -> Dataset:
         return dataset
 
     def corrected(view: View) -> View:
-        camera = scene.poses.interpolated(view.name).corrected(view.camera, view.name, scene.extent)
+        camera = scene.poses.interpolate(view.name).correct(view.camera, view.name, scene.extent)
         return view if camera is view.camera else view.with_camera(detached_camera(camera))
 
     return replace(dataset, train=tuple(map(corrected, dataset.train)), test=tuple(map(corrected, dataset.test)))
@@ -359,7 +359,7 @@ def photographs_read(dataset: Dataset) -> Iterator[Callable[[], None]]:
     """
     stop = Event()
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="photographs") as pool:
-        reading = pool.submit(_read, dataset, stop)
+        reading = pool.submit(_read_photographs, dataset, stop)
 
         def check() -> None:
             if reading.done():
@@ -371,7 +371,7 @@ def photographs_read(dataset: Dataset) -> Iterator[Callable[[], None]]:
             stop.set()
 
 
-def _read(dataset: Dataset, stop: Event) -> None:
+def _read_photographs(dataset: Dataset, stop: Event) -> None:
     for view in dataset.test:
         if stop.is_set():
             return

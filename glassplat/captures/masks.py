@@ -259,7 +259,7 @@ def find_masks(
     """
     ignored = find_ignored(root, photographs)
     if panes is not None:
-        return CaptureMasks(_known_panes(root, panes, polarity), _joined(kept or {}, ignored))
+        return CaptureMasks(_known_panes(root, panes, polarity), _join_masks(kept or {}, ignored))
     paths = _match(root / PANE_FOLDER, photographs)
     if not paths and (root / PANE_FOLDER).is_dir():
         raise InputError(f"{root / PANE_FOLDER} holds no mask images; add masks, or remove the folder")
@@ -271,10 +271,10 @@ def find_masks(
         found = _understood(root, masks, polarity, read_mask_values)
         renaming = f"{earlier} {next(iter(masks.values())).parent} is read as panes; rename it to {PANE_FOLDER}/."
         warnings = (renaming, *warnings)
-        return CaptureMasks(replace(found, warnings=(*warnings, *found.warnings)), _joined(kept or {}, ignored))
+        return CaptureMasks(replace(found, warnings=(*warnings, *found.warnings)), _join_masks(kept or {}, ignored))
     found = _understood(root, paths, polarity, read_mask_values) if paths else MaskSet({})
     return CaptureMasks(
-        replace(found, warnings=(*found.warnings, *warnings)), _joined({**masks, **(kept or {})}, ignored)
+        replace(found, warnings=(*found.warnings, *warnings)), _join_masks({**masks, **(kept or {})}, ignored)
     )
 
 
@@ -341,7 +341,7 @@ def _brightness(path: Path) -> NDArray[np.uint8]:
         return np.array(image.convert("RGB").convert("L") if image.mode == "P" else image.convert("L"))
 
 
-def _joined(kept: Mapping[str, Path], ignored: Mapping[str, PaneMask]) -> dict[str, tuple[IgnoredMask, ...]]:
+def _join_masks(kept: Mapping[str, Path], ignored: Mapping[str, PaneMask]) -> dict[str, tuple[IgnoredMask, ...]]:
     """All masks of what is left out, by name of the photograph."""
     joined: dict[str, tuple[IgnoredMask, ...]] = {name: (KeepMask(path),) for name, path in kept.items()}
     for name, mask in ignored.items():

@@ -202,12 +202,12 @@ def _with_fitting_axes(capture: Capture, evidence: AxesEvidence | None) -> Captu
     )
     return replace(
         capture,
-        shots=_turned(capture.shots),
-        test_shots=None if capture.test_shots is None else _turned(capture.test_shots),
+        shots=_flip_axes(capture.shots),
+        test_shots=None if capture.test_shots is None else _flip_axes(capture.test_shots),
         warnings=(*capture.warnings, turned),
     )
 
 
-def _turned(shots: tuple[Shot, ...]) -> tuple[Shot, ...]:
+def _flip_axes(shots: tuple[Shot, ...]) -> tuple[Shot, ...]:
     """The photographs with the y and z axes of their cameras turned round."""
     return tuple(replace(shot, cam_from_world=OPENCV_FROM_OPENGL @ shot.cam_from_world) for shot in shots)

@@ -19,7 +19,18 @@ from glassplat.captures.capture import Capture, RawPoints, Shot
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.images import IMAGE_SUFFIXES, image_size
 from glassplat.files.ply_table import read_table
-from glassplat.files.records import COORDINATE, Choice, Field, Flag, Items, Number, Optional, Text, checked, read_json
+from glassplat.files.records import (
+    COORDINATE,
+    Choice,
+    Field,
+    Flag,
+    Items,
+    Number,
+    Optional,
+    Text,
+    check_fields,
+    read_json,
+)
 
 if TYPE_CHECKING:
     from glassplat.scene.camera import Camera
@@ -94,7 +105,7 @@ def lens_from_settings(settings: Mapping[str, Any], image_path: Path, name: str)
         InputError: no focal length, a value that is no number, an unknown camera model; names the photograph.
     """
     with input_checked():
-        found = checked(settings, LENS, f"the lens of {name}")
+        found = check_fields(settings, LENS, f"the lens of {name}")
         width, height = _size(found, image_path)
         fx, fy = _focal_lengths(found, width, height, name)
     model = found["camera_model"] or (FISHEYE if found["is_fisheye"] else "OPENCV")
@@ -173,8 +184,8 @@ def read_settings(path: Path) -> dict[str, Any]:
         if not isinstance(frames, list) or not frames:
             raise ValueError(f"{path} lists no frames; expected a list `frames` of at least one photograph")
         for index, frame in enumerate(frames, start=1):
-            checked(frame, FRAME, f"frame {index} of {path}")
-        checked(settings, FILE, str(path))
+            check_fields(frame, FRAME, f"frame {index} of {path}")
+        check_fields(settings, FILE, str(path))
     return settings
 
 

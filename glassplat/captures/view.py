@@ -46,7 +46,7 @@ from glassplat.captures.masks import IgnoredMask, PaneMask
 from glassplat.errors import InputError, input_checked
 from glassplat.files.images import image_size, read_image, read_image_float
 from glassplat.options import WHITE, Rgb
-from glassplat.scene.camera import Camera, moved
+from glassplat.scene.camera import Camera, to_device
 
 LEAST_SIDE = 8
 """Pixels along the side of a photograph that was reduced; below that are no edges to tell panes or details by."""
@@ -196,7 +196,7 @@ class Memory:
             InputError: they cannot be read.
         """
         with self._lock:
-            found = self._found(source)
+            found = self._look_up(source)
             if found is not None:
                 return found
             future = self._pending.get(source)
@@ -210,13 +210,13 @@ class Memory:
     def read_ahead(self, source: Source) -> None:
         """Has a thread read what will be asked for soon; what fails is read again, and raised, when it is asked for."""
         with self._lock:
-            if source in self._pending or self._found(source) is not None:
+            if source in self._pending or self._look_up(source) is not None:
                 return
             future = self._pending[source] = Future()
         reading_threads().submit(self._read, source, future)
 
     @contextmanager
-    def spooled(self, folder: Path) -> Iterator[None]:
+    def spool_to(self, folder: Path) -> Iterator[None]:
         """As long as the context lasts, what has no room and was costly to read is kept on disk in a folder."""
         self._spool = spool = Spool(folder)
         try:
@@ -225,7 +225,7 @@ class Memory:
             self._spool = None
             spool.close()
 
-    def _found(self, source: Source) -> Tensor | None:
+    def _look_up(self, source: Source) -> Tensor | None:
         if source in self._resident:
             return self._resident[source]
         if source in self._passing:
@@ -450,7 +450,7 @@ def prepare_view(
     small = _reduced_size(pinhole, options.downscale, shot.name)
     pixel_map = PixelMap(lens if distorted else None, *small)
     pose = torch.from_numpy(rigid_pose(shot.cam_from_world, shot.name)).float()
-    camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, pinhole.width, pinhole.height).resized(*small)
+    camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, pinhole.width, pinhole.height).resize(*small)
     view = View(
         name=shot.name,
         camera=camera,
@@ -635,5 +635,5 @@ def with_ignored_right(image: Tensor, view: View) -> Tensor:
     """An image [H, W, 3] that shows the photograph itself where the view ignores pixels: no error, no gradient."""
     if view.ignored is None:
         return image
-    photo = moved(view.photo, image.device).to(image.dtype) / 255
-    return torch.where(moved(view.ignored, image.device)[..., None], photo, image)
+    photo = to_device(view.photo, image.device).to(image.dtype) / 255
+    return torch.where(to_device(view.ignored, image.device)[..., None], photo, image)

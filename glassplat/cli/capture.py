@@ -59,7 +59,7 @@ class Prepare:
         )
 
     @cached_property
-    def _finished(self) -> threading.Event:
+    def _has_finished(self) -> threading.Event:
         """Set once this command has made the capture; one that is there may be of an earlier command."""
         return threading.Event()
 
@@ -67,7 +67,7 @@ class Prepare:
         """Prepares, with progress, and says what became of the photographs."""
         with WorkProgress(console) as progress:
             report = prepare(self._task(), progress.show, resume=self.resume, force=self.force)
-            self._finished.set()
+            self._has_finished.set()
         for line in report.lines():
             (warn if line.startswith("advice") else say)(console, line)
         from glassplat.prepare.report_page import write_page  # PyTorch, which nothing before needs.
@@ -78,7 +78,7 @@ class Prepare:
 
     def left_behind(self) -> str:
         """Text after an interrupt: the state on disk, and how to go on."""
-        if self._finished.is_set():
+        if self._has_finished.is_set():
             page = f"glassplat info {shell_word(self.output)} --page {shell_word(self.output / PAGE)}"
             return f"the capture in {self.output} is whole; `{page}` writes its report"
         if Workplace(self.output).folder.exists():

@@ -53,7 +53,7 @@ def shell_word(path: object) -> str:
     return quote(str(path))
 
 
-def counted(number: int, noun: str) -> str:
+def count_noun(number: int, noun: str) -> str:
     """A number of things, as in "1 pane" and "2 panes"."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
@@ -191,7 +191,7 @@ def raised_signals(*, is_program: bool = False) -> Iterator[list[Interrupted]]:
         raised.append(Interrupted(number))
         raise raised[-1]
 
-    with _answered(stop, afterwards=signal.SIG_DFL if is_program else None):
+    with _install_handlers(stop, afterwards=signal.SIG_DFL if is_program else None):
         yield raised
 
 
@@ -208,7 +208,7 @@ def immediate_end() -> Iterator[None]:
         os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, f"{stop}\n".encode())
         os._exit(code_of(stop))
 
-    with _answered(end):
+    with _install_handlers(end):
         yield
 
 
@@ -216,14 +216,14 @@ def immediate_end() -> Iterator[None]:
 def held_signals() -> Iterator[None]:
     """Answers signals when the context ends: for imports while something runs that has to be told to end."""
     held: list[int] = []
-    with _answered(lambda number, frame: held.append(number)):
+    with _install_handlers(lambda number, frame: held.append(number)):
         yield
     for number in held[:1]:
         signal.raise_signal(number)
 
 
 @contextmanager
-def _answered(answer: signal._HANDLER, afterwards: signal._HANDLER | None = None) -> Iterator[None]:
+def _install_handlers(answer: signal._HANDLER, afterwards: signal._HANDLER | None = None) -> Iterator[None]:
     """Has the signals answered, but for those that the process was told to ignore, as by `nohup`.
 
     Args:
@@ -316,10 +316,11 @@ def _failure(error: BaseException) -> str:
     if is_one_of(error, FAILURES):
         return str(error)
     if is_one_of(error, GPU_IS_FULL):
-        return f"{quoted(error)}; {REMEDY}, or use --device cpu; the last checkpoint stays"
+        return f"{first_sentence(error)}; {REMEDY}, or use --device cpu; the last checkpoint stays"
     if is_out_of_memory(error):
-        return f"out of memory ({quoted(error) or 'an allocation failed'}); {REMEDY}; the last checkpoint stays"
-    return f"an error that glassplat did not foresee, {type(error).__name__}: {quoted(error)}; {saved_traceback(error)}"
+        return f"out of memory ({first_sentence(error) or 'an allocation failed'}); {REMEDY}; the last checkpoint stays"
+    said = first_sentence(error)
+    return f"an error that glassplat did not foresee, {type(error).__name__}: {said}; {saved_traceback(error)}"
 
 
 def is_out_of_memory(error: BaseException) -> bool:
@@ -331,7 +332,7 @@ def is_out_of_memory(error: BaseException) -> bool:
     return error.__cause__ is not None and is_out_of_memory(error.__cause__)
 
 
-def quoted(error: BaseException) -> str:
+def first_sentence(error: BaseException) -> str:
     """The first sentence of somebody else's message, which may have many lines."""
     first = (str(error).strip().splitlines() or [""])[0].split(". ")[0].rstrip(".")
     return first if len(first) <= LONGEST_QUOTE else f"{first[:LONGEST_QUOTE]} ..."
@@ -399,7 +400,7 @@ LINE = "loading PyTorch ..."
 
 def import_now(module: str) -> Any:
     """A module of `glassplat` that imports PyTorch, by its dotted name, imported now if it is not there yet."""
-    with _uncollected(), _announced(message_console(stderr=True), module):
+    with _without_garbage_collection(), _announce(message_console(stderr=True), module):
         return importlib.import_module(module)
 
 
@@ -410,7 +411,7 @@ def import_held(module: str) -> Any:
 
 
 @contextmanager
-def _announced(console: Console, module: str) -> Iterator[None]:
+def _announce(console: Console, module: str) -> Iterator[None]:
     """Shows the line meanwhile, where somebody may be watching and the module is not there yet."""
     if module in sys.modules or not console.is_terminal:
         yield
@@ -423,7 +424,7 @@ def _announced(console: Console, module: str) -> Iterator[None]:
 
 
 @contextmanager
-def _uncollected() -> Iterator[None]:
+def _without_garbage_collection() -> Iterator[None]:
     """Keeps Python from looking for garbage among what is imported, now and later: all of it stays to the end."""
     if not gc.isenabled():
         yield

@@ -48,7 +48,7 @@ def remaining_parts(files: CaptureFiles) -> Iterator[Finding]:
     if dataset.measured_points and len(dataset.points) < FEW_POINTS:
         finding.problems.append(f"{len(dataset.points)} points are few; more photographs with more overlap give more")
     yield finding
-    yield _marked(files.root, dataset)
+    yield _describe_panes(files.root, dataset)
     yield _behind(files.root, dataset)
     decoded = Finding()
     describe_broken([view.image_path for view in (*dataset.train, *dataset.test)], decoded)
@@ -70,7 +70,7 @@ def write_capture_page(path: Path, target: Path) -> None:
     write_page(path, target, fitted_planes(dataset, None, PlaneFit()) if marked else None)
 
 
-def _marked(path: Path, dataset: Dataset) -> Finding:
+def _describe_panes(path: Path, dataset: Dataset) -> Finding:
     """Marked panes, and the quality of the marks."""
     finding = Finding()
     if ignoring := sum(view.read_ignored is not None for view in (*dataset.train, *dataset.test)):

@@ -22,7 +22,7 @@ from glassplat.evaluate.evaluate import (
     marked_regions,
     with_aligned_test_views,
 )
-from glassplat.evaluate.metrics import PLANE_COLUMNS, missing_reasons, shown_metrics, written
+from glassplat.evaluate.metrics import PLANE_COLUMNS, format_value, missing_reasons, shown_metrics
 from glassplat.evaluate.report import Report
 from glassplat.methods.planar import fitted_planes
 from glassplat.model.run_directory import write_text
@@ -136,7 +136,7 @@ def results_table(*results: dict) -> Table:
     table = Table("metric", *(r["method"] for r in results))
     metrics = {name: metric for r in results for name, metric in shown_metrics(r).items()}
     for name in dict.fromkeys(name for r in results for name in shown_metrics(r)):
-        table.add_row(name, *(written(r.get(name), metrics[name].pattern) for r in results))
+        table.add_row(name, *(format_value(r.get(name), metrics[name].pattern) for r in results))
     for result in results:
         for plane in result.get("planes") or []:
             cells = (plane_text(plane) if r is result else "" for r in results)
@@ -146,7 +146,7 @@ def results_table(*results: dict) -> Table:
 
 def plane_text(plane: dict) -> str:
     """A pane in one line: its reflectance, and its errors where the truth is known."""
-    text = f"R0 {written(plane['base_reflectance'], PLANE_COLUMNS['base_reflectance'].pattern)}"
+    text = f"R0 {format_value(plane['base_reflectance'], PLANE_COLUMNS['base_reflectance'].pattern)}"
     if plane.get("normal_drift_deg") is not None:
         text += f", {plane['normal_drift_deg']:.2f}° from the plane of the masks"
     if plane.get("normal_error_deg") is None:

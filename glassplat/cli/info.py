@@ -16,7 +16,7 @@ from glassplat.captures.files import CaptureFiles, read_capture
 from glassplat.cli.console import import_held, say, shell_word, warn
 from glassplat.errors import InputError, UnknownFormatError, first_names, input_checked
 from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
-from glassplat.files.records import Text, checked, read_json
+from glassplat.files.records import Text, check_fields, read_json
 from glassplat.files.writing import SCENE, SPLAT_SUFFIXES, scene_source
 from glassplat.model.run_directory import RunDirectory
 from glassplat.prepare.photographs import VIDEO_SUFFIXES, NoOpenCVError, broken_photographs, video_facts
@@ -86,11 +86,11 @@ def _first_part(files: CaptureFiles) -> Finding:
     capture = files.capture
     finding = Finding("a capture", {"format": capture.format_name})
     finding.facts["points"] = "none (random ones are used)" if capture.points is None else len(capture.points)
-    _prepared(files.root, finding)
+    _describe_preparation(files.root, finding)
     return finding
 
 
-def _prepared(path: Path, finding: Finding) -> None:
+def _describe_preparation(path: Path, finding: Finding) -> None:
     """Report of `glassplat prepare` in the capture."""
     try:
         report = read_json(path / RECORD)["report"]
@@ -162,7 +162,7 @@ def preparation_finding(path: Path) -> Iterator[Finding]:
     """The folder of a preparation that was interrupted."""
     settings = path / "settings.json"
     with input_checked():
-        source = checked(read_json(settings), {"input": Text()}, str(settings))["input"]
+        source = check_fields(read_json(settings), {"input": Text()}, str(settings))["input"]
     output = str(path).removesuffix(".partial")
     finding = Finding("an interrupted preparation", {"of": source})
     finding.problems.append("it is not finished")

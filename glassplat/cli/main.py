@@ -79,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         SystemExit: after help (0) and after options that cannot be understood (2).
     """
     try:
-        return guarded(sys.argv[1:] if arguments is None else list(arguments), is_program=arguments is None)
+        return run_guarded(sys.argv[1:] if arguments is None else list(arguments), is_program=arguments is None)
     except KeyboardInterrupt:  # In the moments before anybody listens, or while the end is being reported.
         print("interrupted", file=sys.stderr)
         return INTERRUPTED_CODE
@@ -89,12 +89,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return FAILURE_CODE
 
 
-def guarded(arguments: list[str], *, is_program: bool) -> int:
+def run_guarded(arguments: list[str], *, is_program: bool) -> int:
     """Runs a command; whatever happens ends in one readable message and an exit code, of a rank at once."""
     from glassplat.training.ranks import leave
 
     try:
-        code = ended(arguments, is_program=is_program)
+        code = run_to_exit_code(arguments, is_program=is_program)
     except SystemExit as end:
         if is_program and end.code:
             leave(USAGE_CODE)
@@ -104,7 +104,7 @@ def guarded(arguments: list[str], *, is_program: bool) -> int:
     return code
 
 
-def ended(arguments: list[str], *, is_program: bool) -> int:
+def run_to_exit_code(arguments: list[str], *, is_program: bool) -> int:
     """Runs a command and says how it has ended; returns the exit code."""
     from glassplat.cli import console
     from glassplat.training.ranks import await_leader, leads, tell
@@ -117,10 +117,10 @@ def ended(arguments: list[str], *, is_program: bool) -> int:
     with console.raised_signals(is_program=is_program) as raised:
         try:
             with console.immediate_end() if is_program else nullcontext():
-                command = readied(arguments)
+                command = prepare_command(arguments)
             run(command)
         except KeyboardInterrupt as stop:
-            return interrupted(stop, command)
+            return report_interrupt(stop, command)
         except SystemExit as end:
             if is_training and end.code:
                 tell("error", "the options of the command cannot be understood", USAGE_CODE)
@@ -131,7 +131,7 @@ def ended(arguments: list[str], *, is_program: bool) -> int:
         except BaseException as error:  # noqa: BLE001 - The last guard: nobody is to read a traceback.
             is_lost = isinstance(error, RankLostError)
             if raised and not is_lost:
-                return interrupted(raised[-1], command)
+                return report_interrupt(raised[-1], command)
             found = console.ending(error)
             with suppress(OSError):  # Nobody hears it where the output is full or closed.
                 console.complain(found.label, found.text)
@@ -142,19 +142,19 @@ def ended(arguments: list[str], *, is_program: bool) -> int:
     return 0
 
 
-def readied(arguments: list[str]) -> Any:
+def prepare_command(arguments: list[str]) -> Any:
     """The command that the arguments describe, once it has refused what it can and imported what it works with.
 
     Raises:
         InputError, OSError: an option is out of range, there is nothing at a path, or something that must stay.
-        SystemExit: as in `parsed`.
+        SystemExit: as in `parse_arguments`.
     """
-    command = parsed(arguments)
+    command = parse_arguments(arguments)
     command.ready()
     return command
 
 
-def parsed(arguments: list[str]) -> Any:
+def parse_arguments(arguments: list[str]) -> Any:
     """The command that the arguments describe.
 
     Raises:
@@ -235,7 +235,7 @@ def run(command: Any) -> None:
         command.run(message_console())
 
 
-def interrupted(stop: KeyboardInterrupt, command: Any) -> int:
+def report_interrupt(stop: KeyboardInterrupt, command: Any) -> int:
     """Says what an interrupted command leaves behind, and how to go on."""
     from glassplat.cli.console import code_of, drop_output, message_console, say
 

@@ -157,7 +157,7 @@ class SplatFile:
         if self.planes is not None:
             check_file(self.planes)
 
-    def opened(self, path: Path, device: DeviceName) -> Model:
+    def open(self, path: Path, device: DeviceName) -> Model:
         """The run or the splat file at a path."""
         from glassplat.model.model import load
 
@@ -185,14 +185,14 @@ class SceneEdits:
     shift: dict[PaneLabel, Finite] = field(default_factory=dict)
     surroundings: Path | None = None
 
-    def applied(self, scene: Scene) -> Scene:
+    def apply(self, scene: Scene) -> Scene:
         """The edited scene.
 
         Raises:
             InputError: there are no panes, no pane has a label, a value is out of range, edits contradict, or the
                 panorama cannot be read or nothing mirrors it.
         """
-        from glassplat.scene.scene import as_mirrors, shifted, tilted, with_reflectance, without_glass
+        from glassplat.scene.scene import as_mirrors, shift_pane, tilt_pane, with_reflectance, without_glass
 
         if self.surroundings is not None:
             scene = in_surroundings(scene, self.surroundings)
@@ -203,9 +203,9 @@ class SceneEdits:
             for label, reflectance in self.reflectance.items():
                 scene = with_reflectance(scene, label, reflectance)
             for label, angles in self.tilt.items():
-                scene = tilted(scene, label, *angles)
+                scene = tilt_pane(scene, label, *angles)
             for label, distance in self.shift.items():
-                scene = shifted(scene, label, distance)
+                scene = shift_pane(scene, label, distance)
             scene = as_mirrors(scene, self.as_mirror)
         return without_glass(scene) if self.remove_glass else scene
 

@@ -111,7 +111,7 @@ class Pace:
         speed = seconds / (plan.work(number) - plan.work(number - steps))
         return speed * (plan.work(plan.iterations) - plan.work(number))
 
-    def left(self, number: int) -> str:
+    def time_left(self, number: int) -> str:
         """The time left, in words."""
         seconds = self.seconds_left(number)
         return "time left is not known yet" if seconds is None else f"{in_words(seconds)} left"
@@ -184,7 +184,7 @@ class TrainingProgress:
             standing.loss = _smoothed(standing.loss, message.loss)
             standing.count = message.counts["primary"] + message.counts["glass"]
             self._pace.step(message.step)
-            standing.left = self._pace.left(message.step)
+            standing.left = self._pace.time_left(message.step)
             if forecast := self._pace.forecast(message.step):
                 self._say(forecast)
             self._display.step(standing)
@@ -360,9 +360,9 @@ class WorkProgress:
             say(self._console, f"{step.what} ({step.total})")
         elif now - self._shown >= PAUSE:
             self._shown = now
-            say(self._console, f"{step.what}: {step.done} of {step.total}, {self._left(step, now)}")
+            say(self._console, f"{step.what}: {step.done} of {step.total}, {self._time_left(step, now)}")
 
-    def _left(self, step: Step, now: float) -> str:
+    def _time_left(self, step: Step, now: float) -> str:
         done = step.done - self._first
         if done <= 0:
             return "time left is not known yet"

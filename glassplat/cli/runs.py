@@ -14,14 +14,14 @@ from torch import Tensor
 from glassplat.access import is_local
 from glassplat.captures.dataset import TEST_EVERY, Dataset, dataset_of, load_dataset, with_corrected_cameras
 from glassplat.captures.view import GIGABYTE, PointCloud, View
-from glassplat.cli.console import counted, say, shell_word, warn
+from glassplat.cli.console import count_noun, say, shell_word, warn
 from glassplat.cli.places import chosen_views
 from glassplat.cli.progress import Plan, TrainingProgress
 from glassplat.errors import InputError, input_checked
 from glassplat.files.images import picture_paths
 from glassplat.files.sidecars import read_cameras
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
-from glassplat.methods.recipe import photo_background, settled
+from glassplat.methods.recipe import photo_background, resolve_background
 from glassplat.model.run_directory import RunDirectory, check_output
 from glassplat.model.training import Listener, Training
 from glassplat.render.frame import Renderer
@@ -76,7 +76,7 @@ def open_run(path: Path, device: DeviceName = "auto", data: Path | None = None) 
     directory.check_photographs(dataset)
     if data is not None or not directory.imported.is_file():  # Without a capture, cameras are written corrected.
         dataset = with_corrected_cameras(dataset, scene)
-    recipe = settled(recorded, dataset)
+    recipe = resolve_background(recorded, dataset)
     return StoredRun(directory, recipe, scene, recipe.renderer(), dataset, iterations)
 
 
@@ -146,7 +146,7 @@ def train(asked: Train[Any], console: Console) -> None:
         checkpoint_every=asked.checkpoint_every,
     )
     plan = plan_of(asked)
-    with TrainingProgress(console, plan) as progress, _watched(asked, training, dataset, console) as watch:
+    with TrainingProgress(console, plan) as progress, _viewer_listeners(asked, training, dataset, console) as watch:
 
         def listen(message: Message) -> None:
             progress.show(message)
@@ -156,7 +156,7 @@ def train(asked: Train[Any], console: Console) -> None:
     say(
         console,
         f"trained {asked.recipe.method} for {training.step} iterations in {training.seconds:.0f} s: "
-        f"{len(scene.primary) + len(scene.glass)} Gaussians, {counted(len(scene.planes), 'pane')} -> {asked.output}",
+        f"{len(scene.primary) + len(scene.glass)} Gaussians, {count_noun(len(scene.planes), 'pane')} -> {asked.output}",
     )
     say(console, f"next: glassplat eval {shell_word(asked.output)}")
 
@@ -187,7 +187,7 @@ def shortcuts(asked: Train[Any]) -> str:
 
 
 @contextmanager
-def _watched(asked: Train[Any], training: Training, dataset: Dataset, console: Console) -> Iterator[Listener]:
+def _viewer_listeners(asked: Train[Any], training: Training, dataset: Dataset, console: Console) -> Iterator[Listener]:
     """Further listeners: the viewer, if asked for; of several ranks the first one has it."""
     if not asked.view or not leads():
         yield lambda message: None
@@ -211,8 +211,8 @@ def describe(dataset: Dataset, console: Console) -> None:
     say(
         console,
         f"{dataset.root}: {len(dataset.train)} training and {len(dataset.test)} test views, "
-        f"{len(dataset.points.positions)} points, {counted(annotated, 'annotated view')} with "
-        f"{counted(len(dataset.pane_labels), 'pane')}{given}",
+        f"{len(dataset.points.positions)} points, {count_noun(annotated, 'annotated view')} with "
+        f"{count_noun(len(dataset.pane_labels), 'pane')}{given}",
     )
     needed, room = dataset.photograph_bytes, dataset.memory.budget
     if needed > room:

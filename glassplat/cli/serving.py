@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 def serve_viewer(command: View, console: Console) -> None:
     """Serves until it is interrupted."""
-    model = command.file.opened(command.scene, command.device)
-    model = model.with_scene(command.edits.applied(model.scene))
+    model = command.file.open(command.scene, command.device)
+    model = model.with_scene(command.edits.apply(model.scene))
     viewer = Viewer(shown_of(model, photographs_of(command.scene), keeper(command, model)), command.host, command.port)
     viewer.start()
     try:

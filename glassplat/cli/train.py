@@ -135,7 +135,7 @@ def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:
     full = FULL_HELP in arguments
     recipes = [recipe_of(method, asked_preset(arguments)) for method in RECIPES]
     if (config := last_value(arguments, "--config")) is not None:
-        given = configured(Path(config), arguments)
+        given = read_recipe(Path(config), arguments)
         recipes = [given if recipe.method == given.method else recipe for recipe in recipes]
     if not full and any(help_option in arguments for help_option in HELP):
         recipes = [in_brief(recipe) for recipe in recipes]
@@ -144,7 +144,7 @@ def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:
     return Train[any_recipe], ["--help" if argument == FULL_HELP else argument for argument in arguments]
 
 
-def configured(path: Path, arguments: Sequence[str]) -> Any:
+def read_recipe(path: Path, arguments: Sequence[str]) -> Any:
     """The recipe in a file, which is of the method that the arguments name.
 
     Raises:

@@ -17,20 +17,20 @@ from rich.progress import track
 from torch import Tensor
 
 from glassplat.captures.view import View
-from glassplat.cli.console import counted, say, shell_word, warn
+from glassplat.cli.console import count_noun, say, shell_word, warn
 from glassplat.cli.places import SceneEdits, check_targets, chosen_views, claim_folder
 from glassplat.cli.progress import WorkProgress
 from glassplat.cli.runs import StoredRun, open_run, photographs_of, pictures_of
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.evaluate.evaluate import timed_render
-from glassplat.evaluate.metrics import quantized
+from glassplat.evaluate.metrics import quantize
 from glassplat.files.images import write_image
 from glassplat.files.sidecars import read_cameras, write_cameras
 from glassplat.files.writing import SPLAT_WRITERS, atomic_write, real_path, scene_source, splat_writer
 from glassplat.model.model import CAMERAS, ENVIRONMENT, GLASS, PANORAMA, PLANES, Model, save_page, write_beside
 from glassplat.prepare.photographs import Progress as Step
-from glassplat.publish.camera_paths import interpolated, keyframes_of, widened
-from glassplat.publish.film import side_by_side, wiped, write_film
+from glassplat.publish.camera_paths import fit_to_width, interpolate_cameras, keyframes_of
+from glassplat.publish.film import side_by_side, wipe_pictures, write_film
 from glassplat.publish.web_page import MOST_GAUSSIANS, PREVIEW, Sharing, fits, write_preview
 from glassplat.render.frame import check_layers
 from glassplat.render.layers import layer_image
@@ -46,7 +46,7 @@ def write_layers(command: Render, console: Console) -> None:
     """Renders every layer of every view into its file."""
     stored = open_run(command.run_directory, command.device, command.data)
     check_layers(stored.renderer, stored.scene, command.layers, stored.recipe.method)
-    scene = command.edits.applied(stored.scene)
+    scene = command.edits.apply(stored.scene)
     renderer = stored.renderer.with_layers(command.layers)
     views = chosen_views(stored.dataset, command.split)
     paths = pictures_of(stored.dataset)
@@ -77,15 +77,15 @@ def write_dereflected(command: Dereflect, console: Console) -> None:
     for warning in mirror_warnings(stored):
         warn(console, warning)
     for view in track(views, "taking reflections off", console=console):
-        write_image(command.output / paths[view.name], dereflected(command, stored, renderer, view))
+        write_image(command.output / paths[view.name], dereflect_view(command, stored, renderer, view))
     say(console, f"{len(views)} images without reflections -> {command.output}")
 
 
-def dereflected(command: Dereflect, stored: StoredRun, renderer: Planar, view: View) -> Tensor:
+def dereflect_view(command: Dereflect, stored: StoredRun, renderer: Planar, view: View) -> Tensor:
     """The photograph of a view without its reflections, or the render in its place."""
     frame, _ = timed_render(renderer, stored.scene, view)
     if command.source == "render":
-        return quantized(frame.layers["without_panes"])
+        return quantize(frame.layers["without_panes"])
     # Not `view.photo`, which stays in memory: a capture may be larger than that.
     exposures = stored.scene.exposures.to("cpu")
     return dereflected_photo(frame, view.read_photo(), renderer.blend, exposures=exposures, name=view.name)
@@ -122,12 +122,12 @@ WIPE_SPAN = 0.9
 
 def film(command: Video, console: Console) -> None:
     """Renders the pictures and encodes them one by one."""
-    model = command.file.opened(command.scene, command.device)
+    model = command.file.open(command.scene, command.device)
     check_layers(model.renderer, model.scene, command.layers, model.recipe.method)
-    model = model.with_scene(command.edits.applied(model.scene))
+    model = model.with_scene(command.edits.apply(model.scene))
     cameras = _cameras(command, model)
     with WorkProgress(console) as progress, atomic_write(command.output) as temporary:
-        pictures = followed("filming", _pictures(command, model, cameras), len(cameras), progress)
+        pictures = track_progress("filming", _pictures(command, model, cameras), len(cameras), progress)
         count = write_film(temporary, pictures, command.fps)
     say(console, f"{count} pictures, {command.output.stat().st_size / 1e6:.2f} MB -> {command.output}")
 
@@ -136,12 +136,12 @@ def _cameras(command: Video, model: Model) -> list[Camera]:
     frames = max(2, round(command.seconds * command.fps))
     with input_checked():
         if command.keyframes is not None:
-            cameras = interpolated([camera for _, camera in read_cameras(command.keyframes)], frames)
+            cameras = interpolate_cameras([camera for _, camera in read_cameras(command.keyframes)], frames)
         elif command.path == "interpolate":
-            cameras = interpolated(keyframes_of([model.cameras[name] for name in sorted(model.cameras)]), frames)
+            cameras = interpolate_cameras(keyframes_of([model.cameras[name] for name in sorted(model.cameras)]), frames)
         else:
             cameras = model.orbit(frames)
-    return [widened(camera, command.width + command.width % 2) for camera in cameras]
+    return [fit_to_width(camera, command.width + command.width % 2) for camera in cameras]
 
 
 def _pictures(command: Video, model: Model, cameras: Sequence[Camera]) -> Iterator[NDArray[np.uint8]]:
@@ -153,7 +153,7 @@ def _pictures(command: Video, model: Model, cameras: Sequence[Camera]) -> Iterat
             shown = [_picture(layer_image(frame, layer)) for layer in command.layers]
         if command.layout == "wipe":
             share = 0.5 + WIPE_SPAN / 2 * math.sin(2 * math.pi * index / len(cameras))
-            yield wiped(shown[0], shown[1], share)
+            yield wipe_pictures(shown[0], shown[1], share)
         else:
             yield side_by_side(shown)
 
@@ -162,11 +162,11 @@ def _picture(image: torch.Tensor) -> NDArray[np.uint8]:
     """A layer [H, W] or [H, W, 3] as a picture."""
     if image.dim() == 2:
         image = image[..., None].expand(-1, -1, 3)
-    picture: NDArray[np.uint8] = quantized(image).cpu().contiguous().numpy()
+    picture: NDArray[np.uint8] = quantize(image).cpu().contiguous().numpy()
     return picture
 
 
-def followed(
+def track_progress(
     what: str, pictures: Iterable[NDArray[np.uint8]], total: int, progress: WorkProgress
 ) -> Iterator[NDArray[np.uint8]]:
     """The pictures, with a progress shown as they are taken."""
@@ -178,14 +178,14 @@ def followed(
 
 def write_clean(command: Clean, console: Console) -> None:
     """Writes the clean scene, and says what went."""
-    model = command.file.opened(command.scene, command.device)
-    tidy, found = model.cleaned(command.rules)
+    model = command.file.open(command.scene, command.device)
+    tidy, found = model.clean(command.rules)
     summary = ", ".join(f"{count} {rule}" for rule, count in found.items() if count) or "no floaters"
     say(console, f"{len(tidy.scene.primary)} of {len(model.scene.primary)} Gaussians stay; found {summary}")
     if command.scale is not None:
         *points, metres = command.scale
         factor = metres / math.dist(points[:3], points[3:])
-        tidy = tidy.scaled(factor)
+        tidy = tidy.scale(factor)
         say(console, f"one unit is a metre now; it was {factor:.4g} m")
     tidy.save(command.output)
     say(console, f"next: glassplat view {shell_word(command.output)}")
@@ -193,8 +193,8 @@ def write_clean(command: Clean, console: Console) -> None:
 
 def write_files(command: Export, console: Console) -> None:
     """Writes the files, and removes what an earlier run of the command wrote and this one does not."""
-    model = command.file.opened(command.scene, command.device)
-    model = model.with_scene(_chosen(command, command.edits.applied(model.scene)))
+    model = command.file.open(command.scene, command.device)
+    model = model.with_scene(_chosen(command, command.edits.apply(model.scene)))
     splats = {kind: command.output / f"scene.{kind}" for kind in SPLAT_WRITERS}
     beside = [command.output / name for name in BESIDE_SPLATS]
     check_targets(command.output, [*beside, *splats.values()], [])
@@ -262,7 +262,7 @@ def _write_beside(command: Export, scene: Scene, console: Console) -> list[Path]
     """Planes, glass and environment, where there are any; returns what was written."""
     written = write_beside(command.output, scene)
     if len(scene.planes):
-        say(console, f"{counted(len(scene.planes), 'pane')} -> {command.output / PLANES}, their shape -> {GLASS}")
+        say(console, f"{count_noun(len(scene.planes), 'pane')} -> {command.output / PLANES}, their shape -> {GLASS}")
     if not scene.environment.is_empty:
         warn(console, f"other viewers show this scene without what it mirrors; that is in {ENVIRONMENT}")
     return written

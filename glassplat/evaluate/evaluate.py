@@ -111,14 +111,14 @@ def aligned_camera(scene: Scene, renderer: Renderer, view: View, *, steps: int =
     device = scene.primary.means.device
     still = scene.with_parameters({name: tensor.detach() for name, tensor in scene.parameters().items()})
     camera, photo = view.camera.to(device), view.photo.to(device)
-    exposures = still.exposures.interpolated(view.name)
+    exposures = still.exposures.interpolate(view.name)
     twist = torch.zeros(6, device=device, requires_grad=True)
     optimizer = torch.optim.Adam([twist], lr=FIRST_STEP, betas=(0.8, 0.95))
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST_STEP / FIRST_STEP) ** (1 / max(steps, 1)))
     best, lowest = torch.zeros_like(twist), torch.inf
     for _ in range(steps):
         optimizer.zero_grad()
-        image = exposures.applied(renderer(still, moved_camera(camera, twist, scene.extent)).rgb, view.name)
+        image = exposures.apply(renderer(still, moved_camera(camera, twist, scene.extent)).rgb, view.name)
         found = photometric(with_ignored_right(image, view), photo)
         loss = found.l1.lerp(1 - found.ssim, SSIM_SHARE)
         if (value := float(loss.detach())) < lowest:
@@ -189,7 +189,7 @@ def in_photograph_colors(frame: Frame, exposures: Exposures, name: str) -> Frame
     """The frame with a layer `photographed` in the colours of that photograph; itself where it has the scene's."""
     if name not in exposures.names:
         return frame
-    image = exposures.applied(frame.photographed, name)
+    image = exposures.apply(frame.photographed, name)
     return replace(frame, layers={**frame.layers, "photographed": image})
 
 
@@ -258,7 +258,7 @@ def evaluate(
         true_view = truth.view(view.name, view.camera.width, view.camera.height) if truth else None
         surface = true_surface(view)
         pane = regions.of(view, frame, true_view)
-        exposures = learned.interpolated(view.name)
+        exposures = learned.interpolate(view.name)
         shown = in_photograph_colors(frame, exposures, view.name)
         measured = _measure(shown, seconds, view, pane, truth=(truth, true_view), surface=surface, lpips=lpips)
         measurements[view.name] = measured
@@ -343,7 +343,7 @@ def _lpips(lpips: metrics.Lpips | str, image: Tensor, photo: Tensor) -> metrics.
         return metrics.NO_LPIPS
     if min(photo.shape[:2]) < metrics.SMALLEST_SIDE:
         return f"views of fewer than {metrics.SMALLEST_SIDE} pixels a side"
-    return lpips(metrics.quantized(image), metrics.quantized(photo))
+    return lpips(metrics.quantize(image), metrics.quantize(photo))
 
 
 def _counted_psnr(image: Tensor, photo: Tensor, counted: Tensor | None) -> metrics.Outcome:

@@ -122,7 +122,7 @@ PLANE_COLUMNS = {
 }
 
 
-def written(value: object, pattern: str) -> str:
+def format_value(value: object, pattern: str) -> str:
     """A value with its unit; a dash where there is none."""
     return "-" if value is None else pattern.format(value)
 
@@ -146,7 +146,7 @@ def missing_reasons(results: Mapping[str, Any]) -> dict[str, list[str]]:
     return reasons
 
 
-def quantized(image: Tensor) -> Tensor:
+def quantize(image: Tensor) -> Tensor:
     """The image as it would be stored: clamped to [0, 1] and rounded to uint8; uint8 passes through.
 
     Raises:
@@ -174,7 +174,7 @@ def psnr(image: Tensor, target: Tensor, region: Tensor | None = None) -> float:
         ValueError: shapes disagree, or no pixel counts.
     """
     _check_shapes(image, target)
-    difference = quantized(image).to(torch.float64) - quantized(target).to(torch.float64)
+    difference = quantize(image).to(torch.float64) - quantize(target).to(torch.float64)
     if region is not None:
         if region.dtype != torch.bool or region.shape != image.shape[:-1]:
             raise ValueError(
@@ -202,7 +202,7 @@ def color_corrected(
         region: [H, W] bool, of them those that count; None takes all.
     """
     _check_shapes(image, target)
-    source, wanted = (quantized(picture).to(torch.float64) / 255 for picture in (image, target))
+    source, wanted = (quantize(picture).to(torch.float64) / 255 for picture in (image, target))
     chosen = torch.ones(image.shape[:2], dtype=torch.bool) if region is None else region
     known = source[:, columns][chosen[:, columns]]
     known = torch.cat([known, torch.ones_like(known[:, :1])], dim=1)
@@ -219,7 +219,7 @@ def ssim(image: Tensor, target: Tensor) -> float:
         ValueError: shapes disagree.
     """
     _check_shapes(image, target)
-    return float(photometric(quantized(image).to(torch.float32) / 255, quantized(target)).ssim)
+    return float(photometric(quantize(image).to(torch.float32) / 255, quantize(target)).ssim)
 
 
 def reflection_gain(images: list[Tensor], targets: list[Tensor]) -> float:
@@ -504,8 +504,8 @@ def environment_psnr(learned: Tensor, truth: Tensor) -> tuple[float, float]:
     Raises:
         ValueError: a panorama is not twice as wide as high, or holds values that are not finite.
     """
-    image, target, gain = _equalised(learned, truth)
-    difference = quantized(image).to(torch.float64) - quantized(target).to(torch.float64)
+    image, target, gain = _equalise(learned, truth)
+    difference = quantize(image).to(torch.float64) - quantize(target).to(torch.float64)
     mean_square = _mean_over_sphere(difference.square())
     return math.inf if mean_square == 0 else 10 * math.log10(255**2 / mean_square), gain
 
@@ -520,14 +520,14 @@ def environment_lpips(learned: Tensor, truth: Tensor, lpips: Lpips | str) -> Out
     """
     if isinstance(lpips, str):
         return NO_LPIPS
-    image, target, _ = _equalised(learned, truth)
-    return lpips(quantized(image), quantized(target))
+    image, target, _ = _equalise(learned, truth)
+    return lpips(quantize(image), quantize(target))
 
 
-def _equalised(learned: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, float]:
+def _equalise(learned: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, float]:
     """The learned map at the energy of the true one, the true one at its size, and the factor; 1 for a black map."""
     image, target = _panorama(learned, "learned"), _panorama(truth, "true")
-    target = _averaged(target, image.shape[0])
+    target = _resize_panorama(target, image.shape[0])
     energy = _mean_over_sphere(image)
     gain = _mean_over_sphere(target) / energy if energy > 0 else 1.0
     return gain * image, target, gain
@@ -543,7 +543,7 @@ def _panorama(pixels: Tensor, which: str) -> Tensor:
     return values
 
 
-def _averaged(panorama: Tensor, height: int) -> Tensor:
+def _resize_panorama(panorama: Tensor, height: int) -> Tensor:
     """A panorama at another height."""
     if panorama.shape[0] == height:
         return panorama

@@ -115,10 +115,10 @@ def comparison_sheet(
         subtitle: set in small type beside it; usually the metrics.
     """
     rows: list[Row] = [_image_row(frame, photo), *_layer_rows(frame, truth, surface or NOTHING_KNOWN)]
-    return composed([row for row in rows if any(row)], title, subtitle)
+    return compose_sheet([row for row in rows if any(row)], title, subtitle)
 
 
-def composed(rows: Sequence[Row], title: str, subtitle: str) -> NDArray[np.uint8]:
+def compose_sheet(rows: Sequence[Row], title: str, subtitle: str) -> NDArray[np.uint8]:
     """Panels of one size in rows, with captions and a title line."""
     height, width = next(panel for row in rows for panel in row if panel).image.shape[:2]
     panel_size = _panel_size(width, height)
@@ -215,7 +215,7 @@ def _panel_size(width: int, height: int) -> tuple[int, int]:
 
 
 def _draw_panel(canvas: Image.Image, panel: Panel, corner: tuple[int, int], size: tuple[int, int]) -> None:
-    picture = Image.fromarray(metrics.quantized(panel.image).contiguous().numpy())
+    picture = Image.fromarray(metrics.quantize(panel.image).contiguous().numpy())
     if picture.size != size:
         grows = size[0] > picture.width
         picture = picture.resize(size, Image.Resampling.NEAREST if grows else Image.Resampling.LANCZOS)
@@ -259,14 +259,14 @@ class Uses:
             Panel("without reflections (glassplat dereflect)", plain),
             Panel(
                 "pane as a mirror (glassplat render --as-mirror)",
-                metrics.quantized(as_mirror_image(frame, self._blend)),
+                metrics.quantize(as_mirror_image(frame, self._blend)),
             ),
         ]
         self._rows = sorted([*self._rows, (share, row)], key=lambda kept: -kept[0])[:MOST_VIEWS]
 
     def picture(self) -> NDArray[np.uint8] | None:
         """The views kept [H, W, 3], one per row; None where no view shows a pane."""
-        return composed([row for _, row in self._rows], "What the layers are good for", "") if self._rows else None
+        return compose_sheet([row for _, row in self._rows], "What the layers are good for", "") if self._rows else None
 
 
 USES_FILE = "uses.png"
@@ -337,7 +337,7 @@ def overview_page(
     """The overview as one HTML page; its only references are the pictures, by relative path."""
     title = f"glassplat: {results.get('method', 'evaluation')}"
     parts = [
-        f"<h1>{_escaped(title)}</h1>",
+        f"<h1>{_escape(title)}</h1>",
         f'<p class="settings">{_settings_line(results)}</p>',
         _cards(results),
         _missing(results),
@@ -348,7 +348,7 @@ def overview_page(
         _meanings(results),
         '<dialog id="large"><img alt=""></dialog>',
     ]
-    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{_escaped(title)}</title>'
+    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{_escape(title)}</title>'
     body = "\n".join(part for part in parts if part)
     return (
         f'<!doctype html>\n<html lang="en">\n<head>{head}<style>{STYLE}</style></head>\n'
@@ -358,15 +358,15 @@ def overview_page(
 
 def _settings_line(results: Mapping[str, Any]) -> str:
     known = [(name.replace("_", " "), results[name]) for name in SETTINGS if results.get(name) is not None]
-    return " · ".join(f"{_escaped(name)} <b>{_escaped(value)}</b>" for name, value in known)
+    return " · ".join(f"{_escape(name)} <b>{_escape(value)}</b>" for name, value in known)
 
 
 def _cards(results: Mapping[str, Any]) -> str:
     cards = []
     for name, metric in metrics.shown_metrics(results).items():
         explanation = metric.meaning if results[name] is not None else results.get(f"{name}_reason") or ""
-        value = _formatted(results[name], metric.pattern)
-        cards.append(f'<div title="{_escaped(explanation)}"><b>{value}</b><span>{metric.label}</span></div>')
+        value = _format(results[name], metric.pattern)
+        cards.append(f'<div title="{_escape(explanation)}"><b>{value}</b><span>{metric.label}</span></div>')
     return f'<div class="cards">{"".join(cards)}</div>'
 
 
@@ -374,7 +374,7 @@ def _missing(results: Mapping[str, Any]) -> str:
     """Reasons for the dashes among the metrics."""
     known = metrics.shown_metrics(results)
     lines = [
-        f"<p>Not measured: <b>{_escaped('; '.join(known[name].label for name in names))}</b>: {_escaped(reason)}</p>"
+        f"<p>Not measured: <b>{_escape('; '.join(known[name].label for name in names))}</b>: {_escape(reason)}</p>"
         for reason, names in metrics.missing_reasons(results).items()
     ]
     return f'<div class="settings">{"".join(lines)}</div>' if lines else ""
@@ -390,7 +390,7 @@ def _meanings(results: Mapping[str, Any]) -> str:
 
 
 def _defined(known: Mapping[str, metrics.Metric]) -> str:
-    return "".join(f"<dt>{_escaped(m.label)}</dt><dd>{_escaped(m.meaning)}</dd>" for m in known.values())
+    return "".join(f"<dt>{_escape(m.label)}</dt><dd>{_escape(m.meaning)}</dd>" for m in known.values())
 
 
 def _plane_table(planes: list[Mapping[str, Any]]) -> str:
@@ -399,7 +399,7 @@ def _plane_table(planes: list[Mapping[str, Any]]) -> str:
     columns = {
         n: column for n, column in metrics.PLANE_COLUMNS.items() if any(plane.get(n) is not None for plane in planes)
     }
-    rows = [[_formatted(plane.get(name), column.pattern) for name, column in columns.items()] for plane in planes]
+    rows = [[_format(plane.get(name), column.pattern) for name, column in columns.items()] for plane in planes]
     return _table([column.label for column in columns.values()], rows)
 
 
@@ -407,7 +407,7 @@ def _view_table(per_view: Mapping[str, Mapping[str, Any]], sheets: Mapping[str, 
     columns = metrics.METRICS | metrics.SURFACE_METRICS
     shown = {n: column for n, column in columns.items() if any(row.get(n) is not None for row in per_view.values())}
     rows = [
-        [_link(name, sheets), *(_formatted(row.get(metric), column.pattern) for metric, column in shown.items())]
+        [_link(name, sheets), *(_format(row.get(metric), column.pattern) for metric, column in shown.items())]
         for name, row in per_view.items()
     ]
     return _table(["view", *(column.label for column in shown.values())], rows)
@@ -420,13 +420,13 @@ def _table(head: list[str], rows: list[list[str]]) -> str:
 
 
 def _link(name: str, sheets: Mapping[str, str]) -> str:
-    return f'<a href="#{_escaped(name)}">{_escaped(name)}</a>' if name in sheets else _escaped(name)
+    return f'<a href="#{_escape(name)}">{_escape(name)}</a>' if name in sheets else _escape(name)
 
 
 def _figure(name: str, path: str, description: str) -> str:
     return (
-        f'<figure id="{_escaped(name)}"><a href="{_escaped(path)}">'
-        f'<img src="{_escaped(path)}" alt="{_escaped(description)}" loading="lazy"></a></figure>'
+        f'<figure id="{_escape(name)}"><a href="{_escape(path)}">'
+        f'<img src="{_escape(path)}" alt="{_escape(description)}" loading="lazy"></a></figure>'
     )
 
 
@@ -434,12 +434,12 @@ def _metrics_line(values: Mapping[str, Any]) -> str:
     known = {
         n: metric for n, metric in (metrics.METRICS | metrics.SURFACE_METRICS).items() if values.get(n) is not None
     }
-    return "    ".join(f"{metric.label} {_formatted(values[n], metric.pattern)}" for n, metric in known.items())
+    return "    ".join(f"{metric.label} {_format(values[n], metric.pattern)}" for n, metric in known.items())
 
 
-def _formatted(value: object, pattern: str) -> str:
-    return _escaped(metrics.written(value, pattern))
+def _format(value: object, pattern: str) -> str:
+    return _escape(metrics.format_value(value, pattern))
 
 
-def _escaped(value: object) -> str:
+def _escape(value: object) -> str:
     return html.escape(str(value), quote=True)

@@ -28,8 +28,8 @@ from torch import Tensor
 from glassplat.captures.view import View
 from glassplat.errors import InputError, input_checked
 from glassplat.files.images import image_size, read_image, read_image_float
-from glassplat.files.records import COORDINATE, Field, Flag, Items, Number, Whole, checked, read_json
-from glassplat.options import shown
+from glassplat.files.records import COORDINATE, Field, Flag, Items, Number, Whole, check_fields, read_json
+from glassplat.options import short_repr
 
 
 @dataclass(frozen=True)
@@ -136,13 +136,13 @@ def load_truth(folder: Path | None) -> GroundTruth | None:
     with input_checked():
         entries = read_json(path)
         if not isinstance(entries, list):
-            raise ValueError(f"{path} holds {shown(entries)}; expected a list with one object per plane")
+            raise ValueError(f"{path} holds {short_repr(entries)}; expected a list with one object per plane")
         planes = tuple(_true_plane(entry, f"plane {i} in {path}") for i, entry in enumerate(entries, start=1))
         return GroundTruth(folder, planes)
 
 
 def _true_plane(entry: Any, where: str) -> TruePlane:
-    plane = TruePlane(**checked(entry, TRUE_PLANE, where))
+    plane = TruePlane(**check_fields(entry, TRUE_PLANE, where))
     if not math.hypot(*plane.normal) > 0:
         raise ValueError(f"normal of {where} has length 0; expected a direction")
     return plane
@@ -219,7 +219,7 @@ def _read_beside(view: View, mark: str) -> NDArray[np.float32] | None:
     if not path.is_file():
         return None
     photo_size = image_size(view.image_path)
-    pixels = _read(path)
+    pixels = _read_image(path)
     if pixels.shape[1::-1] != photo_size:
         raise InputError(
             f"{path} is {pixels.shape[1]}x{pixels.shape[0]} pixels large, its photograph {photo_size[0]}x"
@@ -228,7 +228,7 @@ def _read_beside(view: View, mark: str) -> NDArray[np.float32] | None:
     return pixels
 
 
-def _read(path: Path) -> NDArray[np.float32]:
+def _read_image(path: Path) -> NDArray[np.float32]:
     with input_checked():
         return read_image_float(path)
 
@@ -237,21 +237,21 @@ def _coverage(view: View, vectors: NDArray[np.float32] | None) -> NDArray[np.flo
     """[H, W] share of each pixel of the photograph's file that shows the surface."""
     if vectors is not None and vectors.shape[2] == 4:
         return vectors[..., 3]
-    photo = _read(view.image_path)
+    photo = _read_image(view.image_path)
     if photo.shape[2] == 4:
         return photo[..., 3]
     if vectors is None:
         return np.ones(photo.shape[:2], dtype=np.float32)
-    lengths = np.linalg.norm(_decoded(vectors), axis=-1)
+    lengths = np.linalg.norm(_decode_normals(vectors), axis=-1)
     return (np.abs(lengths - 1) < NEARLY_UNIT).astype(np.float32)
 
 
 def _normals(vectors: NDArray[np.float32], coverage: NDArray[np.float32], size: tuple[int, int]) -> Tensor:
     """[H, W, 3] unit vectors: means over the covered parts of the smaller pixels."""
-    weighted = _decoded(vectors) * coverage[..., None]
+    weighted = _decode_normals(vectors) * coverage[..., None]
     means = np.stack([resized_float(weighted[..., axis], size) for axis in range(3)], axis=-1)
     return torch.nn.functional.normalize(torch.from_numpy(means), dim=-1)
 
 
-def _decoded(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+def _decode_normals(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
     return 2 * vectors[..., :3] - 1

@@ -27,7 +27,7 @@ from glassplat.files.ply import CHANNEL_PREFIXES, is_channel
 from glassplat.files.writing import atomic_write
 from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.kernels.project.reference import sh_basis
-from glassplat.options import shown
+from glassplat.options import short_repr
 from glassplat.scene import SH_ZERO
 from glassplat.scene.camera import quat_from_rotation, quat_product, rotation_from_quat
 from glassplat.scene.gaussians import DISC_SCALES, Gaussians, half_turned
@@ -154,26 +154,26 @@ class GltfReader:
         text, self._buffer = _chunks(data, path)
         document = records.parse_json(text, str(path))
         if not isinstance(document, dict):
-            raise ValueError(f"{path} holds {shown(document)}; expected a glTF document")
+            raise ValueError(f"{path} holds {short_repr(document)}; expected a glTF document")
         self.document: dict[str, Any] = document
-        version = records.checked(document.get("asset"), ASSET, f"asset of {path}")["version"]
+        version = records.check_fields(document.get("asset"), ASSET, f"asset of {path}")["version"]
         if version.partition(".")[0] != str(VERSION):
             raise ValueError(f"{path} is glTF of version {version}; expected 2.0: export it again")
 
-    def listed(self, kind: str) -> list[Any]:
+    def list_of(self, kind: str) -> list[Any]:
         """The list of that name in the document; empty where there is none."""
         found = self.document.get(kind, [])
         if not isinstance(found, list):
-            raise ValueError(f"{kind} of {self.path} is {shown(found)}; expected a list")
+            raise ValueError(f"{kind} of {self.path} is {short_repr(found)}; expected a list")
         return found
 
     def entry(self, kind: str, index: int, fields: Mapping[str, records.Field]) -> dict[str, Any]:
         """The checked fields of one entry of a list."""
-        return records.checked(self.raw(kind, index), fields, f"entry {index} of {kind} in {self.path}")
+        return records.check_fields(self.raw(kind, index), fields, f"entry {index} of {kind} in {self.path}")
 
     def raw(self, kind: str, index: int) -> dict[str, Any]:
         """One entry of a list as it is; its extensions are nobody else's to check."""
-        found = self.listed(kind)
+        found = self.list_of(kind)
         if index >= len(found) or not isinstance(found[index], dict):
             raise ValueError(f"{self.path} refers to entry {index} of {kind}, which is not there; it is damaged")
         entry: dict[str, Any] = found[index]
@@ -206,7 +206,7 @@ class GltfReader:
                 f"{len(self._buffer)}: the file is cut off or damaged; export it again"
             )
         rows = np.ndarray((accessor["count"], width), kind, self._buffer, offset=first, strides=(stride, kind.itemsize))
-        return _dequantised(rows, normalized=accessor["normalized"])
+        return _dequantise(rows, normalized=accessor["normalized"])
 
 
 def _chunks(data: bytes, path: Path) -> tuple[str, bytes]:
@@ -236,7 +236,7 @@ def _chunks(data: bytes, path: Path) -> tuple[str, bytes]:
     return text, data[at + CHUNK.size : at + CHUNK.size + size]
 
 
-def _dequantised(rows: NDArray, *, normalized: bool) -> NDArray[np.float32]:
+def _dequantise(rows: NDArray, *, normalized: bool) -> NDArray[np.float32]:
     """Whole numbers as shares of the greatest, where they are normalised; at least -1 (glTF 2.0, Section 3.11)."""
     values: NDArray[np.float32] = rows.astype(np.float32)
     if normalized and rows.dtype.kind in "iu":
@@ -278,7 +278,7 @@ def placement_of(node: Mapping[str, Any], outer: Placement, where: str) -> Place
         own = _of_matrix(torch.tensor(node["matrix"], dtype=torch.float64).reshape(4, 4).T, where)
     else:
         x, y, z, w = node["rotation"]
-        own = _checked(
+        own = _check_placement(
             torch.tensor([w, x, y, z], dtype=torch.float64),
             torch.tensor(node["scale"], dtype=torch.float64),
             torch.tensor(node["translation"], dtype=torch.float64),
@@ -288,7 +288,7 @@ def placement_of(node: Mapping[str, Any], outer: Placement, where: str) -> Place
     return Placement(quat_product(outer.quat, own.quat), outer.scale * own.scale, shift)
 
 
-def placed(gaussians: Gaussians, placement: Placement) -> Gaussians:
+def place_gaussians(gaussians: Gaussians, placement: Placement) -> Gaussians:
     """The Gaussians where a placement puts them, their harmonics turned along; the identity changes no bit."""
     if placement.is_identity:
         return gaussians
@@ -312,10 +312,12 @@ def _of_matrix(matrix: Tensor, where: str) -> Placement:
     shear = float((unit @ unit.T - torch.eye(3, dtype=torch.float64)).abs().max())
     if not is_affine or not shear < TOLERANCE or float(torch.linalg.det(unit)) < 0:
         raise ValueError(_unlike(where))
-    return _checked(quat_from_rotation(unit), torch.full((3,), scale, dtype=torch.float64), matrix[:3, 3], where)
+    return _check_placement(
+        quat_from_rotation(unit), torch.full((3,), scale, dtype=torch.float64), matrix[:3, 3], where
+    )
 
 
-def _checked(quat: Tensor, scales: Tensor, shift: Tensor, where: str) -> Placement:
+def _check_placement(quat: Tensor, scales: Tensor, shift: Tensor, where: str) -> Placement:
     scale = float(scales[0])
     alike = bool(((scales - scale).abs() <= TOLERANCE * abs(scale)).all())
     if not (LEAST_NODE_SCALE <= scale <= MOST_SCALE) or not alike or not float(quat.norm()) > TOLERANCE:
@@ -395,7 +397,9 @@ def read_glb(path: Path | str) -> Gaussians:
     count = sum(file.count(primitive.get("POSITION", 0)) for primitive, _, _ in shown)
     if count > max(PLAIN_COUNT, file.size / BYTES_PER_GAUSSIAN):
         raise ValueError(f"{path} shows {count} Gaussians out of {file.size} bytes; no scene does: it is damaged")
-    found = [placed(_read_primitive(file, primitive, where), placement) for primitive, where, placement in shown]
+    found = [
+        place_gaussians(_read_primitive(file, primitive, where), placement) for primitive, where, placement in shown
+    ]
     if not found:
         raise ValueError(f"{path} shows no splats: expected a primitive of points with {EXTENSION} in its scene")
     most = max(part.sh.shape[1] for part in found)
@@ -403,7 +407,7 @@ def read_glb(path: Path | str) -> Gaussians:
     shared = functools.reduce(set.intersection, (set(part.channels) for part in found))
     alike = (_alike(part, most, are_discs=are_discs) for part in found)
     whole = functools.reduce(
-        Gaussians.joined,
+        Gaussians.concat,
         (replace(part, channels={name: part.channels[name] for name in sorted(shared)}) for part in alike),
     )
     return half_turned(replace(whole, active_sh_degree=round(most**0.5) - 1), TURN)
@@ -443,13 +447,13 @@ def _glb_bytes(gaussians: Gaussians) -> bytes:
 
 def _placed_meshes(file: GltfReader) -> list[tuple[int, Placement]]:
     """The meshes that the scene shows, each with where; a file without scenes shows all its nodes."""
-    scenes = file.listed("scenes")
+    scenes = file.list_of("scenes")
     chosen = file.document.get("scene", 0)
     if scenes:
         index = chosen if isinstance(chosen, int) and 0 <= chosen < len(scenes) else len(scenes)
         pending = [(node, Placement()) for node in file.entry("scenes", index, SCENE)["nodes"]]
     else:
-        pending = [(node, Placement()) for node in range(len(file.listed("nodes")))]
+        pending = [(node, Placement()) for node in range(len(file.list_of("nodes")))]
     found: list[tuple[int, Placement]] = []
     seen: set[int] = set()
     while pending:
@@ -474,12 +478,12 @@ def _splat_primitives(file: GltfReader, mesh: int) -> list[dict[str, int]]:
         raise ValueError(f"{where} has no list of primitives; the file is damaged")
     found = []
     for index, entry in enumerate(primitives):
-        primitive = records.checked(entry, PRIMITIVE, f"primitive {index} of {where}")
+        primitive = records.check_fields(entry, PRIMITIVE, f"primitive {index} of {where}")
         extensions = entry.get("extensions")
         if not isinstance(extensions, dict) or EXTENSION not in extensions:
             continue
         splats = extensions[EXTENSION]
-        records.checked(splats, SPLATS, f"{EXTENSION} of primitive {index} of {where}")
+        records.check_fields(splats, SPLATS, f"{EXTENSION} of primitive {index} of {where}")
         packed = splats.get("extensions") if isinstance(splats, dict) else None
         if packed or primitive["mode"] != POINTS:
             raise ValueError(f"the splats of {where} are packed by {packed or 'no points'}; expected them as they are")

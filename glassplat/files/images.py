@@ -35,7 +35,8 @@ _FULL_SCALE_16 = 65535
 
 # Damaged tags that do not matter end in warnings that name no file; those that do matter raise errors.
 warnings.filterwarnings("ignore", module=r"PIL\.")
-Image.MAX_IMAGE_PIXELS = None  # `opened` sets the bound, and says which file is too large; Pillow warns and names none.
+# `checked_image` sets the bound, and says which file is too large; Pillow warns and names none.
+Image.MAX_IMAGE_PIXELS = None
 
 
 @cache
@@ -56,7 +57,7 @@ def open_image(path: Path) -> Image.Image:
         FileNotFoundError: there is no such file.
         ValueError: the file is no image, is cut off or too large, or its values are no colours; the message names it.
     """
-    with opened(path) as image:
+    with checked_image(path) as image:
         image.load()
         _check_shades(image)
         return image
@@ -69,7 +70,7 @@ def image_size(path: Path) -> tuple[int, int]:
         FileNotFoundError: there is no such file.
         ValueError: the file is no image, or too large.
     """
-    with opened(path) as image:
+    with checked_image(path) as image:
         return image.width, image.height
 
 
@@ -80,7 +81,7 @@ def is_transparent(path: Path) -> bool:
         FileNotFoundError: there is no such file.
         ValueError: the file is no image, is cut off or too large.
     """
-    with opened(path) as image:
+    with checked_image(path) as image:
         if not image.has_transparency_data:
             return False
         with_alpha = image if "A" in image.getbands() else image.convert("RGBA")
@@ -97,7 +98,7 @@ def read_image(path: Path | str) -> NDArray[np.uint8]:
         FileNotFoundError: there is no such file.
         ValueError: the file is no image, is cut off or too large, or its values are no colours.
     """
-    with opened(Path(path)) as image:
+    with checked_image(Path(path)) as image:
         if image.mode in SHADES_16:
             return np.round(_shades(image) * 255).astype(np.uint8)[:, :, None]
         return _pixels(image)
@@ -110,7 +111,7 @@ def read_image_float(path: Path | str) -> NDArray[np.float32]:
         FileNotFoundError: there is no such file.
         ValueError: the file is no image, is cut off or too large, or its values are no colours.
     """
-    with opened(Path(path)) as image:
+    with checked_image(Path(path)) as image:
         if image.mode in SHADES_16:
             return _shades(image)[:, :, None]
         return _pixels(image).astype(np.float32) / np.float32(255)
@@ -136,7 +137,7 @@ def write_image(path: Path | str, image: Tensor | NDArray[np.generic]) -> None:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Image.Image]:
+def checked_image(path: Path) -> Iterator[Image.Image]:
     """An image whose size is checked; all that Pillow raises about a bad file becomes one error that names it.
 
     Raises:

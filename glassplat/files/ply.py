@@ -183,9 +183,9 @@ def read_gaussians(path: Path | str) -> Gaussians:
     columns = {name: torch.from_numpy(_as_float32(values)) for name, values in table.columns.items()}
     sh = _read_sh(columns, path)
     return Gaussians(
-        means=_stacked(columns, POSITION),
-        quats=_stacked(columns, ROTATION),
-        log_scales=_stacked(columns, SCALE if SCALE[-1] in columns else DISC_SCALE),
+        means=_stack_columns(columns, POSITION),
+        quats=_stack_columns(columns, ROTATION),
+        log_scales=_stack_columns(columns, SCALE if SCALE[-1] in columns else DISC_SCALE),
         logit_opacities=columns["opacity"],
         sh=sh,
         channels={name: column for name, column in columns.items() if is_channel(name)},
@@ -214,10 +214,10 @@ def _read_sh(columns: Mapping[str, Tensor], path: Path) -> Tensor:
         raise ValueError(f"{path} lacks the colour properties {missing}; expected f_dc_0..2 and f_rest_* without gaps")
     if rest_count not in [3 * (count - 1) for count in SH_COEFFICIENTS]:
         raise ValueError(f"{path} has {rest_count} f_rest properties; expected 0, 9, 24 or 45 (SH degree 0 to 3)")
-    band_zero = _stacked(columns, COLOR)[:, None]
+    band_zero = _stack_columns(columns, COLOR)[:, None]
     if rest_count == 0:
         return band_zero
-    rest = _stacked(columns, tuple(rest_names)).reshape(-1, 3, rest_count // 3).transpose(1, 2)
+    rest = _stack_columns(columns, tuple(rest_names)).reshape(-1, 3, rest_count // 3).transpose(1, 2)
     return torch.cat([band_zero, rest], dim=1).contiguous()
 
 
@@ -244,5 +244,5 @@ def _as_float32(values: NDArray) -> NDArray[np.float32]:
         return np.ascontiguousarray(values, dtype=np.float32)
 
 
-def _stacked(columns: Mapping[str, Tensor], names: tuple[str, ...]) -> Tensor:
+def _stack_columns(columns: Mapping[str, Tensor], names: tuple[str, ...]) -> Tensor:
     return torch.stack([columns[name] for name in names], dim=1)

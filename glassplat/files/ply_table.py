@@ -181,7 +181,7 @@ def _read_binary(
     available = os.fstat(stream.fileno()).st_size - stream.tell() - skipped
     if available < element.count * row_type.itemsize:
         complete = max(available, 0) // max(row_type.itemsize, 1)
-        raise _truncated(path, element, complete)
+        raise _truncation_error(path, element, complete)
     stream.seek(skipped, os.SEEK_CUR)
     rows = np.fromfile(stream, dtype=row_type, count=element.count)
     return {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name, _ in element.properties}
@@ -197,7 +197,7 @@ def _read_ascii(
     width = len(element.properties)
     complete = next((index for index, row in enumerate(rows) if len(row) != width), len(rows))
     if complete < element.count:
-        raise _truncated(path, element, complete)
+        raise _truncation_error(path, element, complete)
     try:
         values = np.array(rows, dtype=np.float64).reshape(element.count, width)
     except ValueError as error:
@@ -222,7 +222,7 @@ def _in_declared_type(values: NDArray[np.float64], kind: str, name: str, path: P
         return values.astype(kind)
 
 
-def _truncated(path: Path, element: PlyElement, complete: int) -> ValueError:
+def _truncation_error(path: Path, element: PlyElement, complete: int) -> ValueError:
     return ValueError(
         f"{path} is cut off: its header announces {element.count} rows of {element.name!r}, "
         f"but only {complete} are complete; copy or export the file again"

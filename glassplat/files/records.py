@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from glassplat.options import is_finite, shown
+from glassplat.options import is_finite, short_repr
 
 LARGEST_TEXT = 2**28
 """Bytes of a text file; a list of a hundred thousand photographs with their poses has a quarter of it."""
@@ -316,7 +316,7 @@ class Optional:
         return self.field.read(value, where)
 
 
-def checked(value: Any, fields: Mapping[str, Field], where: str) -> dict[str, Any]:
+def check_fields(value: Any, fields: Mapping[str, Field], where: str) -> dict[str, Any]:
     """The fields of an object, each as its entry of the table says; keys that the table does not know are left out.
 
     Args:
@@ -328,7 +328,7 @@ def checked(value: Any, fields: Mapping[str, Field], where: str) -> dict[str, An
         ValueError: no object, a key that is missing, or a value of another type or out of range.
     """
     if not isinstance(value, dict):
-        raise ValueError(f"{where} is {shown(value)}; expected an object with {', '.join(fields)}")
+        raise ValueError(f"{where} is {short_repr(value)}; expected an object with {', '.join(fields)}")
     found = {}
     for key, field in fields.items():
         if key in value:
@@ -342,7 +342,7 @@ def checked(value: Any, fields: Mapping[str, Field], where: str) -> dict[str, An
 
 def mismatch(value: Any, where: str, field: Field) -> ValueError:
     """The error of a value that is not what was expected."""
-    return ValueError(f"{where} is {shown(value)}; expected {field.expected}")
+    return ValueError(f"{where} is {short_repr(value)}; expected {field.expected}")
 
 
 def _range_text(least: float, most: float, above: float = -math.inf) -> str:

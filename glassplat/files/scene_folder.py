@@ -90,7 +90,7 @@ def read_scene(folder: Path) -> Scene:
     Raises:
         FileNotFoundError, ValueError: a file is missing, truncated or foreign.
     """
-    header = records.checked(records.read_json(folder / SCENE), HEADER, str(folder / SCENE))
+    header = records.check_fields(records.read_json(folder / SCENE), HEADER, str(folder / SCENE))
     for name in header["files"] or ():
         if not os.path.isfile(folder / name):
             raise FileNotFoundError(f"no {name} in {folder}; {SCENE} says that the scene has one: export it again")
@@ -265,7 +265,7 @@ def read_forged(path: Path) -> Gaussians:
         data = path.read_bytes()
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder) / "scene.ply"
-        plain.write_bytes(_converted(forge, data, kind, "ply", path))
+        plain.write_bytes(_convert(forge, data, kind, "ply", path))
         return read_gaussians(plain)
 
 
@@ -280,7 +280,7 @@ def write_forged(path: Path, gaussians: Gaussians) -> None:
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder) / "scene.ply"
         write_gaussians(plain, gaussians)
-        data = _converted(forge, plain.read_bytes(), "ply", path.suffix.lower()[1:], path)
+        data = _convert(forge, plain.read_bytes(), "ply", path.suffix.lower()[1:], path)
     with atomic_write(path) as temporary:
         temporary.write_bytes(data)
 
@@ -295,7 +295,7 @@ def _forge(path: Path) -> Any:
     return GaussForge()
 
 
-def _converted(forge: Any, data: bytes, source: str, target: str, path: Path) -> bytes:
+def _convert(forge: Any, data: bytes, source: str, target: str, path: Path) -> bytes:
     result = forge.convert(data, source, target)
     if "data" not in result:
         raise ValueError(f"gaussforge cannot convert {path} from {source} to {target}: {result.get('error')}")

@@ -25,7 +25,7 @@ from glassplat.files import records
 from glassplat.files.images import read_image_float, write_image
 from glassplat.files.writing import atomic_write, make_folder
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
-from glassplat.options import shown
+from glassplat.options import short_repr
 from glassplat.scene.camera import Camera, quat_from_rotation
 from glassplat.scene.corrections import ByPhotograph, Exposures, PoseCorrections
 from glassplat.scene.panes import Planes
@@ -65,7 +65,9 @@ def write_tensors(path: Path | str, tensors: Mapping[str, Tensor], header: Mappi
 
 def system_error(text: str) -> OSError:
     """The error of the operating system that a library tells in words, with the number that says what helps."""
-    if match := re.search(r"\(os error (\d+)\)", text):  # As libraries in Rust have it, on Windows with its own numbers.
+    if match := re.search(
+        r"\(os error (\d+)\)", text
+    ):  # As libraries in Rust have it, on Windows with its own numbers.
         return OSError(int(match[1]), text, None, int(match[1]))
     number = next((number for number in errno.errorcode if os.strerror(number) in text), None)
     return OSError(text) if number is None else OSError(number, text)
@@ -85,7 +87,7 @@ def opened_tensors(path: Path, file_format: str, what: str) -> Iterator[TensorsF
         ValueError: the file cannot be read, is truncated or foreign; also if that shows while it is open.
     """
     try:
-        with records.reading(path), _unicode_name(path) as name, _opened(name) as file:
+        with records.reading(path), _unicode_name(path) as name, _open_table(name) as file:
             header = records.parse_json((file.metadata() or {}).get(HEADER_KEY, "{}"), f"the header of {path}")
             if not isinstance(header, dict) or header.get("format") != file_format:
                 found = header.get("format") if isinstance(header, dict) else header
@@ -97,7 +99,7 @@ def opened_tensors(path: Path, file_format: str, what: str) -> Iterator[TensorsF
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _open_table(path: Path) -> Iterator[Any]:
     """The library's view of one file; it opens a path twice, and another file may be written there in between."""
     while True:
         before = _file_identity(path)
@@ -246,14 +248,14 @@ def _load_entries(path: Path) -> list[Any]:
         raise FileNotFoundError(f"no planes file at {path}; expected the planes.json of a run")
     entries = records.read_json(path)
     if not isinstance(entries, list):
-        raise ValueError(f"{path} holds {shown(entries)}; expected a list with one object per plane")
+        raise ValueError(f"{path} holds {short_repr(entries)}; expected a list with one object per plane")
     return entries
 
 
 def _checked_entry(entry: Any, index: int, path: Path) -> dict[str, Any]:
     """One plane whose rectangle has a direction and an area."""
     where = f"plane {index} in {path}"
-    plane = records.checked(entry, PLANE, where)
+    plane = records.check_fields(entry, PLANE, where)
     normal, tangent = (torch.tensor(plane[key], dtype=torch.float64) for key in ("normal", "tangent"))
     for key, vector in (("normal", normal), ("tangent", tangent)):
         if float(vector.norm()) < LEAST_LENGTH:
@@ -343,12 +345,12 @@ def read_cameras(path: Path | str) -> list[tuple[str, Camera]]:
     path = Path(path)
     entries = records.read_json(path)
     if not isinstance(entries, list):
-        raise ValueError(f"{path} holds {shown(entries)}; expected a list with one object per camera")
+        raise ValueError(f"{path} holds {short_repr(entries)}; expected a list with one object per camera")
     return [_camera(entry, f"camera {index} in {path}") for index, entry in enumerate(entries, start=1)]
 
 
 def _camera(entry: Any, where: str) -> tuple[str, Camera]:
-    values = records.checked(entry, CAMERA, where)
+    values = records.check_fields(entry, CAMERA, where)
     rotation = torch.tensor(values["rotation"], dtype=torch.float64).T
     shear = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
     if float(shear) > LARGEST_SHEAR or float(torch.linalg.det(rotation)) < 0:
@@ -464,7 +466,9 @@ def read_environment(path: Path | str) -> Environment:
     if not os.path.isfile(path):
         raise FileNotFoundError(f"no environment at {path}; expected the environment.safetensors of a run")
     with opened_tensors(path, FORMAT, "an environment") as file:
-        region = records.checked(file.header, {"region": records.Optional(REGION)}, f"the header of {path}")["region"]
+        region = records.check_fields(file.header, {"region": records.Optional(REGION)}, f"the header of {path}")[
+            "region"
+        ]
         raw = file.tensors().get("raw")
     if raw is None or not (raw.is_floating_point() and bool(torch.isfinite(raw).all())):
         raise ValueError(f"{path} holds no tensor `raw` of finite numbers; expected the texels of an environment")

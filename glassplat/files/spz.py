@@ -92,7 +92,7 @@ def _three_log_scales(gaussians: Gaussians) -> Tensor:
     return torch.nn.functional.pad(gaussians.log_scales, (0, 1), value=LOWEST_LOG_SCALE)
 
 
-def unpacked(sections: list[Bytes], layout: Layout) -> Gaussians:
+def unpack_gaussians(sections: list[Bytes], layout: Layout) -> Gaussians:
     """The Gaussians of six sections, in the frame of a PLY; harmonics of the fourth degree are left out."""
     positions, opacities, colors, scales, rotations, harmonics = sections
     count, kept = layout.number, min(HARMONICS[layout.degree], MOST_HARMONICS)
@@ -240,7 +240,7 @@ def read_spz(path: Path | str) -> Gaussians:
         layout, sections = _read_streams(data, path)
     else:
         raise ValueError(f"{path} is no SPZ file: expected it to begin with gzip or NGSP; give a .spz file")
-    return unpacked(sections, layout)
+    return unpack_gaussians(sections, layout)
 
 
 def _streamed(head: tuple[int, ...], sections: list[bytes]) -> bytes:

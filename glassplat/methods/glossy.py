@@ -37,7 +37,7 @@ from glassplat.training.losses import (
     mean_strength,
     normal_consistency,
     strength_outside,
-    weighted,
+    weighted_terms,
 )
 from glassplat.training.options import PUBLISHED_ITERATIONS, GaussianRates, Intervals, Rate
 from glassplat.training.stage import Action, Every, Stage
@@ -84,7 +84,7 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         recipe.intervals.opacity, 0.0, recipe.schedule.stop, recipe.intervals.least, skip_multiples_of=3
     )
     renderer = Deferred(recipe.background or BLACK, depth=recipe.consistency_weight != 0)
-    guidance = weighted(
+    guidance = weighted_terms(
         LossTerm("outside", recipe.outside_weight, strength_outside),
         LossTerm("strength", recipe.strength_weight, mean_strength),
         LossTerm("consistency", recipe.consistency_weight, normal_consistency),
@@ -240,7 +240,7 @@ def traced_stages_of(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHE
         known = tuple(_with_harmonics(stage, Every(recipe.intervals.sh)) for stage in known)
     bootstrap, distant, refinement = known
     if recipe.primitive == "disc":
-        distant, refinement = _rendered(recipe, distant), _rendered(recipe, refinement)
+        distant, refinement = _with_renderer(recipe, distant), _with_renderer(recipe, refinement)
     if recipe.normals_throughout:
         bootstrap = _with_normal_terms(recipe, bootstrap, distant) if recipe.primitive == "disc" else bootstrap
         refinement = replace(refinement, losses=distant.losses, renderer=distant.renderer)
@@ -268,7 +268,7 @@ def _with_normal_terms(recipe: TracedRecipe, bootstrap: Stage, reflecting: Stage
 
 def _tracing(recipe: TracedRecipe, stage: Stage) -> Stage:
     """A stage of `deferred` in which rays find what is mirrored."""
-    stage = _rendered(recipe, stage)
+    stage = _with_renderer(recipe, stage)
     return replace(
         stage,
         rates={**stage.rates, **recipe.surroundings.rates.of("surroundings")},
@@ -277,7 +277,7 @@ def _tracing(recipe: TracedRecipe, stage: Stage) -> Stage:
     )
 
 
-def _rendered(recipe: TracedRecipe, stage: Stage) -> Stage:
+def _with_renderer(recipe: TracedRecipe, stage: Stage) -> Stage:
     """A stage of `deferred` with this method's renderer, which propagation looks through as well."""
     # What no ray leaves and no environment lights mirrors nothing, and a strength that mirrors nothing cannot grow.
     least_strength = 0.0 if recipe.mirrors == "surroundings" else recipe.least_strength

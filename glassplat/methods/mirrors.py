@@ -22,11 +22,11 @@ from torch.nn.functional import interpolate, normalize
 
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import View, estimated_normals, evenly
-from glassplat.render.deferred import cell_side, depth_normals, resized, seen_surface, view_directions
+from glassplat.render.deferred import cell_side, depth_normals, resize_environment, seen_surface, view_directions
 from glassplat.render.frame import Renderer
-from glassplat.render.layers import contributions, gathered
+from glassplat.render.layers import contributions, gather_pixels
 from glassplat.scene import SH_ZERO, logit
-from glassplat.scene.camera import Camera, moved, quat_product, rotation_from_quat
+from glassplat.scene.camera import Camera, quat_product, rotation_from_quat, to_device
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import Densify, GrowSh, ResetOpacity
@@ -201,9 +201,9 @@ def seen_normals(scene: Scene, views: Sequence[View], estimated: bool = False) -
     for view in views:
         camera = view.camera.to(normals.device)
         known = estimated_normals(view) if estimated else None
-        image = slopes_of_depths(scene, camera) if known is None else moved(known, normals.device)
+        image = slopes_of_depths(scene, camera) if known is None else to_device(known, normals.device)
         cosines = -(image * normalize(view_directions(camera), dim=-1)).sum(-1, keepdim=True)
-        normals += gathered(scene, camera, image * cosines.clamp(min=0))
+        normals += gather_pixels(scene, camera, image * cosines.clamp(min=0))
     return normals
 
 
@@ -511,7 +511,7 @@ class RefineEnvironment:
         if environment.size >= self.largest:
             return False
         doublings = sum(round(moment * clock.iterations) == clock.step for moment in self.moments)
-        finer = resized(environment, min(2**doublings * environment.size, self.largest))
+        finer = resize_environment(environment, min(2**doublings * environment.size, self.largest))
         state.scene = replace(state.scene, environment=finer)
         return True
 

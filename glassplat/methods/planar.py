@@ -55,7 +55,7 @@ from glassplat.training.losses import (
     mask_loss,
     reflection_left,
     tint_departure,
-    weighted,
+    weighted_terms,
 )
 from glassplat.training.messages import Working
 from glassplat.training.options import PUBLISHED_ITERATIONS, Rate
@@ -106,7 +106,7 @@ class PaneSetup:
         state.scene = replace(scene, planes=planes.that_may_tint() if self.tint else planes)
         state.statistics.clear()
         for mirrors in surfaces(planes, mirrors=True):
-            yield Working(f"moving what was built behind {named(mirrors, 'mirror')}", 0, 1)
+            yield Working(f"moving what was built behind {name_panes(mirrors, 'mirror')}", 0, 1)
             turn_virtual_scene_round(state, dataset, mirrors)
         for panes in surfaces(planes, mirrors=False) if self.seed_reflections else ():
             yield from seed_reflection(state, dataset, panes)
@@ -171,7 +171,7 @@ def fitted_planes(dataset: Dataset, centers: Tensor | None, fit: PlaneFit) -> Pl
         options=fit,
         unmarked=[(view.name, view.camera) for view in dataset.train if view.pane_labels is None],
     )
-    return fitted if not len(given) else given.to(fitted.centers.device).joined(fitted)
+    return fitted if not len(given) else given.to(fitted.centers.device).concat(fitted)
 
 
 def _check_marked(labels: Sequence[int], masks: Sequence[Tensor], dataset: Dataset) -> None:
@@ -226,7 +226,7 @@ def surfaces(planes: Planes, *, mirrors: bool) -> list[Planes]:
     return [planes.select(group) for group in coplanar_groups(planes, rows)]
 
 
-def named(panes: Planes, kind: str) -> str:
+def name_panes(panes: Planes, kind: str) -> str:
     """Name of panes in messages: "pane 2", "panes 2, 3"."""
     labels = ", ".join(map(str, sorted(panes.labels)))
     return f"{kind}s {labels}" if len(panes) > 1 else f"{kind} {labels}"
@@ -236,7 +236,7 @@ def reflects_little(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> W
     """Return whether Gaussians cover hardly anything of what panes could mirror; False where no view shows any."""
     covered, whole = 0.0, 0
     for done, camera in enumerate(cameras):
-        yield Working(f"looking for what {named(panes, 'pane')} can mirror", done, len(cameras))
+        yield Working(f"looking for what {name_panes(panes, 'pane')} can mirror", done, len(cameras))
         of_view, pixels = mirrored_coverage(scene, panes, camera)
         covered, whole = covered + of_view, whole + pixels
     return covered < LEAST_COVERAGE * whole
@@ -246,7 +246,7 @@ def turn_virtual_scene_round(state: TrainState, dataset: Dataset, mirrors: Plane
     """Moves what the first stage built behind a mirror, or several in one plane, to where it really is, in front."""
     virtual = virtual_points(state.scene.primary.means, mirrors, [view.camera for view in dataset.train])
     if moved := turn_round(state, virtual, mirrors):
-        log.info("%d Gaussians behind %s moved to the front", moved, named(mirrors, "mirror"))
+        log.info("%d Gaussians behind %s moved to the front", moved, name_panes(mirrors, "mirror"))
 
 
 TURN_AFTER = 0.005
@@ -274,7 +274,7 @@ class TurnReflections:
         cameras = [view.camera for view in dataset.train]
         of_glass, moved = surfaces(state.scene.planes, mirrors=False), 0
         for done, panes in enumerate(of_glass):
-            yield Working(f"looking behind {named(panes, 'pane')} for what it mirrors", done, len(of_glass))
+            yield Working(f"looking behind {name_panes(panes, 'pane')} for what it mirrors", done, len(of_glass))
             moved += turn_round(state, reflections_behind(state.scene, panes, cameras), panes)
         if moved:
             state.statistics.pop("primary", None)
@@ -339,7 +339,7 @@ class FillUnseen:
         cameras, added = [view.camera for view in dataset.train], 0
         of_glass = surfaces(state.scene.planes, mirrors=False)
         for done, panes in enumerate(of_glass):
-            yield Working(f"looking for what {named(panes, 'pane')} can mirror", done, len(of_glass))
+            yield Working(f"looking for what {name_panes(panes, 'pane')} can mirror", done, len(of_glass))
             places, color = unseen_places(state.scene, panes, cameras)
             if 0 < len(places) < MOST_ADDED * len(state.scene.primary):
                 colors = (255 * color).round().to(torch.uint8).expand(len(places), 3)
@@ -382,7 +382,9 @@ def seed_reflection(state: TrainState, dataset: Dataset, panes: Planes) -> Work:
     behind = replace(points, positions=points.positions[virtual], colors=points.colors[virtual])
     seeds = mirrored_gaussians(seeds_of(state.scene.primary, behind), panes.centers[0], panes.normals[0])
     add_primary(state, seeds)
-    log.info("no photograph shows what is mirrored by %s: %d points behind mirrored", named(panes, "pane"), len(seeds))
+    log.info(
+        "no photograph shows what is mirrored by %s: %d points behind mirrored", name_panes(panes, "pane"), len(seeds)
+    )
     return True
 
 
@@ -535,7 +537,7 @@ def _glass_post_steps(recipe: PlanarRecipe) -> tuple[PostStep, ...]:
 
 
 def _joint_terms(recipe: PlanarRecipe, population: Population) -> tuple[LossTerm, ...]:
-    glass = weighted(LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, tint_departure))
+    glass = weighted_terms(LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, tint_departure))
     return (image_term(recipe.ssim_weight), *reflection_terms(recipe), *glass, *population.terms)
 
 
@@ -593,7 +595,7 @@ def reflection_terms(recipe: PlanarRecipe) -> tuple[LossTerm, ...]:
     """The terms whose weight is not zero."""
     weights = recipe.weights
     conflict = reflection_left if recipe.conflict == "cells" else gradient_conflict
-    return weighted(
+    return weighted_terms(
         LossTerm("depth", weights.depth, depth_deviation_loss),
         LossTerm("conflict", weights.conflict, conflict),
         LossTerm("mask", weights.mask, mask_loss),

@@ -12,7 +12,7 @@ from glassplat.files.records import parse_json
 from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.splat_recipe import SplatRecipe
-from glassplat.options import BLACK, WHITE, Rgb, options_from_json, shown
+from glassplat.options import BLACK, WHITE, Rgb, options_from_json, short_repr
 from glassplat.training.options import PUBLISHED_ITERATIONS
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def recipe_from_json(text: str, where: str = "the recipe") -> Any:
         fields = parse_json(text, where)
     method = fields.pop("method", None) if isinstance(fields, dict) else None
     if not isinstance(method, str) or method not in RECIPES:
-        raise InputError(f"{where}: the method is {shown(method)}; expected one of {', '.join(RECIPES)}. {REMEDY}")
+        raise InputError(f"{where}: the method is {short_repr(method)}; expected one of {', '.join(RECIPES)}. {REMEDY}")
     try:
         return options_from_json(RECIPES[method], fields)
     except InputError as error:
@@ -93,7 +93,7 @@ def with_background(recipe: Any, background: Rgb | None) -> Any:
     return recipe if recipe.background is not None else replace(recipe, background=background)
 
 
-def settled(recipe: Any, dataset: Dataset) -> Any:
+def resolve_background(recipe: Any, dataset: Dataset) -> Any:
     """The recipe with a background: its own, or else what transparent photographs are laid over, or else black.
 
     Raises:

@@ -222,7 +222,7 @@ class AddSurroundings:
         """Edits `state`; `matte` [N] bool tells which primary Gaussians may be copied."""
         parts = [part for part in self._parts(state, dataset, matte) if len(part)]
         # A scene in which everything reflects has nothing to copy.
-        found = reduce(Gaussians.joined, parts or [self._in_box(state, dataset)])
+        found = reduce(Gaussians.concat, parts or [self._in_box(state, dataset)])
         ordered, _ = apply_edit(found, {}, in_morton_order(found.means), part="surroundings")
         state.scene = replace(state.scene, surroundings=ordered)
 

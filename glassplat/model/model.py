@@ -33,7 +33,7 @@ from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import RunDirectory, write_text
 from glassplat.options import BLACK, Cleaning, Up
 from glassplat.publish.camera_paths import orbit
-from glassplat.publish.cleaning import Floaters, cleaned
+from glassplat.publish.cleaning import Floaters, clean_scene
 from glassplat.publish.web_page import PRIVATE, Sharing, best_view, bounding_ball, cameras_around, write_page
 from glassplat.render.deferred import equirect_from_environment
 from glassplat.render.frame import Frame, Renderer, check_layers
@@ -89,7 +89,7 @@ class Model:
         name = names[best_view(self.scene.planes, tuple(self.cameras.values()))]
         camera = self.cameras[name]
         width = min(NOTEBOOK_WIDTH, camera.width)
-        small = camera.resized(width, max(1, round(width * camera.height / camera.width)))
+        small = camera.resize(width, max(1, round(width * camera.height / camera.width)))
         file = io.BytesIO()
         Image.fromarray((255 * self.image(small)).round().byte().numpy()).save(file, "JPEG", quality=90)
         picture = base64.b64encode(file.getvalue()).decode()
@@ -192,7 +192,7 @@ class Model:
         """The same with some tensors replaced, by their names in `scene.parameters()`; gradients flow to them."""
         return self.with_scene(self.scene.with_parameters(parameters))
 
-    def cleaned(self, cleaning: Cleaning | None = None) -> tuple[Model, dict[str, int]]:
+    def clean(self, cleaning: Cleaning | None = None) -> tuple[Model, dict[str, int]]:
         """The model without floaters, and how many Gaussians each rule found.
 
         Args:
@@ -202,10 +202,10 @@ class Model:
             InputError: nothing would be left.
         """
         centers = torch.stack([camera.center for camera in self.viewpoints.values()])
-        bare, found = cleaned(self.scene, Floaters(self.scene.primary, centers), cleaning or Cleaning())
+        bare, found = clean_scene(self.scene, Floaters(self.scene.primary, centers), cleaning or Cleaning())
         return self.with_scene(bare), found
 
-    def scaled(self, factor: float) -> Model:
+    def scale(self, factor: float) -> Model:
         """The model in other units, its cameras too; it belongs to no capture any more, whose units are the old ones.
 
         Raises:
@@ -216,7 +216,7 @@ class Model:
             pose = camera.cam_from_world.clone()
             pose[:3, 3] *= factor
             cameras[name] = replace(camera, cam_from_world=pose)
-        return replace(self, scene=scene.scaled(self.scene, factor), cameras=cameras, path=None)
+        return replace(self, scene=scene.scale_scene(self.scene, factor), cameras=cameras, path=None)
 
     def without_glass(self) -> Model:
         """Without any panes: what is seen when nothing reflects."""
@@ -246,21 +246,21 @@ class Model:
         """
         return self.with_scene(scene.with_reflectance(self.scene, label, base_reflectance))
 
-    def shifted(self, label: int, distance: float) -> Model:
+    def shift_pane(self, label: int, distance: float) -> Model:
         """A pane moved along its normal by a distance in world units.
 
         Raises:
             ValueError: no pane has the label, or the distance is not finite.
         """
-        return self.with_scene(scene.shifted(self.scene, label, distance))
+        return self.with_scene(scene.shift_pane(self.scene, label, distance))
 
-    def tilted(self, label: int, about_tangent: float, about_bitangent: float = 0.0) -> Model:
+    def tilt_pane(self, label: int, about_tangent: float, about_bitangent: float = 0.0) -> Model:
         """A pane turned about its middle, by degrees about its first and its second side.
 
         Raises:
             ValueError: no pane has the label, or an angle is not finite.
         """
-        return self.with_scene(scene.tilted(self.scene, label, about_tangent, about_bitangent))
+        return self.with_scene(scene.tilt_pane(self.scene, label, about_tangent, about_bitangent))
 
     def with_pane(
         self,

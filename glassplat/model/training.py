@@ -22,7 +22,7 @@ from glassplat.captures.dataset import Dataset, photographs_read, with_corrected
 from glassplat.errors import InputError, RankLostError, first_names
 from glassplat.files.writing import make_folder
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
-from glassplat.methods.recipe import RECIPES, Recipe, recipe_to_json, settled
+from glassplat.methods.recipe import RECIPES, Recipe, recipe_to_json, resolve_background
 from glassplat.model import run_directory
 from glassplat.model.model import Model
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
@@ -128,7 +128,7 @@ class Run:
             InputError: the directory is not fit for it (`check_output`), the run is too short for its stages, or as
                 `settled` does.
         """
-        self.recipe = settled(recipe, dataset)
+        self.recipe = resolve_background(recipe, dataset)
         self._stages = self.recipe.stages(settings.seed, settings.iterations)
         check_length(self._stages, settings.iterations)
         run_directory.check_output(directory, resume=resume)
@@ -166,10 +166,10 @@ class Run:
 
     def _following(self) -> Generator[Message, None, None]:
         """Trains along, and writes nothing."""
-        self.state = self._ranks.shared(self.state, self._settings.device)
+        self.state = self._ranks.broadcast(self.state, self._settings.device)
         self._session = TrainingSession(self.state, self._ranks)
-        with self._dataset.memory.spooled(self._directory.path):
-            yield from self._session.trained(self._stages, self._dataset, self._settings.iterations)
+        with self._dataset.memory.spool_to(self._directory.path):
+            yield from self._session.run_stages(self._stages, self._dataset, self._settings.iterations)
 
     def _leading(self) -> Generator[Message, None, None]:
         directory, settings = self._directory, self._settings
@@ -186,12 +186,12 @@ class Run:
             else:
                 directory.check_vacant()
                 directory.begin(self.recipe, settings, self._dataset)
-            self.state = self._ranks.shared(self.state, settings.device)
+            self.state = self._ranks.broadcast(self.state, settings.device)
             with run_directory.open_log(directory.log, self.state.step) as log:
                 self._session = TrainingSession(self.state, self._ranks, Record(directory.checkpoint, log, self._every))
                 yield from self._session.deliver(RunBegun(self.state.step, settings.iterations, anew))
-                with self._dataset.memory.spooled(directory.path):
-                    yield from self._session.trained(self._stages, self._dataset, settings.iterations)
+                with self._dataset.memory.spool_to(directory.path):
+                    yield from self._session.run_stages(self._stages, self._dataset, settings.iterations)
             self._export()
 
     @property
@@ -314,7 +314,9 @@ class TrainingSession:
         self._longest = self._writing = 0.0
         self._stop = StopRequest()
 
-    def trained(self, stages: tuple[Stage, ...], dataset: Dataset, iterations: int) -> Generator[Message, None, None]:
+    def run_stages(
+        self, stages: tuple[Stage, ...], dataset: Dataset, iterations: int
+    ) -> Generator[Message, None, None]:
         """Trains to the end, or raises KeyboardInterrupt after the step in which the user asks for it."""
         with stop_on_interrupt() as self._stop, photographs_read(dataset) as check_photographs:
             self._ranks.asked = lambda: self._stop.requested
@@ -449,7 +451,7 @@ class Training:
         if output is None:
             if resume:
                 raise InputError("resume=True needs the output that it is to go on with")
-            self.recipe: Any = settled(chosen, dataset)
+            self.recipe: Any = resolve_background(chosen, dataset)
             self._stages = self.recipe.stages(seed, iterations)
             check_length(self._stages, iterations)
             return
@@ -547,7 +549,7 @@ class Training:
         if self._state is None:
             yield Working("preparing the first scene", 0, 1)
             first = first_state(self.recipe, self._settings, self._dataset) if self._ranks.leads else None
-            self._state = self._ranks.shared(first, self._settings.device)
+            self._state = self._ranks.broadcast(first, self._settings.device)
         yield from train(self._stages, self._dataset, self._state, self.iterations, ranks=self._ranks)
 
 

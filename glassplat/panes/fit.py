@@ -18,7 +18,7 @@ from glassplat.panes.masks import (
     PaneView,
     PlaneEquations,
     agreement_of_each,
-    joined,
+    join_planes,
     mask_agreement,
     pane_views,
     plane_candidates,
@@ -191,19 +191,19 @@ def fit_planes(
     found = []
     for label in labels:
         views = pane_views(annotations, label, most=options.most_views, names=names)
-        with _told(label, len(labels)):
+        with _advice(label, len(labels)):
             found.append(_found_pane(label, clouds, views, extent=extent, options=options))
     cameras = [camera for camera, _ in annotations] + [camera for _, camera in unmarked]
     cloud = next(iter(clouds.values()))
     panes = []
     for pane in _in_one_plane(found, options.seed):
-        with _told(pane.label, len(labels)):
-            panes.append(_finished(_placed_by_images(pane, cloud, cameras, options), options, unmarked))
+        with _advice(pane.label, len(labels)):
+            panes.append(_finish(_placed_by_images(pane, cloud, cameras, options), options, unmarked))
     return _planes(panes, labels, options).to(centers.device)
 
 
 @contextmanager
-def _told(label: int, count: int) -> Iterator[None]:
+def _advice(label: int, count: int) -> Iterator[None]:
     """Says what else can be done about a pane that has no plane, where it is one of several."""
     try:
         yield
@@ -317,10 +317,10 @@ def _in_one_plane(found: Sequence[_Found], seed: int) -> list[_Found]:
         joint = _joint([panes[label] for label in labels], seed)
         panes |= {pane.label: pane for pane in joint}
     trusted = [pane for pane in panes.values() if pane.fault is None and not pane.has_few]
-    return [_decided(pane, trusted) if pane.is_open else pane for pane in panes.values()]
+    return [_choose_plane(pane, trusted) if pane.is_open else pane for pane in panes.values()]
 
 
-def _decided(pane: _Found, trusted: Sequence[_Found]) -> _Found:
+def _choose_plane(pane: _Found, trusted: Sequence[_Found]) -> _Found:
     """The pane on that plane of another one which serves it as well as its own; as it is if there is none."""
     losses = [_loss(pane, other.plane) for other in trusted]
     if not losses or min(losses) > MOST_LOSS:
@@ -382,7 +382,7 @@ def _joint(panes: Sequence[_Found], seed: int) -> list[_Found]:
     while len(panes) > 1:
         objective = JointObjective([pane.evidence for pane in panes])
         rng = np.random.default_rng((seed, *(pane.label for pane in panes)))
-        plane = best_joint_plane(objective, joined([pane.plane for pane in panes]), rng)
+        plane = best_joint_plane(objective, join_planes([pane.plane for pane in panes]), rng)
         losses = [_loss(pane, plane) for pane in panes]
         if max(losses) <= MOST_LOSS:
             labels, turned = ", ".join(str(pane.label) for pane in panes), max(angle(p.plane, plane) for p in panes)
@@ -392,7 +392,7 @@ def _joint(panes: Sequence[_Found], seed: int) -> list[_Found]:
     return panes
 
 
-def _finished(pane: _Found, options: PlaneFit, unmarked: Sequence[tuple[str, Camera]]) -> _Pane:
+def _finish(pane: _Found, options: PlaneFit, unmarked: Sequence[tuple[str, Camera]]) -> _Pane:
     """The pane with its rectangle.
 
     Raises:

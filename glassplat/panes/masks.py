@@ -108,7 +108,7 @@ class FramedPlanes:
         return FramedPlanes(self.planes.select(index), self.frames[index])
 
 
-def joined(parts: Sequence[FramedPlanes]) -> FramedPlanes:
+def join_planes(parts: Sequence[FramedPlanes]) -> FramedPlanes:
     """All planes of several sets."""
     normals = np.concatenate([part.planes.normals for part in parts])
     offsets = np.concatenate([part.planes.offsets for part in parts])
@@ -294,9 +294,9 @@ def without_gaps(view: PaneView) -> PaneView:
     """The view with narrow gaps of its mask filled, such as a thing before the pane leaves; itself if it has none."""
     step = max(int(view.diagonal / GAPS_SEEN_AT), 1)
     coarse = view.mask[::step, ::step]
-    if not _is_larger(_closed(coarse), coarse):
+    if not _is_larger(_close_gaps(coarse), coarse):
         return view
-    mask = view.mask | (_closed(view.mask) & ~view.hidden)
+    mask = view.mask | (_close_gaps(view.mask) & ~view.hidden)
     if not _is_larger(mask, view.mask):
         return view
     edge = _edge_points(mask)
@@ -307,7 +307,7 @@ def _is_larger(mask: Mask, other: Mask) -> bool:
     return bool(mask.sum() >= (1 + LEAST_FILLED) * other.sum())
 
 
-def _closed(mask: Mask) -> Mask:
+def _close_gaps(mask: Mask) -> Mask:
     """The mask after everything that is nearer to it than half the width of a gap has been joined to it and taken off
     its outside again.
     """

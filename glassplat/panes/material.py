@@ -13,7 +13,7 @@ from torch import Tensor
 
 from glassplat.captures.view import View, evenly
 from glassplat.kernels.maths.images import linear_from_srgb
-from glassplat.render.layers import gathered, gathered_mirrored
+from glassplat.render.layers import gather_pixels, gathered_mirrored
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene import SH_ZERO, logit
@@ -131,7 +131,7 @@ def reduced_photograph(scene: Scene, view: View) -> Photograph:
     labels = None if view.pane_labels is None else view.pane_labels.to(device)
     if labels is not None:
         labels = torch.nn.functional.interpolate(labels[None, None].float(), size, mode="nearest-exact")[0, 0]
-    return Photograph(camera.resized(size[1], size[0]), pixels, valid == 1, labels)
+    return Photograph(camera.resize(size[1], size[0]), pixels, valid == 1, labels)
 
 
 def judged_pane(scene: Scene, label: int, photographs: Sequence[Photograph]) -> JudgedPane:
@@ -540,7 +540,7 @@ def _lamps_among(scene: Scene, photographs: Sequence[Photograph]) -> Tensor:
         strength = Planar(nearest_only=True)(scene, photograph.camera).layers["strength"]
         past, through = photograph.valid & (strength <= 0), photograph.valid & (strength > 0)
         darkest = photograph.pixels.amin(dim=-1)
-        shown = gathered(scene, photograph.camera, torch.stack([past & (darkest > CLIPPED), past], dim=-1).float())
+        shown = gather_pixels(scene, photograph.camera, torch.stack([past & (darkest > CLIPPED), past], dim=-1).float())
         enough = linear_from_srgb(darkest.clamp(0, 1)) > LEAST_GAIN * strength
         there = gathered_mirrored(scene, photograph.camera, torch.stack([through & enough, through], dim=-1).float())
         clipped, direct = clipped + shown[:, 0], direct + shown[:, 1]
@@ -573,7 +573,7 @@ def _images_of(scene: Scene, seen: Sequence[LitPixels], photographs: Sequence[Ph
     for photograph, (glass, lit) in zip(photographs, seen, strict=True):
         rim = max(round(LAMP_RIM * glass.shape[1]), 1)
         lit = glass & (torch.nn.functional.max_pool2d(lit[None].float(), 2 * rim + 1, 1, rim)[0] > 0)
-        shown = gathered(scene, photograph.camera, torch.stack([lit, glass], dim=-1).float())
+        shown = gather_pixels(scene, photograph.camera, torch.stack([lit, glass], dim=-1).float())
         shown = shown * crosses_pane(means, scene.planes, photograph.camera.to(means.device).center)[:, None]
         near, through = near + shown[:, 0], through + shown[:, 1]
     bright = (scene.primary.sh[:, 0] * SH_ZERO + 0.5).amin(dim=-1) > IMAGE_BRIGHTNESS

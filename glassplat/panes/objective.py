@@ -209,10 +209,10 @@ def planes_nearby(
     steps[..., 2] *= np.broadcast_to(shift, len(planes))[:, None]
     steps[:, 0] = 0
     index = np.repeat(np.arange(len(planes)), 1 + count)
-    return moved(planes.select(index), anchors[index], steps.reshape(-1, 3))
+    return move_planes(planes.select(index), anchors[index], steps.reshape(-1, 3))
 
 
-def moved(planes: PlaneEquations, anchors: Array, steps: Array) -> PlaneEquations:
+def move_planes(planes: PlaneEquations, anchors: Array, steps: Array) -> PlaneEquations:
     """Each plane after a small move [H, 3]: two tilts about the point nearest to its anchor [H, 3], and a shift."""
     normals, (first, second) = planes.normals, in_plane_axes(planes)
     heights = np.einsum("hd,hd->h", normals, anchors) - planes.offsets

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from glassplat.panes.masks import FramedPlanes, PlaneEquations, joined, random_planes
+from glassplat.panes.masks import FramedPlanes, PlaneEquations, join_planes, random_planes
 from glassplat.panes.objective import (
     COARSE,
     EDGES,
@@ -22,7 +22,7 @@ from glassplat.panes.objective import (
     JointObjective,
     Objective,
     Terms,
-    moved,
+    move_planes,
     planes_nearby,
     planes_through_masks,
 )
@@ -41,7 +41,7 @@ SETTLED = 1e-4
 """Change of a parameter below which a plane has arrived."""
 
 
-def refined(planes: FramedPlanes, objective: Evidence, tolerances: Sequence[float]) -> FramedPlanes:
+def refine_planes(planes: FramedPlanes, objective: Evidence, tolerances: Sequence[float]) -> FramedPlanes:
     """Each plane after tilt, offset and height of the frame have minimised the objective.
 
     The Geman-McClure loss ignores what is far off, and it must: where something stands before the pane, the mask's edge
@@ -53,11 +53,11 @@ def refined(planes: FramedPlanes, objective: Evidence, tolerances: Sequence[floa
         tolerances: distances of mask edges at which the loss is one half, in image diagonals, one after the other.
     """
     for tolerance in tolerances:
-        planes = _minimised(planes, objective, tolerance)
+        planes = _minimise(planes, objective, tolerance)
     return planes
 
 
-def _minimised(planes: FramedPlanes, objective: Evidence, tolerance: float) -> FramedPlanes:
+def _minimise(planes: FramedPlanes, objective: Evidence, tolerance: float) -> FramedPlanes:
     """All planes after damped steps; those that have arrived are left where they are."""
     count = len(planes)
     damping, active = np.full(count, FIRST_DAMPING), np.arange(count)
@@ -68,9 +68,9 @@ def _minimised(planes: FramedPlanes, objective: Evidence, tolerance: float) -> F
         diagonal = np.einsum("hii->hi", hessian) + np.finfo(np.float64).eps
         damped = hessian + (damping[active, None] * diagonal)[:, None] * np.eye(4)
         steps = -np.linalg.solve(damped + SMALLEST_CURVATURE * np.eye(4), gradient[..., None])[..., 0]
-        tried = _stepped(moving, anchors[active], steps * scales[active])
+        tried = _step_planes(moving, anchors[active], steps * scales[active])
         better = objective.terms(tried, tolerance).cost < cost
-        planes = _replaced(planes, active[better], tried.select(np.flatnonzero(better)))
+        planes = _replace_planes(planes, active[better], tried.select(np.flatnonzero(better)))
         damping[active] *= np.where(better, EASE, STIFFEN)
         active = active[np.abs(steps).max(axis=1) > SETTLED]
         if not len(active):
@@ -101,8 +101,8 @@ def _nearby(
     count = len(planes)
     nearby = [planes]
     for axis in range(4):
-        nearby.append(_stepped(planes, anchors, STEP * np.eye(4)[axis] * scales))
-    terms = objective.terms(joined(nearby), tolerance)
+        nearby.append(_step_planes(planes, anchors, STEP * np.eye(4)[axis] * scales))
+    terms = objective.terms(join_planes(nearby), tolerance)
     residuals = terms.residuals.reshape(5, count, -1)
     return Terms(residuals[0], terms.weights[:count], terms.rest[:count]), residuals[1:]
 
@@ -119,16 +119,16 @@ def _products(first: Array, second: Array) -> Array:
     return found
 
 
-def _stepped(planes: FramedPlanes, anchors: Array, steps: Array) -> FramedPlanes:
+def _step_planes(planes: FramedPlanes, anchors: Array, steps: Array) -> FramedPlanes:
     """The planes after steps [H, 4]: two tilts, a shift, a change of the frame, which has no negative height."""
-    return FramedPlanes(moved(planes.planes, anchors, steps[:, :3]), np.maximum(planes.frames + steps[:, 3], 0))
+    return FramedPlanes(move_planes(planes.planes, anchors, steps[:, :3]), np.maximum(planes.frames + steps[:, 3], 0))
 
 
-def _replaced(planes: FramedPlanes, index: NDArray[np.int64], others: FramedPlanes) -> FramedPlanes:
+def _replace_planes(planes: FramedPlanes, index: NDArray[np.int64], others: FramedPlanes) -> FramedPlanes:
     """The planes, with those at `index` replaced by others."""
     order = np.arange(len(planes))
     order[index] = len(planes) + np.arange(len(index))
-    return joined([planes, others]).select(order)
+    return join_planes([planes, others]).select(order)
 
 
 def tilt_uncertainty(planes: FramedPlanes, objective: Evidence, tolerance: float) -> Array:
@@ -184,14 +184,14 @@ def best_plane(objective: Objective, *, hypotheses: int, refine: int, rng: np.ra
     """
     beam = first_hypotheses(objective, hypotheses, rng)
     for tilt, shift, tolerance in ROUNDS:
-        beam = _followed(beam, objective, (tilt, shift), tolerance, rng)
+        beam = _follow_beam(beam, objective, (tilt, shift), tolerance, rng)
     # Of a pane that things hide in every mask, planes far behind frames of any height may outdo its own.
-    beam = _possible(_agreed(refined(beam, objective, (COARSE, MIDDLE)), objective), objective)
+    beam = _possible(_best_planes(refine_planes(beam, objective, (COARSE, MIDDLE)), objective), objective)
     tilt, shift, tolerance = SHAKE
-    shaken = _followed(beam, objective, (tilt, shift), tolerance, rng)
+    shaken = _follow_beam(beam, objective, (tilt, shift), tolerance, rng)
     best_first = np.argsort(contradiction(beam, objective, (COARSE, MIDDLE)), kind="stable")
-    leading = joined([beam.select(best_first[:refine]), shaken.select(np.arange(min(refine, len(shaken))))])
-    finished = _possible(_agreed(refined(leading, objective, (MIDDLE, FINE)), objective), objective)
+    leading = join_planes([beam.select(best_first[:refine]), shaken.select(np.arange(min(refine, len(shaken))))])
+    finished = _possible(_best_planes(refine_planes(leading, objective, (MIDDLE, FINE)), objective), objective)
     return finished.select(np.array([np.argmin(contradiction(finished, objective))]))
 
 
@@ -205,8 +205,8 @@ def best_joint_plane(objective: JointObjective, starts: FramedPlanes, rng: np.ra
     """
     beam = starts
     for tilt, shift, tolerance in (*ROUNDS[1:], SHAKE):
-        beam = joined([beam, _followed(beam, objective, (tilt, shift), tolerance, rng)])
-    finished = _possible(refined(beam, objective, (COARSE, MIDDLE, FINE)), objective)
+        beam = join_planes([beam, _follow_beam(beam, objective, (tilt, shift), tolerance, rng)])
+    finished = _possible(refine_planes(beam, objective, (COARSE, MIDDLE, FINE)), objective)
     return finished.select(np.array([np.argmin(contradiction(finished, objective))]))
 
 
@@ -250,16 +250,16 @@ def first_hypotheses(objective: Objective, count: int, rng: np.random.Generator)
         through = random_planes(objective.points, count, rng)
         drawn.append(through.select(np.argsort(-objective.support(through), kind="stable")[: count // 4]))
     usual = USUAL_FRAME * objective.extent
-    planes = joined([FramedPlanes(part, np.full(len(part), usual)) for part in drawn])
+    planes = join_planes([FramedPlanes(part, np.full(len(part), usual)) for part in drawn])
     scores = objective.agreement(planes.planes) + AGREEMENT_WEIGHT * objective.support(planes.planes)
-    best_first = _agreed(planes.select(np.argsort(-scores, kind="stable")[:POOL]), objective, least=BY_AREAS)
+    best_first = _best_planes(planes.select(np.argsort(-scores, kind="stable")[:POOL]), objective, least=BY_AREAS)
     costs = contradiction(best_first, objective, (ROUNDS[0][2],), edges=COARSE_EDGES)
     by_edges = np.argsort(costs, kind="stable")
     by_areas = np.arange(len(best_first))[:BY_AREAS]
     return best_first.select(np.concatenate([by_areas, by_edges[by_edges >= BY_AREAS][:BY_EDGES]]))
 
 
-def _followed(
+def _follow_beam(
     beam: FramedPlanes, objective: Evidence, spread: tuple[float, float], tolerance: float, rng: np.random.Generator
 ) -> FramedPlanes:
     """The best plane around each of the beam's, best first."""
@@ -286,7 +286,7 @@ def _has_possible_frames(planes: FramedPlanes, objective: Evidence) -> NDArray[n
     return possible
 
 
-def _agreed(planes: FramedPlanes, objective: Evidence, *, least: int = 0) -> FramedPlanes:
+def _best_planes(planes: FramedPlanes, objective: Evidence, *, least: int = 0) -> FramedPlanes:
     """The first so many planes, and all others that the masks do not rule out beside the best.
 
     Where other panes or posts hide much of a pane, edges that meet by chance may outdo its own.
@@ -406,7 +406,7 @@ def plane_of_images(plane: PlaneEquations, middle: Array, behind: Array, others:
 
     def tried(steps: Array) -> PlaneEquations:
         index = np.zeros(len(steps), np.int64)
-        return moved(plane.select(index), middle[None][index], steps)
+        return move_planes(plane.select(index), middle[None][index], steps)
 
     def pairs(steps: Array, distance: Callable[[Array], Array]) -> Array:
         planes = tried(steps)

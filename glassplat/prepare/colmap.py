@@ -23,7 +23,7 @@ from PIL import Image
 from glassplat.captures import colmap_library as library
 from glassplat.errors import InputError
 from glassplat.files.writing import atomic_write
-from glassplat.options import shown
+from glassplat.options import short_repr
 from glassplat.prepare.photographs import Listener, Photograph, Progress, read_photograph
 
 Result = TypeVar("Result")
@@ -123,7 +123,7 @@ class FeatureDatabase:
 
     def create(self, lens: LensName) -> None:
         """Writes cameras and photographs, if they are not there yet."""
-        with self._opened() as database:
+        with self._open() as database:
             if database.num_images() == len(self.photographs):
                 return
             database.clear_all_tables()
@@ -160,7 +160,7 @@ class FeatureDatabase:
                 cancellation_token=token,
             )
 
-        with self._opened() as database:
+        with self._open() as database:
             watched = _Watched("looking for features", _image_ids(database), database.exists_keypoints, listen)
             interruptible(work, watched.look)
 
@@ -186,7 +186,7 @@ class FeatureDatabase:
                 cancellation_token=token,
             )
 
-        with self._opened() as database:
+        with self._open() as database:
             ids = _image_ids(database)
             items = [(ids[one], ids[other]) for one, other in pairs]
             watched = _Watched(
@@ -196,18 +196,18 @@ class FeatureDatabase:
 
     def feature_counts(self) -> NDArray[np.int64]:
         """[P] features of each photograph."""
-        with self._opened() as database:
+        with self._open() as database:
             return np.array([database.num_keypoints_for_image(one) for one in _image_ids(database)], dtype=np.int64)
 
     def descriptors(self) -> list[NDArray[np.uint8]]:
         """[F, 128] of each photograph, the order of the features as found."""
-        with self._opened() as database:
+        with self._open() as database:
             return [np.asarray(database.read_descriptors(one).data) for one in _image_ids(database)]
 
     @contextmanager
-    def _opened(self) -> Iterator[Any]:
+    def _open(self) -> Iterator[Any]:
         """The file as COLMAP's database."""
-        with sound(self.path):
+        with check_database(self.path):
             database = library.pycolmap.Database.open(self.path)
             try:
                 with closing(database):
@@ -224,7 +224,7 @@ class FeatureDatabase:
 
 
 @contextmanager
-def sound(path: Path) -> Iterator[None]:
+def check_database(path: Path) -> Iterator[None]:
     """Says in words what is wrong with a database that COLMAP cannot work with.
 
     Raises:
@@ -242,7 +242,7 @@ def sound(path: Path) -> Iterator[None]:
         if "disk is full" in reason:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
         raise InputError(
-            f"{path} is damaged, or cannot be written ({shown(reason)}); begin the preparation again with --force"
+            f"{path} is damaged, or cannot be written ({short_repr(reason)}); begin the preparation again with --force"
         ) from error
 
 
@@ -380,7 +380,7 @@ class Mapping:
     least_matches: int = 30
 
 
-def placed(
+def place_photographs(
     database: Path, mapper: Mapper, options: Mapping, *, count: int, listen: Listener, threads: int
 ) -> list[Any]:
     """The connected groups of photographs that were placed, each a `pycolmap.Reconstruction`, the largest first.
@@ -403,7 +403,7 @@ def placed(
         work = _incremental(database, output, _incremental_options(options, threads), count, listen)
     else:
         work = _global(database, output, threads)
-    with sound(database):
+    with check_database(database):
         found = interruptible(work)
     return sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 

@@ -86,7 +86,7 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
     for done, path in enumerate(paths):
         listen(Progress("looking at the photographs", done, len(paths)))
         try:
-            photograph, contents = _examined(path, names[path], max_size)
+            photograph, contents = _examine(path, names[path], max_size)
         except InputError as error:
             broken[path.name] = error
             continue
@@ -121,7 +121,7 @@ def broken_photographs(paths: Sequence[Path]) -> list[str]:
     broken = []
     for path in paths:
         try:
-            _examined(path, path.name, LEAST_SIDE)
+            _examine(path, path.name, LEAST_SIDE)
         except InputError:
             broken.append(path.name)
     return broken
@@ -164,7 +164,7 @@ def read_photograph(photograph: Photograph) -> NDArray[np.uint8]:
 
 def _upright(path: Path) -> Image.Image:
     """The picture as eight-bit RGB, turned as its EXIF tag says."""
-    with images.opened(path) as image:
+    with images.checked_image(path) as image:
         orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
         if image.mode not in images.SHADES_16:
             return ImageOps.exif_transpose(image).convert("RGB")
@@ -222,11 +222,11 @@ def _numbers_as_such(name: str) -> tuple[tuple[int, int, str], ...]:
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts)
 
 
-def _examined(path: Path, name: str, max_size: int) -> tuple[Photograph, bytes]:
+def _examine(path: Path, name: str, max_size: int) -> tuple[Photograph, bytes]:
     """A photograph and a fingerprint of its file; decoded at a small size, which finds files that are cut off."""
     try:
         size = images.image_size(path)
-        with images.opened(path) as image:
+        with images.checked_image(path) as image:
             exif = image.getexif()
             sideways = exif.get(ExifTags.Base.Orientation) in SIDEWAYS
             tags = dict(exif) | dict(exif.get_ifd(ExifTags.IFD.Exif))
@@ -298,7 +298,7 @@ def frames_of(video: Path, folder: Path, most: int, listen: Listener) -> list[Pa
         InputError: OpenCV is missing, the file is no video, or one in which nothing moves.
     """
     cv2 = _opencv()
-    footage = _measured(cv2, video, listen)
+    footage = _measure_motion(cv2, video, listen)
     chosen = chosen_frames(footage, most)
     if len(chosen) < FEWEST_FRAMES:
         raise InputError(
@@ -359,7 +359,7 @@ def _opencv() -> Any:
         ) from error
 
 
-def _measured(cv2: Any, video: Path, listen: Listener) -> Footage:
+def _measure_motion(cv2: Any, video: Path, listen: Listener) -> Footage:
     travelled, sharpness = [], []
     before, way = None, 0.0
     total = _length(cv2, video)

@@ -212,7 +212,7 @@ def report_of(solution: Solution) -> Report:
         reprojection_error=float(model.compute_mean_reprojection_error()) if model else 0.0,
         track_length=float(model.compute_mean_track_length()) if model else 0.0,
         features=features,
-        cameras=tuple(_described(model)) if model else (),
+        cameras=tuple(_describe_lenses(model)) if model else (),
         attempt=solution.attempt,
         attempts=solution.tried,
         advice=(),
@@ -232,7 +232,7 @@ def _groups(solution: Solution) -> tuple[int, ...]:
     return tuple(sizes)
 
 
-def _described(model: Any) -> list[str]:
+def _describe_lenses(model: Any) -> list[str]:
     """Each lens that took a placed photograph."""
     used = {image.camera_id for image in model.images.values() if image.has_pose}
     return [

@@ -12,9 +12,17 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from glassplat.captures import colmap_library as library
-from glassplat.captures.cameras import undistorted
+from glassplat.captures.cameras import undistort
 from glassplat.errors import InputError, first_names
-from glassplat.prepare.colmap import FeatureDatabase, Features, LensName, Mapper, Mapping, chosen_pairs, placed
+from glassplat.prepare.colmap import (
+    FeatureDatabase,
+    Features,
+    LensName,
+    Mapper,
+    Mapping,
+    chosen_pairs,
+    place_photographs,
+)
 from glassplat.prepare.photographs import Listener, Note, Photograph, Progress, read_photograph
 
 FEWEST_FEATURES = 50
@@ -112,8 +120,8 @@ def best_solution(
                 break
             note = f"{best.registered} of {len(photographs)} photographs were placed; trying again with {attempt.name}"
             listen(Note(note))
-        database = _matched(photographs, work, attempt.features, settings, listen)
-        models = placed(
+        database = _match_features(photographs, work, attempt.features, settings, listen)
+        models = place_photographs(
             database.path,
             settings.mapper,
             attempt.mapping,
@@ -129,7 +137,7 @@ def best_solution(
     return replace(best, tried=tried)
 
 
-def _matched(
+def _match_features(
     photographs: Sequence[Photograph], work: Path, features: Features, settings: Settings, listen: Listener
 ) -> FeatureDatabase:
     """The database of these features, with every pair matched that is worth it."""
@@ -170,7 +178,7 @@ def write_capture(solution: Solution, folder: Path, listen: Listener) -> None:
     for done, (number, image) in enumerate(sorted(images.items())):
         photograph = solution.database.photographs[number]
         listen(Progress("writing photographs without distortion", done, len(images)))
-        pixels = undistorted(read_photograph(photograph), lenses[image.camera_id])
+        pixels = undistort(read_photograph(photograph), lenses[image.camera_id])
         colors.look(image, pixels)
         target = folder / "images" / photograph.name
         target.parent.mkdir(parents=True, exist_ok=True)

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.publish.web_page import surveyed
+from glassplat.publish.web_page import survey_capture
 from glassplat.scene.camera import Camera, look_at
 
 MOST_KEYFRAMES = 12
@@ -31,7 +31,7 @@ def orbit(cameras: Sequence[Camera], extent: float, frames: int) -> list[Camera]
         extent: of the scene.
         frames: how many cameras to return.
     """
-    survey = surveyed(cameras, extent)
+    survey = survey_capture(cameras, extent)
     centers = torch.stack([camera.center.double().cpu() for camera in cameras])
     arms = centers - survey.focus
     heights = arms @ survey.up
@@ -53,7 +53,7 @@ def orbit(cameras: Sequence[Camera], extent: float, frames: int) -> list[Camera]
     ]
 
 
-def interpolated(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """A smooth way through the cameras, at an even pace from one to the next; the first and the last one are on it.
 
     Args:
@@ -75,7 +75,7 @@ def interpolated(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     turned = RotationSpline(knots, rotations)(times).as_matrix()
     places = CubicSpline(knots, np.stack([camera.center.double().cpu().numpy() for camera in cameras]))(times)
     first = cameras[0]
-    alike = [camera.resized(first.width, first.height) for camera in cameras]
+    alike = [camera.resize(first.width, first.height) for camera in cameras]
     lenses = np.array([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in alike])
     lens = np.stack([np.interp(times, knots, column) for column in lenses.T], axis=1)
     path = []
@@ -90,10 +90,10 @@ def keyframes_of(cameras: Sequence[Camera]) -> list[Camera]:
     return [cameras[round(index * (len(cameras) - 1) / max(count - 1, 1))] for index in range(count)]
 
 
-def widened(camera: Camera, width: int) -> Camera:
+def fit_to_width(camera: Camera, width: int) -> Camera:
     """The camera with pictures of a width, both sides even, as encoders want them."""
     height = max(2, 2 * round(width * camera.height / camera.width / 2))
-    return camera.resized(width, height)
+    return camera.resize(width, height)
 
 
 def _loop(spread: Tensor, distance: float) -> float:

@@ -36,7 +36,7 @@ class Floaters:
         self._apart, self._near = torch.from_numpy(apart), torch.from_numpy(near)
         self._longest = gaussians.log_scales.detach().double().cpu().amax(dim=1).exp()
 
-    def found(self, cleaning: Cleaning) -> dict[str, Tensor]:
+    def masks(self, cleaning: Cleaning) -> dict[str, Tensor]:
         """[N] bool for each rule: which Gaussians it takes out."""
         everywhere = torch.zeros(len(self._longest), dtype=torch.bool)
         found = {"outside": everywhere, "isolated": everywhere, "oversized": everywhere}
@@ -51,7 +51,7 @@ class Floaters:
         return found
 
 
-def cleaned(scene: Scene, floaters: Floaters, cleaning: Cleaning) -> tuple[Scene, dict[str, int]]:
+def clean_scene(scene: Scene, floaters: Floaters, cleaning: Cleaning) -> tuple[Scene, dict[str, int]]:
     """The scene without what the rules take out, and how many Gaussians each of them found.
 
     Args:
@@ -62,7 +62,7 @@ def cleaned(scene: Scene, floaters: Floaters, cleaning: Cleaning) -> tuple[Scene
     Raises:
         InputError: nothing would be left.
     """
-    found = floaters.found(cleaning)
+    found = floaters.masks(cleaning)
     kept = ~torch.stack(list(found.values())).any(dim=0)
     if not bool(kept.any()):
         raise InputError(f"nothing would be left of {len(kept)} Gaussians; expected a larger box, or milder rules")

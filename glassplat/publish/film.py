@@ -61,7 +61,7 @@ def side_by_side(pictures: list[Picture]) -> Picture:
     return np.concatenate(pictures, axis=1)
 
 
-def wiped(left: Picture, right: Picture, share: float) -> Picture:
+def wipe_pictures(left: Picture, right: Picture, share: float) -> Picture:
     """The left picture up to a share of the width, a bright line, and then the right one."""
     column = round(share * left.shape[1])
     picture = np.concatenate([left[:, :column], right[:, column:]], axis=1)

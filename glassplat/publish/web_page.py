@@ -110,7 +110,7 @@ class Surveyed(NamedTuple):
     reach: float
 
 
-def surveyed(cameras: Sequence[Camera], extent: float) -> Surveyed:
+def survey_capture(cameras: Sequence[Camera], extent: float) -> Surveyed:
     """Looks at the poses of a capture.
 
     Args:
@@ -146,7 +146,7 @@ def best_view(planes: Planes, cameras: Sequence[Camera]) -> int:
 
 def _composition(planes: Planes, camera: Camera) -> float:
     """Distance of a picture from one that shows panes well: by their share of it, and by how far off its middle."""
-    small = camera.resized(64, max(1, round(64 * camera.height / camera.width)))
+    small = camera.resize(64, max(1, round(64 * camera.height / camera.width)))
     rows, columns = (nearest_hits(panes_in_camera(planes, small), small).pane >= 0).nonzero(as_tuple=True)
     if not len(rows):
         return math.inf
@@ -265,19 +265,19 @@ def page_text(
         )
     poster_view = best_view(scene.planes, [camera for _, camera in cameras])
     poster = jpeg(renderer(scene, poster_camera(cameras[poster_view][1])).rgb)
-    scene = replace(scene, primary=drawn(scene.primary), glass=drawn(scene.glass))
+    scene = replace(scene, primary=visible_gaussians(scene.primary), glass=visible_gaussians(scene.glass))
     drawable = len(scene.primary)
     scene = fitting(scene, [camera for _, camera in cameras]).to("cpu")
     mirrored = settings.get("mirrored")
     cube = b"" if mirrored is None else cube_bytes(scene, settings)
     channel, channel_range = channel_bytes(scene) if mirrored is None else (strength_bytes(scene), [0.0, 0.0])
-    description = described(scene, settings, cameras, poster_view)
+    description = describe_scene(scene, settings, cameras, poster_view)
     count = len(scene.planes)
     kept = f"{len(scene.primary):,}" + (f" of {drawable:,}" if len(scene.primary) < drawable else "")
     subtitle = f"{kept} Gaussians" + (f" · {count} pane{'s' if count > 1 else ''}" if count else "")
     # Glass has no colour; a constant one makes an SPZ file of it.
     glass = replace(scene.glass, sh=torch.zeros(len(scene.glass), 1, 3), channels={}, active_sh_degree=0)
-    return filled(
+    return fill_template(
         asset("page.html"),
         {
             "title": html.escape(title),
@@ -313,7 +313,7 @@ def asset(name: str) -> str:
     return (files("glassplat") / "web_page" / name).read_text(encoding="utf-8")
 
 
-def filled(template: str, values: dict[str, str]) -> str:
+def fill_template(template: str, values: dict[str, str]) -> str:
     """The template with each {{name}} replaced; what is put in is not looked at again."""
     parts = template.split("{{")
     text = [parts[0]]
@@ -333,14 +333,14 @@ def in_base64(data: bytes) -> str:
     return base64.b64encode(data).decode("ascii")
 
 
-def drawn(gaussians: Gaussians) -> Gaussians:
+def visible_gaussians(gaussians: Gaussians) -> Gaussians:
     """Those that can be seen at all."""
     return gaussians.select(torch.sigmoid(gaussians.logit_opacities) > LEAST_OPACITY)
 
 
 def fits(scene: Scene) -> bool:
     """Return whether a page can show all Gaussians that can be seen."""
-    return len(drawn(scene.primary)) + len(drawn(scene.glass)) <= MOST_GAUSSIANS
+    return len(visible_gaussians(scene.primary)) + len(visible_gaussians(scene.glass)) <= MOST_GAUSSIANS
 
 
 def fitting(scene: Scene, cameras: Sequence[Camera]) -> Scene:
@@ -351,7 +351,7 @@ def fitting(scene: Scene, cameras: Sequence[Camera]) -> Scene:
     most = scene.primary.means.new_zeros(len(scene.primary))
     for camera in cameras[:: -(-len(cameras) // RANKING_VIEWS)]:
         width = min(camera.width, RANKING_WIDTH)
-        small = camera.resized(width, max(round(width * camera.height / camera.width), 1))
+        small = camera.resize(width, max(round(width * camera.height / camera.width), 1))
         most = torch.maximum(most, contributions(scene, small))
     kept = torch.zeros(len(scene.primary), dtype=torch.bool, device=most.device)
     kept[torch.topk(most, room).indices] = True
@@ -361,7 +361,7 @@ def fitting(scene: Scene, cameras: Sequence[Camera]) -> Scene:
 def poster_camera(camera: Camera) -> Camera:
     """The camera, small enough for the picture that is shown while the scene is unpacked."""
     share = min(1.0, POSTER_WIDTH / camera.width)
-    return camera.resized(max(1, round(share * camera.width)), max(1, round(share * camera.height)))
+    return camera.resize(max(1, round(share * camera.width)), max(1, round(share * camera.height)))
 
 
 def jpeg(image: Tensor) -> bytes:
@@ -417,11 +417,11 @@ def cube_directions(size: int) -> Tensor:
     return torch.stack([torch.stack(face, dim=-1) for face in faces])
 
 
-def described(
+def describe_scene(
     scene: Scene, settings: Mapping[str, Any], cameras: Sequence[tuple[str, Camera]], first: int
 ) -> dict[str, Any]:
     """Description of the scene for the page, without the Gaussians."""
-    survey = surveyed([camera for _, camera in cameras], scene.extent)
+    survey = survey_capture([camera for _, camera in cameras], scene.extent)
     kept = sorted({*range(0, len(cameras), -(-len(cameras) // MOST_VIEWS)), first})
     return {
         **settings,

@@ -27,8 +27,8 @@ from glassplat.render.frame import (
     check_numbers,
     over_background,
     project_gaussians,
+    reaches_pixel,
     screen_pass,
-    shown,
 )
 from glassplat.render.splat import blended_discs, blended_ellipsoids, disc_layers, ellipsoid_channels, projected_discs
 from glassplat.scene.camera import Camera
@@ -84,7 +84,7 @@ def environment_from_equirect(image: Tensor, size: int) -> Environment:
     return Environment(torch.logit(colors.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN)))
 
 
-def resized(environment: Environment, size: int) -> Environment:
+def resize_environment(environment: Environment, size: int) -> Environment:
     """The environment with another number of texels; raw values are interpolated between texel centres."""
     _check_lit(environment)
     return replace(environment, raw=cube_lookup(environment.raw, texel_directions(size).to(environment.raw)))
@@ -258,7 +258,7 @@ def _seen_ellipsoids(
         strength=strength.squeeze(2),
         depth=mean_depth(depth[0].squeeze(2), alpha) if deep else alpha.new_zeros(0),
         alpha=alpha,
-        direct=shown(projected),
+        direct=reaches_pixel(projected),
         screen=screen,
     )
 
@@ -282,7 +282,7 @@ def _seen_discs(scene: Scene, camera: Camera, background: tuple[float, float, fl
         strength=strength.squeeze(2),
         depth=depth,
         alpha=alpha,
-        direct=shown(projected),
+        direct=reaches_pixel(projected),
         screen=screen,
         extra=extra,
     )

@@ -198,7 +198,7 @@ def joined_splats(*parts: Projected) -> Splats:
     return Splats(*(torch.cat([getattr(part, name) for part in parts], dim=1) for name in names))
 
 
-def shown(projected: Projected | ProjectedDiscs) -> Tensor:
+def reaches_pixel(projected: Projected | ProjectedDiscs) -> Tensor:
     """[N] bool: which Gaussians reach a pixel of some of the cameras."""
     reached = projected.radii[..., 0] > 0
     return reached[0] if len(reached) == 1 else reached.any(dim=0)

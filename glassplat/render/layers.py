@@ -12,7 +12,7 @@ from glassplat.kernels.records import Projected
 from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.frame import NEAR_PER_EXTENT, Frame, joined_splats, project_gaussians
 from glassplat.render.panes import nearest_hits, panes_in_camera, project_mirrored, seen_panes
-from glassplat.render.planar import detached
+from glassplat.render.planar import detach_gaussians
 from glassplat.render.splat import blended_discs, projected_discs
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
@@ -131,7 +131,7 @@ def contributions(scene: Scene, camera: Camera) -> Tensor:
     """
     camera = camera.to(scene.primary.means.device)
     # Colours do not matter here.
-    primary, near = replace(detached(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
+    primary, near = replace(detach_gaussians(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
     if primary.are_discs:
         return _disc_sums(primary, camera, near, primary.means.new_ones(camera.height, camera.width, 1))[:, 0]
     most = _weight_sums(project_gaussians(primary, camera, near=near), camera)
@@ -142,10 +142,10 @@ def contributions(scene: Scene, camera: Camera) -> Tensor:
     return torch.maximum(most, _weight_sums(mirrored, camera, seen.tiles))
 
 
-def gathered(scene: Scene, camera: Camera, values: Tensor) -> Tensor:
+def gather_pixels(scene: Scene, camera: Camera, values: Tensor) -> Tensor:
     """[N, D] an image [H, W, D] summed over the pixels of each primary Gaussian, by its blending weights."""
     camera = camera.to(scene.primary.means.device)
-    primary, near = replace(detached(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
+    primary, near = replace(detach_gaussians(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
     if primary.are_discs:
         return _disc_sums(primary, camera, near, values)
     return _sums(project_gaussians(primary, camera, near=near), camera, values)[0]
@@ -154,7 +154,7 @@ def gathered(scene: Scene, camera: Camera, values: Tensor) -> Tensor:
 def gathered_mirrored(scene: Scene, camera: Camera, values: Tensor) -> Tensor:
     """[N, D] the same, by the weights in what the nearest pane of each pixel mirrors."""
     camera = camera.to(scene.primary.means.device)
-    primary, near = replace(detached(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
+    primary, near = replace(detach_gaussians(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
     seen = seen_panes(scene.planes, camera, nearest_hits(panes_in_camera(scene.planes, camera), camera), most=1)
     if seen is None:
         return values.new_zeros(len(primary), values.shape[-1])

@@ -73,12 +73,12 @@ def seen_panes(
         mask: [H, W] as given to `nearest_hits`.
         most: how many of them on one ray, the nearest ones; all if None.
     """
-    hits, seen = [first], _shown(first)
+    hits, seen = [first], _visible_panes(first)
     if not any(seen):
         return None
     while len(hits) < (len(planes) if most is None else most):
         further = nearest_hits(panes_in_camera(planes, camera), camera, mask, beyond=hits[-1])
-        shown = _shown(further)
+        shown = _visible_panes(further)
         if not any(shown):
             break
         hits.append(further)
@@ -96,7 +96,7 @@ def seen_panes(
     return SeenPanes(planes.select(positions), rows, order, tiles[rows], windows[rows])
 
 
-def _shown(hits: PaneHits) -> list[bool]:
+def _visible_panes(hits: PaneHits) -> list[bool]:
     """Panes that some tile shows. The one thing that the program asks of a GPU here, and waits for."""
     found: list[bool] = hits.tiles.flatten(1).any(dim=1).tolist()
     return found
@@ -186,7 +186,7 @@ class Glazed(NamedTuple):
     share: Tensor
 
 
-def glazed(
+def composite_panes(
     image: Tensor, seen: SeenPanes, masks: Sequence[Tensor], reflections: Tensor, camera: Camera,
     *, fresnel: Fresnel, intensity: bool, blend: Blend,
 ) -> Glazed:  # fmt: skip
@@ -209,7 +209,7 @@ def glazed(
     transmittances = seen.planes.transmittances
     for mask, pane in zip(reversed(masks), reversed(seen.order), strict=True):
         if transmittances is not None:
-            image = tinted(image, mask, pane, transmittances, blend)
+            image = tint_by_panes(image, mask, pane, transmittances, blend)
         result = blend_panes(
             image,
             mask,
@@ -236,7 +236,7 @@ def glazed(
     return Glazed(image, *layers, share)
 
 
-def tinted(image: Tensor, mask: Tensor, pane: Tensor, transmittances: Tensor, blend: Blend) -> Tensor:
+def tint_by_panes(image: Tensor, mask: Tensor, pane: Tensor, transmittances: Tensor, blend: Blend) -> Tensor:
     """[H, W, 3] what gets through panes of the transmittances [K, 3].
 
     Args:

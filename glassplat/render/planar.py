@@ -29,14 +29,14 @@ from glassplat.render.frame import (
     joined_splats,
     over_background,
     project_gaussians,
+    reaches_pixel,
     screen_pass,
-    shown,
 )
 from glassplat.render.panes import (
     Glazed,
     SeenPanes,
+    composite_panes,
     curves,
-    glazed,
     nearest_hits,
     own_masks,
     panes_in_camera,
@@ -98,7 +98,7 @@ class Planar:
 
     Where panes are seen through one another, Eq. 1 holds for one after the other, from the farthest on: the C_t of a
     pane is the C of the pane behind it (the paper shows the nearest only). The layers R, C_r and C_t are those of the
-    nearest one that is more than `FAINT`ly visible; see `glassplat.render.panes.glazed`.
+    nearest one that is more than `FAINT`ly visible; see `glassplat.render.panes.composite_panes`.
 
     Layers: `transmission`, `reflection` [H, W, 3]; `strength`, `mask`, `depth`, `alpha` [H, W]; `pane` [H, W]
     int32, the pane whose rectangle is nearest, -1 for none; `without_panes` [H, W, 3], the image were there no panes,
@@ -159,10 +159,10 @@ class Planar:
             return Frame(first.image, layers, first.direct, None, first.screen)
         second = self._second_pass(scene, camera, seen, with_absgrad, first.total)
         masks = self._visibilities(scene, camera, seen, first)
-        result = self._glazed(first, seen, masks, second, camera)
+        result = self._composite_panes(first, seen, masks, second, camera)
         if self.photographer == "beside" and len(scene.photographer):
             with_body = replace(self, photographer="present")._second_pass(scene, camera, seen, False, first.total)
-            layers["photographed"] = self._glazed(first, seen, masks, with_body, camera).rgb
+            layers["photographed"] = self._composite_panes(first, seen, masks, with_body, camera).rgb
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
         screen = self._screen(first, second, hits, result) if with_absgrad else ()
         return Frame(result.rgb, layers, first.direct, second.mirrored, screen)
@@ -232,7 +232,7 @@ class Planar:
             deviation=result.deviation.squeeze(0) if deviation else None,
             splats=splats,
             marks=marks,
-            direct=shown(primary),
+            direct=reaches_pixel(primary),
             screen=screen,
             total=total,
         )
@@ -242,7 +242,7 @@ class Planar:
     ) -> SecondPass:
         primary = scene.primary
         if self.reflection_gradient == "planes":
-            primary, total = detached(scene.primary), GradientSum()
+            primary, total = detach_gaussians(scene.primary), GradientSum()
         projected = project_mirrored(primary, camera, seen, near=NEAR_PER_EXTENT * scene.extent, total=total)
         # By how much it departs from 1: what is behind all Gaussians has 0 then, and needs no blending.
         gain = torch.expm1(primary.channels["log_intensity"])[None].expand(len(seen.planes), -1)
@@ -261,13 +261,13 @@ class Planar:
         bins = bin_tiles(splats, camera.width, camera.height, seen.tiles)
         result = composite(splats, channels, bins, absgrad=joined_absgrad(screen))
         reflections = over_background(result.image, result.alpha, (*self.background, 0.0))
-        return SecondPass(reflections, shown(projected), screen)
+        return SecondPass(reflections, reaches_pixel(projected), screen)
 
-    def _glazed(
+    def _composite_panes(
         self, first: FirstPass, seen: SeenPanes, masks: Sequence[Tensor], second: SecondPass, camera: Camera
     ) -> Glazed:
         """Lays the panes and what they mirror before the image."""
-        return glazed(
+        return composite_panes(
             first.image,
             seen,
             masks,
@@ -327,7 +327,7 @@ def weighted_screen(
     return (primary, glass, *(replace(record, weight=weight) for record in second.screen))
 
 
-def detached(gaussians: Gaussians) -> Gaussians:
+def detach_gaussians(gaussians: Gaussians) -> Gaussians:
     """The same Gaussians, cut off from the autograd graph."""
     return gaussians.with_tensors({name: tensor.detach() for name, tensor in gaussians.tensors().items()})
 
@@ -388,7 +388,7 @@ def dereflected_photo(
     rendered = decode(without_panes.clamp(0, 1))
     trust = _trust(clipped, light, reflected, share[..., 0])
     behind = rendered + trust[..., None] * (solved - rendered)
-    colors = exposures.applied(encode(behind.clamp(0, 1)), name)
+    colors = exposures.apply(encode(behind.clamp(0, 1)), name)
     pixels = torch.round(colors.clamp(0, 1) * 255).to(torch.uint8)
     return torch.where(share > 0, pixels, photo)
 

@@ -104,7 +104,7 @@ def rasterization(
         edges = viewmats.new_tensor([-ANYWHERE, -ANYWHERE, ANYWHERE, ANYWHERE])
         cameras = cameras._replace(windows=edges.expand(len(viewmats), 4).contiguous())
     _check_colors(colors, means, viewmats, sh_degree)
-    projected = _projected(means, quats, scales, opacities, colors, cameras, sh_degree=sh_degree, near=near_plane)
+    projected = _project(means, quats, scales, opacities, colors, cameras, sh_degree=sh_degree, near=near_plane)
     splats = _splats(projected, opacities, eps2d, antialiased=rasterize_mode == "antialiased")
     seen = (splats.depths < far_plane) & (splats.radii > radius_clip).any(dim=-1)
     splats = splats._replace(radii=torch.where(seen[..., None], splats.radii, 0))
@@ -112,14 +112,14 @@ def rasterization(
     depths = splats.depths[..., None]
     channels = {"RGB": shown, "D": depths, "ED": depths}.get(render_mode)
     bins = bin_tiles(splats, width, height)
-    image, alpha = _blended(
+    image, alpha = _blend(
         splats,
         torch.cat([shown, depths], dim=-1) if channels is None else channels,
         bins,
         chunk=min(channel_chunk, MOST_CHANNELS),
         with_absgrad=absgrad,
     )
-    image = _finished(image, alpha, backgrounds, render_mode)
+    image = _finish(image, alpha, backgrounds, render_mode)
     return image, alpha, _meta(splats, width, height)
 
 
@@ -155,7 +155,7 @@ def _intrinsics(viewmats: Tensor, matrices: Tensor) -> Tensor:
     return torch.stack([matrices[:, row, column] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))], 1).detach()
 
 
-def _projected(
+def _project(
     means: Tensor,
     quats: Tensor,
     scales: Tensor,
@@ -213,7 +213,7 @@ def _inverse(symmetric: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return c / determinant, -b / determinant, a / determinant
 
 
-def _blended(
+def _blend(
     splats: Splats, channels: Tensor, bins: TileBins, *, chunk: int, with_absgrad: bool
 ) -> tuple[Tensor, Tensor]:
     """Images [C, H, W, D] and their coverage [C, H, W, 1]."""
@@ -225,7 +225,7 @@ def _blended(
     return torch.cat([part.image for part in parts], dim=-1), parts[0].alpha[..., None]
 
 
-def _finished(image: Tensor, alpha: Tensor, backgrounds: Tensor | None, render_mode: str) -> Tensor:
+def _finish(image: Tensor, alpha: Tensor, backgrounds: Tensor | None, render_mode: str) -> Tensor:
     """The image over its background, its depth divided by the coverage where that is asked for."""
     colors, depth = (image, image[..., :0]) if render_mode == "RGB" else (image[..., :-1], image[..., -1:])
     if backgrounds is not None and render_mode.startswith("RGB"):

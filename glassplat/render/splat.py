@@ -28,8 +28,8 @@ from glassplat.render.frame import (
     over_background,
     project_gaussians,
     raw_gaussians,
+    reaches_pixel,
     screen_pass,
-    shown,
 )
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
@@ -186,7 +186,7 @@ class Splat:
         if self.depth:
             layers["depth"] = mean_depth(depth[0].squeeze(-1), alpha)
         rgb = over_background(color, alpha, self.background)
-        return Frame(rgb, layers, direct=shown(projected), screen=screen)
+        return Frame(rgb, layers, direct=reaches_pixel(projected), screen=screen)
 
     def _discs(self, scene: Scene, camera: Camera, with_absgrad: bool) -> Frame:
         near = NEAR_PER_EXTENT * scene.extent
@@ -200,7 +200,7 @@ class Splat:
         if self.normal:
             layers["normal"] = blended.image[0, ..., 3:]
         rgb = over_background(blended.image[0, ..., :3], layers["alpha"], self.background)
-        return Frame(rgb, layers, direct=shown(projected), screen=screen)
+        return Frame(rgb, layers, direct=reaches_pixel(projected), screen=screen)
 
     def check(self, scene: Scene) -> None:
         """Raises ValueError where the Gaussians have no colours."""

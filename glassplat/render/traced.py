@@ -85,7 +85,7 @@ class Traced:
         surface = seen_surface(scene, camera, background=self.background, with_absgrad=with_absgrad)
         part = scene.surroundings
         contributions = part.means.new_zeros(len(part), 2).requires_grad_() if with_absgrad and len(part) else None
-        rgb, reflection = self._shaded(scene, camera, surface, contributions)
+        rgb, reflection = self._shade(scene, camera, surface, contributions)
         layers = surface.layers(surface.base) | {"reflection": reflection}
         if self.surroundings:
             layers["surroundings"] = self.behind(scene, camera)
@@ -97,7 +97,7 @@ class Traced:
             space=() if contributions is None else (SpacePass("surroundings", contributions),),
         )
 
-    def _shaded(
+    def _shade(
         self, scene: Scene, camera: Camera, surface: Surface, contributions: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """The image and what it mirrors, [H, W, 3] each (Eq. 5)."""

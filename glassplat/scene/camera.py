@@ -21,7 +21,7 @@ def waits(device: torch.device) -> bool:
     return device.type == "cuda"
 
 
-def moved(tensor: Tensor, device: torch.device | str) -> Tensor:
+def to_device(tensor: Tensor, device: torch.device | str) -> Tensor:
     """The tensor on a device; on its way there, if it comes from memory: what is computed from it comes after it."""
     if tensor.device.type != "cpu" or torch.device(device).type != "cuda":
         return tensor.to(device)
@@ -33,7 +33,7 @@ def moved(tensor: Tensor, device: torch.device | str) -> Tensor:
 @torch.inference_mode(False)  # A later call may need it for gradients.
 def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """A tensor of these numbers, or rows of them: the same one at every call, so leave it as it is."""
-    return moved(torch.tensor(values, dtype=dtype, device="cpu"), device)
+    return to_device(torch.tensor(values, dtype=dtype, device="cpu"), device)
 
 
 LEAST_SINE = 1e-6
@@ -183,10 +183,10 @@ class Camera:
 
     def to(self, device: torch.device | str) -> Camera:
         """The same camera on another device."""
-        pose = moved(self.cam_from_world, device)
+        pose = to_device(self.cam_from_world, device)
         return self if pose is self.cam_from_world else replace(self, cam_from_world=pose)
 
-    def resized(self, width: int, height: int) -> Camera:
+    def resize(self, width: int, height: int) -> Camera:
         """The same camera over another pixel grid that spans the same image."""
         sx, sy = width / self.width, height / self.height
         return replace(

@@ -70,7 +70,7 @@ class ByPhotograph:
         """Values of a photograph; None for one that has none and is taken as it is."""
         return self.values[self.names.index(name)] if name in self.names else None
 
-    def interpolated(self, name: str) -> Self:
+    def interpolate(self, name: str) -> Self:
         """The same with values for a photograph that has none: the mean of its neighbours' in the order of names.
 
         Itself where the photograph has its own, or no neighbours.
@@ -116,7 +116,7 @@ class Exposures(ByPhotograph):
         """[V, 3, 4] A and b; zero for a photograph in the scene's own colours."""
         return self.values
 
-    def applied(self, image: Tensor, name: str) -> Tensor:
+    def apply(self, image: Tensor, name: str) -> Tensor:
         """An image [..., 3] of the scene in the colours of a photograph; differentiable in both."""
         own = self.of(name)
         if own is None:
@@ -151,7 +151,7 @@ class PoseCorrections(ByPhotograph):
         """
         return self.values
 
-    def corrected(self, camera: Camera, name: str, extent: float) -> Camera:
+    def correct(self, camera: Camera, name: str, extent: float) -> Camera:
         """The camera of a photograph where it really is; differentiable in the twists.
 
         Args:

@@ -89,7 +89,7 @@ class Gaussians:
         """The Gaussians at `index` (a boolean mask [N] or integer indices)."""
         return self.with_tensors({name: tensor[index] for name, tensor in self.tensors().items()})
 
-    def joined(self, other: Gaussians) -> Gaussians:
+    def concat(self, other: Gaussians) -> Gaussians:
         """These Gaussians, then others with the same tensors."""
         theirs = other.tensors()
         return self.with_tensors({name: torch.cat([tensor, theirs[name]]) for name, tensor in self.tensors().items()})

@@ -116,10 +116,10 @@ class Planes:
         labels = tuple(self.labels[k] for k in rows)
         return Planes(**chosen, labels=labels, mirrors=tuple(label for label in self.mirrors if label in labels))
 
-    def joined(self, other: Planes) -> Planes:
+    def concat(self, other: Planes) -> Planes:
         """These planes and others, in the order of their labels."""
         if (self.log_transmittances is None) != (other.log_transmittances is None):
-            return self.that_may_tint().joined(other.that_may_tint())
+            return self.that_may_tint().concat(other.that_may_tint())
         mine, theirs = self.tensors(), other.tensors()
         together = Planes(
             **{name: torch.cat([mine[name], theirs[name]]) for name in mine},

@@ -177,7 +177,7 @@ LARGEST_LOGIT = 50.0
 """Its sigmoid is 1 in both precisions, and it is finite, so that the scene can still be written."""
 
 
-def scaled(scene: Scene, factor: float) -> Scene:
+def scale_scene(scene: Scene, factor: float) -> Scene:
     """The scene in other units: all lengths times a factor, about the origin; 1 changes no bit.
 
     Raises:
@@ -244,7 +244,7 @@ def with_reflectance(scene: Scene, label: int, base_reflectance: float) -> Scene
     return replace(scene, planes=scene.planes.with_tensors({"logit_reflectances": logits}))
 
 
-def tilted(scene: Scene, label: int, about_tangent: float, about_bitangent: float) -> Scene:
+def tilt_pane(scene: Scene, label: int, about_tangent: float, about_bitangent: float) -> Scene:
     """The pane and its glass, turned about the rectangle's middle; zero angles change no bit.
 
     Args:
@@ -263,10 +263,10 @@ def tilted(scene: Scene, label: int, about_tangent: float, about_bitangent: floa
         return scene
     tangent, bitangent = (axes[row] for axes in scene.planes.axes())
     axis = torch.nn.functional.normalize(about_tangent * tangent + about_bitangent * bitangent, dim=0)
-    return _turned(scene, row, torch.cat([axis.new_tensor([math.cos(angle / 2)]), math.sin(angle / 2) * axis]))
+    return _turn_pane(scene, row, torch.cat([axis.new_tensor([math.cos(angle / 2)]), math.sin(angle / 2) * axis]))
 
 
-def shifted(scene: Scene, label: int, distance: float) -> Scene:
+def shift_pane(scene: Scene, label: int, distance: float) -> Scene:
     """The pane and its glass, moved along the pane's normal; zero changes no bit.
 
     Args:
@@ -281,10 +281,10 @@ def shifted(scene: Scene, label: int, distance: float) -> Scene:
     _check_finite(label, distance)
     if distance == 0:
         return scene
-    return _translated(scene, row, distance * scene.planes.normals[row])
+    return _translate_pane(scene, row, distance * scene.planes.normals[row])
 
 
-def moved(scene: Scene, label: int, turn: Sequence[float], step: Sequence[float]) -> Scene:
+def move_pane(scene: Scene, label: int, turn: Sequence[float], step: Sequence[float]) -> Scene:
     """The pane and its glass, turned about the rectangle's middle and then taken elsewhere; not to move changes no bit.
 
     Args:
@@ -302,8 +302,8 @@ def moved(scene: Scene, label: int, turn: Sequence[float], step: Sequence[float]
         raise ValueError(f"pane {label} cannot be turned by a quaternion of no length; expected w, x, y, z")
     if any(turn[1:]):
         quat = torch.nn.functional.normalize(scene.planes.centers.new_tensor(turn), dim=0)
-        scene = _turned(scene, row, quat)
-    return _translated(scene, row, scene.planes.centers.new_tensor(step)) if any(step) else scene
+        scene = _turn_pane(scene, row, quat)
+    return _translate_pane(scene, row, scene.planes.centers.new_tensor(step)) if any(step) else scene
 
 
 def glass_of_pane(scene: Scene, row: int) -> Tensor:
@@ -323,7 +323,7 @@ def row_of(planes: Planes, label: int) -> int:
     return planes.labels.index(label)
 
 
-def _turned(scene: Scene, row: int, turn: Tensor) -> Scene:
+def _turn_pane(scene: Scene, row: int, turn: Tensor) -> Scene:
     """A pane and its glass, turned about its middle by a unit quaternion [4]."""
     rotation = rotation_from_quat(turn)
     planes = scene.planes
@@ -336,7 +336,7 @@ def _turned(scene: Scene, row: int, turn: Tensor) -> Scene:
     return replace(scene, glass=glass.with_tensors(placed), planes=planes.with_tensors(turned))
 
 
-def _translated(scene: Scene, row: int, step: Tensor) -> Scene:
+def _translate_pane(scene: Scene, row: int, step: Tensor) -> Scene:
     """A pane and its glass, taken elsewhere by a step [3]."""
     centers = scene.planes.centers.clone()
     centers[row] += step
@@ -414,8 +414,8 @@ def with_pane(scene: Scene, pane: Planes) -> Scene:
     return replace(
         scene,
         primary=with_intensity(scene.primary),
-        planes=scene.planes.joined(pane) if len(scene.planes) else pane,
-        glass=scene.glass.joined(glass) if len(scene.glass) else glass,
+        planes=scene.planes.concat(pane) if len(scene.planes) else pane,
+        glass=scene.glass.concat(glass) if len(scene.glass) else glass,
     )
 
 

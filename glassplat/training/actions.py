@@ -14,7 +14,7 @@ from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import PointCloud, View, evenly
 from glassplat.render.frame import Frame, Renderer
 from glassplat.render.layers import contributions
-from glassplat.scene.camera import Camera, moved
+from glassplat.scene.camera import Camera, to_device
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import behind_panes, crosses_pane, in_image, nearest_pixels
 from glassplat.scene.scene import Scene
@@ -22,7 +22,7 @@ from glassplat.training.densify import (
     Moments,
     append,
     apply_edit,
-    densified,
+    densify,
     fog_around,
     forget,
     gaussians_from_points,
@@ -30,11 +30,11 @@ from glassplat.training.densify import (
     in_morton_order,
     keep,
     perturb_opacities,
-    resampled,
+    relocate_and_grow,
     reset_opacity,
     sgld_noise,
 )
-from glassplat.training.losses import LossTerm, mean_opacity, mean_scale, of_all, residual, weighted
+from glassplat.training.losses import LossTerm, mean_opacity, mean_scale, of_all, residual, weighted_terms
 from glassplat.training.messages import Working
 from glassplat.training.options import DefaultDensify, Intervals, McmcDensify, Rate
 from glassplat.training.stage import Action, Clock, Every, PostStep, TrainState, Work
@@ -125,7 +125,7 @@ class Densify:
             gradient_threshold=self.densifier.gradient_threshold * factor,
             absgrad_threshold=self.densifier.absgrad_threshold * factor,
         )
-        edited, moments = densified(
+        edited, moments = densify(
             densifier,
             gaussians,
             state.optimizer.moments,
@@ -236,7 +236,7 @@ class Relocate:
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state`, if there is anything to edit."""
         densifier = replace(self.densifier, growth=growth_of(self.densifier, clock.iterations))
-        edited, moments = resampled(
+        edited, moments = relocate_and_grow(
             densifier,
             state.scene.primary,
             state.optimizer.moments,
@@ -382,7 +382,7 @@ def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:
     such as a room photographed all around, fades and wanders.
     """
     everywhere = densifier.reach == "all"
-    terms = weighted(
+    terms = weighted_terms(
         LossTerm("opacity", densifier.opacity_weight, of_all(mean_opacity) if everywhere else mean_opacity),
         LossTerm("scale", densifier.scale_weight, of_all(mean_scale) if everywhere else mean_scale),
     )
@@ -481,8 +481,8 @@ def unexplained_places(
         frame = renderer(scene, camera)
         looks = in_image(places, camera) & ~crosses_pane(places, scene.planes, camera.center)
         looks &= _past_panes(frame)[pixels]
-        missing = _unexplained(residual(frame, view, scene))[pixels] & looks
-        color = moved(view.photo, device)[pixels].float() / 255 * missing[:, None]
+        missing = _missing_pixels(residual(frame, view, scene))[pixels] & looks
+        color = to_device(view.photo, device)[pixels].float() / 255 * missing[:, None]
         looking, agreeing = looking + looks, agreeing + missing
         colors, squares = colors + color, squares + color.square()
         sides += torch.nn.functional.normalize(camera.center - places, dim=1) * missing[:, None]
@@ -508,7 +508,7 @@ def grid_around(cameras: Sequence[Camera], extent: float) -> tuple[Tensor, float
     return torch.stack(torch.meshgrid(*along, indexing="ij"), dim=-1).reshape(-1, 3) @ axes, cell
 
 
-def _unexplained(error: Tensor) -> Tensor:
+def _missing_pixels(error: Tensor) -> Tensor:
     """[H, W] bool: pixels of a residual [H, W, 3] in which more than detail is missing."""
     reach = max(round(WINDOW / 2 * error.shape[1]), 1)
     planes = error.movedim(-1, 0)[None]

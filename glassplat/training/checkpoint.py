@@ -11,7 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from glassplat.errors import InputError, input_checked
-from glassplat.files.records import ByName, Field, Items, Nullable, Number, Optional, Text, Whole, checked
+from glassplat.files.records import ByName, Field, Items, Nullable, Number, Optional, Text, Whole, check_fields
 from glassplat.files.scene_folder import DIRECTION, EXTENT, SH_DEGREE, direction
 from glassplat.files.sidecars import HIGHEST_LABEL, REGION, TensorsFile, opened_tensors, write_tensors
 from glassplat.scene.corrections import Exposures, PoseCorrections
@@ -147,7 +147,7 @@ def opened_checkpoint(path: Path) -> Iterator[TensorsFile]:
         raise FileNotFoundError(f"no checkpoint at {path}; expected the file that training writes there")
     try:
         with opened_tensors(path, FORMAT, "a checkpoint") as file:
-            yield TensorsFile(checked(file.header, HEADER, f"the header of {path}"), file.file)
+            yield TensorsFile(check_fields(file.header, HEADER, f"the header of {path}"), file.file)
     except InputError as error:
         raise InputError(f"{path} holds no training state: {error}; use an older one or train again") from error
     except ValueError as error:

@@ -390,7 +390,7 @@ class ScreenStatistics:
 
 
 @torch.no_grad()
-def densified(
+def densify(
     options: DefaultDensify,
     gaussians: Gaussians,
     moments: Moments,
@@ -494,7 +494,7 @@ MOST_LOGIT = 16.0
 
 
 @torch.no_grad()
-def resampled(
+def relocate_and_grow(
     options: McmcDensify,
     gaussians: Gaussians,
     moments: Moments,

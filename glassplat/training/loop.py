@@ -198,7 +198,7 @@ def totals(
     shown = torch.zeros_like(scene.primary.logit_opacities)
     for result in results:
         shown = shown if result.visible is None else torch.maximum(shown, result.visible.to(shown.dtype))
-    sums = ranks.summed([*gradients, *(total for one in known for total in one.sums)])
+    sums = ranks.sum_tensors([*gradients, *(total for one in known for total in one.sums)])
     *radii, shown = ranks.largest([*(one.max_radius for one in known), shown])
     of_parts = iter(sums[len(names) :])
     found = {
@@ -316,7 +316,7 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, with_absgrad: bool)
 
 def seen_from(view: View, scene: Scene) -> View:
     """The view from where the scene says that its camera is; differentiable."""
-    camera = scene.poses.corrected(view.camera, view.name, scene.extent)
+    camera = scene.poses.correct(view.camera, view.name, scene.extent)
     return view if camera is view.camera else view.with_camera(camera)
 
 

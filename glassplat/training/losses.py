@@ -17,7 +17,7 @@ from glassplat.kernels.photometric import photometric
 from glassplat.render.deferred import cell_means, cell_side, depth_normals
 from glassplat.render.frame import Frame
 from glassplat.scene import camera, logit
-from glassplat.scene.camera import Camera, moved
+from glassplat.scene.camera import Camera, to_device
 from glassplat.scene.scene import Scene
 
 LossFunction = Callable[[Frame, View, Scene], Tensor | None]
@@ -32,7 +32,7 @@ class LossTerm:
     function: LossFunction
 
 
-def weighted(*terms: LossTerm) -> tuple[LossTerm, ...]:
+def weighted_terms(*terms: LossTerm) -> tuple[LossTerm, ...]:
     """The terms whose weight is not zero; the others are not even computed."""
     return tuple(term for term in terms if term.weight != 0)
 
@@ -49,8 +49,8 @@ class PhotometricLoss:
 
     def __call__(self, frame: Frame, view: View, scene: Scene) -> Tensor:
         """The loss of a view, in the colours of its photograph; scalar. Ignored pixels count as if they were right."""
-        image = with_ignored_right(scene.exposures.applied(frame.rgb, view.name), view)
-        found = photometric(image, moved(view.photo, image.device))
+        image = with_ignored_right(scene.exposures.apply(frame.rgb, view.name), view)
+        found = photometric(image, to_device(view.photo, image.device))
         return found.l1.lerp(1 - found.ssim, self.ssim_weight)
 
 
@@ -199,12 +199,12 @@ def _size_factor(inside: Tensor) -> float:
 
 def _where_counted(errors: Tensor, view: View) -> Tensor:
     """Errors [H, W] that are 0 where the view ignores pixels."""
-    return errors if view.ignored is None else errors.masked_fill(moved(view.ignored, errors.device), 0)
+    return errors if view.ignored is None else errors.masked_fill(to_device(view.ignored, errors.device), 0)
 
 
 def residual(frame: Frame, view: View, scene: Scene) -> Tensor:
     """[H, W, 3] photograph minus render, sRGB, 0 where the view is ignored."""
-    image = scene.exposures.applied(frame.rgb.detach(), view.name)
+    image = scene.exposures.apply(frame.rgb.detach(), view.name)
     difference = view.photo.to(image) / 255 - image
     if view.ignored is not None:
         difference = difference.masked_fill(view.ignored.to(image.device)[..., None], 0)
@@ -215,7 +215,7 @@ def mask_loss(frame: Frame, view: View, scene: Scene) -> Tensor | None:
     """Reflection mask loss L_m (TR-Gaussians, Eq. 16), on annotated views only. Ignored pixels count as right."""
     if view.pane_labels is None:
         return None
-    annotated = moved(view.pane_labels > 0, frame.rgb.device).to(frame.rgb.dtype)
+    annotated = to_device(view.pane_labels > 0, frame.rgb.device).to(frame.rgb.dtype)
     wrong = (frame.layers["mask"] - annotated).abs()
     return _where_counted(wrong, view).mean()
 
@@ -304,7 +304,7 @@ class MonocularNormals:
                 log.warning("no normals for %s in the folder %r beside it: it is learned without", view.name, FOLDER)
             self._lacking.add(view.name)
             return None
-        estimated = in_world(moved(normals, frame.rgb.device).to(frame.rgb), view.camera)
+        estimated = in_world(to_device(normals, frame.rgb.device).to(frame.rgb), view.camera)
         known = (estimated.square().sum(-1) > 0) & (frame.layers["alpha"].detach() > 0.5)
         blended = torch.nn.functional.normalize(frame.layers["normal"], dim=-1)
         return _where_counted(known * (1 - (blended * estimated).sum(-1)), view).mean()

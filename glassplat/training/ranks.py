@@ -95,7 +95,7 @@ class Ranks:
         """
         if self.count == 1:
             return [value]
-        said = self._gathered(Said(value, self.asked()))
+        said = self._gather(Said(value, self.asked()))
         failed = next((rank for rank, one in enumerate(said) if one.failure is not None), None)
         if failed is not None:
             _hold_termination()
@@ -104,7 +104,7 @@ class Ranks:
         self._is_ending = any(one.is_asked for one in said)
         return [one.value for one in said]
 
-    def _gathered(self, said: Said) -> list[Any]:
+    def _gather(self, said: Said) -> list[Any]:
         import torch.distributed as dist
 
         everything: list[Any] = [None] * self.count
@@ -127,15 +127,15 @@ class Ranks:
                 raise RuntimeError("no answer since this one was asked to end")
         waiting.result()
 
-    def summed(self, tensors: Sequence[Tensor]) -> list[Tensor]:
+    def sum_tensors(self, tensors: Sequence[Tensor]) -> list[Tensor]:
         """The sums over all ranks, of tensors of one type and device; call after an exchange."""
-        return self._reduced(tensors, "SUM")
+        return self._reduce(tensors, "SUM")
 
     def largest(self, tensors: Sequence[Tensor]) -> list[Tensor]:
         """The largest values over all ranks, of tensors of one type and device; call after an exchange."""
-        return self._reduced(tensors, "MAX")
+        return self._reduce(tensors, "MAX")
 
-    def _reduced(self, tensors: Sequence[Tensor], operation: str) -> list[Tensor]:
+    def _reduce(self, tensors: Sequence[Tensor], operation: str) -> list[Tensor]:
         if self.count == 1 or not tensors:
             return list(tensors)
         import torch
@@ -149,7 +149,7 @@ class Ranks:
         parts = flat.split([tensor.numel() for tensor in tensors])
         return [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)]
 
-    def shared(self, state: TrainState | None, device: str) -> TrainState:
+    def broadcast(self, state: TrainState | None, device: str) -> TrainState:
         """The leader's state, on this rank's device; the others need none of their own."""
         if self.count > 1:
             import torch.distributed as dist
@@ -170,7 +170,7 @@ class Ranks:
         time.
         """
         if self.count > 1 and len(set(self.exchange(fingerprint(state)))) > 1:
-            vars(state).update(vars(self.shared(state, str(state.scene.primary.means.device))))
+            vars(state).update(vars(self.broadcast(state, str(state.scene.primary.means.device))))
 
     def check_alike(self, traits: Mapping[str, object]) -> None:
         """Refuses ranks that were not started alike.
@@ -236,7 +236,7 @@ def tell(label: str, text: str, code: int) -> None:
         return
     with suppress(RankLostError):
         ranks = join()
-        ranks._gathered(Said(failure=(label, text, code)))
+        ranks._gather(Said(failure=(label, text, code)))
     await_leader()
 
 
@@ -247,7 +247,7 @@ def await_leader() -> None:
     with suppress(RankLostError):
         ranks = join()
         while True:
-            ranks._gathered(Said())
+            ranks._gather(Said())
 
 
 def leave(code: int) -> None:

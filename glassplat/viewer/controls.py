@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from glassplat.options import Cleaning
-from glassplat.publish.camera_paths import interpolated
+from glassplat.publish.camera_paths import interpolate_cameras
 from glassplat.publish.cleaning import Floaters
 from glassplat.render.layers import LABEL_COLORS
 from glassplat.scene.camera import Camera
@@ -23,7 +23,7 @@ from glassplat.viewer.drawing import LEAST_GAIN, MOST_GAIN, PaneMove, Shown, Wis
 logger = logging.getLogger(__name__)
 
 
-def survived(callback: Callable[..., Any]) -> Callable[..., None]:
+def log_errors(callback: Callable[..., Any]) -> Callable[..., None]:
     """The callback, whose errors end with it: viser's threads print tracebacks, and a training would end with them."""
 
     @wraps(callback)
@@ -77,7 +77,7 @@ class PaneGizmo:
 
     def listen(self, changed: Callable[[], None]) -> None:
         """From now on `changed` is called whenever it is moved."""
-        self._handle.on_update(survived(lambda _: changed()))
+        self._handle.on_update(log_errors(lambda _: changed()))
 
     def show(self, visible: bool) -> None:
         """Shows or hides it; where it stands counts in either case."""
@@ -128,13 +128,13 @@ class PaneControls:
     def listen(self, changed: Callable[[], None]) -> None:
         """From now on `changed` is called whenever something else is wished for, and arrows show as they are chosen."""
         for control in (self._glass, *self._reflectances.values(), self._gain):
-            control.on_update(survived(lambda _: changed()))
+            control.on_update(log_errors(lambda _: changed()))
         for gizmo in self._gizmos:
             gizmo.listen(changed)
-        self._chosen.on_update(survived(lambda _: self._show_gizmo()))
-        self._back.on_click(survived(lambda _: self._put_back(changed)))
+        self._chosen.on_update(log_errors(lambda _: self._show_gizmo()))
+        self._back.on_click(log_errors(lambda _: self._put_back(changed)))
 
-    def applied(self, wish: Wish) -> Wish:
+    def apply(self, wish: Wish) -> Wish:
         """The wish, with the panes as the controls say."""
         sliders = {label: within(slider.value, 0.0, 1.0) for label, slider in self._reflectances.items()}
         changed = [(label, value) for label, value in sliders.items() if value != round(self._own[label], 3)]
@@ -193,9 +193,9 @@ class CleanControls:
     def listen(self, changed: Callable[[], None]) -> None:
         """From now on `changed` is called whenever something else is wished for."""
         for control in (self._on, self._isolated, self._oversized, self._box):
-            control.on_update(survived(lambda _: changed()))
+            control.on_update(log_errors(lambda _: changed()))
 
-    def applied(self, wish: Wish) -> Wish:
+    def apply(self, wish: Wish) -> Wish:
         """The wish, with what the controls leave of the scene."""
         if not self._on.value:
             self._told.content = ""
@@ -208,7 +208,7 @@ class CleanControls:
             within(self._isolated.value, 0.0, MOST_ISOLATED),
             within(self._oversized.value, 0.0, MOST_OVERSIZED),
         )
-        kept = ~torch.stack(list(self._floaters.found(cleaning).values())).any(dim=0)
+        kept = ~torch.stack(list(self._floaters.masks(cleaning).values())).any(dim=0)
         self._told.content = f"{int(kept.sum())} of {len(primary)} Gaussians stay"
         return replace(wish, kept=kept) if bool(kept.any()) else wish
 
@@ -239,7 +239,7 @@ class MeasureControls:
         with self._handle.gui.add_folder("Measure", expand_by_default=False):
             self._on = self._handle.gui.add_checkbox("Click two points", False)
             self._told = self._handle.gui.add_markdown(self._distance())
-        self._on.on_update(survived(lambda _: self._listen(clicked)))
+        self._on.on_update(log_errors(lambda _: self._listen(clicked)))
 
     def take(self, point: np.ndarray) -> None:
         """One more point [3]; a third begins anew."""
@@ -256,7 +256,7 @@ class MeasureControls:
             return
         self._is_listening = True
         register = self._handle.scene.on_click()
-        register(survived(lambda event: clicked(np.array(event.ray_direction)) if self._on.value else None))
+        register(log_errors(lambda event: clicked(np.array(event.ray_direction)) if self._on.value else None))
 
     def _distance(self) -> str:
         if len(self._points) < 2:
@@ -303,13 +303,13 @@ class KeyframeControls:
         """
         gui = self._handle.gui
         with gui.add_folder("Keyframes", expand_by_default=False):
-            self._count = gui.add_markdown(self._counted())
-            gui.add_button("Add this view").on_click(survived(lambda _: self.add()))
-            gui.add_button("Remove the last").on_click(survived(lambda _: self.remove()))
-            gui.add_button("Play or stop").on_click(survived(lambda _: self.play(go)))
+            self._count = gui.add_markdown(self._count_text())
+            gui.add_button("Add this view").on_click(log_errors(lambda _: self.add()))
+            gui.add_button("Remove the last").on_click(log_errors(lambda _: self.remove()))
+            gui.add_button("Play or stop").on_click(log_errors(lambda _: self.play(go)))
             if save is not None:
                 name = gui.add_text("Name", "keyframes")
-                gui.add_button("Save keyframes").on_click(survived(lambda _: save(name.value)))
+                gui.add_button("Save keyframes").on_click(log_errors(lambda _: save(name.value)))
 
     def add(self) -> None:
         """One more keyframe, where the client stands."""
@@ -330,7 +330,7 @@ class KeyframeControls:
             )
             self._frusta.append(frustum)
             self.keyframes = (*self.keyframes, camera)
-            self._count.content = self._counted()
+            self._count.content = self._count_text()
 
     def remove(self) -> None:
         """The last keyframe goes."""
@@ -338,7 +338,7 @@ class KeyframeControls:
             if self._frusta:
                 self._frusta.pop().remove()
                 self.keyframes = self.keyframes[:-1]
-                self._count.content = self._counted()
+                self._count.content = self._count_text()
 
     def play(self, go: Callable[[Camera], None]) -> None:
         """Begins to move the client along the path as the film will, or stops that."""
@@ -351,7 +351,7 @@ class KeyframeControls:
             ended = self._playing = threading.Event()
         frames = (len(keyframes) - 1) * SECONDS_BETWEEN * PLAYED_PER_SECOND + 1
         # A thread of its own: viser has few, and all clients share them.
-        path = interpolated(keyframes, frames)
+        path = interpolate_cameras(keyframes, frames)
         threading.Thread(target=_play, args=(path, go, ended, self._step), daemon=True).start()
 
     def stop(self) -> None:
@@ -360,7 +360,7 @@ class KeyframeControls:
             if self._playing is not None:
                 self._playing.set()
 
-    def _counted(self) -> str:
+    def _count_text(self) -> str:
         count = len(self.keyframes)
         return f"{count} {'keyframe' if count == 1 else 'keyframes'}" + (", a film needs two" if count < 2 else "")
 
@@ -405,9 +405,9 @@ class PhotographControls:
         """From now on they move the camera to where a photograph was taken, with `stand_at`."""
         names, steps = self._names, self._steps
         self._name.on_update(
-            survived(lambda event: stand_at(names.index(self._name.value)) if event.client is not None else None)
+            log_errors(lambda event: stand_at(names.index(self._name.value)) if event.client is not None else None)
         )
-        steps.on_click(survived(lambda _: stand_at((self._at + (1 if steps.value == "next" else -1)) % len(names))))
+        steps.on_click(log_errors(lambda _: stand_at((self._at + (1 if steps.value == "next" else -1)) % len(names))))
 
     def stands_at(self, index: int) -> None:
         """The camera is where a photograph was taken."""

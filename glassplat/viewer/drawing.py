@@ -15,7 +15,7 @@ from glassplat.render.frame import Frame, Renderer
 from glassplat.render.layers import error_colors, layer_image
 from glassplat.render.planar import PHOTOGRAPHED
 from glassplat.scene.camera import Camera, quat_from_rotation, rotation_from_quat
-from glassplat.scene.scene import Scene, as_mirrors, moved, with_reflectance, without_glass
+from glassplat.scene.scene import Scene, as_mirrors, move_pane, with_reflectance, without_glass
 
 
 def matrix_of(wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -141,14 +141,14 @@ class Wish:
         return Camera(self.cam_from_world, focal, focal, width / 2, height / 2, width, height)
 
 
-def edited(scene: Scene, wish: Wish) -> Scene:
+def edit_scene(scene: Scene, wish: Wish) -> Scene:
     """The scene with the panes as they are wished for and cleaned; what is not wished for keeps every bit."""
     if wish.kept is not None and len(wish.kept) == len(scene.primary):
         scene = replace(scene, primary=scene.primary.select(wish.kept.to(scene.primary.means.device)))
     if not len(scene.planes) or wish.glass == "none":
         return without_glass(scene) if len(scene.planes) else scene
     for move in wish.moves:
-        scene = moved(scene, *move)
+        scene = move_pane(scene, *move)
     for label, reflectance in wish.reflectances:
         scene = with_reflectance(scene, label, reflectance)
     if wish.glass == "mirror":
@@ -161,9 +161,9 @@ def edited(scene: Scene, wish: Wish) -> Scene:
 
 
 @torch.no_grad()
-def drawn(scene: Scene, renderer: Renderer, wish: Wish, height: int) -> NDArray[np.uint8]:
+def draw_picture(scene: Scene, renderer: Renderer, wish: Wish, height: int) -> NDArray[np.uint8]:
     """The picture [H, W, 3] of a wish; a layer that the scene does not have shows as the image itself."""
-    frame = renderer.with_layers([wish.layer])(edited(scene, wish), wish.camera(height))
+    frame = renderer.with_layers([wish.layer])(edit_scene(scene, wish), wish.camera(height))
     return _picture(layer_image(frame, wish.layer if _has(frame, wish.layer) else "rgb"))
 
 
@@ -186,7 +186,7 @@ def error_drawn(
     """
     rows = min(height, photo.shape[0])
     columns = max(1, round(rows * camera.width / camera.height))
-    frame = renderer.with_layers([PHOTOGRAPHED])(edited(scene, wish), camera.resized(columns, rows))
+    frame = renderer.with_layers([PHOTOGRAPHED])(edit_scene(scene, wish), camera.resize(columns, rows))
     small = torch.nn.functional.interpolate(
         photo.to(frame.rgb).movedim(-1, 0)[None], (rows, columns), mode="bilinear", antialias=True
     )[0].movedim(0, -1)
@@ -208,7 +208,7 @@ def point_along(scene: Scene, renderer: Renderer, wish: Wish, direction: NDArray
     if z <= 0:
         raise ValueError("the direction is behind the camera")
     column, row = int(camera.fx * x / z + camera.cx), int(camera.fy * y / z + camera.cy)
-    frame = renderer.with_layers(["depth"])(edited(scene, wish), camera)
+    frame = renderer.with_layers(["depth"])(edit_scene(scene, wish), camera)
     is_inside = 0 <= row < camera.height and 0 <= column < camera.width
     if not is_inside or float(frame.layers["alpha"][row, column]) < SURFACE_COVERAGE:
         raise ValueError("nothing is there")

@@ -27,7 +27,7 @@ from websockets.http11 import Request, Response
 
 from glassplat.access import Access, RefusedError
 from glassplat.errors import InputError
-from glassplat.files.records import COORDINATE, ByName, Choice, Field, Items, Number, Optional, Whole, checked
+from glassplat.files.records import COORDINATE, ByName, Choice, Field, Items, Number, Optional, Whole, check_fields
 
 LARGEST_MESSAGE = 64 * 1024
 """Bytes; a page sends cameras and what is typed into controls."""
@@ -104,7 +104,7 @@ def understood(data: str | bytes) -> bytes | None:
     try:
         message = msgspec.msgpack.decode(data if isinstance(data, bytes) else b"")
         kind = message["type"]
-        fields = checked(message, MESSAGES[kind], kind)
+        fields = check_fields(message, MESSAGES[kind], kind)
         turn = fields.get("wxyz", (1.0,))
         if sum(part * part for part in turn) < LEAST_TURN**2 or fields.get("updates", {"value": 0}).keys() != {"value"}:
             return None
@@ -128,13 +128,13 @@ def admission(access: Access, page: Callable[..., Any] | None) -> Callable[[Serv
 
     def answer(connection: ServerConnection, request: Request) -> Any:
         try:
-            entry = admitted(access, request)
+            entry = check_request(access, request)
         except RefusedError as refused:
-            return replied(refused.status, {"Content-Type": "text/plain; charset=utf-8"}, str(refused))
+            return reply_with(refused.status, {"Content-Type": "text/plain; charset=utf-8"}, str(refused))
         if entry is not None:
-            return replied(HTTPStatus.OK, entry)
+            return reply_with(HTTPStatus.OK, entry)
         if PAGE_PATH.fullmatch(request.path.partition("?")[0]) is None:  # viser may follow `..` out of its folder.
-            return replied(HTTPStatus.NOT_FOUND, {}, "there is no such page")
+            return reply_with(HTTPStatus.NOT_FOUND, {}, "there is no such page")
         response = None if page is None else page(connection, request)
         if isinstance(response, Response):
             for name, value in HEADERS.items():
@@ -144,7 +144,7 @@ def admission(access: Access, page: Callable[..., Any] | None) -> Callable[[Serv
     return answer
 
 
-def admitted(access: Access, request: Request) -> Mapping[str, str] | None:
+def check_request(access: Access, request: Request) -> Mapping[str, str] | None:
     """None if a request may be answered; for one that brings the key, the headers of the answer.
 
     Raises:
@@ -162,7 +162,7 @@ def admitted(access: Access, request: Request) -> Mapping[str, str] | None:
     return entry
 
 
-def replied(status: HTTPStatus, headers: Mapping[str, str], text: str = "") -> Response:
+def reply_with(status: HTTPStatus, headers: Mapping[str, str], text: str = "") -> Response:
     """An answer with nothing of viser in it."""
     body = text.encode()
     length = {"Content-Length": str(len(body)), "Cache-Control": "no-store", "Connection": "close"}
@@ -198,10 +198,10 @@ def guarded_server(access: Access, *, host: str, port: int, title: str) -> viser
                 f"viser {viser.__version__} makes its server in a way that glassplat cannot guard: anybody could look; "
                 "pip install viser==1.1.1"
             )
-    found.get_event_loop().set_exception_handler(_noted)
+    found.get_event_loop().set_exception_handler(_log_error)
     return found
 
 
-def _noted(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+def _log_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     """Note an error of one message in place of printing its traceback."""
     logger.debug("a message of a browser was not followed: %s", context.get("exception") or context.get("message"))

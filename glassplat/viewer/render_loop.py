@@ -191,7 +191,7 @@ class RenderLoop(Generic[Wanted]):
         coarse = self.coarse_height(request.size)
         is_sharp = request.is_coarse_shown or coarse >= height
         rows = height if is_sharp else coarse
-        picture = self._timed(client, request.wish, rows)
+        picture = self._draw_timed(client, request.wish, rows)
         with self._changed:
             current = self._requests.get(client)
             if current is None or current.generation != request.generation:
@@ -203,7 +203,7 @@ class RenderLoop(Generic[Wanted]):
         if picture is not None:
             self._show(client, picture, is_sharp)
 
-    def _timed(self, client: int, wish: Wanted, rows: int) -> Picture | None:
+    def _draw_timed(self, client: int, wish: Wanted, rows: int) -> Picture | None:
         """A picture; what goes wrong with one must not end the others."""
         begun = time.perf_counter()
         try:

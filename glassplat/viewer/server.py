@@ -23,12 +23,22 @@ from torch import Tensor
 
 from glassplat.access import Access, is_local
 from glassplat.errors import InputError
-from glassplat.publish.web_page import best_view, surveyed
+from glassplat.publish.web_page import best_view, survey_capture
 from glassplat.render.frame import Renderer
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
 from glassplat.viewer import controls
-from glassplat.viewer.drawing import ERROR, Shown, Viewpoints, Wish, drawn, edited, error_drawn, matrix_of, point_along
+from glassplat.viewer.drawing import (
+    ERROR,
+    Shown,
+    Viewpoints,
+    Wish,
+    draw_picture,
+    edit_scene,
+    error_drawn,
+    matrix_of,
+    point_along,
+)
 from glassplat.viewer.render_loop import RenderLoop, RenderThread, check_port
 
 LARGEST_HEIGHT, MOST_PIXELS = 1080, 4_000_000
@@ -55,7 +65,7 @@ class Client:
         self._waiting: Any = handle.add_notification(*WAITING, loading=True, with_close_button=False)
         self.lay_out()
         self.stand_at(viewer.first)
-        handle.camera.on_update(controls.survived(lambda _: self.ask()))
+        handle.camera.on_update(controls.log_errors(lambda _: self.ask()))
 
     def show(self, picture: NDArray[np.uint8], is_sharp: bool) -> None:
         """Puts a picture on the screen, and with a sharp one the photograph that is nearest to it."""
@@ -103,8 +113,8 @@ class Client:
         self._nearest = self._viewer.viewpoints.nearest(position, matrix_of(wxyz)[:, 2])
         against = self._nearest if self._layer.value == ERROR else None
         wish = Wish(cam_from_world(wxyz, position), fov_rad, aspect, self._layer.value, against=against)
-        wish = wish if self._clean is None else self._clean.applied(wish)
-        return wish if self._panes is None else self._panes.applied(wish)
+        wish = wish if self._clean is None else self._clean.apply(wish)
+        return wish if self._panes is None else self._panes.apply(wish)
 
     def camera(self) -> Camera | None:
         """Camera of the browser, with as many rows as its window has."""
@@ -138,9 +148,9 @@ class Client:
         gui.reset()
         self._told = gui.add_markdown(plain(self._status)) if self._viewer.buttons else None
         for name, act in self._viewer.buttons.items():
-            gui.add_button(name).on_click(controls.survived(lambda _, act=act: act()))
+            gui.add_button(name).on_click(controls.log_errors(lambda _, act=act: act()))
         self._layer = gui.add_dropdown("Layer", layers, initial_value=chosen)
-        self._layer.on_update(controls.survived(lambda _: self.ask()))
+        self._layer.on_update(controls.log_errors(lambda _: self.ask()))
         panes = shown.scene.planes
         if self._panes is not None:
             self._panes.remove()
@@ -174,13 +184,13 @@ class Client:
             except ValueError as error:
                 self._notify("No point", str(error), "red")
 
-        self._viewer.loop.call(controls.survived(work))
+        self._viewer.loop.call(controls.log_errors(work))
 
     def keep_scene(self, name: str) -> None:
         """Saves the scene as it is edited here, under a new name; says how that went."""
         keeper, wish = self._viewer.shown.keeper, self.wish()
         if keeper is not None and wish is not None:
-            self._keep(lambda: keeper.keep_scene(edited(self._viewer.shown.scene, wish), name))
+            self._keep(lambda: keeper.keep_scene(edit_scene(self._viewer.shown.scene, wish), name))
 
     def keep_keyframes(self, name: str) -> None:
         """Saves the keyframes under a new name; says how that went."""
@@ -192,7 +202,7 @@ class Client:
         gui = self._handle.gui
         with gui.add_folder("Edited scene", expand_by_default=False):
             text = gui.add_text("Name", name)
-            gui.add_button("Save as a run").on_click(controls.survived(lambda _: self.keep_scene(text.value)))
+            gui.add_button("Save as a run").on_click(controls.log_errors(lambda _: self.keep_scene(text.value)))
 
     def _keep(self, write: Callable[[], str]) -> None:
         """Writes in the thread that draws: what is written may need kernels."""
@@ -262,7 +272,7 @@ class Viewer:
         self.access = Access(host)
         self._server = guarded_server(self.access, host=host, port=port, title=shown.title)
         cameras = [camera for _, camera in shown.cameras]
-        survey = surveyed(cameras, shown.scene.extent)
+        survey = survey_capture(cameras, shown.scene.extent)
         self._server.scene.set_up_direction(tuple(survey.up.tolist()))
         self.focus = survey.focus.numpy()
         self.first = best_view(shown.scene.planes, cameras)
@@ -270,8 +280,8 @@ class Viewer:
         # The error layer asks for the same one with every edit.
         self._photograph = lru_cache(maxsize=2)(self._read_photograph)
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        self._server.on_client_connect(controls.survived(self._connected))
-        self._server.on_client_disconnect(controls.survived(self._gone))
+        self._server.on_client_connect(controls.log_errors(self._on_connect))
+        self._server.on_client_disconnect(controls.log_errors(self._on_disconnect))
 
     def __repr__(self) -> str:
         return f"look at {self.address}"
@@ -310,21 +320,21 @@ class Viewer:
         self.shown = replace(self.shown, scene=scene, renderer=renderer)
         if scene.planes.labels != had:
             for client in list(self._clients.values()):
-                controls.survived(client.lay_out)()
+                controls.log_errors(client.lay_out)()
 
     def refresh(self, status: str = "") -> None:
         """Asks for everybody's picture again, and tells them something."""
         for client in list(self._clients.values()):
-            controls.survived(client.tell)(status)
-            controls.survived(client.ask)()
+            controls.log_errors(client.tell)(status)
+            controls.log_errors(client.ask)()
 
-    def _connected(self, handle: Any) -> None:
+    def _on_connect(self, handle: Any) -> None:
         client = self._clients[handle.client_id] = Client(handle, self)
         client.ask()
         if handle.client_id not in self._server.get_clients():  # It left before it was known here.
-            self._gone(handle)
+            self._on_disconnect(handle)
 
-    def _gone(self, handle: Any) -> None:
+    def _on_disconnect(self, handle: Any) -> None:
         self.loop.forget(handle.client_id)
         gone = self._clients.pop(handle.client_id, None)
         if gone is not None:
@@ -333,7 +343,7 @@ class Viewer:
     def _draw(self, wish: Wish, height: int) -> NDArray[np.uint8]:
         scene, renderer = self.shown.scene, self.shown.renderer
         if wish.against is None:
-            return drawn(scene, renderer, wish, height)
+            return draw_picture(scene, renderer, wish, height)
         camera = self.shown.cameras[wish.against][1]
         return error_drawn(scene, renderer, wish, height, camera, self._photograph(wish.against))
 

@@ -59,7 +59,7 @@ def marked_document(views: tuple[int, ...] = (0, 1, 2), **more: object) -> dict:
 
 def saved(session: Session, document: dict) -> dict:
     """The answer to a page that has seen all that is saved."""
-    return session.save({"document": document, "version": session.described()["version"]})
+    return session.save({"document": document, "version": session.describe()["version"]})
 
 
 @pytest.fixture

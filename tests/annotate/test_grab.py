@@ -7,8 +7,8 @@ import importlib
 import numpy as np
 import pytest
 
-from glassplat.annotate.document import filled
-from glassplat.annotate.results import grabbed
+from glassplat.annotate.document import fill_polygon
+from glassplat.annotate.results import grab_outlines
 from glassplat.errors import InputError
 
 HEIGHT, WIDTH = 160, 240
@@ -25,34 +25,34 @@ def hedge_before_a_wall() -> tuple[np.ndarray, np.ndarray]:
 
 
 def covered(pieces: list[np.ndarray]) -> np.ndarray:
-    masks = [filled(piece, (WIDTH, HEIGHT)) for piece in pieces]
+    masks = [fill_polygon(piece, (WIDTH, HEIGHT)) for piece in pieces]
     return np.any(masks, axis=0)
 
 
 def test_the_thing_is_found_within_a_rough_outline() -> None:
     photo, disc = hedge_before_a_wall()
-    pieces = grabbed(photo, ROUGH)
+    pieces = grab_outlines(photo, ROUGH)
     wrong = covered(pieces) != disc
     assert len(pieces) == 1 and wrong.sum() < 0.03 * disc.sum()
-    np.testing.assert_array_equal(pieces[0], grabbed(photo, ROUGH)[0])
+    np.testing.assert_array_equal(pieces[0], grab_outlines(photo, ROUGH)[0])
 
 
 def test_large_photographs_are_looked_at_smaller() -> None:
     photo, disc = hedge_before_a_wall()
     large = np.kron(photo, np.ones((6, 6, 1), dtype=np.uint8))
-    pieces = [piece / 6 for piece in grabbed(large, 6 * ROUGH)]
+    pieces = [piece / 6 for piece in grab_outlines(large, 6 * ROUGH)]
     assert (covered(pieces) != disc).sum() < 0.05 * disc.sum()
 
 
 def test_where_nothing_stands_out_the_outline_stays() -> None:
     photo = np.full((HEIGHT, WIDTH, 3), 120, dtype=np.uint8)
-    everywhere = covered(grabbed(photo, ROUGH))
-    assert (everywhere & ~filled(ROUGH, (WIDTH, HEIGHT))).sum() == 0 and everywhere.any()
+    everywhere = covered(grab_outlines(photo, ROUGH))
+    assert (everywhere & ~fill_polygon(ROUGH, (WIDTH, HEIGHT))).sum() == 0 and everywhere.any()
 
 
 def test_an_outline_that_leaves_the_photograph_is_cut_there() -> None:
     photo, disc = hedge_before_a_wall()
-    pieces = grabbed(photo[:, 90:], ROUGH - np.array([90, 0]))
+    pieces = grab_outlines(photo[:, 90:], ROUGH - np.array([90, 0]))
     found = covered([piece + np.array([90, 0]) for piece in pieces])
     assert (found[:, 91:] != disc[:, 91:]).sum() < 0.05 * disc.sum()
 
@@ -60,7 +60,7 @@ def test_an_outline_that_leaves_the_photograph_is_cut_there() -> None:
 def test_an_outline_beside_the_photograph_is_refused() -> None:
     photo, _ = hedge_before_a_wall()
     with pytest.raises(InputError, match="holds nothing of the photograph"):
-        grabbed(photo, ROUGH + np.array([1000, 0]))
+        grab_outlines(photo, ROUGH + np.array([1000, 0]))
 
 
 def test_without_opencv_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -69,4 +69,4 @@ def test_without_opencv_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(importlib, "import_module", missing)
     with pytest.raises(InputError, match=r"pip install 'glassplat\[video\]'"):
-        grabbed(hedge_before_a_wall()[0], ROUGH)
+        grab_outlines(hedge_before_a_wall()[0], ROUGH)

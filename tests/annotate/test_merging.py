@@ -11,7 +11,7 @@ import pytest
 
 from glassplat.annotate import session
 from glassplat.annotate.document import MOST_PANES, read_document
-from glassplat.annotate.session import ChangedElsewhereError, merged, opened_session
+from glassplat.annotate.session import ChangedElsewhereError, merge_documents, opened_session
 from tests.annotate.conftest import marked_document, saved
 
 
@@ -34,7 +34,7 @@ def document(**panes: str) -> dict:
     ],
 )
 def test_both_are_kept(theirs: dict, ours: dict, together: dict, told: list[str]) -> None:
-    found = merged(document(a="1"), theirs, ours)
+    found = merge_documents(document(a="1"), theirs, ours)
     assert (found.document, found.changes) == (together, told)
     for old, new in found.renamed.items():
         (pane,) = (pane for pane in together["panes"] if pane["label"] == new)
@@ -45,7 +45,7 @@ def test_more_panes_than_fit_are_refused() -> None:
     full = {"version": 1, "panes": [{"label": label, "marks": "1"} for label in range(1, MOST_PANES + 1)]}
     ours = {"version": 1, "panes": [{"label": 1, "marks": "2"}]}
     with pytest.raises(ValueError, match="all 64 labels are in use"):
-        merged(document(), full, ours)
+        merge_documents(document(), full, ours)
 
 
 @pytest.mark.parametrize("has_folder_locks", [True, False])

@@ -12,7 +12,7 @@ from glassplat.annotate.fit import (
     Marks,
     TooFewMarksError,
     corner_information,
-    fitted_pane,
+    fit_pane,
     polygon_pane,
     rectangle_pane,
     tilt_deviation,
@@ -48,7 +48,7 @@ def normal_off(frame: np.ndarray, pane: Pane) -> float:
 @pytest.mark.parametrize("shape", ["rectangle", "polygon"])
 def test_exact_marks_give_the_pane(pane: Pane, shape: str) -> None:
     cameras = cameras_on(pane)
-    fit = fitted_pane(corner_marks(pane, cameras), cameras, shape)  # type: ignore[arg-type]
+    fit = fit_pane(corner_marks(pane, cameras), cameras, shape)  # type: ignore[arg-type]
     np.testing.assert_allclose(fit.shape.corners(), pane.at(U, V), atol=1e-4)
     assert fit.error < 1e-2 and normal_off(fit.shape.frame, pane) < 1e-2
     np.testing.assert_allclose(fit.shape.frame @ fit.shape.frame.T, np.eye(3), atol=1e-9)
@@ -57,9 +57,7 @@ def test_exact_marks_give_the_pane(pane: Pane, shape: str) -> None:
 @pytest.mark.parametrize("count", [2, 3])
 def test_the_error_of_the_plane_is_as_large_as_the_doubt_says(count: int) -> None:
     cameras = cameras_on(FRONT, EYES[:count])
-    fits = [
-        fitted_pane(corner_marks(FRONT, cameras, noise=0.37, seed=seed), cameras, "rectangle") for seed in range(30)
-    ]
+    fits = [fit_pane(corner_marks(FRONT, cameras, noise=0.37, seed=seed), cameras, "rectangle") for seed in range(30)]
     errors = np.array([normal_off(fit.shape.frame, FRONT) for fit in fits])
     uncertainty = np.median([fit.uncertainty for fit in fits])
     assert 0.3 * uncertainty < np.sqrt((errors**2).mean()) < 2 * uncertainty
@@ -67,8 +65,8 @@ def test_the_error_of_the_plane_is_as_large_as_the_doubt_says(count: int) -> Non
 
 def test_another_view_lowers_the_doubt_as_foretold() -> None:
     cameras = cameras_on(FRONT)
-    two = fitted_pane(corner_marks(FRONT, cameras[:2], noise=0.2), cameras[:2], "rectangle")
-    three = fitted_pane(corner_marks(FRONT, cameras, noise=0.2), cameras, "rectangle")
+    two = fit_pane(corner_marks(FRONT, cameras[:2], noise=0.2), cameras[:2], "rectangle")
+    three = fit_pane(corner_marks(FRONT, cameras, noise=0.2), cameras, "rectangle")
     foretold = tilt_deviation(two.information + corner_information(cameras[2], two.shape))
     assert three.uncertainty < two.uncertainty
     assert foretold == pytest.approx(three.uncertainty, rel=0.3)
@@ -78,7 +76,7 @@ def test_a_corner_outside_of_the_image_may_be_marked() -> None:
     wide = FRONT.larger(2.5)
     cameras = cameras_on(wide)
     assert not all(camera.holds(wide.at(U, V)).all() for camera in cameras)
-    fit = fitted_pane(corner_marks(wide, cameras), cameras, "rectangle")
+    fit = fit_pane(corner_marks(wide, cameras), cameras, "rectangle")
     np.testing.assert_allclose(fit.shape.corners(), wide.at(U, V), atol=1e-3)
 
 
@@ -87,7 +85,7 @@ def test_one_wrong_mark_moves_the_plane_little(shape: str) -> None:
     cameras = cameras_on(FRONT, [*EYES, (0.6, 0.7, -0.5)])
     marks = corner_marks(FRONT, cameras)
     marks.corners[1][2] = marks.corners[1][2] + 30.0
-    fit = fitted_pane(marks, cameras, shape)  # type: ignore[arg-type]
+    fit = fit_pane(marks, cameras, shape)  # type: ignore[arg-type]
     assert normal_off(fit.shape.frame, FRONT) < 0.5
     assert max(fit.errors, key=fit.errors.__getitem__) == 2
 
@@ -96,9 +94,9 @@ def test_a_corner_that_one_view_shows_is_enough_beside_three_others() -> None:
     cameras = cameras_on(FRONT)
     marks = corner_marks(FRONT, cameras)
     kept = {1: marks.corners[3][1]}
-    fit = fitted_pane(Marks([*marks.corners[:3], kept]), cameras, "polygon")
+    fit = fit_pane(Marks([*marks.corners[:3], kept]), cameras, "polygon")
     np.testing.assert_allclose(fit.shape.corners(), FRONT.at(U, V), atol=1e-3)
-    hidden = fitted_pane(Marks([*marks.corners[:3], {}]), cameras, "rectangle")
+    hidden = fit_pane(Marks([*marks.corners[:3], {}]), cameras, "rectangle")
     np.testing.assert_allclose(hidden.shape.corners(), FRONT.at(U, V), atol=1e-3)
 
 
@@ -115,13 +113,13 @@ def edge_marks(pane: Pane, cameras: Sequence[NumpyCamera], edges: Sequence[int],
 
 def test_all_edges_without_a_corner_give_the_pane() -> None:
     cameras = cameras_on(FRONT)
-    fit = fitted_pane(edge_marks(FRONT, cameras, range(4)), cameras, "rectangle")
+    fit = fit_pane(edge_marks(FRONT, cameras, range(4)), cameras, "rectangle")
     np.testing.assert_allclose(fit.shape.corners(), FRONT.at(U, V), atol=1e-3)
 
 
 def test_two_edges_give_the_plane_and_as_much_of_the_pane_as_was_marked() -> None:
     cameras = cameras_on(FRONT)
-    fit = fitted_pane(edge_marks(FRONT, cameras, (1, 3)), cameras, "rectangle")
+    fit = fit_pane(edge_marks(FRONT, cameras, (1, 3)), cameras, "rectangle")
     assert normal_off(fit.shape.frame, FRONT) < 0.1
     assert fit.uncertainty < 5
     sizes = np.linalg.norm(np.diff(fit.shape.corners()[:3], axis=0), axis=1)
@@ -150,7 +148,7 @@ def test_where_a_long_front_ends_may_be_marked_in_one_photograph_only() -> None:
         {view: seen(view, 3, 0) for view in (0, 2)},
     ]
     places: list[dict[int, np.ndarray]] = [{}, {}, {}, {view: cameras[view].project(corners[3]) for view in (0, 1, 2)}]
-    fit = fitted_pane(Marks(places, edges), cameras, "rectangle")
+    fit = fit_pane(Marks(places, edges), cameras, "rectangle")
     assert normal_off(fit.shape.frame, front) < 2 * fit.uncertainty < 4
     np.testing.assert_allclose(fit.shape.corners(), corners, atol=0.5)
 
@@ -169,7 +167,7 @@ def test_a_corner_in_one_photograph_says_how_far_a_pane_goes() -> None:
         }
 
     edges = [seen(0, 1, (0.0, 1.0)), seen(1, 2, (0.0, 0.1)), {}, seen(3, 0, (0.9, 1.0))]
-    fit = fitted_pane(Marks([{}, {}, {0: cameras[0].project(corners[2])}, {}], edges), cameras, "rectangle")
+    fit = fit_pane(Marks([{}, {}, {0: cameras[0].project(corners[2])}, {}], edges), cameras, "rectangle")
     np.testing.assert_allclose(fit.shape.corners()[2], corners[2], atol=0.1)
     assert fit.error < 4
 
@@ -179,7 +177,7 @@ def test_a_corner_marked_at_another_one_is_fitted_badly_and_not_refused(elsewher
     cameras = cameras_on(FRONT)
     places = list(corner_marks(FRONT, cameras).corners)
     places[2] = {0: places[elsewhere][0]}
-    fit = fitted_pane(Marks(places), cameras, "rectangle")
+    fit = fit_pane(Marks(places), cameras, "rectangle")
     assert fit.error > 10 and fit.uncertainty > 10
 
 
@@ -187,7 +185,7 @@ def test_edges_of_five_corners_are_fitted_too() -> None:
     cameras = cameras_on(FRONT)
     outline = FRONT.at(np.array([-1, 1, 1, 0.2, -1.0]), np.array([-1, -1, 1, 0.4, 1.0]))
     marks = Marks([{view: camera.project(corner) for view, camera in enumerate(cameras)} for corner in outline])
-    fit = fitted_pane(marks, cameras, "rectangle")  # Five corners are no rectangle.
+    fit = fit_pane(marks, cameras, "rectangle")  # Five corners are no rectangle.
     np.testing.assert_allclose(fit.shape.corners(), outline, atol=1e-3)
 
 
@@ -209,13 +207,13 @@ def test_too_few_marks_say_what_is_missing(kept: dict[int, int], expected: str) 
         ]
     )
     with pytest.raises(TooFewMarksError, match=expected):
-        fitted_pane(some, cameras, "rectangle")
+        fit_pane(some, cameras, "rectangle")
 
 
 def test_views_from_one_place_are_not_enough() -> None:
     cameras = cameras_on(FRONT, [EYES[0], EYES[0]])
     with pytest.raises(TooFewMarksError, match="taken farther apart"):
-        fitted_pane(corner_marks(FRONT, cameras), cameras, "rectangle")
+        fit_pane(corner_marks(FRONT, cameras), cameras, "rectangle")
 
 
 def test_the_rectangle_of_a_polygon_keeps_its_order_and_hand() -> None:

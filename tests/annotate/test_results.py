@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from glassplat.annotate.document import filled, parsed_document, seen_outline, with_strokes
-from glassplat.annotate.fit import fitted_pane
+from glassplat.annotate.document import fill_polygon, parsed_document, seen_outline, with_strokes
+from glassplat.annotate.fit import fit_pane
 from glassplat.annotate.results import in_photograph, pane_labels
 from glassplat.annotate.session import opened_session
 from glassplat.captures.dataset import load_dataset
@@ -103,7 +103,7 @@ def test_the_nearer_pane_hides_the_farther_one(room: Path) -> None:
         ]
         (marked,) = parsed_document(marked_document(label=label, corners=places), "here")
         numbers = {name: number for number, name in enumerate(NAMES)}
-        panes.append((marked, fitted_pane(marked.marks(numbers), cameras, "rectangle")))
+        panes.append((marked, fit_pane(marked.marks(numbers), cameras, "rectangle")))
     for order in (panes, panes[::-1]):
         labels = pane_labels(NAMES[1], cameras[1], order)
         truth = label_image(camera_from(PLACES[1], FRONT.center), [behind, FRONT]).numpy()
@@ -113,18 +113,18 @@ def test_the_nearer_pane_hides_the_farther_one(room: Path) -> None:
 def test_an_outline_that_passes_the_camera_is_cut_off() -> None:
     camera = NumpyCamera.of(camera_from((0.0, 0.0, 0.0), np.array([0.0, 0.0, 1.0])))
     floor = np.array([[-5.0, 1, -5], [5, 1, -5], [5, 1, 5], [-5, 1, 5]])
-    mask = filled(seen_outline(camera, floor), (300, 220))
+    mask = fill_polygon(seen_outline(camera, floor), (300, 220))
     horizon = 110 + 240 * 1 / 5
     rows = np.flatnonzero(mask.any(axis=1))
     assert rows.min() == pytest.approx(horizon, abs=2) and rows.max() == 219
     behind = floor - [0, 0, 10]
-    assert not filled(seen_outline(camera, behind), (300, 220)).any()
+    assert not fill_polygon(seen_outline(camera, behind), (300, 220)).any()
 
 
 def test_an_outline_that_passes_the_camera_keeps_its_edges_straight() -> None:
     camera = NumpyCamera.of(camera_from((0.0, 0.0, 0.0), np.array([0.0, 0.0, 1.0])))
     wall = np.array([[-2.0, -1, 6], [2.5, -1, -20], [2.5, 1, -20], [-2, 1, 6]])
-    mask = filled(seen_outline(camera, wall), (300, 220))
+    mask = fill_polygon(seen_outline(camera, wall), (300, 220))
     x, y = np.meshgrid(np.arange(300) + 0.5, np.arange(220) + 0.5)
     rays = camera.rays(np.stack([x, y], axis=-1))
     normal = np.cross(wall[1] - wall[0], wall[3] - wall[0])

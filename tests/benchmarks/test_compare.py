@@ -54,7 +54,7 @@ def test_the_help_shows_variants_that_can_be_trained() -> None:
     shown = re.findall(r"--variant (\S+=\".*?\")", compare.__doc__ or "")
     assert len(shown) == 3
     for _, method, options in named_options(["splat", "planar"], [shlex.split(variant)[0] for variant in shown]):
-        command_line.parsed(["train", method, "--data", "room", "--output", "run", *options])
+        command_line.parse_arguments(["train", method, "--data", "room", "--output", "run", *options])
 
 
 def test_runs_are_trained_and_evaluated_once_and_failures_stop_no_other(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from glassplat.captures.axes import evidence_of_masks, evidence_of_points, flipped
+from glassplat.captures.axes import evidence_of_masks, evidence_of_points, flip_axes
 from glassplat.captures.dataset import load_dataset
 from glassplat.captures.view import View
 from glassplat.errors import InputError
@@ -29,7 +29,7 @@ def test_points_tell_which_way_the_cameras_look(capture) -> None:
     cameras = [view.camera for view in annotated_views(capture)]
     points = torch.from_numpy(capture.points).float()
     right = evidence_of_points(cameras, points)
-    wrong = evidence_of_points([flipped(camera) for camera in cameras], points)
+    wrong = evidence_of_points([flip_axes(camera) for camera in cameras], points)
     assert (right.as_read, right.flipped) == (1.0, 0.0)
     assert (wrong.as_read, wrong.flipped) == (0.0, 1.0)
     assert wrong.contradicts and not right.contradicts
@@ -39,7 +39,7 @@ def test_masks_tell_it_too(capture) -> None:
     views = annotated_views(capture)
     right = evidence_of_masks(views)
     assert right is not None and (right.as_read, right.flipped) == (1.0, 0.0)
-    wrong = evidence_of_masks([replace(view, camera=flipped(view.camera)) for view in views])
+    wrong = evidence_of_masks([replace(view, camera=flip_axes(view.camera)) for view in views])
     assert wrong is not None and wrong.contradicts
 
 
@@ -52,7 +52,7 @@ def test_two_masks_or_parallel_rays_tell_nothing(capture) -> None:
 
 def test_flipping_twice_is_the_identity(capture) -> None:
     camera = annotated_views(capture)[0].camera
-    assert torch.equal(flipped(flipped(camera)).cam_from_world, camera.cam_from_world)
+    assert torch.equal(flip_axes(flip_axes(camera)).cam_from_world, camera.cam_from_world)
 
 
 def test_transforms_in_opencv_axes_are_refused_with_points_to_tell(capture) -> None:

@@ -45,7 +45,7 @@ def test_a_lens_is_rescaled_as_colmap_does_it(model: str) -> None:
     lens = example(model)
     camera = lens.as_colmap()
     camera.rescale(65, 50)
-    assert lens.rescaled(65, 50).parameters == pytest.approx(tuple(camera.params), rel=1e-12)
+    assert lens.rescale(65, 50).parameters == pytest.approx(tuple(camera.params), rel=1e-12)
 
 
 @pytest.mark.parametrize("quat", [(1.0, 0.0, 0.0, 0.0), (0.1, -0.7, 0.5, 0.5), (0.0, 0.6, 0.0, -0.8)])

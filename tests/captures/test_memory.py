@@ -97,7 +97,7 @@ def slow_files(monkeypatch: pytest.MonkeyPatch) -> Files:
 
 def test_what_was_costly_and_has_no_room_is_read_once_and_then_from_disk(slow_files: Files, tmp_path: Path) -> None:
     memory = Memory(1, largest=SIZE)
-    with memory.spooled(tmp_path):
+    with memory.spool_to(tmp_path):
         for _ in range(3):
             assert numbers(memory, slow_files) == list(range(20))
         assert not list(tmp_path.iterdir()) or os.name == "nt"
@@ -109,7 +109,7 @@ def test_what_was_costly_and_has_no_room_is_read_once_and_then_from_disk(slow_fi
 
 def test_masks_come_back_from_disk_as_they_were(slow_files: Files, tmp_path: Path) -> None:
     memory, mask = Memory(1, largest=SIZE), Source(lambda: torch.arange(SIZE) % 3, is_mask=True)
-    with memory.spooled(tmp_path):
+    with memory.spool_to(tmp_path):
         first = memory.get(mask)
         numbers(memory, slow_files)
         assert torch.equal(memory.get(mask), first)
@@ -121,7 +121,7 @@ def test_what_is_cheap_to_read_does_not_go_to_the_disk(
 ) -> None:
     monkeypatch.setattr(view_module, "DISK_RATE", 1e-9)
     memory = Memory(1, largest=SIZE)
-    with memory.spooled(tmp_path):
+    with memory.spool_to(tmp_path):
         for _ in range(2):
             numbers(memory, slow_files)
     assert set(slow_files.times.values()) == {2}
@@ -136,7 +136,7 @@ def test_a_disk_without_room_or_with_errors_costs_time_only(
         monkeypatch.setattr(view_module, "DISK_RESERVE", math.inf)
     if what == "gone":
         folder = tmp_path / "nowhere"
-    with memory.spooled(folder):
+    with memory.spool_to(folder):
         assert numbers(memory, slow_files) == list(range(20))
         if what == "breaks":
             memory._spool._file.close()
@@ -199,7 +199,7 @@ def trained_scene(root: Path, memory: float | None, folder: Path) -> Scene:
     dataset = load_dataset(root, memory=memory)
     recipe = SplatRecipe(sh_degree=0)
     state = TrainState(recipe.initialise(dataset), seed=0)
-    with dataset.memory.spooled(folder):
+    with dataset.memory.spool_to(folder):
         names = [m.view for m in train(recipe.stages(0), dataset, state, 20) if isinstance(m, StepDone)]
     assert len(names) == 20
     assert dataset.train[0].memory.is_full == (memory is not None)

@@ -23,7 +23,7 @@ from glassplat.options import (
     check_options,
     expectation,
     options_from_json,
-    unwrapped,
+    unwrap_annotation,
 )
 from tests.methods.number_fields import number_fields
 
@@ -172,4 +172,4 @@ def test_options_are_named_by_the_fields_they_lie_in() -> None:
     ids=str,
 )
 def test_expectations_are_readable(hint: Any, words: str) -> None:
-    assert expectation(*unwrapped(hint)) == words
+    assert expectation(*unwrap_annotation(hint)) == words

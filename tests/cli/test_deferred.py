@@ -92,4 +92,4 @@ def test_surroundings_can_be_exchanged(run: Path, capsys: pytest.CaptureFixture[
 def test_what_mirrors_nothing_has_no_surroundings_to_exchange(run: Path) -> None:
     scene = replace(open_run(run, "cpu").scene, environment=Environment.empty())
     with pytest.raises(InputError, match="nothing in the run mirrors its surroundings"):
-        SceneEdits(surroundings=run.parent / "red.png").applied(scene)
+        SceneEdits(surroundings=run.parent / "red.png").apply(scene)

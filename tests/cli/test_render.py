@@ -12,7 +12,7 @@ from glassplat.cli.places import SceneEdits
 from glassplat.errors import InputError
 from glassplat.files.images import read_image
 from glassplat.model.model import load
-from glassplat.scene.scene import Scene, as_mirrors, shifted, tilted, with_reflectance, without_glass
+from glassplat.scene.scene import Scene, as_mirrors, shift_pane, tilt_pane, with_reflectance, without_glass
 from tests.cli.tiny_run import rendered, write_run
 from tests.training.tiny_capture import true_scene
 
@@ -20,7 +20,7 @@ EDITS = {
     "--remove-glass": without_glass(true_scene()),
     "--as-mirror 1": as_mirrors(true_scene(), [1]),
     "--reflectance 1 0.8": with_reflectance(true_scene(), 1, 0.8),
-    "--tilt 1 -10 4.5 --shift 1 -0.1": shifted(tilted(true_scene(), 1, -10, 4.5), 1, -0.1),
+    "--tilt 1 -10 4.5 --shift 1 -0.1": shift_pane(tilt_pane(true_scene(), 1, -10, 4.5), 1, -0.1),
 }
 
 
@@ -81,6 +81,6 @@ def test_layers_that_a_method_lacks_are_refused_before_anything_is_rendered(
 
 def test_a_scene_without_panes_cannot_be_edited() -> None:
     bare = without_glass(true_scene())
-    assert SceneEdits().applied(bare) is bare
+    assert SceneEdits().apply(bare) is bare
     with pytest.raises(InputError, match="no panes to edit"):
-        SceneEdits(remove_glass=True).applied(bare)
+        SceneEdits(remove_glass=True).apply(bare)

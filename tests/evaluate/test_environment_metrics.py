@@ -12,7 +12,7 @@ from glassplat.evaluate.metrics import (
     environment_psnr,
     learned_environment,
     psnr,
-    quantized,
+    quantize,
     true_environment,
 )
 from glassplat.files.sidecars import write_equirect
@@ -65,7 +65,7 @@ def test_the_energy_too_is_that_of_the_sphere() -> None:
 def test_a_larger_truth_is_averaged_down() -> None:
     large = TRUTH.repeat_interleave(4, dim=0).repeat_interleave(4, dim=1)
     assert environment_psnr(TRUTH, large)[0] == math.inf
-    assert environment_psnr(TRUTH, quantized(large))[0] > 50
+    assert environment_psnr(TRUTH, quantize(large))[0] > 50
 
 
 def test_black_maps() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from glassplat.evaluate.metrics import color_corrected, psnr, quantized, reflection_gain, ssim
+from glassplat.evaluate.metrics import color_corrected, psnr, quantize, reflection_gain, ssim
 
 GENERATOR = torch.Generator().manual_seed(0)
 IMAGE = torch.rand(20, 30, 3, generator=GENERATOR)
@@ -29,7 +29,7 @@ def test_equal_images_have_no_error() -> None:
 
 
 def test_values_outside_the_range_are_stored_clamped() -> None:
-    assert quantized(torch.tensor([-1.0, 0.4999 / 255, 0.5001 / 255, 2.0])).tolist() == [0, 0, 1, 255]
+    assert quantize(torch.tensor([-1.0, 0.4999 / 255, 0.5001 / 255, 2.0])).tolist() == [0, 0, 1, 255]
 
 
 def test_only_the_region_counts() -> None:
@@ -71,9 +71,9 @@ def test_bad_arguments_are_refused() -> None:
     with pytest.raises(ValueError, match="no pixel to compare"):
         psnr(IMAGE, OTHER, torch.zeros(20, 30, dtype=torch.bool))
     with pytest.raises(ValueError, match="not finite"):
-        quantized(torch.tensor([math.nan]))
+        quantize(torch.tensor([math.nan]))
     with pytest.raises(TypeError, match=r"got torch\.int64"):
-        quantized(torch.tensor([1]))
+        quantize(torch.tensor([1]))
 
 
 def test_a_photograph_of_another_exposure_is_met_after_correction() -> None:

@@ -13,7 +13,7 @@ from glassplat.evaluate.metrics import (
     PLANE_COLUMNS,
     SURFACE_FACTS,
     SURFACE_METRICS,
-    written,
+    format_value,
 )
 from glassplat.evaluate.report import (
     BACKGROUND,
@@ -194,8 +194,8 @@ def test_every_metric_is_written_with_its_unit_and_explained() -> None:
     units = {"psnr": " dB", "seconds": " s", "frame": " s", "deg": "°", "offset_error": "%"}
     for name, column in columns.items():
         unit = next((unit for end, unit in units.items() if name.endswith(end)), "")
-        assert written(1, column.pattern).endswith(unit), name
-        assert written(None, column.pattern) == "-"
+        assert format_value(1, column.pattern).endswith(unit), name
+        assert format_value(None, column.pattern) == "-"
 
 
 def test_names_of_sheets_are_distinct() -> None:

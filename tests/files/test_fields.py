@@ -7,7 +7,19 @@ from typing import Any
 
 import pytest
 
-from glassplat.files.records import ByName, Choice, Field, Flag, Items, Nullable, Number, Optional, Text, Whole, checked
+from glassplat.files.records import (
+    ByName,
+    Choice,
+    Field,
+    Flag,
+    Items,
+    Nullable,
+    Number,
+    Optional,
+    Text,
+    Whole,
+    check_fields,
+)
 
 NOT_NUMBERS = [None, True, "1", [1], {}, math.nan, math.inf, -math.inf, 10**400]
 CASES: list[tuple[Field, list[Any], list[Any]]] = [
@@ -62,7 +74,7 @@ TABLE = {"size": Whole(1), "name": Optional(Text(), "nobody")}
 
 
 def test_an_object_is_checked_by_its_table() -> None:
-    assert checked({"size": 2, "more": []}, TABLE, "it") == {"size": 2, "name": "nobody"}
+    assert check_fields({"size": 2, "more": []}, TABLE, "it") == {"size": 2, "name": "nobody"}
     for value, message in (
         ([], r"it is \[\]; expected an object with size, name"),
         ({}, "it has no size; expected a whole number of at least 1"),
@@ -71,4 +83,4 @@ def test_an_object_is_checked_by_its_table() -> None:
         ({"size": "9" * 1000}, r"size of it is '9{79}\.\.\.; expected"),
     ):
         with pytest.raises(ValueError, match=message):
-            checked(value, TABLE, "it")
+            check_fields(value, TABLE, "it")

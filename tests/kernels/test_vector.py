@@ -14,7 +14,7 @@ from glassplat.kernels.backend.cpu import Kernel, inlined, kernel
 from glassplat.kernels.backend.cpu_vector import (
     ROW,
     constant,
-    interleaved,
+    interleave,
     item,
     sorted_apart,
     store,
@@ -119,7 +119,7 @@ def reorders(real: type, lanes: int) -> Kernel:
     @kernel("vector_reorders", real, parallel=False)
     def compute(a, out):
         four = (load(a, 0), load(a, lanes), load(a, 2 * lanes), load(a, 3 * lanes))
-        mixed = interleaved(four)
+        mixed = interleave(four)
         again = sorted_apart(mixed)
         for i in range(4):
             store(out, i * lanes, mixed[i])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from glassplat.kernels.backend.cpu import Kernel, kernel
-from glassplat.kernels.backend.cpu_vector import row_loader, store, store_all, thirds, transposed, triples, vector_kind
+from glassplat.kernels.backend.cpu_vector import row_loader, store, store_all, thirds, transpose, triples, vector_kind
 
 kinds = pytest.mark.parametrize(
     ("real", "lanes"), [(real, lanes) for real in (np.float32, np.float64) for lanes in (4, 16)]
@@ -41,7 +41,7 @@ def turning(real: type, lanes: int) -> Kernel:
 
     @kernel("vector_transposed", real, parallel=False)
     def compute(values, positions, at, out):
-        store_all(out, 0, transposed(load_rows(values, positions, at)))
+        store_all(out, 0, transpose(load_rows(values, positions, at)))
 
     return compute
 

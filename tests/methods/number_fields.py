@@ -7,7 +7,7 @@ import typing
 from collections.abc import Iterator
 from typing import Any
 
-from glassplat.options import inner_name, unwrapped
+from glassplat.options import inner_name, unwrap_annotation
 
 
 def number_fields(kind: type, name: str = "") -> Iterator[tuple[str, Any]]:
@@ -18,7 +18,7 @@ def number_fields(kind: type, name: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _numbers(hint: Any, name: str) -> Iterator[tuple[str, Any]]:
-    inner, _ = unwrapped(hint)
+    inner, _ = unwrap_annotation(hint)
     if inner in (int, float):
         yield name, hint
     elif isinstance(inner, type) and dataclasses.is_dataclass(inner):

@@ -17,7 +17,7 @@ from glassplat.errors import InputError
 from glassplat.methods.recipe import RECIPES, recipe_from_json, recipe_of, recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import RunDirectory, RunSettings
-from glassplat.options import Range, as_typed, check_options, unwrapped
+from glassplat.options import Range, as_typed, check_options, unwrap_annotation
 from tests.methods.number_fields import number_fields
 
 COMMANDS = [Train, Demo, Render, RunSettings]
@@ -25,13 +25,13 @@ DECLARED = [(kind, name, hint) for kind in (*RECIPES.values(), *COMMANDS) for na
 
 
 def ranges_of(hint: Any) -> list[Range]:
-    return [requirement for requirement in unwrapped(hint)[1] if isinstance(requirement, Range)]
+    return [requirement for requirement in unwrap_annotation(hint)[1] if isinstance(requirement, Range)]
 
 
 def outside(hint: Any) -> Iterator[float]:
     """Numbers that an annotation does not take, just beyond its bounds and far away."""
     (bounds,) = ranges_of(hint)
-    whole = unwrapped(hint)[0] is int
+    whole = unwrap_annotation(hint)[0] is int
     step = 1 if whole else 1e-6
     if bounds.low is not None:
         yield from (bounds.low - step, -1e30 if not whole else -(10**30))
@@ -48,7 +48,7 @@ def outside(hint: Any) -> Iterator[float]:
 @pytest.mark.parametrize(("kind", "name", "hint"), DECLARED, ids=lambda part: getattr(part, "__name__", str(part))[:50])
 def test_every_number_has_a_range(kind: type, name: str, hint: Any) -> None:
     assert len(ranges_of(hint)) == 1, f"{kind.__name__}.{name} needs a range of glassplat.options in its annotation"
-    if unwrapped(hint)[0] is int:
+    if unwrap_annotation(hint)[0] is int:
         assert ranges_of(hint)[0].high is not None, f"{name} is counted: say how many at the most"
 
 

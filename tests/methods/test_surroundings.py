@@ -72,5 +72,5 @@ def test_copies_keep_as_many_harmonics_as_they_may() -> None:
 
 def test_sets_are_joined_in_order() -> None:
     first, second = in_box(), in_box(cells=2)
-    both = replace(first, active_sh_degree=1).joined(second)
+    both = replace(first, active_sh_degree=1).concat(second)
     assert torch.equal(both.means, torch.cat([first.means, second.means])) and both.active_sh_degree == 1

@@ -99,7 +99,7 @@ def test_edits_are_new_models() -> None:
     assert float(mirror.image("2.png", "strength").mean()) > 1.5 * float(before.mean())
     assert without.panes == () and torch.equal(without.image("2.png"), whole.without_pane(LABEL).image("2.png"))
     assert float(whole.with_reflectance(LABEL, 0.01).image("2.png", "strength").mean()) < float(before.mean())
-    moved = whole.shifted(LABEL, 0.1).tilted(LABEL, 5.0)
+    moved = whole.shift_pane(LABEL, 0.1).tilt_pane(LABEL, 5.0)
     assert not torch.equal(moved.scene.planes.centers, whole.scene.planes.centers)
     assert not torch.equal(moved.scene.planes.normals, whole.scene.planes.normals)
     assert torch.equal(whole.image("2.png", "strength"), before)
@@ -175,7 +175,7 @@ def test_the_first_side_of_a_pane_is_level_unless_said_otherwise(normal: tuple[f
 def test_a_model_without_cameras_is_looked_at_from_around_it() -> None:
     blind = dataclasses.replace(model(), cameras={})
     assert len(blind.orbit(3)) == 3 and len(blind.viewpoints) > 1
-    assert blind.cleaned()[1].keys() == model().cleaned()[1].keys()
+    assert blind.clean()[1].keys() == model().clean()[1].keys()
     viewer = blind.show()
     viewer.stop()
 
@@ -238,4 +238,4 @@ def test_metrics_are_those_of_the_test_views() -> None:
 
 def test_gaussians_of_a_model_are_plain_data() -> None:
     primary = model().scene.primary
-    assert isinstance(primary, Gaussians) and len(primary.joined(primary)) == 2 * len(primary)
+    assert isinstance(primary, Gaussians) and len(primary.concat(primary)) == 2 * len(primary)

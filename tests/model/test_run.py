@@ -405,7 +405,7 @@ def test_a_state_in_the_middle_of_a_change_is_not_saved(tmp_path: Path) -> None:
     stages = tuple(replace(stage, actions=(Unreadable(),)) for stage in RECIPE.stages(seed=0, iterations=12))
     state = training.first_state(RECIPE, SETTINGS, tiny_capture())
     with pytest.raises(InputError, match=r"^1\.png cannot be read$"):
-        list(TrainingSession(state, Ranks(), record).trained(stages, tiny_capture(), 12))
+        list(TrainingSession(state, Ranks(), record).run_stages(stages, tiny_capture(), 12))
     assert state.step == 5 and not record.checkpoint.exists()
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from glassplat.panes.masks import FramedPlanes, PaneView, PlaneEquations, pane_views
-from glassplat.panes.objective import Objective, edge_matches, moved
-from glassplat.panes.search import refined, tilt_uncertainty
+from glassplat.panes.objective import Objective, edge_matches, move_planes
+from glassplat.panes.search import refine_planes, tilt_uncertainty
 from tests.panes.pane_scene import EYES, FRONT, framed_scene_of, scene_of
 
 TRUTH = PlaneEquations(FRONT.normal[None], np.array([FRONT.normal @ FRONT.center]))
@@ -38,7 +38,7 @@ def test_refinement_measures_the_frame() -> None:
     views = pane_views(framed_scene_of(FRONT, HEIGHT, BEYOND), 1)
     objective = Objective(views, np.zeros((0, 3)), 3.0, 0.03)
     start = FramedPlanes(PlaneEquations(TRUTH.normals, TRUTH.offsets + 0.01), np.array([0.06]))
-    found = refined(start, objective, (0.01, 0.004))
+    found = refine_planes(start, objective, (0.01, 0.004))
     assert found.frames[0] == pytest.approx(HEIGHT, rel=0.15)
     assert found.planes.offsets[0] == pytest.approx(TRUTH.offsets[0], abs=0.01)
     assert found.planes.normals[0] @ TRUTH.normals[0] > np.cos(np.radians(0.5))
@@ -64,7 +64,7 @@ def test_doubt_is_small_where_all_sides_are_seen_and_large_where_one_is() -> Non
 def test_edges_that_enter_an_image_or_leave_it_make_no_plane_surer() -> None:
     views = pane_views(scene_of([FRONT], [*EYES, (0.9, -0.5, 0.9), (-0.5, 0.4, 1.0)]), 1)
     steps = 1e-3 * np.random.default_rng(0).standard_normal((40, 3))
-    around = moved(TRUTH.select(np.zeros(40, dtype=np.int64)), np.tile(FRONT.center, (40, 1)), steps)
+    around = move_planes(TRUTH.select(np.zeros(40, dtype=np.int64)), np.tile(FRONT.center, (40, 1)), steps)
     doubts = tilt_uncertainty(FramedPlanes(around, np.zeros(40)), Objective(views, np.zeros((0, 3)), 2.0, 0.02), 0.004)
     assert doubts.max() < 1.1 * doubts.min()
 
@@ -73,6 +73,6 @@ def test_the_sign_of_turned_edges_does_not_hang_on_the_axes_of_the_plane() -> No
     views = pane_views(scene_of([FRONT]), 1)
     # The axes of a plane turn by a right angle where its normal is nearest to another axis of the world.
     tilts = 1e-3 * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
-    around = moved(TRUTH.select(np.zeros(5, dtype=np.int64)), np.tile(FRONT.center, (5, 1)), tilts)
+    around = move_planes(TRUTH.select(np.zeros(5, dtype=np.int64)), np.tile(FRONT.center, (5, 1)), tilts)
     turns = edge_matches(around, views, edges_per_view=100).turns
     assert np.abs(turns - turns[0]).max() < 0.05 < np.abs(turns[0]).max()

@@ -89,7 +89,7 @@ def test_an_exposure_does_not_turn_a_mirror_into_glass() -> None:
     views = photographs(scene_with(0.995))
     exposures = Exposures(affine, tuple(view.name for view in views))
     dark = [
-        View.in_memory(v.name, v.camera, photo=(exposures.applied(v.photo.float(), v.name)).to(torch.uint8),
+        View.in_memory(v.name, v.camera, photo=(exposures.apply(v.photo.float(), v.name)).to(torch.uint8),
                        pane_labels=v.pane_labels)
         for v in views
     ]  # fmt: skip

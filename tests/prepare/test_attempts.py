@@ -55,9 +55,13 @@ def test_more_features_only_where_too_few_are_placed(
         tried.append(features)
         return Matches(work, photographs)
 
-    monkeypatch.setattr(reconstruction, "_matched", matched)
+    monkeypatch.setattr(reconstruction, "_match_features", matched)
     left = iter(sizes)
-    monkeypatch.setattr(reconstruction, "placed", lambda *unused, **also: [Group(size)] if (size := next(left)) else [])
+
+    def placed(*unused: object, **also: object) -> list[Group]:
+        return [Group(size)] if (size := next(left)) else []
+
+    monkeypatch.setattr(reconstruction, "place_photographs", placed)
     solution = best_solution(photographs, Path("work"), Settings(), least, notes.append)
     assert tried == features
     assert (solution.registered, solution.tried) == (best, len(sizes))

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from glassplat.errors import InputError
-from glassplat.prepare.colmap import FeatureDatabase, Features, sound
+from glassplat.prepare.colmap import FeatureDatabase, Features, check_database
 from glassplat.prepare.photographs import Photograph
 
 
@@ -69,9 +69,9 @@ def test_half_a_picture_of_a_killed_command_is_no_photograph(tmp_path: Path) -> 
 
 
 def test_a_full_disk_and_errors_of_others_stay_what_they_are(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match="No space left"), sound(tmp_path):
+    with pytest.raises(OSError, match="No space left"), check_database(tmp_path):
         raise RuntimeError("SQLite error: database or disk is full")
-    with pytest.raises(RuntimeError, match="of another kind"), sound(tmp_path):
+    with pytest.raises(RuntimeError, match="of another kind"), check_database(tmp_path):
         raise RuntimeError("of another kind")
 
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from glassplat.publish.camera_paths import interpolated, keyframes_of, orbit, widened
-from glassplat.publish.web_page import best_view, cameras_around, surveyed
+from glassplat.publish.camera_paths import fit_to_width, interpolate_cameras, keyframes_of, orbit
+from glassplat.publish.web_page import best_view, cameras_around, survey_capture
 from glassplat.scene.camera import Camera
 from tests.files.test_spz import typical
 from tests.render.tiny_scene import camera_at
@@ -27,7 +27,7 @@ def forward(camera: Camera) -> torch.Tensor:
 
 
 def test_a_survey_finds_what_all_look_at() -> None:
-    survey = surveyed(AROUND, 1.0)
+    survey = survey_capture(AROUND, 1.0)
     middle = torch.stack([camera.center for camera in AROUND]).mean(0).double()
     down = (survey.focus - middle) @ survey.up
     assert float(down) < 0 and float((survey.focus - middle + survey.up * -down).norm()) < 1e-3 * survey.distance
@@ -35,7 +35,7 @@ def test_a_survey_finds_what_all_look_at() -> None:
 
 
 def test_an_orbit_goes_all_around_what_was_seen_from_all_sides() -> None:
-    survey, path = surveyed(AROUND, 1.0), orbit(AROUND, 1.0, 40)
+    survey, path = survey_capture(AROUND, 1.0), orbit(AROUND, 1.0, 40)
     arms = torch.stack([camera.center.double() - survey.focus for camera in path])
     assert float(torch.nn.functional.normalize(arms, dim=1).mean(0).norm()) < 0.4
     for camera, arm in zip(path, arms, strict=True):
@@ -53,19 +53,19 @@ def test_an_orbit_stays_in_front_of_what_was_seen_from_one_side() -> None:
 @pytest.mark.parametrize("frames", [2, 25])
 def test_an_interpolated_path_begins_and_ends_at_its_cameras(frames: int) -> None:
     keys = keyframes_of(AROUND)[:5]
-    path = interpolated(keys, frames)
+    path = interpolate_cameras(keys, frames)
     assert len(path) == frames
     for mine, given in ((path[0], keys[0]), (path[-1], keys[-1])):
         torch.testing.assert_close(mine.cam_from_world, given.cam_from_world, atol=1e-5, rtol=1e-5)
     for camera in path:
         rotation = camera.cam_from_world[:3, :3]
         torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-5, rtol=0)
-    assert widened(path[0], 321 + 1).width % 2 == 0 and widened(path[0], 322).height % 2 == 0
+    assert fit_to_width(path[0], 321 + 1).width % 2 == 0 and fit_to_width(path[0], 322).height % 2 == 0
 
 
 def test_one_camera_is_no_path() -> None:
     with pytest.raises(ValueError, match="at least two"):
-        interpolated(AROUND[:1], 10)
+        interpolate_cameras(AROUND[:1], 10)
     assert keyframes_of(AROUND[:1]) == AROUND[:1]
 
 

@@ -14,7 +14,7 @@ from glassplat.errors import InputError
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.model.model import Model
 from glassplat.options import Cleaning
-from glassplat.publish.cleaning import Floaters, cleaned
+from glassplat.publish.cleaning import Floaters, clean_scene
 from glassplat.scene.gaussians import Gaussians
 from tests.cli.tiny_run import write_run
 from tests.training.tiny_capture import tiny_capture, true_scene
@@ -40,7 +40,7 @@ def with_one(gaussians: Gaussians, mean: tuple[float, float, float], deviation: 
     one = gaussians.select(torch.tensor([0])).with_tensors(
         {"means": torch.tensor([mean]), "log_scales": torch.full((1, 3), deviation).log()}
     )
-    return gaussians.joined(one)
+    return gaussians.concat(one)
 
 
 @pytest.mark.parametrize(
@@ -52,14 +52,14 @@ def with_one(gaussians: Gaussians, mean: tuple[float, float, float], deviation: 
 )
 def test_a_floater_is_found_by_one_rule_and_the_wall_by_none(mean, deviation: float, rule: str) -> None:
     floaters = Floaters(with_one(wall(), mean, deviation), CAMERA)
-    for name, found in floaters.found(Cleaning()).items():
+    for name, found in floaters.masks(Cleaning()).items():
         assert found.nonzero().flatten().tolist() == ([144] if name == rule else [])
     off = Cleaning(isolated=0, oversized=0)
-    assert not any(bool(found.any()) for found in floaters.found(off).values())
+    assert not any(bool(found.any()) for found in floaters.masks(off).values())
 
 
 def test_a_large_gaussian_far_away_stays() -> None:
-    found = Floaters(with_one(wall(), (0.0, 0.0, 40.0), 12.0), CAMERA).found(Cleaning())
+    found = Floaters(with_one(wall(), (0.0, 0.0, 40.0), 12.0), CAMERA).masks(Cleaning())
     assert not any(bool(gone.any()) for gone in found.values())
 
 
@@ -67,11 +67,11 @@ def test_a_box_keeps_what_is_in_it_whichever_corners_are_given() -> None:
     scene = dataclasses.replace(true_scene(), primary=wall())
     floaters = Floaters(scene.primary, CAMERA)
     for box in ((-2.0, -2.0, 0.0, 0.0, 2.0, 4.0), (0.0, 2.0, 4.0, -2.0, -2.0, 0.0)):
-        left, counts = cleaned(scene, floaters, Cleaning(box=box))
+        left, counts = clean_scene(scene, floaters, Cleaning(box=box))
         assert counts["outside"] == 72 and bool((left.primary.means[:, 0] <= 0).all())
     assert torch.equal(left.planes.centers, scene.planes.centers) and len(scene.primary) == 144
     with pytest.raises(InputError, match="nothing would be left of 144"):
-        cleaned(scene, floaters, Cleaning(box=(5.0, 5.0, 5.0, 6.0, 6.0, 6.0)))
+        clean_scene(scene, floaters, Cleaning(box=(5.0, 5.0, 5.0, 6.0, 6.0, 6.0)))
 
 
 def test_units_change_no_picture() -> None:
@@ -81,7 +81,7 @@ def test_units_change_no_picture() -> None:
         {view.name: view.camera for view in tiny_capture().train},
         "tiny",
     )
-    scaled = model.scaled(2.5)
+    scaled = model.scale(2.5)
     torch.testing.assert_close(scaled.image("2.png"), model.image("2.png"), atol=2e-4, rtol=0)
     torch.testing.assert_close(
         scaled.render("2.png", layers=["depth"]).layers["depth"],
@@ -91,7 +91,7 @@ def test_units_change_no_picture() -> None:
     )
     assert scaled.scene.extent == 2.5 * model.scene.extent
     with pytest.raises(ValueError, match="positive"):
-        model.scaled(0.0)
+        model.scale(0.0)
 
 
 def test_the_command_writes_another_scene_in_metres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from glassplat.publish.film import check_encoder, side_by_side, wiped, write_film
+from glassplat.publish.film import check_encoder, side_by_side, wipe_pictures, write_film
 
 PICTURES = [np.full((48, 64, 3), (40 + 20 * k, 100, 200 - 15 * k), dtype=np.uint8) for k in range(6)]
 
@@ -52,7 +52,7 @@ def test_what_is_no_film_is_refused(tmp_path: Path) -> None:
 
 def test_a_wipe_shows_both() -> None:
     left, right = PICTURES[0], PICTURES[5]
-    picture = wiped(left, right, 0.25)
+    picture = wipe_pictures(left, right, 0.25)
     assert (picture[:, :15] == left[:, :15]).all() and (picture[:, 17:] == right[:, 17:]).all()
     assert (picture[:, 15:17] == 255).all()
     assert side_by_side([left, right]).shape == (48, 128, 3)

@@ -19,7 +19,7 @@ from glassplat.publish.web_page import (
     SHADERS,
     Sharing,
     asset,
-    filled,
+    fill_template,
     fits,
     fitting,
     page_text,
@@ -181,7 +181,7 @@ def dusty_scene() -> Scene:
     dust = primary.select(torch.arange(3000) % few)
     spread = torch.randn(dust.means.shape, generator=torch.Generator().manual_seed(0))
     dust = dust.with_tensors({"means": dust.means + 0.3 * spread, "log_scales": torch.full_like(dust.log_scales, -6.0)})
-    return replace(scene, primary=primary.joined(dust))
+    return replace(scene, primary=primary.concat(dust))
 
 
 @pytest.fixture(scope="module")
@@ -336,7 +336,7 @@ def test_what_shines_mirrors_what_surrounds_it(mirrored: str, tmp_path: Path) ->
     write_page(tmp_path / "index.html", scene, renderer, cameras, "Shining")
     with Browser(tmp_path / "index.html", 320, 240) as browser:
         for _, camera in cameras:
-            large = camera.resized(8 * camera.width, 8 * camera.height)
+            large = camera.resize(8 * camera.width, 8 * camera.height)
             for layer, truth in (("rgb", "rgb"), ("without_panes", "base"), ("strength", "strength")):
                 frame = renderer(scene, large)
                 image = frame.rgb if truth == "rgb" else frame.layers[truth]
@@ -380,7 +380,7 @@ def test_names_cannot_end_the_script() -> None:
     page = page_text(true_scene(), Planar(), [("</script><b>{{title}}", CAMERAS[0][1])], "</title><script>")
     assert "</script><b>" not in page and "</title><script>" not in page
     assert "\\u003c/script>\\u003cb>{{title}}" in page
-    assert filled("a{{x}}b", {"x": "{{x}}"}) == "a{{x}}b"
+    assert fill_template("a{{x}}b", {"x": "{{x}}"}) == "a{{x}}b"
 
 
 def test_a_page_keeps_what_photographs_show_of_more_gaussians_than_it_holds(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -117,9 +117,9 @@ def test_what_the_exposure_made_of_the_photograph_is_left_as_it_is() -> None:
     affine = torch.zeros(1, 3, 4)
     affine[0, :, :3], affine[0, :, 3] = torch.diag(torch.tensor([-0.3, -0.2, -0.25])), torch.tensor([0.02, 0.0, -0.01])
     exposures = Exposures(affine, ("dark.png",))
-    dark = uint8(exposures.applied(photo.float() / 255, "dark.png"))
+    dark = uint8(exposures.apply(photo.float() / 255, "dark.png"))
     result = dereflected_photo(frame, dark, "linear", exposures=exposures, name="dark.png")
-    expected = exposures.applied(truth, "dark.png")
+    expected = exposures.apply(truth, "dark.png")
     torch.testing.assert_close(result.float() / 255, expected, rtol=0, atol=4 / 255)
     assert torch.equal(result[:, 16:], dark[:, 16:])
     unaware = dereflected_photo(frame, dark, "linear").float() / 255

@@ -13,7 +13,7 @@ from glassplat.kernels.maths.pane import LAWS
 from glassplat.kernels.panes.reference import REFLECTANCE
 from glassplat.options import Blend
 from glassplat.render.deferred import view_directions
-from glassplat.render.planar import Planar, detached
+from glassplat.render.planar import Planar, detach_gaussians
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera, mirror_matrices, rotation_from_quat
 from glassplat.scene.panes import Planes
@@ -270,4 +270,4 @@ def test_deviation_is_there_when_asked_for() -> None:
 def test_detached_cuts_every_tensor_off() -> None:
     scene = showcase()
     trainable = scene.primary.with_tensors({"means": scene.primary.means.clone().requires_grad_()})
-    assert not detached(trainable).means.requires_grad
+    assert not detach_gaussians(trainable).means.requires_grad

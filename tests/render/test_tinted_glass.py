@@ -10,7 +10,7 @@ from torch import Tensor
 
 from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.options import Blend
-from glassplat.render.panes import tinted
+from glassplat.render.panes import tint_by_panes
 from glassplat.render.planar import Planar
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
@@ -65,9 +65,9 @@ def test_gradients_of_one_pane_match_finite_differences() -> None:
     which = torch.randint(-1, 2, (4, 5), generator=generator)
     for blend in ("srgb", "linear"):
         inputs = tuple(tensor.clone().requires_grad_() for tensor in (image, mask, shares))
-        assert torch.autograd.gradcheck(lambda i, m, t, b=blend: tinted(i, m, which, t, b), inputs)
+        assert torch.autograd.gradcheck(lambda i, m, t, b=blend: tint_by_panes(i, m, which, t, b), inputs)
     unshown = which < 0
-    assert torch.equal(tinted(image, mask, which, shares, "linear")[unshown], image[unshown])
+    assert torch.equal(tint_by_panes(image, mask, which, shares, "linear")[unshown], image[unshown])
 
 
 def test_gradients_match_finite_differences_through_the_whole_renderer() -> None:
@@ -88,7 +88,7 @@ def test_gradients_match_finite_differences_through_the_whole_renderer() -> None
 
 
 def test_clear_and_tinted_panes_join() -> None:
-    both = of_glass(pane(2.0, label=2)).joined(pane(3.0, label=1))
+    both = of_glass(pane(2.0, label=2)).concat(pane(3.0, label=1))
     assert both.labels == (1, 2) and both.transmittances is not None
     torch.testing.assert_close(both.transmittances, torch.cat([torch.ones_like(GREENISH), GREENISH]))
-    assert pane(2.0, label=2).joined(pane(3.0, label=1)).transmittances is None
+    assert pane(2.0, label=2).concat(pane(3.0, label=1)).transmittances is None

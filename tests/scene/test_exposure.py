@@ -19,24 +19,24 @@ def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
 
 def test_a_neutral_exposure_changes_nothing() -> None:
     image = drawn(4, 5, 3)
-    torch.testing.assert_close(Exposures.neutral(("a",)).applied(image.float(), "a"), image.float())
-    assert Exposures.neutral().applied(image, "a") is image
+    torch.testing.assert_close(Exposures.neutral(("a",)).apply(image.float(), "a"), image.float())
+    assert Exposures.neutral().apply(image, "a") is image
 
 
 def test_a_transform_is_applied_to_its_photograph_only() -> None:
     affine = torch.zeros(2, 3, 4, dtype=torch.float64)
     affine[1, 0, 1], affine[1, 2, 3] = 0.5, -0.1
     exposures, image = Exposures(affine, ("a", "b")), drawn(4, 5, 3)
-    torch.testing.assert_close(exposures.applied(image, "a"), image)
+    torch.testing.assert_close(exposures.apply(image, "a"), image)
     expected = image.clone()
     expected[..., 0] += 0.5 * image[..., 1]
     expected[..., 2] -= 0.1
-    torch.testing.assert_close(exposures.applied(image, "b"), expected)
+    torch.testing.assert_close(exposures.apply(image, "b"), expected)
 
 
 def test_gradients_reach_image_and_transform() -> None:
     image, affine = drawn(3, 2, 3).requires_grad_(), (0.1 * drawn(2, 3, 4, seed=1)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda i, a: Exposures(a, ("a", "b")).applied(i, "b"), (image, affine))
+    assert torch.autograd.gradcheck(lambda i, a: Exposures(a, ("a", "b")).apply(i, "b"), (image, affine))
 
 
 def test_as_many_transforms_as_names_are_expected() -> None:
@@ -56,16 +56,16 @@ def test_the_loss_compares_in_the_colours_of_the_photograph() -> None:
 
 def test_a_view_without_a_transform_gets_the_mean_of_its_neighbours() -> None:
     exposures = Exposures(drawn(4, 3, 4), ("x/8.png", "x/10.png", "y/9.png", "x/12.png"))
-    found = exposures.interpolated("x/9.png")
+    found = exposures.interpolate("x/9.png")
     torch.testing.assert_close(found.of("x/9.png"), exposures.affine[:2].mean(dim=0))
-    torch.testing.assert_close(exposures.interpolated("x/20.png").of("x/20.png"), exposures.affine[3])
-    assert exposures.interpolated("x/10.png") is exposures
-    assert exposures.interpolated("z/9.png") is exposures
-    assert len(Exposures.neutral().interpolated("a")) == 0
+    torch.testing.assert_close(exposures.interpolate("x/20.png").of("x/20.png"), exposures.affine[3])
+    assert exposures.interpolate("x/10.png") is exposures
+    assert exposures.interpolate("z/9.png") is exposures
+    assert len(Exposures.neutral().interpolate("a")) == 0
 
 
 def test_what_an_exposure_does_can_be_undone() -> None:
     exposures = Exposures(0.2 * drawn(2, 3, 4, seed=1), ("a", "b"))
     image = drawn(4, 5, 3)
-    torch.testing.assert_close(exposures.undone(exposures.applied(image, "b"), "b"), image)
+    torch.testing.assert_close(exposures.undone(exposures.apply(image, "b"), "b"), image)
     assert exposures.undone(image, "c") is image

@@ -15,9 +15,9 @@ from glassplat.scene.scene import (
     Scene,
     as_mirrors,
     glass_of_pane,
-    moved,
-    shifted,
-    tilted,
+    move_pane,
+    shift_pane,
+    tilt_pane,
     with_reflectance,
     without_glass,
 )
@@ -78,17 +78,17 @@ def test_the_reflectance_is_what_was_asked_for(reflectance: float) -> None:
 
 def test_no_motion_changes_no_bit() -> None:
     scene = showcase()
-    assert_same(tilted(scene, 1, 0.0, 0.0), scene)
-    assert_same(shifted(scene, 1, 0.0), scene)
-    assert_same(moved(scene, 1, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), scene)
-    assert torch.equal(Planar()(tilted(scene, 1, 0, 0), CAMERA).rgb, Planar()(scene, CAMERA).rgb)
+    assert_same(tilt_pane(scene, 1, 0.0, 0.0), scene)
+    assert_same(shift_pane(scene, 1, 0.0), scene)
+    assert_same(move_pane(scene, 1, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), scene)
+    assert torch.equal(Planar()(tilt_pane(scene, 1, 0, 0), CAMERA).rgb, Planar()(scene, CAMERA).rgb)
 
 
 def test_a_quarter_turn_about_a_side_turns_the_normal_into_the_other_side() -> None:
     scene = showcase()
     (tangent,), (bitangent,) = scene.planes.axes()
     (normal,) = scene.planes.normals
-    about_tangent, about_bitangent = tilted(scene, 1, 90.0, 0.0).planes, tilted(scene, 1, 0.0, 90.0).planes
+    about_tangent, about_bitangent = tilt_pane(scene, 1, 90.0, 0.0).planes, tilt_pane(scene, 1, 0.0, 90.0).planes
     torch.testing.assert_close(about_tangent.normals[0], -bitangent)
     torch.testing.assert_close(about_tangent.axes()[0][0], tangent)
     torch.testing.assert_close(about_bitangent.normals[0], tangent)
@@ -101,8 +101,8 @@ def test_a_turn_and_a_step_are_a_tilt_and_a_shift() -> None:
     half = math.radians(30.0) / 2
     tangent, normal = scene.planes.axes()[0][1], scene.planes.normals[1]
     turn = (2 * math.cos(half), *(2 * math.sin(half) * tangent).tolist())
-    expected = tilted(shifted(scene, 7, 0.5), 7, 30.0, 0.0)
-    edited = moved(scene, 7, turn, (0.5 * normal).tolist())
+    expected = tilt_pane(shift_pane(scene, 7, 0.5), 7, 30.0, 0.0)
+    edited = move_pane(scene, 7, turn, (0.5 * normal).tolist())
     for name, tensor in edited.parameters().items():
         torch.testing.assert_close(tensor, expected.parameters()[name])
     assert torch.equal(edited.glass.means[:12], scene.glass.means[:12])
@@ -110,7 +110,7 @@ def test_a_turn_and_a_step_are_a_tilt_and_a_shift() -> None:
 
 def test_there_and_back_is_the_identity() -> None:
     scene = showcase()
-    back = shifted(shifted(tilted(tilted(scene, 1, 12.0, -5.0), 1, -12.0, 5.0), 1, 0.3), 1, -0.3)
+    back = shift_pane(shift_pane(tilt_pane(tilt_pane(scene, 1, 12.0, -5.0), 1, -12.0, 5.0), 1, 0.3), 1, -0.3)
     torch.testing.assert_close(back.planes.raw_normals, scene.planes.raw_normals)
     torch.testing.assert_close(back.glass.means, scene.glass.means)
     before, after = Planar()(scene, CAMERA), Planar()(back, CAMERA)
@@ -119,11 +119,11 @@ def test_there_and_back_is_the_identity() -> None:
 
 def test_a_shift_goes_along_the_normal_in_world_units() -> None:
     scene = showcase()
-    step = shifted(scene, 1, 0.25).planes.centers - scene.planes.centers
+    step = shift_pane(scene, 1, 0.25).planes.centers - scene.planes.centers
     torch.testing.assert_close(step, 0.25 * scene.planes.normals)
 
 
-@pytest.mark.parametrize("move", [lambda s: tilted(s, 7, 30.0, 0.0), lambda s: shifted(s, 7, 0.5)])
+@pytest.mark.parametrize("move", [lambda s: tilt_pane(s, 7, 30.0, 0.0), lambda s: shift_pane(s, 7, 0.5)])
 def test_a_pane_moves_with_its_own_glass_and_no_other(move: Callable[[Scene], Scene]) -> None:
     scene = two_panes()
     own = glass_of_pane(scene, 1)
@@ -141,7 +141,7 @@ def test_a_pane_moves_with_its_own_glass_and_no_other(move: Callable[[Scene], Sc
 
 def test_the_scene_that_is_edited_stays_as_it_is() -> None:
     scene, untouched = showcase(), showcase()
-    for edit in (lambda: as_mirrors(scene, [1]), lambda: tilted(scene, 1, 5, 5), lambda: shifted(scene, 1, 1.0)):
+    for edit in (lambda: as_mirrors(scene, [1]), lambda: tilt_pane(scene, 1, 5, 5), lambda: shift_pane(scene, 1, 1.0)):
         edit()
         assert_same(scene, untouched)
 
@@ -151,9 +151,9 @@ def test_the_scene_that_is_edited_stays_as_it_is() -> None:
     [
         lambda s: as_mirrors(s, [3]),
         lambda s: with_reflectance(s, 3, 0.5),
-        lambda s: tilted(s, 3, 1.0, 0.0),
-        lambda s: shifted(s, 3, 1.0),
-        lambda s: moved(s, 3, (1, 0, 0, 0), (0, 0, 1)),
+        lambda s: tilt_pane(s, 3, 1.0, 0.0),
+        lambda s: shift_pane(s, 3, 1.0),
+        lambda s: move_pane(s, 3, (1, 0, 0, 0), (0, 0, 1)),
     ],
 )
 def test_an_unknown_label_lists_those_there_are(edit: Callable[[Scene], Scene]) -> None:
@@ -171,10 +171,10 @@ def test_an_impossible_reflectance_is_refused(reflectance: float) -> None:
 
 def test_an_infinite_motion_is_refused() -> None:
     with pytest.raises(ValueError, match="expected finite numbers"):
-        shifted(showcase(), 1, float("inf"))
+        shift_pane(showcase(), 1, float("inf"))
     with pytest.raises(ValueError, match="expected finite numbers"):
-        tilted(showcase(), 1, float("nan"), 0.0)
+        tilt_pane(showcase(), 1, float("nan"), 0.0)
     with pytest.raises(ValueError, match="expected finite numbers"):
-        moved(showcase(), 1, (1, 0, 0, 0), (0, float("nan"), 0))
+        move_pane(showcase(), 1, (1, 0, 0, 0), (0, float("nan"), 0))
     with pytest.raises(ValueError, match="quaternion of no length"):
-        moved(showcase(), 1, (0, 0, 0, 0), (0, 0, 0))
+        move_pane(showcase(), 1, (0, 0, 0, 0), (0, 0, 0))

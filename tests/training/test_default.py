@@ -7,7 +7,7 @@ import torch
 
 from glassplat.kernels.screen_statistics import Views
 from glassplat.scene.gaussians import Gaussians
-from glassplat.training.densify import ScreenStatistics, densified, reset_opacity
+from glassplat.training.densify import ScreenStatistics, densify, reset_opacity
 from glassplat.training.options import DefaultDensify
 
 EXTENT = 2.0
@@ -34,7 +34,7 @@ def seen(gradients: list[float], absgrads: list[float] | None = None, radius: fl
 
 def edited(options: DefaultDensify, gaussians: Gaussians, statistics: ScreenStatistics, **extra: bool) -> Gaussians:
     rng = torch.Generator().manual_seed(0)
-    return densified(options, gaussians, {}, statistics, extent=EXTENT, generator=rng, **extra)[0]
+    return densify(options, gaussians, {}, statistics, extent=EXTENT, generator=rng, **extra)[0]
 
 
 def test_mirror_images_count_only_for_what_is_not_seen_directly() -> None:
@@ -78,7 +78,7 @@ def test_transparent_gaussians_are_pruned_together_with_their_moments() -> None:
     moments = {"primary.means": (gaussians.means + 1, gaussians.means + 2)}
     rng = torch.Generator().manual_seed(0)
     statistics = seen([0.0, 1.0, 0.0])
-    after, moments = densified(DefaultDensify(), gaussians, moments, statistics, extent=EXTENT, generator=rng)
+    after, moments = densify(DefaultDensify(), gaussians, moments, statistics, extent=EXTENT, generator=rng)
     assert torch.equal(after.means, gaussians.means[[0, 2]])
     assert torch.equal(moments["primary.means"][0], gaussians.means[[0, 2]] + 1)
 

@@ -15,8 +15,8 @@ from glassplat.training.actions import AddNoise
 from glassplat.training.densify import (
     MOST_COPIES,
     rank_among_equals,
+    relocate_and_grow,
     relocation,
-    resampled,
     sgld_noise,
     shared_contribution,
 )
@@ -84,7 +84,7 @@ def test_extreme_opacities_stay_finite() -> None:
 
 def test_the_dead_end_up_where_the_live_are_and_share_their_contribution() -> None:
     before = make_gaussians([0.9, 0.001, 0.4, 0.005, 0.002, 0.6])
-    after, _ = resampled(OPTIONS, before, {}, cap=0, generator=rng())
+    after, _ = relocate_and_grow(OPTIONS, before, {}, cap=0, generator=rng())
     live = [0, 2, 5]
     assert len(after) == len(before)
     assert torch.equal(after.means[live], before.means[live])
@@ -107,7 +107,7 @@ def test_live_ones_are_drawn_in_proportion_to_their_opacity() -> None:
 
 def test_moments_start_again_where_values_changed() -> None:
     before = make_gaussians([0.9, 0.001] + [0.006] * 4)
-    after, moments = resampled(OPTIONS, before, make_moments(before), cap=0, generator=rng())
+    after, moments = relocate_and_grow(OPTIONS, before, make_moments(before), cap=0, generator=rng())
     changed = after.logit_opacities != before.logit_opacities
     assert changed.sum() == 2
     for name, tensor in before.tensors().items():
@@ -119,14 +119,14 @@ def test_moments_start_again_where_values_changed() -> None:
 def test_moments_of_other_parts_pass_through() -> None:
     before = make_gaussians([0.9, 0.001])
     pair = (torch.ones(7), torch.ones(7))
-    _, moments = resampled(OPTIONS, before, {"glass.logit_mark": pair}, cap=10, generator=rng())
+    _, moments = relocate_and_grow(OPTIONS, before, {"glass.logit_mark": pair}, cap=10, generator=rng())
     assert moments["glass.logit_mark"] is pair or moments["glass.logit_mark"][0] is pair[0]
 
 
 @pytest.mark.parametrize(("cap", "expected"), [(1000, 105), (103, 103), (100, 100), (50, 100)])
 def test_growth_is_a_twentieth_up_to_the_cap(cap: int, expected: int) -> None:
     before = make_gaussians([0.5] * 100)
-    after, moments = resampled(OPTIONS, before, make_moments(before), cap=cap, generator=rng())
+    after, moments = relocate_and_grow(OPTIONS, before, make_moments(before), cap=cap, generator=rng())
     assert len(after) == expected
     new = moments["primary.means"][0][100:]
     assert new.shape == (expected - 100, 3) and not new.any()
@@ -135,7 +135,7 @@ def test_growth_is_a_twentieth_up_to_the_cap(cap: int, expected: int) -> None:
 
 def test_a_place_takes_no_more_than_the_sum_is_exact_for() -> None:
     before = make_gaussians([0.8] + [0.001] * 200)
-    after, _ = resampled(OPTIONS, before, {}, cap=0, generator=rng())
+    after, _ = relocate_and_grow(OPTIONS, before, {}, cap=0, generator=rng())
     together = (after.means == before.means[0]).all(dim=1)
     assert together.sum() == MOST_COPIES
     opacities = torch.sigmoid(after.logit_opacities[together].double())
@@ -146,7 +146,7 @@ def test_a_place_takes_no_more_than_the_sum_is_exact_for() -> None:
 @pytest.mark.parametrize("opacities", [[], [0.001], [0.001, 0.002, 0.004]], ids=["none", "one dead", "all dead"])
 def test_without_live_ones_nothing_happens(opacities: list[float]) -> None:
     before = make_gaussians(opacities)
-    after, moments = resampled(OPTIONS, before, make_moments(before), cap=100, generator=rng())
+    after, moments = relocate_and_grow(OPTIONS, before, make_moments(before), cap=100, generator=rng())
     for name, tensor in before.tensors().items():
         assert torch.equal(after.tensors()[name], tensor)
         assert torch.equal(moments[f"primary.{name}"][0], tensor + 10)
@@ -154,13 +154,13 @@ def test_without_live_ones_nothing_happens(opacities: list[float]) -> None:
 
 
 def test_a_single_live_one_is_doubled() -> None:
-    after, _ = resampled(OPTIONS, make_gaussians([0.75]), {}, cap=100, generator=rng())
+    after, _ = relocate_and_grow(OPTIONS, make_gaussians([0.75]), {}, cap=100, generator=rng())
     assert torch.sigmoid(after.logit_opacities).tolist() == pytest.approx([0.5, 0.5])
 
 
 def test_the_same_seed_gives_the_same_set_and_another_seed_another() -> None:
     before = make_gaussians([0.9, 0.001, 0.5, 0.3, 0.002] * 20)
-    sets = [resampled(OPTIONS, before, {}, cap=1000, generator=rng(seed))[0] for seed in (3, 3, 4)]
+    sets = [relocate_and_grow(OPTIONS, before, {}, cap=1000, generator=rng(seed))[0] for seed in (3, 3, 4)]
     assert all(torch.equal(t, sets[1].tensors()[name]) for name, t in sets[0].tensors().items())
     assert not torch.equal(sets[0].means, sets[2].means)
     noises = [sgld_noise(OPTIONS, before, rate=1e-4, extent=1.0, generator=rng(seed)) for seed in (3, 3, 4)]

@@ -138,7 +138,7 @@ def test_motions_are_in_the_axes_of_the_world() -> None:
     first, second = (view.camera for view in tiny_capture().train[:2])
     poses = PoseCorrections(torch.tensor([[0.0, 0, 0.1, 0, 0, 0.5]] * 2), ("a", "b"))
     for camera, name in ((first, "a"), (second, "b")):
-        moved = poses.corrected(camera, name, 2.0)
+        moved = poses.correct(camera, name, 2.0)
         turn = moved.cam_from_world[:3, :3].T @ camera.cam_from_world[:3, :3]
         expected = torch.linalg.matrix_exp(torch.tensor([[0.0, 0.1, 0], [-0.1, 0, 0], [0, 0, 0]]))
         torch.testing.assert_close(turn, expected, atol=1e-5, rtol=0)

@@ -15,7 +15,7 @@ from glassplat.model.model import shown_of
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
 from glassplat.viewer.controls import box_of
-from glassplat.viewer.drawing import Wish, edited, point_along
+from glassplat.viewer.drawing import Wish, edit_scene, point_along
 from glassplat.viewer.server import Client, Viewer
 from tests.model.test_model import model
 from tests.publish.test_cleaning import wall
@@ -34,8 +34,8 @@ def test_a_wish_takes_out_what_is_not_kept() -> None:
     scene = model().scene
     kept = torch.arange(len(scene.primary)) % 2 == 0
     wish = Wish(POSE, 1.0, 1.0, kept=kept)
-    assert torch.equal(edited(scene, wish).primary.means, scene.primary.means[kept])
-    assert edited(scene, replace(wish, kept=kept[:-1])).primary is scene.primary, "the scene is another one by now"
+    assert torch.equal(edit_scene(scene, wish).primary.means, scene.primary.means[kept])
+    assert edit_scene(scene, replace(wish, kept=kept[:-1])).primary is scene.primary, "the scene is another one by now"
 
 
 def test_a_point_lies_where_the_wall_is_and_nowhere_beside_it() -> None:

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from glassplat.render.deferred import Deferred
 from glassplat.render.planar import Planar
-from glassplat.scene.scene import Environment, Scene, as_mirrors, moved, with_reflectance, without_glass
-from glassplat.viewer.drawing import PaneMove, Viewpoints, Wish, drawn, edited, error_drawn
+from glassplat.scene.scene import Environment, Scene, as_mirrors, move_pane, with_reflectance, without_glass
+from glassplat.viewer.drawing import PaneMove, Viewpoints, Wish, draw_picture, edit_scene, error_drawn
 from glassplat.viewer.server import cam_from_world
 from tests.training.tiny_capture import tiny_capture, true_scene
 
@@ -24,7 +24,7 @@ EDITS = {
     "none": (replace(WISH, glass="none"), without_glass(true_scene())),
     "moved": (
         replace(WISH, moves=(PaneMove(1, (1.0, 0.0, 0.1, 0.0), (0.0, 0.2, 0.0)),)),
-        moved(true_scene(), 1, (1.0, 0.0, 0.1, 0.0), (0.0, 0.2, 0.0)),
+        move_pane(true_scene(), 1, (1.0, 0.0, 0.1, 0.0), (0.0, 0.2, 0.0)),
     ),
     "reflectance": (replace(WISH, reflectances=((1, 0.9),)), with_reflectance(true_scene(), 1, 0.9)),
 }
@@ -32,7 +32,7 @@ EDITS = {
 
 @pytest.mark.parametrize(("wish", "scene"), EDITS.values(), ids=EDITS)
 def test_a_wish_is_the_render_of_the_edited_scene(wish: Wish, scene: object) -> None:
-    picture = drawn(true_scene(), Planar(), wish, 40)
+    picture = draw_picture(true_scene(), Planar(), wish, 40)
     with torch.no_grad():
         truth = Planar()(scene, wish.camera(40)).rgb
     assert picture.shape == (40, 56, 3)
@@ -41,11 +41,11 @@ def test_a_wish_is_the_render_of_the_edited_scene(wish: Wish, scene: object) -> 
 
 @pytest.mark.parametrize("layer", ["transmission", "reflection", "strength", "depth", "mask", "no such layer"])
 def test_every_layer_is_a_picture(layer: str) -> None:
-    assert drawn(true_scene(), Planar(), replace(WISH, layer=layer), 24).shape == (24, 34, 3)
+    assert draw_picture(true_scene(), Planar(), replace(WISH, layer=layer), 24).shape == (24, 34, 3)
 
 
 def test_what_is_not_wished_for_keeps_every_bit() -> None:
-    for name, tensor in edited(true_scene(), WISH).parameters().items():
+    for name, tensor in edit_scene(true_scene(), WISH).parameters().items():
         assert torch.equal(tensor, true_scene().parameters()[name]), name
 
 
@@ -56,7 +56,7 @@ def test_a_layer_that_is_drawn_on_request_is_drawn() -> None:
         true_scene().extent,
         environment=Environment.random(8, generator=torch.Generator().manual_seed(2)),
     )
-    surroundings = drawn(scene, Deferred(), replace(WISH, layer="environment"), 24)
+    surroundings = draw_picture(scene, Deferred(), replace(WISH, layer="environment"), 24)
     with torch.no_grad():
         truth = Deferred(environment=True)(scene, WISH.camera(24)).layers["environment"]
     assert np.abs(surroundings / 255 - truth.clamp(0, 1).numpy()).max() < 0.003
@@ -87,7 +87,7 @@ def test_the_nearest_photograph_is_near_in_place_and_direction() -> None:
 
 
 def test_gain_brightens_what_is_mirrored() -> None:
-    brighter = edited(true_scene(), replace(WISH, gain=2.0)).primary.channels["log_intensity"]
+    brighter = edit_scene(true_scene(), replace(WISH, gain=2.0)).primary.channels["log_intensity"]
     torch.testing.assert_close(brighter.exp(), 2 * true_scene().primary.channels["log_intensity"].exp())
 
 

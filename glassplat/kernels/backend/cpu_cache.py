@@ -158,37 +158,37 @@ def fingerprint(function: Callable[..., Any], flags: str) -> str:
         TypeError: the function uses a value that has no stable description.
     """
     digest = hashlib.sha256(flags.encode())
-    for part in _described(function, set()):
+    for part in _describe(function, set()):
         digest.update(part.encode() + b"\0")
     return digest.hexdigest()
 
 
-def _described(value: Any, seen: set[int]) -> Iterator[str]:
+def _describe(value: Any, seen: set[int]) -> Iterator[str]:
     """The value as text, part by part; functions are entered once."""
     if isinstance(value, PLAIN):
         yield f"{type(value).__name__} {value!r}"
     elif isinstance(value, tuple | frozenset):
-        parts = [" ".join(_described(item, seen)) for item in value]
+        parts = [" ".join(_describe(item, seen)) for item in value]
         yield f"{type(value).__name__} of {len(parts)}"
         yield from sorted(parts) if isinstance(value, frozenset) else parts
     elif isinstance(value, CodeType):
         yield value.co_code.hex()
         yield " ".join(value.co_names)
-        yield from _described(value.co_consts, seen)
+        yield from _describe(value.co_consts, seen)
     elif isinstance(value, NAMED) or (isinstance(value, FunctionType) and value.__module__.startswith(LIBRARIES)):
         yield f"{getattr(value, '__module__', '')} {value.__name__}"
     elif isinstance(value, SPELLED):
         yield f"{type(value).__name__} {value}"
     elif isinstance(value, INTRINSIC):
         yield "intrinsic"
-        yield from _described(value.__wrapped__, seen)
+        yield from _describe(value.__wrapped__, seen)
     elif isinstance(value, FunctionType):
         if id(value) not in seen:
             seen.add(id(value))
             yield from _described_function(value, seen)
     elif type(value).__name__ == "_Intrinsic":
         # What a kernel says to the compiler in its own words, in a function that Numba wraps.
-        yield from _described(value._defn, seen)
+        yield from _describe(value._defn, seen)
     else:
         raise TypeError(
             f"a kernel uses {value!r}, a {type(value).__name__}, whose changes the cache would not notice; expected "
@@ -198,14 +198,14 @@ def _described(value: Any, seen: set[int]) -> Iterator[str]:
 
 def _described_function(function: FunctionType, seen: set[int]) -> Iterator[str]:
     """Bytecode, defaults, closure and globals of a function."""
-    yield from _described(function.__code__, seen)
-    yield from _described(function.__defaults__, seen)
+    yield from _describe(function.__code__, seen)
+    yield from _describe(function.__defaults__, seen)
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
         yield f"closes over {name}"
-        yield from _described(cell.cell_contents, seen)
+        yield from _describe(cell.cell_contents, seen)
     for name in sorted(_globals_read(function.__code__) & function.__globals__.keys()):
         yield f"reads {name}"
-        yield from _described(function.__globals__[name], seen)
+        yield from _describe(function.__globals__[name], seen)
 
 
 def _globals_read(code: CodeType) -> set[str]:

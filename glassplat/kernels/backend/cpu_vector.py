@@ -231,7 +231,7 @@ def sums_of(typing, vectors):
         parts = [builder.extract_value(packed, i) for i in range(vectors.count)]
         groups = 1
         while len(parts) > 1:
-            parts = [_halved(builder, *pair, groups) for pair in zip(parts[::2], parts[1::2], strict=True)]
+            parts = [_halve(builder, *pair, groups) for pair in zip(parts[::2], parts[1::2], strict=True)]
             groups *= 2
         return parts[0]
 
@@ -239,18 +239,18 @@ def sums_of(typing, vectors):
         return plain(vectors.dtype, (vectors,), build)
 
 
-def shuffled(builder: Any, a: Any, b: Any, order: Any) -> Any:
+def shuffle(builder: Any, a: Any, b: Any, order: Any) -> Any:
     """Lanes of two vectors in a row, in some order, as one vector."""
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(order)), list(order)))
 
 
-def _halved(builder: Any, a: Any, b: Any, groups: int) -> Any:
+def _halve(builder: Any, a: Any, b: Any, groups: int) -> Any:
     """Halves the lanes that hold each of the sums begun in two vectors, `groups` sums in either."""
     lanes = a.type.count
     width = lanes // groups
     near = [g * width + i for g in range(2 * groups) for i in range(width // 2)]
     far = [i + width // 2 for i in near]
-    return builder.fadd(shuffled(builder, a, b, near), shuffled(builder, a, b, far), flags=FLAGS)
+    return builder.fadd(shuffle(builder, a, b, near), shuffle(builder, a, b, far), flags=FLAGS)
 
 
 def _times_power_of_2(builder: Any, x: Any, exponent: Any, kind: VectorType) -> Any:
@@ -366,7 +366,7 @@ ROW = 16
 
 
 @intrinsic
-def interleaved(typing, vectors):
+def interleave(typing, vectors):
     """Four vectors taken apart lane by lane: the first lanes of all four, then their second lanes, and so on.
 
     The result is four vectors again; `sorted_apart` undoes it.
@@ -374,8 +374,8 @@ def interleaved(typing, vectors):
 
     def build(builder, packed):
         a, b, c, d = (builder.extract_value(packed, i) for i in range(4))
-        pairs = [zipped(builder, *pair) for pair in ((a, c), (b, d))]
-        rows = [row for even, odd in zip(*pairs, strict=True) for row in zipped(builder, even, odd)]
+        pairs = [zip_lanes(builder, *pair) for pair in ((a, c), (b, d))]
+        rows = [row for even, odd in zip(*pairs, strict=True) for row in zip_lanes(builder, even, odd)]
         return cgutils.pack_array(builder, rows, a.type)
 
     if isinstance(vectors, types.UniTuple) and vectors.count == 4 and isinstance(vectors.dtype, VectorType):
@@ -384,29 +384,29 @@ def interleaved(typing, vectors):
 
 @intrinsic
 def sorted_apart(typing, vectors):
-    """Four vectors of which every fourth lane belongs together; undoes `interleaved`."""
+    """Four vectors of which every fourth lane belongs together; undoes `interleave`."""
 
     def build(builder, packed):
         rows = [builder.extract_value(packed, i) for i in range(4)]
-        halves = [_unzipped(builder, *pair) for pair in zip(rows[::2], rows[1::2], strict=True)]
-        evens, odds = (_unzipped(builder, *pair) for pair in zip(*halves, strict=True))
+        halves = [_unzip_lanes(builder, *pair) for pair in zip(rows[::2], rows[1::2], strict=True)]
+        evens, odds = (_unzip_lanes(builder, *pair) for pair in zip(*halves, strict=True))
         return cgutils.pack_array(builder, [evens[0], odds[0], evens[1], odds[1]], rows[0].type)
 
     if isinstance(vectors, types.UniTuple) and vectors.count == 4 and isinstance(vectors.dtype, VectorType):
         return plain(vectors, (vectors,), build)
 
 
-def zipped(builder: Any, a: Any, b: Any) -> tuple[Any, Any]:
+def zip_lanes(builder: Any, a: Any, b: Any) -> tuple[Any, Any]:
     """a0 b0 a1 b1 ..., in two vectors."""
     lanes = a.type.count
     order = [i // 2 + i % 2 * lanes for i in range(2 * lanes)]
-    return shuffled(builder, a, b, order[:lanes]), shuffled(builder, a, b, order[lanes:])
+    return shuffle(builder, a, b, order[:lanes]), shuffle(builder, a, b, order[lanes:])
 
 
-def _unzipped(builder: Any, a: Any, b: Any) -> tuple[Any, Any]:
+def _unzip_lanes(builder: Any, a: Any, b: Any) -> tuple[Any, Any]:
     """The even lanes of two vectors in a row, and the odd ones."""
     lanes = a.type.count
-    return shuffled(builder, a, b, range(0, 2 * lanes, 2)), shuffled(builder, a, b, range(1, 2 * lanes, 2))
+    return shuffle(builder, a, b, range(0, 2 * lanes, 2)), shuffle(builder, a, b, range(1, 2 * lanes, 2))
 
 
 @intrinsic
@@ -415,7 +415,7 @@ def without_fourths(typing, row):
 
     def build(builder, x):
         kept = [lane for lane in range(ROW) if lane % 4 < 3]
-        return cgutils.pack_struct(builder, [shuffled(builder, x, x, kept[:8]), shuffled(builder, x, x, kept[8:])])
+        return cgutils.pack_struct(builder, [shuffle(builder, x, x, kept[:8]), shuffle(builder, x, x, kept[8:])])
 
     if isinstance(row, VectorType) and row.lanes == ROW:
         return plain(types.Tuple((VectorType(row.element, 8), VectorType(row.element, 4))), (row,), build)
@@ -426,11 +426,11 @@ def with_fourths(typing, eight, four):
     """A row of four pixels of which three channels are given, as `without_fourths` gives them; the fourth is zero."""
 
     def build(builder, x, y):
-        padded = shuffled(builder, y, y, [*range(4), *range(4)])
-        twelve = shuffled(builder, x, padded, range(ROW))
+        padded = shuffle(builder, y, y, [*range(4), *range(4)])
+        twelve = shuffle(builder, x, padded, range(ROW))
         zeros = ir.Constant(twelve.type, [0.0] * ROW)
         order = [ROW if lane % 4 == 3 else lane // 4 * 3 + lane % 4 for lane in range(ROW)]
-        return shuffled(builder, twelve, zeros, order)
+        return shuffle(builder, twelve, zeros, order)
 
     if isinstance(eight, VectorType) and (eight.lanes, four) == (8, VectorType(eight.element, 4)):
         return plain(VectorType(eight.element, ROW), (eight, four), build)
@@ -446,9 +446,9 @@ def thirds(typing, first, second, third):
         for k in range(3):
             places = [3 * i + k for i in range(lanes)]
             # From the first two vectors, 0 for what is in the third; then that from there.
-            early = shuffled(builder, a, b, [place if place < 2 * lanes else 0 for place in places])
+            early = shuffle(builder, a, b, [place if place < 2 * lanes else 0 for place in places])
             late = [i if place < 2 * lanes else place - lanes for i, place in enumerate(places)]
-            columns.append(shuffled(builder, early, c, late))
+            columns.append(shuffle(builder, early, c, late))
         return cgutils.pack_array(builder, columns, a.type)
 
     if isinstance(first, VectorType) and first == second == third:
@@ -466,9 +466,9 @@ def triples(typing, first, second, third):
         lanes, rows = a.type.count, []
         for k in range(3):
             places = [divmod(k * lanes + i, 3) for i in range(lanes)]
-            early = shuffled(builder, a, b, [n + lanes * which if which < 2 else 0 for n, which in places])
+            early = shuffle(builder, a, b, [n + lanes * which if which < 2 else 0 for n, which in places])
             late = [i if which < 2 else lanes + n for i, (n, which) in enumerate(places)]
-            rows.append(shuffled(builder, early, c, late))
+            rows.append(shuffle(builder, early, c, late))
         return cgutils.pack_array(builder, rows, a.type)
 
     if isinstance(first, VectorType) and first == second == third:
@@ -476,7 +476,7 @@ def triples(typing, first, second, third):
 
 
 @intrinsic
-def transposed(typing, rows):
+def transpose(typing, rows):
     """As many vectors as each has lanes, lane i of vector k being lane k of vector i."""
 
     def build(builder, packed):
@@ -484,7 +484,7 @@ def transposed(typing, rows):
         half = rows.count // 2
         for _ in range(half.bit_length()):
             pairs = zip(parts[:half], parts[half:], strict=True)
-            parts = [part for a, b in pairs for part in zipped(builder, a, b)]
+            parts = [part for a, b in pairs for part in zip_lanes(builder, a, b)]
         return cgutils.pack_array(builder, parts, parts[0].type)
 
     if isinstance(rows, types.UniTuple) and rows.count == getattr(rows.dtype, "lanes", 0):

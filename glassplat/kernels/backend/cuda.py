@@ -51,7 +51,9 @@ class MachineCode(NamedTuple):
     cubin: bytes
 
 
-def compiled(function: Callable[..., None], signature: tuple[Any, ...], capability: tuple[int, int]) -> MachineCode:
+def compile_kernel(
+    function: Callable[..., None], signature: tuple[Any, ...], capability: tuple[int, int]
+) -> MachineCode:
     """Compiles a kernel.
 
     Args:
@@ -116,7 +118,7 @@ class ImageCache:
             return MachineCode(*found[2:])
         log.info("compiling %s for this GPU (first use only, then cached on disk) ...", self.name)
         started = time.perf_counter()
-        made = compiled(self._function, self._signature, capability)
+        made = compile_kernel(self._function, self._signature, capability)
         log.info("compiled %s in %.1f s", self.name, time.perf_counter() - started)
         try:
             folders.locator.ensure_cache_path()
@@ -154,7 +156,7 @@ class LoadedKernel:
         """
         self.name = name
         with current_gpu(index):
-            self._context = driver.CUcontext(int(checked("cuCtxGetCurrent", driver.cuCtxGetCurrent())))
+            self._context = driver.CUcontext(int(check_driver("cuCtxGetCurrent", driver.cuCtxGetCurrent())))
             self._library = ObjectCode.from_cubin(code.cubin, name=name)
             self._function = driver.CUfunction(int(self._library.get_kernel(code.entry).handle))
         self._layout, self._memory = layout, ctypes.create_string_buffer(layout.size)
@@ -176,18 +178,18 @@ class LoadedKernel:
         with self._lock:
             self._layout.pack_into(self._memory, 0, *values)
             # A thread that has not used the GPU yet has no context, and one may be busy with another GPU.
-            current = checked("cuCtxGetCurrent", driver.cuCtxGetCurrent())
+            current = check_driver("cuCtxGetCurrent", driver.cuCtxGetCurrent())
             elsewhere = int(current) != int(self._context)
             if elsewhere:
-                checked("cuCtxPushCurrent", driver.cuCtxPushCurrent(self._context))
+                check_driver("cuCtxPushCurrent", driver.cuCtxPushCurrent(self._context))
             try:
                 done = driver.cuLaunchKernel(
                     self._function, blocks, 1, 1, threads, 1, 1, 0, stream, self._address, 0
                 )  # fmt: skip
             finally:
                 if elsewhere:
-                    checked("cuCtxPopCurrent", driver.cuCtxPopCurrent())
-            checked(self.name, done)
+                    check_driver("cuCtxPopCurrent", driver.cuCtxPopCurrent())
+            check_driver(self.name, done)
 
 
 def current_gpu(index: int) -> Any:
@@ -195,7 +197,7 @@ def current_gpu(index: int) -> Any:
     return cuda.gpus[index]
 
 
-def checked(what: str, answer: tuple[Any, ...]) -> Any:
+def check_driver(what: str, answer: tuple[Any, ...]) -> Any:
     """Result of a call to the driver; raises if it failed.
 
     Raises:
@@ -256,7 +258,7 @@ class Kernel:
         if len(arguments) != len(self.signature):
             raise TypeError(f"{self.name} takes {len(self.signature)} arguments, got {len(arguments)}")
         if self._simulated is not None:
-            values_of = (e.simulated(argument) for e, argument in zip(self._expected, arguments, strict=True))
+            values_of = (e.simulate(argument) for e, argument in zip(self._expected, arguments, strict=True))
             self._simulated[blocks, threads](*values_of)
             return
         index = next(argument.get_device() for argument in arguments if isinstance(argument, Tensor))
@@ -317,7 +319,7 @@ class Expected:
         # Two pointers that only host memory uses come first.
         values += (0, 0, count, self._size, argument.data_ptr(), *after)
 
-    def simulated(self, argument: Any) -> Any:
+    def simulate(self, argument: Any) -> Any:
         """Stand-in for an argument in the simulator."""
         if not self._is_array:
             return bool(argument) if self._is_bool else np.dtype(str(self.type)).type(argument)

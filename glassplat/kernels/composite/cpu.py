@@ -17,7 +17,7 @@ from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
 from glassplat.kernels.backend.cpu_vector import (
     absolute,
     bits_of,
-    interleaved,
+    interleave,
     item,
     minimum,
     select,
@@ -201,7 +201,7 @@ def _write_tile(real: type) -> Scalar:
         """A block of three or four channels that lies within the image; `first` is its first pixel."""
         s0, s1 = load(planes, SUMS + i), load(planes, SUMS + PIXELS + i)
         s2, s3 = load(planes, SUMS + 2 * PIXELS + i), load(planes, SUMS + 3 * PIXELS + i)
-        rows = interleaved((s0, s1, s2, s3))
+        rows = interleave((s0, s1, s2, s3))
         for y in range(BLOCK):
             store(alpha, first + y * width, one - load_row(state, at + T + i + y * BLOCK))
             if channels == 4:

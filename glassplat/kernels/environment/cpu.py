@@ -24,7 +24,7 @@ from torch import Tensor
 
 from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
 from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.maths.cube import cube_maths, lookup_maths, mirrored, mirrored_gradient, over_column, over_row
+from glassplat.kernels.maths.cube import cube_maths, lookup_maths, mirror_ray, mirrored_gradient, over_column, over_row
 from glassplat.kernels.maths.projection import dot
 from glassplat.kernels.maths.surface import surface_maths
 from glassplat.kernels.records import NORMAL_AT, NORMAL_MIN, REAL_OF, STRENGTH_AT, SURFACE_CHANNELS, Shaded
@@ -364,7 +364,7 @@ def _place(real: type) -> Scalar:
             x = (real(whole[COLUMN + i]) + start) * inverse_f
             ray = x * across_x + from_x, x * across_y + from_y, x * across_z + from_z
             normal = run[NORMAL + i], run[NORMAL + RUN + i], run[NORMAL + 2 * RUN + i]
-            to = mirrored(ray, normal)
+            to = mirror_ray(ray, normal)
             axis, face, u, v, inverse = on_face(to[0], to[1], to[2])
             left, along = cell(u, size)
             top, down = cell(v, size)

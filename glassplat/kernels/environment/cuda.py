@@ -21,7 +21,7 @@ from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.environment.cpu import gradients_like
 from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.maths.cube import cube_maths, lookup_maths, mirrored, mirrored_gradient, over_column, over_row
+from glassplat.kernels.maths.cube import cube_maths, lookup_maths, mirror_ray, mirrored_gradient, over_column, over_row
 from glassplat.kernels.maths.projection import dot
 from glassplat.kernels.maths.surface import surface_maths
 from glassplat.kernels.records import NORMAL_AT, NORMAL_MIN, REAL_OF, STRENGTH_AT, SURFACE_CHANNELS, Shaded
@@ -319,7 +319,7 @@ def _place(real: type) -> Scalar:
             x * rotation[1, 0] + y * rotation[1, 1] + rotation[1, 2],
             x * rotation[2, 0] + y * rotation[2, 1] + rotation[2, 2],
         )
-        to = mirrored(ray, normal)
+        to = mirror_ray(ray, normal)
         at = on_face(to[0], to[1], to[2])
         left, along = cell(at[2], size)
         top, down = cell(at[3], size)

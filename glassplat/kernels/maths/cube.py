@@ -167,7 +167,7 @@ TWO = np.float32(2.0)
 
 
 @inlined
-def mirrored(ray, normal):  # type: ignore[no-untyped-def]
+def mirror_ray(ray, normal):  # type: ignore[no-untyped-def]
     """A ray mirrored by a normal of any length, times the square of that length."""
     return blend(dot(normal, normal), ray, -TWO * dot(ray, normal), normal)
 

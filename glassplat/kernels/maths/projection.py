@@ -162,7 +162,7 @@ def screen_maths(real: type) -> ScreenMaths:
 
 
 @inlined
-def clamped(x, lowest, highest):
+def clamp(x, lowest, highest):
     """A value held between two limits."""
     return min(max(x, lowest), highest)
 

@@ -22,7 +22,7 @@ from torch import Tensor
 from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
 from glassplat.kernels.backend.cpu_vector import (
     bits_of,
-    interleaved,
+    interleave,
     sorted_apart,
     store,
     store_all,
@@ -414,7 +414,7 @@ def blend_panes_backward(real: type) -> Kernel:
                                 load_lanes(run, v), load_lanes(run, v + RUN), load_lanes(run, v + 2 * RUN),
                                 load_lanes(run, V_GAIN + start),
                             )  # fmt: skip
-                            store_all(v_mirrored, at, interleaved(four))
+                            store_all(v_mirrored, at, interleave(four))
                             continue
                         for i in range(start, min(count, start + LANES)):
                             column = first + i

@@ -26,7 +26,7 @@ from glassplat.kernels.backend.cpu_vector import (
     row_loader,
     store,
     store_all,
-    transposed,
+    transpose,
     vector_kind,
 )
 from glassplat.kernels.maths.blending import Scalar
@@ -231,7 +231,7 @@ def _add_coefficients(real: type) -> Callable[..., Any]:
         for begin in range(0, 3 * terms, LANES):
             for k in range(3 * terms, begin + LANES):
                 table[whole + k * LANES : whole + (k + 1) * LANES] = 0
-            store_all(table, 0, transposed(load_rows(table, positions, whole + begin * LANES)))
+            store_all(table, 0, transpose(load_rows(table, positions, whole + begin * LANES)))
             for i in range(last + 1 - first):
                 at = listed[first + i] * row_size + begin
                 store(g_sh, at, load(g_sh, at) + load(table, i * LANES))

@@ -26,7 +26,7 @@ from glassplat.kernels.backend.cpu_vector import (
     store_all,
     thirds,
     times_power_of_2,
-    transposed,
+    transpose,
     vector_kind,
 )
 from glassplat.kernels.maths.harmonics import channel_with, color_gradient_with, harmonic_basis
@@ -223,7 +223,7 @@ def color_steps(real: type) -> tuple[Step, Step]:
                 positions[i] = whole + i * COLUMNS
         source = sh if inside else table
         for begin in range(0, 3 * terms, LANES):
-            store_all(table, begin * LANES, transposed(load_rows(source, positions, begin)))
+            store_all(table, begin * LANES, transpose(load_rows(source, positions, begin)))
 
     @inlined
     def color(table, means, at, degree, lens, c):

@@ -14,7 +14,7 @@ from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.maths.projection import (
     along,
     blend,
-    clamped,
+    clamp,
     dot,
     footprint,
     scaled_sum,
@@ -62,7 +62,7 @@ class ViewSteps(NamedTuple):
 
 def view_steps(real: type) -> ViewSteps:
     """Builds the parts for `real`, np.float32 or np.float64."""
-    return ViewSteps(_shape(real), view_with(real, clamped), *_lenses(real))
+    return ViewSteps(_shape(real), view_with(real, clamp), *_lenses(real))
 
 
 def _shape(real: type) -> Callable[..., Any]:

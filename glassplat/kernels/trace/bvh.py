@@ -113,7 +113,7 @@ def curve_cells(points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @inlined
-def unfolded(x, y, z):  # type: ignore[no-untyped-def]
+def hilbert_axes(x, y, z):  # type: ignore[no-untyped-def]
     """Coordinates turned, from the largest cube to the smallest, into the axes of the curve within it.
 
     In each cube the curve enters and leaves at corners that lie along one edge; reflecting and exchanging axes brings
@@ -148,7 +148,7 @@ def unfolded(x, y, z):  # type: ignore[no-untyped-def]
 @inlined
 def curve_place(x, y, z):  # type: ignore[no-untyped-def]
     """The place of a cell along the curve."""
-    x, y, z = unfolded(x, y, z)
+    x, y, z = hilbert_axes(x, y, z)
     place = np.int64(0)
     for j in range(BITS):
         shift = BITS - 1 - j

@@ -122,12 +122,14 @@ def trace_gradients(
         *(tensor.numpy() for tensor in (*outputs[:3], *cotangents)),
         owners.numpy(), rows, sh_rows, *(tensor.numpy() for tensor in v_rays),
     )  # fmt: skip
-    sums, v_sh = _summed(rows, sh_rows, owners, count, real)
+    sums, v_sh = _sum_rows(rows, sh_rows, owners, count, real)
     v_means, v_frames, v_opacities, v_contributions = sums.tensor_split((FRAME_AT, OPACITY_AT, CONTRIBUTION_AT), dim=1)
     return v_means, v_frames.reshape(-1, 3, 3), v_opacities[:, 0], v_sh, *v_rays, v_contributions
 
 
-def _summed(rows: NDArray[Any], sh_rows: NDArray[Any], owners: Tensor, count: int, real: type) -> tuple[Tensor, Tensor]:
+def _sum_rows(
+    rows: NDArray[Any], sh_rows: NDArray[Any], owners: Tensor, count: int, real: type
+) -> tuple[Tensor, Tensor]:
     """Sums [N, 15] of rows per (block, Gaussian), and [N, K, 3] of their harmonics."""
     order = torch.argsort(owners, stable=True)
     offsets = torch.cat([owners.new_zeros(1, dtype=torch.int64), torch.bincount(owners, minlength=count).cumsum(0)])
