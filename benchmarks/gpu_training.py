@@ -1,4 +1,4 @@
-"""A whole run of `planar` on a capture, and its quality beside the same run on the CPU."""
+"""A whole run of `planar` on a capture, and its quality compared with the same run on the CPU."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SAME = ("method", "iterations", "seed", "downscale")
 def training(
     data: Path, iterations: int, output: Path, *, cpu_run: Path | None, device: DeviceName = "cuda", seed: int = 0
 ) -> Table:
-    """Trains and evaluates `planar`, and puts the metrics beside those of the CPU's run.
+    """Trains and evaluates `planar`, and compares the metrics with those of the CPU's run.
 
     Args:
         data: a capture.

@@ -1,4 +1,4 @@
-"""Throughput of the kernels, beside the machine's multiply-add peak and their PyTorch twins."""
+"""Throughput of the kernels, compared with the machine's multiply-add peak and their PyTorch twins."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ def main(run: tyro.conf.Positional[Path], output: Path = Path("edited")) -> None
     mirrored = model.with_pane(beside.tolist(), planes.normals[0].tolist(), (size, size), base_reflectance=1)
     print(mirrored)
 
-    # For other programs, with the panes beside it; as a page for any browser; and as it is, to go on with.
+    # For other programs, with the panes next to it; as a page for any browser; and as it is, to go on with.
     for file in ("mirror.ply", "page.html", "run"):
         print("->", edits["mirror"].save(output / file))
 

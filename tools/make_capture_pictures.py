@@ -5,7 +5,7 @@
 `--scene` ships the truth about its panes (`gt/planes.json`), which is where corners are clicked on the page of
 `glassplat annotate`; of `--capture`, which `glassplat prepare` made, the report is shown, and of `--run` the overview
 that `glassplat eval` wrote. `--busy` is a scene of `tools.make_pane_scene --passers-by`; a photograph of it is shown
-beside its masks. What is not given keeps its pictures.
+next to its masks. What is not given keeps its pictures.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def true_corners(scene: Path) -> NDArray[np.float64]:
 
 
 def whole_views(cameras: Sequence[NumpyCamera], corners: NDArray[np.float64]) -> list[int]:
-    """Views that show the whole pane, with a little room beside the photograph."""
+    """Views that show the whole pane, with a little room next to the photograph."""
     return [number for number, camera in enumerate(cameras) if camera.holds(corners, 0.2).all()]
 
 
@@ -82,7 +82,7 @@ def draw(scene: Path, output: Path) -> None:
 
 
 def draw_masks(scene: Path, picture: Path) -> None:
-    """Saves a photograph in which somebody passes beside its mask of panes and its mask of what is left out."""
+    """Saves a photograph in which somebody passes next to its mask of panes and its mask of what is left out."""
     somebody = {path.name: np.array(Image.open(path)) > 0 for path in sorted((scene / "gt/passers_by").iterdir())}
     name = max((scene / "panes").iterdir(), key=lambda path: somebody.get(path.name, np.zeros(1)).sum()).name
     tiles = {

@@ -282,7 +282,7 @@ def write_difference(path: Path, picture: NDArray[np.uint8], other: NDArray[np.u
 
 
 def write_view(arguments: Arguments, place: Place, number: int, pose: Array, *, annotated: bool) -> None:
-    """Writes all that there is of a view; true layers are those without a photographer, and beside them with one."""
+    """Writes all that there is of a view; true layers are those without a photographer, and next to them with one."""
     folder, name, size = arguments.output, view_name(number), (arguments.width, arguments.width * 3 // 4)
     peopled = replace(place, photographer=photographer(pose)) if arguments.photographer else place
     seen = peopled.view(pose, *size)

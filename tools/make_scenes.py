@@ -83,11 +83,11 @@ class Arguments:
     samples: int = 256
     """Light paths per pixel."""
     points: int = 0
-    """Random grey points to write beside the images; 0 leaves them to whoever reads the scene (glassplat: 100,000)."""
+    """Random grey points to write next to the images; 0 leaves them to whoever reads the scene (glassplat: 100,000)."""
     environment_height: int = 512
     """Height of the equirectangular environment, pixels."""
     estimated_normals: float | None = None
-    """Normals as estimated from single photographs beside those for training, off by so many degrees on average."""
+    """Normals as estimated from single photographs next to those for training, off by so many degrees on average."""
     variant: Variant = "llvm_ad_rgb"
     """Mitsuba's backend: CPU or NVIDIA GPU."""
 
@@ -310,7 +310,7 @@ def write_truth(studio: Studio, pose: Array, stem: Path) -> None:
 
 
 def write_estimate(studio: Studio, pose: Array, stem: Path, error_deg: float, seed: int) -> None:
-    """Writes `normals/<name>.png` beside a photograph, in the camera's axes: x right, y up, z towards the camera."""
+    """Writes `normals/<name>.png` next to a photograph, in the camera's axes: x right, y up, z towards the camera."""
     seen, _ = visible_surfaces(studio, pose)
     in_camera = seen[..., :3] @ pose[:3, :3]
     normals = estimated_normals(in_camera, seen[..., 3], error_deg, np.random.default_rng(seed))

@@ -32,7 +32,7 @@ from tools.browser import Browser
 
 Places = Sequence[Any] | np.ndarray
 WHOLE = 1.5
-"""What the canvas shows of a photograph at first, in its sizes: there is room for corners beside it."""
+"""What the canvas shows of a photograph at first, in its sizes: there is room for corners next to it."""
 
 
 class MarkingPage:

@@ -46,7 +46,7 @@ def mirrored_errors(stored: StoredRun) -> tuple[Tensor, Tensor]:
     for view in stored.dataset.test:
         truth = true_surface(view)
         if truth is None or truth.normals is None or truth.strength is None:
-            raise SystemExit(f"{view.image_path} has no true normals and strength beside it; expected a made scene")
+            raise SystemExit(f"{view.image_path} has no true normals and strength next to it; expected a made scene")
         frame, _ = timed_render(stored.renderer, stored.scene, view)
         mirror = truth.covered & (truth.strength > REFLECTIVE)
         upward.append(mirrored_rays(view, truth.normals)[mirror][:, 2])

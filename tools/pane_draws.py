@@ -177,7 +177,7 @@ def _draw_walls(generator: Generator, low: Array, high: Array, *, shade: float, 
 
 
 def _draw_screens(generator: Generator) -> _Stage:
-    """One to three panes that stand freely near the middle of a room, some of them beside each other in a plane."""
+    """One to three panes that stand freely near the middle of a room, some of them next to each other in a plane."""
     half_x, half_y = generator.uniform(*HALF_WIDTHS, 2)
     low, high = np.array([-half_x, -half_y, 0.0]), np.array([half_x, half_y, _between(generator, CEILINGS)])
     things: list[Thing] = [*_draw_walls(generator, low, high, shade=1.0)]
@@ -219,7 +219,7 @@ def _draw_screen(generator: Generator, label: int, near: tuple[float, ...]) -> P
 
 
 def _draw_post(generator: Generator, pane: Pane, width: float, number: int) -> Carried:
-    """Between the pane that is so many places beside `pane` and the one before that."""
+    """Between the pane that is so many places next to `pane` and the one before that."""
     frame = np.eye(4)
     frame[:3, :3] = np.stack([pane.tangent, pane.bitangent, np.cross(pane.tangent, pane.bitangent)], axis=1)
     frame[:3, 3] = pane.center + ((2 * number - 1) * pane.half_sizes[0] + (number - 0.5) * width) * pane.tangent

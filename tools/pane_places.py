@@ -128,7 +128,7 @@ def case_place() -> Place:
         Box((-0.86, BACK + 0.01, SHELF), (0.86, 1.2, TOP), Paint(40, shade=SHADE)),
         Box((-HALF_WIDTH - POST, FRONT, SHELF), (-HALF_WIDTH, FRONT + POST, TOP), Paint(61, shade=SHADE)),
         Box((HALF_WIDTH, FRONT, SHELF), (HALF_WIDTH + POST, FRONT + POST, TOP), Paint(65, shade=SHADE)),
-        # Beside the bowl, and what it stands on.
+        # Next to the bowl, and what it stands on.
         Box((-0.17, 0.38, SHELF), (0.07, 0.62, 0.78), Paint(12, shade=SHADE)),
         Ball((-0.52, 0.38, 0.83), 0.13, Paint(20)),
         Ball((0.4, 0.3, 0.8), 0.1, Paint(30)),

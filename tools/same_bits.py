@@ -44,7 +44,7 @@ Hashes = dict[str, str]
 
 
 class Case(NamedTuple):
-    """One run: the scene, and what `glassplat train` is given beside it."""
+    """One run: the scene, and what `glassplat train` is given besides."""
 
     scene: str
     arguments: str

@@ -26,7 +26,7 @@ SHEET_SWING = 0.16
 SHEET_THICKNESS = 0.02
 CAR_HALF_AXES = np.array([0.72, 0.36, 0.27])
 WALL = np.array([1.1, 0.05, 0.55])
-"""Half sizes of the wall beside the car."""
+"""Half sizes of the wall next to the car."""
 WALL_Y = 0.8
 COLORS: tuple[Color, ...] = (
     (0.72, 0.10, 0.06), (0.08, 0.35, 0.65), (0.75, 0.58, 0.08), (0.10, 0.48, 0.16), (0.62, 0.22, 0.52),
@@ -71,7 +71,7 @@ def _sheet() -> tuple[tuple[Body, ...], Stand]:
 
 
 def _car() -> tuple[tuple[Body, ...], Stand]:
-    """A lacquered body like a car's, beside a patterned wall and before two things."""
+    """A lacquered body like a car's, next to a patterned wall and before two things."""
     stand = Stand(radius=1.25, z=-0.4, checker_size=0.3, pattern_seed=7)
     body = star_shaped(lambda d: np.sum(np.abs(d / CAR_HALF_AXES) ** 3.0, axis=-1) ** (-1 / 3.0))
     body = placed(body, np.eye(3), np.array([0.0, 0.0, stand.z + CAR_HALF_AXES[2]]))

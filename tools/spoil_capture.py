@@ -41,7 +41,7 @@ def main() -> None:
     parser.add_argument("capture", type=Path)
     parser.add_argument("--output", type=Path, required=True, help="a folder that does not exist yet")
     parser.add_argument("--exposure", type=float, default=0.0, help="standard deviation of the exposure, in stops")
-    parser.add_argument("--white-balance", type=float, default=0.0, help="the same of each channel beside it")
+    parser.add_argument("--white-balance", type=float, default=0.0, help="the same of each channel besides")
     parser.add_argument("--pose-noise", type=float, default=0.0, help="standard deviation of the turns, in degrees")
     parser.add_argument("--passers-by", type=float, default=0.0, help="share of the photographs that show somebody")
     parser.add_argument("--seed", type=int, default=0)
@@ -74,7 +74,7 @@ def spoil(
         capture: its folder.
         output: of the copy.
         exposure: standard deviation of the exposures, in stops.
-        white_balance: the same of each channel beside it.
+        white_balance: the same of each channel besides.
         random: where they come from.
 
     Returns:
@@ -110,7 +110,7 @@ def disturb_transforms(capture: Path, noise: float, random: np.random.Generator)
     """Moves every camera of a capture with transforms a little, each by itself; as `disturb_poses`.
 
     Args:
-        capture: its folder; `true_transforms_train.json` and `..._test.json` are kept beside the new ones.
+        capture: its folder; `true_transforms_train.json` and `..._test.json` are kept next to the new ones.
         noise: standard deviation of the turns about each axis, radians, and of the shifts, in radii of the cameras.
         random: where they come from.
     """
@@ -133,7 +133,7 @@ def disturb_poses(path: Path, noise: float, random: np.random.Generator) -> None
     """Moves every camera of a COLMAP model a little, each by itself.
 
     Args:
-        path: its `images.txt`; the true one is kept beside it.
+        path: its `images.txt`; the true one is kept next to it.
         noise: standard deviation of the turns about each axis, radians, and of the shifts, in radii of the cameras.
         random: where they come from.
     """

@@ -198,7 +198,7 @@ FARTHEST_OUTSIDE = 1e5
 def seen_outline(camera: NumpyCamera, corners: Array) -> Array:
     """[P, 2] the outline of a polygon [K, 3] in a view, cut off where it passes the camera; empty if it is behind.
 
-    It reaches far beside the photograph there, which keeps its edges straight: 1 / `NEAR` focal lengths at most.
+    It reaches far outside the photograph there, which keeps its edges straight: 1 / `NEAR` focal lengths at most.
     """
     return camera.pixels(_before_camera(camera.in_camera(corners)))
 

@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 LONGEST = 480
 """Pixels of the part of the photograph that is looked at: more takes seconds."""
 MARGIN = 0.25
-"""Of the outline's size: how much beside it is looked at, to learn what the background is like."""
+"""Of the outline's size: how much next to it is looked at, to learn what the background is like."""
 ROUNDS = 5
 SMALLEST = 0.01
 """Of the outline's area: smaller pieces are specks."""
@@ -44,7 +44,7 @@ def grab_outlines(photo: NDArray[np.uint8], outline: Array) -> list[Array]:
 
     Args:
         photo: [H, W, 3].
-        outline: [P, 2] pixels round the thing, with a little of what is beside it.
+        outline: [P, 2] pixels round the thing, with a little of what is next to it.
 
     Returns:
         [Q, 2] pixels of each piece; the rough outline itself where nothing in it differs from what is around it.
@@ -77,7 +77,7 @@ def _window(outline: Array, width: int, height: int) -> tuple[NDArray[np.int64],
 
 
 def _foreground(cv2: Any, colors: NDArray[np.uint8], inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """[H, W] 1 where a pixel within the outline is unlike those beside it."""
+    """[H, W] 1 where a pixel within the outline is unlike those next to it."""
     cv2.setRNGSeed(0)  # The same outline gives the same answer.
     mask = np.where(inside, cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8)
     models = np.zeros((1, 65)), np.zeros((1, 65))

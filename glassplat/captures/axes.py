@@ -22,7 +22,7 @@ LEAST_SIGHTINGS = 3
 LEAST_CROSSING = 1e-3
 """Smallest eigenvalue of the mean of I - d d^T for which rays towards a pane are taken to cross."""
 BOX_MARGIN = 0.5
-"""How far beside the box of a mask the pane's middle may lie, in sizes of the box; photographs cut panes off."""
+"""How far outside the box of a mask the pane's middle may lie, in sizes of the box; photographs cut panes off."""
 
 
 @dataclass(frozen=True)

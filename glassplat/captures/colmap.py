@@ -1,4 +1,4 @@
-"""COLMAP captures: a sparse model, binary or text, beside a folder of images.
+"""COLMAP captures: a sparse model, binary or text, next to a folder of images.
 
 With label images `panes/<photograph's stem>.png` for the annotated photographs only, this is also the layout for
 captures of transparent panes such as RTR's, whose own files were never published.
@@ -264,7 +264,7 @@ def _shots(root: Path, model: Model) -> tuple[Shot, ...]:
     images = root / "images"
     if not images.is_dir():
         raise InputError(
-            f"no folder {images} beside the COLMAP model; expected the {len(model.images)} photographs there"
+            f"no folder {images} next to the COLMAP model; expected the {len(model.images)} photographs there"
         )
     missing = sorted(image.name for image in model.images if not isfile(images / image.name))
     if missing:

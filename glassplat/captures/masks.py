@@ -3,8 +3,8 @@
 A mask of panes is either a label image (0 no pane, 1..K the pane) or binary (0 and 255, one pane). Binary masks come in
 both polarities; which one is decided over the whole set, because one mask alone cannot tell.
 
-Masks in `masks/`, or `x_mask.png` beside a photograph `x.png`, mean what they mean in COLMAP, nerfstudio, Brush, 3DGRUT
-and LichtFeld: what is black is left out. Earlier versions kept panes there; such captures are read as they were.
+Masks in `masks/`, or `x_mask.png` next to a photograph `x.png`, mean what they mean in COLMAP, nerfstudio, Brush,
+3DGRUT and LichtFeld: what is black is left out. Earlier versions kept panes there; such captures are read as they were.
 """
 
 from __future__ import annotations
@@ -245,7 +245,7 @@ def find_masks(
 
     Panes are in `panes/`; what is black in `masks/`, or above black in `ignore/`, is left out. In each folder is looked
     for, for a photograph `a/x.jpg`: `a/x.png`, `a/x.jpg.png`, `a/x.jpg` and `a/x_mask.png`, each with any image suffix
-    and without the folder where that is unique; and for masks also `x_mask.png` beside the photograph.
+    and without the folder where that is unique; and for masks also `x_mask.png` next to the photograph.
 
     Args:
         root: the capture's folder.
@@ -279,7 +279,7 @@ def find_masks(
 
 
 def _found_masks(root: Path, photographs: Mapping[str, Path]) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """Masks in `masks/` and beside the photographs, and a warning where some belong to none."""
+    """Masks in `masks/` and next to the photographs, and a warning where some belong to none."""
     unmatched: list[str] = []
     masks = _match(root / MASK_FOLDER, photographs, beside=_beside, unmatched=unmatched)
     if not unmatched:
@@ -409,7 +409,7 @@ def _match(
     beside: Callable[[Path], list[Path]] = lambda path: [],
     unmatched: list[str] | None = None,
 ) -> dict[str, Path]:
-    """Mask path by name of the photograph, in the order of the names; in the folder, or beside the photographs.
+    """Mask path by name of the photograph, in the order of the names; in the folder, or next to the photographs.
 
     What belongs to no photograph is appended to `unmatched`, or refused.
     """

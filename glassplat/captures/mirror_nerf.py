@@ -3,7 +3,7 @@
 Public readers agree on the layout, not on the axes:
 
 ```
-transforms_{train,val,test}.json   an explicit split; transforms.json with all frames may lie beside them
+transforms_{train,val,test}.json   an explicit split; transforms.json with all frames may lie next to them
 masks/<name of the photograph>     real scenes; white is the mirror, one half is the threshold, some may be missing
 masks/MirrorMask_0001.png          synthetic scenes, for the photograph Image_0001
 ```
@@ -44,9 +44,9 @@ SAME_SIZE = 0.1
 def load_mirror_nerf(root: Path) -> Capture | None:
     """Read a Mirror-NeRF scene; None when the folder is none.
 
-    What tells it from other `transforms_train.json` captures, beside the folder of masks: intrinsics spelled `fx` or as
-    a matrix, a validation file, or masks called `MirrorMask_*`. Test views are those of the test file, or else of the
-    validation file; photographs that are in it and in the training file too are only tested on.
+    What tells it from other `transforms_train.json` captures, besides the folder of masks: intrinsics spelled `fx`
+    or as a matrix, a validation file, or masks called `MirrorMask_*`. Test views are those of the test file, or
+    else of the validation file; photographs that are in it and in the training file too are only tested on.
 
     Raises:
         InputError: a broken file, no mask that belongs to a photograph, or poses with which the mirror lies behind

@@ -169,7 +169,7 @@ FILE: dict[str, Field] = {
     "val_filenames": Optional(Items(Text())),
     "test_filenames": Optional(Items(Text())),
 }
-"""What is read beside the lens (`LENS`); more may be in the file."""
+"""What is read besides the lens (`LENS`); more may be in the file."""
 
 
 def read_settings(path: Path) -> dict[str, Any]:
@@ -331,9 +331,9 @@ def _mask_paths(root: Path, file: str, settings: Settings, shots: Mapping[str, S
 
 PRIORS = {
     "depth_file_path": "depths are not used",
-    "normal_file_path": "estimated normals are read from a folder normals/ beside the photographs",
+    "normal_file_path": "estimated normals are read from a folder normals/ next to the photographs",
 }
-"""What frames of nerfstudio and its kin name beside the photograph, and what becomes of it."""
+"""What frames of nerfstudio and its kin name besides the photograph, and what becomes of it."""
 
 
 def _unused_priors(settings: Settings) -> list[str]:

@@ -569,7 +569,7 @@ def normals_in_file(path: Path, camera: Camera) -> Tensor:
 
 
 def normals_path(image_path: Path) -> Path | None:
-    """The file of normals in a folder `normals` beside a photograph or beside its folder; None where there is none."""
+    """The file of normals in a folder `normals` next to a photograph or to its folder; None where there is none."""
     for folder in (image_path.parent / FOLDER, image_path.parent.parent / FOLDER):
         if not folder.is_dir():  # As in most captures, all photographs of which are asked.
             continue

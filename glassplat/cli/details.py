@@ -118,7 +118,7 @@ FAINT = 0.01
 
 
 def splats_part(path: Path) -> Finding:
-    """Part about a file of Gaussians, with the panes beside it, which `load` takes, too.
+    """Part about a file of Gaussians, with the panes next to it, which `load` takes, too.
 
     Raises:
         InputError: one of them cannot be read.

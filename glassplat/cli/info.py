@@ -178,7 +178,7 @@ def splat_finding(path: Path) -> Iterator[Finding]:
     """
     first = Finding("a splat file", {"bytes": path.stat().st_size})
     if (path.parent / SCENE).is_file():
-        first.facts["beside it"] = ", ".join(sorted(one.name for one in path.parent.iterdir() if one != path))
+        first.facts["next to it"] = ", ".join(sorted(one.name for one in path.parent.iterdir() if one != path))
     yield first
     yield import_held(DETAILS).splats_part(path)
 
@@ -204,7 +204,7 @@ def run_finding(path: Path) -> Iterator[Finding]:
 
 
 def holds_runs(path: Path) -> bool:
-    """Return whether a folder has runs in it, and no photographs beside them."""
+    """Return whether a folder has runs in it, and no photographs next to them."""
     return any(path.glob("*/recipe.json")) and not any(is_photograph(one) for one in path.iterdir())
 
 

@@ -22,7 +22,7 @@ DESCRIPTION = "Gaussian splatting for scenes with window panes, showcases and mi
 
 
 class Listed(NamedTuple):
-    """A command in the list: its class, the module beside this one that holds it, and the class's first sentence."""
+    """A command in the list: its class, the module next to this one that holds it, and the class's first sentence."""
 
     module: str
     kind: str
@@ -58,7 +58,7 @@ COMMANDS = {
     "export": Listed(
         "scene",
         "Export",
-        "Write a scene as others read it: PLY, SPZ, GLB, a web page with live panes, and the panes beside them.",
+        "Write a scene as others read it: PLY, SPZ, GLB, a web page with live panes, and the panes next to them.",
     ),
     "info": Listed("info", "Info", "Say what a folder or file is, whether it is healthy, and what to do next."),
     "demo": Listed(

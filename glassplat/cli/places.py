@@ -144,9 +144,9 @@ class SplatFile:
     """Facts that a splat file leaves out and a run records.
 
     Attributes:
-        planes: panes of a splat file: planes.json, written by hand or by `export`; the one beside it if not given.
+        planes: panes of a splat file: planes.json, written by hand or by `export`; the one next to it if not given.
         up: which way is up in a splat file, for the cameras that look at it; y points down in most. A cameras.json
-            beside the file, as `export` writes it, is taken instead.
+            next to the file, as `export` writes it, is taken instead.
     """
 
     planes: Path | None = None

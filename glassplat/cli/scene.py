@@ -273,7 +273,7 @@ class Clean:
 
 @dataclass(frozen=True)
 class Export:
-    """Write a scene as others read it: PLY, SPZ, GLB, a web page with live panes, and the panes beside them.
+    """Write a scene as others read it: PLY, SPZ, GLB, a web page with live panes, and the panes next to them.
 
     Attributes:
         scene: a run's directory, an exported folder, or a splat file (.ply, .spz, .glb, .splat, .sog, .ksplat).
@@ -281,11 +281,11 @@ class Export:
             is removed.
         formats: which files; glb is glTF with KHR_gaussian_splatting, html a page that shows the scene in any browser,
             by itself and without a server.
-        layer: all is the scene with its panes beside it, as planes.json and glass.ply; transmission is the place
+        layer: all is the scene with its panes next to it, as planes.json and glass.ply; transmission is the place
             without its panes and what they reflect.
         title: of the page; the run's name if not given.
         credit: shown on the page: who made the scene, and its licence.
-        url: where the page will lie on the web. Previews of links to it show preview.jpg, which then lies beside it.
+        url: where the page will lie on the web. Previews of links to it show preview.jpg, which then lies next to it.
         spz_version: 3, which every reader knows, or 4.
         file: what a splat file does not say of itself.
         edits: changes to the panes.

@@ -216,7 +216,7 @@ def write_files(command: Export, console: Console) -> None:
 
 
 BESIDE_SPLATS = ("index.html", PREVIEW, GLASS, PLANES, ENVIRONMENT, PANORAMA, CAMERAS)
-"""What `export` may write beside `scene.*`."""
+"""What `export` may write next to `scene.*`."""
 
 
 def _remove_earlier(command: Export, targets: Sequence[Path], written: Sequence[Path], console: Console) -> None:

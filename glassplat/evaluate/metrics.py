@@ -253,7 +253,7 @@ def plane_table(
 
     `normal_error_deg` is the angle between the normals, whose sign does not matter; `offset_error` the
     distance of the true centre from the fitted plane over `extent`; `base_reflectance_error` an absolute
-    difference. Without a true pane of that label they are None, with a reason beside each.
+    difference. Without a true pane of that label they are None, with a reason next to each.
     Glass that may be tinted has its `transmittance` of red, green and blue.
     `normal_drift_deg` and `offset_drift` compare in the same way with the plane that the masks led to, where known.
 
@@ -318,8 +318,8 @@ REFLECTIVE = 0.5
 NO_DIRECTION_DEG = 90.0
 """The error of a vector without direction: what guessing comes to."""
 NO_NORMALS, NO_STRENGTH = "the method renders no normals", "the method renders no strength"
-NO_TRUE_NORMALS = "no true normals lie beside the photograph"
-NO_TRUE_STRENGTH = "no true strength lies beside the photograph"
+NO_TRUE_NORMALS = "no true normals lie next to the photograph"
+NO_TRUE_STRENGTH = "no true strength lies next to the photograph"
 UNCOVERED = f"fewer than {SMALLEST_REGION} pixels show a surface"
 UNREFLECTIVE = f"fewer than {SMALLEST_REGION} pixels reflect more than half"
 

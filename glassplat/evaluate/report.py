@@ -112,7 +112,7 @@ def comparison_sheet(
         truth: the true layers.
         surface: the true surface.
         title: set in large type; usually the view's name.
-        subtitle: set in small type beside it; usually the metrics.
+        subtitle: set in small type next to it; usually the metrics.
     """
     rows: list[Row] = [_image_row(frame, photo), *_layer_rows(frame, truth, surface or NOTHING_KNOWN)]
     return compose_sheet([row for row in rows if any(row)], title, subtitle)

@@ -1,6 +1,6 @@
 """Ground truth of synthetic captures: layers, panes, normals and reflectivity.
 
-Normals and reflectivity lie beside a test photograph:
+Normals and reflectivity lie next to a test photograph:
 
 ```
 r_0.png            the photograph
@@ -9,7 +9,7 @@ r_0_strength.png   grey of 8 or 16 bits: the share of mirror-like reflection
 ```
 
 Shiny Blender has the normals, this project's own captures have both; it could not be tried on Shiny Blender's own
-files. The lens must be a pinhole: what lies beside a photograph is reduced with it, but not undistorted.
+files. The lens must be a pinhole: what lies next to a photograph is reduced with it, but not undistorted.
 """
 
 from __future__ import annotations
@@ -193,7 +193,7 @@ NOTHING_KNOWN = TrueSurface(torch.zeros(0, 0, dtype=torch.bool), None, None)
 
 
 def true_surface(view: View) -> TrueSurface | None:
-    """The true surface of a view at its size, from the files beside its photograph; None where there are none.
+    """The true surface of a view at its size, from the files next to its photograph; None where there are none.
 
     Coverage is the alpha of the normals, else that of the photograph, else all that holds a normal.
 
@@ -214,7 +214,7 @@ def true_surface(view: View) -> TrueSurface | None:
 
 
 def _read_beside(view: View, mark: str) -> NDArray[np.float32] | None:
-    """[H, W, C] in [0, 1] of the file beside a photograph, None where there is none."""
+    """[H, W, C] in [0, 1] of the file next to a photograph, None where there is none."""
     path = view.image_path.with_name(f"{view.image_path.stem}{mark}.png")
     if not path.is_file():
         return None

@@ -70,7 +70,7 @@ class GlossyOptions:
         strength_weight: of the mean strength of all Gaussians in the objective, which the paper does not have: a matte
             thing would learn to reflect a little.
         consistency_weight: weight of the difference between normals and the slope of the depths, while normals spread.
-        monocular_weight: of the difference between normals and those that lie in `normals/` beside the photographs;
+        monocular_weight: of the difference between normals and those that lie in `normals/` next to the photographs;
             nothing where there are none (3DGS-DR: none; EnvGS: 0.01).
         propagation: how normals spread and colours are sabotaged.
         schedule: when they do.

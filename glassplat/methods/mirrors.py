@@ -194,7 +194,7 @@ def seen_normals(scene: Scene, views: Sequence[View], estimated: bool = False) -
     Args:
         scene: with primary Gaussians.
         views: those that are looked at.
-        estimated: take normals that were estimated from a photograph where they lie beside it; all others are those of
+        estimated: take normals that were estimated from a photograph where they lie next to it; all others are those of
             the depth maps.
     """
     normals = torch.zeros_like(scene.primary.means)

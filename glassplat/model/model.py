@@ -306,7 +306,7 @@ class Model:
         """Writes the model; `glassplat.load` reads what it wrote, but for .html, which is for browsers.
 
         Args:
-            path: .ply, .spz or .glb for other programs, with the panes beside it as `planes.json` and `glass.ply`, and
+            path: .ply, .spz or .glb for other programs, with the panes next to it as `planes.json` and `glass.ply`, and
                 the cameras as `cameras.json`, and an environment as `environment.png` and `.json`; .html for
                 a page that shows it with live panes; without a suffix a folder whose tensors are loaded bit for bit,
                 like a run's.
@@ -316,7 +316,7 @@ class Model:
             The path.
 
         Raises:
-            FileExistsError: something is there, also beside it; nothing was written.
+            FileExistsError: something is there, also next to it; nothing was written.
             InputError: the format is not known, or cannot hold this model.
         """
         return save_model(self, Path(path), overwrite=overwrite)
@@ -499,12 +499,12 @@ class ImportedScene(NamedTuple):
 
 
 def imported_scene(file: Path, planes_file: Path | None = None, up: Up = "-y") -> ImportedScene:
-    """Reads a splat file, and beside it planes.json, glass.ply and cameras.json, as `export` writes them.
+    """Reads a splat file, and next to it planes.json, glass.ply and cameras.json, as `export` writes them.
 
     Args:
         file: the splats.
-        planes_file: the panes, in place of those beside the file; glass is then spread evenly over each. The one
-            beside the file is no other.
+        planes_file: the panes, in place of those next to the file; glass is then spread evenly over each. The one
+            next to the file is no other.
         up: which way is up, for cameras that nobody gives.
 
     Raises:
@@ -539,7 +539,7 @@ def _planes(file: Path, planes_file: Path | None) -> Planes:
 
 
 def _glass(file: Path, planes: Planes, *, own: bool) -> Gaussians:
-    """The glass that lies beside the file, or else an even sheet on each pane."""
+    """The glass that lies next to the file, or else an even sheet on each pane."""
     beside = file.with_name("glass.ply")
     if not len(planes) or not own or not beside.is_file():
         return glass_gaussians(planes, opacity=OPAQUE_SHEET)
@@ -564,15 +564,15 @@ def load(
 ) -> Model:
     """Opens a trained run, a model that was saved as one, or a splat file of any program.
 
-    Beside a splat file, `planes.json`, `glass.ply` and `cameras.json` are read if they are there, as `Model.save` and
+    Next to a splat file, `planes.json`, `glass.ply` and `cameras.json` are read if they are there, as `Model.save` and
     `glassplat export` write them.
 
     Args:
         path: a run's directory, a folder of `Model.save` or `glassplat export`, or a .ply, .spz, .glb, .splat, .sog or
                 .ksplat.
         device: where the scene's tensors go; `auto` takes an NVIDIA GPU where one can be used.
-        planes: panes of a splat file, a planes.json written by hand or by `export`; the one beside it if not given.
-        up: which way is up in a splat file, for the cameras that look at it, if no cameras.json is beside it.
+        planes: panes of a splat file, a planes.json written by hand or by `export`; the one next to it if not given.
+        up: which way is up in a splat file, for the cameras that look at it, if no cameras.json is next to it.
 
     Raises:
         CudaUnavailableError: the GPU was asked for and cannot be used.

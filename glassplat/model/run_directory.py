@@ -111,9 +111,9 @@ FILES = (
     "uses.png",
     "index.html",
 )
-"""What a run writes beside its checkpoint, scene and metrics."""
+"""What a run writes next to its checkpoint, scene and metrics."""
 NUMBERED = re.compile(r"iteration_([0-9]{1,18})")
-"""The folder of a scene; people keep copies under other names beside it."""
+"""The folder of a scene; people keep copies under other names next to it."""
 
 
 @dataclass(frozen=True)

@@ -117,7 +117,7 @@ class Run:
 
         Args:
             recipe: how to train.
-            settings: what was asked for beside it.
+            settings: the other settings.
             directory: where everything goes.
             dataset: photographs to fit.
             resume: go on from the checkpoint in `directory`.

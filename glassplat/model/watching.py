@@ -93,7 +93,7 @@ PAUSE_SECONDS = 0.2
 
 
 class WatchedTraining:
-    """A viewer beside a training, which draws between its steps.
+    """A viewer next to a training, which draws between its steps.
 
     The thread that trains draws, so that no kernel is entered twice and every picture is of a finished step. Drawing
     takes at most 15 % of the time while a browser is connected, and none while there is none.

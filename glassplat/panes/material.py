@@ -232,7 +232,7 @@ def aligned_pane(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> 
 def polished_pane(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> Scene:
     """The scene with its only pane where photographs agree best nearby: ever smaller steps along one axis at a time.
 
-    Gradient ascent, one photograph a step, leaves a mirror up to 2 % of the extent beside that place, and training
+    Gradient ascent, one photograph a step, leaves a mirror up to 2 % of the extent away from that place, and training
     brings back only a part of it.
     """
     some = telling[:: max(1, len(telling) // POLISH_PHOTOGRAPHS)]
@@ -488,7 +488,7 @@ LEAST_BRIGHT = 0.8
 IMAGE_BRIGHTNESS = 0.5
 """Of the darkest channel of a lamp's image, sRGB: what is darker a pane mirrors of white things."""
 LAMP_RIM = 0.012
-"""How far beside where it should be an image is looked for, as a share of the image width."""
+"""How far from where it should be an image is looked for, as a share of the image width."""
 FEWEST_SEEN = 0.3
 """Pixels, of all photographs together, below which nothing is told."""
 

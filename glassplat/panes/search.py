@@ -287,7 +287,7 @@ def _has_possible_frames(planes: FramedPlanes, objective: Evidence) -> NDArray[n
 
 
 def _best_planes(planes: FramedPlanes, objective: Evidence, *, least: int = 0) -> FramedPlanes:
-    """The first so many planes, and all others that the masks do not rule out beside the best.
+    """The first so many planes, and all others that the masks do not rule out besides the best.
 
     Where other panes or posts hide much of a pane, edges that meet by chance may outdo its own.
     """

@@ -40,7 +40,7 @@ class Workplace:
 
     @property
     def folder(self) -> Path:
-        """Beside the output, so that the finished capture is moved in one step."""
+        """Next to the output, so that the finished capture is moved in one step."""
         return self.output.with_name(f"{self.output.name}.partial")
 
     @property
@@ -354,7 +354,7 @@ def check_places(task: Preparation) -> None:
         raise InputError(f"{task.source} is a file; expected a folder of photographs, or a video ({known})")
     if output == source or source in output.parents:
         raise InputError(
-            f"the output {task.output} lies inside of the photographs' folder {task.source}; choose a folder beside it"
+            f"the output {task.output} lies inside of the photographs' folder {task.source}; choose a folder next to it"
         )
 
 

@@ -185,7 +185,7 @@ class Sharing(NamedTuple):
 
     Attributes:
         credit: who made the scene, and its licence; plain text.
-        url: the page's address; a picture beside it, `PREVIEW`, shows up in previews of links. None without them.
+        url: the page's address; a picture next to it, `PREVIEW`, shows up in previews of links. None without them.
     """
 
     credit: str = ""

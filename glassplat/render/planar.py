@@ -55,7 +55,7 @@ from glassplat.scene.scene import Scene
 DEPTH_CHANNEL = 3
 """Of the first pass, after the colours."""
 PHOTOGRAPHED = "photographed"
-"""The layer that shows the photographer in the panes, beside an image without."""
+"""The layer that shows the photographer in the panes, next to an image without."""
 Shown = Literal["absent", "present", "beside"]
 """Whether panes show who took a photograph."""
 

@@ -260,7 +260,7 @@ class NumpyCamera:
         return np.asarray(world / np.linalg.norm(world, axis=-1, keepdims=True))
 
     def holds(self, points: Array, margin: float = 0.0) -> NDArray[np.bool_]:
-        """[...] which world points lie in the image, or up to `margin` of its sides beside it."""
+        """[...] which world points lie in the image, or up to `margin` of its sides outside it."""
         in_camera = self.in_camera(points)
         pixels = self.pixels(in_camera)
         room = margin * self.size

@@ -269,7 +269,7 @@ def crosses_pane(points: Tensor, planes: Planes, camera_center: Tensor) -> Tenso
 
 
 def nearest_pixels(positions: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Row and column [N] of the pixels that are nearest to positions [N, 2] in an image or beside it."""
+    """Row and column [N] of the pixels that are nearest to positions [N, 2] in an image or outside it."""
     column, row = positions.nan_to_num().unbind(dim=1)
     return row.clamp(0, camera.height - 1).long(), column.clamp(0, camera.width - 1).long()
 

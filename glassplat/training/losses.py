@@ -297,11 +297,11 @@ class MonocularNormals:
     _lacking: set[str] = field(default_factory=set, init=False, repr=False, compare=False)
 
     def __call__(self, frame: Frame, view: View, scene: Scene) -> Tensor | None:
-        """The loss of a view; None where no normals lie beside its photograph."""
+        """The loss of a view; None where no normals lie next to its photograph."""
         normals = view.normals
         if normals is None:
             if view.name not in self._lacking and (view.image_path.parent.parent / FOLDER).is_dir():
-                log.warning("no normals for %s in the folder %r beside it: it is learned without", view.name, FOLDER)
+                log.warning("no normals for %s in the folder %r next to it: it is learned without", view.name, FOLDER)
             self._lacking.add(view.name)
             return None
         estimated = in_world(to_device(normals, frame.rgb.device).to(frame.rgb), view.camera)

@@ -281,7 +281,7 @@ class MirrorSearch:
         strength: reflection strength of what was found.
         least_opacity: opacities of what was found are raised to this.
         flatness: of what was found, the shortest axis as a share of the middle one, at most.
-        estimated_normals: turn what was found as the normals say that lie in `normals/` beside the photographs, and
+        estimated_normals: turn what was found as the normals say that lie in `normals/` next to the photographs, and
             only where there are none as the depths say.
     """
 

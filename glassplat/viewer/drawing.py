@@ -173,7 +173,7 @@ def error_drawn(
 ) -> NDArray[np.uint8]:
     """Error of the edited scene against a photograph, from its camera: [H, W, 3], W by the wish's aspect.
 
-    The photograph fills the height, is black beside its edges and cut off where the picture is narrower. Both are
+    The photograph fills the height, is black beyond its edges and cut off where the picture is narrower. Both are
     compared pixel by pixel, so that the picture has no more rows than the photograph.
 
     Args:

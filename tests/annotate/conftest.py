@@ -69,7 +69,7 @@ def room(tmp_path: Path) -> Path:
 
 @contextmanager
 def serving(root: Path) -> Iterator[AnnotationServer]:
-    """A server that runs beside the test."""
+    """A server that runs next to the test."""
     with AnnotationServer(opened_session(root), 0) as server:
         thread = Thread(target=server.serve_forever, args=(0.02,))
         thread.start()

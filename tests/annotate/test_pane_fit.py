@@ -127,7 +127,7 @@ def test_two_edges_give_the_plane_and_as_much_of_the_pane_as_was_marked() -> Non
 
 
 def test_where_a_long_front_ends_may_be_marked_in_one_photograph_only() -> None:
-    """As on a walk along a facade: no photograph beside the one that shows its near end does so too."""
+    """As on a walk along a facade: no photograph next to the one that shows its near end does so too."""
     front = Pane(np.array([0.0, 0, 0]), np.array([0.0, 0, 1.0]), np.array([1.0, 0, 0]), (7.0, 1.7))
     walk = {-1.5: -5.5, -2.5: -6.5, -4.0: -7.0, 1.5: -4.0, 5.5: 2.5}
     cameras = [

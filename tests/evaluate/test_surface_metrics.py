@@ -14,7 +14,7 @@ COVERED[2:18, 5:25] = True
 STRENGTH = torch.where(torch.arange(WIDTH) < 15, 0.9, 0.2).expand(HEIGHT, WIDTH)
 TRUTH = TrueSurface(COVERED, NORMALS * COVERED[..., None], STRENGTH)
 PHOTO = torch.full((HEIGHT, WIDTH, 3), 255, dtype=torch.uint8)
-NOT_BESIDE = "no true strength lies beside the photograph"
+NOT_BESIDE = "no true strength lies next to the photograph"
 
 
 def frame(**layers: torch.Tensor) -> Frame:
@@ -69,7 +69,7 @@ def test_what_is_missing_is_the_reason() -> None:
         "reflective_normal_error_deg": "the method renders no normals",
         "strength_error": "the method renders no strength",
     }
-    unknown = "no true normals lie beside the photograph"
+    unknown = "no true normals lie next to the photograph"
     assert surface_metrics(both, PHOTO, None) == {
         "reflective_psnr": NOT_BESIDE,
         "normal_error_deg": unknown,

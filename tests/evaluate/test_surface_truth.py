@@ -1,4 +1,4 @@
-"""True normals and strength beside the photographs of a capture on disk."""
+"""True normals and strength next to the photographs of a capture on disk."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def surface_of(view: View) -> TrueSurface:
 
 
 def rewritten(view: View, mark: str, mode: str) -> None:
-    """The file beside the photograph in another mode."""
+    """The file next to the photograph in another mode."""
     Image.open(beside(view, mark)).convert(mode).save(beside(view, mark))
 
 

@@ -109,7 +109,7 @@ def test_the_process_that_compiles_runs_the_same_kernels_as_the_next_one(tmp_pat
     # This loss is where the body of a parallel loop differed in its last bits from the same body within its kernel.
     script = tmp_path / "gradient.py"
     script.write_text(GRADIENT)
-    # Only there, and not beside the sources, where the kernels may lie ready.
+    # Only there, and not next to the sources, where the kernels may lie ready.
     fresh = {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator"}
     first, second = (printed_by(script, **fresh)[-1] for _ in range(2))
     assert first == second

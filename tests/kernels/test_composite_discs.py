@@ -50,7 +50,7 @@ class Case(NamedTuple):
 def scattered(
     count: int, *, size: float = -1.5, opacity: float = 0.0, dtype: torch.dtype = torch.float64
 ) -> RawGaussians:
-    """Discs before a camera at the origin, at all angles to it, some across the near plane or beside the image."""
+    """Discs before a camera at the origin, at all angles to it, some across the near plane or outside the image."""
     tensors = (
         torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64) + draw(count, 3, seed=1) * torch.tensor([1.2, 1.0, 1.0]),
         draw(count, 4, seed=2),
@@ -89,7 +89,7 @@ def with_gradients(case: Case, function: Callable[..., BlendedDiscs]) -> dict[st
     inputs = [tensor.detach().clone().requires_grad_() for tensor in case.inputs()]
     outputs = case.with_inputs(*inputs)(function)
     cotangents = [draw(*o.shape, seed=20 + i).to(o) for i, o in enumerate(outputs)]
-    # Distances of inverse depths are small: so that a mistake in them shows beside the rest.
+    # Distances of inverse depths are small: so that a mistake in them shows among the rest.
     cotangents[4] = 100 * cotangents[4]
     # The twin does not touch inputs that reach no pixel; the added zero gives them a gradient of zero.
     total = sum((o * c).sum() for o, c in zip(outputs, cotangents, strict=True)) + 0 * sum(i.sum() for i in inputs)

@@ -173,7 +173,7 @@ CULLED = {
     "of no size": {"log_scales": [-800.0, -1.0]},
     "of no orientation": {"quats": [0.0, 0.0, 0.0, 0.0]},
     "too faint": {"logit_opacities": -6.0},
-    "beside the image": {"means": [9.0, 0.0, 2.0]},
+    "outside the image": {"means": [9.0, 0.0, 2.0]},
 }
 
 

@@ -164,7 +164,7 @@ def test_nothing_is_turned_round_where_views_find_no_surface_in_its_place(monkey
     planes = replace(glass.planes, centers=torch.tensor([[0.0, 0, 2]]), raw_normals=torch.tensor([[0.0, 0, -1]]))
     places = (camera_at(x, 0, -0.3) for x in (-0.2, 0.2))
     cameras = [replace(camera, cam_from_world=camera.cam_from_world.float()) for camera in places]
-    # The far one's image lies behind the cameras, that of the other behind a thing that stands beside the pane.
+    # The far one's image lies behind the cameras, that of the other behind a thing that stands next to the pane.
     far, other, thing = (torch.tensor([place]) for place in ((0.05, 0.0, 6.0), (0.7, 0.0, 3.3), (0.45, 0.0, 0.2)))
 
     def found(*parts: Gaussians) -> list[int]:

@@ -1,4 +1,4 @@
-"""What was made in the viewer is written beside the run, under names of which none is taken."""
+"""What was made in the viewer is written next to the run, under names of which none is taken."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ def frame_and_clutter(panes: Sequence[Pane], *, noise: float = 0.01, frame: int 
 
 
 def ragged(labels: torch.Tensor, *, amplitude: float, seed: int) -> torch.Tensor:
-    """A mask whose edge wanders by some pixels, with holes in it and specks beside it."""
+    """A mask whose edge wanders by some pixels, with holes in it and specks next to it."""
     rng = np.random.default_rng(seed)
     mask = labels.numpy() == 1
     waves = ndimage.gaussian_filter(rng.standard_normal(mask.shape), 2)

@@ -72,7 +72,7 @@ def test_every_layer_is_what_the_renderer_shows(opened: Browser, layer: str) -> 
 
 @needs_browser
 def test_what_is_beside_the_picture_is_left_out_unseen(opened: Browser) -> None:
-    """From close by, through a long lens that looks past the middle, most of the scene is beside the picture."""
+    """From close by, through a long lens that looks past the middle, most of the scene is outside the picture."""
     for _, camera in CAMERAS[:2]:
         near = replace(camera, fx=4 * camera.fx, fy=4 * camera.fy, cx=1.5 * camera.cx, cy=0.5 * camera.cy)
         assert likeness(opened, true_scene(), Planar(), near) > 36

@@ -1,4 +1,4 @@
-"""Exposures are learned beside the scene, stored with it, and taken up again."""
+"""Exposures are learned with the scene, stored with it, and taken up again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cameras are corrected beside the scene, stored with it, and taken up again; test cameras follow their photographs."""
+"""Cameras are corrected with the scene, stored with it, and taken up again; test cameras follow their photographs."""
 
 from __future__ import annotations
 

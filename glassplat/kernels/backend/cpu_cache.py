@@ -68,7 +68,7 @@ class TemporaryFolder(caching.InTreeCacheLocator):
 
 
 class Nowhere(caching.InTreeCacheLocator):
-    """The folder beside the source when none can be written: kernels are read from it, and saving fails."""
+    """The folder next to the source when none can be written: kernels are read from it, and saving fails."""
 
     def ensure_cache_path(self) -> None:
         """Leaves everything as it is; whether something can be saved shows when it is."""

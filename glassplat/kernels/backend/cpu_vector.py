@@ -16,7 +16,7 @@ arithmetic may be a scalar of the same element type and of no other: a bare lite
 compile. Sums and products may be fused, as everywhere in kernels. A comparison with NaN is false.
 
 A row of four pixels with four channels is a vector of 16 lanes; with three channels it is 12 numbers, in vectors of 8
-and 4 lanes. What belongs to one thing lies beside each other in memory, the three coordinates of a place or its many
+and 4 lanes. What belongs to one thing lies next to each other in memory, the three coordinates of a place or its many
 coefficients; a vector holds one of these of several things.
 """
 

@@ -182,7 +182,7 @@ def fold_faces(real: type) -> Kernel:
 
     @inlined
     def cell(sums, face, row, column, d):
-        """The gradient of a padded texel, from the lookups that begin in it, beside it, above it and above beside."""
+        """The gradient of a padded texel, from the lookups that begin in it, next to it, above it and above beside."""
         depth = sums.shape[3] // 4
         found = sums[face, row, column, d]
         if column > 0:

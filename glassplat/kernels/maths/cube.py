@@ -185,11 +185,11 @@ def mirrored_gradient(ray, normal, g):  # type: ignore[no-untyped-def]
 
 @inlined
 def over_column(face, side, row, size):  # type: ignore[no-untyped-def]
-    """(face, row, column) of the texel beside `row`: beyond the last column for side 0, before the first for side 1."""
+    """(face, row, column) of the texel next to `row`: after the last column for side 0, before the first for side 1."""
     return 2 * ((face // 2 + 1) % 3) + side, (1 - face % 2) * (size - 1), row
 
 
 @inlined
 def over_row(face, side, column, size):  # type: ignore[no-untyped-def]
-    """The same beside `column`, beyond the last or before the first row."""
+    """The same next to `column`, beyond the last or before the first row."""
     return 2 * ((face // 2 + 2) % 3) + side, column, (1 - face % 2) * (size - 1)

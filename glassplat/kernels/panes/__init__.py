@@ -175,7 +175,7 @@ def inside_panes(pane: Tensor, strength: Tensor) -> Tensor:
     along, above = shown[:, 1:] == shown[:, :-1], shown[1:] == shown[:-1]
     inside[:, 1:] &= along
     inside[:, :-1] &= along
-    # Two rows of which each pixel shows what those beside it and the one above it show.
+    # Two rows of which each pixel shows what those next to it and the one above it show.
     pairs = (inside[1:] & inside[:-1]).logical_and_(above)
     inside[1:] &= pairs
     inside[:-1] &= pairs

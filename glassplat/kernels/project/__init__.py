@@ -197,7 +197,7 @@ def project_discs(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: i
 
     A disc is culled in a camera when the depth of its centre is at most `near`, its centre is not on the kept side of
     the camera's clip plane, it is seen from its edge (the cosine between its normal and the ray to its centre is at
-    most 1e-3), its outline lies beside the camera's window, its opacity is at most 1/255, it has no size (a log scale
+    most 1e-3), its outline lies outside the camera's window, its opacity is at most 1/255, it has no size (a log scale
     beyond -40 or 40), or a parameter or its map is not finite. Then its radii and all its other values are zero and it
     gets no gradient from that camera. A disc that reaches through the near plane is kept where what lies behind
     that plane may be seen: then its outline is the whole image, and `composite_discs` leaves out what lies before it.

@@ -366,7 +366,7 @@ def test_photometric(dtype: torch.dtype, differentiated: bool) -> None:
 
 
 def directions_of(count: int) -> Tensor:
-    """Random directions, then those of all edges, corners and faces of a cube, and a little beside each."""
+    """Random directions, then those of all edges, corners and faces of a cube, and a little next to each."""
     whole = torch.cartesian_prod(*3 * [torch.tensor([-1.0, 0.0, 1.0])])
     whole = whole[whole.abs().sum(1) > 0]
     return torch.cat([draw(count, 3, seed=6).float(), whole + 0.01 * draw(len(whole), 3, seed=7).float()])
