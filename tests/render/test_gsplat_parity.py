@@ -1,4 +1,4 @@
-"""`rasterization` compared with the plain PyTorch functions that gsplat tests its own kernels with, forward and backward."""
+"""`rasterization` compared with the PyTorch functions that gsplat tests its own kernels with, forward and backward."""
 
 from __future__ import annotations
 
