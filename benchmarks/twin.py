@@ -1,4 +1,4 @@
-"""`python -m benchmarks.twin`: the kernels that blend, compared with C++ loops that are compiled here and now; one thread.
+"""`python -m benchmarks.twin`: the kernels that blend, compared with C++ loops compiled here and now; one thread.
 
 The anchor for what Numba makes of its vectors: same algorithm, same tensors, in turn, in one run.
 """
