@@ -90,7 +90,7 @@ SURFACE_METRICS = {
 """Shown where they are known: only synthetic captures of objects have the truth they need."""
 FACTS = {
     "num_gaussians": Metric("Gaussians", "{:,}", "how many the scene has"),
-    "train_seconds": Metric("training", "{:.0f} s", "time that training took"),
+    "train_seconds": Metric("training", "{:.0f} s", "time that training took, without compiling kernels"),
     "seconds_per_frame": Metric("per frame", "{:.3f} s", "time for one test image, median"),
     "reflection_gain": Metric(
         "reflection gain",

@@ -21,7 +21,7 @@ from glassplat import __version__
 from glassplat.captures.dataset import Dataset, photographs_read, with_corrected_cameras
 from glassplat.errors import InputError, RankLostError, first_names
 from glassplat.files.writing import make_folder
-from glassplat.kernels.backend.devices import DeviceName, chosen_device
+from glassplat.kernels.backend.devices import DeviceName, chosen_device, compile_seconds
 from glassplat.methods.recipe import RECIPES, Recipe, recipe_to_json, resolve_background
 from glassplat.model import run_directory
 from glassplat.model.model import Model
@@ -309,6 +309,7 @@ class TrainingSession:
     def __init__(self, state: TrainState, ranks: Ranks, record: Record | None = None) -> None:
         self._state, self._ranks, self._record = state, ranks, record
         self._seconds_before, self._started = state.seconds, time.perf_counter()
+        self._compiled_before = compile_seconds()
         self._saved = self._started
         self._stepped: float | None = None  # The first step may compile kernels, and says nothing of the next.
         self._longest = self._writing = 0.0
@@ -385,7 +386,8 @@ class TrainingSession:
     def save(self) -> None:
         """Writes a checkpoint, if this process is to; the state must not be in the middle of a change."""
         self._saved = time.perf_counter()  # Before it is written: what is trained from now on is not in it.
-        self._state.seconds = self._seconds_before + self._saved - self._started
+        compiling = compile_seconds() - self._compiled_before
+        self._state.seconds = self._seconds_before + self._saved - self._started - compiling
         if self._record is not None:
             save_checkpoint(self._record.checkpoint, self._state)
         self._writing = time.perf_counter() - self._saved
@@ -511,7 +513,7 @@ class Training:
 
     @property
     def seconds(self) -> float:
-        """Time spent training, over all sessions, up to the last checkpoint."""
+        """Time spent training, over all sessions, up to the last checkpoint; without compiling kernels."""
         return self.state.seconds
 
     @property

@@ -129,7 +129,7 @@ class TrainState:
         step: iterations done.
         optimizer: Adam's moments.
         statistics: screen gradients collected for densification, by scene part.
-        seconds: time spent training so far, over all sessions.
+        seconds: time spent training so far, over all sessions; without compiling kernels.
         records: numbers that an action keeps from one turn to the next, and which setup was carried out last, by name.
         means: running means of the parameters over the last steps of the run, see `AverageLast`.
         method: the name of what is trained, so that a checkpoint tells whose it is; None where nobody said.

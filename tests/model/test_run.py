@@ -177,6 +177,18 @@ def test_never_are_more_than_two_minutes_lost(monkeypatch: pytest.MonkeyPatch) -
     assert len(kept) > 10
 
 
+def test_the_time_of_a_run_is_without_that_of_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The compiler runs once on a machine: with it, a first run would look slower than those after it."""
+    now, compiling = 10.0, 3.0
+    monkeypatch.setattr(training, "time", SimpleNamespace(perf_counter=lambda: now))
+    monkeypatch.setattr(training, "compile_seconds", lambda: compiling)
+    state = TrainState(true_scene(), 0, seconds=100.0)
+    session = TrainingSession(state, Ranks())
+    now, compiling = 30.0, 10.0
+    session.save()
+    assert state.seconds == 100 + 20 - 7
+
+
 def test_a_run_says_from_where_it_goes_on(tmp_path: Path) -> None:
     heard: list[Message] = []
     with pytest.raises(KeyboardInterrupt):

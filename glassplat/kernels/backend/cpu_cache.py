@@ -14,7 +14,6 @@ import os
 import pickle
 import stat
 import tempfile
-import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from pathlib import Path
@@ -28,6 +27,8 @@ from numba.core import caching, types
 from numba.core.cpu import CPUContext
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic
+
+from glassplat.kernels.backend.devices import announced_compilation
 
 log = logging.getLogger("glassplat.kernels")
 
@@ -131,8 +132,6 @@ def _user() -> int | None:
     """The user's number; None where users have none."""
     return os.getuid() if hasattr(os, "getuid") else None
 
-
-log = logging.getLogger("glassplat.kernels")
 
 PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
 NAMED = (ModuleType, type, BuiltinFunctionType, np.ufunc)
@@ -290,13 +289,11 @@ class KernelCache(caching.FunctionCache):
 
     def _compile(self, sig: Any) -> Any:
         """Compiles the kernel and keeps it; goes on without when the disk refuses."""
-        log.info("compiling %s for this machine (first use only, then cached on disk) ...", self._name_shown)
-        started = time.perf_counter()
-        dispatcher = self._compiled(self._function)
-        dispatcher.compile(sig)
+        with announced_compilation(self._name_shown, "this machine"):
+            dispatcher = self._compiled(self._function)
+            dispatcher.compile(sig)
         (made,) = dispatcher.overloads.values()
         self.compilations += 1
-        log.info("compiled %s in %.1f s", self._name_shown, time.perf_counter() - started)
         self._keep(sig, made)
         return made
 

@@ -13,7 +13,6 @@ import math
 import re
 import struct
 import threading
-import time
 from collections.abc import Callable
 from functools import cache, lru_cache
 from importlib.metadata import PackageNotFoundError, version
@@ -28,7 +27,7 @@ from numba import config, cuda, types
 from torch import Tensor
 
 from glassplat.kernels.backend.cpu_cache import KernelFiles, fingerprint, keep_data, kept_data
-from glassplat.kernels.backend.devices import SIMULATED
+from glassplat.kernels.backend.devices import SIMULATED, announced_compilation
 
 ENTRY = re.compile(r"\.entry\s+([\w$]+)\s*\(")
 COMPILERS = (
@@ -116,10 +115,8 @@ class ImageCache:
         # Another process may have written its own kernel under the same name at the same time.
         if found is not None and found[:2] == (key, hashlib.sha256(found[3]).digest()):
             return MachineCode(*found[2:])
-        log.info("compiling %s for this GPU (first use only, then cached on disk) ...", self.name)
-        started = time.perf_counter()
-        made = compile_kernel(self._function, self._signature, capability)
-        log.info("compiled %s in %.1f s", self.name, time.perf_counter() - started)
+        with announced_compilation(self.name, "this GPU"):
+            made = compile_kernel(self._function, self._signature, capability)
         try:
             folders.locator.ensure_cache_path()
             keep_data(files[0], key, (key, hashlib.sha256(made.cubin).digest(), *made))

@@ -7,7 +7,10 @@ import importlib
 import importlib.util
 import logging
 import os
+import time
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -20,6 +23,25 @@ COMPILER_LIBRARIES = ("nvvm", "nvrtc")
 
 EXTRAS = {12: "glassplat[cuda12]", 13: "glassplat[cuda]"}
 """What to install for each major version of CUDA."""
+
+
+log = logging.getLogger("glassplat.kernels")
+_compile_times: list[float] = []
+
+
+def compile_seconds() -> float:
+    """Seconds that this process has spent compiling kernels, which no later one will."""
+    return sum(_compile_times)
+
+
+@contextmanager
+def announced_compilation(name: str, where: str) -> Iterator[None]:
+    """Says that a kernel is being compiled, and how long it took."""
+    log.info("compiling %s for %s (first use only, then cached on disk) ...", name, where)
+    started = time.perf_counter()
+    yield
+    _compile_times.append(time.perf_counter() - started)
+    log.info("compiled %s in %.1f s", name, _compile_times[-1])
 
 
 def has_numba_cuda() -> bool:
@@ -84,8 +106,6 @@ def _other_compiler(major: int) -> str:
         return "take a machine with a newer one"
     return f"run `pip install '{EXTRAS[major]}'` in a fresh environment with a PyTorch of CUDA {major}"
 
-
-log = logging.getLogger("glassplat.kernels")
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 
