@@ -180,7 +180,7 @@ class PaneFit:
         shape: the outline in the world.
         error: root mean square distance of marks from it, in pixels.
         errors: the largest distance of a mark in each view, in pixels.
-        information: [F, F] of the parameters of the shape, those of `stepped`: inverse of their covariance.
+        information: [F, F] of the parameters of the shape, those of `apply_step`: inverse of their covariance.
     """
 
     shape: PaneShape

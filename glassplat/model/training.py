@@ -126,7 +126,7 @@ class Run:
 
         Raises:
             InputError: the directory is not fit for it (`check_output`), the run is too short for its stages, or as
-                `settled` does.
+                `resolve_background` does.
         """
         self.recipe = resolve_background(recipe, dataset)
         self._stages = self.recipe.stages(settings.seed, settings.iterations)

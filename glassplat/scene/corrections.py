@@ -124,7 +124,7 @@ class Exposures(ByPhotograph):
         return image @ (torch.eye(3, dtype=image.dtype, device=image.device) + own[:, :3].T) + own[:, 3]
 
     def undone(self, photo: Tensor, name: str) -> Tensor:
-        """A photograph [..., 3] in the colours of the scene: what `applied` would have made the photograph."""
+        """A photograph [..., 3] in the colours of the scene: what `apply` would have made the photograph."""
         own = self.of(name)
         if own is None:
             return photo

@@ -356,12 +356,9 @@ class ScreenStatistics:
         weights, products = met.unbind(dim=1)
         norms = means_gradient.norm(dim=-1)
         equivalents = 0.5 * torch.where(weights > 0, products / weights, 0) * norms
-        for total, added in (
-            (self.gradient_sum, equivalents),
-            (self.absgrad_sum, equivalents),
-            (self.view_count, norms > 0),
-        ):
-            total += added
+        self.gradient_sum.add_(equivalents)
+        self.absgrad_sum.add_(equivalents)
+        self.view_count.add_(norms > 0)
 
     @property
     def sums(self) -> tuple[Tensor, Tensor, Tensor]:

@@ -25,18 +25,18 @@ def adam(flat: Sequence[Update], betas: tuple[float, float], eps: float) -> None
     """Takes the updates, whose tensors are flat."""
     real = REAL_OF[flat[0].parameter.dtype]
     table, step_sizes, roots = [], [], []
-    decays_of: list[float] = []
+    weight_decays: list[float] = []
     for update in flat:
         step_correction, root = update.corrections(betas)
         columns = 1 if update.decay is None else len(update.decay)
         rates = update.lr.tolist() if isinstance(update.lr, Tensor) else [update.lr] * columns
         table.append([*(tensor.data_ptr() for tensor in update[:4]), update.parameter.numel(), len(rates)])
         step_sizes += [rate * step_correction for rate in rates]
-        decays_of += [0.0] * len(rates) if update.decay is None else update.decay.tolist()
+        weight_decays += [0.0] * len(rates) if update.decay is None else update.decay.tolist()
         roots.append(root)
     # 1 - 0.999 loses half of its digits in single precision, so the gains are rounded from the double.
     decays, gains = tuple(real(b) for b in betas), tuple(real(1 - b) for b in betas)
-    columns_of = np.array([step_sizes, decays_of]).astype(real)
+    columns_of = np.array([step_sizes, weight_decays]).astype(real)
     adam_step(real)(np.array(table), columns_of, np.array(roots, real), decays, gains, real(eps))
 
 
