@@ -189,7 +189,7 @@ class Surface:
         alpha: [H, W] coverage.
         background: colour behind everything, sRGB.
         direct: [N] bool, which Gaussians reach a pixel.
-        screen: the record of the pass, if it was with_absgrad.
+        screen: the record of the pass, if asked for `with_absgrad`.
         extra: further layers, of discs those that say how thin the surface is.
     """
 

@@ -211,7 +211,7 @@ def screen_pass(part: str, projected: Projected | ProjectedDiscs, *, direct: boo
 
 
 def joined_absgrad(screen: Sequence[ScreenPass]) -> Tensor | None:
-    """The absgrad [C, G, 2] that `composite` wants for the parts in this order; None where nothing is with_absgrad."""
+    """The `absgrad` [C, G, 2] that `composite` wants for the parts in this order; None without records."""
     absgrads = [record.absgrad for record in screen]
     return torch.cat(absgrads, dim=1) if len(absgrads) > 1 else next(iter(absgrads), None)
 

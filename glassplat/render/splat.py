@@ -63,7 +63,7 @@ def blended_discs(
         channels: values to blend.
         camera: image size.
         near: as for `projected_discs`.
-        screen: the record whose absgrad to feed, if any.
+        screen: the record whose `absgrad` gets its gradient, if any.
     """
     discs = Discs(projected.means2d, projected.maps, projected.opacities, projected.depths, projected.outlines)
     bins = bin_tiles(projected.outlines, camera.width, camera.height)
