@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 
-# Numba reads this once, when it is imported. Two threads are enough to find a result that depends on their number.
+# Numba reads this once, when it is imported. Two threads are enough to find a result that depends on their number,
+# which tests/kernels/threads.py looks for. All other tests run on one: threads that wait for each other on cores that
+# are shared with other tests take ten times as long.
 os.environ.setdefault("NUMBA_NUM_THREADS", "2")
 
 # Before PyTorch, as the package asks: it says how threads wait.
@@ -36,13 +38,9 @@ def fixed_state() -> Iterator[None]:
     random.seed(0)
     np.random.seed(0)  # Third-party code may still draw from the global state.
     torch.manual_seed(0)
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        # The cores are shared with other tests; threads that wait for each other would only stand in their way.
-        torch.set_num_threads(1)
-    threads = torch.get_num_threads()
-    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    torch.set_num_threads(1)
+    numba.set_num_threads(1)
     yield
-    torch.set_num_threads(threads)
     torch.set_default_dtype(torch.float32)
 
 

@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numba
 import pytest
 import torch
 from torch import Tensor
@@ -13,6 +12,7 @@ from glassplat.kernels.composite import Composite, composite
 from glassplat.kernels.composite.reference import composite as composite_twin
 from glassplat.kernels.records import Deviation, Splats, TileBins
 from glassplat.kernels.tiles import bin_tiles
+from tests.kernels.threads import assert_threads_change_no_bit
 
 MakeSplats = Callable[..., Splats]
 INPUTS = ("means2d", "conics", "opacities", "channels", "marks", "absgrad")
@@ -303,10 +303,7 @@ def test_only_active_tiles_are_drawn(random_splats: MakeSplats) -> None:
 def test_the_number_of_threads_changes_no_bit(random_splats: MakeSplats) -> None:
     size = (100, 70)
     case = blend(random_splats((2, 300), size, dtype=torch.float32), size, channels=4, glass=50)
-    both = with_gradients(case, composite)
-    numba.set_num_threads(1)
-    one = with_gradients(case, composite)
-    assert all(torch.equal(one[name], both[name]) for name in both)
+    assert_threads_change_no_bit(lambda: with_gradients(case, composite).values())
 
 
 def test_glass_never_changes_the_image(random_splats: MakeSplats) -> None:

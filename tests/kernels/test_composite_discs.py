@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numba
 import pytest
 import torch
 from torch import Tensor
@@ -20,6 +19,7 @@ from glassplat.kernels.records import CameraBatch, Discs, ProjectedDiscs, RawGau
 from glassplat.kernels.tiles import bin_tiles
 from glassplat.kernels.trace import build_bvh, shapes_of, trace
 from tests.kernels.gaussians_and_cameras import draw
+from tests.kernels.threads import assert_threads_change_no_bit
 
 NEAR = 0.3
 INPUTS = ("means2d", "maps", "opacities", "depths", "channels", "absgrad")
@@ -281,10 +281,7 @@ def test_only_active_tiles_are_drawn() -> None:
 
 def test_the_number_of_threads_changes_no_bit() -> None:
     case = case_of(scattered(400, dtype=torch.float32), cameras_of(2, (100, 70), torch.float32))
-    both = with_gradients(case, composite_discs)
-    numba.set_num_threads(1)
-    one = with_gradients(case, composite_discs)
-    assert all(torch.equal(one[name], both[name]) for name in both)
+    assert_threads_change_no_bit(lambda: with_gradients(case, composite_discs).values())
 
 
 @pytest.mark.parametrize("field", ["means2d", "maps", "opacities", "depths"])

@@ -5,13 +5,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 
-import numba
 import pytest
 import torch
 from torch import Tensor
 
 from glassplat.kernels.environment import cube_lookup
 from glassplat.kernels.environment.reference import cube_lookup as twin
+from tests.kernels.threads import assert_threads_change_no_bit
 
 EDGES = [d for d in itertools.product((-1, 0, 1), repeat=3) if d.count(0) == 1]
 CORNERS = list(itertools.product((-1, 1), repeat=3))
@@ -130,10 +130,7 @@ def test_where_there_is_no_direction_the_result_is_nan_and_others_are_spared(bad
 
 def test_threads_do_not_change_a_bit() -> None:
     texels, directions = normal(6, 9, 9, 3, seed=19).float(), normal(5000, 3, seed=20).float()
-    many = with_gradients(cube_lookup, texels, directions)
-    numba.set_num_threads(1)
-    one = with_gradients(cube_lookup, texels, directions)
-    assert all(torch.equal(a, b) for a, b in zip(many, one, strict=True))
+    assert_threads_change_no_bit(lambda: with_gradients(cube_lookup, texels, directions))
 
 
 def test_bad_input_is_named() -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numba
 import pytest
 import torch
 from torch import Tensor
 
 from glassplat.kernels.gradient_conflict import gradient_conflict, sobel
 from glassplat.kernels.gradient_conflict import gradient_conflict_in_torch as twin
+from tests.kernels.threads import assert_threads_change_no_bit
 
 
 def pictures(height: int, width: int, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
@@ -94,10 +94,7 @@ def test_gradient_matches_finite_differences() -> None:
 
 def test_the_number_of_threads_changes_no_bit() -> None:
     images = (*pictures(80, 60, torch.float32), torch.full((80, 60), 0.1))
-    both = with_gradient(gradient_conflict, images, 7)
-    numba.set_num_threads(1)
-    one = with_gradient(gradient_conflict, images, 7)
-    assert torch.equal(both[0], one[0]) and torch.equal(both[1], one[1])
+    assert_threads_change_no_bit(lambda: with_gradient(gradient_conflict, images, 7))
 
 
 def test_images_without_inner_pixels_are_refused() -> None:

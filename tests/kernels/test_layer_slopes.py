@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numba
 import pytest
 import torch
 from torch import Tensor
@@ -10,6 +9,7 @@ from torch import Tensor
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 from glassplat.kernels.panes import layer_slopes, slopes_at
 from glassplat.kernels.panes.reference import layer_slopes as reference_layer_slopes
+from tests.kernels.threads import assert_threads_change_no_bit
 
 
 def grey_layers(height: int = 5, width: int = 7) -> tuple[Tensor, Tensor, Tensor]:
@@ -76,11 +76,8 @@ def test_what_is_left_out_may_be_anything() -> None:
 
 
 def test_the_number_of_threads_changes_no_bit() -> None:
-    layers, where, found = [layer.float() for layer in grey_layers(90, 70)], some_pixels(90, 70), []
-    for threads in (1, numba.config.NUMBA_NUM_THREADS):
-        numba.set_num_threads(threads)
-        found.append(torch.stack(layer_slopes(*layers, where, linear=True)))
-    assert torch.equal(*found)
+    layers, where = [layer.float() for layer in grey_layers(90, 70)], some_pixels(90, 70)
+    assert_threads_change_no_bit(lambda: layer_slopes(*layers, where, linear=True))
 
 
 @pytest.mark.parametrize(

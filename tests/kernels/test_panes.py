@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-import numba
 import pytest
 import torch
 from torch import Tensor
@@ -16,6 +15,7 @@ from glassplat.kernels.panes import blend_panes, pane_hits
 from glassplat.kernels.panes.reference import blend_panes as blend_twin
 from glassplat.kernels.panes.reference import pane_hits as hits_twin
 from glassplat.kernels.records import BlendedPanes, PaneHits, Panes
+from tests.kernels.threads import assert_threads_change_no_bit
 
 WIDTH, HEIGHT = 53, 37
 INPUTS = ("transmission", "mask", "reflections", "normals", "base_reflectances")
@@ -201,13 +201,7 @@ def test_the_sign_of_a_normal_does_not_matter() -> None:
 
 def test_threads_do_not_change_a_bit() -> None:
     case = blend_case(torch.float32)
-    many = with_gradients(case, blend_panes)
-    numba.set_num_threads(1)
-    try:
-        one = with_gradients(case, blend_panes)
-    finally:
-        numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
-    assert all(torch.equal(a, b) for a, b in zip(many, one, strict=True))
+    assert_threads_change_no_bit(lambda: with_gradients(case, blend_panes))
 
 
 def test_bad_input_is_named() -> None:

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numba
 import pytest
 import torch
 from torch import Tensor
@@ -10,6 +9,7 @@ from torch import Tensor
 from glassplat.kernels.photometric import Photometric, photometric
 from glassplat.kernels.photometric.cpu import COLUMNS, ROWS
 from glassplat.kernels.photometric.reference import photometric as photometric_twin
+from tests.kernels.threads import assert_threads_change_no_bit
 
 
 def pictures(height: int, width: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -62,14 +62,12 @@ def test_an_image_that_equals_the_photograph_is_perfect_and_nothing_pulls() -> N
 
 def test_the_number_of_threads_changes_no_bit() -> None:
     image, target = pictures(2 * ROWS + 9, 200, torch.float32)
-    (both, *both_gradients), threads = with_gradients(photometric, image, target), numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        one, *one_gradients = with_gradients(photometric, image, target)
-    finally:
-        numba.set_num_threads(threads)
-    for first, second in zip((*both, *both_gradients), (*one, *one_gradients), strict=True):
-        assert torch.equal(first, second)
+
+    def everything() -> list[torch.Tensor]:
+        losses, *found = with_gradients(photometric, image, target)
+        return [*losses, *found]
+
+    assert_threads_change_no_bit(everything)
 
 
 def test_images_need_not_be_contiguous() -> None:

@@ -6,7 +6,6 @@ import gc
 import math
 import weakref
 
-import numba
 import pytest
 import torch
 from torch import Tensor
@@ -22,6 +21,7 @@ from tests.kernels.gaussians_and_cameras import (
     random_cameras,
     random_gaussians,
 )
+from tests.kernels.threads import assert_threads_change_no_bit
 
 NEAR = 0.2
 TOLERANCE = {torch.float32: 5e-6, torch.float64: 1e-12}
@@ -229,12 +229,12 @@ def test_gradients_of_needles_do_not_cancel_in_single_precision(angle: float) ->
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_same_bits_on_any_number_of_threads(dtype: torch.dtype) -> None:
     gaussians, cameras = random_gaussians(3000, dtype=dtype), random_cameras(3, dtype=dtype)
-    results = []
-    for threads in (1, 2):
-        numba.set_num_threads(threads)
-        ours = project(gaussians, cameras, sh_degree=3, near=NEAR)
-        results.append([*ours, *gradients(ours, gaussians, cameras).values()])
-    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+    def everything() -> list[Tensor]:
+        found = project(gaussians, cameras, sh_degree=3, near=NEAR)
+        return [*found, *gradients(found, gaussians, cameras).values()]
+
+    assert_threads_change_no_bit(everything)
 
 
 def test_inputs_need_not_be_contiguous() -> None:

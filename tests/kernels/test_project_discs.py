@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numba
 import pytest
 import torch
 from torch import Tensor
@@ -13,6 +12,7 @@ from glassplat.kernels.project import project_discs
 from glassplat.kernels.project.reference import project_discs as twin
 from glassplat.kernels.records import CameraBatch, ProjectedDiscs, RawGaussians
 from tests.kernels.gaussians_and_cameras import HEIGHT, WIDTH, draw, random_cameras, random_gaussians
+from tests.kernels.threads import assert_threads_change_no_bit
 
 NEAR = 0.2
 SMOOTH = 6
@@ -227,9 +227,7 @@ def test_threads_do_not_change_a_bit() -> None:
         found = project_discs(discs, cameras, sh_degree=3, near=NEAR)
         return [*found, *gradients(found, discs, cameras).values()]
 
-    many = everything()
-    numba.set_num_threads(1)
-    assert all(torch.equal(a, b) for a, b in zip(many, everything(), strict=True))
+    assert_threads_change_no_bit(everything)
 
 
 def test_wrong_inputs_are_named() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numba
 import pytest
 import torch
 from torch import Tensor
@@ -12,6 +11,7 @@ from torch import Tensor
 from glassplat.kernels.environment import cube_lookup, shade_environment
 from glassplat.kernels.environment.reference import shade_environment as twin
 from glassplat.kernels.records import NORMAL_MIN, Shaded
+from tests.kernels.threads import assert_threads_change_no_bit
 
 INPUTS = ("blended", "alpha", "texels", "world_from_cam")
 WIDTH, HEIGHT = 29, 23
@@ -174,10 +174,7 @@ def test_poisoned_texels_are_heard_of() -> None:
 
 def test_threads_do_not_change_a_bit() -> None:
     case = shade_case(torch.float32)
-    many = with_gradients(case, shade_environment)
-    numba.set_num_threads(1)
-    one = with_gradients(case, shade_environment)
-    assert all(torch.equal(a, b) for a, b in zip(many, one, strict=True))
+    assert_threads_change_no_bit(lambda: with_gradients(case, shade_environment))
 
 
 def test_bad_input_is_named() -> None:

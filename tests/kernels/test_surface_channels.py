@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numba
 import pytest
 import torch
 from torch import Tensor
@@ -12,6 +11,7 @@ from torch import Tensor
 from glassplat.kernels.environment import surface_channels
 from glassplat.kernels.environment.reference import surface_channels as twin
 from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS
+from tests.kernels.threads import assert_threads_change_no_bit
 
 COLORS, RADII, QUATS, LOG_SCALES, MEANS, STRENGTHS, EYE, EXTRA = range(8)
 DIFFERENTIABLE = (COLORS, QUATS, STRENGTHS, EXTRA)
@@ -114,10 +114,7 @@ def test_a_quaternion_without_direction_gives_no_normal_and_no_gradient(poison: 
 
 def test_threads_do_not_change_a_bit() -> None:
     case = gaussians(1000, torch.float32)
-    many = with_gradients(surface_channels, case)
-    numba.set_num_threads(1)
-    one = with_gradients(surface_channels, case)
-    assert all(torch.equal(a, b) for a, b in zip(many, one, strict=True))
+    assert_threads_change_no_bit(lambda: with_gradients(surface_channels, case))
 
 
 @pytest.mark.parametrize(("which", "name"), [(LOG_SCALES, "log_scales"), (RADII, "radii"), (EXTRA, "extra")])

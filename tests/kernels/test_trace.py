@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-import numba
 import pytest
 import torch
 from torch import Tensor
@@ -14,6 +13,7 @@ from glassplat.kernels.records import Bvh, RawGaussians, Rays, Traced
 from glassplat.kernels.trace import build_bvh, cpu, shapes_of, trace
 from glassplat.kernels.trace.bvh import hilbert_codes
 from glassplat.kernels.trace.reference import trace as twin
+from tests.kernels.threads import assert_threads_change_no_bit
 
 DISCS, ELLIPSOIDS = 2, 3
 DTYPES = [(torch.float32, 1e-4), (torch.float64, 1e-11)]
@@ -131,10 +131,7 @@ def test_thin_ellipsoids_have_the_gradients_of_float64_in_float32() -> None:
 @pytest.mark.parametrize("scales", [DISCS, ELLIPSOIDS])
 def test_threads_do_not_change_a_bit(scales: int) -> None:
     gaussians, rays = cloud(500, scales, dtype=torch.float32), rays_around(900, dtype=torch.float32)
-    many = with_gradients(trace, gaussians, rays, 2)
-    numba.set_num_threads(1)
-    one = with_gradients(trace, gaussians, rays, 2)
-    assert all(torch.equal(a, b) for a, b in zip(many, one, strict=True))
+    assert_threads_change_no_bit(lambda: with_gradients(trace, gaussians, rays, 2))
 
 
 @pytest.mark.parametrize("scales", [DISCS, ELLIPSOIDS])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +18,7 @@ from tests.training.test_trainer import planar_stages
 from tests.training.tiny_capture import tiny_capture
 
 ROOT = Path(__file__).parents[2]
+ONE_THREAD = os.environ | {"NUMBA_NUM_THREADS": "1"}
 
 
 def stages_of(name: str) -> tuple[Stage, ...]:
@@ -42,7 +44,7 @@ def torchrun(count: int, *arguments: str, timeout: float = 240) -> subprocess.Co
     """Runs `python -m ARGUMENTS` in so many processes."""
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}", "-m"]
     return subprocess.run(
-        [*command, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=timeout, check=False
+        [*command, *arguments], cwd=ROOT, env=ONE_THREAD, capture_output=True, text=True, timeout=timeout, check=False
     )
 
 

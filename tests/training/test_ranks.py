@@ -22,7 +22,7 @@ from glassplat.training.checkpoint import load_checkpoint
 from glassplat.training.messages import ActionDone, Message, StepDone, Working
 from glassplat.training.ranks import Ranks
 from glassplat.training.stage import Clock, Optimizer, TrainState
-from tests.training.rank_process import ROOT, losses_of, stages_of, torchrun, trained
+from tests.training.rank_process import ONE_THREAD, ROOT, losses_of, stages_of, torchrun, trained
 from tests.training.tiny_capture import tiny_capture, write_tiny_capture
 
 ITERATIONS = 40
@@ -45,7 +45,7 @@ def running(count: int, *arguments: str) -> Iterator[subprocess.Popen[str]]:
     """`torchrun` at work, which does not outlive the context."""
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}", "-m"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    with subprocess.Popen([*command, *arguments], cwd=ROOT, **pipes) as process:
+    with subprocess.Popen([*command, *arguments], cwd=ROOT, env=ONE_THREAD, **pipes) as process:
         try:
             yield process
         finally:
@@ -88,7 +88,7 @@ def start_apart(arguments: list[str], of_rank_1: list[str]) -> list[subprocess.P
         subprocess.Popen(
             [sys.executable, "-m", *arguments, *more],
             cwd=ROOT,
-            env=os.environ | where | {"RANK": str(rank), "LOCAL_RANK": str(rank)},
+            env=ONE_THREAD | where | {"RANK": str(rank), "LOCAL_RANK": str(rank)},
             **pipes,
         )
         for rank, more in enumerate(([], of_rank_1))
