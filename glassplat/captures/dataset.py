@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from os.path import lexists
 from pathlib import Path
+from statistics import median_low
 from threading import Event
 
 import torch
@@ -123,6 +124,11 @@ class Dataset:
     def memory(self) -> Memory:
         """Pixels of its views that were read."""
         return self.train[0].memory
+
+    @property
+    def photograph_pixels(self) -> int:
+        """Pixels of a training photograph of median size."""
+        return median_low(view.camera.width * view.camera.height for view in self.train)
 
     @property
     def photograph_bytes(self) -> int:

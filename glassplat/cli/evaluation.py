@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from itertools import count
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -10,12 +12,14 @@ from rich.table import Table
 
 from glassplat.captures.dataset import Dataset
 from glassplat.cli.console import say
+from glassplat.cli.progress import Step
 from glassplat.cli.runs import StoredRun
 from glassplat.errors import InputError
 from glassplat.evaluate.evaluate import (
     RENDERED_REGIONS,
     SCENE_COLORS,
     TRUE_REGIONS,
+    EvaluatedView,
     Evaluation,
     PaneRegions,
     evaluate,
@@ -71,10 +75,23 @@ def _marked_regions(dataset: Dataset) -> PaneRegions:
 
 
 UNMOVED = "as the capture has them"
+RENDERING = "rendering test views"
 
 
-def evaluate_run(stored: StoredRun, panes: PaneSource = "auto", *, align: Align = "auto") -> dict:
+def evaluate_run(
+    stored: StoredRun,
+    panes: PaneSource = "auto",
+    *,
+    align: Align = "auto",
+    show: Callable[[Step], None] = lambda step: None,
+) -> dict:
     """Evaluates a run, writes `results.json`, `per_view.json`, sheets and overview; returns the results.
+
+    Args:
+        stored: the run.
+        panes: what says where panes are.
+        align: whether test cameras are moved first.
+        show: is told how far it is.
 
     Raises:
         InputError: the capture does not say where its panes are in this way.
@@ -83,16 +100,27 @@ def evaluate_run(stored: StoredRun, panes: PaneSource = "auto", *, align: Align 
     aligned = align == "always" or (align == "auto" and len(stored.scene.poses) > 0)
     if aligned:
         photographed = with_photographer(stored.renderer, "present")
-        stored = stored._replace(dataset=with_aligned_test_views(stored.scene, photographed, stored.dataset))
+
+        def listen(done: int, total: int) -> None:
+            show(Step("aligning the cameras of test views", done, total))
+
+        stored = stored._replace(dataset=with_aligned_test_views(stored.scene, photographed, stored.dataset, listen))
     settings, path = stored.directory.settings(), stored.directory.path
     blend = stored.renderer.blend if isinstance(stored.renderer, Planar) else None
     report = Report(path, stored.dataset, blend)
+    views = count(1)
+
+    def add(view: EvaluatedView) -> None:
+        report.add(view)
+        show(Step(RENDERING, next(views), len(stored.dataset.test)))
+
+    show(Step(RENDERING, 0, len(stored.dataset.test)))
     evaluation: Evaluation = evaluate(
         stored.scene,
         with_photographer(stored.renderer, "beside"),
         stored.dataset,
         regions=regions,
-        listen=report.add,
+        listen=add,
     )
     results = {
         "method": stored.recipe.method,

@@ -182,7 +182,7 @@ class TrainingProgress:
         elif isinstance(message, messages.StepDone):
             standing.step = message.step
             standing.loss = _smoothed(standing.loss, message.loss)
-            standing.count = message.counts["primary"] + message.counts["glass"]
+            standing.count = sum(count for part, count in message.counts.items() if part != "planes")
             self._pace.step(message.step)
             standing.left = self._pace.time_left(message.step)
             if forecast := self._pace.forecast(message.step):
@@ -193,6 +193,7 @@ class TrainingProgress:
         if message.anew:
             warn(self._console, "an earlier run in this folder was begun and never saved; it is replaced")
         if message.step:
+            self._standing.step = message.step
             self._say(f"going on from step {message.step} of {message.iterations}")
 
     def _say(self, text: str) -> None:

@@ -56,11 +56,12 @@ class Evaluate:
     def run(self, console: Console) -> None:
         """Evaluates and reports."""
         from glassplat.cli.evaluation import evaluate_run, print_results
+        from glassplat.cli.progress import WorkProgress
         from glassplat.cli.runs import open_run
 
         stored = open_run(self.run_directory, self.device, self.data)
-        with console.status(f"rendering {len(stored.dataset.test)} test views"):
-            results = evaluate_run(stored, self.panes, align=self.align)
+        with WorkProgress(console) as progress:
+            results = evaluate_run(stored, self.panes, align=self.align, show=progress.show)
         print_results(console, results)
         say(console, f"pictures: {stored.directory.path / 'index.html'}")
 

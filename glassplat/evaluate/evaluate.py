@@ -256,6 +256,8 @@ def evaluate(
     for view in dataset.test:
         frame, seconds = timed_render(renderer, scene, view)
         true_view = truth.view(view.name, view.camera.width, view.camera.height) if truth else None
+        if true_view is not None and view.ignored is not None:
+            true_view = replace(true_view, labels=true_view.labels.masked_fill(view.ignored, 0))
         surface = true_surface(view)
         pane = regions.of(view, frame, true_view)
         exposures = learned.interpolate(view.name)

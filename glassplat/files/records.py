@@ -6,7 +6,7 @@ Nothing that is read is deeper than `DEEPEST`, no text in it is unprintable in U
 A table of fields checks a JSON object:
 
     SCENE = {"extent": Number(above=0), "active_sh_degree": Whole(0, 3), "files": Optional(Items(Text()), ())}
-    header = checked(read_json(path), SCENE, str(path))
+    header = check_fields(read_json(path), SCENE, str(path))
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ def finished_renderer(recipe: DeferredRecipe) -> Deferred:
 
 
 def stages_of(recipe: DeferredRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
-    """Bootstrap, then everything; what changes in between is up to `Propagate`. A short run has one stage."""
+    """Bootstrap, then everything; what changes in between is up to `Propagate`. A short run has no reflections."""
     short = iterations < recipe.least_iterations
     stages = _matte_stages(recipe, "ellipsoid", seed, iterations) if short else _reflecting_stages(recipe)
     return corrections_learnt(recipe, stages)

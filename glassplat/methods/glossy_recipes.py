@@ -195,7 +195,7 @@ class DeferredRecipe(GlossyOptions):
         return finished_renderer(self)
 
     def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
-        """Bootstrap, then everything; what changes in between is up to `Propagate`. A short run has one stage."""
+        """Bootstrap, then everything; what changes in between is up to `Propagate`. A short run has no reflections."""
         from glassplat.methods.glossy import stages_of
 
         return stages_of(self, seed, iterations)
@@ -314,7 +314,7 @@ class TracedRecipe(GlossyOptions):
         return traced_finished_renderer(self)
 
     def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
-        """Bootstrap, reflections, everything without propagation; a short run has one stage."""
+        """Bootstrap, reflections, everything without propagation; a short run has no reflections."""
         from glassplat.methods.glossy import traced_stages_of
 
         return traced_stages_of(self, seed, iterations)

@@ -236,8 +236,7 @@ class AddSurroundings:
         return parts
 
     def _in_box(self, state: TrainState, dataset: Dataset) -> Gaussians:
-        camera = dataset.train[0].camera
-        cells = self.start.cells or suitable_cells(camera.width * camera.height, self.start.per_cell)
+        cells = self.start.cells or suitable_cells(dataset.photograph_pixels, self.start.per_cell)
         found = surroundings_in_box(
             percentile_box(dataset.points, self.start.outside),
             cells=cells,

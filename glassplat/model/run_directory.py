@@ -112,6 +112,8 @@ FILES = (
     "index.html",
 )
 """What a run writes next to its checkpoint, scene and metrics."""
+MOST_MOVED = 0.02
+"""Share of the scene's extent by which two cameras may differ that are taken for one."""
 NUMBERED = re.compile(r"iteration_([0-9]{1,18})")
 """The folder of a scene; people keep copies under other names next to it."""
 
@@ -221,8 +223,12 @@ class RunDirectory:
 
         make_folder(self.path)
         write_text(self.path / "recipe.json", recipe_to_json(recipe))
-        write_text(self.path / "settings.json", json.dumps(dataclasses.asdict(settings), indent=2))
+        self.write_settings(settings)
         write_cameras(self.path / "cameras.json", [(v.name, v.camera) for v in (*dataset.train, *dataset.test)])
+
+    def write_settings(self, settings: RunSettings) -> None:
+        """Replaces the recorded settings."""
+        write_text(self.path / "settings.json", json.dumps(dataclasses.asdict(settings), indent=2))
 
     def clear(self) -> None:
         """Removes what a training left half-written that was killed; for who holds the lock.
@@ -285,6 +291,21 @@ class RunDirectory:
             return {entry["img_name"] for entry in read_json(self.path / "cameras.json")}
         except (OSError, ValueError, TypeError, KeyError):
             return None
+
+    def has_cameras_of(self, dataset: Dataset) -> bool:
+        """Return whether the recorded cameras are the capture's, give or take what pose refinement may move them."""
+        from glassplat.files.sidecars import read_cameras
+
+        try:
+            recorded = dict(read_cameras(self.path / "cameras.json"))
+        except (OSError, ValueError):
+            return False
+        cameras = {view.name: view.camera for view in (*dataset.train, *dataset.test)}
+        return recorded.keys() == cameras.keys() and all(
+            float((recorded[name].center - camera.center).norm()) <= MOST_MOVED * dataset.extent
+            and (recorded[name].width, recorded[name].height) == (camera.width, camera.height)
+            for name, camera in cameras.items()
+        )
 
     def check_photographs(self, dataset: Dataset) -> None:
         """Refuse a capture of other photographs than the run was trained on.

@@ -234,8 +234,10 @@ def resumed_state(
         InputError: the run was recorded with other settings or photographs, or nothing is saved.
     """
     directory.check_saved()
-    # A run may go on on another device.
-    recorded = replace(directory.settings(), device=settings.device)
+    # A run may go on on another device, and its capture may have been moved.
+    written = directory.settings()
+    has_moved = written.data != settings.data and directory.has_cameras_of(dataset)
+    recorded = replace(written, device=settings.device, data=settings.data if has_moved else written.data)
     if recorded != settings or not directory.was_begun_with(recipe):
         changes = differences(vars(recorded), vars(settings)) + changes_of_recipe(directory, recipe)
         raise InputError(
@@ -246,6 +248,8 @@ def resumed_state(
     state = load_checkpoint(
         directory.checkpoint, method=recipe.method, seed=settings.seed, iterations=settings.iterations
     )
+    if has_moved:
+        directory.write_settings(replace(written, data=settings.data))
     return state.to(settings.device)
 
 

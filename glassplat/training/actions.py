@@ -82,8 +82,7 @@ def threshold_factor(dataset: Dataset) -> float:
     Gaussian a few pixels wide has a larger gradient in a smaller image, and one of 400x300 would grow twice as many
     Gaussians as it has pixels (lab/gaussians.md).
     """
-    camera = dataset.train[0].camera
-    return max(1.0, math.sqrt(LARGE_ENOUGH / (camera.width * camera.height)))
+    return max(1.0, math.sqrt(LARGE_ENOUGH / dataset.photograph_pixels))
 
 
 def limit_of(densifier: DefaultDensify, dataset: Dataset) -> int | None:
@@ -212,8 +211,7 @@ def cap_of(densifier: McmcDensify, dataset: Dataset) -> int:
     """The number of Gaussians to grow to: the one that was asked for, or one that suits the photographs."""
     if densifier.cap is not None:
         return densifier.cap
-    camera = dataset.train[0].camera
-    return round(GAUSSIANS_PER_PIXEL * camera.width * camera.height)
+    return round(GAUSSIANS_PER_PIXEL * dataset.photograph_pixels)
 
 
 def growth_of(densifier: McmcDensify, iterations: int) -> float:

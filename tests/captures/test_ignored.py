@@ -6,6 +6,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from glassplat.captures.dataset import load_dataset
 from glassplat.captures.view import View
 from glassplat.errors import InputError
 from glassplat.evaluate.evaluate import evaluate
-from glassplat.evaluate.truth import TrueSurface
+from glassplat.evaluate.truth import TrueSurface, TrueView
 from glassplat.files.sidecars import write_planes
 from glassplat.panes.material import compared_region, reduced_photograph
 from glassplat.render.frame import Frame
@@ -238,6 +239,26 @@ def test_metrics_leave_ignored_pixels_out() -> None:
     assert ignoring["ssim"] > passed_by["ssim"] + 0.02
     nothing = measured(replace(passed, read_ignored=lambda: torch.ones(28, 40)))
     assert nothing["psnr"] is None and "ignored" in nothing["psnr_reason"]
+
+
+def test_metrics_of_layers_leave_ignored_pixels_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset = tiny_capture()
+    view = dataset.test[0]
+    layers = Planar()(true_scene(), view.camera).layers
+    through, mirrored = ((255 * layers[name].detach().clamp(0, 1)).to(torch.uint8) for name in ("transmission", "reflection"))
+    labels = torch.ones(28, 40, dtype=torch.uint8)
+
+    def measured(spoil: bool, ignored: bool) -> dict:
+        shown = [torch.where(somewhere()[..., None], 255 - x, x) if spoil else x for x in (through, mirrored)]
+        truth = SimpleNamespace(view=lambda *_: TrueView(*shown, torch.full((28, 40), 0.1), labels), planes=())
+        monkeypatch.setattr(glassplat.evaluate.evaluate, "load_truth", lambda path: truth)
+        seen = replace(view, read_ignored=somewhere) if ignored else view
+        return evaluate(true_scene(), Planar(), replace(dataset, test=(seen,))).results
+
+    clean, spoilt, ignoring = measured(False, True), measured(True, False), measured(True, True)
+    for name in ("transmission_psnr", "reflection_psnr"):
+        assert spoilt[name] < clean[name] - 5
+        assert ignoring[name] == pytest.approx(clean[name])
 
 
 def test_metrics_of_surfaces_leave_ignored_pixels_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -72,6 +72,17 @@ def test_the_time_left_is_that_of_this_session_and_its_last_minute() -> None:
     assert lines[-1].endswith(f"{in_words(6 * (1000 - int(lines[-1].split()[1])))} left")
 
 
+def test_work_before_the_first_step_of_a_resumed_run_is_at_its_step() -> None:
+    lines = lines_of([RunBegun(899, 1000), Working("fitting planes to the masks", 0, 2)], 1.0)
+    assert lines[1].startswith("step 899") and "fitting planes" in lines[1]
+
+
+def test_every_set_of_gaussians_counts() -> None:
+    counts = COUNTS | {"surroundings": 500}
+    lines = lines_of([StepDone(number, "1.png", 0.1, {}, counts) for number in range(1, 21)], 1.0)
+    assert "1520 Gaussians" in lines[-1]
+
+
 def test_how_long_a_run_takes_is_said_once_and_counts_the_dearer_steps_to_come() -> None:
     plan = Plan((250, 1000), (1.0, 9.0), "shorter with an NVIDIA GPU")
     steps = [step(number) for number in range(1, 31)]

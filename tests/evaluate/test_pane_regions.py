@@ -51,6 +51,19 @@ def test_methods_are_measured_over_the_same_pixels(tmp_path: Path) -> None:
     assert "from the plane of the masks" in plane_text(plane)
 
 
+def test_an_evaluation_says_how_far_it_is(tmp_path: Path) -> None:
+    write_tiny_capture(tmp_path / "capture")
+    run, steps = open_run(write_run(tmp_path / "run")), []
+    evaluate_run(run, align="always", show=steps.append)
+    (count,) = {step.total for step in steps}
+    assert count == len(run.dataset.test)
+    aligning, rendering = "aligning the cameras of test views", "rendering test views"
+    assert [(step.what, step.done) for step in steps] == [
+        *((aligning, done) for done in range(count)),
+        *((rendering, done) for done in range(count + 1)),
+    ]
+
+
 def test_where_the_masks_lead_nowhere_the_method_says_it(tmp_path: Path) -> None:
     path = write_run(tmp_path / "run")
     assert pane_regions(open_run(path).dataset, "auto") is RENDERED_REGIONS

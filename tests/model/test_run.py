@@ -441,6 +441,20 @@ def test_other_options_are_named_when_a_run_is_to_go_on(recipe: Any, settings: A
     assert f" was started with other options: {told}; expected the same to resume it. Repeat" in str(caught.value)
 
 
+def test_a_run_goes_on_where_its_capture_has_moved_and_not_with_another(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, interrupt_at=5)
+    moved, capture, directory = replace(SETTINGS, data="elsewhere"), tiny_capture(), RunDirectory(tmp_path)
+    *others, last = capture.train
+    pose = last.camera.cam_from_world.clone()
+    pose[0, 3] += 0.1 * capture.extent
+    other = replace(capture, train=(*others, last.with_camera(replace(last.camera, cam_from_world=pose))))
+    with pytest.raises(InputError, match="data was tiny and is elsewhere"):
+        Run(RECIPE, moved, directory, other, resume=True).to_the_end(print)
+    assert Run(RECIPE, moved, directory, capture, resume=True).to_the_end(print).step == SETTINGS.iterations
+    assert directory.settings() == moved
+
+
 def test_an_option_that_another_version_did_not_have_is_named_when_a_run_is_to_go_on(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, interrupt_at=5)

@@ -15,7 +15,7 @@ from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.recipe import recipe_from_json, recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.scene.scene import Scene
-from glassplat.training.actions import AddNoise, Densify, Relocate, ResetOpacity, cap_of, growth_of
+from glassplat.training.actions import AddNoise, Densify, Relocate, ResetOpacity, cap_of, growth_of, threshold_factor
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import differentiate, train
 from glassplat.training.losses import PhotometricLoss
@@ -177,6 +177,14 @@ def test_the_default_cap_follows_the_photographs() -> None:
     camera = tiny_capture().train[0].camera
     assert cap_of(McmcDensify(), tiny_capture()) == round(camera.width * camera.height / 2)
     assert cap_of(McmcDensify(cap=7), tiny_capture()) == 7
+
+
+def test_one_small_photograph_among_large_ones_changes_no_threshold() -> None:
+    capture = tiny_capture()
+    first, *others = capture.train
+    mixed = replace(capture, train=(first.with_camera(first.camera.resize(4, 3)), *others))
+    assert cap_of(McmcDensify(), mixed) == cap_of(McmcDensify(), capture)
+    assert threshold_factor(mixed) == threshold_factor(capture)
 
 
 @pytest.mark.parametrize("iterations", [3_000, 7_000, 30_000, 60_000])
