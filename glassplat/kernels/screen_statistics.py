@@ -23,13 +23,12 @@ class Sums(NamedTuple):
     """Sums for each of N Gaussians, in two rows: over all views, and over those that see it directly.
 
     gradient_sum [2, N]: norms of the gradient of the centre; absgrad_sum [2, N]: of its absolute gradient; view_count
-    [2, N]: how many views; max_radius [N]: largest radius, as a share of the longer image side.
+    [2, N]: how many views.
     """
 
     gradient_sum: Tensor
     absgrad_sum: Tensor
     view_count: Tensor
-    max_radius: Tensor
 
 
 class Views(NamedTuple):
@@ -65,17 +64,18 @@ def add_views(sums: Sums, views: Views) -> None:
         TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
     cameras, count, _ = views.radii.shape
-    expected: dict[str, tuple[Tensor, tuple[int, ...]]] = {"max_radius": (sums.max_radius, (count,))}
-    expected |= {name: (getattr(sums, name), (2, count)) for name in ("gradient_sum", "absgrad_sum", "view_count")}
+    expected: dict[str, tuple[Tensor, tuple[int, ...]]] = {
+        name: (total, (2, count)) for name, total in zip(Sums._fields, sums, strict=True)
+    }
     expected |= {name: (getattr(views, name), (cameras, count, 2)) for name in ("v_means2d", "v_absgrad", "radii")}
     if isinstance(views.weight, Tensor):
         expected["weight"] = (views.weight, (cameras, count) if views.weight.dim() else ())
     check_tensors(expected)
-    device = sums.max_radius.device
+    device = sums.view_count.device
     if device.type != "cpu":
         kernels_for("project", device).add_views(sums, views)
         return
-    real = REAL_OF[sums.max_radius.dtype]
+    real = REAL_OF[sums.view_count.dtype]
     weight = np.ascontiguousarray(np.atleast_2d(views.weight), real)
     gradients = (tensor.detach().contiguous().numpy() for tensor in views[:3])
     add_views_kernel(real)(
@@ -91,13 +91,13 @@ def add_views_kernel(real: type) -> Kernel:
 
     @kernel("screen_statistics", real)
     def add(  # type: ignore[no-untyped-def]
-        gradient_sum, absgrad_sum, view_count, max_radius, v_means2d, v_absgrad, radii, weight, width, height, rows
+        gradient_sum, absgrad_sum, view_count, v_means2d, v_absgrad, radii, weight, width, height, rows
     ):  # fmt: skip
         cameras, count = radii.shape[0], radii.shape[1]
-        right, down, longer = half * real(width), half * real(height), real(max(width, height))
+        right, down = half * real(width), half * real(height)
         for chunk in prange((count + CHUNK - 1) // CHUNK):
             for n in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-                gradient = absgrad = views = radius = zero
+                gradient = absgrad = views = zero
                 for c in range(cameras):
                     if radii[c, n, 0] > zero and radii[c, n, 1] > zero:
                         x, y = right * v_means2d[c, n, 0], down * v_means2d[c, n, 1]
@@ -105,11 +105,9 @@ def add_views_kernel(real: type) -> Kernel:
                         x, y = right * v_absgrad[c, n, 0], down * v_absgrad[c, n, 1]
                         absgrad += math.sqrt(x * x + y * y)
                         views += weight[c, n] if weight.size > 1 else weight[0, 0]
-                        radius = max(radius, radii[c, n, 0], radii[c, n, 1])
                 for row in range(rows):
                     gradient_sum[row, n] += gradient
                     absgrad_sum[row, n] += absgrad
                     view_count[row, n] += views
-                max_radius[n] = max(max_radius[n], radius / longer)
 
     return add

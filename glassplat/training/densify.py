@@ -323,23 +323,20 @@ class ScreenStatistics:
         view_count: [2, N] number of views that saw the Gaussian; one in or through a pane counts by how much of what is
             drawn is left in the image. Gradients are smaller by as much; counted as a full view, a weak reflection
             would look as if it needed no more detail.
-        max_radius: [N] largest radius on screen, as a share of the longer image side.
     """
 
     gradient_sum: Tensor
     absgrad_sum: Tensor
     view_count: Tensor
-    max_radius: Tensor
 
     @staticmethod
     def zeros(count: int, *, device: torch.device | str = "cpu") -> ScreenStatistics:
         """Statistics of `count` Gaussians that no view has seen."""
-        gradients, absgrads, views = torch.zeros(3, 2, count, device=device)
-        return ScreenStatistics(gradients, absgrads, views, torch.zeros(count, device=device))
+        return ScreenStatistics(*torch.zeros(3, 2, count, device=device))
 
     def add(self, views: Views) -> None:
         """Adds the views of one training step, in place."""
-        add_views(Sums(self.gradient_sum, self.absgrad_sum, self.view_count, self.max_radius), views)
+        add_views(Sums(*self.sums), views)
 
     @torch.no_grad()
     def add_in_space(self, means_gradient: Tensor, met: Tensor) -> None:
@@ -362,14 +359,13 @@ class ScreenStatistics:
 
     @property
     def sums(self) -> tuple[Tensor, Tensor, Tensor]:
-        """All statistics that add up over views; the largest radius does not."""
+        """All of them."""
         return self.gradient_sum, self.absgrad_sum, self.view_count
 
     def include(self, other: ScreenStatistics) -> None:
         """Adds what other views have shown of the same Gaussians, in place."""
         for total, added in zip(self.sums, other.sums, strict=True):
             total += added
-        torch.maximum(self.max_radius, other.max_radius, out=self.max_radius)
 
     @property
     def mean_gradient(self) -> Tensor:
@@ -413,14 +409,13 @@ def densify(
         prune_large: also remove what is too large; 3DGS does so once the opacities have been
             reset for the first time.
     """
-    if statistics.max_radius.shape[0] != len(gaussians):
+    if statistics.view_count.shape[1] != len(gaussians):
         raise ValueError(
-            f"statistics hold {statistics.max_radius.shape[0]} rows for {len(gaussians)} Gaussians; "
+            f"statistics hold {statistics.view_count.shape[1]} columns for {len(gaussians)} Gaussians; "
             "start new statistics whenever the set has changed"
         )
     grown = _growth(options, gaussians, statistics, extent=extent, generator=generator)
-    radius = torch.where(grown.fresh, 0, statistics.max_radius[grown.source])
-    superfluous = _superfluous(options, gaussians, grown, radius, extent=extent, prune_large=prune_large)
+    superfluous = _superfluous(options, gaussians, grown, extent=extent, prune_large=prune_large)
     return apply_edit(gaussians, moments, grown.then(keep(~superfluous)), part=part)
 
 
@@ -456,15 +451,13 @@ def _within_cap(options: DefaultDensify, need: Tensor) -> Tensor:
 
 
 def _superfluous(
-    options: DefaultDensify, gaussians: Gaussians, edit: Edit, radius: Tensor, *, extent: float, prune_large: bool
+    options: DefaultDensify, gaussians: Gaussians, edit: Edit, *, extent: float, prune_large: bool
 ) -> Tensor:
-    """[M] bool: which Gaussians of the edited set to remove; `radius` [M] as in `max_radius`."""
+    """[M] bool: which Gaussians of the edited set to remove."""
     superfluous = torch.sigmoid(edit.result(gaussians, "logit_opacities")) < options.prune_opacity
     if prune_large:
         longest = edit.result(gaussians, "log_scales").amax(dim=1)
         superfluous |= longest > math.log(options.prune_scale_fraction * extent)
-        if options.prune_radius_fraction is not None:
-            superfluous |= radius > options.prune_radius_fraction
     return superfluous
 
 

@@ -134,7 +134,7 @@ def advance(
     state.is_whole = False
     update(stage, state, found.gradients, iterations, views=len(views))
     for part, added in found.statistics.items():
-        statistics_of(state.statistics, part, len(added.max_radius), added.max_radius.device).include(added)
+        statistics_of(state.statistics, part, added.view_count.shape[1], added.view_count.device).include(added)
     clocks = [
         Clock(step + 1, iterations, len(dataset.train), batch=len(views))
         for step in range(state.step, state.step + len(views))
@@ -199,12 +199,9 @@ def totals(
     for result in results:
         shown = shown if result.visible is None else torch.maximum(shown, result.visible.to(shown.dtype))
     sums = ranks.sum_tensors([*gradients, *(total for one in known for total in one.sums)])
-    *radii, shown = ranks.largest([*(one.max_radius for one in known), shown])
+    (shown,) = ranks.largest([shown])
     of_parts = iter(sums[len(names) :])
-    found = {
-        part: ScreenStatistics(next(of_parts), next(of_parts), next(of_parts), radius)
-        for part, radius in zip(statistics, radii, strict=True)
-    }
+    found = {part: ScreenStatistics(next(of_parts), next(of_parts), next(of_parts)) for part in statistics}
     return Step([], dict(zip(names, sums[: len(names)], strict=True)), found, shown > 0)
 
 

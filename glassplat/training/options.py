@@ -184,10 +184,8 @@ class DefaultDensify:
         prune_opacity: Gaussians less opaque than this are removed.
         prune_large_start: share of the run after which what is too large is removed as well; 1 never does.
         prune_scale_fraction: from `prune_large_start` on, Gaussians with an axis above this share of the
-            scene extent are removed.
-        prune_radius_fraction: from `prune_large_start` on, Gaussians that any view saw with a radius above
-            this share of its longer side are removed; None keeps them. 3DGS states a limit of 20
-            pixels but clears the radii before it looks at them, so its published results have none.
+            scene extent are removed. 3DGS also states a limit of 20 pixels on screen, but clears the radii before it
+            looks at them, so that its published results have none.
         cap: largest number of Gaussians to grow to; None takes `--densify.per-pixel`.
         per_pixel: largest number of Gaussians to grow to for each pixel of all training photographs, which is reached
             where these contradict each other, by cars and leaves, and never stop asking for more; 0 for no limit.
@@ -209,7 +207,6 @@ class DefaultDensify:
     prune_opacity: Share = 0.005
     prune_large_start: Internal[Share] = 1.0
     prune_scale_fraction: Internal[Positive] = 0.1
-    prune_radius_fraction: Internal[PositiveShare | None] = None
     cap: Annotated[Count | None, ESSENTIAL] = None
     per_pixel: NotNegative = 0.02
     least_contribution: NotNegative = 0.2

@@ -245,7 +245,9 @@ def test_metrics_of_layers_leave_ignored_pixels_out(monkeypatch: pytest.MonkeyPa
     dataset = tiny_capture()
     view = dataset.test[0]
     layers = Planar()(true_scene(), view.camera).layers
-    through, mirrored = ((255 * layers[name].detach().clamp(0, 1)).to(torch.uint8) for name in ("transmission", "reflection"))
+    through, mirrored = (
+        (255 * layers[name].detach().clamp(0, 1)).to(torch.uint8) for name in ("transmission", "reflection")
+    )
     labels = torch.ones(28, 40, dtype=torch.uint8)
 
     def measured(spoil: bool, ignored: bool) -> dict:

@@ -19,12 +19,10 @@ def add_views_in_torch(sums: Sums, views: Views) -> None:
         across, down = gradient[..., 0] * (views.width / 2), gradient[..., 1] * (views.height / 2)
         total[rows] += torch.where(visible, torch.hypot(across, down), 0).sum(dim=0)
     sums.view_count[rows] += (views.weight * visible.to(views.radii.dtype)).sum(dim=0)
-    shares = torch.where(visible, views.radii.amax(dim=-1) / max(views.width, views.height), 0)
-    torch.maximum(sums.max_radius, shares.amax(dim=0).to(sums.max_radius.dtype), out=sums.max_radius)
 
 
 def no_views(count: int, dtype: torch.dtype = torch.float32) -> Sums:
-    return Sums(*torch.zeros(3, 2, count, dtype=dtype), torch.zeros(count, dtype=dtype))
+    return Sums(*torch.zeros(3, 2, count, dtype=dtype))
 
 
 def some_views(cameras: int, count: int, dtype: torch.dtype = torch.float32, *, weighted: bool, direct: bool) -> Views:
@@ -47,7 +45,6 @@ def test_visible_views_count_in_device_coordinates() -> None:
     assert sums.gradient_sum.tolist() == [[3 * 200 + 1 * 100, 100, 0]] * 2
     assert sums.absgrad_sum.tolist() == [[2 * (3 * 200 + 1 * 100), 200, 0]] * 2
     assert sums.view_count.tolist() == [[2, 1, 0]] * 2
-    assert sums.max_radius.tolist() == pytest.approx([0.1, 1 / 400, 0])
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
@@ -82,7 +79,7 @@ def test_the_number_of_threads_changes_no_bit() -> None:
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"radii": torch.zeros(1, 3, 2)}, ValueError, r"max_radius has shape \(4,\); expected \(3,\)"),
+        ({"radii": torch.zeros(1, 3, 2)}, ValueError, r"gradient_sum has shape \(2, 4\); expected \(2, 3\)"),
         ({"v_absgrad": torch.zeros(2, 4, 2)}, ValueError, r"v_absgrad has shape \(2, 4, 2\); expected \(1, 4, 2\)"),
         ({"weight": torch.zeros(4)}, ValueError, r"weight has shape \(4,\); expected \(1, 4\)"),
         ({"radii": torch.zeros(1, 4, 2).double()}, TypeError, "radii is torch.float64"),

@@ -24,12 +24,11 @@ def make_gaussians(scales: list[float], opacities: list[float] | None = None) ->
     )
 
 
-def seen(gradients: list[float], absgrads: list[float] | None = None, radius: float = 0.01) -> ScreenStatistics:
+def seen(gradients: list[float], absgrads: list[float] | None = None) -> ScreenStatistics:
     """What one view saw; the absolute gradient is six times the gradient unless given."""
     count = len(gradients)
     absgrads = absgrads or [6 * gradient for gradient in gradients]
-    sums = (torch.tensor(values).expand(2, -1) for values in (gradients, absgrads, [1.0] * count))
-    return ScreenStatistics(*sums, torch.full((count,), radius))
+    return ScreenStatistics(*(torch.tensor(values).expand(2, -1) for values in (gradients, absgrads, [1.0] * count)))
 
 
 def edited(options: DefaultDensify, gaussians: Gaussians, statistics: ScreenStatistics, **extra: bool) -> Gaussians:
@@ -55,7 +54,6 @@ def test_statistics_do_not_depend_on_the_resolution() -> None:
     small.add(Views(gradient, gradient, radii, 100, 80))
     large.add(Views(gradient / 2, gradient / 2, radii * 2, 200, 160))
     assert torch.allclose(small.gradient_sum, large.gradient_sum)
-    assert torch.allclose(small.max_radius, large.max_radius)
 
 
 def test_small_ones_are_cloned_large_ones_split_and_the_rest_kept() -> None:
@@ -87,8 +85,6 @@ def test_large_ones_are_pruned_only_when_asked() -> None:
     gaussians = make_gaussians([0.1, 0.3])
     assert len(edited(DefaultDensify(), gaussians, seen([0.0, 0.0]))) == 2
     assert len(edited(DefaultDensify(), gaussians, seen([0.0, 0.0]), prune_large=True)) == 1
-    wide = seen([0.0, 0.0], radius=0.3)
-    assert len(edited(DefaultDensify(prune_radius_fraction=0.2), gaussians, wide, prune_large=True)) == 0
 
 
 def test_cap_lets_the_largest_gradients_grow() -> None:

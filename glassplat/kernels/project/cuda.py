@@ -266,13 +266,13 @@ def project_discs_backward(real: type) -> Kernel:
 
 def add_views(sums: Sums, views: Views) -> None:
     """As `glassplat.kernels.screen_statistics.add_views`, of tensors that are checked."""
-    count, weight, factor = len(sums.max_radius), None, 1.0
+    count, weight, factor = sums.view_count.shape[1], None, 1.0
     if isinstance(views.weight, Tensor):
         # A scalar stays on the GPU: who asks for it waits.
         weight = views.weight.contiguous() if views.weight.dim() else views.weight.reshape(1, 1)
     else:
         factor = views.weight
-    add_views_kernel(REAL_OF[sums.max_radius.dtype])(
+    add_views_kernel(REAL_OF[sums.view_count.dtype])(
         blocks_for(count, THREADS), THREADS, *sums, *(tensor.detach().contiguous() for tensor in views[:3]), weight,
         factor, views.width, views.height, 1 + views.direct,
     )  # fmt: skip
@@ -283,16 +283,15 @@ def add_views_kernel(real: type) -> Kernel:
     """Adds to the first `rows` rows of the sums, a Gaussian for each thread."""
     half, zero = real(0.5), real(0.0)
 
-    @kernel("screen_statistics", real, "real2 real2 real2 real1 real3 real3 real3 real2 real real real int")
+    @kernel("screen_statistics", real, "real2 real2 real2 real3 real3 real3 real2 real real real int")
     def add(
-        gradient_sum, absgrad_sum, view_count, max_radius, v_means2d, v_absgrad, radii, weight, factor, width, height,
-        rows,
+        gradient_sum, absgrad_sum, view_count, v_means2d, v_absgrad, radii, weight, factor, width, height, rows
     ):  # fmt: skip
         n = cuda.grid(1)
-        if n >= max_radius.size:
+        if n >= view_count.shape[1]:
             return
-        right, down, longer = half * width, half * height, max(width, height)
-        gradient, absgrad, seen, radius = zero, zero, zero, zero
+        right, down = half * width, half * height
+        gradient, absgrad, seen = zero, zero, zero
         for c in range(radii.shape[0]):
             if radii[c, n, 0] > zero and radii[c, n, 1] > zero:
                 x, y = right * v_means2d[c, n, 0], down * v_means2d[c, n, 1]
@@ -300,11 +299,9 @@ def add_views_kernel(real: type) -> Kernel:
                 x, y = right * v_absgrad[c, n, 0], down * v_absgrad[c, n, 1]
                 absgrad += math.sqrt(x * x + y * y)
                 seen += weight[c, n] if weight.size > 1 else weight[0, 0] if weight.size == 1 else factor
-                radius = max(radius, radii[c, n, 0], radii[c, n, 1])
         for row in range(rows):
             gradient_sum[row, n] += gradient
             absgrad_sum[row, n] += absgrad
             view_count[row, n] += seen
-        max_radius[n] = max(max_radius[n], radius / longer)
 
     return add

@@ -301,7 +301,7 @@ def test_screen_statistics(weight: str, dtype: torch.dtype) -> None:
         "scalar": torch.tensor(0.7, dtype=dtype),
         "each": draw(cameras, count, seed=4).to(dtype).sigmoid(),
     }
-    expected = Sums(*torch.zeros(3, 2, count, dtype=dtype), torch.zeros(count, dtype=dtype))
+    expected = Sums(*torch.zeros(3, 2, count, dtype=dtype))
     found = on_device(expected)
     for direct in (True, False):
         views = Views(v_means, v_absgrad, radii, 40, 30, weights[weight], direct)
