@@ -25,7 +25,7 @@ print("no PyTorch")
 """
 
 
-@pytest.mark.parametrize("name", ["normal_errors", "plane_errors", "compile_kernels"])
+@pytest.mark.parametrize("name", ["same_bits", "page_likeness", "compile_kernels"])
 def test_threads_wait_as_the_package_says(name: str) -> None:
     environment = {key: value for key, value in os.environ.items() if key != "OMP_WAIT_POLICY"}
     command = [sys.executable, "-c", WHAT_IS_SET, f"tools.{name}"]
