@@ -6,7 +6,7 @@ import importlib
 import json
 import os
 from collections.abc import Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from glassplat.captures.dataset import Dataset
 from glassplat.captures.masks import PANE_FOLDER, PLANES
 from glassplat.captures.view import PhotoFile, View
 from glassplat.errors import InputError, first_names
-from glassplat.files.images import image_size, write_image
+from glassplat.files.images import image_size, leads_out, picture_paths, write_image
 from glassplat.files.records import read_json
 from glassplat.files.sidecars import GLASS_REFLECTANCE, write_planes
 from glassplat.files.writing import atomic_write
@@ -120,18 +120,17 @@ def write_results(root: Path, views: Sequence[View], cameras: Sequence[NumpyCame
     folder = root / PANE_FOLDER
     earlier = earlier_masks(root)
     marked = set().union(*(pane.views() for pane, _ in panes))
-    shown = [(view, camera) for view, camera in zip(views, cameras, strict=True) if view.name in marked]
-    names = {view.name: PurePosixPath(view.name).with_suffix(".png").as_posix() for view, _ in shown}
-    if len(set(names.values())) < len(names):
-        names = {name: f"{name}.png" for name in names}
-    for view, camera in shown:
-        write_image(folder / names[view.name], in_photograph(view, pane_labels(view.name, camera, panes)))
-    for path in set(earlier) - {folder / name for name in names.values()}:
+    paths = {name: path for name, path in picture_paths([view.name for view in views]).items() if name in marked}
+    for view, camera in zip(views, cameras, strict=True):
+        if view.name in paths:
+            write_image(folder / paths[view.name], in_photograph(view, pane_labels(view.name, camera, panes)))
+    for path in set(earlier) - {folder / path for path in paths.values()}:
         path.unlink(missing_ok=True)
+    names = sorted(path.as_posix() for path in paths.values())
     with atomic_write(folder / RECORD) as temporary:
-        temporary.write_text(json.dumps(sorted(names.values()), indent=1), encoding="utf-8")
+        temporary.write_text(json.dumps(names, indent=1), encoding="utf-8")
     write_planes(root / PLANES, planes_of(panes, cameras))
-    return sorted(names.values())
+    return names
 
 
 def check_own_masks(dataset: Dataset) -> None:
@@ -167,8 +166,7 @@ def earlier_masks(root: Path) -> list[Path]:
             f"{folder} holds masks that were not made by `glassplat annotate` ({first_names(others)}), and one capture "
             "needs all of one kind: train with them as they are, or move that folder away and mark the panes here"
         )
-    plain = (name for name in known if not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts)
-    return [folder / name for name in plain]
+    return [folder / name for name in known if not leads_out(name)]
 
 
 def pane_labels(name: str, camera: NumpyCamera, panes: Solved) -> Labels:

@@ -239,13 +239,14 @@ def _distinct(parts: Mapping[str, Parts]) -> dict[str, Path]:
 def _inside(names: Sequence[str]) -> dict[str, Parts]:
     """Folders and file of each name, without what leads out; backslashes divide, as on Windows."""
     parts = {name: _normal(name) for name in names}
-    outside = [name for name in names if _leads_out(name)]
+    outside = [name for name in names if leads_out(name)]
     columns = zip(*(parts[name][:-1] for name in outside), strict=False)
     shared = sum(1 for _ in takewhile(lambda column: len(set(column)) == 1, columns))
     return parts | {name: parts[name][shared:] for name in outside}
 
 
-def _leads_out(name: str) -> bool:
+def leads_out(name: str) -> bool:
+    """Return whether a name is an absolute path, or climbs with `..`."""
     path = PureWindowsPath(name)
     return bool(path.anchor) or ".." in path.parts
 

@@ -20,7 +20,7 @@ from glassplat.errors import InputError
 from glassplat.files.images import read_image
 from glassplat.panes.fit import fit_planes
 from glassplat.scene.camera import NumpyCamera
-from tests.annotate.conftest import NAMES, PLACES, marked_document, saved
+from tests.annotate.conftest import NAMES, PLACES, marked_document, renamed, saved, write_colmap_room
 from tests.panes.pane_scene import FRONT, Pane, camera_from, label_image, normal_error, offset_error
 
 
@@ -84,6 +84,18 @@ def test_a_record_that_names_other_files_removes_none(room: Path) -> None:
     (room / "panes" / "annotated.json").write_text(json.dumps(["../transforms.json", *NAMES[:3]]))
     finish(room, marked_document((1, 2)))
     assert (room / "transforms.json").exists()
+
+
+@pytest.mark.parametrize("folder", ["../photos/", "/photos/", "a/../../photos/"])
+def test_masks_stay_in_their_folder_wherever_the_photographs_lie(folder: str, tmp_path: Path) -> None:
+    names = [f"{tmp_path if folder.startswith('/') else ''}{folder}{name}" for name in NAMES]
+    (tmp_path / "room" / "images" / "a").mkdir(parents=True)
+    root = write_colmap_room(tmp_path / "room", names)
+    before = [(root / "images" / name).read_bytes() for name in names]
+    finish(root, renamed(marked_document(), names))
+    assert [(root / "images" / name).read_bytes() for name in names] == before
+    assert sorted(path.name for path in (root / "panes").glob("*.png")) == NAMES[:3]
+    assert [view.name for view in load_dataset(root).train if view.is_annotated] == names[1:3]
 
 
 def test_without_a_pane_nothing_is_written(room: Path) -> None:
