@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from glassplat.annotate.document import MarkedPane, depths, fill_polygon, seen_outline, with_strokes
 from glassplat.annotate.fit import PaneFit
 from glassplat.captures.dataset import Dataset
-from glassplat.captures.masks import PANE_FOLDER, PLANES
+from glassplat.captures.masks import PANE_FOLDER, PLANES, mask_paths
 from glassplat.captures.view import PhotoFile, View
 from glassplat.errors import InputError, first_names
-from glassplat.files.images import image_size, leads_out, picture_paths, write_image
+from glassplat.files.images import image_size, leads_out, write_image
 from glassplat.files.records import read_json
 from glassplat.files.sidecars import GLASS_REFLECTANCE, write_planes
 from glassplat.files.writing import atomic_write
@@ -120,7 +120,7 @@ def write_results(root: Path, views: Sequence[View], cameras: Sequence[NumpyCame
     folder = root / PANE_FOLDER
     earlier = earlier_masks(root)
     marked = set().union(*(pane.views() for pane, _ in panes))
-    paths = {name: path for name, path in picture_paths([view.name for view in views]).items() if name in marked}
+    paths = {name: path for name, path in mask_paths(view.name for view in views).items() if name in marked}
     for view, camera in zip(views, cameras, strict=True):
         if view.name in paths:
             write_image(folder / paths[view.name], in_photograph(view, pane_labels(view.name, camera, panes)))

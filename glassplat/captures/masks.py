@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from glassplat.errors import InputError, first_names, input_checked
-from glassplat.files.images import IMAGE_SUFFIXES, SHADES_16, open_image, read_image
+from glassplat.files.images import IMAGE_SUFFIXES, SHADES_16, leads_out, open_image, picture_paths, read_image
 
 HIGHEST_LABEL = 64
 """Grey values up to this one are labels when nothing brighter occurs; no one paints masks for the eye that dark."""
@@ -245,7 +245,8 @@ def find_masks(
 
     Panes are in `panes/`; what is black in `masks/`, or above black in `ignore/`, is left out. In each folder is looked
     for, for a photograph `a/x.jpg`: `a/x.png`, `a/x.jpg.png`, `a/x.jpg` and `a/x_mask.png`, each with any image suffix
-    and without the folder where that is unique; and for masks also `x_mask.png` next to the photograph.
+    and without the folder where that is unique; and for masks also `x_mask.png` next to the photograph. Where names are
+    alike, `mask_paths` has one for each; and a name with its folder goes before one without.
 
     Args:
         root: the capture's folder.
@@ -414,13 +415,14 @@ def _match(
     What belongs to no photograph is appended to `unmatched`, or refused.
     """
     found: dict[str, list[Path]] = defaultdict(list)
-    names = _names_by_key(photographs)
+    keys = _owners_by_key(photographs if folder.is_dir() else ())
     strangers: list[str] = []
     for path in _image_files(folder):
-        owners = next((names[key] for key in _keys_of_mask(path.relative_to(folder)) if key in names), [])
+        owners = _owners(path.relative_to(folder), keys)
         if len(owners) > 1:
             raise InputError(
-                f"mask {path} could belong to {first_names(sorted(owners))}; name it after one, with its folder"
+                f"mask {path} could belong to {first_names(sorted(owners))}; call it "
+                f"{mask_paths(photographs)[min(owners)]}, or after another of them"
             )
         if owners:
             found[owners[0]].append(path)
@@ -442,7 +444,7 @@ def _no_photograph(folder: Path, unmatched: list[str], photographs: Mapping[str,
     """Message about masks that belong to no photograph."""
     return (
         f"{len(unmatched)} masks in {folder} match no photograph: {first_names(sorted(unmatched))}; name a mask "
-        f"like its photograph, such as {PurePosixPath(min(photographs)).with_suffix('.png')}"
+        f"like its photograph, such as {mask_paths(photographs)[min(photographs)]}"
     )
 
 
@@ -470,20 +472,39 @@ def _beside(photograph: Path) -> list[Path]:
     return [path for path in candidates if path.is_file()]
 
 
-def _names_by_key(names: Iterable[str]) -> dict[str, list[str]]:
-    """Photographs by the names that their masks may have, with and without folder and suffix."""
-    found: dict[str, list[str]] = defaultdict(list)
-    for name in names:
+def mask_paths(photographs: Iterable[str]) -> dict[str, Path]:
+    """Path of a mask in its folder, for every photograph of a capture: no other photograph's is looked for there.
+
+    Photographs in the capture choose first, and then those whose names lead out of it.
+    """
+    return picture_paths(sorted(photographs, key=lambda name: (leads_out(name), name)))
+
+
+Owners = Mapping[str, list[str]]
+"""Photographs by a name that their masks may have."""
+
+
+def _owners_by_key(photographs: Iterable[str]) -> tuple[Owners, Owners, Owners]:
+    """Photographs by the names of `mask_paths`, their own, and those without the folder; with and without suffix."""
+    unique = {path.with_suffix("").as_posix(): [name] for name, path in mask_paths(photographs).items()}
+    whole, bare = defaultdict[str, list[str]](list), defaultdict[str, list[str]](list)
+    for name in photographs:
         path = PurePosixPath(name)
-        for key in {name, str(path.with_suffix("")), path.name, path.stem}:
-            found[key].append(name)
-    return found
+        for key in {name, str(path.with_suffix(""))}:
+            whole[key].append(name)
+        for key in {path.name, path.stem}:
+            bare[key].append(name)
+    return unique, whole, bare
 
 
-def _keys_of_mask(relative: Path) -> tuple[str, ...]:
-    """Names of photographs that a mask file may stand for, the most explicit first."""
-    without_suffix = relative.with_suffix("").as_posix()
-    return relative.as_posix(), without_suffix, without_suffix.removesuffix(MASK_MARK)
+def _owners(relative: Path, keys: tuple[Owners, Owners, Owners]) -> list[str]:
+    """The photographs that a mask file may belong to by the most exact of its names."""
+    unique, *others = keys
+    plain = relative.with_suffix("").as_posix()
+    if plain in unique:
+        return unique[plain]
+    spellings = relative.as_posix(), plain, plain.removesuffix(MASK_MARK)
+    return next((owners[key] for owners in others for key in spellings if key in owners), [])
 
 
 def _check_same_kind(values: Mapping[str, MaskValues], paths: Mapping[str, Path]) -> None:

@@ -98,6 +98,17 @@ def test_masks_stay_in_their_folder_wherever_the_photographs_lie(folder: str, tm
     assert [view.name for view in load_dataset(root).train if view.is_annotated] == names[1:3]
 
 
+@pytest.mark.parametrize(
+    "names", [["a.jpg", "a.png", "b.png", "c.png", "d.png"], ["1.jpg", "a/1.jpg", "b/1.jpg", "2.jpg", "3.jpg"]]
+)
+def test_a_mask_belongs_to_its_photograph_and_to_no_other_of_a_like_name(names: list[str], tmp_path: Path) -> None:
+    root = write_colmap_room(tmp_path / "room", names)
+    finish(root, renamed(marked_document((0, 3)), names))
+    dataset = load_dataset(root)
+    annotated = {view.name for view in (*dataset.train, *dataset.test) if view.is_annotated}
+    assert annotated == {names[0], names[3]}
+
+
 def test_without_a_pane_nothing_is_written(room: Path) -> None:
     with pytest.raises(InputError, match="no pane is known yet"):
         finish(room, marked_document((0,)))
