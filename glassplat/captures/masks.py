@@ -1,7 +1,7 @@
 """Masks of panes (`panes/`) and of what is left out (`masks/`, `ignore/`): their files and what their values mean.
 
-A mask of panes is either a label image (0 no pane, 1..K the pane) or binary (0 and 255, one pane). Binary masks come in
-both polarities; which one is decided over the whole set, because one mask alone cannot tell.
+A mask of panes is either a label image (0 no pane, 1..K the pane) or binary (0 and 255, or one bit; one pane). Binary
+masks come in both polarities; which one is decided over the whole set, because one mask alone cannot tell.
 
 Masks in `masks/`, or `x_mask.png` next to a photograph `x.png`, mean what they mean in COLMAP, nerfstudio, Brush,
 3DGRUT and LichtFeld: what is black is left out. Earlier versions kept panes there; such captures are read as they were.
@@ -83,11 +83,11 @@ def _read_shades(path: Path) -> NDArray[np.uint8]:
     with input_checked():
         image = open_image(path)
     image.info.pop("transparency", None)  # It says nothing about panes, and Pillow warns of some ways to store it.
-    if image.mode == "1" or (image.mode == "P" and not _is_black_and_white(image)):
+    if image.mode == "P" and not _is_black_and_white(image):
         return np.array(image).astype(np.uint8)
     if image.mode in SHADES_16:
         return _in_eight_bits(np.array(image), path)
-    if image.mode in ("L", "LA", "P"):
+    if image.mode in ("1", "L", "LA", "P"):
         return np.array(image.convert("L"))
     return _one_colour(np.array(image.convert("RGB")), path)
 
@@ -315,11 +315,9 @@ def _why_panes(root: Path, masks: Mapping[str, Path], *, marked: bool) -> str | 
 
 
 def _highest_value(path: Path) -> int:
-    """The highest shade of a mask; white for one of one bit."""
+    """The highest shade of a mask."""
     with input_checked():
         image = open_image(path)
-    if image.mode == "1":
-        return WHITE
     brightest = int(_brightness(path).max())
     if path.suffix.lower() in LOSSY_SUFFIXES:
         return int(brightest > LOSSY_NOISE) * WHITE

@@ -272,6 +272,17 @@ def test_inverted_masks_are_recognised_by_their_border(capture) -> None:
     np.testing.assert_array_equal(labels_of(stated), 1 - INSIDE)
 
 
+def test_masks_of_one_bit_have_a_polarity_next_to_those_of_eight(capture) -> None:
+    capture.write_colmap()
+    outside = INSIDE == 0
+    capture.write_mask("panes/0001.png", outside)
+    capture.write_mask("panes/0002.png", outside.astype(np.uint8) * 255)
+    for polarity, expected in (("auto", INSIDE), ("dark", INSIDE), ("bright", 1 - INSIDE)):
+        data = load_dataset(capture.root, mask_polarity=polarity)
+        for name in ("0001.png", "0002.png"):
+            np.testing.assert_array_equal(labels_of(data, name), expected)
+
+
 def test_stated_polarity_does_not_touch_label_images(capture) -> None:
     capture.write_colmap()
     capture.write_mask("panes/0001.png", INSIDE)
