@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +14,12 @@ from numpy.typing import NDArray
 
 from glassplat.annotate.document import MarkedPane, depths, fill_polygon, seen_outline, with_strokes
 from glassplat.annotate.fit import PaneFit
-from glassplat.captures.dataset import Dataset
+from glassplat.captures.dataset import Dataset, dataset_of
+from glassplat.captures.files import read_poses, with_masks
 from glassplat.captures.masks import PANE_FOLDER, PLANES, mask_paths
 from glassplat.captures.view import PhotoFile, View
 from glassplat.errors import InputError, first_names
-from glassplat.files.images import image_size, leads_out, write_image
+from glassplat.files.images import image_size, is_hidden, leads_out, write_image
 from glassplat.files.records import read_json
 from glassplat.files.sidecars import GLASS_REFLECTANCE, write_planes
 from glassplat.files.writing import atomic_write
@@ -120,53 +120,68 @@ def write_results(root: Path, views: Sequence[View], cameras: Sequence[NumpyCame
     folder = root / PANE_FOLDER
     earlier = earlier_masks(root)
     marked = set().union(*(pane.views() for pane, _ in panes))
-    paths = {name: path for name, path in mask_paths(view.name for view in views).items() if name in marked}
-    for view, camera in zip(views, cameras, strict=True):
-        if view.name in paths:
-            write_image(folder / paths[view.name], in_photograph(view, pane_labels(view.name, camera, panes)))
-    for path in set(earlier) - {folder / path for path in paths.values()}:
-        path.unlink(missing_ok=True)
-    names = sorted(path.as_posix() for path in paths.values())
-    with atomic_write(folder / RECORD) as temporary:
-        temporary.write_text(json.dumps(names, indent=1), encoding="utf-8")
+    paths = mask_paths(view.name for view in views)
+    shown = [(view, camera) for view, camera in zip(views, cameras, strict=True) if view.name in marked]
+    new = {paths[view.name].as_posix() for view, _ in shown}
+    _write_record(folder, earlier | new)  # First: after an interrupt, all that is there is known to be ours.
+    for view, camera in shown:
+        write_image(folder / paths[view.name], in_photograph(view, pane_labels(view.name, camera, panes)))
+    for name in earlier - new:
+        (folder / name).unlink(missing_ok=True)
+    _write_record(folder, new)
     write_planes(root / PLANES, planes_of(panes, cameras))
-    return names
+    return sorted(new)
 
 
-def check_own_masks(dataset: Dataset) -> None:
-    """Refuse a capture whose masks of panes were not made here.
+def _write_record(folder: Path, masks: Set[str]) -> None:
+    """Notes which masks of a folder were made here."""
+    with atomic_write(folder / RECORD) as temporary:
+        temporary.write_text(json.dumps(sorted(masks), indent=1), encoding="utf-8")
+
+
+def capture_to_mark(root: Path) -> Dataset:
+    """A capture whose panes are marked here, or nowhere.
+
+    Masks that were made here are not read: after an interrupt, or if they show no pane, they would be in the way.
 
     Raises:
-        InputError: there are others.
+        FileNotFoundError: no such folder.
+        InputError: it cannot be read, or holds masks of panes that were not made here.
     """
-    if not earlier_masks(dataset.root) and any(view.is_annotated for view in (*dataset.train, *dataset.test)):
+    earlier_masks(root)
+    files = read_poses(root)
+    if files.capture.masks is not None or not (root / PANE_FOLDER).is_dir():
+        files = with_masks(files)
+    if files.masks.masks:
         raise InputError(
-            f"the panes of {dataset.root} are marked by masks that were not made by `glassplat annotate`, and one "
+            f"the panes of {root} are marked by masks that were not made by `glassplat annotate`, and one "
             "capture needs all of one kind: train with them as they are, or move them away and mark the panes here"
         )
+    return dataset_of(files)
 
 
-def earlier_masks(root: Path) -> list[Path]:
-    """Masks of a capture's panes that were made here before.
+def earlier_masks(root: Path) -> set[str]:
+    """Names in their folder of the masks of a capture's panes that were made here before.
 
     Raises:
         InputError: there are others.
     """
     folder = root / PANE_FOLDER
     if not folder.is_dir():
-        return []
+        return set()
     try:
-        known = [str(name) for name in read_json(folder / RECORD)]
+        known = {str(name) for name in read_json(folder / RECORD)}
     except (OSError, ValueError, TypeError):
-        known = []
-    found = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
-    others = sorted(name for name in found if name not in known and os.path.basename(name) != RECORD)
+        known = set()
+    found = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file()]
+    seen = {path.as_posix() for path in found if not is_hidden(path) and path.name != RECORD}
+    others = sorted(seen - known)
     if others:
         raise InputError(
             f"{folder} holds masks that were not made by `glassplat annotate` ({first_names(others)}), and one capture "
             "needs all of one kind: train with them as they are, or move that folder away and mark the panes here"
         )
-    return [folder / name for name in known if not leads_out(name)]
+    return {name for name in known if not leads_out(name)}
 
 
 def pane_labels(name: str, camera: NumpyCamera, panes: Solved) -> Labels:

@@ -27,8 +27,8 @@ from glassplat.annotate.document import (
     write_document,
 )
 from glassplat.annotate.fit import Marks, PaneFit, TooFewMarksError, corner_information, fit_pane, tilt_deviation
-from glassplat.annotate.results import check_own_masks, grab_outlines, write_results
-from glassplat.captures.dataset import Dataset, load_dataset
+from glassplat.annotate.results import capture_to_mark, grab_outlines, write_results
+from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import View
 from glassplat.errors import InputError, input_checked
 from glassplat.files.records import Field, Items, Text, Whole, check_fields
@@ -419,7 +419,6 @@ def opened_session(root: Path) -> Session:
     Raises:
         InputError: it cannot be read, or nothing may be written in it.
     """
-    dataset = load_dataset(root)
+    dataset = capture_to_mark(root)
     check_folder(root)
-    check_own_masks(dataset)
     return Session(dataset)

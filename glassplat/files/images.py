@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from itertools import count, takewhile
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -197,6 +197,11 @@ def _to_uint8(pixels: NDArray[np.generic]) -> NDArray[np.uint8]:
     if not np.isfinite(values).all():
         raise ValueError("the image holds values that are not finite; expected numbers in [0, 1]")
     return np.ascontiguousarray(np.round(np.clip(values, 0, 1) * 255).astype(np.uint8))
+
+
+def is_hidden(relative: PurePath) -> bool:
+    """Return whether a file, by its path from a folder, is one that people do not see there: it or a folder of it."""
+    return any(part.startswith(".") for part in relative.parts)
 
 
 Parts = tuple[str, ...]

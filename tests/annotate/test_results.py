@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,8 @@ from glassplat.panes.fit import fit_planes
 from glassplat.scene.camera import NumpyCamera
 from tests.annotate.conftest import NAMES, PLACES, marked_document, renamed, saved, write_colmap_room
 from tests.panes.pane_scene import FRONT, Pane, camera_from, label_image, normal_error, offset_error
+
+EVERYTHING = {"kind": "polygon", "effect": "cut", "radius": 1, "points": [[0, 0], [300, 0], [300, 220], [0, 220]]}
 
 
 def finish(root: Path, document: dict) -> None:
@@ -107,6 +110,45 @@ def test_a_mask_belongs_to_its_photograph_and_to_no_other_of_a_like_name(names: 
     dataset = load_dataset(root)
     annotated = {view.name for view in (*dataset.train, *dataset.test) if view.is_annotated}
     assert annotated == {names[0], names[3]}
+
+
+@pytest.mark.parametrize("written", range(6))
+def test_an_interrupt_at_any_file_loses_nothing(written: int, room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files that are put in their places: the record, three masks, the record again, the planes."""
+    places: list[str] = []
+
+    def replace(source: str, target: str) -> None:
+        if len(places) == written:
+            (room / "panes" / ".0.0123456789ab.tmp.png").write_text("what a killed writer leaves behind")
+            raise KeyboardInterrupt
+        places.append(target)
+        replace_file(source, target)
+
+    replace_file = os.replace
+    session = opened_session(room)
+    saved(session, marked_document(strokes={"0.png": [EVERYTHING]}))
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(os, "replace", replace)
+        session.finish()
+    assert len(places) == written
+    finish(room, marked_document((1, 2)))
+    assert sorted(path.name for path in (room / "panes").glob("[!.]*.png")) == ["1.png", "2.png"]
+    assert load_dataset(room).pane_labels == (1,)
+    Image.new("L", (300, 220), 1).save(room / "panes" / "0.png")
+    with pytest.raises(InputError, match=r"not made by `glassplat annotate` \(0\.png\)"):
+        opened_session(room)
+
+
+def test_masks_of_the_format_or_in_another_folder_were_not_made_here(room: Path) -> None:
+    (room / "masks").mkdir()
+    Image.new("L", (300, 220), 1).save(room / "masks" / "0.png")
+    with pytest.raises(InputError, match="marked by masks that were not made by `glassplat annotate`"):
+        opened_session(room)
+    (room / "transforms.json").rename(room / "transforms_train.json")
+    (room / "masks" / "0.png").rename(room / "masks" / "MirrorMask_0.png")
+    (room / "panes").mkdir()
+    with pytest.raises(InputError, match="marked by masks that were not made by `glassplat annotate`"):
+        opened_session(room)
 
 
 def test_without_a_pane_nothing_is_written(room: Path) -> None:
