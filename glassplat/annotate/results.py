@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import json
 from collections.abc import Sequence, Set
@@ -22,7 +23,7 @@ from glassplat.errors import InputError, first_names
 from glassplat.files.images import image_size, is_hidden, leads_out, write_image
 from glassplat.files.records import read_json
 from glassplat.files.sidecars import GLASS_REFLECTANCE, write_planes
-from glassplat.files.writing import atomic_write
+from glassplat.files.writing import atomic_write, remove_empty, remove_unfinished
 from glassplat.panes.masks import min_area_rectangle
 from glassplat.scene import logit
 from glassplat.scene.camera import NumpyCamera
@@ -104,7 +105,7 @@ Labels = NDArray[np.uint8]
 Solved = Sequence[tuple[MarkedPane, PaneFit]]
 
 RECORD = "annotated.json"
-"""In the folder of masks: which of them were made here, and may be replaced."""
+"""In the folder of masks: which of them, and which planes, were made here, and may be replaced."""
 MIRROR_REFLECTANCE = 0.999
 
 
@@ -123,20 +124,56 @@ def write_results(root: Path, views: Sequence[View], cameras: Sequence[NumpyCame
     paths = mask_paths(view.name for view in views)
     shown = [(view, camera) for view, camera in zip(views, cameras, strict=True) if view.name in marked]
     new = {paths[view.name].as_posix() for view, _ in shown}
-    _write_record(folder, earlier | new)  # First: after an interrupt, all that is there is known to be ours.
+    # First: after an interrupt, all that is there is known to be ours.
+    _write_record(folder, earlier | new, _made_here(folder)[1])
     for view, camera in shown:
         write_image(folder / paths[view.name], in_photograph(view, pane_labels(view.name, camera, panes)))
     for name in earlier - new:
         (folder / name).unlink(missing_ok=True)
-    _write_record(folder, new)
     write_planes(root / PLANES, planes_of(panes, cameras))
+    _write_record(folder, new, _digest(root / PLANES))
     return sorted(new)
 
 
-def _write_record(folder: Path, masks: Set[str]) -> None:
-    """Notes which masks of a folder were made here."""
+def remove_results(root: Path) -> list[str]:
+    """Removes the masks and planes that were made here, and nothing else; returns their names in the capture.
+
+    Raises:
+        InputError: the folder of masks holds some that were not made here.
+        OSError: something cannot be removed.
+    """
+    folder = root / PANE_FOLDER
+    masks, planes = [folder / name for name in sorted(earlier_masks(root))], _made_here(folder)[1]
+    ours = [*([root / PLANES] if planes == _digest(root / PLANES) else ()), *masks]
+    removed = [path for path in ours if path.is_file()]
+    for path in (*removed, folder / RECORD):  # The record last: after an interrupt, the rest is known to be ours.
+        path.unlink(missing_ok=True)
+    folders = {folder, *(above for path in masks for above in path.parents if above.is_relative_to(folder))}
+    for emptied in folders:
+        remove_unfinished(emptied, (".png", ".json"))
+    remove_empty(sorted(folders, reverse=True))
+    return [path.relative_to(root).as_posix() for path in removed]
+
+
+def _write_record(folder: Path, masks: Set[str], planes: str) -> None:
+    """Notes which masks of a folder were made here, and the digest of the planes that were."""
     with atomic_write(folder / RECORD) as temporary:
-        temporary.write_text(json.dumps(sorted(masks), indent=1), encoding="utf-8")
+        temporary.write_text(json.dumps({"masks": sorted(masks), "planes": planes}, indent=1), encoding="utf-8")
+
+
+def _made_here(folder: Path) -> tuple[set[str], str]:
+    """Masks of a folder and digest of planes, as recorded; a list of masks alone where an earlier version did it."""
+    try:
+        record = read_json(folder / RECORD)
+        masks, planes = (record["masks"], record["planes"]) if isinstance(record, dict) else (record, "")
+        return {str(name) for name in masks}, str(planes)
+    except (OSError, ValueError, TypeError, KeyError):
+        return set(), ""
+
+
+def _digest(path: Path) -> str:
+    """Digest of a file's contents; empty where there is none."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
 
 def capture_to_mark(root: Path) -> Dataset:
@@ -169,10 +206,7 @@ def earlier_masks(root: Path) -> set[str]:
     folder = root / PANE_FOLDER
     if not folder.is_dir():
         return set()
-    try:
-        known = {str(name) for name in read_json(folder / RECORD)}
-    except (OSError, ValueError, TypeError):
-        known = set()
+    known, _ = _made_here(folder)
     found = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file()]
     seen = {path.as_posix() for path in found if not is_hidden(path) and path.name != RECORD}
     others = sorted(seen - known)

@@ -27,10 +27,10 @@ from tests.panes.pane_scene import FRONT, Pane, camera_from, label_image, normal
 EVERYTHING = {"kind": "polygon", "effect": "cut", "radius": 1, "points": [[0, 0], [300, 0], [300, 220], [0, 220]]}
 
 
-def finish(root: Path, document: dict) -> None:
+def finish(root: Path, document: dict) -> dict:
     session = opened_session(root)
     saved(session, document)
-    session.finish()
+    return session.finish()
 
 
 def photographed_pane(root: Path, name: str) -> np.ndarray:
@@ -114,7 +114,7 @@ def test_a_mask_belongs_to_its_photograph_and_to_no_other_of_a_like_name(names: 
 
 @pytest.mark.parametrize("written", range(6))
 def test_an_interrupt_at_any_file_loses_nothing(written: int, room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Files that are put in their places: the record, three masks, the record again, the planes."""
+    """Files that are put in their places: the record, three masks, the planes, the record again."""
     places: list[str] = []
 
     def replace(source: str, target: str) -> None:
@@ -149,6 +149,46 @@ def test_masks_of_the_format_or_in_another_folder_were_not_made_here(room: Path)
     (room / "panes").mkdir()
     with pytest.raises(InputError, match="marked by masks that were not made by `glassplat annotate`"):
         opened_session(room)
+
+
+@pytest.mark.parametrize("unmarked", [{"version": 1, "panes": []}, marked_document(())])
+def test_the_last_pane_can_be_unmarked(unmarked: dict, tmp_path: Path) -> None:
+    names = ["left/0.png", "left/1.png", "right/2.png", "3.png", "4.png"]
+    root = write_colmap_room(tmp_path / "room", names)
+    before = sorted(root.rglob("*"))
+    finish(root, renamed(marked_document(), names))
+    removed = "planes.json, panes/left/0.png, panes/left/1.png, panes/right/2.png"
+    told = finish(root, unmarked)
+    assert told == {"masks": [], "planes": [], "told": f"no pane is marked; removed what was written: {removed}"}
+    assert sorted(root.rglob("*")) == sorted([*before, root / "annotations.json"])
+    with pytest.raises(InputError, match="no pane is known yet"):
+        finish(root, unmarked)
+
+
+def test_unmarking_removes_nothing_that_was_not_written_here(room: Path) -> None:
+    nothing = {"version": 1, "panes": []}
+    finish(room, marked_document())
+    with pytest.raises(InputError, match="no pane is known yet"):
+        finish(room, marked_document((0,)))
+    assert (room / "panes" / "1.png").exists()
+    session = opened_session(room)
+    saved(session, nothing)
+    Image.new("L", (300, 220), 1).save(room / "panes" / "4.png")
+    with pytest.raises(InputError, match=r"not made by `glassplat annotate` \(4\.png\)"):
+        session.finish()
+    assert len(list((room / "panes").glob("*.png"))) == 4
+    (room / "panes" / "4.png").unlink()
+    planes = (room / "planes.json").read_text()
+    (room / "planes.json").write_text(planes + " ")
+    assert "planes.json stays: it was not written here" in session.finish()["told"]
+    assert not (room / "panes").exists() and (room / "planes.json").read_text() == planes + " "
+
+
+def test_a_record_of_earlier_versions_tells_of_masks_only(room: Path) -> None:
+    finish(room, marked_document())
+    (room / "panes" / "annotated.json").write_text(json.dumps(NAMES[:3]))
+    assert "planes.json stays" in finish(room, {"version": 1, "panes": []})["told"]
+    assert not (room / "panes").exists() and (room / "planes.json").exists()
 
 
 def test_without_a_pane_nothing_is_written(room: Path) -> None:
