@@ -10,7 +10,7 @@ Masks in `masks/`, or `x_mask.png` next to a photograph `x.png`, mean what they 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from os.path import lexists, normpath
 from pathlib import Path, PurePosixPath
@@ -21,7 +21,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from glassplat.errors import InputError, first_names, input_checked
-from glassplat.files.images import IMAGE_SUFFIXES, SHADES_16, leads_out, open_image, picture_paths, read_image
+from glassplat.files.images import (
+    IMAGE_SUFFIXES,
+    SHADES_16,
+    is_hidden,
+    leads_out,
+    open_image,
+    picture_paths,
+    read_image,
+)
 
 HIGHEST_LABEL = 64
 """Grey values up to this one are labels when nothing brighter occurs; no one paints masks for the eye that dark."""
@@ -415,7 +423,7 @@ def _match(
     found: dict[str, list[Path]] = defaultdict(list)
     keys = _owners_by_key(photographs if folder.is_dir() else ())
     strangers: list[str] = []
-    for path in _image_files(folder):
+    for path in _image_files(folder, keys[0]):
         owners = _owners(path.relative_to(folder), keys)
         if len(owners) > 1:
             raise InputError(
@@ -446,8 +454,8 @@ def _no_photograph(folder: Path, unmatched: list[str], photographs: Mapping[str,
     )
 
 
-def _image_files(folder: Path) -> Iterator[Path]:
-    """Image files below a folder, hidden ones left out.
+def _image_files(folder: Path, hidden: Container[str]) -> Iterator[Path]:
+    """Image files below a folder, without hidden ones but those that are known by name, of hidden photographs.
 
     Raises:
         InputError: something else goes by the folder's or by an image's name, such as a link to nowhere.
@@ -457,7 +465,10 @@ def _image_files(folder: Path) -> Iterator[Path]:
             raise InputError(f"{folder} is no folder that can be read; expected one of mask images, or none")
         return
     for path in sorted(folder.rglob("*")):
-        if path.suffix.lower() not in IMAGE_SUFFIXES or path.name.startswith(".") or path.is_dir():
+        relative = path.relative_to(folder)
+        if is_hidden(relative) and relative.with_suffix("").as_posix() not in hidden:
+            continue
+        if path.suffix.lower() not in IMAGE_SUFFIXES or path.is_dir():
             continue
         if not path.is_file():
             raise InputError(f"mask {path} is no file that can be read; replace or remove it")

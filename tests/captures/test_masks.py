@@ -116,6 +116,22 @@ def test_every_photograph_has_a_mask_of_its_own(tmp_path: Path, photographs: lis
     assert masks_of(tmp_path, list(expected.values()), photographs) == expected
 
 
+@pytest.mark.parametrize("folder", ["panes", "masks", "ignore"])
+def test_hidden_folders_are_left_out(capture, folder: str) -> None:
+    capture.write_colmap()
+    capture.write_mask(f"{folder}/0001.png", INSIDE * 255)
+    capture.write_mask(f"{folder}/.ipynb_checkpoints/0001-checkpoint.png", INSIDE * 255)
+    capture.write_mask(f"{folder}/left/.thumbnails/0001.png", INSIDE * 255)
+    (capture.root / folder / ".#0001.png").symlink_to("/nowhere")
+    assert load_dataset(capture.root).warnings == ()
+
+
+def test_masks_of_hidden_photographs_are_not(tmp_path: Path) -> None:
+    assert masks_of(tmp_path, [".cam/1.png", ".cam/2-checkpoint.png"], [".cam/1.jpg", "2.jpg"]) == {
+        ".cam/1.jpg": ".cam/1.png"
+    }
+
+
 def test_a_name_that_does_for_two_photographs_is_refused_with_one_that_does_for_one(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"could belong to a\.jpg, a\.png; call it a\.jpg\.png, or after another"):
         masks_of(tmp_path, ["a.tif"], ["a.jpg", "a.png"])
