@@ -253,8 +253,9 @@ def find_masks(
 
     Panes are in `panes/`; what is black in `masks/`, or above black in `ignore/`, is left out. In each folder is looked
     for, for a photograph `a/x.jpg`: `a/x.png`, `a/x.jpg.png`, `a/x.jpg` and `a/x_mask.png`, each with any image suffix
-    and without the folder where that is unique; and for masks also `x_mask.png` next to the photograph. Where names are
-    alike, `mask_paths` has one for each; and a name with its folder goes before one without.
+    and without the folder where that is unique; and for masks also `x_mask.png` next to the photograph, unless that is
+    a photograph of the capture. Where names are alike, `mask_paths` has one for each; and a name with its folder goes
+    before one without.
 
     Args:
         root: the capture's folder.
@@ -438,8 +439,9 @@ def _match(
         raise InputError(_no_photograph(folder, strangers, photographs))
     if unmatched is not None:
         unmatched.extend(strangers)
+    taken = {normpath(path) for path in photographs.values()}
     for name, path in photographs.items():
-        found[name].extend(beside(path))
+        found[name].extend(mask for mask in beside(path) if normpath(mask) not in taken)
     for name, several in found.items():
         if len(several) > 1:
             raise InputError(f"{name} has {len(several)} masks: {first_names([str(p) for p in several])}; keep one")

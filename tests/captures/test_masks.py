@@ -132,6 +132,16 @@ def test_masks_of_hidden_photographs_are_not(tmp_path: Path) -> None:
     }
 
 
+def test_a_photograph_is_no_mask_of_the_one_next_to_it(capture) -> None:
+    capture.names[:3] = ["wall.png", "wall_mask.png", "door.png"]
+    capture.write_colmap()
+    capture.write_mask("images/door_mask.png", INSIDE * 255)
+    data = load_dataset(capture.root)
+    ignored = {view.name: view.ignored for view in (*data.train, *data.test) if view.ignored is not None}
+    assert list(ignored) == ["door.png"]
+    np.testing.assert_array_equal(ignored["door.png"].numpy() == 0, INSIDE == 1)
+
+
 def test_a_name_that_does_for_two_photographs_is_refused_with_one_that_does_for_one(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"could belong to a\.jpg, a\.png; call it a\.jpg\.png, or after another"):
         masks_of(tmp_path, ["a.tif"], ["a.jpg", "a.png"])
