@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import json
-import os
-from collections.abc import Sequence
-from pathlib import Path, PurePosixPath
+from collections.abc import Sequence, Set
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,14 +15,15 @@ from numpy.typing import NDArray
 
 from glassplat.annotate.document import MarkedPane, depths, fill_polygon, seen_outline, with_strokes
 from glassplat.annotate.fit import PaneFit
-from glassplat.captures.dataset import Dataset
-from glassplat.captures.masks import PANE_FOLDER, PLANES
+from glassplat.captures.dataset import Dataset, dataset_of
+from glassplat.captures.files import read_poses, with_masks
+from glassplat.captures.masks import PANE_FOLDER, PLANES, mask_paths
 from glassplat.captures.view import PhotoFile, View
 from glassplat.errors import InputError, first_names
-from glassplat.files.images import image_size, write_image
+from glassplat.files.images import image_size, is_hidden, leads_out, write_image
 from glassplat.files.records import read_json
 from glassplat.files.sidecars import GLASS_REFLECTANCE, write_planes
-from glassplat.files.writing import atomic_write
+from glassplat.files.writing import atomic_write, remove_empty, remove_unfinished
 from glassplat.panes.masks import min_area_rectangle
 from glassplat.scene import logit
 from glassplat.scene.camera import NumpyCamera
@@ -104,7 +105,7 @@ Labels = NDArray[np.uint8]
 Solved = Sequence[tuple[MarkedPane, PaneFit]]
 
 RECORD = "annotated.json"
-"""In the folder of masks: which of them were made here, and may be replaced."""
+"""In the folder of masks: which of them, and which planes, were made here, and may be replaced."""
 MIRROR_REFLECTANCE = 0.999
 
 
@@ -120,55 +121,101 @@ def write_results(root: Path, views: Sequence[View], cameras: Sequence[NumpyCame
     folder = root / PANE_FOLDER
     earlier = earlier_masks(root)
     marked = set().union(*(pane.views() for pane, _ in panes))
+    paths = mask_paths(view.name for view in views)
     shown = [(view, camera) for view, camera in zip(views, cameras, strict=True) if view.name in marked]
-    names = {view.name: PurePosixPath(view.name).with_suffix(".png").as_posix() for view, _ in shown}
-    if len(set(names.values())) < len(names):
-        names = {name: f"{name}.png" for name in names}
+    new = {paths[view.name].as_posix() for view, _ in shown}
+    # First: after an interrupt, all that is there is known to be ours.
+    _write_record(folder, earlier | new, _made_here(folder)[1])
     for view, camera in shown:
-        write_image(folder / names[view.name], in_photograph(view, pane_labels(view.name, camera, panes)))
-    for path in set(earlier) - {folder / name for name in names.values()}:
-        path.unlink(missing_ok=True)
-    with atomic_write(folder / RECORD) as temporary:
-        temporary.write_text(json.dumps(sorted(names.values()), indent=1), encoding="utf-8")
+        write_image(folder / paths[view.name], in_photograph(view, pane_labels(view.name, camera, panes)))
+    for name in earlier - new:
+        (folder / name).unlink(missing_ok=True)
     write_planes(root / PLANES, planes_of(panes, cameras))
-    return sorted(names.values())
+    _write_record(folder, new, _digest(root / PLANES))
+    return sorted(new)
 
 
-def check_own_masks(dataset: Dataset) -> None:
-    """Refuse a capture whose masks of panes were not made here.
+def remove_results(root: Path) -> list[str]:
+    """Removes the masks and planes that were made here, and nothing else; returns their names in the capture.
 
     Raises:
-        InputError: there are others.
+        InputError: the folder of masks holds some that were not made here.
+        OSError: something cannot be removed.
     """
-    if not earlier_masks(dataset.root) and any(view.is_annotated for view in (*dataset.train, *dataset.test)):
+    folder = root / PANE_FOLDER
+    masks, planes = [folder / name for name in sorted(earlier_masks(root))], _made_here(folder)[1]
+    ours = [*([root / PLANES] if planes == _digest(root / PLANES) else ()), *masks]
+    removed = [path for path in ours if path.is_file()]
+    for path in (*removed, folder / RECORD):  # The record last: after an interrupt, the rest is known to be ours.
+        path.unlink(missing_ok=True)
+    folders = {folder, *(above for path in masks for above in path.parents if above.is_relative_to(folder))}
+    for emptied in folders:
+        remove_unfinished(emptied, (".png", ".json"))
+    remove_empty(sorted(folders, reverse=True))
+    return [path.relative_to(root).as_posix() for path in removed]
+
+
+def _write_record(folder: Path, masks: Set[str], planes: str) -> None:
+    """Notes which masks of a folder were made here, and the digest of the planes that were."""
+    with atomic_write(folder / RECORD) as temporary:
+        temporary.write_text(json.dumps({"masks": sorted(masks), "planes": planes}, indent=1), encoding="utf-8")
+
+
+def _made_here(folder: Path) -> tuple[set[str], str]:
+    """Masks of a folder and digest of planes, as recorded; a list of masks alone where an earlier version did it."""
+    try:
+        record = read_json(folder / RECORD)
+        masks, planes = (record["masks"], record["planes"]) if isinstance(record, dict) else (record, "")
+        return {str(name) for name in masks}, str(planes)
+    except (OSError, ValueError, TypeError, KeyError):
+        return set(), ""
+
+
+def _digest(path: Path) -> str:
+    """Digest of a file's contents; empty where there is none."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+
+
+def capture_to_mark(root: Path) -> Dataset:
+    """A capture whose panes are marked here, or nowhere.
+
+    Masks that were made here are not read: after an interrupt, or if they show no pane, they would be in the way.
+
+    Raises:
+        FileNotFoundError: no such folder.
+        InputError: it cannot be read, or holds masks of panes that were not made here.
+    """
+    earlier_masks(root)
+    files = read_poses(root)
+    if files.capture.masks is not None or not (root / PANE_FOLDER).is_dir():
+        files = with_masks(files)
+    if files.masks.masks:
         raise InputError(
-            f"the panes of {dataset.root} are marked by masks that were not made by `glassplat annotate`, and one "
+            f"the panes of {root} are marked by masks that were not made by `glassplat annotate`, and one "
             "capture needs all of one kind: train with them as they are, or move them away and mark the panes here"
         )
+    return dataset_of(files)
 
 
-def earlier_masks(root: Path) -> list[Path]:
-    """Masks of a capture's panes that were made here before.
+def earlier_masks(root: Path) -> set[str]:
+    """Names in their folder of the masks of a capture's panes that were made here before.
 
     Raises:
         InputError: there are others.
     """
     folder = root / PANE_FOLDER
     if not folder.is_dir():
-        return []
-    try:
-        known = [str(name) for name in read_json(folder / RECORD)]
-    except (OSError, ValueError, TypeError):
-        known = []
-    found = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
-    others = sorted(name for name in found if name not in known and os.path.basename(name) != RECORD)
+        return set()
+    known, _ = _made_here(folder)
+    found = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file()]
+    seen = {path.as_posix() for path in found if not is_hidden(path) and path.name != RECORD}
+    others = sorted(seen - known)
     if others:
         raise InputError(
             f"{folder} holds masks that were not made by `glassplat annotate` ({first_names(others)}), and one capture "
             "needs all of one kind: train with them as they are, or move that folder away and mark the panes here"
         )
-    plain = (name for name in known if not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts)
-    return [folder / name for name in plain]
+    return {name for name in known if not leads_out(name)}
 
 
 def pane_labels(name: str, camera: NumpyCamera, panes: Solved) -> Labels:

@@ -27,10 +27,11 @@ from glassplat.annotate.document import (
     write_document,
 )
 from glassplat.annotate.fit import Marks, PaneFit, TooFewMarksError, corner_information, fit_pane, tilt_deviation
-from glassplat.annotate.results import check_own_masks, grab_outlines, write_results
-from glassplat.captures.dataset import Dataset, load_dataset
+from glassplat.annotate.results import capture_to_mark, grab_outlines, remove_results, write_results
+from glassplat.captures.dataset import Dataset
+from glassplat.captures.masks import PLANES
 from glassplat.captures.view import View
-from glassplat.errors import InputError, input_checked
+from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.records import Field, Items, Text, Whole, check_fields
 from glassplat.files.writing import check_folder
 from glassplat.scene.camera import NumpyCamera
@@ -312,13 +313,21 @@ class Session:
     def finish(self) -> dict[str, Any]:
         """Writes masks and planes of everything that is marked; says what was written.
 
+        Where nothing is marked any more, what was written before is removed.
+
         Raises:
             InputError: no pane is known yet, or a folder of masks holds some that were not made here.
         """
-        panes = [self.solve(pane) for pane in parsed_document(self._document, "the document")]
-        solved = [(one.pane, one.fit) for one in panes if one.fit is not None]
+        panes = parsed_document(self._document, "the document")
+        solved = [(one.pane, one.fit) for one in map(self.solve, panes) if one.fit is not None]
         if not solved:
-            raise InputError("no pane is known yet; mark the same corners in two photographs")
+            is_marked = any(places for pane in panes for places in (*pane.corners, *pane.edges))
+            removed = [] if is_marked else remove_results(self.root)
+            if not removed:
+                raise InputError("no pane is known yet; mark the same corners in two photographs")
+            stays = f"; {PLANES} stays: it was not written here" if (self.root / PLANES).exists() else ""
+            told = f"no pane is marked; removed what was written: {first_names(removed)}{stays}"
+            return {"masks": [], "planes": [], "told": told}
         written = write_results(self.root, self.views, self.cameras, solved)
         return {
             "masks": written,
@@ -419,7 +428,6 @@ def opened_session(root: Path) -> Session:
     Raises:
         InputError: it cannot be read, or nothing may be written in it.
     """
-    dataset = load_dataset(root)
+    dataset = capture_to_mark(root)
     check_folder(root)
-    check_own_masks(dataset)
     return Session(dataset)

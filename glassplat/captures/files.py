@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from glassplat.captures import colmap, mirror_nerf, transforms
@@ -62,13 +62,33 @@ def read_capture(root: Path | str, *, mask_polarity: Polarity = "auto") -> Captu
         FileNotFoundError: no such folder.
         InputError: a format that is not known, or a capture that cannot be used; the message says why.
     """
+    return with_masks(read_poses(root), mask_polarity)
+
+
+def read_poses(root: Path | str) -> CaptureFiles:
+    """Read a capture as `read_capture` does, but look for no masks.
+
+    Raises:
+        FileNotFoundError: no such folder.
+        InputError: a format that is not known, or a capture that cannot be used; the message says why.
+    """
     root = Path(root)
     capture = _load_capture(root)
     shots = tuple(sorted((*capture.shots, *(capture.test_shots or ())), key=lambda shot: shot.name))
     _check_names(shots)
-    photographs = {shot.name: shot.image_path for shot in shots}
-    masks = find_masks(root, photographs, mask_polarity, panes=capture.masks, kept=capture.kept)
-    return CaptureFiles(root, capture, shots, masks.panes, masks.ignored, mask_polarity)
+    return CaptureFiles(root, capture, shots, MaskSet({}), {}, "auto")
+
+
+def with_masks(files: CaptureFiles, mask_polarity: Polarity = "auto") -> CaptureFiles:
+    """A capture of which the poses were read, with its masks.
+
+    Raises:
+        InputError: they cannot be used; the message says why.
+    """
+    photographs = {shot.name: shot.image_path for shot in files.shots}
+    capture = files.capture
+    found = find_masks(files.root, photographs, mask_polarity, panes=capture.masks, kept=capture.kept)
+    return replace(files, masks=found.panes, ignored=found.ignored, mask_polarity=mask_polarity)
 
 
 def _load_capture(root: Path) -> Capture:

@@ -1,7 +1,7 @@
 """Masks of panes (`panes/`) and of what is left out (`masks/`, `ignore/`): their files and what their values mean.
 
-A mask of panes is either a label image (0 no pane, 1..K the pane) or binary (0 and 255, one pane). Binary masks come in
-both polarities; which one is decided over the whole set, because one mask alone cannot tell.
+A mask of panes is either a label image (0 no pane, 1..K the pane) or binary (0 and 255, or one bit; one pane). Binary
+masks come in both polarities; which one is decided over the whole set, because one mask alone cannot tell.
 
 Masks in `masks/`, or `x_mask.png` next to a photograph `x.png`, mean what they mean in COLMAP, nerfstudio, Brush,
 3DGRUT and LichtFeld: what is black is left out. Earlier versions kept panes there; such captures are read as they were.
@@ -10,7 +10,7 @@ Masks in `masks/`, or `x_mask.png` next to a photograph `x.png`, mean what they 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from os.path import lexists, normpath
 from pathlib import Path, PurePosixPath
@@ -21,7 +21,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from glassplat.errors import InputError, first_names, input_checked
-from glassplat.files.images import IMAGE_SUFFIXES, SHADES_16, open_image, read_image
+from glassplat.files.images import (
+    IMAGE_SUFFIXES,
+    SHADES_16,
+    is_hidden,
+    leads_out,
+    open_image,
+    picture_paths,
+    read_image,
+)
 
 HIGHEST_LABEL = 64
 """Grey values up to this one are labels when nothing brighter occurs; no one paints masks for the eye that dark."""
@@ -83,11 +91,11 @@ def _read_shades(path: Path) -> NDArray[np.uint8]:
     with input_checked():
         image = open_image(path)
     image.info.pop("transparency", None)  # It says nothing about panes, and Pillow warns of some ways to store it.
-    if image.mode == "1" or (image.mode == "P" and not _is_black_and_white(image)):
+    if image.mode == "P" and not _is_black_and_white(image):
         return np.array(image).astype(np.uint8)
     if image.mode in SHADES_16:
         return _in_eight_bits(np.array(image), path)
-    if image.mode in ("L", "LA", "P"):
+    if image.mode in ("1", "L", "LA", "P"):
         return np.array(image.convert("L"))
     return _one_colour(np.array(image.convert("RGB")), path)
 
@@ -245,7 +253,9 @@ def find_masks(
 
     Panes are in `panes/`; what is black in `masks/`, or above black in `ignore/`, is left out. In each folder is looked
     for, for a photograph `a/x.jpg`: `a/x.png`, `a/x.jpg.png`, `a/x.jpg` and `a/x_mask.png`, each with any image suffix
-    and without the folder where that is unique; and for masks also `x_mask.png` next to the photograph.
+    and without the folder where that is unique; and for masks also `x_mask.png` next to the photograph, unless that is
+    a photograph of the capture. Where names are alike, `mask_paths` has one for each; and a name with its folder goes
+    before one without.
 
     Args:
         root: the capture's folder.
@@ -314,11 +324,9 @@ def _why_panes(root: Path, masks: Mapping[str, Path], *, marked: bool) -> str | 
 
 
 def _highest_value(path: Path) -> int:
-    """The highest shade of a mask; white for one of one bit."""
+    """The highest shade of a mask."""
     with input_checked():
         image = open_image(path)
-    if image.mode == "1":
-        return WHITE
     brightest = int(_brightness(path).max())
     if path.suffix.lower() in LOSSY_SUFFIXES:
         return int(brightest > LOSSY_NOISE) * WHITE
@@ -414,13 +422,14 @@ def _match(
     What belongs to no photograph is appended to `unmatched`, or refused.
     """
     found: dict[str, list[Path]] = defaultdict(list)
-    names = _names_by_key(photographs)
+    keys = _owners_by_key(photographs if folder.is_dir() else ())
     strangers: list[str] = []
-    for path in _image_files(folder):
-        owners = next((names[key] for key in _keys_of_mask(path.relative_to(folder)) if key in names), [])
+    for path in _image_files(folder, keys[0]):
+        owners = _owners(path.relative_to(folder), keys)
         if len(owners) > 1:
             raise InputError(
-                f"mask {path} could belong to {first_names(sorted(owners))}; name it after one, with its folder"
+                f"mask {path} could belong to {first_names(sorted(owners))}; call it "
+                f"{mask_paths(photographs)[min(owners)]}, or after another of them"
             )
         if owners:
             found[owners[0]].append(path)
@@ -430,8 +439,9 @@ def _match(
         raise InputError(_no_photograph(folder, strangers, photographs))
     if unmatched is not None:
         unmatched.extend(strangers)
+    taken = {normpath(path) for path in photographs.values()}
     for name, path in photographs.items():
-        found[name].extend(beside(path))
+        found[name].extend(mask for mask in beside(path) if normpath(mask) not in taken)
     for name, several in found.items():
         if len(several) > 1:
             raise InputError(f"{name} has {len(several)} masks: {first_names([str(p) for p in several])}; keep one")
@@ -442,12 +452,12 @@ def _no_photograph(folder: Path, unmatched: list[str], photographs: Mapping[str,
     """Message about masks that belong to no photograph."""
     return (
         f"{len(unmatched)} masks in {folder} match no photograph: {first_names(sorted(unmatched))}; name a mask "
-        f"like its photograph, such as {PurePosixPath(min(photographs)).with_suffix('.png')}"
+        f"like its photograph, such as {mask_paths(photographs)[min(photographs)]}"
     )
 
 
-def _image_files(folder: Path) -> Iterator[Path]:
-    """Image files below a folder, hidden ones left out.
+def _image_files(folder: Path, hidden: Container[str]) -> Iterator[Path]:
+    """Image files below a folder, without hidden ones but those that are known by name, of hidden photographs.
 
     Raises:
         InputError: something else goes by the folder's or by an image's name, such as a link to nowhere.
@@ -457,7 +467,10 @@ def _image_files(folder: Path) -> Iterator[Path]:
             raise InputError(f"{folder} is no folder that can be read; expected one of mask images, or none")
         return
     for path in sorted(folder.rglob("*")):
-        if path.suffix.lower() not in IMAGE_SUFFIXES or path.name.startswith(".") or path.is_dir():
+        relative = path.relative_to(folder)
+        if is_hidden(relative) and relative.with_suffix("").as_posix() not in hidden:
+            continue
+        if path.suffix.lower() not in IMAGE_SUFFIXES or path.is_dir():
             continue
         if not path.is_file():
             raise InputError(f"mask {path} is no file that can be read; replace or remove it")
@@ -470,20 +483,39 @@ def _beside(photograph: Path) -> list[Path]:
     return [path for path in candidates if path.is_file()]
 
 
-def _names_by_key(names: Iterable[str]) -> dict[str, list[str]]:
-    """Photographs by the names that their masks may have, with and without folder and suffix."""
-    found: dict[str, list[str]] = defaultdict(list)
-    for name in names:
+def mask_paths(photographs: Iterable[str]) -> dict[str, Path]:
+    """Path of a mask in its folder, for every photograph of a capture: no other photograph's is looked for there.
+
+    Photographs in the capture choose first, and then those whose names lead out of it.
+    """
+    return picture_paths(sorted(photographs, key=lambda name: (leads_out(name), name)))
+
+
+Owners = Mapping[str, list[str]]
+"""Photographs by a name that their masks may have."""
+
+
+def _owners_by_key(photographs: Iterable[str]) -> tuple[Owners, Owners, Owners]:
+    """Photographs by the names of `mask_paths`, their own, and those without the folder; with and without suffix."""
+    unique = {path.with_suffix("").as_posix(): [name] for name, path in mask_paths(photographs).items()}
+    whole, bare = defaultdict[str, list[str]](list), defaultdict[str, list[str]](list)
+    for name in photographs:
         path = PurePosixPath(name)
-        for key in {name, str(path.with_suffix("")), path.name, path.stem}:
-            found[key].append(name)
-    return found
+        for key in {name, str(path.with_suffix(""))}:
+            whole[key].append(name)
+        for key in {path.name, path.stem}:
+            bare[key].append(name)
+    return unique, whole, bare
 
 
-def _keys_of_mask(relative: Path) -> tuple[str, ...]:
-    """Names of photographs that a mask file may stand for, the most explicit first."""
-    without_suffix = relative.with_suffix("").as_posix()
-    return relative.as_posix(), without_suffix, without_suffix.removesuffix(MASK_MARK)
+def _owners(relative: Path, keys: tuple[Owners, Owners, Owners]) -> list[str]:
+    """The photographs that a mask file may belong to by the most exact of its names."""
+    unique, *others = keys
+    plain = relative.with_suffix("").as_posix()
+    if plain in unique:
+        return unique[plain]
+    spellings = relative.as_posix(), plain, plain.removesuffix(MASK_MARK)
+    return next((owners[key] for owners in others for key in spellings if key in owners), [])
 
 
 def _check_same_kind(values: Mapping[str, MaskValues], paths: Mapping[str, Path]) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from itertools import count, takewhile
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -199,6 +199,11 @@ def _to_uint8(pixels: NDArray[np.generic]) -> NDArray[np.uint8]:
     return np.ascontiguousarray(np.round(np.clip(values, 0, 1) * 255).astype(np.uint8))
 
 
+def is_hidden(relative: PurePath) -> bool:
+    """Return whether a file, by its path from a folder, is one that people do not see there: it or a folder of it."""
+    return any(part.startswith(".") for part in relative.parts)
+
+
 Parts = tuple[str, ...]
 
 
@@ -239,13 +244,14 @@ def _distinct(parts: Mapping[str, Parts]) -> dict[str, Path]:
 def _inside(names: Sequence[str]) -> dict[str, Parts]:
     """Folders and file of each name, without what leads out; backslashes divide, as on Windows."""
     parts = {name: _normal(name) for name in names}
-    outside = [name for name in names if _leads_out(name)]
+    outside = [name for name in names if leads_out(name)]
     columns = zip(*(parts[name][:-1] for name in outside), strict=False)
     shared = sum(1 for _ in takewhile(lambda column: len(set(column)) == 1, columns))
     return parts | {name: parts[name][shared:] for name in outside}
 
 
-def _leads_out(name: str) -> bool:
+def leads_out(name: str) -> bool:
+    """Return whether a name is an absolute path, or climbs with `..`."""
     path = PureWindowsPath(name)
     return bool(path.anchor) or ".." in path.parts
 

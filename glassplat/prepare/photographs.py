@@ -181,7 +181,7 @@ def _photograph_paths(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise InputError(f"no folder or video {folder}; expected a folder of photographs, or a video file")
-    files = [path for path in folder.rglob("*") if path.is_file() and not _is_hidden(path, folder)]
+    files = [path for path in folder.rglob("*") if path.is_file() and not images.is_hidden(path.relative_to(folder))]
     unreadable = {path.name: kind for path in sorted(files) if (kind := _unreadable_kind(path))}
     if unreadable:
         kinds = "/".join(sorted(set(unreadable.values())))
@@ -210,10 +210,6 @@ def _unreadable_kind(path: Path) -> str | None:
     except (ValueError, FileNotFoundError):
         return None  # Which is said when it is decoded.
     return "HEIC" if start[4:8] == b"ftyp" and start[8:] in HEIF_BRANDS else None
-
-
-def _is_hidden(path: Path, folder: Path) -> bool:
-    return any(part.startswith(".") for part in path.relative_to(folder).parts)
 
 
 def _numbers_as_such(name: str) -> tuple[tuple[int, int, str], ...]:

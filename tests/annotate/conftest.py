@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Thread
 
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 
@@ -38,7 +39,7 @@ def true_corners(number: int) -> np.ndarray:
 
 def write_room(root: Path) -> Path:
     """Five photographs of a grey pane on a dark wall, as transforms.json."""
-    (root / "images").mkdir(parents=True)
+    (root / "images").mkdir(parents=True, exist_ok=True)
     frames = []
     for name, camera in zip(NAMES, cameras(), strict=True):
         pane = label_image(camera, [FRONT]).numpy() == 1
@@ -48,6 +49,32 @@ def write_room(root: Path) -> Path:
     lens = {"fl_x": 240.0, "fl_y": 240.0, "cx": 150.0, "cy": 110.0, "w": 300, "h": 220}
     (root / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
     return root
+
+
+def write_colmap_room(root: Path, names: Sequence[str]) -> Path:
+    """The same as a COLMAP model that calls the photographs by other names, wherever these lead from `images/`."""
+    write_room(root)
+    (root / "sparse").mkdir()
+    (root / "sparse" / "cameras.txt").write_text("1 PINHOLE 300 220 240 240 150 110\n")
+    lines = []
+    for number, (old, new, camera) in enumerate(zip(NAMES, names, cameras(), strict=True), start=1):
+        (root / "images" / new).parent.mkdir(parents=True, exist_ok=True)
+        (root / "images" / old).rename(root / "images" / f"{new}.moved")
+        pose = camera.cam_from_world.double().numpy()
+        x, y, z, w = pycolmap.Rotation3d(pose[:3, :3]).quat
+        lines += [" ".join(map(str, (number, w, x, y, z, *pose[:3, 3], 1, new))), ""]
+    for new in names:
+        (root / "images" / f"{new}.moved").rename(root / "images" / new)
+    (root / "sparse" / "images.txt").write_text("\n".join(lines) + "\n")
+    (root / "sparse" / "points3D.txt").write_text("")
+    return root
+
+
+def renamed(document: dict, names: Sequence[str]) -> dict:
+    """A document whose photographs have other names."""
+    (pane,) = document["panes"]
+    corners = [{names[NAMES.index(name)]: place for name, place in places.items()} for places in pane["corners"]]
+    return {**document, "panes": [{**pane, "corners": corners}]}
 
 
 def marked_document(views: tuple[int, ...] = (0, 1, 2), **more: object) -> dict:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -20,14 +21,16 @@ from glassplat.errors import InputError
 from glassplat.files.images import read_image
 from glassplat.panes.fit import fit_planes
 from glassplat.scene.camera import NumpyCamera
-from tests.annotate.conftest import NAMES, PLACES, marked_document, saved
+from tests.annotate.conftest import NAMES, PLACES, marked_document, renamed, saved, write_colmap_room
 from tests.panes.pane_scene import FRONT, Pane, camera_from, label_image, normal_error, offset_error
 
+EVERYTHING = {"kind": "polygon", "effect": "cut", "radius": 1, "points": [[0, 0], [300, 0], [300, 220], [0, 220]]}
 
-def finish(root: Path, document: dict) -> None:
+
+def finish(root: Path, document: dict) -> dict:
     session = opened_session(root)
     saved(session, document)
-    session.finish()
+    return session.finish()
 
 
 def photographed_pane(root: Path, name: str) -> np.ndarray:
@@ -84,6 +87,108 @@ def test_a_record_that_names_other_files_removes_none(room: Path) -> None:
     (room / "panes" / "annotated.json").write_text(json.dumps(["../transforms.json", *NAMES[:3]]))
     finish(room, marked_document((1, 2)))
     assert (room / "transforms.json").exists()
+
+
+@pytest.mark.parametrize("folder", ["../photos/", "/photos/", "a/../../photos/"])
+def test_masks_stay_in_their_folder_wherever_the_photographs_lie(folder: str, tmp_path: Path) -> None:
+    names = [f"{tmp_path if folder.startswith('/') else ''}{folder}{name}" for name in NAMES]
+    (tmp_path / "room" / "images" / "a").mkdir(parents=True)
+    root = write_colmap_room(tmp_path / "room", names)
+    before = [(root / "images" / name).read_bytes() for name in names]
+    finish(root, renamed(marked_document(), names))
+    assert [(root / "images" / name).read_bytes() for name in names] == before
+    assert sorted(path.name for path in (root / "panes").glob("*.png")) == NAMES[:3]
+    assert [view.name for view in load_dataset(root).train if view.is_annotated] == names[1:3]
+
+
+@pytest.mark.parametrize(
+    "names", [["a.jpg", "a.png", "b.png", "c.png", "d.png"], ["1.jpg", "a/1.jpg", "b/1.jpg", "2.jpg", "3.jpg"]]
+)
+def test_a_mask_belongs_to_its_photograph_and_to_no_other_of_a_like_name(names: list[str], tmp_path: Path) -> None:
+    root = write_colmap_room(tmp_path / "room", names)
+    finish(root, renamed(marked_document((0, 3)), names))
+    dataset = load_dataset(root)
+    annotated = {view.name for view in (*dataset.train, *dataset.test) if view.is_annotated}
+    assert annotated == {names[0], names[3]}
+
+
+@pytest.mark.parametrize("written", range(6))
+def test_an_interrupt_at_any_file_loses_nothing(written: int, room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files that are put in their places: the record, three masks, the planes, the record again."""
+    places: list[str] = []
+
+    def replace(source: str, target: str) -> None:
+        if len(places) == written:
+            (room / "panes" / ".0.0123456789ab.tmp.png").write_text("what a killed writer leaves behind")
+            raise KeyboardInterrupt
+        places.append(target)
+        replace_file(source, target)
+
+    replace_file = os.replace
+    session = opened_session(room)
+    saved(session, marked_document(strokes={"0.png": [EVERYTHING]}))
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(os, "replace", replace)
+        session.finish()
+    assert len(places) == written
+    finish(room, marked_document((1, 2)))
+    assert sorted(path.name for path in (room / "panes").glob("[!.]*.png")) == ["1.png", "2.png"]
+    assert load_dataset(room).pane_labels == (1,)
+    Image.new("L", (300, 220), 1).save(room / "panes" / "0.png")
+    with pytest.raises(InputError, match=r"not made by `glassplat annotate` \(0\.png\)"):
+        opened_session(room)
+
+
+def test_masks_of_the_format_or_in_another_folder_were_not_made_here(room: Path) -> None:
+    (room / "masks").mkdir()
+    Image.new("L", (300, 220), 1).save(room / "masks" / "0.png")
+    with pytest.raises(InputError, match="marked by masks that were not made by `glassplat annotate`"):
+        opened_session(room)
+    (room / "transforms.json").rename(room / "transforms_train.json")
+    (room / "masks" / "0.png").rename(room / "masks" / "MirrorMask_0.png")
+    (room / "panes").mkdir()
+    with pytest.raises(InputError, match="marked by masks that were not made by `glassplat annotate`"):
+        opened_session(room)
+
+
+@pytest.mark.parametrize("unmarked", [{"version": 1, "panes": []}, marked_document(())])
+def test_the_last_pane_can_be_unmarked(unmarked: dict, tmp_path: Path) -> None:
+    names = ["left/0.png", "left/1.png", "right/2.png", "3.png", "4.png"]
+    root = write_colmap_room(tmp_path / "room", names)
+    before = sorted(root.rglob("*"))
+    finish(root, renamed(marked_document(), names))
+    removed = "planes.json, panes/left/0.png, panes/left/1.png, panes/right/2.png"
+    told = finish(root, unmarked)
+    assert told == {"masks": [], "planes": [], "told": f"no pane is marked; removed what was written: {removed}"}
+    assert sorted(root.rglob("*")) == sorted([*before, root / "annotations.json"])
+    with pytest.raises(InputError, match="no pane is known yet"):
+        finish(root, unmarked)
+
+
+def test_unmarking_removes_nothing_that_was_not_written_here(room: Path) -> None:
+    nothing = {"version": 1, "panes": []}
+    finish(room, marked_document())
+    with pytest.raises(InputError, match="no pane is known yet"):
+        finish(room, marked_document((0,)))
+    assert (room / "panes" / "1.png").exists()
+    session = opened_session(room)
+    saved(session, nothing)
+    Image.new("L", (300, 220), 1).save(room / "panes" / "4.png")
+    with pytest.raises(InputError, match=r"not made by `glassplat annotate` \(4\.png\)"):
+        session.finish()
+    assert len(list((room / "panes").glob("*.png"))) == 4
+    (room / "panes" / "4.png").unlink()
+    planes = (room / "planes.json").read_text()
+    (room / "planes.json").write_text(planes + " ")
+    assert "planes.json stays: it was not written here" in session.finish()["told"]
+    assert not (room / "panes").exists() and (room / "planes.json").read_text() == planes + " "
+
+
+def test_a_record_of_earlier_versions_tells_of_masks_only(room: Path) -> None:
+    finish(room, marked_document())
+    (room / "panes" / "annotated.json").write_text(json.dumps(NAMES[:3]))
+    assert "planes.json stays" in finish(room, {"version": 1, "panes": []})["told"]
+    assert not (room / "panes").exists() and (room / "planes.json").exists()
 
 
 def test_without_a_pane_nothing_is_written(room: Path) -> None:

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from glassplat.captures.dataset import Dataset, load_dataset
-from glassplat.captures.masks import CaptureMasks, MaskSet, find_masks
+from glassplat.captures.masks import CaptureMasks, MaskSet, find_masks, mask_paths
 from glassplat.captures.view import View
 from glassplat.errors import InputError
 
@@ -68,6 +68,83 @@ def test_folder_may_be_left_out_where_the_name_is_unique(capture) -> None:
     capture.write_colmap()
     capture.write_mask("panes/3.png", INSIDE)
     assert list(annotated(load_dataset(capture.root))) == ["cam1/3.png"]
+
+
+def masks_of(root: Path, masks: list[str], photographs: list[str]) -> dict[str, str]:
+    """Name in `panes/` of each photograph's mask, of masks and photographs of these names."""
+    for mask in masks:
+        path = root / "panes" / mask
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(INSIDE).save(path)
+    found = find_masks(root, {name: root / name for name in photographs}).panes.masks
+    return {name: mask.path.relative_to(root / "panes").as_posix() for name, mask in found.items()}
+
+
+@pytest.mark.parametrize(
+    ("mask", "photographs", "owner"),
+    [
+        ("1.png", ["1.jpg", "a/1.jpg"], "1.jpg"),
+        ("1.jpg.png", ["1.jpg", "a/1.jpg"], "1.jpg"),
+        ("a/1.png", ["1.jpg", "a/1.jpg"], "a/1.jpg"),
+        ("a.jpg.png", ["a.jpg", "a.png"], "a.jpg"),
+        ("a.png.png", ["a.jpg", "a.png"], "a.png"),
+        ("a.png", ["a.jpg", "a.png"], "a.png"),
+        ("a.jpg_mask.png", ["a.jpg", "a.png"], "a.jpg"),
+        ("1_mask.png", ["1.jpg", "a/1.jpg"], "1.jpg"),
+        ("1.jpg.png", ["/x/1.jpg", "1.jpg"], "1.jpg"),
+        ("1.png", ["1.jpg", "1.png.jpg"], "1.jpg"),
+        ("left/1.png", ["/x/left/1.jpg", "/x/right/1.jpg"], "/x/left/1.jpg"),
+    ],
+)
+def test_an_exact_name_wins(tmp_path: Path, mask: str, photographs: list[str], owner: str) -> None:
+    assert masks_of(tmp_path, [mask], photographs) == {owner: mask}
+
+
+@pytest.mark.parametrize(
+    "photographs",
+    [
+        ["a.jpg", "a.png", "A.jpg", "b/a.jpg", "b/a.tif"],
+        ["../x/a.png", "a.png", "/y/a.png", "../x/b/a.png"],
+        ["1.jpg", "1.webp", "1.jpg.png", "1.jpg.tif"],
+        ["1.jpg", "1.jpg.webp", "1.png.jpg"],
+        ["wall.jpg", "wall_mask.jpg", "a/wall.jpg", "a/wall_mask.png"],
+    ],
+)
+def test_every_photograph_has_a_mask_of_its_own(tmp_path: Path, photographs: list[str]) -> None:
+    expected = {name: path.as_posix() for name, path in mask_paths(photographs).items()}
+    assert sorted(expected) == sorted(photographs)
+    assert masks_of(tmp_path, list(expected.values()), photographs) == expected
+
+
+@pytest.mark.parametrize("folder", ["panes", "masks", "ignore"])
+def test_hidden_folders_are_left_out(capture, folder: str) -> None:
+    capture.write_colmap()
+    capture.write_mask(f"{folder}/0001.png", INSIDE * 255)
+    capture.write_mask(f"{folder}/.ipynb_checkpoints/0001-checkpoint.png", INSIDE * 255)
+    capture.write_mask(f"{folder}/left/.thumbnails/0001.png", INSIDE * 255)
+    (capture.root / folder / ".#0001.png").symlink_to("/nowhere")
+    assert load_dataset(capture.root).warnings == ()
+
+
+def test_masks_of_hidden_photographs_are_not(tmp_path: Path) -> None:
+    assert masks_of(tmp_path, [".cam/1.png", ".cam/2-checkpoint.png"], [".cam/1.jpg", "2.jpg"]) == {
+        ".cam/1.jpg": ".cam/1.png"
+    }
+
+
+def test_a_photograph_is_no_mask_of_the_one_next_to_it(capture) -> None:
+    capture.names[:3] = ["wall.png", "wall_mask.png", "door.png"]
+    capture.write_colmap()
+    capture.write_mask("images/door_mask.png", INSIDE * 255)
+    data = load_dataset(capture.root)
+    ignored = {view.name: view.ignored for view in (*data.train, *data.test) if view.ignored is not None}
+    assert list(ignored) == ["door.png"]
+    np.testing.assert_array_equal(ignored["door.png"].numpy() == 0, INSIDE == 1)
+
+
+def test_a_name_that_does_for_two_photographs_is_refused_with_one_that_does_for_one(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"could belong to a\.jpg, a\.png; call it a\.jpg\.png, or after another"):
+        masks_of(tmp_path, ["a.tif"], ["a.jpg", "a.png"])
 
 
 def test_labels_of_several_panes_stay(capture) -> None:
@@ -219,6 +296,17 @@ def test_inverted_masks_are_recognised_by_their_border(capture) -> None:
     assert any("inverted" in warning for warning in data.warnings)
     stated = load_dataset(capture.root, mask_polarity="bright")
     np.testing.assert_array_equal(labels_of(stated), 1 - INSIDE)
+
+
+def test_masks_of_one_bit_have_a_polarity_next_to_those_of_eight(capture) -> None:
+    capture.write_colmap()
+    outside = INSIDE == 0
+    capture.write_mask("panes/0001.png", outside)
+    capture.write_mask("panes/0002.png", outside.astype(np.uint8) * 255)
+    for polarity, expected in (("auto", INSIDE), ("dark", INSIDE), ("bright", 1 - INSIDE)):
+        data = load_dataset(capture.root, mask_polarity=polarity)
+        for name in ("0001.png", "0002.png"):
+            np.testing.assert_array_equal(labels_of(data, name), expected)
 
 
 def test_stated_polarity_does_not_touch_label_images(capture) -> None:

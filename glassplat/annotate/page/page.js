@@ -347,10 +347,10 @@ async function write() {
   document.body.dataset.written = "";
   try {
     await settled();
-    const { masks, planes } = await ask("/results", {});
+    const { masks, planes, told } = await ask("/results", {});
     const unsure = planes.filter((plane) => plane.uncertainty >= SURE).map((plane) => `pane ${plane.label} (${degrees(plane.uncertainty)})`);
     const warning = unsure.length ? `; still unsure, mark more: ${unsure.join(", ")}` : "";
-    tell(`written: ${counted(masks.length, "mask")}, ${counted(planes.length, "plane")}${warning}`, unsure.length > 0);
+    tell(told ?? `written: ${counted(masks.length, "mask")}, ${counted(planes.length, "plane")}${warning}`, unsure.length > 0);
     document.body.dataset.written = `${masks.length} ${planes.length}`;
   } catch (error) {
     tell(error.message, true);
