@@ -14,8 +14,8 @@ from mkdocs.structure.files import File, Files
 import glassplat
 
 ROOT = Path(__file__).parent.parent
-PAGES = ("CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md", "LICENSE")
-FOLDERS = {"lab": "*.md", "examples": "*.py"}
+PAGES = ("CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md", "LICENSE", "Dockerfile")
+PATTERNS = ("lab/*.md", "examples/*.py", "examples/*.ipynb")
 
 NAMES = "<!-- names -->"
 UPWARDS = re.compile(r"\]\(\.\./")
@@ -25,7 +25,7 @@ INTO_DOCS = re.compile(r"\]\((\.\./)?docs/")
 def on_files(files: Files, *, config: Any) -> Files:
     """Add what lies elsewhere."""
     paths = [ROOT / name for name in PAGES]
-    paths += [path for folder, pattern in FOLDERS.items() for path in sorted((ROOT / folder).glob(pattern))]
+    paths += [path for pattern in PATTERNS for path in sorted(ROOT.glob(pattern))]
     for path in paths:
         name = path.relative_to(ROOT).as_posix()
         files.append(File.generated(config, name, abs_src_path=str(path)))

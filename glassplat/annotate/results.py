@@ -22,8 +22,9 @@ from glassplat.captures.view import PhotoFile, View
 from glassplat.errors import InputError, first_names
 from glassplat.files.images import image_size, is_hidden, leads_out, write_image
 from glassplat.files.records import read_json
-from glassplat.files.sidecars import GLASS_REFLECTANCE, write_planes
+from glassplat.files.sidecars import write_planes
 from glassplat.files.writing import atomic_write, remove_empty, remove_unfinished
+from glassplat.options import CLEAR_GLASS
 from glassplat.panes.masks import min_area_rectangle
 from glassplat.scene import logit
 from glassplat.scene.camera import NumpyCamera
@@ -262,7 +263,7 @@ def planes_of(panes: Solved, cameras: Sequence[NumpyCamera]) -> Planes:
         torch.tensor(np.stack(column), dtype=torch.float32) for column in zip(*rows, strict=True)
     )
     mirrors = tuple(pane.label for pane, _ in panes if pane.material == "mirror")
-    reflectances = [MIRROR_REFLECTANCE if pane.label in mirrors else GLASS_REFLECTANCE for pane, _ in panes]
+    reflectances = [MIRROR_REFLECTANCE if pane.label in mirrors else CLEAR_GLASS for pane, _ in panes]
     return Planes(
         centers=centers,
         raw_normals=normals,

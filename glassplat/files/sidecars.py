@@ -25,7 +25,7 @@ from glassplat.files import records
 from glassplat.files.images import read_image_float, write_image
 from glassplat.files.writing import atomic_write, make_folder
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
-from glassplat.options import short_repr
+from glassplat.options import CLEAR_GLASS, short_repr
 from glassplat.scene.camera import Camera, quat_from_rotation
 from glassplat.scene.corrections import ByPhotograph, Exposures, PoseCorrections
 from glassplat.scene.panes import Planes
@@ -143,8 +143,6 @@ LEAST_LENGTH = 1e-6
 LEAST_ANGLE = 1e-3
 """Between tangent and normal, in radians: below it the rectangle's sides have no direction."""
 LEAST_HALF_SIZE = 1e-9
-GLASS_REFLECTANCE = 0.2
-"""That learning starts at, where nobody says."""
 LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE = 1e-6, 1.0
 HIGHEST_LABEL = 255
 VECTOR = records.Items(records.COORDINATE, 3)
@@ -156,7 +154,7 @@ PLANE: dict[str, records.Field] = {
     "normal": VECTOR,
     "tangent": VECTOR,
     "half_sizes": records.Items(records.Number(LEAST_HALF_SIZE, records.LARGEST_COORDINATE), 2),
-    "base_reflectance": records.Optional(records.Number(0, 1), default=GLASS_REFLECTANCE),
+    "base_reflectance": records.Optional(records.Number(0, 1), default=CLEAR_GLASS),
     "raw_normal": records.Optional(VECTOR),
     "logit_reflectance": records.Optional(LOGIT),
     "transmittance": records.Optional(records.Items(records.Number(LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE), 3)),

@@ -13,7 +13,7 @@ from torch import Tensor
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import PointCloud
 from glassplat.methods.splat import image_term, population_of
-from glassplat.options import BLACK
+from glassplat.options import BLACK, CLEAR_GLASS
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.fit import fit_planes, with_mirrors
 from glassplat.panes.material import (
@@ -29,6 +29,7 @@ from glassplat.panes.material import (
 )
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
+from glassplat.scene import logit
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import mirrored_gaussians
 from glassplat.scene.panes import Planes, coplanar_groups
@@ -188,7 +189,10 @@ def _check_marked(labels: Sequence[int], masks: Sequence[Tensor], dataset: Datas
 
 
 def _as_given(planes: Planes, fit: PlaneFit) -> Planes:
-    """Given rectangles with the margin that fitted ones get, and mirrors as mirrors."""
+    """Given rectangles with the margin that fitted ones get, mirrors as mirrors, and R0 of clear glass as unknown."""
+    is_clear = (planes.base_reflectances - CLEAR_GLASS).abs() < 1e-5
+    begun = torch.full_like(planes.logit_reflectances, logit(fit.glass_reflectance))
+    planes = replace(planes, logit_reflectances=torch.where(is_clear, begun, planes.logit_reflectances))
     mirrors = tuple(dict.fromkeys((*planes.mirrors, *fit.mirror_labels)))
     log.info("from the capture's planes.json: %s", ", ".join(f"pane {label}" for label in planes.labels))
     return with_mirrors(replace(planes, half_sizes=fit.margin * planes.half_sizes), mirrors, fit.mirror_reflectance)

@@ -5,15 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from glassplat.options import ESSENTIAL, InnerShare, Internal, PaneLabel, PositiveShare, Range, Seed, Share
+from glassplat.options import CLEAR_GLASS, ESSENTIAL, InnerShare, Internal, PaneLabel, PositiveShare, Range, Seed, Share
 
 
 class PlaneFitError(ValueError):
     """No plane could be fitted to a pane; the message names the pane and what to annotate."""
-
-
-CLEAR_GLASS = 0.0817
-"""R0 of a clear pane: 2 r / (1 + r) with r = ((n - 1) / (n + 1))^2 for each of its surfaces, n = 1.52."""
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from glassplat.errors import InputError
 from glassplat.files.sidecars import read_planes, write_planes
 from glassplat.methods.planar import PaneSetup, fitted_planes
 from glassplat.methods.planar_recipe import PlanarRecipe
+from glassplat.options import CLEAR_GLASS
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.scene.panes import Planes
 from glassplat.training.stage import TrainState
@@ -52,7 +53,15 @@ def test_hand_written_values_are_few(capture: Path) -> None:
     (capture / "planes.json").write_text(json.dumps([entry]))
     planes = fitted_planes(load_dataset(capture), None, PlaneFit())
     assert planes.labels == (3,) and planes.mirrors == ()
-    assert float(planes.base_reflectances) == pytest.approx(0.2)
+    assert float(planes.base_reflectances) == pytest.approx(CLEAR_GLASS)
+
+
+def test_glass_of_unknown_reflectance_starts_where_the_options_say_and_known_glass_where_it_is(capture: Path) -> None:
+    dataset, fit = load_dataset(capture), PlaneFit(glass_reflectance=0.15)
+    for given, expected in ((CLEAR_GLASS, 0.15), (0.3, 0.3)):
+        logits = torch.logit(torch.tensor([given]))
+        planes = fitted_planes(replace(dataset, planes=replace(PANE, logit_reflectances=logits)), None, fit)
+        assert float(planes.base_reflectances) == pytest.approx(expected)
 
 
 def test_panes_that_only_masks_name_are_fitted_beside_it() -> None:
