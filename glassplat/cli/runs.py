@@ -53,13 +53,16 @@ class StoredRun(NamedTuple):
     iterations: int
 
 
-def open_run(path: Path, device: DeviceName = "auto", data: Path | None = None) -> StoredRun:
+def open_run(
+    path: Path, device: DeviceName = "auto", data: Path | None = None, downscale: float | None = None
+) -> StoredRun:
     """Opens the run in a directory, with the capture it was trained on, over the same background.
 
     Args:
         path: the run's directory.
         device: where to render.
         data: where the capture is now; where it was during training if None.
+        downscale: by how much photographs are reduced; as in training if None.
 
     Raises:
         CudaUnavailableError: the GPU was asked for and cannot be used.
@@ -72,7 +75,7 @@ def open_run(path: Path, device: DeviceName = "auto", data: Path | None = None) 
     with input_checked():
         recorded.renderer().check(scene)
     scene = scene.to(chosen_device(device))
-    dataset = capture_of(directory, recorded, data)
+    dataset = capture_of(directory, recorded, data, downscale)
     directory.check_photographs(dataset)
     if data is not None or not directory.imported.is_file():  # Without a capture, cameras are written corrected.
         dataset = with_corrected_cameras(dataset, scene)
@@ -80,7 +83,9 @@ def open_run(path: Path, device: DeviceName = "auto", data: Path | None = None) 
     return StoredRun(directory, recipe, scene, recipe.renderer(), dataset, iterations)
 
 
-def capture_of(directory: RunDirectory, recipe: Any, moved: Path | None = None) -> Dataset:
+def capture_of(
+    directory: RunDirectory, recipe: Any, moved: Path | None = None, downscale: float | None = None
+) -> Dataset:
     """The capture of a run, where it was or where it is said to be now; of a scene without one its cameras alone.
 
     Raises:
@@ -97,7 +102,7 @@ def capture_of(directory: RunDirectory, recipe: Any, moved: Path | None = None) 
         )
     return load_dataset(
         data,
-        downscale=settings.downscale,
+        downscale=settings.downscale if downscale is None else downscale,
         background=photo_background(recipe),
         mask_polarity=settings.mask_polarity,
     )

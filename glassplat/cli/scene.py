@@ -17,7 +17,7 @@ from glassplat.errors import InputError, input_checked
 from glassplat.files.writing import FORGED_SUFFIXES, WRITTEN, check_folder
 from glassplat.kernels.backend.devices import DeviceName
 from glassplat.model.run_directory import RunDirectory
-from glassplat.options import Cleaning, Finite, Positive, Range
+from glassplat.options import Cleaning, Downscale, Finite, Positive, Range
 from glassplat.publish.film import check_encoder
 from glassplat.viewer.render_loop import LOCAL, check_port
 
@@ -340,6 +340,7 @@ class Dereflect:
         split: which photographs.
         source: photo keeps the photograph, and takes the rendered reflection off it where a pane is; render shows
             the rendered scene without its panes.
+        downscale: factor by which the images are smaller than the photographs, whatever it was in training.
         device: where to render; auto takes an NVIDIA GPU where one can be used.
         data: where the capture is now, if it has moved since training.
     """
@@ -348,6 +349,7 @@ class Dereflect:
     output: Path
     split: Split = "all"
     source: Literal["photo", "render"] = "photo"
+    downscale: Downscale = 1.0
     device: DeviceName = "auto"
     data: Path | None = None
 

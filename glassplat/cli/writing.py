@@ -67,7 +67,7 @@ def write_layers(command: Render, console: Console) -> None:
 
 def write_dereflected(command: Dereflect, console: Console) -> None:
     """Writes an image for each photograph."""
-    stored = open_run(command.run_directory, command.device, command.data)
+    stored = open_run(command.run_directory, command.device, command.data, command.downscale)
     renderer = planar_renderer(stored)
     views = chosen_views(stored.dataset, command.split)
     paths = pictures_of(stored.dataset)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from glassplat.cli.main import main
 from glassplat.cli.places import RECORD, claim_folder
 from glassplat.errors import InputError
 from glassplat.files.images import read_image
+from glassplat.model.run_directory import RunDirectory
 from glassplat.scene.scene import without_glass
 from tests.cli.tiny_run import rendered, write_run
 from tests.training.tiny_capture import tiny_capture, true_scene
@@ -41,6 +43,17 @@ def test_the_reflection_is_gone_and_everything_else_is_there(source: str, tmp_pa
         assert largest_difference(image, truth) <= 6
         elsewhere = (photo == truth).all(axis=2)
         assert largest_difference(image[elsewhere], photo[elsewhere]) <= 1
+
+
+@pytest.mark.parametrize(("options", "size"), [([], (28, 40)), (["--downscale", "2"], (14, 20))])
+def test_images_are_as_large_as_the_photographs_however_small_those_of_training_were(
+    options: list[str], size: tuple[int, int], tmp_path: Path
+) -> None:
+    run, output = write_run(tmp_path / "run"), tmp_path / "clean"
+    directory = RunDirectory(run)
+    directory.write_settings(replace(directory.settings(), downscale=4.0))
+    assert main(["dereflect", str(run), "--output", str(output), "--split", "test", *options]) == 0
+    assert read_image(output / "0.png").shape[:2] == size
 
 
 @pytest.mark.parametrize(("split", "expected"), [("test", ["0.png"]), ("train", [f"{k}.png" for k in range(1, 6)])])
