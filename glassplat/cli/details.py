@@ -18,7 +18,7 @@ from glassplat.files.scene_folder import read_scene, read_splats
 from glassplat.files.sidecars import read_planes
 from glassplat.methods.planar import fitted_planes
 from glassplat.model.model import PLANES
-from glassplat.model.run_directory import RunDirectory
+from glassplat.model.run_directory import RunDirectory, RunSettings
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.material import virtual_points
 from glassplat.prepare.preparation import PAGE, RECORD
@@ -26,6 +26,7 @@ from glassplat.prepare.report_page import write_page
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
+from glassplat.training.checkpoint import recorded_step
 
 FEW_POINTS, FEW_MASKS = 500, 3
 
@@ -132,15 +133,32 @@ def splats_part(path: Path) -> Finding:
     return finding
 
 
+def resume_command(directory: RunDirectory) -> str:
+    """The command that goes on with an interrupted run."""
+    settings, usual = directory.settings(), RunSettings("", 1)
+    method, recipe = directory.recipe().method, shell_word(directory.path / "recipe.json")
+    words = [f"glassplat train {method} --config {recipe} --data {shell_word(settings.data)}"]
+    words += [f"--output {shell_word(directory.path)} --iterations {settings.iterations}"]
+    for name in ("downscale", "seed", "mask_polarity"):
+        if getattr(settings, name) != getattr(usual, name):
+            words.append(f"--{name.replace('_', '-')} {getattr(settings, name)}")
+    return " ".join([*words, "--resume"])
+
+
 def trained_part(directory: RunDirectory) -> Finding:
     """Part about the state of a training."""
     finding = Finding()
     try:
         scene, step = directory.latest_scene()
     except InputError as error:
-        begun = directory.checkpoint.is_file()
-        finding.problems.append("it was interrupted, and goes on with --resume" if begun else str(error))
-        finding.next.append(f"the train command that began it, {'with --resume' if begun else 'again'}")
+        try:
+            reached = recorded_step(directory.checkpoint)
+        except (FileNotFoundError, InputError):
+            finding.problems.append(str(error))
+            finding.next.append("the train command that began it, again")
+            return finding
+        finding.problems.append(f"it was interrupted at step {reached} of {directory.settings().iterations}")
+        finding.next.append(resume_command(directory))
         return finding
     finding.facts["trained to"] = step
     _describe_scene(scene, finding)
@@ -177,6 +195,10 @@ def scene_part(path: Path) -> Finding:
 
 def _describe_scene(scene: Scene, finding: Finding) -> None:
     _look_at(scene.primary, finding)
+    finding.facts["Gaussians"] = scene.num_gaussians
+    if scene.num_gaussians > len(scene.primary):
+        sets = (f"{len(part)} {name}" for name, part in scene.gaussian_sets().items() if len(part))
+        finding.facts["sets of Gaussians"] = ", ".join(sets)
     planes = scene.planes
     if len(planes):
         descriptions = (

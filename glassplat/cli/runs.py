@@ -161,7 +161,7 @@ def train(asked: Train[Any], console: Console) -> None:
     say(
         console,
         f"trained {asked.recipe.method} for {training.step} iterations in {training.seconds:.0f} s: "
-        f"{len(scene.primary) + len(scene.glass)} Gaussians, {count_noun(len(scene.planes), 'pane')} -> {asked.output}",
+        f"{scene.num_gaussians} Gaussians, {count_noun(len(scene.planes), 'pane')} -> {asked.output}",
     )
     say(console, f"next: glassplat eval {shell_word(asked.output)}")
 

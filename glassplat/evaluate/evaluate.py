@@ -421,7 +421,7 @@ def _description(scene: Scene, dataset: Dataset) -> dict[str, Any]:
         "split": dataset.split,
         "num_test_views": len(dataset.test),
         "test_exposures": NEIGHBOURS_COLORS if len(scene.exposures) else SCENE_COLORS,
-        "num_gaussians": sum(len(part) for part in scene.gaussian_sets().values()),
+        "num_gaussians": scene.num_gaussians,
         "num_glass_gaussians": len(scene.glass),
         "num_surroundings_gaussians": len(scene.surroundings),
     }

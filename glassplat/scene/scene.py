@@ -134,6 +134,11 @@ class Scene:
         sets = {"primary": self.primary, "glass": self.glass}
         return sets | {name: getattr(self, name) for name in OPTIONAL_SETS if len(getattr(self, name))}
 
+    @property
+    def num_gaussians(self) -> int:
+        """Gaussians of all sets."""
+        return sum(map(len, self.gaussian_sets().values()))
+
     def tensors(self) -> dict[str, Tensor]:
         """Every tensor by dotted name (`primary.means`, `planes.tangents`, ...).
 

@@ -123,6 +123,17 @@ def recorded_seconds(path: Path) -> float:
         return float(file.header["seconds"])
 
 
+def recorded_step(path: Path) -> int:
+    """The step of a checkpoint; reads its header and no tensor.
+
+    Raises:
+        InputError: the file is truncated, or is no checkpoint of glassplat.
+        FileNotFoundError: there is no such file.
+    """
+    with opened_checkpoint(path) as file:
+        return int(file.header["step"])
+
+
 def check_belongs(
     state: TrainState, path: Path, *, method: str | None, seed: int | None, iterations: int | None
 ) -> None:

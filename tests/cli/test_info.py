@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -14,14 +15,19 @@ import numpy as np
 import pytest
 import torch
 
+from glassplat.captures.dataset import load_dataset
 from glassplat.cli.main import main
 from glassplat.cli.train import SCENE
 from glassplat.files.ply import write_gaussians
 from glassplat.files.spz import write_spz
+from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.model.run_directory import RunDirectory, RunSettings
+from glassplat.model.training import Run
 from glassplat.scene.gaussians import Gaussians
+from glassplat.training.messages import Message, StepDone
 from tests.cli.tiny_run import write_run
 from tests.prepare.test_video import film
-from tests.training.tiny_capture import true_scene
+from tests.training.tiny_capture import true_scene, write_tiny_capture
 
 
 def told(path: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
@@ -125,6 +131,28 @@ def test_what_was_interrupted_goes_on(tmp_path: Path, capsys: pytest.CaptureFixt
         (tmp_path / "my capture.partial" / "settings.json").write_text(damaged)
         assert main(["info", str(tmp_path / "my capture.partial")]) == 2
         assert "report it" not in capsys.readouterr().err
+
+
+def test_an_interrupted_run_says_its_step_and_the_command_that_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_tiny_capture(tmp_path / "a capture")
+    options = ["--data", str(tmp_path / "a capture"), "--output", str(tmp_path / "run"), "--iterations", "12"]
+
+    def stop(message: Message) -> None:
+        if isinstance(message, StepDone) and message.step == 5:
+            signal.raise_signal(signal.SIGINT)
+
+    recipe, settings = SplatRecipe(sh_degree=1), RunSettings(str(tmp_path / "a capture"), 12, seed=3)
+    with pytest.raises(KeyboardInterrupt):
+        Run(recipe, settings, RunDirectory(tmp_path / "run"), load_dataset(settings.data)).to_the_end(stop)
+    found = told(tmp_path / "run", capsys)
+    assert "it was interrupted at step 5 of 12" in found["problems"]
+    (command,) = (line for line in found["next"] if "--resume" in line)
+    assert all(word in shlex.split(command) for word in options)
+    assert main([*shlex.split(command)[1:], "--device", "cpu"]) == 0
+    capsys.readouterr()
+    assert told(tmp_path / "run", capsys)["facts"]["trained to"] == 12
 
 
 def test_what_is_for_programs_has_no_line_of_the_log_in_it() -> None:
