@@ -42,7 +42,7 @@ $(STAMP): pyproject.toml constraints.txt
 		{ echo "glassplat needs Python 3.11 or newer; '$(PYTHON)' is not. Try: make PYTHON=/path/to/python3.11" >&2; exit 1; }
 	@echo "Setting up $(VENV) (downloads PyTorch, takes a few minutes the first time) ..."
 	@"$(PYTHON)" -m venv --clear $(VENV)
-	@$(PIP) install $(addprefix --constraint ,$(CONSTRAINTS)) --editable '.[dev]'
+	@$(PIP) install $(addprefix --constraint ,$(CONSTRAINTS)) --config-settings editable_mode=compat --editable '.[dev]'
 	@touch $@
 
 # Tests of pages are skipped, and said to be, where there is no Chromium.

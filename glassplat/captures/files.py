@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -11,6 +12,7 @@ from glassplat.captures import colmap, mirror_nerf, transforms
 from glassplat.captures.capture import Capture, Loader, Shot
 from glassplat.captures.masks import IgnoredMask, MaskSet, Polarity, find_masks
 from glassplat.errors import InputError, UnknownFormatError, first_names
+from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
 from glassplat.files.writing import check_capture_folder
 
 LOADERS: tuple[tuple[Loader, str], ...] = (
@@ -99,8 +101,12 @@ def _load_capture(root: Path) -> Capture:
         if capture is not None:
             return capture
     looked_for = "; ".join(text for _, text in LOADERS)
-    found = first_names(sorted(path.name for path in root.iterdir()), limit=8) or "nothing"
-    raise UnknownFormatError(f"{root} is no capture that can be read. Looked for: {looked_for}. Found: {found}.")
+    names = sorted(path.name for path in root.iterdir())
+    found = first_names(names, limit=8) or "nothing"
+    message = f"{root} is no capture that can be read. Looked for: {looked_for}. Found: {found}."
+    if any(Path(name).suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) for name in names):
+        message += f" Photographs become a capture by: glassplat prepare {shlex.quote(str(root))} --output CAPTURE"
+    raise UnknownFormatError(message)
 
 
 def _check_names(shots: tuple[Shot, ...]) -> None:

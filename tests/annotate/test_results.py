@@ -276,6 +276,16 @@ def test_the_command_needs_a_capture(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "is no capture that can be read" in " ".join(capsys.readouterr().err.split())
 
 
+def test_photographs_without_poses_are_told_what_makes_a_capture_of_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    (folder / "1.HEIC").write_bytes(b"")
+    assert main(["annotate", str(folder)]) == 2
+    assert f"glassplat prepare {folder} --output CAPTURE" in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_damaged_document_is_named(room: Path) -> None:
     (room / "annotations.json").write_text('{"version": 1}')
     with pytest.raises(InputError, match=r"annotations\.json has no panes"):
