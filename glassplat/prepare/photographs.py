@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import math
+import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -103,6 +104,21 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
             "from places a step apart"
         )
     return list(found.values())
+
+
+def file_states(source: Path) -> dict[str, list[int]]:
+    """Size and time of the last change of a video, or of every photograph below a folder, by name.
+
+    Raises:
+        InputError: there are no photographs, or some of a kind that cannot be read.
+    """
+    folder, paths = (source.parent, [source]) if source.is_file() else (source, _photograph_paths(source))
+    found = {}
+    for path in paths:
+        name = os.fsencode(path.relative_to(folder)).decode("utf-8", "backslashreplace")
+        state = path.stat()
+        found[name] = [state.st_size, state.st_mtime_ns]
+    return found
 
 
 def _refusal(broken: Mapping[str, InputError], count: int) -> InputError:
