@@ -16,7 +16,7 @@ from typing import Any
 import gsply
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, ImageCms
 
 from glassplat.annotate.document import ANNOTATIONS, read_document
 from glassplat.captures import colmap_library as library
@@ -25,7 +25,7 @@ from glassplat.captures.masks import read_mask_values
 from glassplat.captures.transforms import load_transforms
 from glassplat.captures.view import View, estimated_normals, normals_reader
 from glassplat.files.glb import write_glb
-from glassplat.files.images import read_image
+from glassplat.files.images import read_colors
 from glassplat.files.ply import write_gaussians
 from glassplat.files.scene_folder import drawable, read_scene, read_splats, write_scene
 from glassplat.files.sidecars import (
@@ -272,6 +272,7 @@ def _picture_seeds(folder: Path) -> None:
     Image.fromarray(pixels).save(folder / "transparent.png")
     Image.fromarray(pixels[..., 0].astype(np.uint16) * 257).save(folder / "deep.png")
     color.quantize(4).save(folder / "palette.png")
+    color.save(folder / "profile.png", icc_profile=ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
 
 
 def _mask_seeds(folder: Path) -> None:
@@ -323,7 +324,7 @@ READERS: dict[str, Reader] = {
     "settings": Reader("settings.json", lambda path: RunDirectory(path.parent).settings(), _settings_seeds),
     "log": Reader("log.jsonl", lambda path: lines_until(path, 10), _log_seeds),
     "annotations": Reader(ANNOTATIONS, _annotations, _annotations_seeds),
-    "photograph": Reader("a.png", read_image, _picture_seeds, most_mib=LARGEST_PICTURE_MIB),
+    "photograph": Reader("a.png", read_colors, _picture_seeds, most_mib=LARGEST_PICTURE_MIB),
     "mask": Reader("a.png", read_mask_values, _mask_seeds, most_mib=LARGEST_PICTURE_MIB),
     "panorama": Reader(
         "a.exr", read_equirect, lambda folder: write_equirect(folder / "a.exr", torch.rand(4, 8, 3)), most_mib=2048

@@ -44,7 +44,7 @@ from glassplat.captures.cameras import (
 from glassplat.captures.capture import RawPoints, Shot
 from glassplat.captures.masks import IgnoredMask, PaneMask
 from glassplat.errors import InputError, input_checked
-from glassplat.files.images import image_size, read_image, read_image_float
+from glassplat.files.images import image_size, read_colors, read_image_float
 from glassplat.options import WHITE, Rgb
 from glassplat.scene.camera import Camera, to_device
 
@@ -386,7 +386,7 @@ class PhotoFile:
     def __call__(self) -> Tensor:
         """[H, W, 3] uint8 in the pixel grid of the view's camera."""
         with input_checked():
-            pixels = read_image(self.path)
+            pixels = read_colors(self.path)
         return torch.from_numpy(self.pixel_map.photo(_opaque(pixels, self.background)))
 
 

@@ -179,14 +179,12 @@ def read_photograph(photograph: Photograph) -> NDArray[np.uint8]:
 
 
 def _upright(path: Path) -> Image.Image:
-    """The picture as eight-bit RGB, turned as its EXIF tag says."""
+    """The picture as eight-bit sRGB, turned as its EXIF tag says."""
     with images.checked_image(path) as image:
         orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
-        if image.mode not in images.SHADES_16:
-            return ImageOps.exif_transpose(image).convert("RGB")
-    grey = Image.fromarray(images.read_image(path)[:, :, 0])
-    grey.getexif()[ExifTags.Base.Orientation] = orientation
-    return ImageOps.exif_transpose(grey).convert("RGB")
+        shown = images.in_srgb(image)
+        shown.getexif()[ExifTags.Base.Orientation] = orientation
+        return ImageOps.exif_transpose(shown).convert("RGB")
 
 
 def _photograph_paths(folder: Path) -> list[Path]:
