@@ -179,12 +179,16 @@ def read_photograph(photograph: Photograph) -> NDArray[np.uint8]:
 
 
 def _upright(path: Path) -> Image.Image:
-    """The picture as eight-bit sRGB, turned as its EXIF tag says."""
+    """The picture as eight-bit sRGB over black, turned as its EXIF tag says."""
     with images.checked_image(path) as image:
         orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
         shown = images.in_srgb(image)
         shown.getexif()[ExifTags.Base.Orientation] = orientation
-        return ImageOps.exif_transpose(shown).convert("RGB")
+        upright = ImageOps.exif_transpose(shown)
+    if not upright.has_transparency_data:
+        return upright.convert("RGB")
+    seen = upright.convert("RGBA")
+    return Image.alpha_composite(Image.new("RGBA", seen.size, "black"), seen).convert("RGB")
 
 
 def _photograph_paths(folder: Path) -> list[Path]:

@@ -79,6 +79,25 @@ def test_every_kind_of_pixel_becomes_colour(mode: str, tmp_path: Path, heard: He
         assert corner[0] > 200 and corner[1] < 60
 
 
+@pytest.mark.parametrize("mode", ["RGBA", "LA", "P", "RGB"])
+def test_what_was_cut_out_is_black(mode: str, tmp_path: Path, heard: Heard) -> None:
+    folder = three(tmp_path / "in")
+    pixels = np.full((90, 120, 4), 200, dtype=np.uint8)
+    pixels[:, :, 3] = np.repeat([0, 128, 255], 40)
+    image = Image.fromarray(pixels)
+    if mode in ("RGBA", "LA"):
+        image.convert(mode).save(folder / "cut.png")
+    else:  # One of its colours is transparent.
+        shades = image.convert("RGB")
+        shades.paste((9, 9, 9), (0, 0, 40, 90))
+        shades = shades.quantize(4) if mode == "P" else shades
+        shades.save(folder / "cut.png", transparency=shades.getpixel((0, 0)))
+    row = read_photograph(found(folder, heard)["cut.png"])[45]
+    assert not row[:36].any() and (row[84:] == 200).all()
+    if mode in ("RGBA", "LA"):
+        assert (row[46:74] == 100).all()
+
+
 @pytest.mark.parametrize("orientation", [1, 6])
 def test_colours_of_a_telephone_become_srgb(tmp_path: Path, heard: Heard, orientation: int) -> None:
     folder = three(tmp_path / "in")
