@@ -590,9 +590,10 @@ def _vectors(path: Path) -> NDArray[np.float32]:
         vectors = 2 * pixels[..., :3] - 1
         return vectors * (pixels[..., 3:] > LEAST_LENGTH) if pixels.shape[2] == 4 else vectors
     try:
-        vectors = np.load(path, allow_pickle=False)
+        with path.open("rb") as file:  # Not `load`, which opens archives of arrays, too.
+            vectors = np.lib.format.read_array(file, allow_pickle=False)
     except Exception as error:  # It evaluates the head of the file, and damaged ones raise what tokens do.
-        raise ValueError(f"{path} is no array that NumPy can read: {error}") from error
+        raise ValueError(f"{path} is no array that NumPy can read ({error}); save it with numpy.save") from error
     if vectors.ndim != 3 or vectors.shape[2] != 3 or vectors.dtype.kind != "f" or 0 in vectors.shape:
         raise ValueError(f"{path} holds {vectors.dtype} of shape {list(vectors.shape)}; expected floats [H, W, 3]")
     return np.nan_to_num(vectors.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)

@@ -87,3 +87,11 @@ def test_what_is_no_map_of_normals_is_refused(tmp_path: Path) -> None:
         (tmp_path / "normals" / "a.npy").write_bytes(damaged)
         with pytest.raises(InputError, match="is no array that NumPy can read"):
             estimated_normals(view_in(tmp_path))
+
+
+def test_an_archive_by_the_name_of_an_array_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "normals").mkdir()
+    with (tmp_path / "normals" / "a.npy").open("wb") as file:
+        np.savez(file, normals=all_along((0.0, 0.0, 1.0)))
+    with pytest.raises(InputError, match=r"a\.npy is no array that NumPy can read .*; save it with numpy\.save"):
+        estimated_normals(view_in(tmp_path))
