@@ -20,8 +20,10 @@ from glassplat.evaluate.report import (
     CAPTION_HEIGHT,
     MARGIN,
     TITLE_HEIGHT,
+    Panel,
     Report,
     comparison_sheet,
+    compose_sheet,
     overview_page,
     sheet_names,
 )
@@ -107,6 +109,14 @@ def test_panels_lie_where_their_captions_say(case) -> None:
     top, factor = MARGIN + TITLE_HEIGHT + CAPTION_HEIGHT, 6
     photo = sheet[top : top + 32 * factor, MARGIN : MARGIN + 48 * factor]
     np.testing.assert_array_equal(photo[::factor, ::factor], view.photo.numpy())
+
+
+def test_a_name_with_a_line_break_is_drawn_on_one_line(case) -> None:
+    frame, view = case.renderer.frames[40.0], case.dataset.test[0]
+    broken, whole = (comparison_sheet(frame, view.photo, None, title=title) for title in ("a\nb.jpg", "a b.jpg"))
+    np.testing.assert_array_equal(broken, whole)
+    broken, whole = (compose_sheet([[Panel(text, view.photo)]], "", "") for text in ("a\r\nb.jpg", "a b.jpg"))
+    np.testing.assert_array_equal(broken, whole)
 
 
 def test_rows_follow_what_is_known(case) -> None:
