@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from glassplat.captures.cameras import LEAST_SIDE
 from glassplat.captures.dataset import Dataset, dataset_of, load_dataset
 from glassplat.captures.files import CaptureFiles
 from glassplat.captures.view import normals_path
@@ -51,7 +52,7 @@ def remaining_parts(files: CaptureFiles) -> Iterator[Finding]:
     yield _describe_panes(files.root, dataset)
     yield _behind(files.root, dataset)
     decoded = Finding()
-    describe_broken([view.image_path for view in (*dataset.train, *dataset.test)], decoded)
+    describe_broken([view.image_path for view in (*dataset.train, *dataset.test)], decoded, LEAST_SIDE)
     yield decoded
 
 

@@ -132,12 +132,12 @@ def _refusal(broken: Mapping[str, InputError], count: int) -> InputError:
     )
 
 
-def broken_photographs(paths: Sequence[Path]) -> list[str]:
-    """Names of those that `photographs_in` would refuse; each is decoded at a small size."""
+def broken_photographs(paths: Sequence[Path], least_side: int) -> list[str]:
+    """Names of those that cannot be read, or have fewer pixels along a side; each is decoded at a small size."""
     broken = []
     for path in paths:
         try:
-            _examine(path, path.name, LEAST_SIDE)
+            _examine(path, path.name, LEAST_SIDE, least_side)
         except InputError:
             broken.append(path.name)
     return broken
@@ -240,7 +240,7 @@ def _numbers_as_such(name: str) -> tuple[tuple[int, int, str], ...]:
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts)
 
 
-def _examine(path: Path, name: str, max_size: int) -> tuple[Photograph, bytes]:
+def _examine(path: Path, name: str, max_size: int, least_side: int = LEAST_SIDE) -> tuple[Photograph, bytes]:
     """A photograph and a fingerprint of its file; decoded at a small size, which finds files that are cut off."""
     try:
         size = images.image_size(path)
@@ -254,9 +254,9 @@ def _examine(path: Path, name: str, max_size: int) -> tuple[Photograph, bytes]:
             contents = hashlib.blake2b(path.read_bytes(), digest_size=16).digest()
     except (ValueError, FileNotFoundError) as error:
         raise InputError(str(error)) from error
-    if min(size) < LEAST_SIDE:
+    if min(size) < least_side:
         raise InputError(
-            f"{path} is {size[0]}x{size[1]} pixels large; expected a photograph, {LEAST_SIDE} pixels at least along "
+            f"{path} is {size[0]}x{size[1]} pixels large; expected a photograph, {least_side} pixels at least along "
             "each side: remove it"
         )
     width, height = size[::-1] if sideways else size
