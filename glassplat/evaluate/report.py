@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -429,9 +430,10 @@ def _link(name: str, sheets: Mapping[str, str]) -> str:
 
 
 def _figure(name: str, path: str, description: str) -> str:
+    address = _escape(quote(path))
     return (
-        f'<figure id="{_escape(name)}"><a href="{_escape(path)}">'
-        f'<img src="{_escape(path)}" alt="{_escape(description)}" loading="lazy"></a></figure>'
+        f'<figure id="{_escape(name)}"><a href="{address}">'
+        f'<img src="{address}" alt="{_escape(description)}" loading="lazy"></a></figure>'
     )
 
 

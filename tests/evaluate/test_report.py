@@ -2,8 +2,10 @@ import html
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import unquote, urlsplit
 
 import numpy as np
+import pytest
 import torch
 
 from glassplat.evaluate.evaluate import evaluate
@@ -206,6 +208,17 @@ def test_every_metric_is_written_with_its_unit_and_explained() -> None:
         unit = next((unit for end, unit in units.items() if name.endswith(end)), "")
         assert format_value(1, column.pattern).endswith(unit), name
         assert format_value(None, column.pattern) == "-"
+
+
+@pytest.mark.parametrize("name", ["IMG#1.jpg", "what?.jpg", "50%25.jpg", "a & b.jpg", "Bild ä.jpg", "a\nb.jpg"])
+def test_the_page_finds_sheets_of_any_name(name: str) -> None:
+    sheets = sheet_names([name])
+    found = references(overview_page({}, {name: {"psnr": 30.0}}, sheets))
+    paths = {address for address in found if not address.startswith("#")}
+    assert {unquote(address) for address in paths} == set(sheets.values())
+    parsed = [urlsplit(address) for address in paths]
+    assert [(part.query, part.fragment) for part in parsed] == [("", "")]
+    assert found - paths == {f"#{name}"}
 
 
 def test_names_of_sheets_are_distinct() -> None:
