@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import gzip
 import json
-import shutil
 import struct
 from collections.abc import Callable
 from contextlib import closing, suppress
@@ -283,14 +282,10 @@ def _mask_seeds(folder: Path) -> None:
 
 
 def _normals(path: Path) -> None:
-    beside = path.parent / "normals"
-    beside.mkdir(exist_ok=True)
-    shutil.copy(path, beside / path.name)
-
     def no_photograph() -> torch.Tensor:
         raise FileNotFoundError
 
-    read = normals_reader(path.parent / "a.png", camera_of())
+    read = normals_reader(path, camera_of())
     estimated_normals(View("a.png", camera_of(), path.parent / "a.png", no_photograph, read_normals=read))
 
 
