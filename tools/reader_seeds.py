@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import gzip
 import json
-import shutil
 import struct
 from collections.abc import Callable
 from contextlib import closing, suppress
@@ -16,7 +15,7 @@ from typing import Any
 import gsply
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, ImageCms
 
 from glassplat.annotate.document import ANNOTATIONS, read_document
 from glassplat.captures import colmap_library as library
@@ -25,7 +24,7 @@ from glassplat.captures.masks import read_mask_values
 from glassplat.captures.transforms import load_transforms
 from glassplat.captures.view import View, estimated_normals, normals_reader
 from glassplat.files.glb import write_glb
-from glassplat.files.images import read_image
+from glassplat.files.images import read_colors
 from glassplat.files.ply import write_gaussians
 from glassplat.files.scene_folder import drawable, read_scene, read_splats, write_scene
 from glassplat.files.sidecars import (
@@ -272,6 +271,7 @@ def _picture_seeds(folder: Path) -> None:
     Image.fromarray(pixels).save(folder / "transparent.png")
     Image.fromarray(pixels[..., 0].astype(np.uint16) * 257).save(folder / "deep.png")
     color.quantize(4).save(folder / "palette.png")
+    color.save(folder / "profile.png", icc_profile=ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
 
 
 def _mask_seeds(folder: Path) -> None:
@@ -282,14 +282,10 @@ def _mask_seeds(folder: Path) -> None:
 
 
 def _normals(path: Path) -> None:
-    beside = path.parent / "normals"
-    beside.mkdir(exist_ok=True)
-    shutil.copy(path, beside / path.name)
-
     def no_photograph() -> torch.Tensor:
         raise FileNotFoundError
 
-    read = normals_reader(path.parent / "a.png", camera_of())
+    read = normals_reader(path, camera_of())
     estimated_normals(View("a.png", camera_of(), path.parent / "a.png", no_photograph, read_normals=read))
 
 
@@ -323,7 +319,7 @@ READERS: dict[str, Reader] = {
     "settings": Reader("settings.json", lambda path: RunDirectory(path.parent).settings(), _settings_seeds),
     "log": Reader("log.jsonl", lambda path: lines_until(path, 10), _log_seeds),
     "annotations": Reader(ANNOTATIONS, _annotations, _annotations_seeds),
-    "photograph": Reader("a.png", read_image, _picture_seeds, most_mib=LARGEST_PICTURE_MIB),
+    "photograph": Reader("a.png", read_colors, _picture_seeds, most_mib=LARGEST_PICTURE_MIB),
     "mask": Reader("a.png", read_mask_values, _mask_seeds, most_mib=LARGEST_PICTURE_MIB),
     "panorama": Reader(
         "a.exr", read_equirect, lambda folder: write_equirect(folder / "a.exr", torch.rand(4, 8, 3)), most_mib=2048

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from glassplat.captures.dataset import TEST_EVERY
-from glassplat.files.images import read_image, write_image
+from glassplat.files.images import read_colors, write_image
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 
 FIGURES = (0.4, 0.9)
@@ -87,7 +87,7 @@ def spoil(
     for name, path in photographs(output):
         stops = exposure * random.standard_normal() + white_balance * random.standard_normal(3)
         factors[name] = 2.0**stops
-        write_image(path, exposed(read_image(path), 2.0**stops))
+        write_image(path, exposed(read_colors(path), 2.0**stops))
     return factors
 
 
@@ -165,7 +165,7 @@ def add_passers_by(capture: Path, share: float, random: np.random.Generator) -> 
     for number, path in enumerate(paths):
         if number % TEST_EVERY == 0 or random.random() >= share:
             continue
-        photo = read_image(path)[..., :3].copy()
+        photo = read_colors(path)[..., :3].copy()
         body = figure(photo.shape[0], photo.shape[1], random)
         clothes = random.uniform(0, 255, 3) + random.normal(scale=12, size=(int(body.sum()), 3))
         photo[body] = np.clip(clothes, 0, 255).astype(np.uint8)

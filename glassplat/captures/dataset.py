@@ -19,7 +19,16 @@ from glassplat.captures.capture import Capture, Shot
 from glassplat.captures.files import CaptureFiles, read_capture
 from glassplat.captures.masks import PLANES, CutOut, Polarity
 from glassplat.captures.transforms import points_in_view
-from glassplat.captures.view import GIGABYTE, Memory, PointCloud, PreparedView, View, ViewOptions, prepare_view
+from glassplat.captures.view import (
+    GIGABYTE,
+    Memory,
+    PointCloud,
+    PreparedView,
+    View,
+    ViewOptions,
+    normals_paths,
+    prepare_view,
+)
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.images import is_transparent
 from glassplat.files.records import LARGEST_COORDINATE
@@ -192,12 +201,14 @@ def dataset_of(
     cut_out = transparent and capture.cut_out
     shown = background if transparent and not cut_out else None
     options = ViewOptions(downscale, None if cut_out else background)
+    normals = normals_paths({shot.name: shot.image_path for shot in shots})
     prepared = [
         prepare_view(
             shot,
             masks.masks.get(shot.name),
             options,
             ignored=(*files.ignored.get(shot.name, ()), *([CutOut(shot.image_path)] if cut_out else ())),
+            normals=normals.get(shot.name),
         )
         for shot in shots
     ]

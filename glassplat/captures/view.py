@@ -16,14 +16,14 @@ import os
 import shutil
 import tempfile
 import time
-from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cache, partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from threading import Lock
 from typing import IO, TypeVar
 
@@ -44,7 +44,7 @@ from glassplat.captures.cameras import (
 from glassplat.captures.capture import RawPoints, Shot
 from glassplat.captures.masks import IgnoredMask, PaneMask
 from glassplat.errors import InputError, input_checked
-from glassplat.files.images import image_size, read_image, read_image_float
+from glassplat.files.images import image_size, read_colors, read_image_float
 from glassplat.options import WHITE, Rgb
 from glassplat.scene.camera import Camera, to_device
 
@@ -386,7 +386,7 @@ class PhotoFile:
     def __call__(self) -> Tensor:
         """[H, W, 3] uint8 in the pixel grid of the view's camera."""
         with input_checked():
-            pixels = read_image(self.path)
+            pixels = read_colors(self.path)
         return torch.from_numpy(self.pixel_map.photo(_opaque(pixels, self.background)))
 
 
@@ -436,9 +436,21 @@ class PreparedView:
 
 
 def prepare_view(
-    shot: Shot, mask: PaneMask | None, options: ViewOptions, *, ignored: Sequence[IgnoredMask] = ()
+    shot: Shot,
+    mask: PaneMask | None,
+    options: ViewOptions,
+    *,
+    ignored: Sequence[IgnoredMask] = (),
+    normals: Path | None = None,
 ) -> PreparedView:
     """Check one photograph against its camera and set up how it is read; decodes no pixels of it.
+
+    Args:
+        shot: the photograph.
+        mask: of its panes.
+        options: how it is read.
+        ignored: masks of what is not to be learned.
+        normals: file of its estimated normals.
 
     Raises:
         InputError: unreadable file, sizes that disagree, a pose that is not rigid, a lens that cannot be undistorted.
@@ -460,7 +472,7 @@ def prepare_view(
         read_ignored=MaskFiles(tuple(_mask_file(one, (width, height), pixel_map) for one in ignored))
         if ignored
         else None,
-        read_normals=normals_reader(shot.image_path, camera),
+        read_normals=normals_reader(normals, camera),
     )
     return PreparedView(view, lens is not shot.lens)
 
@@ -539,9 +551,8 @@ def in_world(normals: Tensor, camera: Camera) -> Tensor:
     return normals @ camera.cam_from_world[:3, :3].to(normals)
 
 
-def normals_reader(image_path: Path, camera: Camera) -> Callable[[], Tensor] | None:
-    """Reader of the estimated normals of a photograph, at a camera's size; None where there is no file of them."""
-    path = normals_path(image_path)
+def normals_reader(path: Path | None, camera: Camera) -> Callable[[], Tensor] | None:
+    """Reader of a file of estimated normals, at a camera's size; None for None."""
     return None if path is None else partial(normals_in_file, path, camera)
 
 
@@ -568,17 +579,34 @@ def normals_in_file(path: Path, camera: Camera) -> Tensor:
     return torch.where(known, unit, 0)
 
 
-def normals_path(image_path: Path) -> Path | None:
-    """The file of normals in a folder `normals` next to a photograph or to its folder; None where there is none."""
-    for folder in (image_path.parent / FOLDER, image_path.parent.parent / FOLDER):
-        if not folder.is_dir():  # As in most captures, all photographs of which are asked.
-            continue
-        for name in (image_path.stem, image_path.name):
-            for suffix in SUFFIXES:
-                path = folder / f"{name}{suffix}"
-                if path.is_file():
-                    return path
-    return None
+def normals_paths(photographs: Mapping[str, Path]) -> dict[str, Path]:
+    """The files of estimated normals by name of the photograph; those without any are left out.
+
+    Those of `left/3.jpg` are `left/3.png` in a folder `normals` among the photographs or next to their folder, or
+    `3.png` in a folder `normals` next to the photograph itself. If no other photograph is called 3, `3.png` among the
+    photographs or next to the folder `left` will do. Each may also be `3.npy`, `3.jpg.png` or `3.jpg.npy`.
+
+    Args:
+        photographs: path of every photograph of a capture by name.
+    """
+    stems = Counter(path.stem for path in photographs.values())
+    is_folder = cache(Path.is_dir)  # Most captures have none, and thousands of photographs ask.
+    found = {}
+    for name, path in photographs.items():
+        whole, alone = PurePosixPath(name), PurePosixPath(path.name)
+        if whole.anchor or ".." in whole.parts or path.parts[-len(whole.parts) :] != whole.parts:
+            whole = alone  # Its folders lead elsewhere.
+        base = path.parents[len(whole.parts) - 1]
+        places = [(base, whole), (base.parent, whole), (path.parent, alone)]
+        if stems[path.stem] == 1:
+            places += [(path.parent.parent, alone), (base, alone)]
+        folders = [(folder / FOLDER / one.parent, one) for folder, one in places if is_folder(folder / FOLDER)]
+        names = [folder / stem for folder, one in folders for stem in (one.stem, one.name)]
+        files = (file.with_name(f"{file.name}{suffix}") for file in names for suffix in SUFFIXES)
+        file = next(filter(Path.is_file, files), None)
+        if file is not None:
+            found[name] = file
+    return found
 
 
 def _vectors(path: Path) -> NDArray[np.float32]:
@@ -590,9 +618,10 @@ def _vectors(path: Path) -> NDArray[np.float32]:
         vectors = 2 * pixels[..., :3] - 1
         return vectors * (pixels[..., 3:] > LEAST_LENGTH) if pixels.shape[2] == 4 else vectors
     try:
-        vectors = np.load(path, allow_pickle=False)
+        with path.open("rb") as file:  # Not `load`, which opens archives of arrays, too.
+            vectors = np.lib.format.read_array(file, allow_pickle=False)
     except Exception as error:  # It evaluates the head of the file, and damaged ones raise what tokens do.
-        raise ValueError(f"{path} is no array that NumPy can read: {error}") from error
+        raise ValueError(f"{path} is no array that NumPy can read ({error}); save it with numpy.save") from error
     if vectors.ndim != 3 or vectors.shape[2] != 3 or vectors.dtype.kind != "f" or 0 in vectors.shape:
         raise ValueError(f"{path} holds {vectors.dtype} of shape {list(vectors.shape)}; expected floats [H, W, 3]")
     return np.nan_to_num(vectors.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)

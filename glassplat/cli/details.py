@@ -7,9 +7,9 @@ from pathlib import Path
 
 import torch
 
+from glassplat.captures.cameras import LEAST_SIDE
 from glassplat.captures.dataset import Dataset, dataset_of, load_dataset
 from glassplat.captures.files import CaptureFiles
-from glassplat.captures.view import normals_path
 from glassplat.cli.console import shell_word
 from glassplat.cli.info import FEW_VIEWS, Finding, describe_broken
 from glassplat.errors import InputError, input_checked
@@ -52,7 +52,7 @@ def remaining_parts(files: CaptureFiles) -> Iterator[Finding]:
     yield _describe_panes(files.root, dataset)
     yield _behind(files.root, dataset)
     decoded = Finding()
-    describe_broken([view.image_path for view in (*dataset.train, *dataset.test)], decoded)
+    describe_broken([view.image_path for view in (*dataset.train, *dataset.test)], decoded, LEAST_SIDE)
     yield decoded
 
 
@@ -76,7 +76,7 @@ def _describe_panes(path: Path, dataset: Dataset) -> Finding:
     finding = Finding()
     if ignoring := sum(view.read_ignored is not None for view in (*dataset.train, *dataset.test)):
         finding.facts["ignored"] = f"parts of {ignoring} photographs, by masks or transparency"
-    if estimated := sum(normals_path(view.image_path) is not None for view in dataset.train):
+    if estimated := sum(view.read_normals is not None for view in dataset.train):
         finding.facts["normals"] = f"estimated for {estimated} training photographs; deferred and traced use them"
     annotated = sum(view.is_annotated for view in dataset.train)
     if not dataset.pane_labels and dataset.planes is None:

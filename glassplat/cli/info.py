@@ -19,7 +19,7 @@ from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
 from glassplat.files.records import Text, check_fields, read_json
 from glassplat.files.writing import SCENE, SPLAT_SUFFIXES, scene_source
 from glassplat.model.run_directory import RunDirectory
-from glassplat.prepare.photographs import VIDEO_SUFFIXES, NoOpenCVError, broken_photographs, video_facts
+from glassplat.prepare.photographs import LEAST_SIDE, VIDEO_SUFFIXES, NoOpenCVError, broken_photographs, video_facts
 from glassplat.prepare.preparation import RECORD
 
 KINDS = f"a capture, photographs, a video, a run, an exported scene, or a splat file ({', '.join(SPLAT_SUFFIXES)})"
@@ -120,16 +120,16 @@ def photographs_finding(path: Path) -> Iterator[Finding]:
         raise InputError(f"{path} is nothing that is known; expected {KINDS}; it holds {names}")
     yield Finding("photographs without poses", {"photographs": len(found)})
     finding = Finding()
-    sound = len(found) - describe_broken(found, finding)
+    sound = len(found) - describe_broken(found, finding, LEAST_SIDE)
     if sound < FEW_VIEWS:
         finding.problems.append(f"{sound} photographs are few; 30 and more do better")
     finding.next.append(f"glassplat prepare {shell_word(path)} --output CAPTURE    finds out where they were taken")
     yield finding
 
 
-def describe_broken(photographs: Sequence[Path], finding: Finding) -> int:
-    """Looks for photographs that nothing can be done with; each is decoded. Returns how many there are."""
-    if broken := broken_photographs(photographs):
+def describe_broken(photographs: Sequence[Path], finding: Finding, least_side: int) -> int:
+    """Finds photographs that are broken, or have fewer pixels a side, and decodes each. Returns how many there are."""
+    if broken := broken_photographs(photographs, least_side):
         finding.problems.append(
             f"{len(broken)} are broken, tiny or of a kind that cannot be read ({first_names(broken)}); replace or "
             "remove them"

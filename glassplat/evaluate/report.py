@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -221,17 +222,22 @@ def _draw_panel(canvas: Image.Image, panel: Panel, corner: tuple[int, int], size
         picture = picture.resize(size, Image.Resampling.NEAREST if grows else Image.Resampling.LANCZOS)
     canvas.paste(picture, (corner[0], corner[1] + CAPTION_HEIGHT))
     font = ImageFont.load_default(CAPTION_SIZE)
-    ImageDraw.Draw(canvas).text((corner[0], corner[1] + 2), panel.caption, fill=QUIET_TEXT, font=font)
+    ImageDraw.Draw(canvas).text((corner[0], corner[1] + 2), _one_line(panel.caption), fill=QUIET_TEXT, font=font)
 
 
 def _draw_title(draw: ImageDraw.ImageDraw, title: str, subtitle: str, width: int) -> None:
     title_font, font = ImageFont.load_default(TITLE_SIZE), ImageFont.load_default(CAPTION_SIZE)
-    baseline = MARGIN + TITLE_SIZE
+    title, baseline = _one_line(title), MARGIN + TITLE_SIZE
     draw.text((MARGIN, baseline), title, fill=TEXT, font=title_font, anchor="ls")
     start = MARGIN + draw.textlength(title, font=title_font) + 2 * GAP
     # A narrow sheet has no room for the metrics; the overview page lists them anyway.
     if start + draw.textlength(subtitle, font=font) <= width - MARGIN:
         draw.text((start, baseline), subtitle, fill=QUIET_TEXT, font=font, anchor="ls")
+
+
+def _one_line(text: str) -> str:
+    """A text without the line breaks that a photograph's name may have."""
+    return " ".join(text.splitlines())
 
 
 MOST_VIEWS = 2
@@ -424,9 +430,10 @@ def _link(name: str, sheets: Mapping[str, str]) -> str:
 
 
 def _figure(name: str, path: str, description: str) -> str:
+    address = _escape(quote(path))
     return (
-        f'<figure id="{_escape(name)}"><a href="{_escape(path)}">'
-        f'<img src="{_escape(path)}" alt="{_escape(description)}" loading="lazy"></a></figure>'
+        f'<figure id="{_escape(name)}"><a href="{address}">'
+        f'<img src="{address}" alt="{_escape(description)}" loading="lazy"></a></figure>'
     )
 
 

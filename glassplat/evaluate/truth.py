@@ -27,7 +27,7 @@ from torch import Tensor
 
 from glassplat.captures.view import View
 from glassplat.errors import InputError, input_checked
-from glassplat.files.images import image_size, read_image, read_image_float
+from glassplat.files.images import image_size, read_colors, read_image, read_image_float
 from glassplat.files.records import COORDINATE, Field, Flag, Items, Number, Whole, check_fields, read_json
 from glassplat.options import short_repr
 
@@ -109,8 +109,8 @@ class GroundTruth:
         size = (width, height)
         with input_checked():
             return TrueView(
-                transmission=torch.from_numpy(_resized_color(read_image(paths["transmission"]), size)),
-                reflection=torch.from_numpy(_resized_color(read_image(paths["reflection"]), size)),
+                transmission=torch.from_numpy(_resized_color(read_colors(paths["transmission"]), size)),
+                reflection=torch.from_numpy(_resized_color(read_colors(paths["reflection"]), size)),
                 strength=torch.from_numpy(resized_float(read_image_float(paths["strength"])[..., 0], size)),
                 labels=torch.from_numpy(_resized_labels(read_image(paths["labels"])[..., 0], size)),
             )

@@ -1,20 +1,21 @@
-"""Image files, sRGB as stored, and the picture files of named views."""
+"""Image files, sRGB as stored or by their colour profile, and the picture files of named views."""
 
 from __future__ import annotations
 
+import io
 import unicodedata
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, lru_cache
 from itertools import count, takewhile
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageCms
 
 from glassplat.files.writing import atomic_write
 
@@ -92,16 +93,25 @@ def is_transparent(path: Path) -> bool:
 def read_image(path: Path | str) -> NDArray[np.uint8]:
     """Read an image as uint8 [H, W, C]: one channel for grey, three for colour, four with transparency.
 
-    Sixteen-bit grey is scaled to eight bits.
+    Sixteen-bit grey is scaled to eight bits. Values are as stored: `read_colors` is for photographs.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: the file is no image, is cut off or too large, or its values are no colours.
     """
     with checked_image(Path(path)) as image:
-        if image.mode in SHADES_16:
-            return np.round(_shades(image) * 255).astype(np.uint8)[:, :, None]
-        return _pixels(image)
+        return _pixels(_in_eight_bits(image))
+
+
+def read_colors(path: Path | str) -> NDArray[np.uint8]:
+    """Read a photograph as `read_image` does, its colours converted to sRGB by the embedded profile.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is no image, is cut off or too large, or its values are no colours.
+    """
+    with checked_image(Path(path)) as image:
+        return _pixels(in_srgb(image))
 
 
 def read_image_float(path: Path | str) -> NDArray[np.float32]:
@@ -157,6 +167,56 @@ def checked_image(path: Path) -> Iterator[Image.Image]:
     except Exception as error:  # Its parsers raise whatever damaged bytes lead to, from KeyError to struct.error.
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error) or type(error).__name__
         raise ValueError(f"cannot read {path} as an image ({reason}); replace the file or remove it") from error
+
+
+SPACES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}
+"""Pillow's mode of the pixels that a profile describes, by its name of the colour space."""
+NEARLY_SRGB = 1
+"""Of 255: a profile that changes no colour by more is one of the many of sRGB, whose pixels stay as they are."""
+
+
+def in_srgb(image: Image.Image) -> Image.Image:
+    """The image in eight bits, with the colours that its embedded profile says, in sRGB.
+
+    One without a profile, with that of sRGB, or with one that is broken or for other pixels stays as it is.
+    """
+    profile = image.info.get("icc_profile")
+    image = _in_eight_bits(image)
+    known = _to_srgb(profile) if profile and isinstance(profile, bytes) else None
+    own = "CMYK" if image.mode == "CMYK" else "L" if image.mode in ("1", "L", "LA") else "RGB"
+    if known is None or (own, known[0]) not in {("L", "RGB"), (own, own)}:
+        return image
+    mode, transform = known
+    converted = transform.apply(image if image.mode == mode else image.convert(mode))
+    if image.has_transparency_data:
+        converted.putalpha(image.convert("RGBA").getchannel("A"))
+    return converted
+
+
+@lru_cache(maxsize=8)
+def _to_srgb(profile: bytes) -> tuple[str, ImageCms.ImageCmsTransform] | None:
+    """Mode of the pixels that a profile describes, and their way to sRGB; None if it is broken, or leads nowhere."""
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        mode = SPACES[source.profile.xcolor_space.strip()]
+        target = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB"))
+        transform = ImageCms.ImageCmsTransform(source, target, mode, "RGB")
+    except (OSError, ValueError, KeyError):
+        return None
+    steps = np.arange(0, 256, 15, dtype=np.uint8)
+    colors = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(1, -1, 3)
+    before = Image.fromarray(colors).convert(mode)
+    after = np.asarray(transform.apply(before), dtype=np.int16)
+    changed = np.abs(after - np.asarray(before.convert("RGB"))).max()
+    return (mode, transform) if changed > NEARLY_SRGB else None
+
+
+def _in_eight_bits(image: Image.Image) -> Image.Image:
+    """The image, of grey in sixteen bits its shades in eight."""
+    _check_shades(image)
+    if image.mode not in SHADES_16:
+        return image
+    return Image.fromarray(np.round(_shades(image) * 255).astype(np.uint8))
 
 
 def _pixels(image: Image.Image) -> NDArray[np.uint8]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import math
+import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -105,6 +106,21 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
     return list(found.values())
 
 
+def file_states(source: Path) -> dict[str, list[int]]:
+    """Size and time of the last change of a video, or of every photograph below a folder, by name.
+
+    Raises:
+        InputError: there are no photographs, or some of a kind that cannot be read.
+    """
+    folder, paths = (source.parent, [source]) if source.is_file() else (source, _photograph_paths(source))
+    found = {}
+    for path in paths:
+        name = os.fsencode(path.relative_to(folder)).decode("utf-8", "backslashreplace")
+        state = path.stat()
+        found[name] = [state.st_size, state.st_mtime_ns]
+    return found
+
+
 def _refusal(broken: Mapping[str, InputError], count: int) -> InputError:
     """Reason for refusing some of so many photographs, by their names."""
     first = next(iter(broken.values()))
@@ -116,12 +132,12 @@ def _refusal(broken: Mapping[str, InputError], count: int) -> InputError:
     )
 
 
-def broken_photographs(paths: Sequence[Path]) -> list[str]:
-    """Names of those that `photographs_in` would refuse; each is decoded at a small size."""
+def broken_photographs(paths: Sequence[Path], least_side: int) -> list[str]:
+    """Names of those that cannot be read, or have fewer pixels along a side; each is decoded at a small size."""
     broken = []
     for path in paths:
         try:
-            _examine(path, path.name, LEAST_SIDE)
+            _examine(path, path.name, LEAST_SIDE, least_side)
         except InputError:
             broken.append(path.name)
     return broken
@@ -163,14 +179,16 @@ def read_photograph(photograph: Photograph) -> NDArray[np.uint8]:
 
 
 def _upright(path: Path) -> Image.Image:
-    """The picture as eight-bit RGB, turned as its EXIF tag says."""
+    """The picture as eight-bit sRGB over black, turned as its EXIF tag says."""
     with images.checked_image(path) as image:
         orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
-        if image.mode not in images.SHADES_16:
-            return ImageOps.exif_transpose(image).convert("RGB")
-    grey = Image.fromarray(images.read_image(path)[:, :, 0])
-    grey.getexif()[ExifTags.Base.Orientation] = orientation
-    return ImageOps.exif_transpose(grey).convert("RGB")
+        shown = images.in_srgb(image)
+        shown.getexif()[ExifTags.Base.Orientation] = orientation
+        upright = ImageOps.exif_transpose(shown)
+    if not upright.has_transparency_data:
+        return upright.convert("RGB")
+    seen = upright.convert("RGBA")
+    return Image.alpha_composite(Image.new("RGBA", seen.size, "black"), seen).convert("RGB")
 
 
 def _photograph_paths(folder: Path) -> list[Path]:
@@ -218,7 +236,7 @@ def _numbers_as_such(name: str) -> tuple[tuple[int, int, str], ...]:
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts)
 
 
-def _examine(path: Path, name: str, max_size: int) -> tuple[Photograph, bytes]:
+def _examine(path: Path, name: str, max_size: int, least_side: int = LEAST_SIDE) -> tuple[Photograph, bytes]:
     """A photograph and a fingerprint of its file; decoded at a small size, which finds files that are cut off."""
     try:
         size = images.image_size(path)
@@ -232,9 +250,9 @@ def _examine(path: Path, name: str, max_size: int) -> tuple[Photograph, bytes]:
             contents = hashlib.blake2b(path.read_bytes(), digest_size=16).digest()
     except (ValueError, FileNotFoundError) as error:
         raise InputError(str(error)) from error
-    if min(size) < LEAST_SIDE:
+    if min(size) < least_side:
         raise InputError(
-            f"{path} is {size[0]}x{size[1]} pixels large; expected a photograph, {LEAST_SIDE} pixels at least along "
+            f"{path} is {size[0]}x{size[1]} pixels large; expected a photograph, {least_side} pixels at least along "
             "each side: remove it"
         )
     width, height = size[::-1] if sideways else size

@@ -17,13 +17,23 @@ from glassplat.captures.colmap_library import quiet_pycolmap
 from glassplat.errors import InputError, first_names
 from glassplat.files.records import read_json
 from glassplat.files.writing import atomic_write, check_folder, make_folder, missing_folders, real_path, remove_empty
-from glassplat.prepare.photographs import FEWEST, VIDEO_SUFFIXES, Listener, Photograph, frames_of, photographs_in
+from glassplat.prepare.photographs import (
+    FEWEST,
+    VIDEO_SUFFIXES,
+    Listener,
+    Photograph,
+    file_states,
+    frames_of,
+    photographs_in,
+)
 from glassplat.prepare.reconstruction import Settings, Solution, best_solution, image_numbers, write_capture
 
 RECORD = "prepare.json"
 """In the capture: that it was prepared here, and the report."""
 PAGE = "prepare.html"
 """In the capture: the same for people."""
+PHOTOGRAPHS = "photographs"
+"""In the settings of an interrupted preparation: the states of the files that it was begun with."""
 HAND_MADE = ("panes", "masks", "ignore", "planes.json", "annotations.json")
 """In a capture: what somebody spent time on."""
 
@@ -69,12 +79,8 @@ class Workplace:
                 f"{self.folder} holds an interrupted preparation of {self.output}; go on from it with --resume, or "
                 "begin again with --force"
             )
-        if known is not None and known != json.loads(json.dumps(settings)):
-            changed = sorted(key for key in {*known, *settings} if known.get(key) != settings.get(key))
-            raise InputError(
-                f"{self.folder} was begun with another {first_names(changed)}; give the same to --resume, or begin "
-                "again with --force"
-            )
+        if known is not None:
+            self._check_unchanged(known, json.loads(json.dumps(settings)))
         if known is None:
             make_folder(self.folder)
             with atomic_write(self.folder / "settings.json") as temporary:
@@ -94,6 +100,31 @@ class Workplace:
     def discard(self) -> None:
         """Removes the folder."""
         shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _check_unchanged(self, known: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
+        """Refuse to go on with other settings, or with other photographs: their poses and features are kept by number.
+
+        Raises:
+            InputError: names what differs.
+        """
+        changed = sorted(key for key in {*known, *settings} if known.get(key) != settings.get(key))
+        if set(changed) - {PHOTOGRAPHS}:
+            raise InputError(
+                f"{self.folder} was begun with another {first_names([key for key in changed if key != PHOTOGRAPHS])}; "
+                "give the same to --resume, or begin again with --force"
+            )
+        if not changed:
+            return
+        before, now = known.get(PHOTOGRAPHS), settings[PHOTOGRAPHS]
+        if not isinstance(before, dict):
+            raise InputError(
+                f"{self.folder} does not say which photographs it was begun with; begin again with --force"
+            )
+        names = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
+        raise InputError(
+            f"photographs have changed since {self.folder} was begun (added, removed or written again: "
+            f"{first_names(names)}); put them back to go on with --resume, or begin again with --force"
+        )
 
     def _check_output(self, force: bool) -> None:
         check_folder(self.output)
@@ -321,8 +352,9 @@ def prepare(task: Preparation, listen: Listener, *, resume: bool = False, force:
     check_places(task)
     quiet_pycolmap()
     workplace = Workplace(task.output)
+    settings = {**task.record(), PHOTOGRAPHS: file_states(task.source)}
     missing = missing_folders(workplace.folder.parent)
-    workplace.begin(task.record(), resume=resume, force=force)
+    workplace.begin(settings, resume=resume, force=force)
     try:
         photographs = _photographs(task, workplace, listen)
     except InputError:

@@ -17,8 +17,9 @@ from PIL import Image
 
 from glassplat.captures.dataset import Dataset, load_dataset
 from glassplat.captures.view import PointCloud, View
+from glassplat.errors import InputError
 from glassplat.evaluate.report import STYLE
-from glassplat.files.records import read_json
+from glassplat.files.records import Field, Items, Number, Text, Whole, check_fields, read_json
 from glassplat.files.writing import atomic_write
 from glassplat.panes.material import virtual_points
 from glassplat.prepare.preparation import RECORD
@@ -147,6 +148,23 @@ svg { background: #0c0d0f; border-radius: 8px }
 """
 
 
+COUNT, NAMES = Whole(0), Items(Text())
+REPORT: dict[str, Field] = {
+    "photographs": COUNT,
+    "registered": COUNT,
+    "missing": NAMES,
+    "points": COUNT,
+    "reprojection_error": Number(),
+    "track_length": Number(),
+    "features": COUNT,
+    "cameras": NAMES,
+    "attempt": Text(),
+    "attempts": COUNT,
+    "advice": NAMES,
+}
+"""What the page shows of a preparation's report."""
+
+
 @dataclass(frozen=True)
 class Shown:
     """Record of one photograph in the model.
@@ -171,10 +189,10 @@ def write_page(capture: Path, target: Path, planes: Planes | None = None) -> Non
         planes: of panes that are marked in it; points behind them are counted and shown.
 
     Raises:
-        InputError: the capture cannot be read.
+        InputError: the capture cannot be read, or has no report.
         OSError: it was not prepared here, or the page cannot be written.
     """
-    report = read_json(capture / RECORD)["report"]
+    report = _read_report(capture / RECORD)
     dataset = load_dataset(capture)
     from glassplat.captures.colmap_library import pycolmap  # `info` names this page, and need not wait for it.
 
@@ -182,6 +200,15 @@ def write_page(capture: Path, target: Path, planes: Planes | None = None) -> Non
     page = _page(report, dataset, model, planes, capture.resolve().name)
     with atomic_write(target) as temporary:
         temporary.write_text(page, encoding="utf-8")
+
+
+def _read_report(path: Path) -> dict[str, Any]:
+    try:
+        record = read_json(path)
+        report = record.get("report") if isinstance(record, dict) else record
+        return check_fields(report, REPORT, f"the report in {path}")
+    except ValueError as error:
+        raise InputError(f"{error}; prepare the capture again to have a page about it") from error
 
 
 def _page(report: Mapping[str, Any], dataset: Dataset, model: Any, planes: Planes | None, title: str) -> str:

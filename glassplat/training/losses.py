@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import PurePosixPath
 
 import torch
 from torch import Tensor
@@ -300,7 +301,8 @@ class MonocularNormals:
         """The loss of a view; None where no normals lie next to its photograph."""
         normals = view.normals
         if normals is None:
-            if view.name not in self._lacking and (view.image_path.parent.parent / FOLDER).is_dir():
+            folders = view.image_path.parents[: len(PurePosixPath(view.name).parts) + 1]
+            if view.name not in self._lacking and any((folder / FOLDER).is_dir() for folder in folders):
                 log.warning("no normals for %s in the folder %r next to it: it is learned without", view.name, FOLDER)
             self._lacking.add(view.name)
             return None

@@ -12,6 +12,7 @@ from PIL import Image
 from glassplat.captures.dataset import load_dataset
 from glassplat.captures.view import View
 from glassplat.errors import InputError
+from tests.files.profiles import IN_P3, IN_SRGB, p3_profile
 
 
 def test_every_eighth_image_by_name_is_held_out(capture) -> None:
@@ -53,6 +54,14 @@ def test_downscaling_spans_the_same_image(capture, downscale: float, size: tuple
     full_uv, full_depth = full.camera.project(points)
     torch.testing.assert_close(uv / torch.tensor(size), full_uv / torch.tensor([32, 24]))
     torch.testing.assert_close(depth, full_depth)
+
+
+def test_photographs_of_another_colour_space_are_read_in_srgb(capture) -> None:
+    capture.write_colmap()
+    path = capture.root / "images" / capture.names[1]
+    Image.new("RGB", capture.size, IN_P3).save(path, icc_profile=p3_profile())
+    (view,) = [view for view in load_dataset(capture.root).train if view.name == capture.names[1]]
+    np.testing.assert_allclose(view.photo[3, 4].numpy(), IN_SRGB, atol=1)
 
 
 def test_downscaling_averages_area(capture) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from glassplat.captures.dataset import load_dataset
 from glassplat.cli.main import main
@@ -114,6 +115,16 @@ def test_a_photograph_of_a_capture_that_is_cut_off_is_named(tmp_path: Path, caps
     assert told(capture, capsys)["problems"] == [
         "1 are broken, tiny or of a kind that cannot be read (0005.jpg); replace or remove them"
     ]
+
+
+def test_small_photographs_of_a_capture_are_sound(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """They are smaller than those that `prepare` could place."""
+    capture = shutil.copytree(SCENE, tmp_path / "capture", ignore=shutil.ignore_patterns("panes", "gt"))
+    for path in (capture / "images").iterdir():
+        with Image.open(path) as image:
+            image.resize((80, 60)).save(path)
+    (scaled,) = told(capture, capsys)["problems"]
+    assert "are scaled copies of what was calibrated" in scaled
 
 
 def test_a_folder_of_few_photographs_is_said_to_be_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,8 +2,10 @@ import html
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import unquote, urlsplit
 
 import numpy as np
+import pytest
 import torch
 
 from glassplat.evaluate.evaluate import evaluate
@@ -20,8 +22,10 @@ from glassplat.evaluate.report import (
     CAPTION_HEIGHT,
     MARGIN,
     TITLE_HEIGHT,
+    Panel,
     Report,
     comparison_sheet,
+    compose_sheet,
     overview_page,
     sheet_names,
 )
@@ -107,6 +111,14 @@ def test_panels_lie_where_their_captions_say(case) -> None:
     top, factor = MARGIN + TITLE_HEIGHT + CAPTION_HEIGHT, 6
     photo = sheet[top : top + 32 * factor, MARGIN : MARGIN + 48 * factor]
     np.testing.assert_array_equal(photo[::factor, ::factor], view.photo.numpy())
+
+
+def test_a_name_with_a_line_break_is_drawn_on_one_line(case) -> None:
+    frame, view = case.renderer.frames[40.0], case.dataset.test[0]
+    broken, whole = (comparison_sheet(frame, view.photo, None, title=title) for title in ("a\nb.jpg", "a b.jpg"))
+    np.testing.assert_array_equal(broken, whole)
+    broken, whole = (compose_sheet([[Panel(text, view.photo)]], "", "") for text in ("a\r\nb.jpg", "a b.jpg"))
+    np.testing.assert_array_equal(broken, whole)
 
 
 def test_rows_follow_what_is_known(case) -> None:
@@ -196,6 +208,17 @@ def test_every_metric_is_written_with_its_unit_and_explained() -> None:
         unit = next((unit for end, unit in units.items() if name.endswith(end)), "")
         assert format_value(1, column.pattern).endswith(unit), name
         assert format_value(None, column.pattern) == "-"
+
+
+@pytest.mark.parametrize("name", ["IMG#1.jpg", "what?.jpg", "50%25.jpg", "a & b.jpg", "Bild ä.jpg", "a\nb.jpg"])
+def test_the_page_finds_sheets_of_any_name(name: str) -> None:
+    sheets = sheet_names([name])
+    found = references(overview_page({}, {name: {"psnr": 30.0}}, sheets))
+    paths = {address for address in found if not address.startswith("#")}
+    assert {unquote(address) for address in paths} == set(sheets.values())
+    parsed = [urlsplit(address) for address in paths]
+    assert [(part.query, part.fragment) for part in parsed] == [("", "")]
+    assert found - paths == {f"#{name}"}
 
 
 def test_names_of_sheets_are_distinct() -> None:

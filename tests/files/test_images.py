@@ -11,7 +11,16 @@ import pytest
 import torch
 from PIL import Image
 
-from glassplat.files.images import image_size, is_transparent, open_image, read_image, read_image_float, write_image
+from glassplat.files.images import (
+    image_size,
+    is_transparent,
+    open_image,
+    read_colors,
+    read_image,
+    read_image_float,
+    write_image,
+)
+from tests.files.profiles import IN_P3, IN_SRGB, p3_profile, srgb_profile
 
 GENERATOR = np.random.default_rng(0)
 
@@ -67,7 +76,7 @@ def test_orientation_tag_is_not_applied(tmp_path: Path) -> None:
     assert read_image(tmp_path / "a.jpg").shape == (4, 8, 3)
 
 
-@pytest.mark.parametrize("read", [read_image, read_image_float, image_size, open_image, is_transparent])
+@pytest.mark.parametrize("read", [read_image, read_colors, read_image_float, image_size, open_image, is_transparent])
 def test_files_that_cannot_be_read(tmp_path: Path, read) -> None:
     with pytest.raises(FileNotFoundError):
         read(tmp_path / "nothing.png")
@@ -108,8 +117,8 @@ def test_an_image_too_large_to_decode_is_named_with_its_size(tmp_path: Path) -> 
 def test_values_of_which_nothing_says_what_is_white_are_refused(
     tmp_path: Path, values: np.ndarray, message: str
 ) -> None:
-    Image.fromarray(values).save(tmp_path / "a.tif")
-    for read in (open_image, read_image, read_image_float):
+    Image.fromarray(values).save(tmp_path / "a.tif", icc_profile=p3_profile())
+    for read in (open_image, read_image, read_colors, read_image_float):
         with pytest.raises(ValueError, match=rf"a\.tif as an image \(it holds {message}"):
             read(tmp_path / "a.tif")
 
@@ -129,6 +138,39 @@ OLD_PILLOW = pytest.mark.xfail(int(PIL.__version__.partition(".")[0]) < 13, reas
 def test_every_way_to_store_colours_is_read(tmp_path: Path, mode: str) -> None:
     Image.new(mode, (5, 4)).save(tmp_path / "a.tif")
     assert read_image(tmp_path / "a.tif").shape[:2] == read_image_float(tmp_path / "a.tif").shape[:2] == (4, 5)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "P"])
+def test_colours_of_another_profile_become_srgb(tmp_path: Path, mode: str) -> None:
+    image = Image.new("RGB", (5, 4), IN_P3)
+    if mode == "P":
+        image = image.quantize(4)
+    if mode == "RGBA":
+        image.putalpha(7)
+    image.save(tmp_path / "a.png", icc_profile=p3_profile())
+    expected = [*IN_SRGB, 7] if mode == "RGBA" else list(IN_SRGB)
+    np.testing.assert_allclose(read_colors(tmp_path / "a.png")[2, 3], expected, atol=1)
+    assert read_image(tmp_path / "a.png")[2, 3, :3].tolist() == list(IN_P3)
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "I;16"])
+def test_greys_of_a_colour_profile_stay_grey(tmp_path: Path, mode: str) -> None:
+    shade, expected = {"1": (1, 255), "I;16": (200 * 257, 200), "LA": ((200, 255), 200)}.get(mode, (200, 200))
+    Image.new(mode, (5, 4), shade).save(tmp_path / "a.png", icc_profile=p3_profile())
+    np.testing.assert_allclose(read_colors(tmp_path / "a.png")[..., :3], expected, atol=1)
+
+
+@pytest.mark.parametrize("profile", [None, srgb_profile(), b"", b"no profile", p3_profile()[:300], srgb_profile()[:90]])
+@pytest.mark.parametrize("mode", ["RGB", "CMYK"])
+def test_without_another_profile_colours_stay_as_they_are(tmp_path: Path, profile: bytes | None, mode: str) -> None:
+    pixels = GENERATOR.integers(0, 256, (40, 30, 3), dtype=np.uint8)
+    Image.fromarray(pixels).convert(mode).save(tmp_path / "a.tif", icc_profile=profile)
+    np.testing.assert_array_equal(read_colors(tmp_path / "a.tif"), read_image(tmp_path / "a.tif"))
+
+
+def test_a_profile_of_colours_is_none_of_inks(tmp_path: Path) -> None:
+    Image.new("CMYK", (5, 4), (9, 99, 200, 3)).save(tmp_path / "a.tif", icc_profile=p3_profile())
+    np.testing.assert_array_equal(read_colors(tmp_path / "a.tif"), read_image(tmp_path / "a.tif"))
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])

@@ -117,7 +117,7 @@ def test_estimated_normals_say_it_before_depths_do(tmp_path: Path, estimated: bo
     in_picture = (elsewhere * torch.tensor(CAMERA_FROM_PICTURE)).expand(SIZE, SIZE, 3)
     np.save(tmp_path / FOLDER / "0.npy", in_picture.numpy())
     (view,) = views(0.0)
-    view = replace(view, read_normals=normals_reader(tmp_path / "0.png", view.camera))
+    view = replace(view, read_normals=normals_reader(tmp_path / FOLDER / "0.npy", view.camera))
     chosen = inner(scene)
     made = made_mirrors(replace(SEARCH, estimated_normals=estimated), scene, [view], chosen).select(chosen)
     expected = elsewhere if estimated else true_normal()

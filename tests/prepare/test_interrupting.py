@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import json
+import os
 import signal
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from glassplat.cli import capture
 from glassplat.cli.main import main
+from glassplat.errors import InputError
 from glassplat.prepare import report_page
 from glassplat.prepare.colmap import interruptible
-from glassplat.prepare.preparation import PAGE, RECORD
+from glassplat.prepare.preparation import PAGE, RECORD, Preparation, prepare
+from tests.prepare.conftest import Heard
+from tests.prepare.test_video import film
 
 
 def test_an_interrupt_waits_until_the_work_has_ended() -> None:
@@ -76,3 +83,60 @@ def test_an_earlier_capture_is_not_taken_for_this_one(
     (tmp_path / "capture" / RECORD).write_text("{}")
     monkeypatch.setattr(capture, "prepare", interrupt)
     assert "nothing was written" in interrupted(photographs, tmp_path / "capture", capsys)
+
+
+def begun(photographs: Path, output: Path) -> Preparation:
+    """A preparation that was interrupted at its first word."""
+    task = Preparation(photographs, output)
+    with pytest.raises(KeyboardInterrupt):
+        prepare(task, interrupt)
+    return task
+
+
+def exchange(folder: Path) -> None:
+    first, *_, last = sorted(folder.iterdir())
+    last.with_name("new.jpg").write_bytes(last.read_bytes() + b" ")
+    first.unlink()
+
+
+def edit(folder: Path) -> None:
+    first = min(folder.iterdir())
+    data = first.read_bytes()
+    first.write_bytes(data[:-1] + b" ")
+    os.utime(first, (0, 0))
+
+
+@pytest.mark.parametrize(
+    ("change", "names"),
+    [(exchange, r"Bild ä 0000\.jpg, new\.jpg\)"), (edit, r": Bild ä 0000\.jpg\)")],
+)
+def test_work_on_other_photographs_is_not_gone_on_with(
+    change: Callable[[Path], None], names: str, photographs: Path, tmp_path: Path, heard: Heard
+) -> None:
+    task = begun(photographs, tmp_path / "capture")
+    change(photographs)
+    with pytest.raises(InputError, match=rf"photographs have changed since .*capture\.partial .*{names}.*--force"):
+        prepare(task, heard, resume=True)
+    assert not heard
+    with pytest.raises(KeyboardInterrupt):
+        prepare(task, interrupt, force=True)
+    with pytest.raises(KeyboardInterrupt):
+        prepare(task, interrupt, resume=True)
+
+
+def test_work_that_does_not_name_its_photographs_is_not_gone_on_with(
+    photographs: Path, tmp_path: Path, heard: Heard
+) -> None:
+    task = begun(photographs, tmp_path / "capture")
+    settings = tmp_path / "capture.partial" / "settings.json"
+    settings.write_text(json.dumps(task.record()))
+    with pytest.raises(InputError, match=r"capture\.partial does not say which photographs .* --force"):
+        prepare(task, heard, resume=True)
+
+
+def test_another_video_of_the_same_name_is_not_gone_on_with(tmp_path: Path, heard: Heard) -> None:
+    video = film(tmp_path / "walk.avi", np.arange(5) * 8)
+    task = begun(video, tmp_path / "capture")
+    film(video, np.arange(6) * 8)
+    with pytest.raises(InputError, match=r"written again: walk\.avi\)"):
+        prepare(task, heard, resume=True)

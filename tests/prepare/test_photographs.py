@@ -11,6 +11,7 @@ from PIL import ExifTags, Image
 
 from glassplat.errors import InputError
 from glassplat.prepare.photographs import Photograph, capture_names, photographs_in, read_photograph
+from tests.files.profiles import IN_P3, IN_SRGB, p3_profile
 from tests.prepare.conftest import Heard
 
 SIZE = (120, 90)
@@ -76,6 +77,36 @@ def test_every_kind_of_pixel_becomes_colour(mode: str, tmp_path: Path, heard: He
     assert corner[0] > elsewhere[0] + 20
     if mode not in ("L", "I;16"):
         assert corner[0] > 200 and corner[1] < 60
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "LA", "P", "RGB"])
+def test_what_was_cut_out_is_black(mode: str, tmp_path: Path, heard: Heard) -> None:
+    folder = three(tmp_path / "in")
+    pixels = np.full((90, 120, 4), 200, dtype=np.uint8)
+    pixels[:, :, 3] = np.repeat([0, 128, 255], 40)
+    image = Image.fromarray(pixels)
+    if mode in ("RGBA", "LA"):
+        image.convert(mode).save(folder / "cut.png")
+    else:  # One of its colours is transparent.
+        shades = image.convert("RGB")
+        shades.paste((9, 9, 9), (0, 0, 40, 90))
+        shades = shades.quantize(4) if mode == "P" else shades
+        shades.save(folder / "cut.png", transparency=shades.getpixel((0, 0)))
+    row = read_photograph(found(folder, heard)["cut.png"])[45]
+    assert not row[:36].any() and (row[84:] == 200).all()
+    if mode in ("RGBA", "LA"):
+        assert (row[46:74] == 100).all()
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_colours_of_a_telephone_become_srgb(tmp_path: Path, heard: Heard, orientation: int) -> None:
+    folder = three(tmp_path / "in")
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    Image.new("RGB", SIZE, IN_P3).save(folder / "p3.jpg", quality=95, exif=exif, icc_profile=p3_profile())
+    pixels = read_photograph(found(folder, heard)["p3.jpg"])
+    assert pixels.shape[:2] == (SIZE if orientation == 6 else SIZE[::-1])
+    np.testing.assert_allclose(pixels.reshape(-1, 3).mean(axis=0), IN_SRGB, atol=4)
 
 
 def test_photographs_are_reduced_and_the_focal_length_with_them(tmp_path: Path, heard: Heard) -> None:

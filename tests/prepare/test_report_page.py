@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,10 +15,11 @@ import pytest
 from glassplat.captures.dataset import load_dataset
 from glassplat.cli.main import main
 from glassplat.cli.train import SCENE
+from glassplat.errors import InputError
 from glassplat.prepare.preparation import PAGE
 from glassplat.prepare.report_page import plan, write_page
 
-RECORD = {
+RECORD: dict[str, Any] = {
     "command": "prepare",
     "report": {
         "photographs": 98,
@@ -90,6 +92,17 @@ def test_a_capture_of_others_has_no_report(tmp_path: Path, capsys: pytest.Captur
     assert main(["info", str(SCENE), "--page", str(tmp_path / "page.html")]) == 2
     assert "was not made by `glassplat prepare`" in capsys.readouterr().err
     assert not (tmp_path / "page.html").exists()
+
+
+@pytest.mark.parametrize(
+    "record",
+    [{}, [], {"report": None}, {"report": {}}, {"report": {**RECORD["report"], "points": "many"}}, "cut off"],
+)
+def test_a_record_without_a_report_is_named(record: object, tmp_path: Path) -> None:
+    (tmp_path / "prepare.json").write_text(str(record) if record == "cut off" else json.dumps(record))
+    with pytest.raises(InputError, match=r"prepare\.json.*; prepare the capture again"):
+        write_page(tmp_path, tmp_path / PAGE)
+    assert not (tmp_path / PAGE).exists()
 
 
 def test_cameras_in_the_plan_lie_as_they_stood() -> None:

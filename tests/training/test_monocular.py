@@ -70,3 +70,12 @@ def test_views_without_a_file_have_no_such_term(tmp_path: Path, caplog: pytest.L
         term = MonocularNormals()
         assert term(frame, view_in(tmp_path), SCENE) is term(frame, view_in(tmp_path), SCENE) is None
     assert caplog.text.count("no normals for a.jpg") == 1
+
+
+def test_views_in_folders_are_warned_about_too(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Their folder of normals may lie next to that of all photographs."""
+    view = replace(view_in(tmp_path), name="left/a.jpg", image_path=tmp_path / "images" / "left" / "a.jpg")
+    (tmp_path / "normals").mkdir()
+    with caplog.at_level(logging.WARNING):
+        assert MonocularNormals()(frame_of(torch.tensor([0.0, 0.0, 1.0])), view, SCENE) is None
+    assert "no normals for left/a.jpg" in caplog.text
