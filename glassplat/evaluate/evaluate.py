@@ -97,7 +97,7 @@ def with_aligned_test_views(
     return replace(dataset, test=tuple(test))
 
 
-def aligned_camera(scene: Scene, renderer: Renderer, view: View, *, steps: int = STEPS) -> Camera:
+def aligned_camera(scene: Scene, renderer: Renderer, view: View) -> Camera:
     """The camera from which the scene looks most like the view's photograph, starting from the view's own.
 
     The two are compared in the colours in which `evaluate` compares them.
@@ -106,7 +106,6 @@ def aligned_camera(scene: Scene, renderer: Renderer, view: View, *, steps: int =
         scene: trained; gets no gradient.
         renderer: how photographs show it.
         view: photograph and camera.
-        steps: of Adam.
     """
     device = scene.primary.means.device
     still = scene.with_parameters({name: tensor.detach() for name, tensor in scene.parameters().items()})
@@ -114,9 +113,9 @@ def aligned_camera(scene: Scene, renderer: Renderer, view: View, *, steps: int =
     exposures = still.exposures.interpolate(view.name)
     twist = torch.zeros(6, device=device, requires_grad=True)
     optimizer = torch.optim.Adam([twist], lr=FIRST_STEP, betas=(0.8, 0.95))
-    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST_STEP / FIRST_STEP) ** (1 / max(steps, 1)))
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST_STEP / FIRST_STEP) ** (1 / STEPS))
     best, lowest = torch.zeros_like(twist), torch.inf
-    for _ in range(steps):
+    for _ in range(STEPS):
         optimizer.zero_grad()
         image = exposures.apply(renderer(still, moved_camera(camera, twist, scene.extent)).rgb, view.name)
         found = photometric(with_ignored_right(image, view), photo)

@@ -223,10 +223,6 @@ class Report:
             *(f"advice: {line}" for line in self.advice),
         ]
 
-    def as_json(self) -> dict[str, Any]:
-        """The report for programs."""
-        return asdict(self)
-
 
 def report_of(solution: Solution) -> Report:
     """The figures of a solution; one without any model has zeros."""

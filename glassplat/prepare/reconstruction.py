@@ -71,10 +71,6 @@ class Solution:
         """Photographs in the largest group."""
         return int(self.models[0].num_reg_images()) if self.models else 0
 
-    def group(self, number: int) -> list[Photograph]:
-        """The photographs of one model, by their numbers."""
-        return [self.database.photographs[index] for index in sorted(image_numbers(self.models[number]))]
-
     def missing(self) -> list[Photograph]:
         """The photographs that are not in the largest group."""
         known = set(image_numbers(self.models[0])) if self.models else set()
