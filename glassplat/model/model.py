@@ -40,7 +40,7 @@ from glassplat.render.frame import Frame, Renderer, check_layers
 from glassplat.render.layers import layer_image
 from glassplat.scene import scene
 from glassplat.scene.camera import LEAST_SINE, Camera
-from glassplat.scene.corrections import upward
+from glassplat.scene.corrections import DEFAULT_UP, upward
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import OPAQUE_SHEET, Scene, glass_gaussians, with_intensity, with_pane
@@ -297,7 +297,7 @@ class Model:
 
     def _level_direction(self, normal: Sequence[float]) -> list[float] | None:
         """[3] a direction at right angles to a normal that is level; None where all of them or none are."""
-        up = upward([*self.cameras.values()]) if self.cameras else (0.0, -1.0, 0.0)
+        up = upward([*self.cameras.values()]) if self.cameras else DEFAULT_UP
         across = np.asarray([*normal], np.float64)
         level = np.cross(up, across) if across.shape == (3,) else np.zeros(3)
         return level.tolist() if np.linalg.norm(level) > LEAST_SINE * np.linalg.norm(across) else None

@@ -32,6 +32,7 @@ from glassplat.render.layers import contributions
 from glassplat.render.panes import nearest_hits, panes_in_camera
 from glassplat.render.traced import traced_colors
 from glassplat.scene.camera import Camera
+from glassplat.scene.corrections import upward
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes, nearest_panes
 from glassplat.scene.scene import Scene, without_glass
@@ -56,7 +57,7 @@ def cameras_around(gaussians: Gaussians, up: Tensor) -> list[tuple[str, Camera]]
     """
     middle, radius = bounding_ball(gaussians)
     up = torch.nn.functional.normalize(up.double(), dim=0)
-    aside = torch.nn.functional.normalize(torch.linalg.cross(up, _least_along(up)), dim=0)
+    aside = torch.nn.functional.normalize(torch.linalg.cross(up, least_along(up)), dim=0)
     ahead = torch.linalg.cross(up, aside)
     distance = CLOSE * radius / math.tan(FOV_RAD / 2)
     cameras = []
@@ -81,7 +82,7 @@ def bounding_ball(gaussians: Gaussians) -> tuple[Tensor, float]:
     return middle, max(float(distances.quantile(INNER_SHARE)), 1e-6)
 
 
-def _least_along(up: Tensor) -> Tensor:
+def least_along(up: Tensor) -> Tensor:
     """The coordinate axis that is furthest from a direction."""
     return torch.eye(3, dtype=up.dtype)[int(up.abs().argmin())]
 
@@ -99,7 +100,7 @@ class Surveyed(NamedTuple):
 
     Attributes:
         focus: [3] the point that the cameras look at.
-        up: [3] unit vector, away from the ground.
+        up: [3] unit vector, away from the ground, as `upward` finds it.
         distance: of the cameras from the focus, the median; world units.
         reach: how far from the nearest photograph the scene is still known, world units.
     """
@@ -118,7 +119,7 @@ def survey_capture(cameras: Sequence[Camera], extent: float) -> Surveyed:
         extent: of the scene, for captures whose cameras all look the same way.
     """
     poses = torch.stack([camera.cam_from_world for camera in cameras]).double().cpu()
-    centers, down, forward = (-(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0], poses[:, 1, :3], poses[:, 2, :3])
+    centers, forward = -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0], poses[:, 2, :3]
     across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
     ahead = centers.mean(0) + extent * forward.mean(0)
     weight = TOWARDS_MIDDLE * len(cameras)
@@ -132,8 +133,7 @@ def survey_capture(cameras: Sequence[Camera], extent: float) -> Surveyed:
         )
         spacing = float(distances.amin(dim=1).median())
     reach = max(SPACINGS * spacing, SHARE_OF_DISTANCE * distance, 1e-6)
-    up = torch.nn.functional.normalize(-down.mean(0), dim=0)
-    return Surveyed(focus, up, distance, reach)
+    return Surveyed(focus, torch.tensor(upward(cameras), dtype=torch.float64), distance, reach)
 
 
 @torch.no_grad()
