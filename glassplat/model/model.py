@@ -241,6 +241,8 @@ class Model:
     def with_reflectance(self, label: int, base_reflectance: float) -> Model:
         """A pane reflects this share of light at normal incidence; Fresnel's laws add to it at an angle.
 
+        With less than 1, it is no mirror any more, whose reflectance gets no gradient.
+
         Raises:
             ValueError: no pane has the label, or the reflectance is not in [0, 1].
         """

@@ -233,6 +233,8 @@ def as_mirrors(scene: Scene, labels: Sequence[int]) -> Scene:
 def with_reflectance(scene: Scene, label: int, base_reflectance: float) -> Scene:
     """The pane reflects this share of light at normal incidence; Fresnel's laws add to it at an angle.
 
+    With less than 1, it is no mirror any more, whose reflectance gets no gradient.
+
     Raises:
         ValueError: no pane has the label, or the reflectance is not in [0, 1].
     """
@@ -241,7 +243,8 @@ def with_reflectance(scene: Scene, label: int, base_reflectance: float) -> Scene
     row = row_of(scene.planes, label)
     logits = scene.planes.logit_reflectances.clone()
     logits[row] = torch.logit(logits.new_tensor(base_reflectance)).clamp(-LARGEST_LOGIT, LARGEST_LOGIT)
-    return replace(scene, planes=scene.planes.with_tensors({"logit_reflectances": logits}))
+    mirrors = tuple(k for k in scene.planes.mirrors if k != label or base_reflectance == 1)
+    return replace(scene, planes=replace(scene.planes, logit_reflectances=logits, mirrors=mirrors))
 
 
 def tilt_pane(scene: Scene, label: int, about_tangent: float, about_bitangent: float) -> Scene:

@@ -76,6 +76,16 @@ def test_the_reflectance_is_what_was_asked_for(reflectance: float) -> None:
     assert bool(torch.isfinite(edited.planes.logit_reflectances).all())
 
 
+def test_a_mirror_that_is_given_a_lower_reflectance_is_none_any_more() -> None:
+    mirrors = as_mirrors(two_panes(), [1, 7])
+    edited = with_reflectance(mirrors, 7, 0.25)
+    logits = edited.planes.logit_reflectances.clone().requires_grad_()
+    edited.planes.with_tensors({"logit_reflectances": logits}).base_reflectances.sum().backward()
+    assert edited.planes.mirrors == (1,)
+    assert logits.grad is not None and float(logits.grad[1]) == pytest.approx(0.25 * 0.75)
+    assert with_reflectance(mirrors, 7, 1.0).planes.mirrors == (1, 7)
+
+
 def test_no_motion_changes_no_bit() -> None:
     scene = showcase()
     assert_same(tilt_pane(scene, 1, 0.0, 0.0), scene)
