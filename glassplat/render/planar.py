@@ -197,6 +197,7 @@ class Planar:
             "fresnel": self.fresnel,
             "blend": self.blend,
             "intensity": self.intensity,
+            "nearest": self.nearest_only,
         }
 
     def _first_pass(self, scene: Scene, camera: Camera, rectangles: Panes, with_absgrad: bool) -> FirstPass:
