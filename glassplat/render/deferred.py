@@ -132,13 +132,16 @@ def _looked_up(image: Tensor, directions: Tensor) -> Tensor:
 CELLS_ACROSS = 32
 """Cells along the longer side of an image; depths and normals are averaged over cells before they are compared."""
 LEAST_COVERAGE = 0.5
+LEAST_ACROSS = 3
+"""Cells along the shorter side, where it has so many pixels: a normal takes a cell and its neighbours."""
 STEEPEST = 0.15
 """Largest change of depth between neighbouring cells, as a share of the depth, that is a slope and not an edge."""
 
 
 def cell_side(camera: Camera) -> int:
     """Pixels along the side of a cell."""
-    return max(1, round(max(camera.width, camera.height) / CELLS_ACROSS))
+    shorter, longer = sorted((camera.width, camera.height))
+    return max(1, min(round(longer / CELLS_ACROSS), shorter // LEAST_ACROSS))
 
 
 def depth_normals(depth: Tensor, alpha: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
