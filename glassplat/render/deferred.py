@@ -393,8 +393,9 @@ class Deferred:
         return ("rgb", "base", "reflection", "strength", "normal", "environment", "depth", "alpha")
 
     def with_layers(self, layers: Sequence[str]) -> Deferred:
-        """The renderer, also of `environment` where that is among the layers."""
-        return replace(self, environment=self.environment or "environment" in layers)
+        """The renderer, also of `depth` and `environment` where they are among the layers."""
+        environment = self.environment or "environment" in layers
+        return replace(self, depth=self.depth or "depth" in layers, environment=environment)
 
     def page_settings(self) -> Mapping[str, Any]:
         """Settings for the web page, which shades pixels and looks up distant light."""
