@@ -282,7 +282,7 @@ class Model:
             half_sizes: half its sides along tangent and bitangent, world units.
             tangent: [3] direction of its first side; if None a horizontal one, as the cameras are held upright.
             base_reflectance: R0; that of window glass if not given, 1 makes a mirror.
-            label: what to call it; the first number that is free if None.
+            label: what to call it, 1 to 255; the first number that is free if None.
 
         Raises:
             ValueError: the label is taken, a direction has no length, or a value is out of range; or the scene is of

@@ -141,6 +141,13 @@ def test_a_pane_that_is_none_is_refused(normal: tuple, half_sizes: tuple, tangen
         model().with_pane((0.0, 0.0, 0.0), normal, half_sizes, tangent=tangent)
 
 
+@pytest.mark.parametrize("label", [0, -1, 256])
+def test_a_label_that_no_file_can_hold_is_refused(label: int) -> None:
+    with pytest.raises(ValueError, match=rf"the labels \[{label}\]; expected 1 to 255"):
+        bare().with_pane((0.0, 0.0, 1.5), (0.0, 0.0, -1.0), (2.0, 2.0), label=label)
+    assert bare().with_pane((0.0, 0.0, 1.5), (0.0, 0.0, -1.0), (2.0, 2.0), label=255).panes == (255,)
+
+
 @pytest.mark.parametrize(("name", "tolerance"), [("a.ply", 1e-6), ("a.spz", 0.1), ("folder", 0.0)])
 def test_what_is_saved_is_loaded_again(name: str, tolerance: float, tmp_path: Path) -> None:
     whole = model()
