@@ -157,7 +157,7 @@ def depth_normals(depth: Tensor, alpha: Tensor, camera: Camera) -> tuple[Tensor,
     share = cell_means(covered[..., None], side)[..., 0]
     mean_depth = cell_means((depth * covered)[..., None], side)[..., 0] / share.clamp(min=1e-6)
     height, width = mean_depth.shape
-    points = mean_depth[..., None] * ray_grid(camera.intrinsics.to(depth) / side, width, height)
+    points = mean_depth[..., None] * ray_grid(camera.shared_intrinsics.to(depth) / side, width, height)
     along, down = torch.zeros_like(points), torch.zeros_like(points)
     along[:, 1:-1] = points[:, 2:] - points[:, :-2]
     down[1:-1] = points[2:] - points[:-2]
@@ -298,7 +298,7 @@ def reflected_rays(surface: Surface, camera: Camera, chosen: tuple[Tensor, ...])
     """
     rotation = camera.cam_from_world[:3, :3]
     rows, columns = (index.to(rotation) for index in chosen)
-    d = pixel_rays(camera.intrinsics.to(rotation), columns, rows) @ rotation
+    d = pixel_rays(camera.shared_intrinsics.to(rotation), columns, rows) @ rotation
     places = camera.center + surface.depth[chosen][:, None] * d
     normal = surface.normal[chosen]
     normal = normal / normal.norm(dim=-1, keepdim=True).clamp(min=NORMAL_MIN)
@@ -319,7 +319,7 @@ def shaded_pixels(
         image,
         alpha,
         scene.environment.raw,
-        camera.intrinsics,
+        camera.shared_intrinsics,
         camera.cam_from_world[:3, :3].T.contiguous(),
         background=background,
         least_strength=least_strength,
@@ -329,7 +329,7 @@ def shaded_pixels(
 def view_directions(camera: Camera) -> Tensor:
     """[H, W, 3] directions from the camera through the pixel centres, world axes, not unit."""
     rotation = camera.cam_from_world[:3, :3]
-    return ray_grid(camera.intrinsics.to(rotation), camera.width, camera.height) @ rotation
+    return ray_grid(camera.shared_intrinsics.to(rotation), camera.width, camera.height) @ rotation
 
 
 def page_settings(background: tuple[float, float, float], mirrored: str) -> dict[str, Any]:

@@ -185,7 +185,7 @@ def raw_gaussians(gaussians: Gaussians) -> RawGaussians:
 def camera_batch(camera: Camera, poses: Tensor | None = None) -> CameraBatch:
     """One camera as the kernels take it, or several of its intrinsics at the `poses` [C, 4, 4]."""
     poses = camera.cam_from_world[None] if poses is None else poses
-    intrinsics = camera.intrinsics.expand(poses.shape[0], 4).contiguous()
+    intrinsics = camera.shared_intrinsics.expand(poses.shape[0], 4).contiguous()
     return CameraBatch(poses, intrinsics, camera.width, camera.height)
 
 

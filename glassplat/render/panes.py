@@ -58,7 +58,7 @@ def panes_in_camera(planes: Planes, camera: Camera) -> Panes:
 
 def nearest_hits(panes: Panes, camera: Camera, mask: Tensor | None = None, beyond: PaneHits | None = None) -> PaneHits:
     """The nearest of `panes_in_camera` on the ray of each pixel, or the next one; see `pane_hits`."""
-    return pane_hits(panes, camera.intrinsics, camera.width, camera.height, mask, beyond=beyond)
+    return pane_hits(panes, camera.shared_intrinsics, camera.width, camera.height, mask, beyond=beyond)
 
 
 def seen_panes(
@@ -217,7 +217,7 @@ def composite_panes(
             pane,
             normals,
             seen.planes.base_reflectances,
-            camera.intrinsics,
+            camera.shared_intrinsics,
             fresnel=fresnel,
             intensity=intensity,
             linear=blend == "linear",
