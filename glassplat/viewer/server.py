@@ -296,6 +296,7 @@ class Viewer:
         """Address to open in the browser: with the key, without which there is no answer."""
         everywhere = self.host in ("0.0.0.0", "::")
         name = "localhost" if is_local(self.host) else socket.gethostname() if everywhere else self.host
+        name = f"[{name}]" if ":" in name else name  # The port of an IPv6 address begins after the bracket.
         return f"http://{name}:{self.port}/?key={self.access.key}"
 
     @property

@@ -6,6 +6,8 @@ import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -36,6 +38,17 @@ def eventually(happens: Callable[[], bool], seconds: float = 120) -> None:
     while not happens():
         assert time.monotonic() < deadline, "it did not happen"
         time.sleep(0.05)
+
+
+@pytest.mark.parametrize(
+    ("host", "shown"),
+    [("2001:db8::5", "[2001:db8::5]"), ("192.0.2.1", "192.0.2.1"), ("gpu.lan", "gpu.lan"), ("::1", "localhost")],
+)
+def test_the_address_is_one_that_browsers_understand(host: str, shown: str) -> None:
+    viewer = SimpleNamespace(host=host, port=8080, access=SimpleNamespace(key="k"))
+    address = Viewer.address.fget(viewer)
+    assert address == f"http://{shown}:8080/?key=k"
+    assert urlsplit(address).port == 8080 and urlsplit(address).hostname == shown.strip("[]")
 
 
 @needs_browser
