@@ -52,11 +52,11 @@ def cameras_around(gaussians: Gaussians, up: Tensor) -> list[tuple[str, Camera]]
     """Named cameras on a circle, which look at the middle of the scene.
 
     Args:
-        gaussians: at least one, all finite.
+        gaussians: at least one, all finite; on any device, the cameras are on the CPU.
         up: [3] away from the ground.
     """
     middle, radius = bounding_ball(gaussians)
-    up = torch.nn.functional.normalize(up.double(), dim=0)
+    middle, up = middle.cpu(), torch.nn.functional.normalize(up.double().cpu(), dim=0)
     aside = torch.nn.functional.normalize(torch.linalg.cross(up, least_along(up)), dim=0)
     ahead = torch.linalg.cross(up, aside)
     distance = CLOSE * radius / math.tan(FOV_RAD / 2)
