@@ -69,8 +69,8 @@ def environment_from_equirect(image: Tensor, size: int) -> Environment:
     Raises:
         ValueError: the image is not twice as wide as high or not finite floating point, or the size is below 1.
     """
-    height = image.shape[0]
-    if image.ndim != 3 or height < 1 or tuple(image.shape) != (height, 2 * height, 3):
+    height = image.shape[0] if image.ndim else 0
+    if height < 1 or tuple(image.shape) != (height, 2 * height, 3):
         raise ValueError(f"the panorama has shape {tuple(image.shape)}; expected (H, 2 H, 3)")
     if not image.is_floating_point() or not bool(torch.isfinite(image).all()):
         raise ValueError(

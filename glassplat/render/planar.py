@@ -140,7 +140,7 @@ class Planar:
         """Renders `scene` from `camera`, where the scene's tensors are.
 
         Raises:
-            ValueError: an intensity, mark or reflectance cannot be drawn.
+            ValueError: an intensity, mark or reflectance is missing or cannot be drawn.
         """
         check_panes(scene)
         camera = camera.to(scene.primary.means.device)
@@ -171,13 +171,7 @@ class Planar:
         """Raises ValueError where a scene lacks colours, or its panes what they need; there may be no panes."""
         check_colored(scene.primary)
         check_ellipsoids(scene.primary)
-        if len(scene.planes) and "log_intensity" not in scene.primary.channels:
-            raise ValueError(
-                f"the Gaussians have the channels {sorted(scene.primary.channels)}; expected log_intensity, as "
-                "`planar` trains it"
-            )
-        if "logit_mark" not in scene.glass.channels:
-            raise ValueError(f"the glass has the channels {sorted(scene.glass.channels)}; expected logit_mark")
+        check_channels(scene)
 
     def layers(self, scene: Scene) -> tuple[str, ...]:
         """Names of the layers that are worth looking at; with `photographed` where a photographer is known."""
@@ -298,8 +292,20 @@ LARGEST_LOG = 80.0
 """Of a factor on colours, which is finite in single precision."""
 
 
+def check_channels(scene: Scene) -> None:
+    """Raises ValueError where the Gaussians lack a channel that panes need."""
+    if len(scene.planes) and "log_intensity" not in scene.primary.channels:
+        raise ValueError(
+            f"the Gaussians have the channels {sorted(scene.primary.channels)}; expected log_intensity, as "
+            "`planar` trains it"
+        )
+    if "logit_mark" not in scene.glass.channels:
+        raise ValueError(f"the glass has the channels {sorted(scene.glass.channels)}; expected logit_mark")
+
+
 def check_panes(scene: Scene) -> None:
-    """Raises ValueError where a value that only panes need cannot be drawn."""
+    """Raises ValueError where a value that only panes need is missing or cannot be drawn."""
+    check_channels(scene)
     check_numbers({"logit_mark": scene.glass.channels["logit_mark"]})
     if len(scene.planes):
         logs = {"log_intensity": scene.primary.channels["log_intensity"]}
