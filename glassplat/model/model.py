@@ -123,7 +123,11 @@ class Model:
 
     @property
     def viewpoints(self) -> Mapping[str, Camera]:
-        """Its cameras; where it has none, some that look at the scene from around it, -y up."""
+        """Its cameras; where it has none, some that look at the scene from around it, -y up.
+
+        Raises:
+            InputError: it has neither cameras nor Gaussians.
+        """
         return self.cameras or dict(cameras_around(self.scene.primary, torch.tensor(AXES["-y"], dtype=torch.float64)))
 
     def render(self, camera: Camera | str, *, layers: Sequence[str] = ("rgb",)) -> Frame:
@@ -199,7 +203,7 @@ class Model:
             cleaning: the rules; the usual ones if None.
 
         Raises:
-            InputError: nothing would be left.
+            InputError: nothing would be left, or nothing is there.
         """
         centers = torch.stack([camera.center for camera in self.viewpoints.values()])
         bare, found = clean_scene(self.scene, Floaters(self.scene.primary, centers), cleaning or Cleaning())

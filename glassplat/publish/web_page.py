@@ -24,6 +24,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from glassplat.errors import InputError
 from glassplat.files.spz import FLIP, spz_bytes
 from glassplat.files.writing import atomic_write
 from glassplat.kernels.environment import cube_lookup
@@ -71,7 +72,13 @@ def cameras_around(gaussians: Gaussians, up: Tensor) -> list[tuple[str, Camera]]
 
 
 def bounding_ball(gaussians: Gaussians) -> tuple[Tensor, float]:
-    """Middle [3] and radius of a ball around the inner Gaussians; those that are hardly visible do not count."""
+    """Middle [3] and radius of a ball around the inner Gaussians; those that are hardly visible do not count.
+
+    Raises:
+        InputError: there are no Gaussians.
+    """
+    if not len(gaussians):
+        raise InputError("the scene has no Gaussians to look at; expected at least one, or cameras of the capture")
     means = gaussians.means.double()
     seen = gaussians.logit_opacities > 0
     means = means[seen] if bool(seen.any()) else means

@@ -187,6 +187,14 @@ def test_a_model_without_cameras_is_looked_at_from_around_it() -> None:
     viewer.stop()
 
 
+def test_a_model_of_nothing_says_so() -> None:
+    nothing = model().with_scene(Scene(Gaussians.empty(1, channels=("log_intensity",)), 1.0))
+    with pytest.raises(InputError, match="cannot be cleaned; expected at least one"):
+        nothing.clean()
+    with pytest.raises(InputError, match="no Gaussians to look at"):
+        _ = dataclasses.replace(nothing, cameras={}).viewpoints
+
+
 def test_a_model_without_cameras_is_saved_as_a_file_and_as_no_folder(tmp_path: Path) -> None:
     blind = dataclasses.replace(model(), cameras={})
     with pytest.raises(InputError, match=r"without cameras cannot be saved as the folder .*; give it some"):
