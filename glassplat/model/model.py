@@ -361,8 +361,11 @@ def by_name(cameras: Iterable[tuple[str, Camera]]) -> dict[str, Camera]:
     """Cameras by name; of several with one name the later ones get a number."""
     named: dict[str, Camera] = {}
     for name, camera in cameras:
-        number = sum(known.partition(" #")[0] == name for known in named) if name in named else 0
-        named[f"{name} #{number + 1}" if number else name] = camera
+        free, number = name, 1
+        while free in named:
+            number += 1
+            free = f"{name} #{number}"
+        named[free] = camera
     return named
 
 

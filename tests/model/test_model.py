@@ -14,6 +14,7 @@ from PIL import Image
 
 import glassplat
 from glassplat import Camera, Gaussians, InputError, Model, Planar, PlanarRecipe, Scene, SplatRecipe
+from glassplat.model.model import by_name
 from glassplat.scene.scene import Environment
 from tests.cli.tiny_run import write_run
 from tests.training.tiny_capture import tiny_capture, true_scene
@@ -193,6 +194,12 @@ def test_a_model_of_nothing_says_so() -> None:
         nothing.clean()
     with pytest.raises(InputError, match="no Gaussians to look at"):
         _ = dataclasses.replace(nothing, cameras={}).viewpoints
+
+
+def test_cameras_of_one_name_are_all_kept() -> None:
+    cameras = list(model().cameras.values())
+    names = ("a", "a", "a #2", "b", "a")
+    assert list(by_name(zip(names, cameras, strict=False))) == ["a", "a #2", "a #2 #2", "b", "a #3"]
 
 
 def test_a_model_without_cameras_is_saved_as_a_file_and_as_no_folder(tmp_path: Path) -> None:
