@@ -93,7 +93,7 @@ def keyframes_of(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 def fit_to_width(camera: Camera, width: int) -> Camera:
-    """The camera with pictures of a width, both sides even, as encoders want them."""
+    """The camera with pictures of this width, and of the even height that fits best; encoders want both sides even."""
     height = max(2, 2 * round(width * camera.height / camera.width / 2))
     return camera.resize(width, height)
 

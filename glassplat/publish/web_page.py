@@ -103,7 +103,7 @@ FULL_SHARE = 0.55
 
 
 class Surveyed(NamedTuple):
-    """A capture seen from above.
+    """Places of a capture's cameras, and what they look at.
 
     Attributes:
         focus: [3] the point that the cameras look at.
