@@ -309,13 +309,16 @@ class Model:
         return level.tolist() if np.linalg.norm(level) > LEAST_SINE * np.linalg.norm(across) else None
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
-        """Writes the model; `glassplat.load` reads what it wrote, but for .html, which is for browsers.
+        """Writes the model; `glassplat.load` reads a folder whole, and of a splat file what such files hold.
+
+        A scene from a splat file is rendered over black and by the default options of `planar`, without what shiny
+        things mirror. A warning says what of this model is left out.
 
         Args:
-            path: .ply, .spz or .glb for other programs, with the panes next to it as `planes.json` and `glass.ply`, and
-                the cameras as `cameras.json`, and an environment as `environment.png` and `.json`; .html for
-                a page that shows it with live panes; without a suffix a folder whose tensors are loaded bit for bit,
-                like a run's.
+            path: without a suffix a folder whose tensors are loaded bit for bit, like a run's; .ply, .spz or .glb for
+                other programs, with the panes next to it as `planes.json` and `glass.ply`, the cameras as
+                `cameras.json`, and an environment, which only other programs read, as `environment.png` and `.json`;
+                .html for a page that shows it with live panes in a browser, and is not loaded again.
             overwrite: replace files that are there.
 
         Returns:
@@ -400,11 +403,31 @@ def save_model(model: Model, path: Path, *, overwrite: bool) -> Path:
         return path
     with input_checked():
         writing.splat_writer(kind)(path, model.scene.primary)
+    if lost := left_out(model, kind):
+        log.warning("%s leaves out %s; a folder, saved without a suffix, holds everything", path, ", ".join(lost))
     write_beside(path.parent, model.scene)
     if not len(model.scene.planes) and (path.parent / PLANES).exists():
         write_planes(path.parent / PLANES, model.scene.planes)  # Panes of what was there must not be taken for its own.
     write_cameras(path.parent / CAMERAS, model.cameras.items())
     return path
+
+
+CHANNELED = ("ply", "glb")
+"""Formats of splats that hold channels, too."""
+
+
+def left_out(model: Model, kind: str) -> list[str]:
+    """Parts of a model's look that a splat file of this kind does not hold, nor what `load` reads next to it."""
+    scene = model.scene
+    own, read = (recipe.renderer().page_settings() for recipe in (model.recipe, recipe_of_splats(scene.primary)))
+    names = read if len(scene.planes) else ("background",)
+    lost = [f"{name}={own[name]}" for name in names if name in own and own[name] != read[name]]
+    logs = scene.primary.channels.get("log_intensity")
+    if kind not in CHANNELED and len(scene.planes) and logs is not None and bool(logs.any()):
+        lost.append("how bright Gaussians are in panes")
+    if len(scene.surroundings) or not scene.environment.is_empty:
+        lost.append("what shiny things mirror")
+    return [*lost, "the photographer"] if len(scene.photographer) else lost
 
 
 def save_page(model: Model, path: Path, title: str, *, sharing: Sharing = PRIVATE) -> None:
@@ -613,11 +636,15 @@ def _from_run(path: Path, device: DeviceName) -> Model:
 
 
 def _from_file(path: Path, device: DeviceName, planes: Path | None, up: Up) -> Model:
-    """A scene that was not trained here, over black; discs, before which no pane can stand, as `splat` draws them."""
+    """A scene that was not trained here, over black."""
     with input_checked():
         scene, cameras, lost = imported_scene(path, planes, up)
     if lost:
         log.warning("%d Gaussians of %s are left out: values that are no numbers or too large to draw", lost, path)
-    discs = scene.primary.are_discs
-    recipe: Any = SplatRecipe(background=BLACK, primitive="disc") if discs else PlanarRecipe(background=BLACK)
+    recipe = recipe_of_splats(scene.primary)
     return Model(scene.to(chosen_device(device)), recipe, by_name(cameras), path.stem, path)
+
+
+def recipe_of_splats(gaussians: Gaussians) -> Any:
+    """The recipe that renders a file's Gaussians: discs, before which no pane can stand, as `splat` draws them."""
+    return SplatRecipe(background=BLACK, primitive="disc") if gaussians.are_discs else PlanarRecipe(background=BLACK)

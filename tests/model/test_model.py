@@ -6,6 +6,7 @@ import base64
 import dataclasses
 import io
 from pathlib import Path
+from typing import Any
 from urllib.request import HTTPCookieProcessor, build_opener
 
 import pytest
@@ -15,6 +16,7 @@ from PIL import Image
 import glassplat
 from glassplat import Camera, Gaussians, InputError, Model, Planar, PlanarRecipe, Scene, SplatRecipe
 from glassplat.model.model import by_name
+from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Environment
 from tests.cli.tiny_run import write_run
 from tests.training.tiny_capture import tiny_capture, true_scene
@@ -162,6 +164,32 @@ def test_what_is_saved_is_loaded_again(name: str, tolerance: float, tmp_path: Pa
     darker.save(path, overwrite=True)
     assert float(glassplat.load(path, device="cpu").scene.planes.base_reflectances) == pytest.approx(0.01, rel=1e-3)
     assert not [left for left in path.parent.iterdir() if left.name.startswith(".")]
+
+
+NO_PANES, PLAIN = {"planes": Planes.empty()}, PlanarRecipe(background=(0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("name", "recipe", "parts", "lost"),
+    [
+        ("a.ply", PLAIN, {}, None),
+        ("a.glb", PLAIN, {}, None),
+        ("a.spz", PLAIN, {}, "how bright Gaussians are in panes"),
+        ("a.ply", PlanarRecipe.paper(), {}, "fresnel=schlick, blend=srgb, nearest=True"),
+        ("a.ply", SplatRecipe(background=(0.0, 0.0, 0.0)), NO_PANES, None),
+        ("a.ply", SplatRecipe(background=(1.0, 1.0, 1.0)), NO_PANES, "background=(1.0, 1.0, 1.0)"),
+        ("a.ply", PLAIN, {"surroundings": true_scene().primary}, "what shiny things mirror"),
+        ("a.ply", PLAIN, {"photographer": true_scene().primary}, "the photographer"),
+    ],
+)
+def test_what_a_splat_file_leaves_out_is_said(
+    name: str, recipe: Any, parts: dict, lost: str | None, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole = model()
+    scene = dataclasses.replace(whole.scene, **parts)
+    path = dataclasses.replace(whole, scene=scene, recipe=recipe).save(tmp_path / name)
+    expected = f"{path} leaves out {lost}; a folder, saved without a suffix, holds everything"
+    assert caplog.messages == ([] if lost is None else [expected])
 
 
 def test_a_folder_that_is_no_saved_model_is_never_replaced(tmp_path: Path) -> None:
