@@ -106,7 +106,8 @@ class Renderer(Protocol):
         Args:
             scene: what is there.
             camera: from where it is seen.
-            with_absgrad: also prepare the statistics of densification, `Frame.screen`; the backward pass is slower.
+            with_absgrad: also prepare all records of densification, `Frame.screen` and `Frame.space`, not absolute
+                gradients alone; the backward pass is slower.
         """
         ...
 
