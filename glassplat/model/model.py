@@ -44,7 +44,7 @@ from glassplat.scene.corrections import DEFAULT_UP, upward
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import OPAQUE_SHEET, Scene, glass_gaussians, with_intensity, with_pane
-from glassplat.viewer.drawing import ERROR, Keeper, Shown
+from glassplat.viewer.drawing import ERROR, ViewerState, Writer
 from glassplat.viewer.render_loop import LOCAL, vacant_port
 from glassplat.viewer.server import Viewer
 
@@ -101,7 +101,7 @@ class Model:
         Raises:
             InputError: viser is not installed.
         """
-        viewer = Viewer(shown_of(replace(self, cameras=self.viewpoints), {}), LOCAL, vacant_port(LOCAL))
+        viewer = Viewer(viewer_state(replace(self, cameras=self.viewpoints), {}), LOCAL, vacant_port(LOCAL))
         viewer.start()
         return viewer
 
@@ -331,18 +331,22 @@ class Model:
         return save_model(self, Path(path), overwrite=overwrite)
 
 
-def shown_of(model: Model, photographs: Mapping[str, Callable[[], Tensor]], keeper: Keeper | None = None) -> Shown:
+def viewer_state(
+    model: Model, photographs: Mapping[str, Callable[[], Tensor]], writer: Writer | None = None
+) -> ViewerState:
     """A model as the viewer shows it.
 
     Args:
         model: to be looked at.
         photographs: [H, W, 3] uint8 by name, read when asked for.
-        keeper: writes what is made in the browser; None where nothing may be written.
+        writer: writes what is made in the browser; None where nothing may be written.
     """
     layers: list[str] = [layer for layer in model.layers if layer not in HIDDEN_LAYERS]
     if photographs:
         layers.append(ERROR)
-    return Shown(model.name, model.scene, model.renderer, layers, tuple(model.cameras.items()), photographs, keeper)
+    return ViewerState(
+        model.name, model.scene, model.renderer, layers, tuple(model.cameras.items()), photographs, writer
+    )
 
 
 def planar_of(recipe: Any) -> PlanarRecipe:

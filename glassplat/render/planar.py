@@ -33,7 +33,7 @@ from glassplat.render.frame import (
     screen_pass,
 )
 from glassplat.render.panes import (
-    Glazed,
+    CompositedPanes,
     SeenPanes,
     composite_panes,
     curves,
@@ -56,7 +56,7 @@ DEPTH_CHANNEL = 3
 """Of the first pass, after the colours."""
 PHOTOGRAPHED = "photographed"
 """The layer that shows the photographer in the panes, next to an image without."""
-Shown = Literal["absent", "present", "beside"]
+PhotographerMode = Literal["absent", "present", "beside"]
 """Whether panes show who took a photograph."""
 
 
@@ -133,7 +133,7 @@ class Planar:
     deviation_depth_gradient: bool = False
     blend: Blend = "linear"
     nearest_only: bool = False
-    photographer: Shown = "absent"
+    photographer: PhotographerMode = "absent"
     tells_mirrored: bool = True
 
     def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
@@ -260,7 +260,7 @@ class Planar:
 
     def _composite_panes(
         self, first: FirstPass, seen: SeenPanes, masks: Sequence[Tensor], second: SecondPass, camera: Camera
-    ) -> Glazed:
+    ) -> CompositedPanes:
         """Lays the panes and what they mirror before the image."""
         return composite_panes(
             first.image,
@@ -273,7 +273,9 @@ class Planar:
             blend=self.blend,
         )
 
-    def _screen(self, first: FirstPass, second: SecondPass, hits: PaneHits, result: Glazed) -> tuple[ScreenPass, ...]:
+    def _screen(
+        self, first: FirstPass, second: SecondPass, hits: PaneHits, result: CompositedPanes
+    ) -> tuple[ScreenPass, ...]:
         """The records of both passes."""
         if self.tells_mirrored:
             return weighted_screen(first, second, hits, result, self.blend)
@@ -317,7 +319,7 @@ def check_panes(scene: Scene) -> None:
 
 @torch.no_grad()
 def weighted_screen(
-    first: FirstPass, second: SecondPass, hits: PaneHits, result: Glazed, blend: Blend
+    first: FirstPass, second: SecondPass, hits: PaneHits, result: CompositedPanes, blend: Blend
 ) -> tuple[ScreenPass, ...]:
     """The records of both passes, weighted by how much of each layer is left in the image (see `layer_slopes`).
 
@@ -339,7 +341,7 @@ def detach_gaussians(gaussians: Gaussians) -> Gaussians:
     return gaussians.with_tensors({name: tensor.detach() for name, tensor in gaussians.tensors().items()})
 
 
-def with_photographer(renderer: Renderer, photographer: Shown) -> Renderer:
+def with_photographer(renderer: Renderer, photographer: PhotographerMode) -> Renderer:
     """A renderer whose frames tell what photographs show, as far as it knows of anybody; see `Planar.photographer`."""
     return replace(renderer, photographer=photographer) if isinstance(renderer, Planar) else renderer
 
