@@ -19,7 +19,7 @@ from benchmarks.methods import doublings, thread_count
 from benchmarks.scene import bench_camera, bench_scene
 from benchmarks.table import Table
 from glassplat.render.planar import Planar
-from glassplat.viewer.drawing import Wish, draw_picture
+from glassplat.viewer.drawing import ViewRequest, draw_picture
 from glassplat.viewer.render_loop import Picture, RenderLoop, RenderThread
 from glassplat.viewer.server import COARSE_QUALITY, SHARP_QUALITY
 
@@ -56,9 +56,9 @@ class Looker:
         """Begins to look at a room of so many Gaussians with one pane over half of the picture."""
         camera = bench_camera(WIDTH, HEIGHT)
         self._scene, self._renderer = bench_scene(count, 1, 0.5, camera), Planar()
-        self._wish = Wish(camera.cam_from_world, 2 * float(np.arctan(HEIGHT / 2 / camera.fy)), WIDTH / HEIGHT)
-        self._drawing = self._wish
-        self._loop: RenderLoop[Wish] = RenderLoop(self._draw, self._show)
+        self._request = ViewRequest(camera.cam_from_world, 2 * float(np.arctan(HEIGHT / 2 / camera.fy)), WIDTH / HEIGHT)
+        self._drawing = self._request
+        self._loop: RenderLoop[ViewRequest] = RenderLoop(self._draw, self._show)
         self._shown: list[Shown] = []
         self._changed = threading.Condition()
         self._thread = RenderThread(self._loop)
@@ -86,24 +86,24 @@ class Looker:
         return Answer(1e3 * (first.at - begun), 1e3 * (full.at - begun), first.width)
 
     def _ask(self, place: float) -> float:
-        pose = self._wish.cam_from_world.clone()
+        pose = self._request.cam_from_world.clone()
         pose[0, 3] = STEP * place
         with self._changed:
             self._shown.clear()
-            self._wish = replace(self._wish, cam_from_world=pose)
+            self._request = replace(self._request, cam_from_world=pose)
             begun = time.perf_counter()
-            self._loop.ask(1, self._wish, (WIDTH, HEIGHT))
+            self._loop.ask(1, self._request, (WIDTH, HEIGHT))
         return begun
 
-    def _draw(self, wish: Wish, rows: int) -> Picture:
-        self._drawing = wish
-        return draw_picture(self._scene, self._renderer, wish, rows)
+    def _draw(self, request: ViewRequest, rows: int) -> Picture:
+        self._drawing = request
+        return draw_picture(self._scene, self._renderer, request, rows)
 
     def _show(self, client: int, picture: Picture, is_full: bool) -> None:
         """Packs the picture as viser does."""
         Image.fromarray(picture).save(BytesIO(), "JPEG", quality=SHARP_QUALITY if is_full else COARSE_QUALITY)
         with self._changed:
-            if self._drawing is self._wish:
+            if self._drawing is self._request:
                 self._shown.append(Shown(time.perf_counter(), picture.shape[1], is_full))
                 self._changed.notify()
 

@@ -31,7 +31,7 @@ from glassplat.annotate.session import opened_session
 from glassplat.files.images import write_image
 from glassplat.prepare.preparation import PAGE
 from glassplat.render.planar import Planar
-from glassplat.viewer.drawing import Shown
+from glassplat.viewer.drawing import ViewerState
 from glassplat.viewer.gate import LARGEST_MESSAGE, MESSAGES
 from glassplat.viewer.server import Viewer
 from tests.annotate.conftest import write_room
@@ -126,7 +126,7 @@ def viewed() -> Iterator[Viewer]:
     photographs = {view.name: lambda: torch.zeros(28, 40, 3, dtype=torch.uint8) for view in views}
     cameras = [(view.name, view.camera) for view in views]
     viewer = Viewer(
-        Shown("trial", true_scene(), Planar(), ("rgb", "depth"), cameras, photographs), "127.0.0.1", free_port()
+        ViewerState("trial", true_scene(), Planar(), ("rgb", "depth"), cameras, photographs), "127.0.0.1", free_port()
     )
     viewer.start()
     try:

@@ -21,9 +21,9 @@ from glassplat.annotate.session import opened_session
 from glassplat.cli.console import say, shell_word
 from glassplat.cli.runs import announce, capture_of
 from glassplat.errors import InputError
-from glassplat.model.model import Model, shown_of
+from glassplat.model.model import Model, viewer_state
 from glassplat.model.run_directory import RunDirectory
-from glassplat.model.watching import KeptBeside
+from glassplat.model.watching import FolderWriter
 from glassplat.viewer.server import Viewer
 
 if TYPE_CHECKING:
@@ -35,7 +35,9 @@ def serve_viewer(command: View, console: Console) -> None:
     """Serves until it is interrupted."""
     model = command.file.open(command.scene, command.device)
     model = model.with_scene(command.edits.apply(model.scene))
-    viewer = Viewer(shown_of(model, photographs_of(command.scene), keeper(command, model)), command.host, command.port)
+    viewer = Viewer(
+        viewer_state(model, photographs_of(command.scene), writer_for(command, model)), command.host, command.port
+    )
     viewer.start()
     try:
         announce(viewer, console)
@@ -46,11 +48,11 @@ def serve_viewer(command: View, console: Console) -> None:
         viewer.stop()
 
 
-def keeper(command: View, model: Model) -> KeptBeside | None:
-    """Keeper of edited scenes; viewers from other machines may write only if asked for."""
+def writer_for(command: View, model: Model) -> FolderWriter | None:
+    """Writer of edited scenes; viewers from other machines may write only if asked for."""
     if command.output is None and not is_local(command.host):
         return None
-    return KeptBeside(model, command.output or Path(os.path.abspath(command.scene)).parent)
+    return FolderWriter(model, command.output or Path(os.path.abspath(command.scene)).parent)
 
 
 def photographs_of(run: Path) -> dict[str, Callable[[], Tensor]]:

@@ -28,7 +28,7 @@ from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 from glassplat.options import CLEAR_GLASS, short_repr
 from glassplat.scene.camera import Camera, quat_from_rotation
 from glassplat.scene.corrections import ByPhotograph, Exposures, PoseCorrections
-from glassplat.scene.panes import Planes
+from glassplat.scene.panes import HIGHEST_LABEL, Planes
 from glassplat.scene.scene import Environment
 
 HEADER_KEY = "glassplat"
@@ -144,7 +144,6 @@ LEAST_ANGLE = 1e-3
 """Between tangent and normal, in radians: below it the rectangle's sides have no direction."""
 LEAST_HALF_SIZE = 1e-9
 LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE = 1e-6, 1.0
-HIGHEST_LABEL = 255
 VECTOR = records.Items(records.COORDINATE, 3)
 LOGIT = records.Number(-1e3, 1e3)
 PLANE: dict[str, records.Field] = {

@@ -49,7 +49,7 @@ def gradient_conflict(
 
     Raises:
         ValueError: shapes disagree, an image is too small, or cells have no pixels.
-        TypeError: tensors of different or unsupported floating-point types, or not on the CPU.
+        TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
     height, width = hit.shape
     if height < 3 or width < 3:

@@ -40,11 +40,11 @@ from glassplat.render.frame import Frame, Renderer, check_layers
 from glassplat.render.layers import layer_image
 from glassplat.scene import scene
 from glassplat.scene.camera import LEAST_SINE, Camera
-from glassplat.scene.corrections import upward
+from glassplat.scene.corrections import DEFAULT_UP, upward
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import OPAQUE_SHEET, Scene, glass_gaussians, with_intensity, with_pane
-from glassplat.viewer.drawing import ERROR, Keeper, Shown
+from glassplat.viewer.drawing import ERROR, ViewerState, Writer
 from glassplat.viewer.render_loop import LOCAL, vacant_port
 from glassplat.viewer.server import Viewer
 
@@ -101,7 +101,7 @@ class Model:
         Raises:
             InputError: viser is not installed.
         """
-        viewer = Viewer(shown_of(replace(self, cameras=self.viewpoints), {}), LOCAL, vacant_port(LOCAL))
+        viewer = Viewer(viewer_state(replace(self, cameras=self.viewpoints), {}), LOCAL, vacant_port(LOCAL))
         viewer.start()
         return viewer
 
@@ -123,7 +123,11 @@ class Model:
 
     @property
     def viewpoints(self) -> Mapping[str, Camera]:
-        """Its cameras; where it has none, some that look at the scene from around it, -y up."""
+        """Its cameras; where it has none, some that look at the scene from around it, -y up.
+
+        Raises:
+            InputError: it has neither cameras nor Gaussians.
+        """
         return self.cameras or dict(cameras_around(self.scene.primary, torch.tensor(AXES["-y"], dtype=torch.float64)))
 
     def render(self, camera: Camera | str, *, layers: Sequence[str] = ("rgb",)) -> Frame:
@@ -199,7 +203,7 @@ class Model:
             cleaning: the rules; the usual ones if None.
 
         Raises:
-            InputError: nothing would be left.
+            InputError: nothing would be left, or nothing is there.
         """
         centers = torch.stack([camera.center for camera in self.viewpoints.values()])
         bare, found = clean_scene(self.scene, Floaters(self.scene.primary, centers), cleaning or Cleaning())
@@ -241,6 +245,8 @@ class Model:
     def with_reflectance(self, label: int, base_reflectance: float) -> Model:
         """A pane reflects this share of light at normal incidence; Fresnel's laws add to it at an angle.
 
+        With less than 1, it is no mirror any more, whose reflectance gets no gradient.
+
         Raises:
             ValueError: no pane has the label, or the reflectance is not in [0, 1].
         """
@@ -280,7 +286,7 @@ class Model:
             half_sizes: half its sides along tangent and bitangent, world units.
             tangent: [3] direction of its first side; if None a horizontal one, as the cameras are held upright.
             base_reflectance: R0; that of window glass if not given, 1 makes a mirror.
-            label: what to call it; the first number that is free if None.
+            label: what to call it, 1 to 255; the first number that is free if None.
 
         Raises:
             ValueError: the label is taken, a direction has no length, or a value is out of range; or the scene is of
@@ -297,19 +303,22 @@ class Model:
 
     def _level_direction(self, normal: Sequence[float]) -> list[float] | None:
         """[3] a direction at right angles to a normal that is level; None where all of them or none are."""
-        up = upward([*self.cameras.values()]) if self.cameras else (0.0, -1.0, 0.0)
+        up = upward([*self.cameras.values()]) if self.cameras else DEFAULT_UP
         across = np.asarray([*normal], np.float64)
         level = np.cross(up, across) if across.shape == (3,) else np.zeros(3)
         return level.tolist() if np.linalg.norm(level) > LEAST_SINE * np.linalg.norm(across) else None
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
-        """Writes the model; `glassplat.load` reads what it wrote, but for .html, which is for browsers.
+        """Writes the model; `glassplat.load` reads a folder whole, and of a splat file what such files hold.
+
+        A scene from a splat file is rendered over black and by the default options of `planar`, without what shiny
+        things mirror. A warning says what of this model is left out.
 
         Args:
-            path: .ply, .spz or .glb for other programs, with the panes next to it as `planes.json` and `glass.ply`, and
-                the cameras as `cameras.json`, and an environment as `environment.png` and `.json`; .html for
-                a page that shows it with live panes; without a suffix a folder whose tensors are loaded bit for bit,
-                like a run's.
+            path: without a suffix a folder whose tensors are loaded bit for bit, like a run's; .ply, .spz or .glb for
+                other programs, with the panes next to it as `planes.json` and `glass.ply`, the cameras as
+                `cameras.json`, and an environment, which only other programs read, as `environment.png` and `.json`;
+                .html for a page that shows it with live panes in a browser, and is not loaded again.
             overwrite: replace files that are there.
 
         Returns:
@@ -322,18 +331,22 @@ class Model:
         return save_model(self, Path(path), overwrite=overwrite)
 
 
-def shown_of(model: Model, photographs: Mapping[str, Callable[[], Tensor]], keeper: Keeper | None = None) -> Shown:
+def viewer_state(
+    model: Model, photographs: Mapping[str, Callable[[], Tensor]], writer: Writer | None = None
+) -> ViewerState:
     """A model as the viewer shows it.
 
     Args:
         model: to be looked at.
         photographs: [H, W, 3] uint8 by name, read when asked for.
-        keeper: writes what is made in the browser; None where nothing may be written.
+        writer: writes what is made in the browser; None where nothing may be written.
     """
     layers: list[str] = [layer for layer in model.layers if layer not in HIDDEN_LAYERS]
     if photographs:
         layers.append(ERROR)
-    return Shown(model.name, model.scene, model.renderer, layers, tuple(model.cameras.items()), photographs, keeper)
+    return ViewerState(
+        model.name, model.scene, model.renderer, layers, tuple(model.cameras.items()), photographs, writer
+    )
 
 
 def planar_of(recipe: Any) -> PlanarRecipe:
@@ -355,8 +368,11 @@ def by_name(cameras: Iterable[tuple[str, Camera]]) -> dict[str, Camera]:
     """Cameras by name; of several with one name the later ones get a number."""
     named: dict[str, Camera] = {}
     for name, camera in cameras:
-        number = sum(known.partition(" #")[0] == name for known in named) if name in named else 0
-        named[f"{name} #{number + 1}" if number else name] = camera
+        free, number = name, 1
+        while free in named:
+            number += 1
+            free = f"{name} #{number}"
+        named[free] = camera
     return named
 
 
@@ -391,11 +407,31 @@ def save_model(model: Model, path: Path, *, overwrite: bool) -> Path:
         return path
     with input_checked():
         writing.splat_writer(kind)(path, model.scene.primary)
+    if lost := left_out(model, kind):
+        log.warning("%s leaves out %s; a folder, saved without a suffix, holds everything", path, ", ".join(lost))
     write_beside(path.parent, model.scene)
     if not len(model.scene.planes) and (path.parent / PLANES).exists():
         write_planes(path.parent / PLANES, model.scene.planes)  # Panes of what was there must not be taken for its own.
     write_cameras(path.parent / CAMERAS, model.cameras.items())
     return path
+
+
+CHANNELED = ("ply", "glb")
+"""Formats of splats that hold channels, too."""
+
+
+def left_out(model: Model, kind: str) -> list[str]:
+    """Parts of a model's look that a splat file of this kind does not hold, nor what `load` reads next to it."""
+    scene = model.scene
+    own, read = (recipe.renderer().page_settings() for recipe in (model.recipe, recipe_of_splats(scene.primary)))
+    names = read if len(scene.planes) else ("background",)
+    lost = [f"{name}={own[name]}" for name in names if name in own and own[name] != read[name]]
+    logs = scene.primary.channels.get("log_intensity")
+    if kind not in CHANNELED and len(scene.planes) and logs is not None and bool(logs.any()):
+        lost.append("how bright Gaussians are in panes")
+    if len(scene.surroundings) or not scene.environment.is_empty:
+        lost.append("what shiny things mirror")
+    return [*lost, "the photographer"] if len(scene.photographer) else lost
 
 
 def save_page(model: Model, path: Path, title: str, *, sharing: Sharing = PRIVATE) -> None:
@@ -604,11 +640,15 @@ def _from_run(path: Path, device: DeviceName) -> Model:
 
 
 def _from_file(path: Path, device: DeviceName, planes: Path | None, up: Up) -> Model:
-    """A scene that was not trained here, over black; discs, before which no pane can stand, as `splat` draws them."""
+    """A scene that was not trained here, over black."""
     with input_checked():
         scene, cameras, lost = imported_scene(path, planes, up)
     if lost:
         log.warning("%d Gaussians of %s are left out: values that are no numbers or too large to draw", lost, path)
-    discs = scene.primary.are_discs
-    recipe: Any = SplatRecipe(background=BLACK, primitive="disc") if discs else PlanarRecipe(background=BLACK)
+    recipe = recipe_of_splats(scene.primary)
     return Model(scene.to(chosen_device(device)), recipe, by_name(cameras), path.stem, path)
+
+
+def recipe_of_splats(gaussians: Gaussians) -> Any:
+    """The recipe that renders a file's Gaussians: discs, before which no pane can stand, as `splat` draws them."""
+    return SplatRecipe(background=BLACK, primitive="disc") if gaussians.are_discs else PlanarRecipe(background=BLACK)

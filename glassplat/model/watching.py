@@ -14,14 +14,14 @@ from glassplat.captures.dataset import Dataset
 from glassplat.errors import InputError
 from glassplat.files.sidecars import write_cameras
 from glassplat.files.writing import make_folder
-from glassplat.model.model import Model, save_folder, shown_of
+from glassplat.model.model import Model, save_folder, viewer_state
 from glassplat.model.training import Training
 from glassplat.render.frame import Renderer
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
 from glassplat.training.messages import Message, StepDone
-from glassplat.viewer.drawing import Shown
+from glassplat.viewer.drawing import ViewerState
 from glassplat.viewer.render_loop import DrawingShare, check_port
 from glassplat.viewer.server import Viewer
 
@@ -29,7 +29,7 @@ NAME = re.compile(r"\w[\w .+-]{0,99}")
 LEAST_KEYFRAMES = 2
 
 
-class KeptBeside:
+class FolderWriter:
     """Writes edited scenes and keyframes into one folder, under names of which none is taken.
 
     The names come from browsers, so that none leads out of the folder.
@@ -44,7 +44,7 @@ class KeptBeside:
         """
         self._model, self._folder = model, folder
 
-    def keep_scene(self, scene: Scene, name: str) -> str:
+    def write_scene(self, scene: Scene, name: str) -> str:
         """Writes a scene as a run of its own; returns what to say.
 
         Raises:
@@ -56,7 +56,7 @@ class KeptBeside:
         save_folder(self._model.with_scene(scene.to("cpu")), path)
         return f"{path}: look at it with `glassplat view {quote(str(path))}`"
 
-    def keep_keyframes(self, cameras: Sequence[Camera], name: str) -> str:
+    def write_keyframes(self, cameras: Sequence[Camera], name: str) -> str:
         """Writes the cameras of a film; returns what to say.
 
         Raises:
@@ -127,7 +127,7 @@ class WatchedTraining:
         if not isinstance(message, StepDone):
             return
         if self._viewer is None or self._share is None:
-            self._viewer = Viewer(self._shown(), self._host, self._port, {"pause": self._pause, "save": self._save})
+            self._viewer = Viewer(self._state(), self._host, self._port, {"pause": self._pause, "save": self._save})
             self._share = DrawingShare(self._viewer.loop)
             self._announce(self._viewer)
         if self._viewer.is_watched:
@@ -140,9 +140,9 @@ class WatchedTraining:
         if self._viewer is not None:
             self._viewer.stop()
 
-    def _shown(self) -> Shown:
+    def _state(self) -> ViewerState:
         views = (*self._dataset.train, *self._dataset.test)
-        return shown_of(self._training.model, {view.name: view.read_photo for view in views})
+        return viewer_state(self._training.model, {view.name: view.read_photo for view in views})
 
     def _update(self, viewer: Viewer, message: StepDone) -> None:
         """Shows the scene as it is now, and asks for pictures of it now and then."""

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.publish.web_page import survey_capture
+from glassplat.publish.web_page import least_along, survey_capture
 from glassplat.scene.camera import Camera, look_at
 
 MOST_KEYFRAMES = 12
@@ -20,7 +20,7 @@ ALL_AROUND = 0.4
 """Length of the mean direction from which photographs were taken, below which they were taken from all sides."""
 SHARE_OF_SPREAD = 1.2
 LEAST_LOOP = 0.08
-"""Of the distance: a loop in front of the scene is no smaller."""
+"""Of the distance: a loop in front of the scene, or over it, is no smaller."""
 
 
 def orbit(cameras: Sequence[Camera], extent: float, frames: int) -> list[Camera]:
@@ -38,10 +38,12 @@ def orbit(cameras: Sequence[Camera], extent: float, frames: int) -> list[Camera]
     flat = arms - heights[:, None] * survey.up
     facing = torch.nn.functional.normalize(flat, dim=1).mean(0)
     angles = [2 * math.pi * index / frames for index in range(frames)]
-    if float(facing.norm()) < ALL_AROUND:
-        aside = torch.nn.functional.normalize(flat[0], dim=0)
-        ahead = torch.linalg.cross(survey.up, aside)
-        radius, height = float(flat.norm(dim=1).median()), float(heights.median())
+    radius, height = float(flat.norm(dim=1).median()), float(heights.median())
+    least = LEAST_LOOP * survey.distance
+    if float(facing.norm()) < ALL_AROUND or radius < least:
+        first = flat[0] if float(flat[0].norm()) > least else torch.linalg.cross(survey.up, least_along(survey.up))
+        aside = torch.nn.functional.normalize(first, dim=0)
+        ahead, radius = torch.linalg.cross(survey.up, aside), max(radius, least)
         places = [radius * (math.cos(a) * aside + math.sin(a) * ahead) + height * survey.up for a in angles]
     else:
         arm = arms.median(dim=0).values
@@ -91,7 +93,7 @@ def keyframes_of(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 def fit_to_width(camera: Camera, width: int) -> Camera:
-    """The camera with pictures of a width, both sides even, as encoders want them."""
+    """The camera with pictures of this width, and of the even height that fits best; encoders want both sides even."""
     height = max(2, 2 * round(width * camera.height / camera.width / 2))
     return camera.resize(width, height)
 

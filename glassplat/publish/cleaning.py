@@ -25,7 +25,12 @@ class Floaters:
         Args:
             gaussians: N of them.
             cameras: [V, 3] centres; at least one.
+
+        Raises:
+            InputError: there are no Gaussians.
         """
+        if not len(gaussians):
+            raise InputError("a scene without Gaussians cannot be cleaned; expected at least one")
         from scipy.spatial import cKDTree  # Takes long to import, and most commands never need it.
 
         self._gaussians = gaussians

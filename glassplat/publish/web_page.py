@@ -24,6 +24,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from glassplat.errors import InputError
 from glassplat.files.spz import FLIP, spz_bytes
 from glassplat.files.writing import atomic_write
 from glassplat.kernels.environment import cube_lookup
@@ -32,6 +33,7 @@ from glassplat.render.layers import contributions
 from glassplat.render.panes import nearest_hits, panes_in_camera
 from glassplat.render.traced import traced_colors
 from glassplat.scene.camera import Camera
+from glassplat.scene.corrections import upward
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes, nearest_panes
 from glassplat.scene.scene import Scene, without_glass
@@ -51,12 +53,12 @@ def cameras_around(gaussians: Gaussians, up: Tensor) -> list[tuple[str, Camera]]
     """Named cameras on a circle, which look at the middle of the scene.
 
     Args:
-        gaussians: at least one, all finite.
+        gaussians: at least one, all finite; on any device, the cameras are on the CPU.
         up: [3] away from the ground.
     """
     middle, radius = bounding_ball(gaussians)
-    up = torch.nn.functional.normalize(up.double(), dim=0)
-    aside = torch.nn.functional.normalize(torch.linalg.cross(up, _least_along(up)), dim=0)
+    middle, up = middle.cpu(), torch.nn.functional.normalize(up.double().cpu(), dim=0)
+    aside = torch.nn.functional.normalize(torch.linalg.cross(up, least_along(up)), dim=0)
     ahead = torch.linalg.cross(up, aside)
     distance = CLOSE * radius / math.tan(FOV_RAD / 2)
     cameras = []
@@ -70,7 +72,13 @@ def cameras_around(gaussians: Gaussians, up: Tensor) -> list[tuple[str, Camera]]
 
 
 def bounding_ball(gaussians: Gaussians) -> tuple[Tensor, float]:
-    """Middle [3] and radius of a ball around the inner Gaussians; those that are hardly visible do not count."""
+    """Middle [3] and radius of a ball around the inner Gaussians; those that are hardly visible do not count.
+
+    Raises:
+        InputError: there are no Gaussians.
+    """
+    if not len(gaussians):
+        raise InputError("the scene has no Gaussians to look at; expected at least one, or cameras of the capture")
     means = gaussians.means.double()
     seen = gaussians.logit_opacities > 0
     means = means[seen] if bool(seen.any()) else means
@@ -81,7 +89,7 @@ def bounding_ball(gaussians: Gaussians) -> tuple[Tensor, float]:
     return middle, max(float(distances.quantile(INNER_SHARE)), 1e-6)
 
 
-def _least_along(up: Tensor) -> Tensor:
+def least_along(up: Tensor) -> Tensor:
     """The coordinate axis that is furthest from a direction."""
     return torch.eye(3, dtype=up.dtype)[int(up.abs().argmin())]
 
@@ -95,11 +103,11 @@ FULL_SHARE = 0.55
 
 
 class Surveyed(NamedTuple):
-    """A capture seen from above.
+    """Places of a capture's cameras, and what they look at.
 
     Attributes:
         focus: [3] the point that the cameras look at.
-        up: [3] unit vector, away from the ground.
+        up: [3] unit vector, away from the ground, as `upward` finds it.
         distance: of the cameras from the focus, the median; world units.
         reach: how far from the nearest photograph the scene is still known, world units.
     """
@@ -118,7 +126,7 @@ def survey_capture(cameras: Sequence[Camera], extent: float) -> Surveyed:
         extent: of the scene, for captures whose cameras all look the same way.
     """
     poses = torch.stack([camera.cam_from_world for camera in cameras]).double().cpu()
-    centers, down, forward = (-(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0], poses[:, 1, :3], poses[:, 2, :3])
+    centers, forward = -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0], poses[:, 2, :3]
     across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
     ahead = centers.mean(0) + extent * forward.mean(0)
     weight = TOWARDS_MIDDLE * len(cameras)
@@ -132,8 +140,7 @@ def survey_capture(cameras: Sequence[Camera], extent: float) -> Surveyed:
         )
         spacing = float(distances.amin(dim=1).median())
     reach = max(SPACINGS * spacing, SHARE_OF_DISTANCE * distance, 1e-6)
-    up = torch.nn.functional.normalize(-down.mean(0), dim=0)
-    return Surveyed(focus, up, distance, reach)
+    return Surveyed(focus, torch.tensor(upward(cameras), dtype=torch.float64), distance, reach)
 
 
 @torch.no_grad()

@@ -69,8 +69,8 @@ def environment_from_equirect(image: Tensor, size: int) -> Environment:
     Raises:
         ValueError: the image is not twice as wide as high or not finite floating point, or the size is below 1.
     """
-    height = image.shape[0]
-    if image.ndim != 3 or height < 1 or tuple(image.shape) != (height, 2 * height, 3):
+    height = image.shape[0] if image.ndim else 0
+    if height < 1 or tuple(image.shape) != (height, 2 * height, 3):
         raise ValueError(f"the panorama has shape {tuple(image.shape)}; expected (H, 2 H, 3)")
     if not image.is_floating_point() or not bool(torch.isfinite(image).all()):
         raise ValueError(
@@ -132,13 +132,16 @@ def _looked_up(image: Tensor, directions: Tensor) -> Tensor:
 CELLS_ACROSS = 32
 """Cells along the longer side of an image; depths and normals are averaged over cells before they are compared."""
 LEAST_COVERAGE = 0.5
+LEAST_ACROSS = 3
+"""Cells along the shorter side, where it has so many pixels: a normal takes a cell and its neighbours."""
 STEEPEST = 0.15
 """Largest change of depth between neighbouring cells, as a share of the depth, that is a slope and not an edge."""
 
 
 def cell_side(camera: Camera) -> int:
     """Pixels along the side of a cell."""
-    return max(1, round(max(camera.width, camera.height) / CELLS_ACROSS))
+    shorter, longer = sorted((camera.width, camera.height))
+    return max(1, min(round(longer / CELLS_ACROSS), shorter // LEAST_ACROSS))
 
 
 def depth_normals(depth: Tensor, alpha: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
@@ -154,7 +157,7 @@ def depth_normals(depth: Tensor, alpha: Tensor, camera: Camera) -> tuple[Tensor,
     share = cell_means(covered[..., None], side)[..., 0]
     mean_depth = cell_means((depth * covered)[..., None], side)[..., 0] / share.clamp(min=1e-6)
     height, width = mean_depth.shape
-    points = mean_depth[..., None] * ray_grid(camera.intrinsics.to(depth) / side, width, height)
+    points = mean_depth[..., None] * ray_grid(camera.shared_intrinsics.to(depth) / side, width, height)
     along, down = torch.zeros_like(points), torch.zeros_like(points)
     along[:, 1:-1] = points[:, 2:] - points[:, :-2]
     down[1:-1] = points[2:] - points[:-2]
@@ -295,7 +298,7 @@ def reflected_rays(surface: Surface, camera: Camera, chosen: tuple[Tensor, ...])
     """
     rotation = camera.cam_from_world[:3, :3]
     rows, columns = (index.to(rotation) for index in chosen)
-    d = pixel_rays(camera.intrinsics.to(rotation), columns, rows) @ rotation
+    d = pixel_rays(camera.shared_intrinsics.to(rotation), columns, rows) @ rotation
     places = camera.center + surface.depth[chosen][:, None] * d
     normal = surface.normal[chosen]
     normal = normal / normal.norm(dim=-1, keepdim=True).clamp(min=NORMAL_MIN)
@@ -316,7 +319,7 @@ def shaded_pixels(
         image,
         alpha,
         scene.environment.raw,
-        camera.intrinsics,
+        camera.shared_intrinsics,
         camera.cam_from_world[:3, :3].T.contiguous(),
         background=background,
         least_strength=least_strength,
@@ -326,7 +329,7 @@ def shaded_pixels(
 def view_directions(camera: Camera) -> Tensor:
     """[H, W, 3] directions from the camera through the pixel centres, world axes, not unit."""
     rotation = camera.cam_from_world[:3, :3]
-    return ray_grid(camera.intrinsics.to(rotation), camera.width, camera.height) @ rotation
+    return ray_grid(camera.shared_intrinsics.to(rotation), camera.width, camera.height) @ rotation
 
 
 def page_settings(background: tuple[float, float, float], mirrored: str) -> dict[str, Any]:
@@ -390,8 +393,9 @@ class Deferred:
         return ("rgb", "base", "reflection", "strength", "normal", "environment", "depth", "alpha")
 
     def with_layers(self, layers: Sequence[str]) -> Deferred:
-        """The renderer, also of `environment` where that is among the layers."""
-        return replace(self, environment=self.environment or "environment" in layers)
+        """The renderer, also of `depth` and `environment` where they are among the layers."""
+        environment = self.environment or "environment" in layers
+        return replace(self, depth=self.depth or "depth" in layers, environment=environment)
 
     def page_settings(self) -> Mapping[str, Any]:
         """Settings for the web page, which shades pixels and looks up distant light."""

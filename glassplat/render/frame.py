@@ -106,7 +106,8 @@ class Renderer(Protocol):
         Args:
             scene: what is there.
             camera: from where it is seen.
-            with_absgrad: also prepare the statistics of densification, `Frame.screen`; the backward pass is slower.
+            with_absgrad: also prepare all records of densification, `Frame.screen` and `Frame.space`, not absolute
+                gradients alone; the backward pass is slower.
         """
         ...
 
@@ -185,7 +186,7 @@ def raw_gaussians(gaussians: Gaussians) -> RawGaussians:
 def camera_batch(camera: Camera, poses: Tensor | None = None) -> CameraBatch:
     """One camera as the kernels take it, or several of its intrinsics at the `poses` [C, 4, 4]."""
     poses = camera.cam_from_world[None] if poses is None else poses
-    intrinsics = camera.intrinsics.expand(poses.shape[0], 4).contiguous()
+    intrinsics = camera.shared_intrinsics.expand(poses.shape[0], 4).contiguous()
     return CameraBatch(poses, intrinsics, camera.width, camera.height)
 
 

@@ -58,7 +58,7 @@ def panes_in_camera(planes: Planes, camera: Camera) -> Panes:
 
 def nearest_hits(panes: Panes, camera: Camera, mask: Tensor | None = None, beyond: PaneHits | None = None) -> PaneHits:
     """The nearest of `panes_in_camera` on the ray of each pixel, or the next one; see `pane_hits`."""
-    return pane_hits(panes, camera.intrinsics, camera.width, camera.height, mask, beyond=beyond)
+    return pane_hits(panes, camera.shared_intrinsics, camera.width, camera.height, mask, beyond=beyond)
 
 
 def seen_panes(
@@ -172,7 +172,7 @@ FAINT = 0.5
 """A pane that is less visible in a pixel, as at its rim, leaves the layers to the pane behind it."""
 
 
-class Glazed(NamedTuple):
+class CompositedPanes(NamedTuple):
     """An image behind panes.
 
     rgb [H, W, 3]; transmission and reflection [H, W, 3] and strength [H, W] of the nearest pane that is not `FAINT`
@@ -189,7 +189,7 @@ class Glazed(NamedTuple):
 def composite_panes(
     image: Tensor, seen: SeenPanes, masks: Sequence[Tensor], reflections: Tensor, camera: Camera,
     *, fresnel: Fresnel, intensity: bool, blend: Blend,
-) -> Glazed:  # fmt: skip
+) -> CompositedPanes:  # fmt: skip
     """Applies Eq. 1 of TR-Gaussians for each pane on a ray, C_t being what all panes behind it make of the image.
 
     Tinted glass, which the paper does not have, lets through a share of each primary of C_t.
@@ -217,7 +217,7 @@ def composite_panes(
             pane,
             normals,
             seen.planes.base_reflectances,
-            camera.intrinsics,
+            camera.shared_intrinsics,
             fresnel=fresnel,
             intensity=intensity,
             linear=blend == "linear",
@@ -228,12 +228,12 @@ def composite_panes(
     behind, nearest = laid.pop()
     layers = (behind, nearest.reflection, nearest.strength)
     if not laid:
-        return Glazed(image, *layers, share)
+        return CompositedPanes(image, *layers, share)
     faint = masks[0] < FAINT
     for mask, (behind, farther) in zip(masks[1:], reversed(laid), strict=True):
         layers = _joined_layers(layers, behind, farther, faint & (farther.strength > 0), blend)
         faint = faint & (mask < FAINT)
-    return Glazed(image, *layers, share)
+    return CompositedPanes(image, *layers, share)
 
 
 def tint_by_panes(image: Tensor, mask: Tensor, pane: Tensor, transmittances: Tensor, blend: Blend) -> Tensor:

@@ -33,7 +33,7 @@ from glassplat.render.frame import (
     screen_pass,
 )
 from glassplat.render.panes import (
-    Glazed,
+    CompositedPanes,
     SeenPanes,
     composite_panes,
     curves,
@@ -56,7 +56,7 @@ DEPTH_CHANNEL = 3
 """Of the first pass, after the colours."""
 PHOTOGRAPHED = "photographed"
 """The layer that shows the photographer in the panes, next to an image without."""
-Shown = Literal["absent", "present", "beside"]
+PhotographerMode = Literal["absent", "present", "beside"]
 """Whether panes show who took a photograph."""
 
 
@@ -133,14 +133,14 @@ class Planar:
     deviation_depth_gradient: bool = False
     blend: Blend = "linear"
     nearest_only: bool = False
-    photographer: Shown = "absent"
+    photographer: PhotographerMode = "absent"
     tells_mirrored: bool = True
 
     def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are.
 
         Raises:
-            ValueError: an intensity, mark or reflectance cannot be drawn.
+            ValueError: an intensity, mark or reflectance is missing or cannot be drawn.
         """
         check_panes(scene)
         camera = camera.to(scene.primary.means.device)
@@ -171,13 +171,7 @@ class Planar:
         """Raises ValueError where a scene lacks colours, or its panes what they need; there may be no panes."""
         check_colored(scene.primary)
         check_ellipsoids(scene.primary)
-        if len(scene.planes) and "log_intensity" not in scene.primary.channels:
-            raise ValueError(
-                f"the Gaussians have the channels {sorted(scene.primary.channels)}; expected log_intensity, as "
-                "`planar` trains it"
-            )
-        if "logit_mark" not in scene.glass.channels:
-            raise ValueError(f"the glass has the channels {sorted(scene.glass.channels)}; expected logit_mark")
+        check_channels(scene)
 
     def layers(self, scene: Scene) -> tuple[str, ...]:
         """Names of the layers that are worth looking at; with `photographed` where a photographer is known."""
@@ -197,6 +191,7 @@ class Planar:
             "fresnel": self.fresnel,
             "blend": self.blend,
             "intensity": self.intensity,
+            "nearest": self.nearest_only,
         }
 
     def _first_pass(self, scene: Scene, camera: Camera, rectangles: Panes, with_absgrad: bool) -> FirstPass:
@@ -265,7 +260,7 @@ class Planar:
 
     def _composite_panes(
         self, first: FirstPass, seen: SeenPanes, masks: Sequence[Tensor], second: SecondPass, camera: Camera
-    ) -> Glazed:
+    ) -> CompositedPanes:
         """Lays the panes and what they mirror before the image."""
         return composite_panes(
             first.image,
@@ -278,7 +273,9 @@ class Planar:
             blend=self.blend,
         )
 
-    def _screen(self, first: FirstPass, second: SecondPass, hits: PaneHits, result: Glazed) -> tuple[ScreenPass, ...]:
+    def _screen(
+        self, first: FirstPass, second: SecondPass, hits: PaneHits, result: CompositedPanes
+    ) -> tuple[ScreenPass, ...]:
         """The records of both passes."""
         if self.tells_mirrored:
             return weighted_screen(first, second, hits, result, self.blend)
@@ -297,8 +294,20 @@ LARGEST_LOG = 80.0
 """Of a factor on colours, which is finite in single precision."""
 
 
+def check_channels(scene: Scene) -> None:
+    """Raises ValueError where the Gaussians lack a channel that panes need."""
+    if len(scene.planes) and "log_intensity" not in scene.primary.channels:
+        raise ValueError(
+            f"the Gaussians have the channels {sorted(scene.primary.channels)}; expected log_intensity, as "
+            "`planar` trains it"
+        )
+    if "logit_mark" not in scene.glass.channels:
+        raise ValueError(f"the glass has the channels {sorted(scene.glass.channels)}; expected logit_mark")
+
+
 def check_panes(scene: Scene) -> None:
-    """Raises ValueError where a value that only panes need cannot be drawn."""
+    """Raises ValueError where a value that only panes need is missing or cannot be drawn."""
+    check_channels(scene)
     check_numbers({"logit_mark": scene.glass.channels["logit_mark"]})
     if len(scene.planes):
         logs = {"log_intensity": scene.primary.channels["log_intensity"]}
@@ -310,7 +319,7 @@ def check_panes(scene: Scene) -> None:
 
 @torch.no_grad()
 def weighted_screen(
-    first: FirstPass, second: SecondPass, hits: PaneHits, result: Glazed, blend: Blend
+    first: FirstPass, second: SecondPass, hits: PaneHits, result: CompositedPanes, blend: Blend
 ) -> tuple[ScreenPass, ...]:
     """The records of both passes, weighted by how much of each layer is left in the image (see `layer_slopes`).
 
@@ -332,7 +341,7 @@ def detach_gaussians(gaussians: Gaussians) -> Gaussians:
     return gaussians.with_tensors({name: tensor.detach() for name, tensor in gaussians.tensors().items()})
 
 
-def with_photographer(renderer: Renderer, photographer: Shown) -> Renderer:
+def with_photographer(renderer: Renderer, photographer: PhotographerMode) -> Renderer:
     """A renderer whose frames tell what photographs show, as far as it knows of anybody; see `Planar.photographer`."""
     return replace(renderer, photographer=photographer) if isinstance(renderer, Planar) else renderer
 

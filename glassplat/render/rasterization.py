@@ -9,6 +9,7 @@ from torch import Tensor
 
 from glassplat.errors import InputError
 from glassplat.kernels.composite import MOST_CHANNELS, composite
+from glassplat.kernels.maths.blending import ALPHA_MIN
 from glassplat.kernels.maths.projection import LOW_PASS
 from glassplat.kernels.project import project
 from glassplat.kernels.records import TILE, CameraBatch, Projected, RawGaussians, Splats, TileBins
@@ -107,6 +108,9 @@ def rasterization(
     projected = _project(means, quats, scales, opacities, colors, cameras, sh_degree=sh_degree, near=near_plane)
     splats = _splats(projected, opacities, eps2d, antialiased=rasterize_mode == "antialiased")
     seen = (splats.depths < far_plane) & (splats.radii > radius_clip).any(dim=-1)
+    if eps2d > LOW_PASS:
+        size = splats.means2d.new_tensor([width, height])
+        seen &= ((splats.means2d + splats.radii > 0) & (splats.means2d - splats.radii < size)).all(dim=-1)
     splats = splats._replace(radii=torch.where(seen[..., None], splats.radii, 0))
     shown = projected.colors if sh_degree is not None else colors.expand(len(viewmats), *colors.shape[-2:])
     depths = splats.depths[..., None]
@@ -192,9 +196,9 @@ def _project(
 
 def _splats(projected: Projected, opacities: Tensor, eps2d: float, *, antialiased: bool) -> Splats:
     """The splats with another variance than 3DGS adds on screen."""
-    conics, shown = projected.conics, opacities.expand(projected.depths.shape)
+    conics, shown, radii = projected.conics, opacities.expand(projected.depths.shape), projected.radii
     if antialiased or eps2d != LOW_PASS:
-        a, b, c = _inverse(torch.where(projected.radii[..., :1] > 0, conics, conics.new_tensor([1.0, 0.0, 1.0])))
+        a, b, c = _inverse(torch.where(radii[..., :1] > 0, conics, conics.new_tensor([1.0, 0.0, 1.0])))
         a, c = a - LOW_PASS, c - LOW_PASS
         wide = torch.stack([a + eps2d, b, c + eps2d], dim=-1)
         if antialiased:
@@ -203,7 +207,9 @@ def _splats(projected: Projected, opacities: Tensor, eps2d: float, *, antialiase
             share = determinant / (wide[..., 0] * wide[..., 2] - b * b)
             shown = shown * torch.where(share > 0, share, 1).sqrt() * (share > 0)
         conics = torch.stack(_inverse(wide), dim=-1)
-    return Splats(projected.means2d, conics.contiguous(), shown.contiguous(), projected.depths, projected.radii)
+        reach = 2 * (shown / ALPHA_MIN).clamp(min=1).log()[..., None]
+        radii = torch.where(radii > 0, (reach * wide[..., ::2].clamp(min=0)).sqrt().detach(), 0)
+    return Splats(projected.means2d, conics.contiguous(), shown.contiguous(), projected.depths, radii)
 
 
 def _inverse(symmetric: Tensor) -> tuple[Tensor, Tensor, Tensor]:

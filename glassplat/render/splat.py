@@ -211,8 +211,9 @@ class Splat:
         return ("rgb", "normal", "depth", "alpha", *((MEDIAN_DEPTH,) if scene.primary.are_discs else ()))
 
     def with_layers(self, layers: Sequence[str]) -> Drawing:
-        """The drawing of frames, also of `normal` where that is among the layers."""
-        return with_normals(self) if "normal" in layers else self
+        """The drawing of frames, also of `depth` and `normal` where they are among the layers."""
+        renderer = replace(self, depth=self.depth or "depth" in layers, normal=self.normal or "normal" in layers)
+        return with_normals(renderer) if "normal" in layers else renderer
 
     def page_settings(self) -> Mapping[str, Any]:
         """Settings for the web page: there are no panes."""

@@ -173,6 +173,11 @@ class Camera:
     @property
     def intrinsics(self) -> Tensor:
         """[4] tensor (fx, fy, cx, cy)."""
+        return self.shared_intrinsics.clone()
+
+    @property
+    def shared_intrinsics(self) -> Tensor:
+        """The intrinsics in the same tensor for all cameras that have them, for kernels; leave it as it is."""
         matrix = self.cam_from_world
         return constant((self.fx, self.fy, self.cx, self.cy), matrix.dtype, matrix.device)
 

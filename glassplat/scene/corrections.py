@@ -189,11 +189,15 @@ def motion(twist: Tensor, extent: float) -> Tensor:
 
 
 Direction = tuple[float, float, float]
+DEFAULT_UP: Direction = (0.0, -1.0, 0.0)
+"""Of most captures, where no camera tells."""
 
 LEVEL_SHARE = 0.2
 """Of the image's own horizontal axis, which decides where a camera looks straight down or up."""
 TILT_PENALTY = 0.01
 """Against an upward direction that only fits because all cameras look the same way."""
+LEAST_AGREEMENT = 0.1
+"""Length of a mean of unit vectors below which they tell no direction."""
 
 
 def upward(cameras: Sequence[Camera]) -> Direction:
@@ -201,13 +205,17 @@ def upward(cameras: Sequence[Camera]) -> Direction:
 
     Handheld cameras are tilted up and down, but hardly rolled: their x axes are level. Of the directions at right
     angles to these the one along which images stand upright is taken; where all cameras look the same way, that of
-    the mean image.
+    the mean image. Cameras that look straight down, rolled in all directions, look away from it.
     """
     rotations = torch.stack([camera.cam_from_world[:3, :3] for camera in cameras]).double().cpu()
-    level, upright = rotations[:, 0], -rotations[:, 1].mean(dim=0)
+    level = rotations[:, 0]
     spread = level.T @ level / len(cameras) + TILT_PENALTY * torch.eye(3, dtype=torch.float64)
-    x, y, z = torch.nn.functional.normalize(torch.linalg.solve(spread, upright), dim=0).tolist()
-    return (x, y, z)
+    for axis in (1, 2):
+        told = -rotations[:, axis].mean(dim=0)
+        if float(told.norm()) > LEAST_AGREEMENT:
+            x, y, z = torch.nn.functional.normalize(torch.linalg.solve(spread, told), dim=0).tolist()
+            return (x, y, z)
+    return DEFAULT_UP
 
 
 def world_from_photographer(camera: Camera, up: Direction | None) -> Tensor:

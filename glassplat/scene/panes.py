@@ -14,6 +14,7 @@ from glassplat.scene.camera import Camera, constant
 
 LEAST_SINE = 1e-6
 """Of the angle between a pane's normal and its tangent."""
+HIGHEST_LABEL = 255
 PANE_TENSORS = ("centers", "raw_normals", "logit_reflectances", "log_transmittances")
 
 
@@ -31,7 +32,7 @@ class Planes:
         logit_reflectances: [K] base reflectance R0 before the sigmoid.
         tangents: [K, 3] direction of the rectangle's first side; made orthogonal to the normal in use.
         half_sizes: [K, 2] half the side lengths along tangent and bitangent; world units.
-        labels: pane label of each plane, as found in the masks.
+        labels: pane label of each plane, as found in the masks, 1 to 255.
         mirrors: labels of the planes that transmit nothing; their base reflectance gets no gradient.
         log_transmittances: [K, 3] logarithm of the share of red, green and blue light that gets through, of what does
             not come back. None where all panes are clear.
@@ -52,6 +53,8 @@ class Planes:
                 raise ValueError(
                     f"{name} has {tensor.shape[0]} rows for {len(self.labels)} plane labels; expected one row per plane"
                 )
+        if wrong := [label for label in self.labels if not 1 <= label <= HIGHEST_LABEL]:
+            raise ValueError(f"there are planes with the labels {wrong}; expected 1 to {HIGHEST_LABEL}, as in masks")
         if not set(self.mirrors) <= set(self.labels):
             raise ValueError(f"mirrors {self.mirrors} are not all among the plane labels {self.labels}")
 
@@ -148,10 +151,11 @@ class Planes:
             normal: [3] of any length.
             half_sizes: half its sides along tangent and bitangent, world units.
             tangent: [3] direction of its first side; some direction in the plane if None.
-            label: what to call it.
+            label: what to call it, 1 to 255.
 
         Raises:
-            ValueError: a value is not finite, a size is not above 0, or a direction has no length in the plane.
+            ValueError: a value is not finite, a size is not above 0, a direction has no length in the plane, or the
+                label is out of range.
         """
         middle, across, half = (
             torch.tensor(list(values), dtype=torch.float32) for values in (center, normal, half_sizes)

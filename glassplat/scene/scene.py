@@ -238,6 +238,8 @@ def as_mirrors(scene: Scene, labels: Sequence[int]) -> Scene:
 def with_reflectance(scene: Scene, label: int, base_reflectance: float) -> Scene:
     """The pane reflects this share of light at normal incidence; Fresnel's laws add to it at an angle.
 
+    With less than 1, it is no mirror any more, whose reflectance gets no gradient.
+
     Raises:
         ValueError: no pane has the label, or the reflectance is not in [0, 1].
     """
@@ -246,7 +248,8 @@ def with_reflectance(scene: Scene, label: int, base_reflectance: float) -> Scene
     row = row_of(scene.planes, label)
     logits = scene.planes.logit_reflectances.clone()
     logits[row] = torch.logit(logits.new_tensor(base_reflectance)).clamp(-LARGEST_LOGIT, LARGEST_LOGIT)
-    return replace(scene, planes=scene.planes.with_tensors({"logit_reflectances": logits}))
+    mirrors = tuple(k for k in scene.planes.mirrors if k != label or base_reflectance == 1)
+    return replace(scene, planes=replace(scene.planes, logit_reflectances=logits, mirrors=mirrors))
 
 
 def tilt_pane(scene: Scene, label: int, about_tangent: float, about_bitangent: float) -> Scene:
@@ -375,7 +378,7 @@ MARK = 0.99
 
 
 def glass_gaussians(planes: Planes, *, count: int = 1000, seed: int = 0, opacity: float = 0.5) -> Gaussians:
-    """Glass Gaussians on every pane's rectangle.
+    """Glass Gaussians on every pane's rectangle, on the device and of the type of its centre.
 
     They are spread by a scrambled Sobol sequence, so that chance leaves no holes. At the default
     opacity the sheet shows a mask of about 0.8 from the first step on, and training thins it out where
@@ -392,18 +395,19 @@ def glass_gaussians(planes: Planes, *, count: int = 1000, seed: int = 0, opacity
         return Gaussians.empty(channels=("logit_mark",))
     means, quats, log_scales = (torch.cat(tensors) for tensors in zip(*panes, strict=True))
     number = len(means)
-    return Gaussians(
+    glass = Gaussians(
         means=means,
         quats=quats,
         log_scales=log_scales,
         logit_opacities=torch.full((number,), logit(opacity)),
         sh=torch.zeros(number, 0, 3),
         channels={"logit_mark": torch.full((number,), logit(MARK))},
-    ).to(planes.centers.device)
+    )
+    return glass.with_tensors({name: tensor.to(planes.centers) for name, tensor in glass.tensors().items()})
 
 
 def with_pane(scene: Scene, pane: Planes) -> Scene:
-    """The scene with one more pane, its rectangle evenly covered with glass.
+    """The scene with one more pane, its rectangle evenly covered with glass; on its device, in its precision.
 
     Args:
         scene: any; Gaussians that do not say how bright they are in a pane are as bright as they are.
@@ -414,7 +418,7 @@ def with_pane(scene: Scene, pane: Planes) -> Scene:
     """
     if set(pane.labels) & set(scene.planes.labels):
         raise ValueError(f"the scene has a pane {pane.labels[0]} already; its panes are {list(scene.planes.labels)}")
-    pane = pane.to(scene.primary.means.device)
+    pane = pane.with_tensors({name: tensor.to(scene.primary.means) for name, tensor in pane.tensors().items()})
     glass = glass_gaussians(pane, opacity=OPAQUE_SHEET)
     return replace(
         scene,

@@ -18,7 +18,7 @@ from glassplat.publish.cleaning import Floaters
 from glassplat.render.layers import LABEL_COLORS
 from glassplat.scene.camera import Camera
 from glassplat.scene.panes import Planes
-from glassplat.viewer.drawing import LEAST_GAIN, MOST_GAIN, PaneMove, Shown, Wish, matrix_of, wxyz_of
+from glassplat.viewer.drawing import LEAST_GAIN, MOST_GAIN, PaneMove, ViewerState, ViewRequest, matrix_of, wxyz_of
 
 logger = logging.getLogger(__name__)
 
@@ -126,7 +126,7 @@ class PaneControls:
             self._back = gui.add_button("Put panes back")
 
     def listen(self, changed: Callable[[], None]) -> None:
-        """From now on `changed` is called whenever something else is wished for, and arrows show as they are chosen."""
+        """From now on `changed` is called whenever something else is asked for, and arrows show as they are chosen."""
         for control in (self._glass, *self._reflectances.values(), self._gain):
             control.on_update(log_errors(lambda _: changed()))
         for gizmo in self._gizmos:
@@ -134,13 +134,13 @@ class PaneControls:
         self._chosen.on_update(log_errors(lambda _: self._show_gizmo()))
         self._back.on_click(log_errors(lambda _: self._put_back(changed)))
 
-    def apply(self, wish: Wish) -> Wish:
-        """The wish, with the panes as the controls say."""
+    def apply(self, request: ViewRequest) -> ViewRequest:
+        """The request, with the panes as the controls say."""
         sliders = {label: within(slider.value, 0.0, 1.0) for label, slider in self._reflectances.items()}
         changed = [(label, value) for label, value in sliders.items() if value != round(self._own[label], 3)]
         moves = [move for gizmo in self._gizmos if (move := gizmo.move()) is not None]
         return replace(
-            wish,
+            request,
             glass=self._glass.value,
             reflectances=tuple(changed),
             gain=within(self._gain.value, LEAST_GAIN, MOST_GAIN),
@@ -174,14 +174,14 @@ BOX_HINT = "x y z x y z"
 class CleanControls:
     """A folder of controls that take floaters out, as `glassplat clean` does."""
 
-    def __init__(self, gui: Any, shown: Shown) -> None:
+    def __init__(self, gui: Any, state: ViewerState) -> None:
         """Lays them out; they do nothing yet.
 
         Args:
             gui: of the client.
-            shown: what is looked at.
+            state: what is looked at.
         """
-        self._shown, usual = shown, Cleaning()
+        self._state, usual = state, Cleaning()
         self._floaters: Floaters | None = None
         with gui.add_folder("Clean", expand_by_default=False):
             self._on = gui.add_checkbox("Take floaters out", False)
@@ -191,18 +191,18 @@ class CleanControls:
             self._told = gui.add_markdown("")
 
     def listen(self, changed: Callable[[], None]) -> None:
-        """From now on `changed` is called whenever something else is wished for."""
+        """From now on `changed` is called whenever something else is asked for."""
         for control in (self._on, self._isolated, self._oversized, self._box):
             control.on_update(log_errors(lambda _: changed()))
 
-    def apply(self, wish: Wish) -> Wish:
-        """The wish, with what the controls leave of the scene."""
+    def apply(self, request: ViewRequest) -> ViewRequest:
+        """The request, with what the controls leave of the scene."""
         if not self._on.value:
             self._told.content = ""
-            return wish
-        primary = self._shown.scene.primary
+            return request
+        primary = self._state.scene.primary
         if self._floaters is None:
-            self._floaters = Floaters(primary, torch.stack([camera.center for _, camera in self._shown.cameras]))
+            self._floaters = Floaters(primary, torch.stack([camera.center for _, camera in self._state.cameras]))
         cleaning = Cleaning(
             box_of(self._box.value),
             within(self._isolated.value, 0.0, MOST_ISOLATED),
@@ -210,7 +210,7 @@ class CleanControls:
         )
         kept = ~torch.stack(list(self._floaters.masks(cleaning).values())).any(dim=0)
         self._told.content = f"{int(kept.sum())} of {len(primary)} Gaussians stay"
-        return replace(wish, kept=kept) if bool(kept.any()) else wish
+        return replace(request, kept=kept) if bool(kept.any()) else request
 
 
 def box_of(text: str) -> tuple[float, float, float, float, float, float] | None:
@@ -384,21 +384,21 @@ NO_PHOTOGRAPH = np.zeros((2, 3, 3), dtype=np.uint8)
 class PhotographControls:
     """A folder of controls: a list of photographs to stand at, and the picture of the nearest one."""
 
-    def __init__(self, gui: Any, shown: Shown, at: int) -> None:
+    def __init__(self, gui: Any, state: ViewerState, at: int) -> None:
         """Lays them out; they do nothing yet.
 
         Args:
             gui: of the client.
-            shown: what is looked at.
+            state: what is looked at.
             at: the photograph to begin with.
         """
-        self._shown, self._at, self._on_screen = shown, at, -1
-        self._names = tuple(name for name, _ in shown.cameras)
+        self._state, self._at, self._on_screen = state, at, -1
+        self._names = tuple(name for name, _ in state.cameras)
         with gui.add_folder("Photographs"):
             self._name = gui.add_dropdown("Stand at", self._names, initial_value=self._names[at])
             self._steps = gui.add_button_group("Step", ("previous", "next"))
             self._photo = None
-            if shown.photographs:
+            if state.photographs:
                 self._photo = gui.add_image(NO_PHOTOGRAPH, label="Nearest photograph")
 
     def listen(self, stand_at: Callable[[int], None]) -> None:
@@ -412,16 +412,16 @@ class PhotographControls:
     def stands_at(self, index: int) -> None:
         """The camera is where a photograph was taken."""
         self._at = index
-        self._name.value = self._shown.cameras[index][0]
+        self._name.value = self._state.cameras[index][0]
 
     def show_nearest(self, index: int) -> None:
         """Shows a photograph, unless it is there already; where it is gone or broken, says so in its place."""
-        name = self._shown.cameras[index][0]
-        if self._photo is None or index == self._on_screen or name not in self._shown.photographs:
+        name = self._state.cameras[index][0]
+        if self._photo is None or index == self._on_screen or name not in self._state.photographs:
             return
         self._at = self._on_screen = index
         try:
-            photo = self._shown.photographs[name]()
+            photo = self._state.photographs[name]()
         except (OSError, ValueError) as error:
             self._photo.image = NO_PHOTOGRAPH
             self._photo.label = f"Nearest photograph: {name} cannot be read ({error})"

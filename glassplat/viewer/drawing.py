@@ -1,4 +1,4 @@
-"""Wishes of those who look at a scene, and the pictures of them."""
+"""Requests of those who look at a scene, and the pictures of them."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ def wxyz_of(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 Photograph = Callable[[], Tensor]
 
 
-class Keeper(Protocol):
+class Writer(Protocol):
     """Writes what was made in the browser, each under a new name, and says where it is.
 
     Both raise InputError or OSError, with nothing overwritten, where that cannot be.
     """
 
-    def keep_scene(self, scene: Scene, name: str) -> str:
+    def write_scene(self, scene: Scene, name: str) -> str:
         """Writes an edited scene."""
 
-    def keep_keyframes(self, cameras: Sequence[Camera], name: str) -> str:
+    def write_keyframes(self, cameras: Sequence[Camera], name: str) -> str:
         """Writes the cameras of a film."""
 
 
 @dataclass(frozen=True)
-class Shown:
+class ViewerState:
     """Scene on show, with its cameras.
 
     Attributes:
@@ -57,7 +57,7 @@ class Shown:
         layers: names of the layers, the first one first shown.
         cameras: of the photographs, by name; at least one.
         photographs: [H, W, 3] uint8 by name, read when asked for; may be empty.
-        keeper: writes what is made in the browser; None where nothing may be written.
+        writer: writes what is made in the browser; None where nothing may be written.
     """
 
     title: str
@@ -66,7 +66,7 @@ class Shown:
     layers: Sequence[str]
     cameras: Sequence[tuple[str, Camera]]
     photographs: Mapping[str, Photograph]
-    keeper: Keeper | None = None
+    writer: Writer | None = None
 
 
 class Viewpoints:
@@ -107,7 +107,7 @@ class PaneMove(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Wish:
+class ViewRequest:
     """A view that a client asks for.
 
     Attributes:
@@ -141,37 +141,37 @@ class Wish:
         return Camera(self.cam_from_world, focal, focal, width / 2, height / 2, width, height)
 
 
-def edit_scene(scene: Scene, wish: Wish) -> Scene:
-    """The scene with the panes as they are wished for and cleaned; what is not wished for keeps every bit."""
-    if wish.kept is not None and len(wish.kept) == len(scene.primary):
-        scene = replace(scene, primary=scene.primary.select(wish.kept.to(scene.primary.means.device)))
-    if not len(scene.planes) or wish.glass == "none":
+def edit_scene(scene: Scene, request: ViewRequest) -> Scene:
+    """The scene with the panes as they are asked for and cleaned; what is not asked for keeps every bit."""
+    if request.kept is not None and len(request.kept) == len(scene.primary):
+        scene = replace(scene, primary=scene.primary.select(request.kept.to(scene.primary.means.device)))
+    if not len(scene.planes) or request.glass == "none":
         return without_glass(scene) if len(scene.planes) else scene
-    for move in wish.moves:
+    for move in request.moves:
         scene = move_pane(scene, *move)
-    for label, reflectance in wish.reflectances:
+    for label, reflectance in request.reflectances:
         scene = with_reflectance(scene, label, reflectance)
-    if wish.glass == "mirror":
+    if request.glass == "mirror":
         scene = as_mirrors(scene, scene.planes.labels)
     logs = scene.primary.channels.get("log_intensity")
-    if wish.gain == 1 or logs is None:
+    if request.gain == 1 or logs is None:
         return scene
-    shift = float(np.log(np.clip(wish.gain, LEAST_GAIN, MOST_GAIN)))
+    shift = float(np.log(np.clip(request.gain, LEAST_GAIN, MOST_GAIN)))
     return replace(scene, primary=scene.primary.with_tensors({"log_intensity": logs + shift}))
 
 
 @torch.no_grad()
-def draw_picture(scene: Scene, renderer: Renderer, wish: Wish, height: int) -> NDArray[np.uint8]:
-    """The picture [H, W, 3] of a wish; a layer that the scene does not have shows as the image itself."""
-    frame = renderer.with_layers([wish.layer])(edit_scene(scene, wish), wish.camera(height))
-    return _picture(layer_image(frame, wish.layer if _has(frame, wish.layer) else "rgb"))
+def draw_picture(scene: Scene, renderer: Renderer, request: ViewRequest, height: int) -> NDArray[np.uint8]:
+    """The picture [H, W, 3] of a request; a layer that the scene does not have shows as the image itself."""
+    frame = renderer.with_layers([request.layer])(edit_scene(scene, request), request.camera(height))
+    return _picture(layer_image(frame, request.layer if _has(frame, request.layer) else "rgb"))
 
 
 @torch.no_grad()
 def error_drawn(
-    scene: Scene, renderer: Renderer, wish: Wish, height: int, camera: Camera, photo: Tensor
+    scene: Scene, renderer: Renderer, request: ViewRequest, height: int, camera: Camera, photo: Tensor
 ) -> NDArray[np.uint8]:
-    """Error of the edited scene against a photograph, from its camera: [H, W, 3], W by the wish's aspect.
+    """Error of the edited scene against a photograph, from its camera: [H, W, 3], W by the request's aspect.
 
     The photograph fills the height, is black beyond its edges and cut off where the picture is narrower. Both are
     compared pixel by pixel, so that the picture has no more rows than the photograph.
@@ -179,36 +179,38 @@ def error_drawn(
     Args:
         scene: what is shown.
         renderer: of its frames.
-        wish: whose edits and aspect count; not its camera.
+        request: whose edits and aspect count; not its camera.
         height: rows of the picture, at most.
         camera: of the photograph.
         photo: [H, W, 3] uint8.
     """
     rows = min(height, photo.shape[0])
     columns = max(1, round(rows * camera.width / camera.height))
-    frame = renderer.with_layers([PHOTOGRAPHED])(edit_scene(scene, wish), camera.resize(columns, rows))
+    frame = renderer.with_layers([PHOTOGRAPHED])(edit_scene(scene, request), camera.resize(columns, rows))
     small = torch.nn.functional.interpolate(
         photo.to(frame.rgb).movedim(-1, 0)[None], (rows, columns), mode="bilinear", antialias=True
     )[0].movedim(0, -1)
     colors = error_colors(frame.photographed, small)
-    missing = max(1, round(wish.aspect * rows)) - columns
+    missing = max(1, round(request.aspect * rows)) - columns
     left = missing // 2
     return _picture(torch.nn.functional.pad(colors, (0, 0, left, missing - left)))
 
 
 @torch.no_grad()
-def point_along(scene: Scene, renderer: Renderer, wish: Wish, direction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[3] the point that a picture of a wish shows in a direction [3], world axes.
+def point_along(
+    scene: Scene, renderer: Renderer, request: ViewRequest, direction: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """[3] the point that a picture of a request shows in a direction [3], world axes.
 
     Raises:
         ValueError: there is nothing.
     """
-    camera = wish.camera(MEASURED_ROWS)
+    camera = request.camera(MEASURED_ROWS)
     x, y, z = (camera.cam_from_world[:3, :3].double().numpy() @ direction).tolist()
     if z <= 0:
         raise ValueError("the direction is behind the camera")
     column, row = int(camera.fx * x / z + camera.cx), int(camera.fy * y / z + camera.cy)
-    frame = renderer.with_layers(["depth"])(edit_scene(scene, wish), camera)
+    frame = renderer.with_layers(["depth"])(edit_scene(scene, request), camera)
     is_inside = 0 <= row < camera.height and 0 <= column < camera.width
     if not is_inside or float(frame.layers["alpha"][row, column]) < SURFACE_COVERAGE:
         raise ValueError("nothing is there")

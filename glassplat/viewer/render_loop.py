@@ -1,6 +1,6 @@
 """Pictures for all clients, one at a time: coarse at once, sharp when nobody asks for anything else.
 
-A wish has a generation. When a picture is done whose client has meanwhile asked for another view, it is dropped.
+A request has a generation. When a picture is done whose client has meanwhile asked for another view, it is dropped.
 
 One thread draws, since kernels are not entered twice at a time: a `RenderThread`, or one that has other work to do and
 keeps what it spends on pictures to a share of its time, a `DrawingShare`.
@@ -79,23 +79,23 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Request(Generic[Wanted]):
-    """The newest wish of a client.
+    """The newest request of a client.
 
     Attributes:
-        wish: what to draw.
+        view: what to draw.
         size: width and height of the sharp picture, pixels.
-        generation: counts the wishes of all clients.
+        generation: counts the requests of all clients.
         is_coarse_shown: whether the coarse picture is there.
     """
 
-    wish: Wanted
+    view: Wanted
     size: tuple[int, int]
     generation: int
     is_coarse_shown: bool = False
 
 
 class RenderLoop(Generic[Wanted]):
-    """Knows the newest wish of each client, and draws the next picture when it is told to."""
+    """Knows the newest request of each client, and draws the next picture when it is told to."""
 
     def __init__(
         self,
@@ -103,10 +103,10 @@ class RenderLoop(Generic[Wanted]):
         show: Callable[[int, Picture, bool], None],
         fail: Callable[[int, str], None] = lambda client, reason: None,
     ) -> None:
-        """Begins to wait for wishes.
+        """Begins to wait for requests.
 
         Args:
-            draw: the picture of a wish with so many rows; called by `serve` only.
+            draw: the picture of a view with so many rows; called by `serve` only.
             show: sends a picture to a client, and says whether it is the sharp one.
             fail: tells a client why its picture could not be drawn.
         """
@@ -118,11 +118,11 @@ class RenderLoop(Generic[Wanted]):
         self._seconds_per_pixel = 1e-7
         self._complaint = ""
 
-    def ask(self, client: int, wish: Wanted, size: tuple[int, int]) -> None:
+    def ask(self, client: int, view: Wanted, size: tuple[int, int]) -> None:
         """Replaces what a client wants to see."""
         with self._changed:
             self._generation += 1
-            self._requests[client] = Request(wish, size, self._generation)
+            self._requests[client] = Request(view, size, self._generation)
             self._changed.notify()
 
     def forget(self, client: int) -> None:
@@ -179,7 +179,7 @@ class RenderLoop(Generic[Wanted]):
         return max(1, round(height * min(1.0, max(share, LEAST_WIDTH / width))))
 
     def _next(self) -> tuple[int, Request[Wanted]]:
-        """Clients that see nothing of their wish yet come first, in turn."""
+        """Clients that see nothing of their view yet come first, in turn."""
         waiting = [client for client, request in self._requests.items() if not request.is_coarse_shown]
         clients = sorted(waiting or self._requests)
         client = next((one for one in clients if one > self._turn), clients[0])
@@ -191,7 +191,7 @@ class RenderLoop(Generic[Wanted]):
         coarse = self.coarse_height(request.size)
         is_sharp = request.is_coarse_shown or coarse >= height
         rows = height if is_sharp else coarse
-        picture = self._draw_timed(client, request.wish, rows)
+        picture = self._draw_timed(client, request.view, rows)
         with self._changed:
             current = self._requests.get(client)
             if current is None or current.generation != request.generation:
@@ -199,15 +199,15 @@ class RenderLoop(Generic[Wanted]):
             if is_sharp:
                 del self._requests[client]
             else:
-                self._requests[client] = Request(request.wish, request.size, request.generation, True)
+                self._requests[client] = Request(request.view, request.size, request.generation, True)
         if picture is not None:
             self._show(client, picture, is_sharp)
 
-    def _draw_timed(self, client: int, wish: Wanted, rows: int) -> Picture | None:
+    def _draw_timed(self, client: int, view: Wanted, rows: int) -> Picture | None:
         """A picture; what goes wrong with one must not end the others."""
         begun = time.perf_counter()
         try:
-            picture = self._draw(wish, rows)
+            picture = self._draw(view, rows)
         except Exception as error:  # noqa: BLE001 - A photograph that is gone, no memory: whatever it was.
             self._fail(client, self._complain(error))
             return None

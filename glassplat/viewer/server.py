@@ -30,9 +30,9 @@ from glassplat.scene.scene import Scene
 from glassplat.viewer import controls
 from glassplat.viewer.drawing import (
     ERROR,
-    Shown,
+    ViewerState,
     Viewpoints,
-    Wish,
+    ViewRequest,
     draw_picture,
     edit_scene,
     error_drawn,
@@ -60,7 +60,7 @@ class Client:
         self._panes: controls.PaneControls | None = None
         self._clean: controls.CleanControls | None = None
         self._measure = controls.MeasureControls(handle)
-        self.keyframes = controls.KeyframeControls(handle, viewer.shown.scene.extent, self.camera)
+        self.keyframes = controls.KeyframeControls(handle, viewer.state.scene.extent, self.camera)
         self._failure = ""
         self._waiting: Any = handle.add_notification(*WAITING, loading=True, with_close_button=False)
         self.lay_out()
@@ -95,15 +95,15 @@ class Client:
 
     def ask(self) -> None:
         """Asks for what the controls and the camera say."""
-        wish = self.wish()
-        if wish is None:
+        request = self.request()
+        if request is None:
             return
-        most = min(LARGEST_HEIGHT, int((MOST_PIXELS / wish.aspect) ** 0.5))
+        most = min(LARGEST_HEIGHT, int((MOST_PIXELS / request.aspect) ** 0.5))
         rows = max(1, min(int(self._handle.camera.image_height), most))
-        self._viewer.loop.ask(self._handle.client_id, wish, (max(1, round(wish.aspect * rows)), rows))
+        self._viewer.loop.ask(self._handle.client_id, request, (max(1, round(request.aspect * rows)), rows))
 
-    def wish(self) -> Wish | None:
-        """Wish of the controls and the camera; None before the browser has reported its camera."""
+    def request(self) -> ViewRequest | None:
+        """Request of the controls and the camera; None before the browser has reported its camera."""
         camera = self._handle.camera
         try:
             wxyz, position = np.asarray(camera.wxyz), np.asarray(camera.position)
@@ -112,27 +112,27 @@ class Client:
             return None
         self._nearest = self._viewer.viewpoints.nearest(position, matrix_of(wxyz)[:, 2])
         against = self._nearest if self._layer.value == ERROR else None
-        wish = Wish(cam_from_world(wxyz, position), fov_rad, aspect, self._layer.value, against=against)
-        wish = wish if self._clean is None else self._clean.apply(wish)
-        return wish if self._panes is None else self._panes.apply(wish)
+        request = ViewRequest(cam_from_world(wxyz, position), fov_rad, aspect, self._layer.value, against=against)
+        request = request if self._clean is None else self._clean.apply(request)
+        return request if self._panes is None else self._panes.apply(request)
 
     def camera(self) -> Camera | None:
         """Camera of the browser, with as many rows as its window has."""
-        wish = self.wish()
-        return None if wish is None else wish.camera(max(1, int(self._handle.camera.image_height)))
+        request = self.request()
+        return None if request is None else request.camera(max(1, int(self._handle.camera.image_height)))
 
     def stand_at(self, index: int) -> None:
         """Moves the camera to where a photograph was taken, and shows that; keyframes play no further."""
         self.keyframes.stop()
         self._photographs.stands_at(index)
         self._photographs.show_nearest(index)
-        self.go(self._viewer.shown.cameras[index][1])
+        self.go(self._viewer.state.cameras[index][1])
 
     def go(self, camera: Camera) -> None:
         """Moves the camera."""
         rotation = camera.cam_from_world[:3, :3].double().cpu().numpy()
         position = camera.center.double().cpu().numpy()
-        extent = self._viewer.shown.scene.extent
+        extent = self._viewer.state.scene.extent
         ahead = max(float((self._viewer.focus - position) @ rotation[2]), LEAST_AHEAD * extent)
         with self._handle.atomic():
             self._handle.camera.up_direction = tuple(-rotation[1])
@@ -142,8 +142,8 @@ class Client:
 
     def lay_out(self) -> None:
         """Puts the controls there, anew where there were some."""
-        gui, shown = self._handle.gui, self._viewer.shown
-        layers = tuple(shown.layers)
+        gui, state = self._handle.gui, self._viewer.state
+        layers = tuple(state.layers)
         chosen = layers[0] if self._layer is None else self._layer.value
         gui.reset()
         self._told = gui.add_markdown(plain(self._status)) if self._viewer.buttons else None
@@ -151,60 +151,62 @@ class Client:
             gui.add_button(name).on_click(controls.log_errors(lambda _, act=act: act()))
         self._layer = gui.add_dropdown("Layer", layers, initial_value=chosen)
         self._layer.on_update(controls.log_errors(lambda _: self.ask()))
-        panes = shown.scene.planes
+        panes = state.scene.planes
         if self._panes is not None:
             self._panes.remove()
         self._panes = controls.PaneControls(self._handle, panes) if len(panes) else None
         # A scene that is trained changes from step to step.
-        self._clean = None if self._viewer.buttons else controls.CleanControls(gui, shown)
+        self._clean = None if self._viewer.buttons else controls.CleanControls(gui, state)
         self._measure.lay_out(self.measure)
-        self._photographs = controls.PhotographControls(gui, shown, self._nearest)
+        self._photographs = controls.PhotographControls(gui, state, self._nearest)
         # Now that all are there: a control may be used as soon as it listens.
         if self._panes is not None:
             self._panes.listen(self.ask)
         if self._clean is not None:
             self._clean.listen(self.ask)
         self._photographs.listen(self.stand_at)
-        self.keyframes.lay_out(self.go, None if shown.keeper is None else self.keep_keyframes)
-        if shown.keeper is not None:
-            self._add_saving(f"{shown.title}-edited")
+        self.keyframes.lay_out(self.go, None if state.writer is None else self.save_keyframes)
+        if state.writer is not None:
+            self._add_saving(f"{state.title}-edited")
 
     def measure(self, direction: NDArray[np.float64]) -> None:
         """Takes the point that is seen in a direction [3], world axes, as an end of what is measured.
 
         It is seen from where the camera is now: the thread that draws may take long to come to it.
         """
-        wish = self.wish()
-        if wish is None:
+        request = self.request()
+        if request is None:
             return
 
         def work() -> None:
             try:
-                self._measure.take(point_along(self._viewer.shown.scene, self._viewer.shown.renderer, wish, direction))
+                self._measure.take(
+                    point_along(self._viewer.state.scene, self._viewer.state.renderer, request, direction)
+                )
             except ValueError as error:
                 self._notify("No point", str(error), "red")
 
         self._viewer.loop.call(controls.log_errors(work))
 
-    def keep_scene(self, name: str) -> None:
+    def save_scene(self, name: str) -> None:
         """Saves the scene as it is edited here, under a new name; says how that went."""
-        keeper, wish = self._viewer.shown.keeper, self.wish()
-        if keeper is not None and wish is not None:
-            self._keep(lambda: keeper.keep_scene(edit_scene(self._viewer.shown.scene, wish), name))
+        writer, request = self._viewer.state.writer, self.request()
+        if writer is not None and request is not None:
+            self._save(lambda: writer.write_scene(edit_scene(self._viewer.state.scene, request), name))
 
-    def keep_keyframes(self, name: str) -> None:
+    def save_keyframes(self, name: str) -> None:
         """Saves the keyframes under a new name; says how that went."""
-        keeper, keyframes = self._viewer.shown.keeper, self.keyframes.keyframes
-        if keeper is not None:
-            self._keep(lambda: keeper.keep_keyframes(keyframes, name))
+        writer, keyframes = self._viewer.state.writer, self.keyframes.keyframes
+        if writer is not None:
+            self._save(lambda: writer.write_keyframes(keyframes, name))
 
     def _add_saving(self, name: str) -> None:
         gui = self._handle.gui
         with gui.add_folder("Edited scene", expand_by_default=False):
             text = gui.add_text("Name", name)
-            gui.add_button("Save as a run").on_click(controls.log_errors(lambda _: self.keep_scene(text.value)))
+            gui.add_button("Save as a run").on_click(controls.log_errors(lambda _: self.save_scene(text.value)))
 
-    def _keep(self, write: Callable[[], str]) -> None:
+    def _save(self, write: Callable[[], str]) -> None:
         """Writes in the thread that draws: what is written may need kernels."""
 
         def work() -> None:
@@ -241,12 +243,12 @@ class Viewer:
     """Serves a scene to any number of browsers until it is stopped; who made it draws, or `start` does."""
 
     def __init__(
-        self, shown: Shown, host: str, port: int, buttons: Mapping[str, Callable[[], None]] | None = None
+        self, state: ViewerState, host: str, port: int, buttons: Mapping[str, Callable[[], None]] | None = None
     ) -> None:
         """Begins to serve.
 
         Args:
-            shown: what there is to look at.
+            state: what there is to look at.
             host: who may look, with the key of the address; 127.0.0.1 is this machine alone.
             port: where the browser finds it.
             buttons: further ones by what is written on them, and what they do; called from other threads.
@@ -262,21 +264,21 @@ class Viewer:
                 f"the viewer needs viser, which is not installed ({error}); pip install 'glassplat[view]', or look at "
                 "the page of `glassplat export`, which needs nothing"
             ) from error
-        self.shown, self.host, self.buttons = shown, host, buttons or {}
-        self.loop: RenderLoop[Wish] = RenderLoop(self._draw, self._show, self._fail)
+        self.state, self.host, self.buttons = state, host, buttons or {}
+        self.loop: RenderLoop[ViewRequest] = RenderLoop(self._draw, self._show, self._fail)
         self._thread: RenderThread | None = None
         self._clients: dict[int, Client] = {}
         logging.getLogger("websockets").setLevel(logging.CRITICAL)
         # A browser that leaves in the middle of something is nothing that anybody needs to know.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         self.access = Access(host)
-        self._server = guarded_server(self.access, host=host, port=port, title=shown.title)
-        cameras = [camera for _, camera in shown.cameras]
-        survey = survey_capture(cameras, shown.scene.extent)
+        self._server = guarded_server(self.access, host=host, port=port, title=state.title)
+        cameras = [camera for _, camera in state.cameras]
+        survey = survey_capture(cameras, state.scene.extent)
         self._server.scene.set_up_direction(tuple(survey.up.tolist()))
         self.focus = survey.focus.numpy()
-        self.first = best_view(shown.scene.planes, cameras)
-        self.viewpoints = Viewpoints(cameras, shown.scene.extent)
+        self.first = best_view(state.scene.planes, cameras)
+        self.viewpoints = Viewpoints(cameras, state.scene.extent)
         # The error layer asks for the same one with every edit.
         self._photograph = lru_cache(maxsize=2)(self._read_photograph)
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
@@ -296,6 +298,7 @@ class Viewer:
         """Address to open in the browser: with the key, without which there is no answer."""
         everywhere = self.host in ("0.0.0.0", "::")
         name = "localhost" if is_local(self.host) else socket.gethostname() if everywhere else self.host
+        name = f"[{name}]" if ":" in name else name  # The port of an IPv6 address begins after the bracket.
         return f"http://{name}:{self.port}/?key={self.access.key}"
 
     @property
@@ -316,8 +319,8 @@ class Viewer:
 
     def change(self, scene: Scene, renderer: Renderer) -> None:
         """Shows another scene from now on; to be called by the thread that draws. `refresh` draws it anew."""
-        had = self.shown.scene.planes.labels
-        self.shown = replace(self.shown, scene=scene, renderer=renderer)
+        had = self.state.scene.planes.labels
+        self.state = replace(self.state, scene=scene, renderer=renderer)
         if scene.planes.labels != had:
             for client in list(self._clients.values()):
                 controls.log_errors(client.lay_out)()
@@ -340,12 +343,12 @@ class Viewer:
         if gone is not None:
             gone.leave()
 
-    def _draw(self, wish: Wish, height: int) -> NDArray[np.uint8]:
-        scene, renderer = self.shown.scene, self.shown.renderer
-        if wish.against is None:
-            return draw_picture(scene, renderer, wish, height)
-        camera = self.shown.cameras[wish.against][1]
-        return error_drawn(scene, renderer, wish, height, camera, self._photograph(wish.against))
+    def _draw(self, request: ViewRequest, height: int) -> NDArray[np.uint8]:
+        scene, renderer = self.state.scene, self.state.renderer
+        if request.against is None:
+            return draw_picture(scene, renderer, request, height)
+        camera = self.state.cameras[request.against][1]
+        return error_drawn(scene, renderer, request, height, camera, self._photograph(request.against))
 
     def _read_photograph(self, index: int) -> Tensor:
         """[H, W, 3] uint8.
@@ -353,10 +356,10 @@ class Viewer:
         Raises:
             ValueError, OSError: the photograph is not there, or cannot be read.
         """
-        name = self.shown.cameras[index][0]
-        if name not in self.shown.photographs:
+        name = self.state.cameras[index][0]
+        if name not in self.state.photographs:
             raise ValueError(f"there is no photograph {name} to compare with")
-        return self.shown.photographs[name]()
+        return self.state.photographs[name]()
 
     def _fail(self, client: int, reason: str) -> None:
         found = self._clients.get(client)

@@ -1,4 +1,5 @@
-// Lays the panes before the image, from the farthest on each ray to the nearest: Eq. 1 of TR-Gaussians for each.
+// Lays the panes before the image, from the farthest on each ray to the nearest: Eq. 1 of TR-Gaussians for each, or for
+// the nearest alone, with the mask of them all.
 precision highp float;
 precision highp sampler2DArray;
 
@@ -22,7 +23,7 @@ uniform vec3 background;
 uniform ivec2 layers;        // left and right of the divider
 uniform float divider;
 uniform int law;
-uniform bool linearLight, gained;
+uniform bool linearLight, gained, nearestOnly;
 out vec4 shown;
 
 const float FAR = 1e30;
@@ -61,8 +62,7 @@ float depthOf(int k, vec3 ray) {
 
 float maskOf(int k) { return texture(masks, vec3(within(usedByMirrors), float(k))).r; }
 
-void glaze(int k, vec3 ray, inout vec3 seen, inout vec4 mirror) {
-  float mask = maskOf(k);
+void layPane(int k, float mask, vec3 ray, inout vec3 seen, inout vec4 mirror) {
   if (mask <= 0.0) return;
   vec2 there = within(usedByMirrors);
   vec4 reflected = texture(reflections, vec3(there, float(k)));
@@ -102,8 +102,10 @@ void main() {
       if (depths[k] < FAR && depths[k] > depth) { farthest = k; depth = depths[k]; }
     }
     if (farthest < 0) break;
-    glaze(farthest, ray, seen, mirror);
-    mask = maskOf(farthest);
+    float own = maskOf(farthest);
+    mask = nearestOnly ? own + (1.0 - own) * mask : own;
+    if (nearestOnly) { seen = behind; mirror = vec4(0.0); }
+    layPane(farthest, mask, ray, seen, mirror);
     for (int k = 0; k < PANES; k++) if (k == farthest) depths[k] = FAR;
   }
 #endif

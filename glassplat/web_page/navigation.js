@@ -115,7 +115,7 @@ function makeNavigation(scene, changed) {
     const fade = Math.min(1, passed / 3), right = row(from.rotation, 0), down = row(from.rotation, 1);
     const place = plus(
       plus(centerOf(from), right, width * fade * Math.sin(passed * 0.45)), down, 0.3 * width * fade * Math.sin(passed * 0.31));
-    set(poseAt(lookingAt(place, target, up), place), target);
+    set(poseAt(lookingAt(place, target, levelUp(from.rotation)), place), target);
   }
 
   function flown() {

@@ -127,6 +127,7 @@ function makeRenderer(canvas, scene) {
     gl.uniform1i(at('law'), LAWS.indexOf(scene.fresnel));
     gl.uniform1i(at('linearLight'), scene.blend === 'linear' ? 1 : 0);
     gl.uniform1i(at('gained'), scene.intensity ? 1 : 0);
+    gl.uniform1i(at('nearestOnly'), scene.nearest ? 1 : 0);
     gl.bindVertexArray(empty);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }

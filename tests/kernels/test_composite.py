@@ -383,6 +383,8 @@ def test_wrong_inputs_are_named(random_splats: MakeSplats) -> None:
         composite(splats, channels, bins, marks=case.marks, num_primary=3, absgrad=case.absgrad[:, 1:])
     with pytest.raises(TypeError, match=r"channels is torch\.float32 and means2d is torch\.float64"):
         composite(splats, channels.float(), bins)
+    with pytest.raises(TypeError, match="channels is on meta, but only the CPU"):
+        composite(splats, channels.to("meta"), bins)
     fewer = Splats(*(tensor[:, :4] for tensor in splats))
     with pytest.raises(ValueError, match="bin these very splats"):
         composite(fewer, channels[:, :4], bins)

@@ -325,6 +325,8 @@ def test_wrong_inputs_are_named() -> None:
         composite_discs(case.discs, case.channels, case.bins, near=NEAR, absgrad=case.absgrad[:, 1:])
     with pytest.raises(TypeError, match=r"channels is torch\.float32 and means2d is torch\.float64"):
         composite_discs(case.discs, case.channels.float(), case.bins, near=NEAR)
+    with pytest.raises(TypeError, match="channels is on meta, but only the CPU"):
+        composite_discs(case.discs, case.channels.to("meta"), case.bins, near=NEAR)
     with pytest.raises(ValueError, match="near is -1"):
         composite_discs(case.discs, case.channels, case.bins, near=-1)
     other = case_of(scattered(4), cameras_of(1, (20, 20)))

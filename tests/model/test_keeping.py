@@ -13,10 +13,10 @@ import glassplat
 from glassplat.access import is_local
 from glassplat.cli.main import main
 from glassplat.cli.scene import View
-from glassplat.cli.serving import keeper
+from glassplat.cli.serving import writer_for
 from glassplat.errors import InputError
 from glassplat.files.sidecars import read_cameras
-from glassplat.model.watching import KeptBeside
+from glassplat.model.watching import FolderWriter
 from glassplat.scene.scene import move_pane
 from tests.cli.tiny_run import write_run
 from tests.model.test_model import model
@@ -30,7 +30,7 @@ def test_an_edited_scene_is_a_run_of_its_own_that_knows_the_photographs(tmp_path
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     loaded = glassplat.load(run, device="cpu")
     edited = move_pane(loaded.scene, 1, (1.0, 0.0, 0.05, 0.0), (0.0, 0.0, 0.1))
-    said = KeptBeside(loaded, tmp_path).keep_scene(edited, " place, seen twice ".replace(",", " +").strip())
+    said = FolderWriter(loaded, tmp_path).write_scene(edited, " place, seen twice ".replace(",", " +").strip())
     place = tmp_path / "place + seen twice"
     assert f"glassplat view '{place}'" in said
     again = glassplat.load(place, device="cpu")
@@ -44,47 +44,47 @@ def test_an_edited_scene_is_a_run_of_its_own_that_knows_the_photographs(tmp_path
 
 def test_nothing_is_written_over(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
-    keeper = KeptBeside(glassplat.load(run, device="cpu"), tmp_path)
+    writer = FolderWriter(glassplat.load(run, device="cpu"), tmp_path)
     recipe = (run / "recipe.json").read_bytes()
     with pytest.raises(FileExistsError, match="already there and not empty"):
-        keeper.keep_scene(true_scene(), "run")
+        writer.write_scene(true_scene(), "run")
     (tmp_path / "mine").write_text("mine")
     (tmp_path / "nowhere").symlink_to(tmp_path / "gone")
     for name in ("mine", "nowhere"):
         with pytest.raises(FileExistsError, match="nothing was written"):
-            keeper.keep_scene(true_scene(), name)
-    keeper.keep_keyframes(CAMERAS, "path.json")
+            writer.write_scene(true_scene(), name)
+    writer.write_keyframes(CAMERAS, "path.json")
     with pytest.raises(FileExistsError, match="Choose another name"):
-        keeper.keep_keyframes(CAMERAS[:2], "path")
+        writer.write_keyframes(CAMERAS[:2], "path")
     assert (run / "recipe.json").read_bytes() == recipe and (tmp_path / "mine").read_text() == "mine"
     assert len(read_cameras(tmp_path / "path.json")) == len(CAMERAS) and not (tmp_path / "gone").exists()
 
 
 @pytest.mark.parametrize("name", ["", "../out", "a/b", "/etc/x", ".hidden", "-option", "a\0b", "x" * 200, "..", "a\nb"])
 def test_no_name_leads_out_of_the_folder(name: str, tmp_path: Path) -> None:
-    keeper = KeptBeside(model(), tmp_path / "here")
+    writer = FolderWriter(model(), tmp_path / "here")
     with pytest.raises(InputError, match="cannot be a name"):
-        keeper.keep_scene(true_scene(), name)
+        writer.write_scene(true_scene(), name)
     with pytest.raises(InputError, match="cannot be a name"):
-        keeper.keep_keyframes(CAMERAS, name)
+        writer.write_keyframes(CAMERAS, name)
     assert not [*tmp_path.iterdir()]
 
 
 def test_who_looks_from_another_machine_saves_nothing_unless_a_folder_is_named(tmp_path: Path) -> None:
     here = View(tmp_path / "scene")
     elsewhere = replace(here, host="0.0.0.0")
-    assert is_local(here.host) and keeper(here, model()) is not None
-    assert keeper(elsewhere, model()) is None
-    assert keeper(replace(elsewhere, host="192.168.1.2"), model()) is None
-    assert keeper(replace(elsewhere, output=tmp_path), model()) is not None
+    assert is_local(here.host) and writer_for(here, model()) is not None
+    assert writer_for(elsewhere, model()) is None
+    assert writer_for(replace(elsewhere, host="192.168.1.2"), model()) is None
+    assert writer_for(replace(elsewhere, output=tmp_path), model()) is not None
 
 
 def test_keyframes_are_what_a_film_is_made_of(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
-    keeper = KeptBeside(glassplat.load(run, device="cpu"), tmp_path)
+    writer = FolderWriter(glassplat.load(run, device="cpu"), tmp_path)
     with pytest.raises(InputError, match="at least two"):
-        keeper.keep_keyframes(CAMERAS[:1], "my path")
-    said = shlex.split(keeper.keep_keyframes(CAMERAS[:3], "my path").split("`")[1])
+        writer.write_keyframes(CAMERAS[:1], "my path")
+    said = shlex.split(writer.write_keyframes(CAMERAS[:3], "my path").split("`")[1])
     assert said[:3] == ["glassplat", "video", str(run)] and said[-2:] == ["--output", "film.mp4"]
     film = ["--output", str(tmp_path / "film.webp"), "--seconds", "0.3", "--fps", "10", "--width", "64"]
     assert main([*said[1:-2], *film]) == 0

@@ -6,6 +6,7 @@ import base64
 import dataclasses
 import io
 from pathlib import Path
+from typing import Any
 from urllib.request import HTTPCookieProcessor, build_opener
 
 import pytest
@@ -14,6 +15,8 @@ from PIL import Image
 
 import glassplat
 from glassplat import Camera, Gaussians, InputError, Model, Planar, PlanarRecipe, Scene, SplatRecipe
+from glassplat.model.model import by_name
+from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Environment
 from tests.cli.tiny_run import write_run
 from tests.training.tiny_capture import tiny_capture, true_scene
@@ -141,6 +144,13 @@ def test_a_pane_that_is_none_is_refused(normal: tuple, half_sizes: tuple, tangen
         model().with_pane((0.0, 0.0, 0.0), normal, half_sizes, tangent=tangent)
 
 
+@pytest.mark.parametrize("label", [0, -1, 256])
+def test_a_label_that_no_file_can_hold_is_refused(label: int) -> None:
+    with pytest.raises(ValueError, match=rf"the labels \[{label}\]; expected 1 to 255"):
+        bare().with_pane((0.0, 0.0, 1.5), (0.0, 0.0, -1.0), (2.0, 2.0), label=label)
+    assert bare().with_pane((0.0, 0.0, 1.5), (0.0, 0.0, -1.0), (2.0, 2.0), label=255).panes == (255,)
+
+
 @pytest.mark.parametrize(("name", "tolerance"), [("a.ply", 1e-6), ("a.spz", 0.1), ("folder", 0.0)])
 def test_what_is_saved_is_loaded_again(name: str, tolerance: float, tmp_path: Path) -> None:
     whole = model()
@@ -154,6 +164,32 @@ def test_what_is_saved_is_loaded_again(name: str, tolerance: float, tmp_path: Pa
     darker.save(path, overwrite=True)
     assert float(glassplat.load(path, device="cpu").scene.planes.base_reflectances) == pytest.approx(0.01, rel=1e-3)
     assert not [left for left in path.parent.iterdir() if left.name.startswith(".")]
+
+
+NO_PANES, PLAIN = {"planes": Planes.empty()}, PlanarRecipe(background=(0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("name", "recipe", "parts", "lost"),
+    [
+        ("a.ply", PLAIN, {}, None),
+        ("a.glb", PLAIN, {}, None),
+        ("a.spz", PLAIN, {}, "how bright Gaussians are in panes"),
+        ("a.ply", PlanarRecipe.paper(), {}, "fresnel=schlick, blend=srgb, nearest=True"),
+        ("a.ply", SplatRecipe(background=(0.0, 0.0, 0.0)), NO_PANES, None),
+        ("a.ply", SplatRecipe(background=(1.0, 1.0, 1.0)), NO_PANES, "background=(1.0, 1.0, 1.0)"),
+        ("a.ply", PLAIN, {"surroundings": true_scene().primary}, "what shiny things mirror"),
+        ("a.ply", PLAIN, {"photographer": true_scene().primary}, "the photographer"),
+    ],
+)
+def test_what_a_splat_file_leaves_out_is_said(
+    name: str, recipe: Any, parts: dict, lost: str | None, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole = model()
+    scene = dataclasses.replace(whole.scene, **parts)
+    path = dataclasses.replace(whole, scene=scene, recipe=recipe).save(tmp_path / name)
+    expected = f"{path} leaves out {lost}; a folder, saved without a suffix, holds everything"
+    assert caplog.messages == ([] if lost is None else [expected])
 
 
 def test_a_folder_that_is_no_saved_model_is_never_replaced(tmp_path: Path) -> None:
@@ -178,6 +214,20 @@ def test_a_model_without_cameras_is_looked_at_from_around_it() -> None:
     assert blind.clean()[1].keys() == model().clean()[1].keys()
     viewer = blind.show()
     viewer.stop()
+
+
+def test_a_model_of_nothing_says_so() -> None:
+    nothing = model().with_scene(Scene(Gaussians.empty(1, channels=("log_intensity",)), 1.0))
+    with pytest.raises(InputError, match="cannot be cleaned; expected at least one"):
+        nothing.clean()
+    with pytest.raises(InputError, match="no Gaussians to look at"):
+        _ = dataclasses.replace(nothing, cameras={}).viewpoints
+
+
+def test_cameras_of_one_name_are_all_kept() -> None:
+    cameras = list(model().cameras.values())
+    names = ("a", "a", "a #2", "b", "a")
+    assert list(by_name(zip(names, cameras, strict=False))) == ["a", "a #2", "a #2 #2", "b", "a #3"]
 
 
 def test_a_model_without_cameras_is_saved_as_a_file_and_as_no_folder(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -32,6 +33,24 @@ def test_a_survey_finds_what_all_look_at() -> None:
     down = (survey.focus - middle) @ survey.up
     assert float(down) < 0 and float((survey.focus - middle + survey.up * -down).norm()) < 1e-3 * survey.distance
     torch.testing.assert_close(survey.up, UP, atol=1e-3, rtol=0)
+
+
+def test_cameras_that_look_down_from_one_side_are_not_taken_to_stand_upright() -> None:
+    tilt = math.radians(20)
+    angles = [math.radians(yaw) for yaw in range(0, 91, 10)]
+    eyes = [(math.sin(a), -math.tan(tilt), math.cos(a)) for a in angles]
+    arc = [Camera.look_at(eye, (0.0, 0.0, 0.0), up=UP) for eye in eyes]
+    assert float(torch.rad2deg(torch.acos(survey_capture(arc, 1.0).up @ UP))) < 2
+
+
+@pytest.mark.parametrize("aside", [0.0, 0.3])
+def test_an_orbit_goes_around_below_cameras_that_look_straight_down(aside: float) -> None:
+    cameras = [
+        Camera.look_at((aside * x, -2.0, aside * z), (aside * x, 0.0, aside * z), up=(x, 0.0, z))
+        for x, z in ((1, 0), (0, 1), (-1, 0), (0, -1))
+    ]
+    torch.testing.assert_close(survey_capture(cameras, 2.0).up, UP, atol=1e-6, rtol=0)
+    assert all(float(forward(camera) @ -UP) > 0.9 for camera in orbit(cameras, 2.0, 12))
 
 
 def test_an_orbit_goes_all_around_what_was_seen_from_all_sides() -> None:

@@ -37,6 +37,7 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Environment, Scene, as_mirrors, without_glass
 from tests.browser_needed import needs_browser
 from tests.render.test_deferred import glossy as glossy_scene
+from tests.render.test_seen_panes import vitrine
 from tests.render.tiny_scene import camera_at, concatenated, in_single_precision, joined, pane, showcase
 from tests.training.tiny_capture import tiny_capture, true_scene
 from tools.browser import Browser
@@ -304,6 +305,18 @@ def test_panes_behind_panes_and_scenes_without_any(tmp_path: Path) -> None:
             for _, camera in CAMERAS[:2]:
                 assert likeness(browser, scene, renderer, camera) > 36
             assert browser.complaints() == []
+
+
+@needs_browser
+def test_only_the_nearest_pane_is_laid_if_asked(tmp_path: Path) -> None:
+    scene, renderer = in_single_precision(vitrine(1, 2)), Planar(nearest_only=True)
+    write_page(tmp_path / "index.html", scene, renderer, CAMERAS, "nearest")
+    with Browser(tmp_path / "index.html", 320, 240) as browser:
+        for _, camera in CAMERAS[:2]:
+            assert likeness(browser, scene, renderer, camera) > 45
+            for layer in ("strength", "reflection"):
+                assert likeness(browser, scene, renderer, camera, layer) > 45
+        assert browser.complaints() == []
 
 
 def shining(mirrored: str) -> tuple[Scene, Renderer]:

@@ -96,6 +96,8 @@ def test_bad_input_is_named() -> None:
         equirect_from_environment(smooth(), 0)
     with pytest.raises(ValueError, match=r"shape \(4, 4, 3\); expected \(H, 2 H, 3\)"):
         environment_from_equirect(torch.zeros(4, 4, 3), 4)
+    with pytest.raises(ValueError, match=r"shape \(\); expected"):
+        environment_from_equirect(torch.tensor(0.5), 4)
     with pytest.raises(ValueError, match="not finite"):
         environment_from_equirect(torch.full((4, 8, 3), torch.nan), 4)
     with pytest.raises(ValueError, match="size is 0"):

@@ -101,6 +101,14 @@ def test_things_of_intensity_one_are_mirrored_as_they_are(background: tuple[floa
     torch.testing.assert_close(with_intensity, without, atol=1e-5, rtol=1e-5)
 
 
+def test_what_panes_need_of_gaussians_is_named_where_it_is_missing() -> None:
+    scene = showcase()
+    for part, channel in (("primary", "log_intensity"), ("glass", "logit_mark")):
+        lacking = scene.with_gaussians(part, replace(scene.gaussian_sets()[part], channels={}))
+        with pytest.raises(ValueError, match=rf"the channels \[\]; expected {channel}"):
+            Planar()(lacking, CAMERA)
+
+
 def test_moving_everything_together_changes_nothing() -> None:
     scene = showcase()
     turn = rotation_from_quat(torch.tensor([0.8, 0.3, -0.4, 0.2], dtype=torch.float64))

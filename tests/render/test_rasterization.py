@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -172,6 +174,21 @@ def test_opaque_and_flat_gaussians_are_drawn() -> None:
 
 def test_what_reaches_no_farther_than_the_clip_is_left_out() -> None:
     assert not bool(plain(radius_clip=1e4)[1].any())
+
+
+@pytest.mark.parametrize("eps2d", [0.0, 0.3, 10.0])
+def test_radii_are_of_what_is_drawn(eps2d: float) -> None:
+    """The second Gaussian lies 9 pixels to the left of the image."""
+    only = {"quats": torch.tensor([[1.0, 0, 0, 0]] * 2), "scales": torch.full((2, 3), 0.05)}
+    only |= {"means": torch.tensor([[0.0, 0, 4], [-4.0, 0, 4]]), "opacities": torch.full((2,), 0.5)}
+    _, alpha, meta = plain(**only, colors=torch.ones(2, 3), eps2d=eps2d)
+    variances = (0.05 * torch.tensor([30.0, 33.0]) / 4).square() + eps2d
+    reach = (2 * math.log(0.5 * 255) * variances).sqrt()
+    radii = reach.ceil().int().tolist()
+    assert meta["radii"][0].tolist() == [radii, radii if reach[0] > 9 else [0, 0]]
+    columns = (alpha[0, 13, 10:, 0] >= 1 / 255).sum()
+    assert int(columns) == pytest.approx(2 * float(reach[0]), abs=1)
+    assert bool(plain(**only, colors=torch.ones(2, 3), eps2d=eps2d, radius_clip=5.0)[1].any()) == (reach[0] > 5)
 
 
 @pytest.mark.parametrize(

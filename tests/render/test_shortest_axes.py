@@ -8,11 +8,13 @@ from dataclasses import replace
 import pytest
 import torch
 
+from glassplat.render.deferred import Deferred
 from glassplat.render.frame import Renderer
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat, with_normals
 from glassplat.scene.camera import rotation_from_quat
 from glassplat.scene.scene import Scene
+from tests.render.test_deferred import glossy
 from tests.render.tiny_scene import camera_at, pane, random_gaussians
 
 TURN = torch.tensor([0.9, 0.2, -0.3, 0.1], dtype=torch.float64)
@@ -59,12 +61,25 @@ def test_a_frame_has_normals_only_where_they_are_asked_for(renderer: Renderer) -
     assert math.isclose(float(middle @ -rotation_from_quat(TURN)[:, 2]), float(middle.norm()), rel_tol=1e-6)
 
 
-def test_discs_keep_their_own_normals() -> None:
+@pytest.mark.parametrize("renderer", [Splat(), Splat(normal=False)])
+def test_discs_keep_their_own_normals(renderer: Splat) -> None:
     scene = wall(1.0)
     flat = replace(scene, primary=scene.primary.with_tensors({"log_scales": scene.primary.log_scales[:, :2].clone()}))
     camera = camera_at(0, 0, 0)
     expected = Splat()(flat, camera).layers["normal"]
-    assert torch.equal(Splat().with_layers(["normal"])(flat, camera).layers["normal"], expected)
+    assert torch.equal(renderer.with_layers(["normal"])(flat, camera).layers["normal"], expected)
+
+
+@pytest.mark.parametrize(
+    ("renderer", "scene"),
+    [(Splat(depth=False), wall(1.0)), (Deferred(depth=False), glossy(0.5))],
+    ids=["splat", "deferred"],
+)
+def test_a_renderer_without_depths_has_them_where_they_are_asked_for(renderer: Renderer, scene: Scene) -> None:
+    camera = camera_at(0, 0, 0)
+    expected = replace(renderer, depth=True)(scene, camera).layers["depth"]
+    assert "depth" not in renderer.with_layers(["rgb"])(scene, camera).layers
+    assert torch.equal(renderer.with_layers(["depth"])(scene, camera).layers["depth"], expected)
 
 
 def test_what_the_renderer_needs_is_still_looked_for() -> None:

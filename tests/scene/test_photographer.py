@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from glassplat.scene.camera import Camera
-from glassplat.scene.corrections import upward, world_from_photographer
+from glassplat.scene.corrections import DEFAULT_UP, upward, world_from_photographer
 from tests.render.tiny_scene import camera_at
 
 UP = (0.36, 0.48, -0.8)
@@ -42,6 +43,17 @@ def test_cameras_that_are_tilted_down_tell_where_up_is() -> None:
 
 def test_cameras_that_look_one_way_are_taken_to_stand_upright() -> None:
     assert angle_deg(upward([turned(10, 0), turned(10, 0)]), UP) < 1e-3
+
+
+@pytest.mark.parametrize("wobble_deg", [0, 4])
+def test_cameras_that_look_straight_down_look_away_from_up(wobble_deg: float) -> None:
+    cameras = [turned(yaw, -90 + wobble_deg * (yaw % 4 - 1), wobble_deg) for yaw in range(0, 360, 90)]
+    assert angle_deg(upward(cameras), UP) < max(wobble_deg, 0.1)
+    assert math.hypot(*upward(cameras)) == pytest.approx(1)
+
+
+def test_cameras_that_contradict_each_other_tell_the_usual_direction() -> None:
+    assert upward([turned(0, 0), turned(0, 180)]) == DEFAULT_UP
 
 
 @pytest.mark.parametrize("pitch_deg", [0.0, -35.0, 50.0, -89.9])

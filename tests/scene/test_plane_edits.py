@@ -18,6 +18,7 @@ from glassplat.scene.scene import (
     move_pane,
     shift_pane,
     tilt_pane,
+    with_pane,
     with_reflectance,
     without_glass,
 )
@@ -74,6 +75,24 @@ def test_the_reflectance_is_what_was_asked_for(reflectance: float) -> None:
     edited = with_reflectance(two_panes(), 7, reflectance)
     assert edited.planes.base_reflectances.tolist() == pytest.approx([0.3, reflectance], abs=1e-12)
     assert bool(torch.isfinite(edited.planes.logit_reflectances).all())
+
+
+def test_a_mirror_that_is_given_a_lower_reflectance_is_none_any_more() -> None:
+    mirrors = as_mirrors(two_panes(), [1, 7])
+    edited = with_reflectance(mirrors, 7, 0.25)
+    logits = edited.planes.logit_reflectances.clone().requires_grad_()
+    edited.planes.with_tensors({"logit_reflectances": logits}).base_reflectances.sum().backward()
+    assert edited.planes.mirrors == (1,)
+    assert logits.grad is not None and float(logits.grad[1]) == pytest.approx(0.25 * 0.75)
+    assert with_reflectance(mirrors, 7, 1.0).planes.mirrors == (1, 7)
+
+
+@pytest.mark.parametrize("label", [2, 3])
+def test_another_pane_has_the_precision_of_the_scene(label: int) -> None:
+    before = showcase() if label == 2 else without_glass(showcase())
+    scene = with_pane(before, Planes.rectangle((0, 0, 1), (0, 0, -1), (0.5, 0.5), label=label))
+    assert {tensor.dtype for tensor in scene.tensors().values()} == {torch.float64}
+    assert float(Planar()(scene, CAMERA).layers["mask"].max()) > 0.9
 
 
 def test_no_motion_changes_no_bit() -> None:

@@ -49,6 +49,15 @@ def test_a_flat_wall_has_its_normal_everywhere(normal: tuple[float, float, float
     assert float(cosines.min()) > math.cos(math.radians(1.0))
 
 
+@pytest.mark.parametrize(("width", "height"), [(640, 16), (16, 640), (3, 1)])
+def test_narrow_images_have_cells_too(width: int, height: int) -> None:
+    camera = Camera(torch.eye(4), 100.0, 100.0, width / 2, height / 2, width, height)
+    depth = torch.full((height, width), 3.0)
+    normals, trusted = depth_normals(depth, torch.ones_like(depth), camera)
+    assert bool(trusted.any()) == (min(width, height) > 1)
+    torch.testing.assert_close(normals[trusted > 0], torch.tensor([0.0, 0, -1]).expand(int(trusted.sum()), 3))
+
+
 def test_edges_and_holes_are_not_trusted() -> None:
     camera = oblique_camera()
     depth = torch.full((camera.height, camera.width), 3.0)

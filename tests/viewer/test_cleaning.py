@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 
-from glassplat.model.model import shown_of
+from glassplat.model.model import viewer_state
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
 from glassplat.viewer.controls import box_of
-from glassplat.viewer.drawing import Wish, edit_scene, point_along
+from glassplat.viewer.drawing import ViewRequest, edit_scene, point_along
 from glassplat.viewer.server import Client, Viewer
 from tests.model.test_model import model
 from tests.publish.test_cleaning import wall
@@ -30,24 +30,26 @@ def wall_scene() -> Scene:
     return Scene(gaussians, 1.0)
 
 
-def test_a_wish_takes_out_what_is_not_kept() -> None:
+def test_a_request_takes_out_what_is_not_kept() -> None:
     scene = model().scene
     kept = torch.arange(len(scene.primary)) % 2 == 0
-    wish = Wish(POSE, 1.0, 1.0, kept=kept)
-    assert torch.equal(edit_scene(scene, wish).primary.means, scene.primary.means[kept])
-    assert edit_scene(scene, replace(wish, kept=kept[:-1])).primary is scene.primary, "the scene is another one by now"
+    request = ViewRequest(POSE, 1.0, 1.0, kept=kept)
+    assert torch.equal(edit_scene(scene, request).primary.means, scene.primary.means[kept])
+    assert edit_scene(scene, replace(request, kept=kept[:-1])).primary is scene.primary, (
+        "the scene is another one by now"
+    )
 
 
 def test_a_point_lies_where_the_wall_is_and_nowhere_beside_it() -> None:
-    splat = shown_of(replace(model(), scene=wall_scene()), {}).renderer
-    wish = Wish(POSE, 1.0, 1.0)
+    splat = viewer_state(replace(model(), scene=wall_scene()), {}).renderer
+    request = ViewRequest(POSE, 1.0, 1.0)
     for aside in (0.0, 0.2, -0.25):
         direction = np.array([aside, 0.0, 1.0]) / np.hypot(aside, 1.0)
-        found = point_along(wall_scene(), splat, wish, direction)
+        found = point_along(wall_scene(), splat, request, direction)
         np.testing.assert_allclose(found, [3 * aside, 0.0, 3.0], atol=0.05)
     for away in ([0.45, 0.0, 0.89], [0.0, 0.0, -1.0], [0.9, 0.0, 0.43]):
         with pytest.raises(ValueError, match=r"nothing is there|behind"):
-            point_along(wall_scene(), splat, wish, np.array(away))
+            point_along(wall_scene(), splat, request, np.array(away))
 
 
 def test_a_box_is_six_numbers() -> None:
@@ -65,7 +67,7 @@ async def stand(client: ViewerClient, inner: Client, place: tuple[float, float, 
     """Moves the camera, and waits until the server knows."""
     await client.look(position=place, look_at=(place[0], place[1], place[2] + 1))
     center = -torch.tensor(place)
-    await until(lambda: (wish := inner.wish()) is not None and torch.equal(wish.cam_from_world[:3, 3], center))
+    await until(lambda: (request := inner.request()) is not None and torch.equal(request.cam_from_world[:3, 3], center))
 
 
 async def begin_to_measure(client: ViewerClient, inner: Client) -> None:
@@ -85,7 +87,7 @@ async def click(client: ViewerClient, aside: float) -> None:
 
 
 def test_a_click_is_seen_from_where_the_camera_was() -> None:
-    viewer = Viewer(shown_of(replace(model(), scene=wall_scene()), {}), "127.0.0.1", free_port())
+    viewer = Viewer(viewer_state(replace(model(), scene=wall_scene()), {}), "127.0.0.1", free_port())
 
     async def work() -> None:
         async with ViewerClient(viewer.address) as client:
@@ -108,7 +110,7 @@ def test_a_click_is_seen_from_where_the_camera_was() -> None:
 
 
 def test_two_clicks_are_measured_and_floaters_go_and_come_back() -> None:
-    viewer = Viewer(shown_of(replace(model(), scene=wall_scene()), {}), "127.0.0.1", free_port())
+    viewer = Viewer(viewer_state(replace(model(), scene=wall_scene()), {}), "127.0.0.1", free_port())
     viewer.start()
 
     async def work() -> None:
@@ -125,9 +127,9 @@ def test_two_clicks_are_measured_and_floaters_go_and_come_back() -> None:
             assert "--scale" in inner._measure._told.content
             await client.set("Box", "-2 -2 0 0 2 4")
             await client.set("Take floaters out", True)
-            await until(lambda: inner.wish().kept is not None and int(inner.wish().kept.sum()) == 288)
+            await until(lambda: inner.request().kept is not None and int(inner.request().kept.sum()) == 288)
             await client.set("Take floaters out", False)
-            await until(lambda: inner.wish().kept is None)
+            await until(lambda: inner.request().kept is None)
 
     try:
         asyncio.run(work())

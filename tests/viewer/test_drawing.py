@@ -12,40 +12,40 @@ from scipy.spatial.transform import Rotation
 from glassplat.render.deferred import Deferred
 from glassplat.render.planar import Planar
 from glassplat.scene.scene import Environment, Scene, as_mirrors, move_pane, with_reflectance, without_glass
-from glassplat.viewer.drawing import PaneMove, Viewpoints, Wish, draw_picture, edit_scene, error_drawn
+from glassplat.viewer.drawing import PaneMove, Viewpoints, ViewRequest, draw_picture, edit_scene, error_drawn
 from glassplat.viewer.server import cam_from_world
 from tests.training.tiny_capture import tiny_capture, true_scene
 
 POSE = tiny_capture().train[1].camera.cam_from_world
-WISH = Wish(POSE, fov_rad=0.9, aspect=1.4)
+REQUEST = ViewRequest(POSE, fov_rad=0.9, aspect=1.4)
 EDITS = {
-    "as it is": (WISH, true_scene()),
-    "mirror": (replace(WISH, glass="mirror"), as_mirrors(true_scene(), [1])),
-    "none": (replace(WISH, glass="none"), without_glass(true_scene())),
+    "as it is": (REQUEST, true_scene()),
+    "mirror": (replace(REQUEST, glass="mirror"), as_mirrors(true_scene(), [1])),
+    "none": (replace(REQUEST, glass="none"), without_glass(true_scene())),
     "moved": (
-        replace(WISH, moves=(PaneMove(1, (1.0, 0.0, 0.1, 0.0), (0.0, 0.2, 0.0)),)),
+        replace(REQUEST, moves=(PaneMove(1, (1.0, 0.0, 0.1, 0.0), (0.0, 0.2, 0.0)),)),
         move_pane(true_scene(), 1, (1.0, 0.0, 0.1, 0.0), (0.0, 0.2, 0.0)),
     ),
-    "reflectance": (replace(WISH, reflectances=((1, 0.9),)), with_reflectance(true_scene(), 1, 0.9)),
+    "reflectance": (replace(REQUEST, reflectances=((1, 0.9),)), with_reflectance(true_scene(), 1, 0.9)),
 }
 
 
-@pytest.mark.parametrize(("wish", "scene"), EDITS.values(), ids=EDITS)
-def test_a_wish_is_the_render_of_the_edited_scene(wish: Wish, scene: object) -> None:
-    picture = draw_picture(true_scene(), Planar(), wish, 40)
+@pytest.mark.parametrize(("asked", "scene"), EDITS.values(), ids=EDITS)
+def test_a_request_is_the_render_of_the_edited_scene(asked: ViewRequest, scene: object) -> None:
+    picture = draw_picture(true_scene(), Planar(), asked, 40)
     with torch.no_grad():
-        truth = Planar()(scene, wish.camera(40)).rgb
+        truth = Planar()(scene, asked.camera(40)).rgb
     assert picture.shape == (40, 56, 3)
     assert torch.equal(torch.from_numpy(picture), torch.round(truth.clamp(0, 1) * 255).to(torch.uint8))
 
 
 @pytest.mark.parametrize("layer", ["transmission", "reflection", "strength", "depth", "mask", "no such layer"])
 def test_every_layer_is_a_picture(layer: str) -> None:
-    assert draw_picture(true_scene(), Planar(), replace(WISH, layer=layer), 24).shape == (24, 34, 3)
+    assert draw_picture(true_scene(), Planar(), replace(REQUEST, layer=layer), 24).shape == (24, 34, 3)
 
 
 def test_what_is_not_wished_for_keeps_every_bit() -> None:
-    for name, tensor in edit_scene(true_scene(), WISH).parameters().items():
+    for name, tensor in edit_scene(true_scene(), REQUEST).parameters().items():
         assert torch.equal(tensor, true_scene().parameters()[name]), name
 
 
@@ -56,21 +56,21 @@ def test_a_layer_that_is_drawn_on_request_is_drawn() -> None:
         true_scene().extent,
         environment=Environment.random(8, generator=torch.Generator().manual_seed(2)),
     )
-    surroundings = draw_picture(scene, Deferred(), replace(WISH, layer="environment"), 24)
+    surroundings = draw_picture(scene, Deferred(), replace(REQUEST, layer="environment"), 24)
     with torch.no_grad():
-        truth = Deferred(environment=True)(scene, WISH.camera(24)).layers["environment"]
+        truth = Deferred(environment=True)(scene, REQUEST.camera(24)).layers["environment"]
     assert np.abs(surroundings / 255 - truth.clamp(0, 1).numpy()).max() < 0.003
 
 
 def test_the_error_is_none_where_the_photograph_is_the_render_and_follows_edits() -> None:
     view = tiny_capture().train[1]
-    wide = replace(WISH, aspect=3.0)
+    wide = replace(REQUEST, aspect=3.0)
     same = error_drawn(true_scene(), Planar(), wide, 4000, view.camera, view.photo)
     assert same.shape == (28, 84, 3)
     assert same[..., 0].max() <= 5 and not same[:, :22].any() and not same[:, 62:].any()
     elsewhere = error_drawn(true_scene(), Planar(), replace(wide, glass="mirror"), 28, view.camera, view.photo)
     assert elsewhere[:, 22:62, 0].max() > 100
-    assert error_drawn(true_scene(), Planar(), replace(WISH, aspect=0.5), 20, view.camera, view.photo).shape == (
+    assert error_drawn(true_scene(), Planar(), replace(REQUEST, aspect=0.5), 20, view.camera, view.photo).shape == (
         20,
         10,
         3,
@@ -87,7 +87,7 @@ def test_the_nearest_photograph_is_near_in_place_and_direction() -> None:
 
 
 def test_gain_brightens_what_is_mirrored() -> None:
-    brighter = edit_scene(true_scene(), replace(WISH, gain=2.0)).primary.channels["log_intensity"]
+    brighter = edit_scene(true_scene(), replace(REQUEST, gain=2.0)).primary.channels["log_intensity"]
     torch.testing.assert_close(brighter.exp(), 2 * true_scene().primary.channels["log_intensity"].exp())
 
 

@@ -14,7 +14,7 @@ import torch
 
 import glassplat
 from glassplat.files.sidecars import read_cameras
-from glassplat.model.watching import KeptBeside, shown_of
+from glassplat.model.watching import FolderWriter, viewer_state
 from glassplat.scene.camera import Camera
 from glassplat.viewer.controls import HANDLE_SHARE, PaneControls
 from glassplat.viewer.server import Client, Viewer
@@ -38,8 +38,8 @@ PHOTOGRAPHS = {view.name: (lambda view=view: view.photo) for view in tiny_captur
 @contextmanager
 def watched(folder: Path) -> Iterator[tuple[Viewer, Client, Browser]]:
     """A viewer of the tiny scene with one browser, which writes into a folder."""
-    shown = shown_of(model(), PHOTOGRAPHS, KeptBeside(model(), folder))
-    viewer = Viewer(shown, "127.0.0.1", free_port())
+    state = viewer_state(model(), PHOTOGRAPHS, FolderWriter(model(), folder))
+    viewer = Viewer(state, "127.0.0.1", free_port())
     viewer.start()
     try:
         with Browser(viewer.address, *WINDOW) as browser:
@@ -100,7 +100,7 @@ def test_a_person_moves_a_pane_sets_keyframes_and_saves_both(tmp_path: Path) -> 
         click(browser, "Save as a run")
         eventually(lambda: says(browser, "already there and not empty"))
         click(browser, "Put panes back")
-        eventually(lambda: not client.wish().moves)
+        eventually(lambda: not client.request().moves)
         stood = keyframes_are_set_and_played(client, browser)
         error_is_shown(viewer, client, browser)
     saved = glassplat.load(tmp_path / "tiny-edited", device="cpu").scene
@@ -127,10 +127,10 @@ def pane_is_dragged(client: Client, browser: Browser) -> torch.Tensor:
         time.sleep(0.5)  # The gizmo is drawn after the camera has moved.
         browser.drag([on_screen(client, center + arrow * length * side) for length in (0.85, 1.3)])
         time.sleep(0.5)
-        return bool(client.wish().moves)
+        return bool(client.request().moves)
 
     eventually(is_dragged)
-    ((label, turn, step),) = client.wish().moves
+    ((label, turn, step),) = client.request().moves
     assert (label, turn) == (1, (1.0, 0.0, 0.0, 0.0))
     found = torch.tensor(step, dtype=torch.float32)
     assert float(found @ side) > 0.2 * arrow
@@ -164,7 +164,7 @@ def error_is_shown(viewer: Viewer, client: Client, browser: Browser) -> None:
     viewer.loop._show = lambda to, picture, is_sharp: (pictures.append(picture), show(to, picture, is_sharp))
     client._layer.value = "error"
     # Where the browser stood before, it may tell once more before it obeys.
-    eventually(lambda: client.wish().against == 3)
+    eventually(lambda: client.request().against == 3)
     eventually(lambda: bool(pictures) and pictures[-1][..., 0].max() <= 5)
     client._panes._glass.value = "mirror"
     eventually(lambda: pictures[-1][..., 0].max() > 100)

@@ -24,13 +24,13 @@ from glassplat.viewer import gate
 from glassplat.viewer.gate import LARGEST_MESSAGE, MESSAGES, understood
 from glassplat.viewer.server import MOST_PIXELS, Viewer
 from tests.viewer.free_port import free_port
-from tests.viewer.test_server import SHOWN
+from tests.viewer.test_server import STATE
 from tools.viewer_client import ViewerClient, page
 
 
 @pytest.fixture(scope="module")
 def viewer() -> Iterator[Viewer]:
-    made = Viewer(SHOWN, "127.0.0.1", free_port())
+    made = Viewer(STATE, "127.0.0.1", free_port())
     made.start()
     yield made
     made.stop()
@@ -116,7 +116,7 @@ def test_every_file_of_the_page_is_served(viewer: Viewer) -> None:
 
 
 def test_others_may_look_by_any_name_where_the_host_says_so() -> None:
-    viewer = Viewer(SHOWN, "0.0.0.0", free_port())
+    viewer = Viewer(STATE, "0.0.0.0", free_port())
     viewer.start()
     try:
         address = f"http://localhost:{viewer.port}/?key={viewer.access.key}"
@@ -236,15 +236,15 @@ def test_a_photograph_that_is_gone_ends_nobody_s_drawing(capfd: pytest.CaptureFi
             raise FileNotFoundError("no such photograph")
         return torch.zeros(28, 28, 3, dtype=torch.uint8)
 
-    photographs = dict.fromkeys(SHOWN.photographs, photograph)
-    shown = replace(SHOWN, photographs=photographs, layers=("rgb", "error"))
-    viewer = Viewer(shown, "127.0.0.1", free_port())
+    photographs = dict.fromkeys(STATE.photographs, photograph)
+    state = replace(STATE, photographs=photographs, layers=("rgb", "error"))
+    viewer = Viewer(state, "127.0.0.1", free_port())
     viewer.start()
 
     async def work(client: ViewerClient) -> None:
         nonlocal gone
         gone = True
-        await client.set("Stand at", shown.cameras[2][0])
+        await client.set("Stand at", state.cameras[2][0])
         await client.picture()
         await client.set("Layer", "error")
         async with asyncio.timeout(60):
@@ -275,5 +275,5 @@ def test_a_viser_that_cannot_be_guarded_is_not_served(monkeypatch: pytest.Monkey
     serve = gate.websockets_server.serve
     monkeypatch.setattr(gate.viser, "ViserServer", Elsewhere)
     with pytest.raises(InputError, match="cannot guard"):
-        Viewer(SHOWN, "127.0.0.1", free_port())
+        Viewer(STATE, "127.0.0.1", free_port())
     assert stopped and gate.websockets_server.serve is serve

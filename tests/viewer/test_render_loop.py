@@ -39,17 +39,17 @@ class Recorder:
         self.loop: RenderLoop[int] = RenderLoop(self.draw, self.show)
         self.thread = RenderThread(self.loop)
 
-    def draw(self, wish: int, rows: int) -> Picture:
+    def draw(self, view: int, rows: int) -> Picture:
         self._at_once += 1
         self.most_at_once = max(self.most_at_once, self._at_once)
-        self.drawn.append((wish, rows))
+        self.drawn.append((view, rows))
         self.let.wait()
-        if wish < 0:
+        if view < 0:
             self._at_once -= 1
             raise ValueError("cannot be drawn")
         time.sleep(0.01 * rows / SIZE[1])
         self._at_once -= 1
-        return np.full((rows, round(rows * SIZE[0] / SIZE[1]), 3), wish, dtype=np.uint8)
+        return np.full((rows, round(rows * SIZE[0] / SIZE[1]), 3), view, dtype=np.uint8)
 
     def show(self, client: int, picture: Picture, is_sharp: bool) -> None:
         self.shown.append((client, int(picture[0, 0, 0]), is_sharp))
@@ -103,12 +103,12 @@ def test_pictures_of_the_past_are_not_shown() -> None:
     recorder = Recorder(held=True)
     recorder.loop.ask(1, 1, SIZE)
     wait_until(lambda: len(recorder.drawn) == 1)
-    for wish in (2, 3, 4):
-        recorder.loop.ask(1, wish, SIZE)
+    for view in (2, 3, 4):
+        recorder.loop.ask(1, view, SIZE)
     recorder.let.set()
     wait_until(lambda: (1, 4, True) in recorder.shown)
     recorder.thread.stop()
-    assert {wish for _, wish, _ in recorder.shown} == {4}
+    assert {view for _, view, _ in recorder.shown} == {4}
 
 
 def test_clients_take_turns_and_one_picture_is_drawn_at_a_time() -> None:
@@ -159,7 +159,7 @@ class Clock:
         self.loop: RenderLoop[int] = RenderLoop(self.draw, lambda *shown: None)
         self.share = DrawingShare(self.loop, lambda: self.now)
 
-    def draw(self, wish: int, rows: int) -> Picture:
+    def draw(self, view: int, rows: int) -> Picture:
         seconds = 1e-6 * rows * rows * SIZE[0] / SIZE[1]
         self.now, self.drawing = self.now + seconds, self.drawing + seconds
         return np.zeros((rows, round(rows * SIZE[0] / SIZE[1]), 3), dtype=np.uint8)

@@ -6,12 +6,14 @@ import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from urllib.parse import urlsplit
 
 import pytest
 
 from glassplat.cli.main import main
 from glassplat.render.planar import Planar
-from glassplat.viewer.drawing import Shown
+from glassplat.viewer.drawing import ViewerState
 from glassplat.viewer.server import WAITING, Viewer
 from tests.browser_needed import needs_browser
 from tests.cli.tiny_run import write_run
@@ -20,7 +22,7 @@ from tests.viewer.free_port import free_port
 from tools.browser import Browser
 
 VIEWS = tiny_capture().train
-SHOWN = Shown(
+STATE = ViewerState(
     "tiny",
     true_scene(),
     Planar(),
@@ -38,9 +40,20 @@ def eventually(happens: Callable[[], bool], seconds: float = 120) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.parametrize(
+    ("host", "shown"),
+    [("2001:db8::5", "[2001:db8::5]"), ("192.0.2.1", "192.0.2.1"), ("gpu.lan", "gpu.lan"), ("::1", "localhost")],
+)
+def test_the_address_is_one_that_browsers_understand(host: str, shown: str) -> None:
+    viewer = SimpleNamespace(host=host, port=8080, access=SimpleNamespace(key="k"))
+    address = Viewer.address.fget(viewer)
+    assert address == f"http://{shown}:8080/?key=k"
+    assert urlsplit(address).port == 8080 and urlsplit(address).hostname == shown.strip("[]")
+
+
 @needs_browser
 def test_a_browser_is_shown_sharp_pictures_and_may_leave() -> None:
-    viewer = Viewer(SHOWN, "127.0.0.1", free_port())
+    viewer = Viewer(STATE, "127.0.0.1", free_port())
     viewer.start()
     shown: list[bool] = []
     show = viewer._show
@@ -55,8 +68,8 @@ def test_a_browser_is_shown_sharp_pictures_and_may_leave() -> None:
             client._panes._glass.value = "mirror"
             eventually(lambda: any(shown))
             eventually(lambda: "Layer" in browser.evaluate("document.body.innerText"))
-            client.keep_scene("mine")
-            client.keep_keyframes("mine")
+            client.save_scene("mine")
+            client.save_keyframes("mine")
             assert "Edited scene" not in browser.evaluate("document.body.innerText")  # Nobody said where to.
         eventually(lambda: not viewer._clients)
     finally:
@@ -74,7 +87,7 @@ def test_a_port_in_use_gets_a_message(tmp_path: Path, capsys: pytest.CaptureFixt
 
 @needs_browser
 def test_who_waits_for_the_first_picture_is_told_so() -> None:
-    viewer = Viewer(SHOWN, "127.0.0.1", free_port())  # Nobody draws before it starts.
+    viewer = Viewer(STATE, "127.0.0.1", free_port())  # Nobody draws before it starts.
     try:
         with Browser(viewer.address, 400, 300) as browser:
             eventually(lambda: WAITING[1] in browser.evaluate("document.body.innerText"))
@@ -86,7 +99,7 @@ def test_who_waits_for_the_first_picture_is_told_so() -> None:
 def test_names_in_the_line_above_the_controls_are_text() -> None:
     # viser runs what stands in braces of its Markdown; a failed save tells a path there.
     status = "not saved: {globalThis.ran = 1} <b>name</b> *a* _b_ `c` [d](e) \\f"
-    viewer = Viewer(SHOWN, "127.0.0.1", free_port(), buttons={"Pause": lambda: None})
+    viewer = Viewer(STATE, "127.0.0.1", free_port(), buttons={"Pause": lambda: None})
     viewer.start()
     try:
         with Browser(viewer.address, 400, 300) as browser:

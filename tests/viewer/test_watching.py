@@ -92,7 +92,7 @@ def test_a_training_is_drawn_paused_and_saved_while_it_goes_on(tmp_path: Path) -
         (viewer,) = found.viewers
         drawn: list[int] = []
         draw = viewer.loop._draw
-        viewer.loop._draw = lambda wish, rows: (drawn.append(found.training.step), draw(wish, rows))[1]
+        viewer.loop._draw = lambda request, rows: (drawn.append(found.training.step), draw(request, rows))[1]
         before = found.training.step
         eventually(lambda: found.training.step > before + 20)
         assert not drawn

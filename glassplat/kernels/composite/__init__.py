@@ -97,8 +97,8 @@ def composite(
             arXiv 2404.10484, Eq. 8). Pixels that disagree cancel there and show here.
 
     Raises:
-        TypeError: tensors are not all float32 or all float64.
-        ValueError: shapes disagree, glass has no marks, or tensors are on different devices.
+        TypeError: tensors are not all float32 or all float64, or on different devices.
+        ValueError: shapes disagree, or glass has no marks.
     """
     cameras, count = splats.opacities.shape
     check_bins(channels, bins, cameras, count, "these very splats")
@@ -204,8 +204,8 @@ def composite_discs(
             pixels added up without their signs.
 
     Raises:
-        TypeError: tensors are not all float32 or all float64.
-        ValueError: shapes disagree, a number is out of range, or tensors are on different devices.
+        TypeError: tensors are not all float32 or all float64, or on different devices.
+        ValueError: shapes disagree, or a number is out of range.
     """
     _check(discs, channels, bins, absgrad)
     if not near >= 0 or not low_pass >= 0:

@@ -113,14 +113,14 @@ UP, VP, E, AROUND, G, G_Z, ABSGRAD, MOMENTS = 0, 3, 6, 9, 11, 12, 13, 15
 
 
 @cache
-def composite_discs_pulls(real: type, num_channels: int = 6) -> Kernel:
+def composite_discs_cotangents(real: type, num_channels: int = 6) -> Kernel:
     """Gathers, tile by tile, the gradients of each pixel [A, D + 8, 256]: one plane per channel, then those
     that the constants name. What the pixel gathered in all holds each part times its gradient.
     """
     zero, one, two = real(0.0), real(1.0), real(2.0)
 
     @kernel(
-        f"composite_discs_pulls_{num_channels}",
+        f"composite_discs_cotangents_{num_channels}",
         real,
         "int1 real3 real4 real3 real4 real3 real3 real3 real3 real3",
     )
@@ -351,7 +351,7 @@ def composite_discs_gradients(
     real, (cameras, count, num_channels) = REAL_OF[channels.dtype], channels.shape
     tiles, size = len(bins.active), cameras * count
     v_pixels = channels.new_empty(tiles, num_channels + EXTRAS, PIXELS)
-    composite_discs_pulls(real, num_channels)(
+    composite_discs_cotangents(real, num_channels)(
         tiles, PIXELS, bins.active, saved.finals, *saved.outputs, *v_outputs, v_pixels
     )  # fmt: skip
     rows = channels.new_zeros(len(bins.pair_splats), MOMENTS + num_channels)
