@@ -160,7 +160,11 @@ def test_greys_of_a_colour_profile_stay_grey(tmp_path: Path, mode: str) -> None:
     np.testing.assert_allclose(read_colors(tmp_path / "a.png")[..., :3], expected, atol=1)
 
 
-@pytest.mark.parametrize("profile", [None, srgb_profile(), b"", b"no profile", p3_profile()[:300], srgb_profile()[:90]])
+@pytest.mark.parametrize(
+    "profile",
+    [None, srgb_profile(), b"", b"no profile", p3_profile()[:300], srgb_profile()[:90]],
+    ids=["none", "sRGB", "empty", "noise", "P3 cut off", "sRGB cut off"],
+)
 @pytest.mark.parametrize("mode", ["RGB", "CMYK"])
 def test_without_another_profile_colours_stay_as_they_are(tmp_path: Path, profile: bytes | None, mode: str) -> None:
     pixels = GENERATOR.integers(0, 256, (40, 30, 3), dtype=np.uint8)
