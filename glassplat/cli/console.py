@@ -7,6 +7,7 @@ as a picture, and break it at 80 columns where the output goes to a file; a cont
 from __future__ import annotations
 
 import ctypes
+import difflib
 import errno
 import gc
 import importlib
@@ -24,7 +25,7 @@ import threading
 import time
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from shlex import quote
 from types import FrameType
@@ -392,6 +393,47 @@ def check_arguments(arguments: Sequence[str]) -> None:
         if argument == "" or (option.startswith("--") and is_joined and not value):
             name = option or before
             raise InputError(f"what follows {name} is empty, as of a shell variable that is not set; expected a value")
+
+
+def similar(word: str, known: Iterable[str]) -> list[str]:
+    """The known word that a mistyped one resembles most; none where it resembles none."""
+    return difflib.get_close_matches(word, list(known), n=1, cutoff=0.7)
+
+
+def no_such(what: str, word: str, known: Iterable[str], command: str) -> str:
+    """The message about a word that is no command or method: the one meant perhaps, all of them, and their help."""
+    meant = similar(word, known)
+    guess = f"did you mean {meant[0]}? There are" if meant else "expected one of"
+    return f"there is no {what} {word!r}; {guess} {', '.join(known)}: see {command}"
+
+
+NUMBERS = {"INT": "whole number", "FLOAT": "number"}
+"""Of tyro's signs for what an option takes, those that it explains in Python's words."""
+NOT_A_NUMBER = re.compile(
+    r"Error parsing (--[\w./-]+):.*Argument helptext:[ \n]+--[\w., -]+? ((?:INT|FLOAT|None|[|{} ])+)"
+)
+
+
+def wrong_number(said: str, arguments: Sequence[str]) -> str | None:
+    """In place of tyro's message about an option that takes numbers, what it takes and what came; None for others."""
+    plain = " ".join(re.sub(r"\x1b\[[0-9;]*m|[│─╭╮╰╯]", "", said).split())
+    if (found := NOT_A_NUMBER.search(plain)) is None:
+        return None
+    names = found[1].split("/")
+    place = max((at for at, word in enumerate(arguments) if word.partition("=")[0] in names), default=-1)
+    option, _, value = arguments[place].partition("=") if place >= 0 else (names[0], "", "")
+    came = (
+        [value] if value else list(itertools.takewhile(lambda word: not word.startswith("--"), arguments[place + 1 :]))
+    )
+    expected = " or ".join(numbers_in_words(signs.strip("{} ")) for signs in found[2].split("|"))
+    return f"{option}: expected {expected}, not {' '.join(came)!r}"
+
+
+def numbers_in_words(signs: str) -> str:
+    """An option's values in words, as in "3 numbers" for "FLOAT FLOAT FLOAT"."""
+    kinds = signs.split()
+    word = NUMBERS.get(kinds[0])
+    return signs if word is None else f"a {word}" if len(kinds) == 1 else count_noun(len(kinds), word)
 
 
 LINE = "loading PyTorch ..."

@@ -8,13 +8,15 @@ imported when the command has understood its options and refused what can be ref
 from __future__ import annotations
 
 import importlib
+import re
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext, redirect_stderr, redirect_stdout, suppress
 from dataclasses import field, make_dataclass
+from io import StringIO
 from typing import Annotated, Any, NamedTuple, Union
 
-from glassplat.errors import RankLostError
+from glassplat.errors import InputError, RankLostError
 
 FAILURE_CODE, USAGE_CODE, INTERRUPTED_CODE, UNREAD_CODE = 1, 2, 130, 141
 """The last two as shells report a process that Ctrl-C or a closed pipe ended."""
@@ -163,32 +165,102 @@ def parse_arguments(arguments: list[str]) -> Any:
     """
     import tyro
 
-    from glassplat.cli.console import check_arguments, message_console, say, versions
+    from glassplat.cli.console import check_arguments, no_such, versions
     from glassplat.options import check_options
 
     if arguments[:1] == ["--version"]:
         print(versions())
         raise SystemExit(0)
-    config = (tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes)
     name = arguments[0] if arguments else ""
     if name in COMMANDS:
         check_arguments(arguments)
-        kind, options = command_line(name, arguments[1:])
-        try:
-            command = tyro.cli(kind, prog=f"glassplat {name}", args=options, config=config)
-        except SystemExit as end:
-            if end.code and name == "train":
-                from glassplat.cli.train import help_of_method
-
-                say(message_console(stderr=True), help_of_method(options))
-            raise
+        command = parse_options(name, arguments[1:])
         check_options(command)
         return command
+    if name and not name.startswith("-"):
+        raise InputError(no_such("command", name, COMMANDS, "glassplat --help"))
     # Nothing is left to run after the list of commands; only a shell's completions need to know every option.
     complete = name.startswith("--tyro-")
     kinds = {known: command_line(known, [])[0] if complete else stub(known) for known in COMMANDS}
-    tyro.cli(overview(kinds), prog="glassplat", description=DESCRIPTION, args=arguments, config=config)
+    tyro.cli(overview(kinds), prog="glassplat", description=DESCRIPTION, args=arguments, config=settings())
     raise SystemExit(USAGE_CODE)
+
+
+def settings() -> tuple[Any, ...]:
+    """Settings for tyro that every command line shares."""
+    import tyro
+
+    return tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes
+
+
+def parse_options(name: str, arguments: list[str]) -> Any:
+    """The command of this name that the arguments describe.
+
+    Raises:
+        InputError: there is no such option or method, or a number is none.
+        SystemExit: they ask for help, something is missing, or a choice is none.
+    """
+    import tyro
+
+    from glassplat.cli.console import message_console, say, wrong_number
+
+    kind, options = command_line(name, arguments)
+    said = StringIO()
+    try:
+        with redirect_stderr(said):
+            command, unknown = tyro.cli(
+                kind, prog=f"glassplat {name}", args=options, config=settings(), return_unknown_args=True
+            )
+    except SystemExit as end:
+        if wrong := wrong_number(said.getvalue(), options):
+            raise InputError(f"{wrong}; {pointer(name, options)}") from None
+        sys.stderr.write(said.getvalue())
+        if end.code and name == "train":
+            say(message_console(stderr=True), pointer(name, options))
+        raise
+    if unknown:
+        raise InputError(unknown_option(name, options, unknown))
+    return command
+
+
+def pointer(name: str, options: list[str]) -> str:
+    """Pointer to the list of all options of a command, or of the method that its options name."""
+    if name == "train":
+        from glassplat.cli.train import help_of_method
+
+        return help_of_method(options)
+    return f"all options: glassplat {name} --help"
+
+
+def unknown_option(name: str, options: list[str], unknown: list[str]) -> str:
+    """The message about arguments that a command does not take: what is meant perhaps, and who takes them."""
+    from glassplat.cli.console import similar
+
+    option, command, methods = unknown[0].partition("=")[0], f"glassplat {name}", []
+    if not option.startswith("-"):
+        return f"{command} takes no further argument {option!r}; {pointer(name, options)}"
+    chosen = []
+    if name == "train":
+        from glassplat.cli.train import RECIPES, asked_method
+
+        chosen = [method for method in [asked_method(options)] if method]
+        methods = [method for method in RECIPES if [method] != chosen and option in listed_options(name, [method])]
+    known = listed_options(name, chosen)
+    meant = similar(option, known) or [other for other in known if option.strip("-") in other][:3]
+    guess = f"; did you mean {' or '.join(meant)}?" if meant else ""
+    elsewhere = f"; it is an option of {' and '.join(methods)}" if methods else ""
+    return f"{' '.join([command, *chosen])} has no option {option}{elsewhere or guess}; {pointer(name, options)}"
+
+
+def listed_options(name: str, words: list[str]) -> list[str]:
+    """The options in the full help of a command after some words."""
+    import tyro
+
+    kind, arguments = command_line(name, [*words, "--help-advanced" if name == "train" else "--help"])
+    shown = StringIO()
+    with redirect_stdout(shown), suppress(SystemExit):
+        tyro.cli(kind, prog=f"glassplat {name}", args=arguments, config=settings())
+    return re.findall(r"(?<![\w`-])--[a-z0-9.-]+", re.sub(r"\x1b\[[0-9;]*m", "", shown.getvalue()))
 
 
 def command_line(name: str, options: list[str]) -> tuple[Any, list[str]]:

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from glassplat.captures.files import CaptureFiles, read_capture
 from glassplat.captures.masks import Polarity
-from glassplat.cli.console import import_now, message_console, say
+from glassplat.cli.console import import_now, message_console, no_such, say
 from glassplat.cli.places import check_targets
 from glassplat.errors import InputError, input_checked
 from glassplat.files.records import read_text
@@ -130,8 +130,11 @@ def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:
         for help, with the options that help should show; and the arguments for it.
 
     Raises:
-        InputError: the file is no recipe, or another method's.
+        InputError: there is no such method; the file is no recipe, or another method's.
     """
+    first = arguments[0] if arguments else "-"
+    if first not in RECIPES and not first.startswith("-"):
+        raise InputError(no_such("method", first, RECIPES, "glassplat train --help"))
     full = FULL_HELP in arguments
     recipes = [recipe_of(method, asked_preset(arguments)) for method in RECIPES]
     if (config := last_value(arguments, "--config")) is not None:

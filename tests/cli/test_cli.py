@@ -120,10 +120,8 @@ def test_planar_without_masks_says_what_to_annotate(tmp_path: Path, capsys: pyte
 
 
 def test_an_unknown_option_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stopped:
-        main(["train", "splat", "--data", str(SCENE), "--output", "y", "--no-such-option"])
-    assert stopped.value.code == 2
-    assert "no-such-option" in capsys.readouterr().err
+    assert main(["train", "splat", "--data", str(SCENE), "--output", "y", "--no-such-option"]) == 2
+    assert "has no option --no-such-option" in capsys.readouterr().err
 
 
 def test_a_strategy_that_there_is_not_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

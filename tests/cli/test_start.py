@@ -242,7 +242,7 @@ def test_options_that_cannot_be_understood_end_with_code_2(
     arguments: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as stopped:
-        main(arguments)
+        raise SystemExit(main(arguments))
     assert stopped.value.code == 2
     said = capsys.readouterr().err
     assert f"glassplat {arguments[0]}" in said and "Traceback" not in said

@@ -158,10 +158,37 @@ def test_help_speaks_of_options_and_not_of_what_lies_behind_them(
     assert not re.search("train_options|find_region|`plane_fit|`per_pixel", shown)
 
 
-def test_the_help_of_the_method_is_named_beside_an_unknown_option(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        ("train traced --data x --output y --iteratons 5", ["did you mean --iterations?", "train traced --help-adv"]),
+        ("train planar --data x --output y --iteration 5", ["did you mean --iterations?", "train planar --help-adv"]),
+        ("train planar --data x --output y --means 5", ["did you mean --rates.means?"]),
+        ("train splat --data x --output y --tint", ["--tint; it is an option of planar;"]),
+        ("train planer --data x --output y", ["no method 'planer'; did you mean planar?", "glassplat train --help"]),
+        ("train planar more --data x --output y", ["glassplat train takes no further argument 'more'"]),
+        ("tarin planar --data x --output y", ["no command 'tarin'; did you mean train?"]),
+        ("tidy x", ["no command 'tidy'; expected one of prepare, annotate, train"]),
+        ("render x --output y --lyers z", ["glassplat render has no option --lyers; did you mean --layers?"]),
+        ("train planar --data x --output y --iterations abc", ["--iterations: expected a whole number, not 'abc';"]),
+        ("train planar --data x --output y --memory=a --view", ["--memory: expected None or a number, not 'a';"]),
+        ("train splat --data x --output y --background 0 a", ["--background: expected None or 3 numbers, not '0 a'"]),
+        ("train splat --data x --output y --rates.means ''", ["--rates.means: expected a number, not"]),
+    ],
+)
+@pytest.mark.parametrize("width", ["50", "200"])
+def test_a_mistyped_word_is_answered_with_what_exists(
+    arguments: str, parts: list[str], width: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", width)
+    message = refused(arguments.split(), capsys)
+    assert message.startswith("error: ") and all(part in message for part in parts)
+
+
+def test_the_help_of_the_method_is_named_next_to_what_is_missing(capsys: pytest.CaptureFixture[str]) -> None:
     for method in ("planar", "traced"):
         with pytest.raises(SystemExit):
-            main(["train", method, "--data", "x", "--output", "y", "--iteratons", "5"])
+            main(["train", method, "--data", "x", "--outptu", "y"])
         assert capsys.readouterr().err.endswith(f"glassplat train {method} --help-advanced\n")
 
 
@@ -169,9 +196,8 @@ def test_the_help_of_the_method_is_named_beside_an_unknown_option(capsys: pytest
     "option", [["--intervals.opacity", "0.1"], ["--densify.split-by", "absgrad"], ["--blend", "srgb"]]
 )
 def test_what_a_preset_decides_is_no_option(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stopped:
-        main(["train", "planar", "--data", str(SCENE), "--output", "y", *option])
-    assert stopped.value.code == 2 and option[0] in capsys.readouterr().err
+    message = refused(["train", "planar", "--data", str(SCENE), "--output", "y", *option], capsys)
+    assert f"no option {option[0]}" in message
 
 
 def settings(text: str) -> set[str]:
