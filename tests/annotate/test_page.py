@@ -239,9 +239,15 @@ def test_the_page_asks_for_nothing_from_elsewhere(page: Page) -> None:
 
 
 def test_done_ends_the_command(page: Page) -> None:
+    for view in range(3):
+        page.mark_true(view)
     page.window.press("#close")
     page.window.wait("document.body.dataset.state === 'closed'", "the end")
     assert page.server.is_finished
+    page.window.evaluate("new Promise((next) => setTimeout(next, 300))")
+    assert page.window.complaints() == []
+    text = "const text = document.createRange(); text.selectNodeContents(document.body.firstElementChild);"
+    assert page.window.run(f"{text} return text.getBoundingClientRect().height") < 30  # One line.
 
 
 def test_what_another_tab_marks_is_kept_beside_what_is_marked_here(page: Page) -> None:

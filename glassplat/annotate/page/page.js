@@ -365,6 +365,8 @@ async function settled() {
   if (document.body.dataset.state === "failed") throw new Error(element("status").textContent);
 }
 
+const resized = new ResizeObserver(() => { drawing.fit(); draw(); });
+
 async function close() {
   try {
     await settled();
@@ -373,7 +375,8 @@ async function close() {
     tell(error.message, true);
     return;
   }
-  document.body.replaceChildren(make("main", { textContent: "Saved. The command has ended; this page can be closed." }));
+  resized.disconnect();
+  document.body.replaceChildren(make("p", { textContent: "Saved. The command has ended; this page can be closed." }));
   document.body.dataset.state = "closed";
 }
 
@@ -388,7 +391,7 @@ function listen() {
   window.addEventListener("keydown", keyed);
   window.addEventListener("keyup", (event) => { if (event.key === " ") spaceHeld = false; });
   window.addEventListener("beforeunload", (event) => { if (["changed", "failed"].includes(document.body.dataset.state)) event.preventDefault(); });
-  new ResizeObserver(() => { drawing.fit(); draw(); }).observe(canvas);
+  resized.observe(canvas);
   document.querySelectorAll("[data-tool]").forEach((button) => button.addEventListener("click", () => choose(button.dataset.tool)));
   for (const [id, act] of [["undo", () => marking.undo()], ["redo", () => marking.redo()], ["add", KEYS.a], ["write", write], ["close", close]]) {
     element(id).addEventListener("click", (event) => { act(); event.currentTarget.blur(); });
