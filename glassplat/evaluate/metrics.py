@@ -9,6 +9,7 @@ which 3DGS-DR blends the reflection: there the two trade off exactly.
 
 from __future__ import annotations
 
+import importlib.metadata
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -433,8 +434,24 @@ def load_lpips() -> Lpips | str:
     except ImportError:
         return "pip install 'glassplat[lpips]'"
     except (OSError, RuntimeError) as error:  # torchvision of another build, or weights that cannot be had.
-        return f"torchmetrics cannot load it: {error}"
+        return _other_build() or f"torchmetrics cannot load it: {error}"
     return Lpips(network)
+
+
+def _other_build() -> str | None:
+    """Reason and remedy where torchvision was built for another PyTorch; None where it can be imported."""
+    try:
+        importlib.import_module("torchvision")
+    except RuntimeError:
+        version, _, build = torch.__version__.partition("+")
+        index = f" --index-url https://download.pytorch.org/whl/{build}" if build else ""
+        return (
+            f"torchvision {importlib.metadata.version('torchvision')} is of another build than PyTorch "
+            f"{torch.__version__}: pip uninstall torchvision, then pip install torchvision torch=={version}{index}"
+        )
+    except ImportError:
+        return None
+    return None
 
 
 def _batch(image: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -68,4 +69,27 @@ def test_what_keeps_torchmetrics_from_loading_is_the_reason(error: Exception, mo
         raise error
 
     with_metric(monkeypatch, fail)
+    monkeypatch.setitem(sys.modules, "torchvision", ModuleType("torchvision"))
     assert load_lpips() == f"torchmetrics cannot load it: {error}"
+
+
+@pytest.mark.parametrize(
+    ("build", "index"), [("+cpu", " --index-url https://download.pytorch.org/whl/cpu"), ("", "")], ids=["cpu", "pypi"]
+)
+def test_a_torchvision_of_another_build_is_named_with_the_remedy(
+    build: str, index: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(**options: object) -> None:
+        raise RuntimeError("operator torchvision::nms does not exist")
+
+    (tmp_path / "torchvision.py").write_text("raise RuntimeError('operator torchvision::nms does not exist')")
+    (tmp_path / "torchvision-0.1.dist-info").mkdir()
+    (tmp_path / "torchvision-0.1.dist-info" / "METADATA").write_text("Name: torchvision\nVersion: 0.1\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "torchvision", raising=False)
+    monkeypatch.setattr(torch, "__version__", f"2.9.0{build}")
+    with_metric(monkeypatch, fail)
+    assert load_lpips() == (
+        f"torchvision 0.1 is of another build than PyTorch 2.9.0{build}: pip uninstall torchvision, "
+        f"then pip install torchvision torch==2.9.0{index}"
+    )
