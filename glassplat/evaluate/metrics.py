@@ -361,9 +361,9 @@ def _reflective_psnr(frame: Frame, photo: Tensor, truth: TrueSurface) -> Outcome
 
 
 def _normal_errors(frame: Frame, truth: TrueSurface) -> Tensor | str:
-    if "normal" not in frame.layers:
-        return NO_NORMALS
-    return NO_TRUE_NORMALS if truth.normals is None else angular_errors_deg(frame.layers["normal"], truth.normals)
+    if truth.normals is None:  # First: a method whose evaluation leaves normals out may well render them.
+        return NO_TRUE_NORMALS
+    return angular_errors_deg(frame.layers["normal"], truth.normals) if "normal" in frame.layers else NO_NORMALS
 
 
 def _strength_errors(frame: Frame, truth: TrueSurface) -> Tensor | str:

@@ -188,7 +188,7 @@ def test_surfaces_are_compared_with_what_lies_beside_the_photographs(tmp_path: P
 
 def test_without_true_surfaces_the_reason_is_said(case) -> None:
     results = evaluate(case.scene, case.renderer, case.dataset).results
-    assert results["normal_error_deg_reason"] == "the method renders no normals"
+    assert results["normal_error_deg_reason"] == "no true normals lie next to the photograph"
     assert results["strength_error_reason"] == "no true strength lies next to the photograph"
 
 

@@ -70,6 +70,7 @@ def test_what_is_missing_is_the_reason() -> None:
         "strength_error": "the method renders no strength",
     }
     unknown = "no true normals lie next to the photograph"
+    assert surface_metrics(frame(), PHOTO, None)["normal_error_deg"] == unknown
     assert surface_metrics(both, PHOTO, None) == {
         "reflective_psnr": NOT_BESIDE,
         "normal_error_deg": unknown,
