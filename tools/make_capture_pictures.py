@@ -112,6 +112,7 @@ def main() -> None:
     parser.add_argument("--busy", type=Path)
     parser.add_argument("--output", type=Path, default=Path("docs/images"))
     options = parser.parse_args()
+    options.output.mkdir(parents=True, exist_ok=True)
     if options.scene:
         draw(options.scene, options.output)
     if options.capture:
