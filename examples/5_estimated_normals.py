@@ -31,7 +31,13 @@ def main(
 ) -> None:
     dataset = glassplat.load_dataset(data)
     source = "local" if Path(repository).is_dir() else "github"
-    network = torch.hub.load(repository, model, source=source, pretrain=True).to(device).eval()
+    try:
+        network = torch.hub.load(repository, model, source=source, pretrain=True).to(device).eval()
+    except (OSError, RuntimeError) as error:
+        raise SystemExit(
+            f"error: torch.hub cannot load {model} of {repository}: {error}\nExpected access to github.com and to the "
+            "weights; or give a folder with a hubconf.py, fetched elsewhere, as --repository"
+        ) from None
     for number, view in enumerate(dataset.train, start=1):
         normals = estimated(network, view.photo.to(device), height, width).cpu().numpy()
         path = view.image_path.parent / "normals" / f"{view.image_path.stem}.png"

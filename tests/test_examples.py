@@ -116,6 +116,17 @@ def slope(pretrain):
 """
 
 
+def test_a_network_that_cannot_be_fetched_is_one_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*place: str, **options: object) -> None:
+        raise RuntimeError("It looks like there is no internet connection")
+
+    monkeypatch.setattr(torch.hub, "load", fail)
+    with pytest.raises(
+        SystemExit, match=r"cannot load metric3d_vit_small of yvanyin/metric3d.*no internet(.|\n)*--repo"
+    ):
+        said_by("5_estimated_normals.py", "--data", str(DEMO), folder=tmp_path)
+
+
 def test_estimated_normals_lie_where_they_are_read(tmp_path: Path) -> None:
     capture, hub = shutil.copytree(DEMO, tmp_path / "capture"), tmp_path / "hub"
     hub.mkdir()
