@@ -10,7 +10,7 @@ import torch
 from glassplat.captures.cameras import LEAST_SIDE
 from glassplat.captures.dataset import Dataset, dataset_of, load_dataset
 from glassplat.captures.files import CaptureFiles
-from glassplat.cli.console import shell_word
+from glassplat.cli.console import count_noun, shell_word
 from glassplat.cli.info import FEW_VIEWS, Finding, describe_broken
 from glassplat.errors import InputError, input_checked
 from glassplat.files.records import read_json
@@ -45,7 +45,9 @@ def remaining_parts(files: CaptureFiles) -> Iterator[Finding]:
     )
     finding.problems += dataset.warnings
     if len(dataset.train) + len(dataset.test) < FEW_VIEWS:
-        finding.problems.append(f"{len(dataset.train) + len(dataset.test)} photographs are few; 30 and more do better")
+        finding.problems.append(
+            f"only {count_noun(len(dataset.train) + len(dataset.test), 'photograph')}; 30 and more do better"
+        )
     if dataset.measured_points and len(dataset.points) < FEW_POINTS:
         finding.problems.append(f"{len(dataset.points)} points are few; more photographs with more overlap give more")
     yield finding

@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 
 from glassplat.captures.files import CaptureFiles, read_capture
-from glassplat.cli.console import import_held, say, shell_word, warn
+from glassplat.cli.console import count_noun, import_held, say, shell_word, warn
 from glassplat.errors import InputError, UnknownFormatError, first_names, input_checked
 from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
 from glassplat.files.records import Text, check_fields, read_json
@@ -122,7 +122,7 @@ def photographs_finding(path: Path) -> Iterator[Finding]:
     finding = Finding()
     sound = len(found) - describe_broken(found, finding, LEAST_SIDE)
     if sound < FEW_VIEWS:
-        finding.problems.append(f"{sound} photographs are few; 30 and more do better")
+        finding.problems.append(f"only {count_noun(sound, 'photograph')}; 30 and more do better")
     finding.next.append(f"glassplat prepare {shell_word(path)} --output CAPTURE    finds out where they were taken")
     yield finding
 

@@ -130,7 +130,7 @@ def test_small_photographs_of_a_capture_are_sound(tmp_path: Path, capsys: pytest
 def test_a_folder_of_few_photographs_is_said_to_be_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "few").mkdir()
     shutil.copy(SCENE / "images" / "0000.jpg", tmp_path / "few")
-    assert told(tmp_path / "few", capsys)["problems"] == ["1 photographs are few; 30 and more do better"]
+    assert told(tmp_path / "few", capsys)["problems"] == ["only 1 photograph; 30 and more do better"]
 
 
 def test_what_was_interrupted_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
