@@ -487,7 +487,7 @@ def _reduced_size(pinhole: Pinhole, downscale: float, name: str) -> tuple[int, i
     if downscale > 1 and min(width, height) < LEAST_SIDE:
         most = max(min(pinhole.width, pinhole.height) / LEAST_SIDE, 1)
         raise InputError(
-            f"{name} is {pinhole.width}x{pinhole.height} pixels large, and reduced by {downscale:g} {width}x{height}; "
+            f"{name} is {pinhole.width}x{pinhole.height} pixels large, and {width}x{height} reduced by {downscale:g}; "
             f"expected at least {LEAST_SIDE} pixels along each side: use --downscale {int(10 * most) / 10:g} or less"
         )
     return width, height

@@ -137,6 +137,12 @@ def test_unknown_format_says_what_was_looked_for_and_found(tmp_path: Path) -> No
         load_dataset(tmp_path)
 
 
+def test_a_photograph_that_would_be_reduced_to_nothing_is_refused(capture) -> None:
+    capture.write_colmap()
+    with pytest.raises(InputError, match=r" is 32x24 pixels large, and 1x1 reduced by 1000; expected at least"):
+        load_dataset(capture.root, downscale=1000.0)
+
+
 @pytest.mark.parametrize("downscale", [0.5, 0.0, -1.0, float("nan"), float("inf")])
 def test_downscale_out_of_range(capture, downscale: float) -> None:
     capture.write_colmap()
