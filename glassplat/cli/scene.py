@@ -117,7 +117,7 @@ class View:
 
     Attributes:
         scene: a run's directory, an exported folder, or a splat file (.ply, .spz, .glb, .splat, .sog, .ksplat).
-        port: where the browser finds it.
+        port: where the browser finds it; 0 takes any that is free.
         host: who may look with the link; 127.0.0.1 is this machine alone, 0.0.0.0 everybody who can reach it.
         output: folder for edited scenes and keyframes that are saved in the browser; the one that holds the scene if
             not given. Where others may look, too, nothing can be saved unless it is given.
@@ -127,7 +127,7 @@ class View:
     """
 
     scene: tyro.conf.Positional[Path]
-    port: Annotated[int, Range(1, 65535)] = 8080
+    port: Annotated[int, Range(0, 65535)] = 8080
     host: str = LOCAL
     output: Path | None = None
     file: Annotated[SplatFile, tyro.conf.arg(name="")] = field(default_factory=SplatFile)

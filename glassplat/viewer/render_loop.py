@@ -41,8 +41,11 @@ def vacant_port(host: str) -> int:
     raise InputError(f"no port from {FIRST_PORT} on can be used; end what serves there")
 
 
-def check_port(host: str, port: int) -> None:
+def check_port(host: str, port: int) -> int:
     """Refuses a port that is taken, or an address that is not this machine's, before anything is served.
+
+    Returns:
+        The port; one that is free in place of 0.
 
     Raises:
         InputError: nothing can listen there.
@@ -52,6 +55,7 @@ def check_port(host: str, port: int) -> None:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((host, port))
+            return int(probe.getsockname()[1])
         except OSError as error:
             if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
                 raise InputError(

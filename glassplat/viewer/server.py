@@ -250,13 +250,13 @@ class Viewer:
         Args:
             state: what there is to look at.
             host: who may look, with the key of the address; 127.0.0.1 is this machine alone.
-            port: where the browser finds it.
+            port: where the browser finds it; 0 takes any that is free.
             buttons: further ones by what is written on them, and what they do; called from other threads.
 
         Raises:
             InputError: viser is not installed or cannot be guarded, or the port cannot be used.
         """
-        check_port(host, port)
+        port = check_port(host, port)
         try:
             from glassplat.viewer.gate import guarded_server
         except ImportError as error:

@@ -98,7 +98,7 @@ REFUSED = {
     "view splats.ply --host none.invalid": "none.invalid is no address of this machine",
     "view splats.ply --host 192.0.2.1": "192.0.2.1 is no address of this machine",
     "view none.ply": "no file none.ply",
-    "view splats.ply --port 0": "port is 0",
+    "view splats.ply --port 65536": "port is 65536",
     "view splats.ply --output splats.ply": "splats.ply is a file",
     "video none --output film.webp": "there is nothing at none",
     "video begun --output film.avi": "film.avi is no name of a film",

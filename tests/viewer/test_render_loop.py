@@ -71,7 +71,8 @@ def test_a_port_of_any_address_of_this_machine_is_checked(host: str) -> None:
         with socket.socket(socket.AF_INET6) as probe:
             if probe.connect_ex(("::1", free_port())) == errno.EADDRNOTAVAIL:
                 pytest.skip("this machine has no IPv6")
-    check_port(host, free_port())
+    port = free_port()
+    assert check_port(host, port) == port and check_port(host, 0) > 0
     with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as taken:
         taken.bind((host, 0))
         taken.listen()

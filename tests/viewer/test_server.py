@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from glassplat.cli.main import main
+from glassplat.cli.main import main, parse_arguments
 from glassplat.render.planar import Planar
 from glassplat.viewer.drawing import ViewerState
 from glassplat.viewer.server import WAITING, Viewer
@@ -108,5 +108,16 @@ def test_names_in_the_line_above_the_controls_are_text() -> None:
             eventually(lambda: "not saved" in browser.evaluate("document.body.innerText"), 20)
             assert status in browser.evaluate("document.body.innerText")
             assert browser.evaluate("typeof globalThis.ran") == "undefined"
+    finally:
+        viewer.stop()
+
+
+def test_port_0_is_one_that_is_free_and_the_link_has_it() -> None:
+    assert parse_arguments(["view", "run", "--port", "0"]).port == 0
+    viewer = Viewer(STATE, "127.0.0.1", 0)
+    try:
+        assert viewer.port > 0 and f"http://localhost:{viewer.port}/" in viewer.address
+        with socket.create_connection(("127.0.0.1", viewer.port)):
+            pass
     finally:
         viewer.stop()
