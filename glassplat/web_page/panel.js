@@ -51,6 +51,10 @@ function makePanel(scene, navigation, changed) {
   function embed() {
     const code = document.querySelector('#embed textarea'), title = document.title.replace(/[&"<]/g, (c) => `&#${c.charCodeAt(0)};`);
     element('embed').toggleAttribute('hidden');
+    if (location.protocol === 'file:') {
+      code.value = 'This page lies on your disk, where others cannot see it: upload it to a web server, open it there, and press Embed again.';
+      return;
+    }
     code.value = `<iframe src="${location.href}" title="${title}" width="800" height="500" style="border: 0" allow="fullscreen"></iframe>`;
     code.select();
     navigator.clipboard?.writeText(code.value).catch(() => {});

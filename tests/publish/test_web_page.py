@@ -6,7 +6,10 @@ import math
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 
 import pytest
 import torch
@@ -381,12 +384,30 @@ def test_a_link_to_the_page_is_shown_with_a_picture_of_both_sides(url: str, tmp_
 
 
 @needs_browser
-def test_the_page_gives_the_frame_that_embeds_it(opened: Browser) -> None:
+def test_a_page_on_disk_has_to_be_uploaded_before_it_is_embedded(opened: Browser) -> None:
     opened.evaluate("document.querySelector('[data-do=embed]').click()")
-    code = opened.evaluate("document.querySelector('#embed textarea').value")
-    assert re.match(r'<iframe src="file:///[^"]*/index.html[^"]*" title="A &#60;tiny> scene &#38; more" ', code)
+    assert "upload it" in opened.evaluate("document.querySelector('#embed textarea').value")
     opened.keys("Escape")
     assert opened.evaluate("document.querySelector('#embed').hidden")
+
+
+class QuietHandler(SimpleHTTPRequestHandler):
+    """Serves files without saying so."""
+
+    def log_message(self, *words: object) -> None:
+        """Says nothing."""
+
+
+@needs_browser
+def test_on_the_web_the_page_gives_the_frame_that_embeds_it(opened: Browser, tmp_path: Path) -> None:
+    write_page(tmp_path / "index.html", true_scene(), Planar(), CAMERAS, "A <tiny> scene & more")
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(QuietHandler, directory=tmp_path)) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        with Browser(f"http://127.0.0.1:{server.server_address[1]}/index.html", 320, 240) as window:
+            window.evaluate("document.querySelector('[data-do=embed]').click()")
+            code = window.evaluate("document.querySelector('#embed textarea').value")
+        server.shutdown()
+    assert re.match(r'<iframe src="http://[^"]*/index.html[^"]*" title="A &#60;tiny> scene &#38; more" ', code)
 
 
 def test_names_cannot_end_the_script() -> None:
