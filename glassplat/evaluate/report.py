@@ -263,10 +263,7 @@ class Uses:
         row = [
             Panel(f"photograph {evaluated.view.name}", photo),
             Panel("without reflections (glassplat dereflect)", plain),
-            Panel(
-                "pane as a mirror (glassplat render --as-mirror)",
-                metrics.quantize(as_mirror_image(frame, self._blend)),
-            ),
+            Panel("pane as a mirror (glassplat render)", metrics.quantize(as_mirror_image(frame, self._blend))),
         ]
         self._rows = sorted([*self._rows, (share, row)], key=lambda kept: -kept[0])[:MOST_VIEWS]
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from glassplat.evaluate import report
 from glassplat.evaluate.evaluate import evaluate
 from glassplat.evaluate.metrics import (
     FACTS,
@@ -97,6 +98,15 @@ def test_the_uses_are_shown_of_the_views_with_the_largest_panes(case, tmp_path: 
     dereflected = uses[top : top + 32 * 6 : 6, beside : beside + 48 * 6 : 6]
     expected = dereflected_photo(case.renderer.frames[40.0], case.dataset.test[0].photo, "linear")
     np.testing.assert_array_equal(dereflected, expected.numpy())
+
+
+def test_captions_of_uses_have_no_dashes_that_the_font_joins(
+    case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    captions: list[str] = []
+    monkeypatch.setattr(report, "Panel", lambda caption, image: captions.append(caption) or Panel(caption, image))
+    written_report(case, tmp_path / "run")
+    assert "pane as a mirror (glassplat render)" in captions and not any("--" in caption for caption in captions)
 
 
 def test_without_a_pane_in_view_there_are_no_uses_to_show(case, tmp_path: Path) -> None:
