@@ -182,6 +182,8 @@ def write_clean(command: Clean, console: Console) -> None:
     tidy, found = model.clean(command.rules)
     summary = ", ".join(f"{count} {rule}" for rule, count in found.items() if count) or "no floaters"
     say(console, f"{len(tidy.scene.primary)} of {len(model.scene.primary)} Gaussians stay; found {summary}")
+    if found["outside"] > len(model.scene.primary) / 2:
+        warn(console, f"--box takes out {found['outside']} Gaussians, more than half; is it in the scene's own units?")
     if command.scale is not None:
         *points, metres = command.scale
         factor = metres / math.dist(points[:3], points[3:])

@@ -94,6 +94,20 @@ def test_units_change_no_picture() -> None:
         model.scale(0.0)
 
 
+@pytest.mark.parametrize(("kept", "warns"), [(0.2, True), (0.8, False)])
+def test_a_box_that_takes_out_most_of_the_scene_is_warned_of(
+    kept: float, warns: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = write_run(tmp_path / "run")
+    along = glassplat.load(run).scene.primary.means[:, 0]
+    box = ["-99", "-99", "-99", str(float(along.quantile(kept))), "99", "99"]
+    rules = ["--isolated", "0", "--oversized", "0", "--box", *box]
+    assert main(["clean", str(run), "--output", str(tmp_path / "clean"), *rules]) == 0
+    count = int((along > along.quantile(kept)).sum())
+    said = f"warning: --box takes out {count} Gaussians, more than half"
+    assert (said in " ".join(capsys.readouterr().out.split())) == warns
+
+
 def test_the_command_writes_another_scene_in_metres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run, output = write_run(tmp_path / "run"), tmp_path / "clean"
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
