@@ -38,7 +38,7 @@ class Train(Generic[RecipeKind]):
     """Train a scene from photographs.
 
     Attributes:
-        recipe: method and its options; `glassplat train planar --help` lists them.
+        recipe: method and its options; `glassplat train planar --help` lists those that most runs need.
         preset: what the options are unless they are given: the best that this project found, or those of the paper.
         data: directory of the capture: COLMAP or transforms.json, panes in panes/.
         output: directory of the run.
@@ -141,7 +141,8 @@ def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:
         given = read_recipe(Path(config), arguments)
         recipes = [given if recipe.method == given.method else recipe for recipe in recipes]
     if not full and any(help_option in arguments for help_option in HELP):
-        recipes = [in_brief(recipe) for recipe in recipes]
+        note = POINTER if asked_method(arguments) else ""  # Once, not with each method in their list.
+        recipes = [in_brief(recipe, note) for recipe in recipes]
     choices = [Annotated[type(r), tyro.conf.subcommand(r.method, default=r)] for r in recipes]
     any_recipe: Any = functools.reduce(operator.or_, choices)
     return Train[any_recipe], ["--help" if argument == FULL_HELP else argument for argument in arguments]
@@ -183,8 +184,8 @@ def last_value(arguments: Sequence[str], option: str) -> str | None:
     return found
 
 
-def in_brief(options: Any) -> Any:
-    """The same options as another type, of which help shows the essential ones only; it parses no others."""
+def in_brief(options: Any, note: str = "") -> Any:
+    """The same options as another type, of which help shows the essential ones only, and a note; parses no others."""
     kind, hints = type(options), typing.get_type_hints(type(options), include_extras=True)
     values = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
     fields: list[Any] = []
@@ -195,7 +196,8 @@ def in_brief(options: Any) -> Any:
         elif not is_essential(hints[name]):
             fields.append((name, Annotated[hints[name], tyro.conf.Suppress], dataclasses.field(default=value)))
     summary, _, rest = (kind.__doc__ or "").partition("\n\n")
-    namespace = {"__doc__": f"{summary}\n\n    {POINTER}\n\n{rest}", "__module__": kind.__module__}
+    manual = f"{summary}\n\n    {note}\n\n{rest}" if note else kind.__doc__
+    namespace = {"__doc__": manual, "__module__": kind.__module__}
     return dataclasses.make_dataclass(kind.__name__, fields, bases=(kind,), namespace=namespace, frozen=True)(**values)
 
 

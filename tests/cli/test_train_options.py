@@ -150,6 +150,12 @@ def test_help_shows_what_most_runs_need_and_says_how_to_see_the_rest(
     assert len(settings(brief)) <= 25 and len(settings(full)) <= 60
 
 
+def test_how_to_see_the_rest_is_said_once(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    assert help_of(["planar", "--help"], capsys, monkeypatch).count("These are the options") == 1
+    listed = help_of(["--help"], capsys, monkeypatch)
+    assert "These are the options" not in listed and "those that most runs need" in " ".join(listed.split())
+
+
 @pytest.mark.parametrize("method", list(RECIPES))
 def test_help_speaks_of_options_and_not_of_what_lies_behind_them(
     method: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
