@@ -275,7 +275,8 @@ def _bars(title: str, values: NDArray[Any], edges: Sequence[float]) -> str:
 def _bin(low: float, high: float) -> str:
     if high >= 1 << 30:
         return f"{low:g} and more"
-    return f"{low:g}" if isinstance(low, int) and high == low + 1 else f"{low:g} to {high:g}"
+    last = high - 1 if isinstance(low, int) else high
+    return f"{low:g}" if last == low else f"{low:g} to {last:g}"
 
 
 def _shown(views: Sequence[View], model: Any) -> list[Shown]:

@@ -17,7 +17,7 @@ from glassplat.cli.main import main
 from glassplat.cli.train import SCENE
 from glassplat.errors import InputError
 from glassplat.prepare.preparation import PAGE
-from glassplat.prepare.report_page import plan, write_page
+from glassplat.prepare.report_page import _bin, plan, write_page
 
 RECORD: dict[str, Any] = {
     "command": "prepare",
@@ -124,3 +124,7 @@ def _level(views: list) -> np.ndarray:
     up = -np.mean([view.camera.cam_from_world[1, :3].double().numpy() for view in views], axis=0)
     up /= np.linalg.norm(up)
     return np.eye(3) - np.outer(up, up)
+
+
+def test_bins_of_whole_numbers_do_not_overlap() -> None:
+    assert [_bin(2, 3), _bin(5, 7), _bin(15, 1 << 30), _bin(0.25, 0.5)] == ["2", "5 to 6", "15 and more", "0.25 to 0.5"]
