@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from glassplat.captures.colmap_library import quiet_pycolmap
-from glassplat.cli.console import import_now, say, shell_word, warn
+from glassplat.cli.console import import_now, say, shell_word
 from glassplat.cli.progress import WorkProgress
 from glassplat.files.writing import check_capture_folder
 from glassplat.options import Range, Share
@@ -69,7 +69,8 @@ class Prepare:
             report = prepare(self._task(), progress.show, resume=self.resume, force=self.force)
             self._has_finished.set()
         for line in report.lines():
-            (warn if line.startswith("advice") else say)(console, line)
+            label = "advice" if line.startswith("advice: ") else ""
+            say(console, line.removeprefix("advice: "), label=label, style="yellow")
         from glassplat.prepare.report_page import write_page  # PyTorch, which nothing before needs.
 
         write_page(self.output, self.output / PAGE)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from glassplat.cli.capture import Prepare
 from glassplat.prepare.photographs import Photograph
 from glassplat.prepare.preparation import report_of
 from glassplat.prepare.reconstruction import Solution
@@ -102,3 +105,11 @@ def test_what_is_poor_is_said(model: dict[str, float], features: int, expected: 
 def test_nothing_placed_is_reported_too() -> None:
     found = report([])
     assert found.registered == 0 and found.points == 0 and len(found.missing) == 10
+
+
+def test_advice_has_one_label(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found, file = report([FakeModel(range(10))], features=200), io.StringIO()
+    monkeypatch.setattr("glassplat.cli.capture.prepare", lambda *task, **options: found)
+    monkeypatch.setattr("glassplat.prepare.report_page.write_page", lambda *places: None)
+    Prepare(tmp_path, tmp_path / "capture").run(Console(file=file, width=200))
+    assert f"\nadvice: {found.advice[0]}\n" in file.getvalue()
