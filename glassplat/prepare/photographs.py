@@ -208,10 +208,11 @@ def _photograph_paths(folder: Path) -> list[Path]:
             f"({first_names(list(unreadable))}); save them as JPEG and remove these (a telephone does so by itself "
             "with 'most compatible' in the camera's settings). HEIC is read after pip install 'glassplat[heic]'"
         )
-    paths = [path for path in files if path.suffix.lower() in (*images.IMAGE_SUFFIXES, *images.HEIF_SUFFIXES)]
+    suffixes = (*images.IMAGE_SUFFIXES, *(images.HEIF_SUFFIXES if images.reads_heif() else ()))
+    paths = [path for path in files if path.suffix.lower() in suffixes]
     if not paths:
         found = first_names(sorted(path.name for path in files)) or "nothing"
-        raise InputError(f"no photograph in {folder}; expected {', '.join(images.IMAGE_SUFFIXES)} files, found {found}")
+        raise InputError(f"no photograph in {folder}; expected {', '.join(suffixes)} files, found {found}")
     return sorted(paths, key=lambda path: _numbers_as_such(path.relative_to(folder).as_posix()))
 
 

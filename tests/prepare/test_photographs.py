@@ -233,6 +233,16 @@ def test_what_cannot_be_used_is_named(
         photographs_in(folder, 1600, heard)
 
 
+@pytest.mark.parametrize("reads", [False, True])
+def test_heic_is_expected_where_it_can_be_read(
+    reads: bool, tmp_path: Path, heard: Heard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("glassplat.files.images.reads_heif", lambda: reads)
+    with pytest.raises(InputError) as refused:
+        photographs_in(tmp_path, 1600, heard)
+    assert (".tiff, .heic, .heif files" in str(refused.value)) == reads
+
+
 def test_photographs_of_a_telephone_are_read_upright_under_any_name(tmp_path: Path, heard: Heard) -> None:
     pytest.importorskip("pi_heif")
     folder = three(tmp_path / "in")
