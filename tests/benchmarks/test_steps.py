@@ -13,6 +13,7 @@ from glassplat.training.messages import ActionDone, Message, StepDone
 
 def test_every_number_of_threads_takes_its_turn() -> None:
     threads: list[int] = []
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
 
     def run() -> Iterator[Message]:
         for step in range(100):
