@@ -154,7 +154,7 @@ def test_a_set_grows_to_its_limit_and_no_further() -> None:
     state, capture = TrainState(SplatRecipe(sh_degree=1).initialise(tiny_capture()), seed=0), tiny_capture()
     count = len(state.scene.primary)
     ones = torch.ones(2, count)
-    state.statistics["primary"] = ScreenStatistics(ones, ones, ones, torch.full((count,), 0.01))
+    state.statistics["primary"] = ScreenStatistics(ones, ones, ones)
     share = (count + 2) / sum(view.camera.width * view.camera.height for view in capture.train)
     Densify(DefaultDensify(per_pixel=share)).apply(state, capture, Clock(10, 100, 5))
     assert len(state.scene.primary) == count + 2

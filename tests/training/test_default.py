@@ -102,7 +102,7 @@ def test_same_seed_same_bits() -> None:
 
 
 def test_stale_statistics_are_refused() -> None:
-    with pytest.raises(ValueError, match="3 rows for 2 Gaussians"):
+    with pytest.raises(ValueError, match="3 columns for 2 Gaussians"):
         edited(DefaultDensify(), make_gaussians([0.1, 0.1]), ScreenStatistics.zeros(3))
 
 

@@ -285,7 +285,7 @@ def test_a_rank_that_falls_silent_is_given_up_and_what_was_trained_is_saved(capt
         (["--sh-degree", "2"], "error: rank 1 has 2 as sh_degree, rank 0 has 3"),
         (["--data", "/nowhere"], "error: rank 1: "),
         (["--downscale", "0.5"], "error: rank 1: "),
-        (["--no-such-option"], "error: rank 1: the options of the command cannot be understood"),
+        (["--no-such-option"], "error: rank 1: glassplat train splat has no option --no-such-option"),
     ],
 )
 def test_ranks_that_disagree_end_with_one_message_of_rank_0(
