@@ -25,12 +25,14 @@ make_once() { # FOLDER TOOL [--OPTION...]
 glossy=(--samples 64 --points 10000 --environment-height 256)
 make_once far make_scenes --scenes ball torus control --train 60 --samples 64
 make_once near make_scenes --scenes table car sheet --size 128 --train 40 --test 8 "${glossy[@]}"
+make_once near-normals make_scenes --scenes table car sheet --size 128 --train 40 --test 8 "${glossy[@]}" --estimated-normals 10
 make_once drawn make_scenes --seed 1 2 3 4 5 21 22 23 24 25 --size 200 --train 60 --test 12 "${glossy[@]}"
 for seed in {245..254}; do
     make_once "rooms/$seed" make_pane_scene --drawn "$seed" --width 400 --noise 2
 done
 
 compare facade "$data/facade" --options "--downscale 2"
+compare facade-seed1 "$data/facade" --methods planar --seeds 1 --options "--downscale 2"
 compare screen "$data/screen"
 compare fox "$data/fox" --methods splat --options "--downscale 4"
 compare scenes "$data"/{showcase,corner,mirror,front}
@@ -44,3 +46,4 @@ compare parts "$data"/{showcase,corner} --iterations 3000 \
 compare far "$data"/far/{ball,torus,control} --methods splat deferred
 compare drawn "$data"/drawn/drawn-{1,2,3,4,5,21,22,23,24,25} --methods splat deferred
 compare near "$data"/near/{table,car,sheet} --methods splat deferred traced
+compare near-normals "$data"/near-normals/{table,car,sheet} --methods traced
