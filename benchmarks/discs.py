@@ -100,7 +100,7 @@ def disc_costs() -> Table:
     camera, gaussians = bench_camera(WIDTH, HEIGHT), room(COUNT)
     solid, flat = ellipsoids(gaussians, camera), discs(gaussians, camera)
     table = Table(
-        f"Discs beside ellipsoids, {COUNT // 1000}k Gaussians, {WIDTH}x{HEIGHT}",
+        f"Discs and ellipsoids, {COUNT // 1000}k Gaussians, {WIDTH}x{HEIGHT}",
         ("step", "ellipsoids, ms", "discs, ms", "ratio"),
         f"{solid.pairs:,} (tile, splat) pairs of ellipsoids with 4 channels, {flat.pairs:,} of discs with 6 and depths "
         "besides; processor time.",
