@@ -340,9 +340,9 @@ Rgb = tuple[float, float, float]
 """sRGB in [0, 1]."""
 WHITE: Rgb = (1.0, 1.0, 1.0)
 BLACK: Rgb = (0.0, 0.0, 0.0)
+"""Behind captures of places, which fill their photographs."""
 CLEAR_GLASS = 0.0817
 """R0 of a clear pane: 2 r / (1 + r) with r = ((n - 1) / (n + 1))^2 for each of its surfaces, n = 1.52."""
-"""Behind captures of places, which fill their photographs."""
 
 Blend = Literal["srgb", "linear"]
 """The space in which transmission and reflection are blended: as photographed, or in radiance."""

@@ -26,7 +26,7 @@ from glassplat.prepare.report_page import write_page
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
-from glassplat.training.checkpoint import recorded_step
+from glassplat.training.checkpoint import recorded
 
 FEW_POINTS, FEW_MASKS = 500, 3
 
@@ -154,7 +154,7 @@ def trained_part(directory: RunDirectory) -> Finding:
         scene, step = directory.latest_scene()
     except InputError as error:
         try:
-            reached = recorded_step(directory.checkpoint)
+            reached = recorded(directory.checkpoint).step
         except (FileNotFoundError, InputError):
             finding.problems.append(str(error))
             finding.next.append("the train command that began it, again")

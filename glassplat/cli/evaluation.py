@@ -32,7 +32,7 @@ from glassplat.methods.planar import fitted_planes
 from glassplat.model.run_directory import write_text
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.render.planar import Planar, with_photographer
-from glassplat.training.checkpoint import recorded_seconds
+from glassplat.training.checkpoint import recorded
 
 if TYPE_CHECKING:
     from glassplat.cli.scene import Align, PaneSource
@@ -147,7 +147,7 @@ def cameras_of_test_views(stored: StoredRun, aligned: bool) -> str:
 def train_seconds(stored: StoredRun) -> float | None:
     """Training time as the checkpoint recorded it; None where none is whole: the scene does not need it."""
     try:
-        return recorded_seconds(stored.directory.checkpoint)
+        return recorded(stored.directory.checkpoint).seconds
     except (FileNotFoundError, InputError):
         return None
 

@@ -124,7 +124,7 @@ def read_image_float(path: Path | str) -> NDArray[np.float32]:
     with checked_image(Path(path)) as image:
         if image.mode in SHADES_16:
             return _shades(image)[:, :, None]
-        return _pixels(image).astype(np.float32) / np.float32(255)
+        return _pixels(_in_eight_bits(image)).astype(np.float32) / np.float32(255)
 
 
 def write_image(path: Path | str, image: Tensor | NDArray[np.generic]) -> None:
@@ -213,15 +213,14 @@ def _to_srgb(profile: bytes) -> tuple[str, ImageCms.ImageCmsTransform] | None:
 
 def _in_eight_bits(image: Image.Image) -> Image.Image:
     """The image, of grey in sixteen bits its shades in eight."""
+    if image.mode in SHADES_16:
+        return Image.fromarray(np.round(_shades(image) * 255).astype(np.uint8))
     _check_shades(image)
-    if image.mode not in SHADES_16:
-        return image
-    return Image.fromarray(np.round(_shades(image) * 255).astype(np.uint8))
+    return image
 
 
 def _pixels(image: Image.Image) -> NDArray[np.uint8]:
-    """[H, W, C] in the eight-bit mode that keeps what the image shows."""
-    _check_shades(image)
+    """[H, W, C] of an image in eight bits, in the mode that keeps what it shows."""
     mode = "RGBA" if image.has_transparency_data else "L" if image.mode in ("1", "L") else "RGB"
     pixels = np.array(image if image.mode == mode else image.convert(mode))
     return pixels[:, :, None] if pixels.ndim == 2 else pixels

@@ -192,10 +192,11 @@ def _as_given(planes: Planes, fit: PlaneFit) -> Planes:
     """Given rectangles with the margin that fitted ones get, mirrors as mirrors, and R0 of clear glass as unknown."""
     is_clear = (planes.base_reflectances - CLEAR_GLASS).abs() < 1e-5
     begun = torch.full_like(planes.logit_reflectances, logit(fit.glass_reflectance))
-    planes = replace(planes, logit_reflectances=torch.where(is_clear, begun, planes.logit_reflectances))
+    logits = torch.where(is_clear, begun, planes.logit_reflectances)
     mirrors = tuple(dict.fromkeys((*planes.mirrors, *fit.mirror_labels)))
     log.info("from the capture's planes.json: %s", ", ".join(f"pane {label}" for label in planes.labels))
-    return with_mirrors(replace(planes, half_sizes=fit.margin * planes.half_sizes), mirrors, fit.mirror_reflectance)
+    found = replace(planes, logit_reflectances=logits, half_sizes=fit.margin * planes.half_sizes)
+    return with_mirrors(found, mirrors, fit.mirror_reflectance)
 
 
 def judged_panes(

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -112,26 +112,22 @@ def load_checkpoint(
     return state
 
 
-def recorded_seconds(path: Path) -> float:
-    """Training time up to a checkpoint; reads its header and no tensor, so it costs nothing.
+class Recorded(NamedTuple):
+    """Step of a checkpoint, and the training time up to it in seconds."""
+
+    step: int
+    seconds: float
+
+
+def recorded(path: Path) -> Recorded:
+    """Step and training time of a checkpoint; reads its header and no tensor, so it costs nothing.
 
     Raises:
         InputError: the file is truncated, or is no checkpoint of glassplat.
         FileNotFoundError: there is no such file.
     """
     with opened_checkpoint(path) as file:
-        return float(file.header["seconds"])
-
-
-def recorded_step(path: Path) -> int:
-    """The step of a checkpoint; reads its header and no tensor.
-
-    Raises:
-        InputError: the file is truncated, or is no checkpoint of glassplat.
-        FileNotFoundError: there is no such file.
-    """
-    with opened_checkpoint(path) as file:
-        return int(file.header["step"])
+        return Recorded(int(file.header["step"]), float(file.header["seconds"]))
 
 
 def check_belongs(

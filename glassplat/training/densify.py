@@ -336,7 +336,7 @@ class ScreenStatistics:
 
     def add(self, views: Views) -> None:
         """Adds the views of one training step, in place."""
-        add_views(Sums(*self.sums), views)
+        add_views(self.sums, views)
 
     @torch.no_grad()
     def add_in_space(self, means_gradient: Tensor, met: Tensor) -> None:
@@ -358,9 +358,9 @@ class ScreenStatistics:
         self.view_count.add_(norms > 0)
 
     @property
-    def sums(self) -> tuple[Tensor, Tensor, Tensor]:
-        """All of them."""
-        return self.gradient_sum, self.absgrad_sum, self.view_count
+    def sums(self) -> Sums:
+        """All of them, as the kernel takes them."""
+        return Sums(self.gradient_sum, self.absgrad_sum, self.view_count)
 
     def include(self, other: ScreenStatistics) -> None:
         """Adds what other views have shown of the same Gaussians, in place."""
