@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from glassplat.captures.view import FOLDER, View, in_world, with_ignored_right
-from glassplat.kernels.gradient_conflict import gradient_conflict as shared_edges
+from glassplat.kernels.panes import gradient_conflict as shared_edges
 from glassplat.kernels.panes import inside_panes
 from glassplat.kernels.photometric import photometric
 from glassplat.render.deferred import cell_means, cell_side, depth_normals
@@ -182,8 +182,8 @@ def reflection_left(frame: Frame, view: View, scene: Scene) -> Tensor:
     Counted pixel by pixel, three fifths of L_c are edges that only happen to meet. And where the true edge of something
     behind the glass is in the reflection too, L_c takes it out of the transmission; the reflection grows brighter to
     make up for it, and L_c grows along. So edges are added up in cells first, a cell with more of them than a pane
-    could have left counts for nothing (see `kernels.gradient_conflict`), and what is brighter than white counts as
-    white.
+    could have left counts for nothing (see `gradient_conflict` of `kernels.panes`), and what is brighter than white
+    counts as white.
     """
     layers = frame.layers
     inside = inside_panes(layers["pane"], layers["strength"])

@@ -23,7 +23,7 @@ from glassplat.kernels.panes import blend_panes
 from glassplat.kernels.composite import composite
 from glassplat.kernels.backend.cpu import Kernel
 from glassplat.kernels.environment import cube_lookup
-from glassplat.kernels.gradient_conflict import gradient_conflict
+from glassplat.kernels.panes import gradient_conflict
 from glassplat.kernels.panes import pane_hits
 from glassplat.kernels.records import Panes
 from glassplat.kernels.project import project

@@ -8,8 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.gradient_conflict import gradient_conflict, sobel
-from glassplat.kernels.gradient_conflict import gradient_conflict_in_torch as twin
+from glassplat.kernels.panes import gradient_conflict
+from glassplat.kernels.panes.reference import gradient_conflict as twin
+from glassplat.kernels.panes.reference import sobel
 from tests.kernels.threads import assert_threads_change_no_bit
 
 

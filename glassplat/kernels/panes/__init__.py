@@ -1,4 +1,4 @@
-"""Flat panes: where the camera sees them, and how they blend what is behind with what they reflect."""
+"""Flat panes: where the camera sees them, how they blend transmission and reflection, and edges that both share."""
 
 from __future__ import annotations
 
@@ -170,16 +170,8 @@ def inside_panes(pane: Tensor, strength: Tensor) -> Tensor:
     check_device("pane", pane, "strength", strength)
     if pane.dtype != torch.int32:
         raise TypeError(f"pane is {pane.dtype}; expected int32")
-    shown = torch.where(strength > 0, pane, -1)
-    inside = shown >= 0
-    along, above = shown[:, 1:] == shown[:, :-1], shown[1:] == shown[:-1]
-    inside[:, 1:] &= along
-    inside[:, :-1] &= along
-    # Two rows of which each pixel shows what those next to it and the one above it show.
-    pairs = (inside[1:] & inside[:-1]).logical_and_(above)
-    inside[1:] &= pairs
-    inside[:-1] &= pairs
-    return inside.to(strength.dtype)
+    inside: Tensor = kernels_for("panes", pane.device).inside_panes(pane.contiguous(), strength.detach().contiguous())
+    return inside
 
 
 @torch.no_grad()
@@ -249,3 +241,69 @@ def slopes_at(slopes: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> 
     pixels = (rows * width + columns).flatten()
     surface, slope = (image.flatten().index_select(0, pixels).view_as(depths) for image in (near, slopes))
     return torch.where(depths > surface, slope, 1.0)
+
+
+DARKEST = 0.05
+"""sRGB value from which on the slope of linear light is taken to grow as the value, as of a gamma of 2."""
+MOST_HELD = 2.0
+"""Times what a pane adds, up to which a transmission may hold the edges of a reflection."""
+
+
+def gradient_conflict(
+    transmission: Tensor, reflection: Tensor, hit: Tensor, strength: Tensor | None = None, *, cell: int = 1
+) -> Tensor:
+    """Edges that transmission and reflection share, per colour channel and inner pixel (after TR-Gaussians, Eq. 15).
+
+    In cells of a single pixel, and without a strength, that is Eq. 15: the mean of hit |grad C_t . grad C_r|. In larger
+    cells it is their |sum of hit grad C_t . grad C_r|, which is small where edges only happen to meet.
+    With a strength R, a cell counts by how much of the reflection the transmission seems to hold, in units of what a
+    pane of that strength adds: s, the sum of grad C_t . grad C_r over that of R |grad C_r|^2, in linear light. What is
+    left of a reflection has an s of 1, or of 2 where the reflection has found half of its contrast. From there to twice
+    as much, cells count less and less: that is an edge of the transmission itself.
+
+    Gradients are Sobel's; pixels on the image border are left out.
+    Differentiable in `transmission` only, for which what cells count is constant: an edge of the reflection should not
+    appear in the transmission, and the reflection is not to give way.
+
+    Args:
+        transmission: [H, W, 3] C_t, with H and W of at least 3.
+        reflection: [H, W, 3] C_r.
+        hit: [H, W] weight of each pixel, 1 where a pane is.
+        strength: [H, W] R, the share of the light that is reflected; None counts all cells alike.
+        cell: side of the cells, in pixels.
+
+    Raises:
+        ValueError: shapes disagree, an image is too small, or cells have no pixels.
+        TypeError: tensors of different or unsupported floating-point types, or on different devices.
+    """
+    height, width = hit.shape
+    if height < 3 or width < 3:
+        raise ValueError(f"the images are {width} x {height} pixels; expected at least 3 x 3 for Sobel derivatives")
+    if cell < 1:
+        raise ValueError(f"cell is {cell}; expected at least one pixel")
+    shape = (height, width, 3)
+    check_tensors(
+        {"transmission": (transmission, shape), "reflection": (reflection, shape), "hit": (hit, (height, width))}
+        | ({} if strength is None else {"strength": (strength, (height, width))})
+    )
+    mean: Tensor = _GradientConflict.apply(transmission, reflection, hit, strength, cell)
+    return mean
+
+
+class _GradientConflict(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, transmission: Tensor, reflection: Tensor, hit: Tensor, strength: Tensor | None, cell: int
+    ) -> Tensor:
+        images = [None if t is None else t.detach().contiguous() for t in (transmission, reflection, hit, strength)]
+        mean: Tensor
+        mean, slopes = kernels_for("panes", hit.device).gradient_conflict(*images, cell)
+        ctx.save_for_backward(slopes)
+        return mean
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_mean: Tensor) -> tuple[Tensor | None, ...]:
+        (slopes,) = ctx.saved_tensors
+        kernels = kernels_for("panes", slopes.device)
+        return kernels.gradient_conflict_gradient(slopes, v_mean), None, None, None, None

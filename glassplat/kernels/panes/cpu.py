@@ -1,4 +1,4 @@
-"""Panes on the CPU: which one each pixel shows, their blending, and how much of each layer is left.
+"""Panes on the CPU: which one each pixel shows, their blending, how much of each layer is left, edges that they share.
 
 Rays meet rectangles row by row: everything but one division is affine along a row. Blending takes runs of pixels of one
 row and one pane. A run is first copied into *planes* of one flat buffer, one plane per quantity, at offsets known to
@@ -33,6 +33,7 @@ from glassplat.kernels.backend.cpu_vector import (
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.images import color_space_maths
 from glassplat.kernels.maths.pane import mixing, pane_maths
+from glassplat.kernels.panes import DARKEST, MOST_HELD
 from glassplat.kernels.records import DAZZLING, REAL_OF, TILE, PaneHits
 
 
@@ -474,3 +475,152 @@ def layer_slopes_kernel(real: type) -> Kernel:
                 out_mirrored[x] = by_mirror_image if shown[x] else zero
 
     return slopes
+
+
+def inside_panes(pane: Tensor, strength: Tensor) -> Tensor:
+    """As `glassplat.kernels.panes.inside_panes`, of contiguous images."""
+    shown = torch.where(strength > 0, pane, -1)
+    inside = shown >= 0
+    along, above = shown[:, 1:] == shown[:, :-1], shown[1:] == shown[:-1]
+    inside[:, 1:] &= along
+    inside[:, :-1] &= along
+    # Two rows of which each pixel shows what those next to it and the one above it show.
+    pairs = (inside[1:] & inside[:-1]).logical_and_(above)
+    inside[1:] &= pairs
+    inside[:-1] &= pairs
+    return inside.to(strength.dtype)
+
+
+CHANNELS = 3
+
+
+def gradient_conflict(
+    transmission: Tensor, reflection: Tensor, hit: Tensor, strength: Tensor | None, cell: int
+) -> tuple[Tensor, Tensor]:
+    """The mean of the edges that are counted, and slopes for its gradient (`kernels.panes.gradient_conflict`).
+
+    Args:
+        transmission: [H, W, 3], as all of these contiguous.
+        reflection: [H, W, 3].
+        hit: [H, W].
+        strength: [H, W], or None.
+        cell: side of the cells in pixels.
+    """
+    height, width = hit.shape
+    # A ring of zeros around the derivatives spares the backward pass all questions about the border.
+    slopes = transmission.new_zeros(2, height + 2, CHANNELS * (width + 2))
+    sums = torch.zeros(-(-(height - 2) // cell), dtype=torch.float64)
+    images = (transmission, reflection, hit, hit if strength is None else strength)
+    forward = conflict_forward(REAL_OF[hit.dtype])
+    forward(*(t.numpy() for t in images), strength is not None, cell, slopes.numpy(), sums.numpy())
+    return (sums.sum() / conflict_count(height, width)).to(transmission.dtype), slopes
+
+
+def gradient_conflict_gradient(slopes: Tensor, v_mean: Tensor) -> Tensor:
+    """Gradient of the transmission [H, W, 3], given the slopes of `gradient_conflict` and the gradient of the mean."""
+    real, height, width = REAL_OF[slopes.dtype], slopes.shape[1] - 2, slopes.shape[2] // CHANNELS - 2
+    v_transmission = slopes.new_empty(height, width, CHANNELS)
+    factor = real(v_mean.item() / conflict_count(height, width))
+    conflict_backward(real)(slopes.numpy(), factor, v_transmission.numpy())
+    return v_transmission
+
+
+def conflict_count(height: int, width: int) -> int:
+    """How many derivatives along one axis an image has, of all channels; those on its border are left out."""
+    return CHANNELS * (height - 2) * (width - 2)
+
+
+@cache
+def conflict_forward(real: type) -> Kernel:
+    """Fills the sum of each row of cells, and slopes [2, H + 2, 3 (W + 2)], the derivatives by both of Sobel's images.
+
+    Columns are added up first, and then cells, so that the loops over pixels are of one piece.
+    """
+    zero, one, two, darkest, most = real(0.0), real(1.0), real(2.0), real(DARKEST), real(MOST_HELD)
+
+    @kernel("gradient_conflict_forward", real)
+    def forward(transmission, reflection, hit, strength, is_told, cell, slopes, sums):
+        height, width = hit.shape
+        floats = CHANNELS * width
+        t, r = transmission.reshape(height, floats), reflection.reshape(height, floats)
+        for block in prange(len(sums)):
+            top = 1 + block * cell
+            bottom = min(top + cell, height - 1)
+            shared: NDArray[Any] = np.zeros(floats, real)
+            held: NDArray[Any] = np.zeros(floats, real)
+            full: NDArray[Any] = np.zeros(floats, real)
+            weights: NDArray[Any] = np.empty(floats, real)
+            strengths: NDArray[Any] = np.empty(floats, real)
+            for row in range(top, bottom):
+                for x in range(width):
+                    for d in range(CHANNELS):
+                        weights[CHANNELS * x + d] = hit[row, x]
+                        strengths[CHANNELS * x + d] = strength[row, x]
+                t_up, t_here, t_down = t[row - 1], t[row], t[row + 1]
+                r_up, r_here, r_down = r[row - 1], r[row], r[row + 1]
+                out_x, out_y = slopes[0, row + 1], slopes[1, row + 1]
+                for j in range(floats - 2 * CHANNELS):
+                    k = j + 2 * CHANNELS
+                    m = j + CHANNELS
+                    t_x = t_up[k] - t_up[j] + two * (t_here[k] - t_here[j]) + t_down[k] - t_down[j]
+                    r_x = r_up[k] - r_up[j] + two * (r_here[k] - r_here[j]) + r_down[k] - r_down[j]
+                    t_y = t_down[j] - t_up[j] + two * (t_down[m] - t_up[m]) + t_down[k] - t_up[k]
+                    r_y = r_down[j] - r_up[j] + two * (r_down[m] - r_up[m]) + r_down[k] - r_up[k]
+                    weight = weights[m]
+                    product = weight * (t_x * r_x + t_y * r_y)
+                    shared[m] += product
+                    out_x[m + CHANNELS] = weight * r_x
+                    out_y[m + CHANNELS] = weight * r_y
+                    if is_told:
+                        light_t, light_r = min(max(t_here[m], darkest), one), min(max(r_here[m], darkest), one)
+                        held[m] += light_t * light_r * product
+                        full[m] += weight * strengths[m] * light_r * light_r * (r_x * r_x + r_y * r_y)
+            total = zero
+            factors = weights
+            for left in range(1, width - 1, cell):
+                right = min(left + cell, width - 1)
+                for d in range(CHANNELS):
+                    edges, holds, could = zero, zero, zero
+                    for x in range(left, right):
+                        edges += shared[CHANNELS * x + d]
+                        holds += held[CHANNELS * x + d]
+                        could += full[CHANNELS * x + d]
+                    counted = one
+                    if is_told and holds != zero:
+                        counted = min(max(two - abs(holds) / (most * could), zero), one)
+                    total += counted * abs(edges)
+                    factor = counted if edges > zero else -counted
+                    factor = factor if edges != zero else zero
+                    for x in range(left, right):
+                        factors[CHANNELS * x + d] = factor
+            for row in range(top, bottom):
+                for axis in range(2):
+                    out = slopes[axis, row + 1]
+                    for m in range(CHANNELS, floats - CHANNELS):
+                        out[m + CHANNELS] *= factors[m]
+            sums[block] = total
+
+    return forward
+
+
+@cache
+def conflict_backward(real: type) -> Kernel:
+    """Fills the gradient of the transmission [H, W, 3], the transposed Sobel operators of the slopes."""
+    two = real(2.0)
+
+    @kernel("gradient_conflict_backward", real)
+    def backward(slopes, v_mean, v_transmission):
+        height, width = v_transmission.shape[:2]
+        floats = CHANNELS * width
+        out = v_transmission.reshape(height, floats)
+        for row in prange(height):
+            x_up, x_here, x_down = slopes[0, row], slopes[0, row + 1], slopes[0, row + 2]
+            y_up, y_down = slopes[1, row], slopes[1, row + 2]
+            target = out[row]
+            for j in range(floats):
+                m, k = j + CHANNELS, j + 2 * CHANNELS
+                across = x_up[j] - x_up[k] + two * (x_here[j] - x_here[k]) + x_down[j] - x_down[k]
+                down = y_up[j] - y_down[j] + two * (y_up[m] - y_down[m]) + y_up[k] - y_down[k]
+                target[j] = v_mean * (across + down)
+
+    return backward

@@ -1,4 +1,7 @@
-"""Panes on the GPU: which one a pixel shows, and their blending."""
+"""Panes on the GPU: which one a pixel shows, their blending, and edges that layers share.
+
+Shared edges are added up by a block for each cell and channel.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,8 @@ from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.images import color_space_maths
 from glassplat.kernels.maths.pane import mixing, pane_maths
+from glassplat.kernels.panes import DARKEST, MOST_HELD
+from glassplat.kernels.panes.cpu import CHANNELS, conflict_count
 from glassplat.kernels.records import DAZZLING, REAL_OF, TILE, PaneHits
 
 PIXELS = TILE * TILE
@@ -271,3 +276,147 @@ def layer_slopes_kernel(real: type) -> Kernel:
         through[row, x], mirrored[row, x] = by_behind, by_mirror_image
 
     return slopes
+
+
+def inside_panes(pane: Tensor, strength: Tensor) -> Tensor:
+    """As `glassplat.kernels.panes.cpu.inside_panes`."""
+    inside = torch.empty_like(strength)
+    inside_of(REAL_OF[strength.dtype])(blocks_for(pane.numel(), THREADS), THREADS, pane, strength, inside)
+    return inside
+
+
+@cache
+def inside_of(real: type) -> Kernel:
+    """Fills 1 where a pixel and its neighbours show the same pane, and 0 elsewhere; a pixel for each thread."""
+    zero, one = real(0.0), real(1.0)
+
+    @kernel("inside_panes", real, "int2 real2 real2")
+    def fill(pane, strength, inside):
+        height, width = pane.shape
+        i = cuda.grid(1)
+        if i >= height * width:
+            return
+        row, column = i // width, i % width
+        own = pane[row, column]
+        same = own >= 0
+        for y in range(max(row - 1, 0), min(row + 2, height)):
+            for x in range(max(column - 1, 0), min(column + 2, width)):
+                same = same and strength[y, x] > zero and pane[y, x] == own
+        inside[row, column] = one if same else zero
+
+    return fill
+
+
+def gradient_conflict(
+    transmission: Tensor, reflection: Tensor, hit: Tensor, strength: Tensor | None, cell: int
+) -> tuple[Tensor, Tensor]:
+    """As `glassplat.kernels.panes.cpu.gradient_conflict`; the slopes are [2, H - 2, W - 2, 3]."""
+    height, width = hit.shape
+    slopes = transmission.new_empty(2, height - 2, width - 2, CHANNELS)
+    sums = hit.new_empty(CHANNELS * -(-(height - 2) // cell) * -(-(width - 2) // cell))
+    conflict_forward(REAL_OF[hit.dtype])(
+        len(sums), CELL_THREADS, transmission, reflection, hit, strength, cell, slopes, sums
+    )
+    return sums.sum() / conflict_count(height, width), slopes
+
+
+def gradient_conflict_gradient(slopes: Tensor, v_mean: Tensor) -> Tensor:
+    """As `glassplat.kernels.panes.cpu.gradient_conflict_gradient`."""
+    height, width = slopes.shape[1] + 2, slopes.shape[2] + 2
+    v_transmission = slopes.new_empty(height, width, CHANNELS)
+    conflict_backward(REAL_OF[slopes.dtype])(
+        blocks_for(v_transmission.numel(), THREADS), THREADS, slopes, v_mean.view(1), v_transmission
+    )
+    return v_transmission
+
+
+CELL_THREADS = 64
+
+
+@inlined
+def sobel_at(image, y, x, d):
+    """Sobel derivatives of a channel along both axes at an inner pixel."""
+    a, b, c = image[y - 1, x - 1, d], image[y - 1, x, d], image[y - 1, x + 1, d]
+    e, f = image[y, x - 1, d], image[y, x + 1, d]
+    g, h, i = image[y + 1, x - 1, d], image[y + 1, x, d], image[y + 1, x + 1, d]
+    right, below = f - e, h - b
+    return c - a + right + right + i - g, g - a + below + below + i - c
+
+
+@cache
+def conflict_forward(real: type) -> Kernel:
+    """Fills the sum of each cell and channel, and slopes [2, H - 2, W - 2, 3], its derivatives by Sobel's images."""
+    zero, one, two, darkest, most = real(0.0), real(1.0), real(2.0), real(DARKEST), real(MOST_HELD)
+
+    @kernel("gradient_conflict_forward", real, "real3 real3 real2 real2 int real4 real1")
+    def forward(transmission, reflection, hit, strength, cell, slopes, sums):
+        edges = cuda.shared.array(CELL_THREADS, real)
+        holds = cuda.shared.array(CELL_THREADS, real)
+        fills = cuda.shared.array(CELL_THREADS, real)
+        height, width, t = hit.shape[0], hit.shape[1], cuda.threadIdx.x
+        d, n, across = cuda.blockIdx.x % CHANNELS, cuda.blockIdx.x // CHANNELS, (width - 3 + cell) // cell
+        top, left = 1 + n // across * cell, 1 + n % across * cell
+        rows, columns = min(cell, height - 1 - top), min(cell, width - 1 - left)
+        shared, held, full = zero, zero, zero
+        for i in range(t, rows * columns, CELL_THREADS):
+            y, x = top + i // columns, left + i % columns
+            t_x, t_y = sobel_at(transmission, y, x, d)
+            r_x, r_y = sobel_at(reflection, y, x, d)
+            product = hit[y, x] * (t_x * r_x + t_y * r_y)
+            shared += product
+            if strength.size > 0:
+                light_t = min(max(transmission[y, x, d], darkest), one)
+                light_r = min(max(reflection[y, x, d], darkest), one)
+                held += light_t * light_r * product
+                full += hit[y, x] * strength[y, x] * light_r * light_r * (r_x * r_x + r_y * r_y)
+        edges[t], holds[t], fills[t] = shared, held, full
+        step = CELL_THREADS // 2
+        while step > 0:
+            cuda.syncthreads()
+            if t < step:
+                edges[t] += edges[t + step]
+                holds[t] += holds[t + step]
+                fills[t] += fills[t + step]
+            step //= 2
+        cuda.syncthreads()
+        total, counted = edges[0], one
+        if strength.size > 0 and holds[0] != zero:
+            counted = min(max(two - abs(holds[0]) / (most * fills[0]), zero), one)
+        if t == 0:
+            sums[cuda.blockIdx.x] = counted * abs(total)
+        factor = counted if total > zero else -counted
+        factor = factor if total != zero else zero
+        for i in range(t, rows * columns, CELL_THREADS):
+            y, x = top + i // columns, left + i % columns
+            r_x, r_y = sobel_at(reflection, y, x, d)
+            weight = factor * hit[y, x]
+            slopes[0, y - 1, x - 1, d] = weight * r_x
+            slopes[1, y - 1, x - 1, d] = weight * r_y
+
+    return forward
+
+
+@cache
+def conflict_backward(real: type) -> Kernel:
+    """Fills the gradient of the transmission [H, W, 3], the transposed Sobel operators of the slopes."""
+    zero, one, two, count = real(0.0), real(1.0), real(2.0), real(CHANNELS)
+
+    @kernel("gradient_conflict_backward", real, "real4 real1 real3")
+    def backward(slopes, v_mean, v_transmission):
+        height, width, i = v_transmission.shape[0], v_transmission.shape[1], cuda.grid(1)
+        if i >= v_transmission.size:
+            return
+        d, column, row = i % CHANNELS, i // CHANNELS % width, i // CHANNELS // width
+        total = zero
+        for down in range(-1, 2):
+            for right in range(-1, 2):
+                y, x = row + down, column + right
+                if 0 < y < height - 1 and 0 < x < width - 1:
+                    across = two if down == 0 else one
+                    along = two if right == 0 else one
+                    total -= real(np.int32(right)) * across * slopes[0, y - 1, x - 1, d]
+                    total -= real(np.int32(down)) * along * slopes[1, y - 1, x - 1, d]
+        inner = real(np.int32(height - 2)) * real(np.int32(width - 2))
+        v_transmission[row, column, d] = v_mean[0] / (count * inner) * total
+
+    return backward

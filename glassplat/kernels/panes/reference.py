@@ -9,6 +9,7 @@ from torch import Tensor
 
 from glassplat.kernels import Fresnel
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
+from glassplat.kernels.panes import DARKEST, MOST_HELD
 from glassplat.kernels.records import DAZZLING, TILE, BlendedPanes, PaneHits, Panes
 
 
@@ -128,3 +129,37 @@ def layer_slopes(
             image = (1 - share) * behind + share * mirror_image
         through, mirrored = torch.autograd.grad(image.sum(), (behind, mirror_image))
     return torch.where(where, through, 1), torch.where(where, mirrored, 0)
+
+
+def gradient_conflict(
+    transmission: Tensor, reflection: Tensor, hit: Tensor, strength: Tensor | None = None, *, cell: int = 1
+) -> Tensor:
+    """See `glassplat.kernels.panes.gradient_conflict`: products of Sobel derivatives, added up in cells."""
+    reflection, weight = reflection.detach(), hit[1:-1, 1:-1, None]
+    of_transmission, of_reflection = sobel(transmission), sobel(reflection)
+    products = weight * (of_transmission[0] * of_reflection[0] + of_transmission[1] * of_reflection[1])
+    shared = in_cells(products, cell)
+    counted = torch.ones_like(shared)
+    if strength is not None:
+        with torch.no_grad():
+            light_t, light_r = (image[1:-1, 1:-1].clamp(DARKEST, 1) for image in (transmission, reflection))
+            squares = of_reflection[0].square() + of_reflection[1].square()
+            held = in_cells(light_t * light_r * products, cell).abs()
+            full = in_cells(weight * strength[1:-1, 1:-1, None] * light_r.square() * squares, cell)
+            counted = torch.where(held > 0, (2 - held / (MOST_HELD * full)).clamp(0, 1), 1)
+    return (counted * shared.abs()).sum() / products.numel()
+
+
+def in_cells(values: Tensor, cell: int) -> Tensor:
+    """Sums of values [H, W, C] over square cells of so many pixels; the last ones of a row or column may be smaller."""
+    sums = torch.nn.functional.avg_pool2d(values.permute(2, 0, 1), cell, ceil_mode=True, divisor_override=1)
+    return sums.permute(1, 2, 0)
+
+
+def sobel(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Horizontal and vertical Sobel derivatives [H-2, W-2, C] of an image [H, W, C], borders left out."""
+    across = image[:, 2:] - image[:, :-2]
+    down = image[2:] - image[:-2]
+    horizontal = across[:-2] + 2 * across[1:-1] + across[2:]
+    vertical = down[:, :-2] + 2 * down[:, 1:-1] + down[:, 2:]
+    return horizontal, vertical

@@ -26,6 +26,7 @@ from glassplat.kernels.adam import reference as adam_twin
 from glassplat.kernels.backend.devices import SIMULATED, kernels_for
 from glassplat.kernels.composite import reference as composite_twin
 from glassplat.kernels.environment import reference as environment_twin
+from glassplat.kernels.panes import cpu as panes_on_the_cpu
 from glassplat.kernels.panes import reference as panes_twin
 from glassplat.kernels.photometric import reference as photometric_twin
 from glassplat.kernels.project import reference as project_twin
@@ -42,6 +43,7 @@ from tests.kernels.cuda.agreement import (
     on_device,
 )
 from tests.kernels.gaussians_and_cameras import draw, needle_before_camera, random_cameras, random_gaussians
+from tests.kernels.test_gradient_conflict import pictures
 from tests.kernels.test_screen_statistics import add_views_in_torch
 
 on_a_device_or_skipped()
@@ -322,6 +324,32 @@ def test_layer_slopes(linear: bool, dtype: torch.dtype) -> None:
     found = panes_operation.layer_slopes(*own, linear=linear)
     for value, want in zip(found, panes_twin.layer_slopes(strength, *layers, where, linear=linear), strict=True):
         close(value, want)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(
+    ("size", "cell", "is_told"), [((many(4, 60), 5), 1, False), ((many(7, HEIGHT), many(8, WIDTH)), 4, True)]
+)
+def test_gradient_conflict(size: tuple[int, int], cell: int, is_told: bool, dtype: torch.dtype) -> None:
+    images = pictures(*size, dtype)
+    strength = draw(*size, seed=7).to(dtype).sigmoid() if is_told else None
+    transmission, own = images[0].requires_grad_(), on_device(images[0])
+    found = panes_operation.gradient_conflict(own, *map(on_device, images[1:]), on_device(strength), cell=cell)
+    expected = panes_twin.gradient_conflict(*images, strength, cell=cell)
+    close(found, expected)
+    check_gradients([found], [expected], [own], [transmission])
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("size", [(many(9, HEIGHT), many(20, WIDTH)), (1, 7), (7, 1)])
+def test_inside_of_panes(size: tuple[int, int], dtype: torch.dtype) -> None:
+    """Stripes of two panes and of none, with holes where nothing reflects."""
+    pane = (torch.arange(size[1]).expand(size) // 6 % 3 - 1).int().contiguous()
+    strength = (draw(*size, seed=3).to(dtype) + 1.8).clamp(min=0)
+    found = panes_operation.inside_panes(pane.to(DEVICE), strength.to(DEVICE))
+    expected = panes_on_the_cpu.inside_panes(pane, strength)
+    close(found, expected)
+    assert min(size) == 1 or 0.1 < float(expected.mean()) < 0.9
 
 
 def test_no_pane_is_hit_where_there_is_none() -> None:

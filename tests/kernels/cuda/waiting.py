@@ -14,9 +14,8 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from glassplat.kernels.backend import devices
-from glassplat.kernels.gradient_conflict import gradient_conflict_in_torch
 from glassplat.scene import camera
-from glassplat.training import densify, losses
+from glassplat.training import densify
 from tests.kernels.test_screen_statistics import add_views_in_torch
 
 ATEN = torch.ops.aten
@@ -111,7 +110,6 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch, waits: Waits) -> None:
         return SimpleNamespace(**{name: run(name) for name, value in vars(module).items() if callable(value)})
 
     monkeypatch.setattr(devices, "_module", counted)
-    # The operations that are PyTorch's own on a GPU, and one whose kernel is not asked for on a CPU.
-    monkeypatch.setattr(losses, "shared_edges", gradient_conflict_in_torch)
+    # Its kernel is not asked for on a CPU.
     monkeypatch.setattr(densify, "add_views", add_views_in_torch)
     monkeypatch.setattr(camera, "waits", lambda device: True)
