@@ -20,10 +20,10 @@ from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.render.deferred import INVISIBLE, Deferred
 from glassplat.render.frame import NEAR_PER_EXTENT, Renderer, joined_splats, project_gaussians
-from glassplat.render.panes import half_spaces_of, nearest_hits, panes_in_camera
+from glassplat.render.panes import mirrored_views, nearest_hits, panes_in_camera
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
-from glassplat.scene.camera import Camera, mirror_matrices
+from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
 from glassplat.training.loop import differentiate, update
 from glassplat.training.stage import Stage, TrainState
@@ -46,8 +46,7 @@ def bare_work(scene: Scene, camera: Camera) -> Work:
     """Least work of a `planar` frame: the `splat` frame, and the mirrored one in the tiles of the panes."""
     splat, planes = Splat(depth=False), scene.planes
     hits = nearest_hits(panes_in_camera(planes, camera), camera)
-    poses = camera.cam_from_world @ mirror_matrices(planes.centers, planes.normals)
-    half_spaces = half_spaces_of(planes, camera)
+    views = mirrored_views(planes, camera)
 
     def work() -> None:
         with torch.no_grad():
@@ -56,8 +55,8 @@ def bare_work(scene: Scene, camera: Camera) -> Work:
                 scene.primary,
                 camera,
                 near=NEAR_PER_EXTENT * scene.extent,
-                poses=poses,
-                clip_planes=half_spaces,
+                poses=views.poses,
+                clip_planes=views.half_spaces,
                 windows=hits.windows,
             )
             splats = joined_splats(mirrored)

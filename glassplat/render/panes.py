@@ -10,15 +10,16 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels import Fresnel
+from glassplat.kernels import panes as pane_kernels
 from glassplat.kernels.composite import composite
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
-from glassplat.kernels.panes import blend_panes, pane_hits
+from glassplat.kernels.panes import MirroredViews, blend_panes, pane_hits
 from glassplat.kernels.project import GradientSum
 from glassplat.kernels.records import TILE, BlendedPanes, PaneHits, Panes, Projected, Splats
 from glassplat.kernels.tiles import bin_tiles
 from glassplat.options import Blend
 from glassplat.render.frame import project_gaussians
-from glassplat.scene.camera import Camera, constant, mirror_matrices
+from glassplat.scene.camera import Camera, constant, mirror_matrices, waits
 from glassplat.scene.corrections import world_from_photographer
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
@@ -36,6 +37,7 @@ class SeenPanes:
             `planes`; -1 where there is none left.
         tiles: [K, rows, columns] bool, tiles in which a pixel shows the pane, in front or through others.
         windows: [K, 4] left, top, right and bottom edge, in pixels, of the pixels that show it.
+        views: the camera mirrored about each of `planes`.
     """
 
     planes: Planes
@@ -43,10 +45,14 @@ class SeenPanes:
     order: tuple[Tensor, ...]
     tiles: Tensor
     windows: Tensor
+    views: MirroredViews
 
 
 def panes_in_camera(planes: Planes, camera: Camera) -> Panes:
     """The rectangles in the camera frame; no gradient."""
+    if waits(planes.centers.device):
+        given = planes.centers, planes.raw_normals, planes.tangents, planes.half_sizes, camera.cam_from_world
+        return pane_kernels.panes_in_camera(*given)
     with torch.no_grad():
         rotation, translation = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
         centers, normals, axes, half_sizes = (
@@ -88,12 +94,13 @@ def seen_panes(
     positions = tuple(k for k, is_seen in enumerate(seen) if is_seen)
     rows = constant(positions, torch.int64, tiles.device)
     if len(positions) == len(planes):
-        return SeenPanes(planes, rows, tuple(h.pane for h in hits), tiles, windows)
+        return SeenPanes(planes, rows, tuple(h.pane for h in hits), tiles, windows, mirrored_views(planes, camera))
     # The last entry is for index -1, pixels without a pane.
     found = (*(positions.index(k) if is_seen else -1 for k, is_seen in enumerate(seen)), -1)
     position = constant(found, torch.int32, tiles.device)
     order = tuple(position[h.pane.long()] for h in hits)
-    return SeenPanes(planes.select(positions), rows, order, tiles[rows], windows[rows])
+    shown = planes.select(positions)
+    return SeenPanes(shown, rows, order, tiles[rows], windows[rows], mirrored_views(shown, camera))
 
 
 def _visible_panes(hits: PaneHits) -> list[bool]:
@@ -127,8 +134,8 @@ def project_mirrored(
         gaussians,
         camera,
         near=near,
-        poses=camera.cam_from_world @ mirror_matrices(seen.planes.centers, seen.planes.normals),
-        clip_planes=half_spaces_of(seen.planes, camera),
+        poses=seen.views.poses,
+        clip_planes=seen.views.half_spaces,
         windows=seen.windows,
         total=total,
     )
@@ -147,25 +154,33 @@ def project_photographer(scene: Scene, camera: Camera, seen: SeenPanes, *, near:
         near: depth below which a Gaussian is culled, world units.
     """
     frame = world_from_photographer(camera, scene.up)
-    half_spaces = half_spaces_of(seen.planes, camera)
     return project_gaussians(
         scene.photographer,
         camera,
         near=near,
-        poses=camera.cam_from_world @ mirror_matrices(seen.planes.centers, seen.planes.normals) @ frame,
+        poses=seen.views.poses @ frame,
         # A plane n . x + d = 0 is (n, d) as a row vector, so that frames change it from the right.
-        clip_planes=half_spaces @ frame.detach(),
+        clip_planes=seen.views.half_spaces @ frame.detach(),
         windows=seen.windows,
     )
 
 
-def half_spaces_of(planes: Planes, camera: Camera) -> Tensor:
-    """Clip planes [K, 4] that keep each plane's side on which the camera stands; no gradient."""
+def mirrored_views(planes: Planes, camera: Camera) -> MirroredViews:
+    """The camera mirrored about each plane, and the clip planes that keep the side on which it stands.
+
+    The half spaces have no gradient. On a GPU that is one kernel, as some sixty operations on few numbers would take
+    longer than all Gaussians.
+    """
+    pose = camera.cam_from_world
+    if waits(planes.centers.device):
+        return pane_kernels.mirrored_views(planes.centers, planes.raw_normals, pose)
+    poses = pose @ mirror_matrices(planes.centers, planes.normals)
     with torch.no_grad():
         normals = planes.normals
         side = torch.sign(((camera.center - planes.centers) * normals).sum(-1, keepdim=True))
         facing = normals * side
-        return torch.cat([facing, -(facing * planes.centers).sum(-1, keepdim=True)], dim=1)
+        half_spaces = torch.cat([facing, -(facing * planes.centers).sum(-1, keepdim=True)], dim=1)
+    return MirroredViews(poses, planes.normals @ pose[:3, :3].T, half_spaces)
 
 
 FAINT = 0.5
@@ -204,7 +219,6 @@ def composite_panes(
         intensity: as for `blend_panes`.
         blend: the space in which light adds up.
     """
-    normals = seen.planes.normals @ camera.cam_from_world[:3, :3].T
     laid = []
     transmittances = seen.planes.transmittances
     for mask, pane in zip(reversed(masks), reversed(seen.order), strict=True):
@@ -215,7 +229,7 @@ def composite_panes(
             mask,
             reflections,
             pane,
-            normals,
+            seen.views.normals,
             seen.planes.base_reflectances,
             camera.shared_intrinsics,
             fresnel=fresnel,

@@ -77,7 +77,8 @@ def composite(
     # Where all tiles are active, every pixel is written.
     new = channels.new_empty if tiles == len(bins.tile_offsets) - 1 else channels.new_zeros
     image, alpha, mask = (new(s) for s in ((*shape, num_channels), shape, shape))
-    deviated, center, lean = (channels.new_zeros(shape if deviation else (0, 0, 0)) for _ in range(3))
+    zeros = channels.new_zeros if deviation else channels.new_empty
+    deviated, center, lean = (zeros(shape if deviation else (0, 0, 0)) for _ in range(3))
     buckets = len(bins.pair_splats) // BUCKET + tiles if needs_gradients else 0
     planes = num_channels + (1 if num_primary == count else 3)
     saved = Saved(

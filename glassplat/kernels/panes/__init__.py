@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,6 +12,80 @@ from glassplat.kernels import Fresnel
 from glassplat.kernels.backend.devices import kernels_for
 from glassplat.kernels.maths.pane import LAWS
 from glassplat.kernels.records import BlendedPanes, PaneHits, Panes, check_device, check_tensors
+
+
+class MirroredViews(NamedTuple):
+    """A camera mirrored about K planes.
+
+    poses [K, 4, 4]: `cam_from_world` times the reflection about each plane; left-handed. normals [K, 3]: of the planes,
+    unit, in the camera frame. half_spaces [K, 4]: planes (n, d) of the world with n . x + d > 0 on the camera's side.
+    """
+
+    poses: Tensor
+    normals: Tensor
+    half_spaces: Tensor
+
+
+def mirrored_views(centers: Tensor, raw_normals: Tensor, cam_from_world: Tensor) -> MirroredViews:
+    """A camera on a GPU mirrored about planes, in one kernel; `glassplat.render.panes.mirrored_views` says how.
+
+    Differentiable in all three; the half spaces have no gradient.
+
+    Args:
+        centers: [K, 3] a point on each plane, world units.
+        raw_normals: [K, 3] normals of any length.
+        cam_from_world: [4, 4].
+
+    Raises:
+        ValueError: shapes disagree.
+        TypeError: tensors of different or unsupported floating-point types, or on different devices.
+    """
+    expected = {"centers": (centers, (len(centers), 3)), "raw_normals": (raw_normals, (len(centers), 3))}
+    check_tensors({**expected, "cam_from_world": (cam_from_world, (4, 4))})
+    return MirroredViews(*_MirroredViews.apply(centers, raw_normals, cam_from_world))
+
+
+class _MirroredViews(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *inputs: Tensor) -> tuple[Tensor, ...]:
+        tensors = [tensor.detach().contiguous() for tensor in inputs]
+        poses, normals, half_spaces = kernels_for("panes", tensors[0].device).mirrored_views(*tensors)
+        ctx.save_for_backward(*tensors)
+        ctx.mark_non_differentiable(half_spaces)
+        return poses, normals, half_spaces
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_poses: Tensor, v_normals: Tensor, _: Tensor) -> tuple[Tensor, ...]:
+        kernels = kernels_for("panes", v_poses.device)
+        found: tuple[Tensor, ...] = kernels.mirrored_views_gradients(
+            *ctx.saved_tensors, v_poses.contiguous(), v_normals.contiguous()
+        )
+        return found
+
+
+@torch.no_grad()
+def panes_in_camera(
+    centers: Tensor, raw_normals: Tensor, tangents: Tensor, half_sizes: Tensor, cam_from_world: Tensor
+) -> Panes:
+    """Rectangles on a GPU in the frame of a camera, in one kernel; see `glassplat.render.panes.panes_in_camera`.
+
+    Args:
+        centers: [K, 3] world units.
+        raw_normals: [K, 3] of any length.
+        tangents: [K, 3] direction of the first side, made orthogonal to the normal.
+        half_sizes: [K, 2] along tangent and bitangent.
+        cam_from_world: [4, 4].
+
+    Raises:
+        ValueError: shapes disagree.
+        TypeError: tensors of different or unsupported floating-point types, or on different devices.
+    """
+    rows = {"centers": (centers, 3), "raw_normals": (raw_normals, 3), "tangents": (tangents, 3)}
+    expected = {name: (tensor, (len(centers), width)) for name, (tensor, width) in rows.items()}
+    check_tensors({**expected, "cam_from_world": (cam_from_world, (4, 4))})
+    tensors = (tensor.detach().contiguous() for tensor in (centers, raw_normals, tangents, cam_from_world))
+    return Panes(*kernels_for("panes", centers.device).panes_in_camera(*tensors), half_sizes.detach().contiguous())
 
 
 @torch.no_grad()
@@ -231,16 +305,9 @@ def slopes_at(slopes: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> 
     size, leading = tuple(slopes.shape), tuple(depths.shape)
     expected = {"slopes": (slopes, size), "near": (near, size), "means2d": (means2d, (*leading, 2))}
     check_tensors({**expected, "depths": (depths, leading)})
-    height, width = slopes.shape
-    # Held within the image before the conversion, which infinities and NaN would leave to chance; fmax takes 0 for NaN.
-    zero = means2d.new_zeros(())
-    columns, rows = (
-        torch.fmax(axis, zero).clamp_(max=size - 1).int()
-        for axis, size in zip(means2d.unbind(-1), (width, height), strict=True)
-    )
-    pixels = (rows * width + columns).flatten()
-    surface, slope = (image.flatten().index_select(0, pixels).view_as(depths) for image in (near, slopes))
-    return torch.where(depths > surface, slope, 1.0)
+    images = (tensor.detach().contiguous() for tensor in (slopes, near, means2d, depths))
+    found: Tensor = kernels_for("panes", slopes.device).slopes_at(*images)
+    return found
 
 
 DARKEST = 0.05

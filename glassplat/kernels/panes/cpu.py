@@ -477,6 +477,20 @@ def layer_slopes_kernel(real: type) -> Kernel:
     return slopes
 
 
+def slopes_at(slopes: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
+    """As `glassplat.kernels.panes.slopes_at`, of contiguous tensors."""
+    height, width = slopes.shape
+    # Held within the image before the conversion, which infinities and NaN would leave to chance; fmax takes 0 for NaN.
+    zero = means2d.new_zeros(())
+    columns, rows = (
+        torch.fmax(axis, zero).clamp_(max=size - 1).int()
+        for axis, size in zip(means2d.unbind(-1), (width, height), strict=True)
+    )
+    pixels = (rows * width + columns).flatten()
+    surface, slope = (image.flatten().index_select(0, pixels).view_as(depths) for image in (near, slopes))
+    return torch.where(depths > surface, slope, 1.0)
+
+
 def inside_panes(pane: Tensor, strength: Tensor) -> Tensor:
     """As `glassplat.kernels.panes.inside_panes`, of contiguous images."""
     shown = torch.where(strength > 0, pane, -1)

@@ -5,6 +5,7 @@ Shared edges are added up by a block for each cell and channel.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cache
 
@@ -23,6 +24,8 @@ from glassplat.kernels.panes.cpu import CHANNELS, conflict_count
 from glassplat.kernels.records import DAZZLING, REAL_OF, TILE, PaneHits
 
 PIXELS = TILE * TILE
+SHORTEST = 1e-12
+"""Length below which a vector is not made unit, as by PyTorch."""
 
 
 def pane_hits(
@@ -41,6 +44,148 @@ def pane_hits(
     windows = centers.new_empty(count, 4)
     windows_of(real)(blocks_for(count, THREADS), THREADS, reaches, width, height, windows)
     return PaneHits(index, depth, tiles, windows)
+
+
+def panes_in_camera(
+    centers: Tensor, raw_normals: Tensor, tangents: Tensor, cam_from_world: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Centres [K, 3], unit normals [K, 3] and axes [K, 2, 3] in the camera frame."""
+    found = torch.empty_like(centers), torch.empty_like(centers), centers.new_empty(len(centers), 2, 3)
+    rectangles_in_camera(REAL_OF[centers.dtype])(1, 1, centers, raw_normals, tangents, cam_from_world, *found)
+    return found
+
+
+def mirrored_views(centers: Tensor, raw_normals: Tensor, cam_from_world: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Poses [K, 4, 4], normals in the camera frame [K, 3] and half spaces [K, 4]."""
+    count = len(centers)
+    found = centers.new_empty(count, 4, 4), centers.new_empty(count, 3), centers.new_empty(count, 4)
+    mirrored_views_forward(REAL_OF[centers.dtype])(1, 1, centers, raw_normals, cam_from_world, *found)
+    return found
+
+
+def mirrored_views_gradients(
+    centers: Tensor, raw_normals: Tensor, cam_from_world: Tensor, v_poses: Tensor, v_normals: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradients of the three inputs of `mirrored_views`."""
+    found = torch.empty_like(centers), torch.empty_like(raw_normals), torch.empty_like(cam_from_world)
+    mirrored_views_backward(REAL_OF[centers.dtype])(
+        1, 1, centers, raw_normals, cam_from_world, v_poses, v_normals, *found
+    )
+    return found
+
+
+def vectors(real: type) -> tuple[Scalar, Scalar]:
+    """A row made unit, with its inverse length; and a vector turned by the rotation of a pose."""
+    least, one = real(SHORTEST), real(1.0)
+
+    @inlined
+    def unit(x, y, z):
+        inverse = one / max(math.sqrt(x * x + y * y + z * z), least)
+        return x * inverse, y * inverse, z * inverse, inverse
+
+    @inlined
+    def turned(pose, x, y, z):
+        return (
+            pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z,
+            pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z,
+            pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z,
+        )
+
+    return unit, turned
+
+
+@cache
+def rectangles_in_camera(real: type) -> Kernel:
+    """Fills all rectangles, of which there are few, in one thread."""
+    unit, turned = vectors(real)
+
+    @kernel("panes_in_camera", real, "real2 real2 real2 real2 real2 real2 real3")
+    def fill(centers, raw_normals, tangents, pose, placed, facing, axes):
+        for k in range(centers.shape[0]):
+            c_x, c_y, c_z = turned(pose, centers[k, 0], centers[k, 1], centers[k, 2])
+            placed[k, 0], placed[k, 1], placed[k, 2] = c_x + pose[0, 3], c_y + pose[1, 3], c_z + pose[2, 3]
+            n_x, n_y, n_z, _ = unit(raw_normals[k, 0], raw_normals[k, 1], raw_normals[k, 2])
+            facing[k, 0], facing[k, 1], facing[k, 2] = turned(pose, n_x, n_y, n_z)
+            t_x, t_y, t_z = tangents[k, 0], tangents[k, 1], tangents[k, 2]
+            along = t_x * n_x + t_y * n_y + t_z * n_z
+            t_x, t_y, t_z, _ = unit(t_x - along * n_x, t_y - along * n_y, t_z - along * n_z)
+            axes[k, 0, 0], axes[k, 0, 1], axes[k, 0, 2] = turned(pose, t_x, t_y, t_z)
+            b_x, b_y, b_z = n_y * t_z - n_z * t_y, n_z * t_x - n_x * t_z, n_x * t_y - n_y * t_x
+            axes[k, 1, 0], axes[k, 1, 1], axes[k, 1, 2] = turned(pose, b_x, b_y, b_z)
+
+    return fill
+
+
+@cache
+def mirrored_views_forward(real: type) -> Kernel:
+    """Fills poses, normals and half spaces of all planes in one thread.
+
+    With m = R n the pose about a plane has the rotation R - 2 m n^T and the translation t + 2 (c . n) m.
+    """
+    unit, turned = vectors(real)
+    zero, one, two = real(0.0), real(1.0), real(2.0)
+
+    @kernel("mirrored_views_forward", real, "real2 real2 real2 real3 real2 real2")
+    def forward(centers, raw_normals, pose, poses, normals, half_spaces):
+        for k in range(centers.shape[0]):
+            n_x, n_y, n_z, _ = unit(raw_normals[k, 0], raw_normals[k, 1], raw_normals[k, 2])
+            normals[k, 0], normals[k, 1], normals[k, 2] = turned(pose, n_x, n_y, n_z)
+            offset = centers[k, 0] * n_x + centers[k, 1] * n_y + centers[k, 2] * n_z
+            # The camera's centre is -R^T t, so that its height above the plane is -t . m - c . n.
+            height = -offset
+            for i in range(3):
+                m = normals[k, i]
+                poses[k, i, 0] = pose[i, 0] - two * m * n_x
+                poses[k, i, 1] = pose[i, 1] - two * m * n_y
+                poses[k, i, 2] = pose[i, 2] - two * m * n_z
+                poses[k, i, 3] = pose[i, 3] + two * offset * m
+                poses[k, 3, i] = zero
+                height -= pose[i, 3] * m
+            poses[k, 3, 3] = one
+            side = one if height > zero else (-one if height < zero else zero)
+            half_spaces[k, 0], half_spaces[k, 1], half_spaces[k, 2] = side * n_x, side * n_y, side * n_z
+            half_spaces[k, 3] = -side * offset
+
+    return forward
+
+
+@cache
+def mirrored_views_backward(real: type) -> Kernel:
+    """Fills the gradients of centres, raw normals and pose in one thread."""
+    unit, turned = vectors(real)
+    zero, two = real(0.0), real(2.0)
+
+    @kernel("mirrored_views_backward", real, "real2 real2 real2 real3 real2 real2 real2 real2")
+    def backward(centers, raw_normals, pose, v_poses, v_normals, v_centers, v_raw_normals, v_pose):
+        for i in range(4):
+            for j in range(4):
+                v_pose[i, j] = zero
+        for k in range(centers.shape[0]):
+            n_x, n_y, n_z, inverse = unit(raw_normals[k, 0], raw_normals[k, 1], raw_normals[k, 2])
+            m_x, m_y, m_z = turned(pose, n_x, n_y, n_z)
+            offset = centers[k, 0] * n_x + centers[k, 1] * n_y + centers[k, 2] * n_z
+            v_x, v_y, v_z, v_offset = zero, zero, zero, zero
+            for i in range(3):
+                m = m_x if i == 0 else (m_y if i == 1 else m_z)
+                row_x, row_y, row_z, row_t = v_poses[k, i, 0], v_poses[k, i, 1], v_poses[k, i, 2], v_poses[k, i, 3]
+                v_m = v_normals[k, i] + two * (offset * row_t - row_x * n_x - row_y * n_y - row_z * n_z)
+                v_offset += two * row_t * m
+                v_x += v_m * pose[i, 0] - two * row_x * m
+                v_y += v_m * pose[i, 1] - two * row_y * m
+                v_z += v_m * pose[i, 2] - two * row_z * m
+                v_pose[i, 0] += row_x + v_m * n_x
+                v_pose[i, 1] += row_y + v_m * n_y
+                v_pose[i, 2] += row_z + v_m * n_z
+                v_pose[i, 3] += row_t
+            v_centers[k, 0], v_centers[k, 1], v_centers[k, 2] = v_offset * n_x, v_offset * n_y, v_offset * n_z
+            v_x, v_y = v_x + v_offset * centers[k, 0], v_y + v_offset * centers[k, 1]
+            v_z += v_offset * centers[k, 2]
+            along = v_x * n_x + v_y * n_y + v_z * n_z
+            v_raw_normals[k, 0] = (v_x - along * n_x) * inverse
+            v_raw_normals[k, 1] = (v_y - along * n_y) * inverse
+            v_raw_normals[k, 2] = (v_z - along * n_z) * inverse
+
+    return backward
 
 
 @cache
@@ -276,6 +421,34 @@ def layer_slopes_kernel(real: type) -> Kernel:
         through[row, x], mirrored[row, x] = by_behind, by_mirror_image
 
     return slopes
+
+
+def slopes_at(slopes: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
+    """As `glassplat.kernels.panes.cpu.slopes_at`."""
+    found = torch.empty_like(depths)
+    slopes_under(REAL_OF[depths.dtype])(
+        blocks_for(depths.numel(), THREADS), THREADS, slopes, near, means2d.view(-1, 2), depths.view(-1), found.view(-1)
+    )
+    return found
+
+
+@cache
+def slopes_under(real: type) -> Kernel:
+    """Fills the slope at each centre, 1 before the surface; a splat for each thread."""
+    zero, one = real(0.0), real(1.0)
+
+    @kernel("slopes_at", real, "real2 real2 real2 real1 real1")
+    def fill(slopes, near, means2d, depths, found):
+        i = cuda.grid(1)
+        if i >= depths.size:
+            return
+        x, y, right, bottom = means2d[i, 0], means2d[i, 1], slopes.shape[1] - 1, slopes.shape[0] - 1
+        # Neither comparison holds for NaN, which counts as 0.
+        column = right if x >= real(np.int32(right)) else (np.int32(x) if x > zero else 0)
+        row = bottom if y >= real(np.int32(bottom)) else (np.int32(y) if y > zero else 0)
+        found[i] = slopes[row, column] if depths[i] > near[row, column] else one
+
+    return fill
 
 
 def inside_panes(pane: Tensor, strength: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,9 @@ from glassplat.kernels.project import reference as project_twin
 from glassplat.kernels.records import CameraBatch, Deviation, Panes, RawGaussians, Splats
 from glassplat.kernels.screen_statistics import Sums, Views
 from glassplat.kernels.tiles import reference as tiles_twin
+from glassplat.render.panes import mirrored_views, panes_in_camera
+from glassplat.scene.camera import Camera
+from glassplat.scene.panes import Planes
 from tests.kernels.cuda.agreement import (
     DEVICE,
     DTYPES,
@@ -327,6 +331,18 @@ def test_layer_slopes(linear: bool, dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
+def test_slopes_at(dtype: torch.dtype) -> None:
+    """At centres within the image, far beyond it and at NaN, before and behind the surface."""
+    slopes, near = (draw(HEIGHT, WIDTH, seed=seed).to(dtype) for seed in (1, 2))
+    means, depths = 30 * draw(2, many(20, 2000), 2, seed=3).to(dtype), draw(2, many(20, 2000), seed=4).to(dtype)
+    means[0, 0, 0], means[1, 1, 1], means[0, 2], means[1, 3] = torch.nan, torch.nan, torch.inf, -torch.inf
+    given = slopes, near, means, depths
+    found, expected = panes_operation.slopes_at(*map(on_device, given)), panes_on_the_cpu.slopes_at(*given)
+    close(found, expected)
+    assert 0.2 < float((expected == 1).double().mean()) < 0.8
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize(
     ("size", "cell", "is_told"), [((many(4, 60), 5), 1, False), ((many(7, HEIGHT), many(8, WIDTH)), 4, True)]
 )
@@ -350,6 +366,39 @@ def test_inside_of_panes(size: tuple[int, int], dtype: torch.dtype) -> None:
     expected = panes_on_the_cpu.inside_panes(pane, strength)
     close(found, expected)
     assert min(size) == 1 or 0.1 < float(expected.mean()) < 0.9
+
+
+def three_planes(dtype: torch.dtype) -> tuple[Planes, Camera]:
+    """Planes of raw normals of any length, one of which the camera sees from behind."""
+    planes = Planes(*(draw(3, n, seed=n + i) for i, n in enumerate((3, 3))), draw(3, seed=5), draw(3, 3, seed=6),
+                    draw(3, 2, seed=7).exp(), (1, 2, 3))  # fmt: skip
+    pose = random_cameras(1).cam_from_world[0].detach()
+    camera = Camera(pose.to(dtype), 10.0, 10.0, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
+    return planes.with_tensors({name: tensor.to(dtype) for name, tensor in planes.tensors().items()}), camera
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_mirrored_views(dtype: torch.dtype) -> None:
+    planes, camera = three_planes(dtype)
+    rows, last = camera.cam_from_world.split((3, 1))
+    leaves = [t.requires_grad_() for t in (planes.centers, planes.raw_normals, rows)]
+    own = [on_device(leaf) for leaf in leaves]
+    found = panes_operation.mirrored_views(*own[:2], torch.cat([own[2], last.to(DEVICE)]))
+    expected = mirrored_views(planes, replace(camera, cam_from_world=torch.cat([rows, last])))
+    sides = expected.half_spaces[:, :3] * planes.normals
+    assert len(set(sides.sum(dim=1).sign().tolist())) == 2
+    for value, want in zip(found, expected, strict=True):
+        close(value, want)
+    check_gradients(found[:2], expected[:2], own, leaves)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_panes_in_camera(dtype: torch.dtype) -> None:
+    planes, camera = three_planes(dtype)
+    given = planes.centers, planes.raw_normals, planes.tangents, planes.half_sizes, camera.cam_from_world
+    found = panes_operation.panes_in_camera(*map(on_device, given))
+    for value, want in zip(found, panes_in_camera(planes, camera), strict=True):
+        close(value, want)
 
 
 def test_no_pane_is_hit_where_there_is_none() -> None:
