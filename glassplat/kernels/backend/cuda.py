@@ -13,7 +13,7 @@ import math
 import re
 import struct
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, NamedTuple
@@ -142,43 +142,63 @@ class LoadedKernel:
         name: of the kernel.
     """
 
-    def __init__(self, code: MachineCode, name: str, index: int, layout: struct.Struct) -> None:
+    def __init__(self, code: MachineCode, name: str, index: int, expected: Sequence[Expected]) -> None:
         """Loads machine code.
 
         Args:
             code: for the GPU.
             name: of the kernel.
             index: of the GPU, as torch counts.
-            layout: how the arguments lie in memory, each at the beginning of a slot.
+            expected: the arguments.
         """
         self.name = name
         with current_gpu(index):
-            self._context = driver.CUcontext(int(check_driver("cuCtxGetCurrent", driver.cuCtxGetCurrent())))
+            self._context = int(check_driver("cuCtxGetCurrent", driver.cuCtxGetCurrent()))
             self._library = ObjectCode.from_cubin(code.cubin, name=name)
             self._function = driver.CUfunction(int(self._library.get_kernel(code.entry).handle))
-        self._layout, self._memory = layout, ctypes.create_string_buffer(layout.size)
+        # Addresses and numbers lie in front, then a zero, then what is known of the shapes, which seldom change.
+        self._front = struct.Struct("<" + "".join(one.layout for one in expected))
+        zero, behind = len(expected), len(expected) + 1
+        places: list[int] = []
+        self._sizes: list[tuple[struct.Struct, int, int]] = []
+        for place, (_, dtype, ndim, size) in enumerate(expected):
+            if dtype is None:
+                places.append(place)
+                continue
+            count, each, *others = range(behind, behind + 2 + 2 * ndim)
+            # Two pointers that only host memory uses come first.
+            places += (zero, zero, count, each, place, *others)
+            self._sizes.append((struct.Struct(f"<{2 + 2 * ndim}q"), behind * SLOT, size))
+            behind += 2 + 2 * ndim
+        self._shapes: Sequence[tuple[int, ...] | None] = [()] * len(self._sizes)
+        self._memory = ctypes.create_string_buffer(behind * SLOT)
         first = ctypes.addressof(self._memory)
-        self._slots = (ctypes.c_void_p * (layout.size // SLOT))(*range(first, first + layout.size, SLOT))
+        self._slots = (ctypes.c_void_p * len(places))(*(first + place * SLOT for place in places))
         self._address = ctypes.addressof(self._slots)
         # The threads of a backward pass launch too, and the driver reads the arguments while others may run.
         self._lock = threading.Lock()
 
-    def launch(self, blocks: int, threads: int, stream: int, values: list[Any]) -> None:
+    def launch(
+        self, blocks: int, threads: int, stream: int, values: list[Any], shapes: list[tuple[int, ...] | None]
+    ) -> None:
         """Queues the kernel.
 
         Args:
             blocks: how many of them.
             threads: in each block.
             stream: the address of a stream of the GPU's primary context.
-            values: what the slots hold.
+            values: each argument, of an array its address.
+            shapes: of the arrays; None for one that is not there.
         """
         with self._lock:
-            self._layout.pack_into(self._memory, 0, *values)
+            self._front.pack_into(self._memory, 0, *values)
+            if shapes != self._shapes:
+                self._keep(shapes)
             # A thread that has not used the GPU yet has no context, and one may be busy with another GPU.
             current = check_driver("cuCtxGetCurrent", driver.cuCtxGetCurrent())
-            elsewhere = int(current) != int(self._context)
+            elsewhere = int(current) != self._context
             if elsewhere:
-                check_driver("cuCtxPushCurrent", driver.cuCtxPushCurrent(self._context))
+                check_driver("cuCtxPushCurrent", driver.cuCtxPushCurrent(driver.CUcontext(self._context)))
             try:
                 done = driver.cuLaunchKernel(
                     self._function, blocks, 1, 1, threads, 1, 1, 0, stream, self._address, 0
@@ -187,6 +207,23 @@ class LoadedKernel:
                 if elsewhere:
                     check_driver("cuCtxPopCurrent", driver.cuCtxPopCurrent())
             check_driver(self.name, done)
+
+    def _keep(self, shapes: Sequence[tuple[int, ...] | None]) -> None:
+        """Writes what has changed of the arrays: number and bytes of the elements, shape, strides."""
+        for shape, known, (layout, offset, size) in zip(shapes, self._shapes, self._sizes, strict=True):
+            if shape == known:
+                continue
+            if shape is None:
+                layout.pack_into(self._memory, offset, 0, size, *(0,) * (layout.size // SLOT - 2))
+            else:
+                layout.pack_into(self._memory, offset, math.prod(shape), size, *shape, *_strides(shape, size))
+        self._shapes = shapes
+
+
+@lru_cache(maxsize=1024)
+def _strides(shape: tuple[int, ...], size: int) -> tuple[int, ...]:
+    """Bytes from one element to the next along each dimension of a contiguous array."""
+    return tuple(math.prod(shape[axis + 1 :]) * size for axis in range(len(shape)))
 
 
 def current_gpu(index: int) -> Any:
@@ -235,35 +272,48 @@ class Kernel:
         self.name = name
         self.function = function
         self.signature = signature
-        self._expected = [Expected(type_) for type_ in signature]
+        self._expected = [Expected.of(type_) for type_ in signature]
         self._loaded: dict[int, LoadedKernel] = {}
-        self._layout = struct.Struct("<" + "".join(expected.layout for expected in self._expected))
         self._images = ImageCache(function, name, signature)
         self._simulated = cuda.jit(function) if SIMULATED else None
 
     def __call__(self, blocks: int, threads: int, *arguments: Any) -> None:
-        """Launches on torch's current stream of the device of the first tensor; does nothing for no blocks.
+        """Launches on torch's current stream of the tensors' device; does nothing for no blocks.
 
         Args:
             blocks: how many of them.
             threads: in each block.
-            arguments: contiguous tensors of one device, and numbers, in the order of the signature. None stands for
-                an array without elements.
+            arguments: contiguous tensors of one device, at least one, and numbers, in the order of the signature. None
+                stands for an array without elements.
         """
         if blocks == 0:
             return
         if len(arguments) != len(self.signature):
             raise TypeError(f"{self.name} takes {len(self.signature)} arguments, got {len(arguments)}")
         if self._simulated is not None:
-            values_of = (e.simulate(argument) for e, argument in zip(self._expected, arguments, strict=True))
-            self._simulated[blocks, threads](*values_of)
+            own = (e.simulate(argument) for e, argument in zip(self._expected, arguments, strict=True))
+            self._simulated[blocks, threads](*own)
             return
-        index = next(argument.get_device() for argument in arguments if isinstance(argument, Tensor))
+        # Python takes longer over the arguments than the driver does for the launch: nothing is called without need.
         values: list[Any] = []
-        for argument, expected in zip(arguments, self._expected, strict=True):
-            expected.append(values, argument)
+        shapes: list[tuple[int, ...] | None] = []
+        for argument, (type_, dtype, ndim, _) in zip(arguments, self._expected, strict=True):
+            if dtype is None:
+                values.append(argument)
+            elif argument is None:
+                values.append(0)
+                shapes.append(None)
+            else:
+                shape = argument.shape
+                if argument.dtype is not dtype or len(shape) != ndim or not argument.is_contiguous():
+                    raise refusal(argument, type_)
+                values.append(argument.data_ptr())
+                shapes.append(shape)
+                tensor = argument
+        index = tensor.get_device()
         loaded = self._loaded.get(index) or self._on_device(index)
-        loaded.launch(blocks, threads, torch.cuda.current_stream(index).cuda_stream, values)
+        # The number that `torch.cuda.current_stream` makes an object of.
+        loaded.launch(blocks, threads, torch._C._cuda_getCurrentRawStream(index), values, shapes)
 
     def _on_device(self, index: int) -> LoadedKernel:
         """The kernel on a GPU, loaded at first use."""
@@ -271,61 +321,52 @@ class Kernel:
             # Numba asks the current GPU about itself while it compiles, and torch's threads may have none.
             with current_gpu(index):
                 code = self._images.machine_code(torch.cuda.get_device_capability(index))
-                self._loaded[index] = LoadedKernel(code, self.name, index, self._layout)
+                self._loaded[index] = LoadedKernel(code, self.name, index, self._expected)
         return self._loaded[index]
 
 
-@lru_cache(maxsize=4096)
-def _array_layout(shape: tuple[int, ...], size: int) -> tuple[int, tuple[int, ...]]:
-    """The number of an array's elements, each of so many bytes, and what stands after its address: shape, strides."""
-    strides = tuple(math.prod(shape[axis + 1 :]) * size for axis in range(len(shape)))
-    return math.prod(shape), (*shape, *strides)
-
-
-class Expected:
-    """Expected argument of a kernel, and how it is handed over.
+class Expected(NamedTuple):
+    """Expected argument of a kernel.
 
     Attributes:
         type: the Numba type.
-        layout: how what stands for an argument lies in memory, eight bytes for each value.
+        dtype: of an array; None for a number.
+        ndim: dimensions of an array.
+        size: bytes of a number or an element.
     """
 
-    def __init__(self, type_: Any) -> None:
-        self.type = type_
-        self._is_array = isinstance(type_, types.Array)
-        self._ndim = type_.ndim if self._is_array else 0
-        element = str(type_.dtype if self._is_array else type_)
-        self._dtype = torch.bool if element == "bool" else getattr(torch, element)
-        self._is_bool = element == "bool"
-        self._size = self._dtype.itemsize
-        self._nothing = (0, 0, 0, self._size, 0, *(0,) * (2 * self._ndim))
-        self.layout = f"{5 + 2 * self._ndim}q" if self._is_array else f"{FORMATS[element]}{8 - self._size}x"
+    type: Any
+    dtype: torch.dtype | None
+    ndim: int
+    size: int
 
-    def append(self, values: list[Any], argument: Any) -> None:
-        """Adds what stands for an argument in Numba's calling convention to the values of a launch."""
-        if not self._is_array:
-            values.append(argument)
-            return
-        if argument is None:
-            values += self._nothing
-            return
-        shape = argument.shape
-        if argument.dtype != self._dtype or len(shape) != self._ndim or not argument.is_contiguous():
-            raise TypeError(f"got {argument.dtype} of shape {tuple(shape)}, expected contiguous {self.type}")
-        count, after = _array_layout(shape, self._size)
-        # Two pointers that only host memory uses come first.
-        values += (0, 0, count, self._size, argument.data_ptr(), *after)
+    @classmethod
+    def of(cls, type_: Any) -> Expected:
+        """The argument of a Numba type."""
+        is_array = isinstance(type_, types.Array)
+        element = str(type_.dtype if is_array else type_)
+        dtype: torch.dtype = torch.bool if element == "bool" else getattr(torch, element)
+        return cls(type_, dtype if is_array else None, type_.ndim if is_array else 0, dtype.itemsize)
+
+    @property
+    def layout(self) -> str:
+        """Format of the eight bytes that hold a number, or the address of an array."""
+        return "q" if self.dtype is not None else f"{FORMATS[str(self.type)]}{SLOT - self.size}x"
 
     def simulate(self, argument: Any) -> Any:
         """Stand-in for an argument in the simulator."""
-        if not self._is_array:
-            return bool(argument) if self._is_bool else np.dtype(str(self.type)).type(argument)
+        if self.dtype is None:
+            return bool(argument) if self.type == types.boolean else np.dtype(str(self.type)).type(argument)
         if argument is None:
-            return np.empty((0,) * self.type.ndim, np.dtype(str(self.type.dtype)))
-        array = argument.detach().numpy()
-        if argument.dtype != self._dtype or array.ndim != self.type.ndim or not array.flags.c_contiguous:
-            raise TypeError(f"got {array.dtype} of shape {array.shape}, expected contiguous {self.type}")
-        return array
+            return np.empty((0,) * self.ndim, np.dtype(str(self.type.dtype)))
+        if argument.dtype != self.dtype or argument.dim() != self.ndim or not argument.is_contiguous():
+            raise refusal(argument, self.type)
+        return argument.detach().numpy()
+
+
+def refusal(argument: Tensor, type_: Any) -> TypeError:
+    """The error for a tensor that is not the array which a kernel takes."""
+    return TypeError(f"got {argument.dtype} of shape {tuple(argument.shape)}, expected contiguous {type_}")
 
 
 def kernel(name: str, real: type, arguments: str) -> Callable[[Callable[..., None]], Kernel]:

@@ -1,5 +1,5 @@
-"""Binning on the GPU: one pass over the splats to count their tiles, one to list their rows of tiles, one over the
-pairs; torch scans and sorts.
+"""Binning on the GPU: one pass over the splats to count their tiles, one to list their rows of tiles, two over the
+pairs; torch scans and sorts. There are few steps, as to start one takes longer than a small one itself.
 
 Splats are sorted by depth first. Their pairs are written in that order, so that one stable sort of the pairs by tile,
 an integer of 16 bits for all but very large images, leaves each tile's splats nearest first. Each pair has a thread,
@@ -9,7 +9,7 @@ the whole image. Only the passes over the splats compute in float64, which most 
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 import torch
@@ -28,99 +28,121 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
     """As `glassplat.kernels.tiles.cpu.bin_tiles`; waits for the GPU once, to learn the number of pairs."""
     num_cameras, per_camera = splats.depths.shape
     count, device, real = num_cameras * per_camera, splats.depths.device, REAL_OF[splats.depths.dtype]
-    num_tiles = num_cameras * -(-height // TILE) * -(-width // TILE)
+    rows, columns = -(-height // TILE), -(-width // TILE)
+    num_tiles = num_cameras * rows * columns
     shapes = (splats.means2d.view(count, 2), splats.conics.view(count, 3), splats.opacities.view(count))
-    radii = splats.radii.view(count, 2)
-    counts = torch.empty(2, count, dtype=torch.int32, device=device)
-    count_tiles(real)(
-        blocks_for(count, THREADS), THREADS, *shapes, radii, active_tiles, per_camera, width, height, counts
-    )
-    offsets = torch.zeros(2 * count + 1, dtype=torch.int64, device=device)
-    # One sum over both rows: torch gives each row of a matrix to a single block of threads.
-    torch.cumsum(counts.view(-1), 0, out=offsets[1:])
-    splat_offsets, span_offsets = offsets[: count + 1], offsets[count:] - offsets[count]
-    active, num_active = _active(active_tiles, num_tiles, device)
+    seen = (*shapes, splats.radii.view(count, 2), active_tiles, per_camera, width, height)
+    # One sum over sections of equal length: the pairs of each splat, its rows of tiles, which tiles are active where
+    # not all are, and the pairs again in the order of depths. So each total is where a section ends.
+    masked = active_tiles is not None and num_tiles > 0
+    length = max(count, num_tiles if masked else 1)
+    by_depth = (3 if masked else 2) * length
+    sums = torch.empty(by_depth + count + 1, dtype=torch.int64, device=device)
+    count_tiles(real)(blocks_for(length, THREADS), THREADS, *seen, length, sums)
+    order = torch.argsort(splats.depths, dim=1, stable=True).flatten()
+    order_counts()(blocks_for(count, THREADS), THREADS, per_camera, by_depth, order, sums)
+    sums.cumsum_(0)
     # The one thing that the program asks of the GPU, and waits for.
-    num_pairs, num_spans, num_active = torch.stack([splat_offsets[-1], span_offsets[-1], num_active]).tolist()
+    num_pairs, *totals = sums[length : by_depth + 1 : length].tolist()
     check_pair_count(num_pairs)
-    spans = torch.empty(num_spans, 3, dtype=torch.int32, device=device)
-    list_spans(real)(
-        blocks_for(count, THREADS), THREADS, *shapes, radii, active_tiles, per_camera, width, height, span_offsets,
-        spans,
-    )  # fmt: skip
-    narrow = num_tiles < np.iinfo(np.int16).max
-    tiles = torch.empty(num_pairs, dtype=torch.int16 if narrow else torch.int32, device=device)
+    spans = torch.empty(totals[0] - num_pairs, 3, dtype=torch.int32, device=device)
+    active = torch.empty(totals[1] - totals[0], dtype=torch.int32, device=device) if masked else None
+    list_spans(real)(blocks_for(length, THREADS), THREADS, *seen, length, sums, spans, active)
+    key, dtype = (np.int16, torch.int16) if num_tiles < np.iinfo(np.int16).max else (np.int32, torch.int32)
+    tiles = torch.empty(num_pairs, dtype=dtype, device=device)
     members, slots = torch.empty(2, num_pairs, dtype=torch.int32, device=device)
-    emit_tiles(np.int16 if narrow else np.int32)(
-        blocks_for(num_pairs, THREADS), THREADS, active_tiles, per_camera, -(-height // TILE), -(-width // TILE),
-        num_tiles, *_sequence(splats.depths, counts[0]), splat_offsets, span_offsets, spans, tiles, members, slots,
+    emit_tiles(key)(
+        blocks_for(num_pairs, THREADS), THREADS, active_tiles, per_camera, rows, columns, num_tiles, length, by_depth,
+        order, sums, spans, tiles, members, slots,
     )  # fmt: skip
     by_tile, order = torch.sort(tiles, stable=True)
-    edges = torch.arange(num_tiles + 1, dtype=tiles.dtype, device=device)
-    pair_slots = torch.empty_like(slots)
-    pair_slots[slots[order].long()] = torch.arange(num_pairs, dtype=torch.int32, device=device)
-    tile_offsets = torch.searchsorted(by_tile, edges)
-    return TileBins(
-        members[order], tile_offsets, pair_slots, splat_offsets, active[:num_active], width, height, num_cameras
-    )
+    pair_splats, pair_slots = torch.empty(2, num_pairs, dtype=torch.int32, device=device)
+    tile_offsets = torch.empty(num_tiles + 1, dtype=torch.int64, device=device)
+    list_pairs(key)(
+        blocks_for(max(num_pairs, num_tiles + 1), THREADS), THREADS, by_tile, order, members, slots, pair_splats,
+        pair_slots, tile_offsets,
+    )  # fmt: skip
+    if active is None:
+        active = _every_tile(num_tiles, device)
+    return TileBins(pair_splats, tile_offsets, pair_slots, sums[: count + 1], active, width, height, num_cameras)
 
 
-def _active(active_tiles: Tensor | None, num_tiles: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """The active tiles in order, in the front of a longer list, and how many they are."""
-    every = torch.arange(num_tiles, dtype=torch.int32, device=device)
-    if active_tiles is None:
-        return every, torch.full((), num_tiles, device=device)
-    flags = active_tiles.flatten()
-    counted = flags.cumsum(0)
-    # All that are not active are written to the place behind the last.
-    places = torch.where(flags, counted - 1, num_tiles)
-    return every.new_empty(num_tiles + 1).scatter_(0, places, every), flags.sum()
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)
+def _every_tile(count: int, device: torch.device) -> Tensor:
+    """The numbers of all tiles, the same tensor at every call: leave it as it is."""
+    return torch.arange(count, dtype=torch.int32, device=device)
 
 
-def _sequence(depths: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-    """The splats [S] in the order of their depths, camera by camera, and how many pairs those before each have."""
-    num_cameras, per_camera = depths.shape
-    first = torch.arange(num_cameras, device=depths.device)[:, None] * per_camera
-    order = (torch.argsort(depths, dim=1, stable=True) + first).flatten()
-    in_order = counts[order].long()
-    return order, in_order.cumsum(0) - in_order
+@inlined
+def is_active(active_tiles, tile):
+    """Return whether a tile is active; tiles are counted over all cameras."""
+    rows, columns = active_tiles.shape[1], active_tiles.shape[2]
+    row = tile // columns
+    return active_tiles[row // rows, row % rows, tile % columns]
 
 
 @cache
 def count_tiles(real: type) -> Kernel:
-    """Counts the active tiles that each splat touches, and the rows of tiles that it may touch any in [2, S]."""
+    """Writes what is summed up: of each splat how many active tiles it touches, and how many rows of tiles that it may
+    touch any in; of each tile whether it is active, where not all are. A zero is in front.
+    """
 
-    @kernel("count_tiles", real, "real2 real2 real1 real2 bool3 int int int int2")
-    def count(means2d, conics, opacities, radii, active_tiles, per_camera, width, height, counts):
+    @kernel("count_tiles", real, "real2 real2 real1 real2 bool3 int int int long long1")
+    def count(means2d, conics, opacities, radii, active_tiles, per_camera, width, height, length, sums):
         s = cuda.grid(1)
-        if s >= opacities.size:
+        if s >= length:
             return
         found, spans = 0, 0
-        rows = rows_of(means2d, conics, opacities, radii, s, height)
-        if rows[0] <= rows[1]:
-            shape, first, last = shape_of(means2d, conics, s, rows), rows[0] // TILE, rows[1] // TILE
-            spans = last - first + 1
-            for row in range(first, last + 1):
-                left, right = columns_of(shape, row, width)
-                found += active_between(active_tiles, s // per_camera, row, left, right)
-        counts[0, s], counts[1, s] = found, spans
+        if s < opacities.size:
+            rows = rows_of(means2d, conics, opacities, radii, s, height)
+            if rows[0] <= rows[1]:
+                shape, first, last = shape_of(means2d, conics, s, rows), rows[0] // TILE, rows[1] // TILE
+                spans = last - first + 1
+                for row in range(first, last + 1):
+                    left, right = columns_of(shape, row, width)
+                    found += active_between(active_tiles, s // per_camera, row, left, right)
+        sums[1 + s], sums[1 + length + s] = found, spans
+        if active_tiles.size > 0:
+            sums[1 + 2 * length + s] = 1 if s < active_tiles.size and is_active(active_tiles, s) else 0
+        if s == 0:
+            sums[0] = 0
 
     return count
 
 
 @cache
-def list_spans(real: type) -> Kernel:
-    """Lists the rows of tiles of each splat: the row, its first column, and the pairs of the splat up to its end."""
+def order_counts(key: type = np.int64) -> Kernel:
+    """Writes the rest of it: the pairs of each splat, camera by camera in the order of depths."""
 
-    @kernel("list_spans", real, "real2 real2 real1 real2 bool3 int int int long1 int2")
-    def fill(means2d, conics, opacities, radii, active_tiles, per_camera, width, height, span_offsets, spans):
+    @kernel("order_counts", key, "int long long1 long1")
+    def fill(per_camera, by_depth, order, sums):
+        i = cuda.grid(1)
+        if i < order.size:
+            sums[1 + by_depth + i] = sums[1 + i // per_camera * per_camera + order[i]]
+
+    return fill
+
+
+@cache
+def list_spans(real: type) -> Kernel:
+    """Lists the rows of tiles of each splat: the row, its first column, and the pairs of the splat up to its end.
+
+    Lists the active tiles besides, where not all are.
+    """
+
+    @kernel("list_spans", real, "real2 real2 real1 real2 bool3 int int int long long1 int2 int1")
+    def fill(means2d, conics, opacities, radii, active_tiles, per_camera, width, height, length, sums, spans, active):
         s = cuda.grid(1)
-        if s >= opacities.size or span_offsets[s] == span_offsets[s + 1]:
+        if s < active_tiles.size and is_active(active_tiles, s):
+            active[sums[2 * length + s] - sums[2 * length]] = s
+        if s >= opacities.size or sums[length + s] == sums[length + s + 1]:
             return
         rows = rows_of(means2d, conics, opacities, radii, s, height)
         shape, first, found = shape_of(means2d, conics, s, rows), rows[0] // TILE, 0
-        for i in range(span_offsets[s], span_offsets[s + 1]):
-            row, left, right = first + i - span_offsets[s], 0, -1
+        begin = sums[length + s] - sums[length]
+        for i in range(begin, sums[length + s + 1] - sums[length]):
+            row, left, right = first + i - begin, 0, -1
             # Should the passes ever round differently, a row that only the first one saw is empty.
             if row * TILE <= rows[1]:
                 left, right = columns_of(shape, row, width)
@@ -131,9 +153,9 @@ def list_spans(real: type) -> Kernel:
 
 
 @inlined
-def search(values, x):
-    """The last of ascending values that is at most x; the first is."""
-    low, high = 0, values.size
+def search(values, begin, end, x):
+    """The last place, from `begin` and before `end`, whose ascending value is at most x; `begin` if none is."""
+    low, high = begin, end
     while high - low > 1:
         middle = (low + high) // 2
         if values[middle] <= x:
@@ -148,31 +170,34 @@ def emit_tiles(key: type = np.int16) -> Kernel:
     """Writes the tile, the splat and the slot of every pair."""
     keys = "short1" if key is np.int16 else "int1"
 
-    @kernel("emit_tiles", key, f"bool3 int int int int long1 long1 long1 long1 int2 {keys} int1 int1")
+    @kernel("emit_tiles", key, f"bool3 int int int int long long long1 long1 int2 {keys} int1 int1")
     def emit(
-        active_tiles, per_camera, grid_rows, grid_columns, num_tiles,
-        order, starts, splat_offsets, span_offsets, spans, tiles, members, slots,
+        active_tiles, per_camera, grid_rows, grid_columns, num_tiles, length, by_depth,
+        order, sums, spans, tiles, members, slots,
     ):  # fmt: skip
         pair = cuda.grid(1)
         if pair >= tiles.size:
             return
-        place = search(starts, pair)
-        s, left_over = order[place], pair - starts[place]
-        members[pair], slots[pair] = s, splat_offsets[s] + left_over
-        low, high = span_offsets[s], span_offsets[s + 1]
+        before = sums[by_depth] + pair
+        place = search(sums, by_depth, by_depth + order.size, before)
+        left_over, camera = before - sums[place], (place - by_depth) // per_camera
+        s = camera * per_camera + order[place - by_depth]
+        members[pair], slots[pair] = s, sums[s] + left_over
+        begin, end = sums[length + s] - sums[length], sums[length + s + 1] - sums[length]
+        low, high = begin, end
         while low < high:
             middle = (low + high) // 2
             if spans[middle, 2] <= left_over:
                 low = middle + 1
             else:
                 high = middle
-        if low == span_offsets[s + 1]:
+        if low == end:
             # Should the passes ever round differently, what is left over goes behind the last tile, where none looks.
             tiles[pair] = key(num_tiles)
             return
-        if low > span_offsets[s]:
+        if low > begin:
             left_over -= spans[low - 1, 2]
-        camera, row, column = s // per_camera, spans[low, 0], spans[low, 1] + left_over
+        row, column = spans[low, 0], spans[low, 1] + left_over
         if active_tiles.size > 0:
             column = spans[low, 1]
             while left_over > 0 or not active_tiles[camera, row, column]:
@@ -181,3 +206,19 @@ def emit_tiles(key: type = np.int16) -> Kernel:
         tiles[pair] = key((camera * grid_rows + row) * grid_columns + column)
 
     return emit
+
+
+@cache
+def list_pairs(key: type = np.int16) -> Kernel:
+    """Writes the splats and slots of the pairs, which are sorted by tile now, and where each tile's pairs begin."""
+    keys = "short1" if key is np.int16 else "int1"
+
+    @kernel("list_pairs", key, f"{keys} long1 int1 int1 int1 int1 long1")
+    def fill(tiles, order, members, slots, pair_splats, pair_slots, tile_offsets):
+        i = cuda.grid(1)
+        if i < tiles.size:
+            pair_splats[i], pair_slots[slots[order[i]]] = members[order[i]], i
+        if i < tile_offsets.size:
+            tile_offsets[i] = search(tiles, -1, tiles.size, i - 1) + 1
+
+    return fill

@@ -40,7 +40,8 @@ def test_every_operation_has_its_kernels() -> None:
     traced = {f"trace_{step}_{kind}" for step in ("forward", "gradients") for kind in ("discs", "ellipsoids")}
     both_ways |= {"shade_environment", "surface_channels", "project_discs", "composite_discs"}
     expected = {f"{name}_{way}" for name in both_ways for way in ("forward", "backward")} | {"adam", "pane_hits"}
-    expected |= traced | {"count_tiles", "emit_tiles", "hilbert_places", "fit_leaves", "fit_level"}
+    expected |= traced | {"count_tiles", "order_counts", "list_spans", "emit_tiles", "list_pairs"}
+    expected |= {"hilbert_places", "fit_leaves", "fit_level"}
     assert all(any(name.startswith(want) for name in names) for want in expected)
 
 

@@ -17,7 +17,7 @@ pytest.importorskip("numba_cuda", reason="numba-cuda is not installed; `make set
 from cuda.bindings.driver import CUresult
 from numba import types
 
-from glassplat.kernels.backend.cuda import Expected, ImageCache, MachineCode, blocks_for, kernel
+from glassplat.kernels.backend.cuda import Expected, ImageCache, Kernel, MachineCode, blocks_for, kernel
 from glassplat.kernels.backend.devices import SIMULATED
 
 if SIMULATED:
@@ -49,39 +49,6 @@ def numbas_values(type_: Any, value: Any) -> list[Any]:
     return found
 
 
-@pytest.mark.parametrize(
-    ("dtype", "element"),
-    [
-        (torch.float32, types.float32),
-        (torch.float64, types.float64),
-        (torch.int16, types.int16),
-        (torch.int32, types.int32),
-        (torch.int64, types.int64),
-        (torch.bool, types.boolean),
-    ],
-)
-@pytest.mark.parametrize("shape", [(3,), (2, 3), (1, 4, 1), (2, 1, 3, 2)])
-def test_arrays_are_handed_over_as_numba_does(dtype: torch.dtype, element: Any, shape: tuple[int, ...]) -> None:
-    tensor, own = torch.zeros(shape, dtype=dtype), []
-    type_ = types.Array(element, len(shape), "C")
-    Expected(type_).append(own, tensor)
-    assert own == numbas_values(type_, OnDevice(np.zeros(shape, tensor.numpy().dtype), tensor.data_ptr()))
-
-
-@pytest.mark.parametrize(
-    ("type_", "value"),
-    [(types.int32, 7), (types.int64, -3), (types.float32, 0.1), (types.float64, 0.1), (types.boolean, True)],
-)
-def test_numbers_are_handed_over_as_numba_does(type_: Any, value: Any) -> None:
-    expected = Expected(type_)
-    own: list[Any] = []
-    expected.append(own, value)
-    packed = struct.pack(f"<{expected.layout}", *own)
-    (numbas,) = numbas_values(type_, value)
-    assert len(packed) == SLOT
-    assert packed.startswith(bytes(numbas) if isinstance(numbas, ctypes._SimpleCData) else struct.pack("?", numbas))
-
-
 class Driver:
     """Stands in for the driver: notes each call, and reads the arguments of a launch as a GPU's driver would."""
 
@@ -92,6 +59,7 @@ class Driver:
         self.launches: list[tuple[Any, ...]] = []
         self.contexts = [OWN]
         self.refusal = 0
+        self.slots = SLOTS
 
     def cuCtxGetCurrent(self) -> tuple[int, int]:  # noqa: N802
         self.calls.append("get")
@@ -109,7 +77,7 @@ class Driver:
     def cuLaunchKernel(self, *arguments: int) -> tuple[Any]:  # noqa: N802
         self.calls.append("launch")
         *head, slots, _ = arguments
-        pointers = (ctypes.c_void_p * SLOTS).from_address(slots)
+        pointers = (ctypes.c_void_p * self.slots).from_address(slots)
         self.launches.append((self.contexts[-1], *head, *(ctypes.string_at(pointer, SLOT) for pointer in pointers)))
         return (CUresult(self.refusal),)
 
@@ -127,10 +95,60 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> Driver:
     monkeypatch.setattr(launch, "ObjectCode", SimpleNamespace(from_cubin=lambda cubin, name: library))
     monkeypatch.setattr(launch, "current_gpu", lambda index: nullcontext())
     monkeypatch.setattr(torch.Tensor, "get_device", lambda tensor: 0)
-    monkeypatch.setattr(torch.cuda, "current_stream", lambda index: SimpleNamespace(cuda_stream=STREAM))
+    monkeypatch.setattr(torch._C, "_cuda_getCurrentRawStream", lambda index: STREAM, raising=False)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: (9, 0))
     monkeypatch.setattr(ImageCache, "machine_code", lambda images, capability: MachineCode("entry", b"cubin"))
     return found
+
+
+def handed_over(gpu: Driver, type_: Any, value: Any) -> list[bytes]:
+    """The slots of a launch with an argument of that type, and an array without elements before and behind it."""
+    nothing, before, behind = types.Array(types.int16, 1, "C"), 7, 7
+    gpu.slots = before + behind + (5 + 2 * type_.ndim if isinstance(type_, types.Array) else 1)
+    made = Kernel(lambda first, argument, last: None, "nothing", (nothing, type_, nothing))
+    made(1, 32, torch.zeros(0, dtype=torch.int16), value, None)
+    return list(gpu.launches[-1][10 + before : -behind])
+
+
+@pytest.mark.parametrize(
+    ("dtype", "element"),
+    [
+        (torch.float32, types.float32),
+        (torch.float64, types.float64),
+        (torch.int16, types.int16),
+        (torch.int32, types.int32),
+        (torch.int64, types.int64),
+        (torch.bool, types.boolean),
+    ],
+)
+@pytest.mark.parametrize("shape", [(3,), (2, 3), (1, 4, 1), (2, 1, 3, 2)])
+def test_arrays_are_handed_over_as_numba_does(
+    gpu: Driver, dtype: torch.dtype, element: Any, shape: tuple[int, ...]
+) -> None:
+    tensor = torch.zeros(shape, dtype=dtype)
+    type_ = types.Array(element, len(shape), "C")
+    numbas = numbas_values(type_, OnDevice(np.zeros(shape, tensor.numpy().dtype), tensor.data_ptr()))
+    assert [int.from_bytes(slot, "little") for slot in handed_over(gpu, type_, tensor)] == numbas
+
+
+@pytest.mark.parametrize(
+    ("type_", "value"),
+    [(types.int32, 7), (types.int64, -3), (types.float32, 0.1), (types.float64, 0.1), (types.boolean, True)],
+)
+def test_numbers_are_handed_over_as_numba_does(gpu: Driver, type_: Any, value: Any) -> None:
+    (slot,) = handed_over(gpu, type_, value)
+    (numbas,) = numbas_values(type_, value)
+    assert slot.startswith(bytes(numbas) if isinstance(numbas, ctypes._SimpleCData) else struct.pack("?", numbas))
+
+
+@pytest.mark.parametrize("ndim", [1, 3])
+def test_none_stands_for_an_array_without_elements(gpu: Driver, ndim: int) -> None:
+    tensor, type_ = torch.zeros((0,) * ndim), types.Array(types.float32, ndim, "C")
+    given, own = handed_over(gpu, type_, tensor), handed_over(gpu, type_, None)
+    assert own[:4] == given[:4]
+    assert int.from_bytes(own[4], "little") == tensor.data_ptr() == 0
+    # No element, no step from one to the next: shapes agree, strides do not count.
+    assert own[5 : 5 + ndim] == given[5 : 5 + ndim] == [bytes(SLOT)] * ndim
 
 
 def declared() -> Any:
@@ -179,17 +197,17 @@ def test_what_the_driver_refuses_is_named(gpu: Driver) -> None:
         declared()(5, 64, torch.zeros(3, 2), 1, True)
 
 
-@pytest.mark.parametrize("ndim", [1, 3])
-def test_none_stands_for_an_array_without_elements(ndim: int) -> None:
-    tensor = torch.zeros((0,) * ndim)
-    given, own = [], []
-    expected = Expected(types.Array(types.float32, ndim, "C"))
-    expected.append(given, tensor)
-    expected.append(own, None)
-    assert own[:4] == given[:4]
-    assert own[4] == tensor.data_ptr() == 0
-    # No element, no step from one to the next: shapes agree, strides do not count.
-    assert own[5 : 5 + ndim] == given[5 : 5 + ndim] == [0] * ndim
+def test_shapes_of_one_launch_are_not_those_of_the_next(gpu: Driver) -> None:
+    gpu.slots = 18
+    made = kernel("nothing", np.float32, "real2 real2")(lambda first, second: None)
+    for shape in [(3, 2), (3, 2), (5, 2), None, None, (5, 2), (0, 2), (3, 2)]:
+        made(1, 32, torch.zeros(1, 1), None if shape is None else torch.zeros(shape))
+        first, second = gpu.launches[-1][10:19], gpu.launches[-1][19:28]
+        rows, columns = shape or (0, 0)
+        assert [int.from_bytes(first[i], "little") for i in (2, 3, 5, 6, 7, 8)] == [1, 4, 1, 1, 4, 4]
+        assert [int.from_bytes(second[i], "little") for i in (2, 3, 5, 6)] == [rows * columns, 4, rows, columns]
+        if shape is not None:
+            assert [int.from_bytes(second[i], "little") for i in (7, 8)] == [4 * columns, 4]
 
 
 @pytest.mark.parametrize(
@@ -197,9 +215,12 @@ def test_none_stands_for_an_array_without_elements(ndim: int) -> None:
     [torch.zeros(2, 3, dtype=torch.float64), torch.zeros(3), torch.zeros(3, 2).T],
     ids=["type", "rank", "order"],
 )
-def test_what_a_kernel_does_not_take_is_refused(tensor: torch.Tensor) -> None:
+def test_what_a_kernel_does_not_take_is_refused(gpu: Driver, tensor: torch.Tensor) -> None:
     with pytest.raises(TypeError, match="expected contiguous array"):
-        Expected(types.Array(types.float32, 2, "C")).append([], tensor)
+        declared()(1, 32, tensor, 1, True)
+    assert gpu.launches == []
+    with pytest.raises(TypeError, match="expected contiguous array"):
+        Expected.of(types.Array(types.float32, 2, "C")).simulate(tensor)
 
 
 def test_a_wrong_argument_list_is_refused() -> None:
