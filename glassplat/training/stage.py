@@ -7,6 +7,7 @@ import math
 import zlib
 from collections.abc import Generator, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Protocol
 
 import torch
@@ -102,19 +103,25 @@ def rate_tensor(rate: Rate, parameter: Tensor, progress: float, extent: float, i
     value = rate.at(progress, extent, iterations)
     if rate.rest is None:
         return value
-    return _columns(parameter, value, value * rate.rest)
+    return _columns(value, value * rate.rest, parameter.shape[1:], parameter.dtype, parameter.device)
 
 
 def decay_tensor(rate: Rate, parameter: Tensor) -> Tensor | None:
     """The decay that gives the gradient of `Rate.penalty`; None where there is no penalty."""
     if not rate.penalty or not parameter.numel():
         return None
-    return _columns(parameter, 0.0, 2 * rate.penalty / len(parameter))
+    rest = 2 * rate.penalty / len(parameter)
+    return _columns(0.0, rest, parameter.shape[1:], parameter.dtype, parameter.device)
 
 
-def _columns(parameter: Tensor, constant: float, rest: float) -> Tensor:
-    """One number per column of spherical harmonics [N, K, 3]: of the constant one, and of all others."""
-    columns = torch.full(parameter.shape[1:], rest, dtype=parameter.dtype, device=parameter.device)
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)
+def _columns(constant: float, rest: float, shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """One number per column of spherical harmonics [N, K, 3]: of the constant one, and of all others.
+
+    Steps share the tensor: leave it as it is.
+    """
+    columns = torch.full(shape, rest, dtype=dtype, device=device)
     columns[:1].fill_(constant)
     return columns.flatten()
 

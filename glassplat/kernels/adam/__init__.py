@@ -86,5 +86,7 @@ def _check(update: Update, like: Tensor) -> None:
 
 def _flat(update: Update) -> Update:
     """The same update of one row of elements each."""
-    contiguous = update._replace(gradient=update.gradient.contiguous())
-    return contiguous._replace(**{name: getattr(contiguous, name).detach().view(-1) for name in TENSORS})
+    parameter, gradient, first, second, lr, step, decay = update
+    return Update(
+        parameter.view(-1), gradient.contiguous().view(-1), first.view(-1), second.view(-1), lr, step, decay
+    )  # fmt: skip

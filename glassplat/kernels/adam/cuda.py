@@ -1,10 +1,12 @@
-"""Adam on the GPU: one thread for each element."""
+"""Adam on the GPU: one thread for each element, of several parameters at once, as many are small."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from functools import cache
+from typing import Any
 
 from numba import cuda
 from torch import Tensor
@@ -14,43 +16,80 @@ from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.records import REAL_OF
 
 THREADS = 256
+AT_ONCE = 5
+"""Parameters of one launch."""
+NOTHING = (None, None, None, None, None, None, 0.0, 0.0)
+"""Stands for a parameter where there are fewer."""
 
 
 def adam(flat: Sequence[Update], betas: tuple[float, float], eps: float) -> None:
     """As `glassplat.kernels.adam.cpu.adam`."""
-    for update in flat:
-        parameter, lr, (step_correction, root) = update.parameter, update.lr, update.corrections(betas)
-        # As few small operations as can be: each costs more than the step of a small parameter.
-        rates, rate = None, step_correction
-        if isinstance(lr, Tensor):
-            rates = lr.detach().to(parameter.device, parameter.dtype).contiguous()
-        else:
-            rate *= lr
-        decays = update.decay
-        if decays is not None:
-            decays = decays.detach().to(parameter.device, parameter.dtype).contiguous()
-        adam_step(REAL_OF[parameter.dtype])(
-            blocks_for(parameter.numel(), THREADS), THREADS, *update[:4], rates, decays, rate,
-            betas[0], betas[1], 1 - betas[0], 1 - betas[1], root, eps,
-        )  # fmt: skip
+    step = adam_step(REAL_OF[flat[0].parameter.dtype])
+    common = (betas[0], betas[1], 1 - betas[0], 1 - betas[1], eps)
+    for begin in range(0, len(flat), AT_ONCE):
+        updates = flat[begin : begin + AT_ONCE]
+        blocks = sum(blocks_for(update.parameter.numel(), THREADS) for update in updates)
+        own = itertools.chain(*(_arguments(update, betas) for update in updates))
+        step(blocks, THREADS, *common, *own, *NOTHING * (AT_ONCE - len(updates)))
+
+
+def _arguments(update: Update, betas: tuple[float, float]) -> tuple[Any, ...]:
+    """A parameter as the kernel takes it, in as few small operations as can be: each costs more than a small step."""
+    parameter, lr, decays, (rate, root) = update.parameter, update.lr, update.decay, update.corrections(betas)
+    rates = None
+    if isinstance(lr, Tensor):
+        rates = lr.to(parameter.device, parameter.dtype).contiguous()
+    else:
+        rate *= lr
+    if decays is not None:
+        decays = decays.to(parameter.device, parameter.dtype).contiguous()
+    return *update[:4], rates, decays, rate, root
 
 
 @cache
 def adam_step(real: type) -> Kernel:
-    """Updates flat arrays in place; `rate` is the step size, times that of the column in `rates`."""
+    """Updates flat arrays in place; each begins with a block of its own, so that the threads of one agree.
 
-    @kernel("adam", real, "real1 real1 real1 real1 real1 real1 real real real real real real real")
+    `rate` is the step size, times that of the column in `rates`.
+    """
+    one = "real1 real1 real1 real1 real1 real1 real real "
+
+    @kernel("adam", real, "real real real real real " + AT_ONCE * one)
     def step(
-        parameter, gradient, first, second, rates, decays, rate, beta_1, beta_2, gain_1, gain_2, second_scale, eps
+        beta_1, beta_2, gain_1, gain_2, eps,
+        p_0, g_0, m_0, v_0, rates_0, decays_0, rate_0, scale_0,
+        p_1, g_1, m_1, v_1, rates_1, decays_1, rate_1, scale_1,
+        p_2, g_2, m_2, v_2, rates_2, decays_2, rate_2, scale_2,
+        p_3, g_3, m_3, v_3, rates_3, decays_3, rate_3, scale_3,
+        p_4, g_4, m_4, v_4, rates_4, decays_4, rate_4, scale_4,
     ):  # fmt: skip
-        i = cuda.grid(1)
-        if i >= parameter.size:
+        end_0 = (p_0.size + THREADS - 1) // THREADS
+        end_1 = end_0 + (p_1.size + THREADS - 1) // THREADS
+        end_2 = end_1 + (p_2.size + THREADS - 1) // THREADS
+        end_3 = end_2 + (p_3.size + THREADS - 1) // THREADS
+        block = cuda.blockIdx.x
+        if block < end_0:
+            p, g, m, v, rates, decays, rate, scale = p_0, g_0, m_0, v_0, rates_0, decays_0, rate_0, scale_0
+        elif block < end_1:
+            block -= end_0
+            p, g, m, v, rates, decays, rate, scale = p_1, g_1, m_1, v_1, rates_1, decays_1, rate_1, scale_1
+        elif block < end_2:
+            block -= end_1
+            p, g, m, v, rates, decays, rate, scale = p_2, g_2, m_2, v_2, rates_2, decays_2, rate_2, scale_2
+        elif block < end_3:
+            block -= end_2
+            p, g, m, v, rates, decays, rate, scale = p_3, g_3, m_3, v_3, rates_3, decays_3, rate_3, scale_3
+        else:
+            block -= end_3
+            p, g, m, v, rates, decays, rate, scale = p_4, g_4, m_4, v_4, rates_4, decays_4, rate_4, scale_4
+        i = block * THREADS + cuda.threadIdx.x
+        if i >= p.size:
             return
-        g = gradient[i] + decays[i % decays.size] * parameter[i] if decays.size > 0 else gradient[i]
-        mean = beta_1 * first[i] + gain_1 * g
-        square = beta_2 * second[i] + gain_2 * g * g
-        first[i], second[i] = mean, square
+        gradient = g[i] + decays[i % decays.size] * p[i] if decays.size > 0 else g[i]
+        mean = beta_1 * m[i] + gain_1 * gradient
+        square = beta_2 * v[i] + gain_2 * gradient * gradient
+        m[i], v[i] = mean, square
         step_size = rate * rates[i % rates.size] if rates.size > 0 else rate
-        parameter[i] -= step_size * mean / (math.sqrt(square) * second_scale + eps)
+        p[i] -= step_size * mean / (math.sqrt(square) * scale + eps)
 
     return step

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import weakref
 from collections.abc import Callable
 from dataclasses import replace
@@ -558,6 +559,24 @@ def test_adam(columns: bool, dtype: torch.dtype) -> None:
         adam_twin.adam([adam_operation.Update(*expected, lr, step, decay)])
     for value, want in zip(found, expected, strict=True):
         close(value, want)
+
+
+@pytest.mark.parametrize("count", [1, 5, 6, 11])
+def test_adam_of_many_parameters(count: int) -> None:
+    """Blocks of threads, and launches of several parameters, end within the list."""
+    shapes = [(256,), (3, 4, 3), (257,), (0, 3), (1, 3), (130, 2), (7,), (2, 2, 3), (1,), (512,), (300,)][:count]
+    found, expected = [], []
+    for i, shape in enumerate(shapes):
+        tensors = [draw(*shape, seed=4 * i + k) for k in range(3)] + [draw(*shape, seed=4 * i + 3).square()]
+        columns = torch.linspace(0.1, 0.6, math.prod(shape[1:]), dtype=torch.float64)
+        options = (columns if i % 3 == 1 else 0.1 + 0.1 * i, i + 1, columns / 2 if i % 2 else None)
+        expected.append(adam_operation.Update(*tensors, *options))
+        found.append(adam_operation.Update(*(tensor.to(DEVICE, copy=True) for tensor in tensors), *options))
+    adam_operation.adam(found, betas=(0.8, 0.95))
+    adam_twin.adam(expected, betas=(0.8, 0.95))
+    for own, wanted in zip(found, expected, strict=True):
+        for value, want in zip(own[:4], wanted[:4], strict=True):
+            close(value, want)
 
 
 def test_the_result_has_the_same_bits_every_time(random_splats: SplatMaker) -> None:
