@@ -50,11 +50,12 @@ class SeenPanes:
 
 def panes_in_camera(planes: Planes, camera: Camera) -> Panes:
     """The rectangles in the camera frame; no gradient."""
-    if waits(planes.centers.device):
-        given = planes.centers, planes.raw_normals, planes.tangents, planes.half_sizes, camera.cam_from_world
-        return pane_kernels.panes_in_camera(*given)
+    pose = camera.cam_from_world
+    if waits(pose.device):
+        given = planes.centers, planes.raw_normals, planes.tangents, planes.half_sizes
+        return pane_kernels.panes_in_camera(*(tensor.to(pose) for tensor in given), pose)
     with torch.no_grad():
-        rotation, translation = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
+        rotation, translation = pose[:3, :3], pose[:3, 3]
         centers, normals, axes, half_sizes = (
             tensor.to(rotation)
             for tensor in (planes.centers, planes.normals, torch.stack(planes.axes(), 1), planes.half_sizes)
