@@ -540,7 +540,7 @@ def gradient_conflict_gradient(slopes: Tensor, v_mean: Tensor) -> Tensor:
 
 
 def conflict_count(height: int, width: int) -> int:
-    """How many derivatives along one axis an image has, of all channels; those on its border are left out."""
+    """Number of derivatives of an image along one axis, of all channels; those on its border are left out."""
     return CHANNELS * (height - 2) * (width - 2)
 
 
