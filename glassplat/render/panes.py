@@ -53,7 +53,8 @@ def panes_in_camera(planes: Planes, camera: Camera) -> Panes:
     pose = camera.cam_from_world
     if waits(pose.device):
         given = planes.centers, planes.raw_normals, planes.tangents, planes.half_sizes
-        return pane_kernels.panes_in_camera(*(tensor.to(pose) for tensor in given), pose)
+        centers, raw_normals, tangents, half_sizes = (tensor.to(pose) for tensor in given)
+        return pane_kernels.panes_in_camera(centers, raw_normals, tangents, half_sizes, pose)
     with torch.no_grad():
         rotation, translation = pose[:3, :3], pose[:3, 3]
         centers, normals, axes, half_sizes = (
@@ -100,8 +101,8 @@ def seen_panes(
     found = (*(positions.index(k) if is_seen else -1 for k, is_seen in enumerate(seen)), -1)
     position = constant(found, torch.int32, tiles.device)
     order = tuple(position[h.pane.long()] for h in hits)
-    shown = planes.select(positions)
-    return SeenPanes(shown, rows, order, tiles[rows], windows[rows], mirrored_views(shown, camera))
+    planes = planes.select(positions)
+    return SeenPanes(planes, rows, order, tiles[rows], windows[rows], mirrored_views(planes, camera))
 
 
 def _visible_panes(hits: PaneHits) -> list[bool]:

@@ -85,7 +85,8 @@ def panes_in_camera(
     expected = {name: (tensor, (len(centers), width)) for name, (tensor, width) in rows.items()}
     check_tensors({**expected, "cam_from_world": (cam_from_world, (4, 4))})
     tensors = (tensor.detach().contiguous() for tensor in (centers, raw_normals, tangents, cam_from_world))
-    return Panes(*kernels_for("panes", centers.device).panes_in_camera(*tensors), half_sizes.detach().contiguous())
+    placed, normals, axes = kernels_for("panes", centers.device).panes_in_camera(*tensors)
+    return Panes(placed, normals, axes, half_sizes.detach().contiguous())
 
 
 @torch.no_grad()
