@@ -22,7 +22,10 @@ from glassplat.kernels.backend.devices import cuda_problem
 
 ROOT = Path(__file__).parent.parent
 COUNT = 560_000
-CHECKS = [f"tests/kernels/cuda/test_{name}.py" for name in ("parity", "disc_parity", "trace_parity", "on_a_gpu")]
+CHECKS = [
+    f"tests/kernels/cuda/test_{name}.py"
+    for name in ("parity", "pane_parity", "disc_parity", "trace_parity", "on_a_gpu")
+]
 DATA, ITERATIONS = ROOT / "glassplat" / "demo_scene", 7000
 LIMITS = {"launch": 60, "parity": 165, "frames": 100, "operations": 60, "training": 150}
 """The parts in their order, and the seconds that each may take."""

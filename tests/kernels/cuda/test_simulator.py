@@ -17,7 +17,9 @@ ROOT = Path(__file__).parents[3]
 
 
 @pytest.mark.skipif(SIMULATED, reason="this process is the simulator")
-@pytest.mark.parametrize("tests", ["test_parity.py", "test_disc_parity.py", "test_trace_parity.py"])
+@pytest.mark.parametrize(
+    "tests", ["test_parity.py", "test_pane_parity.py", "test_disc_parity.py", "test_trace_parity.py"]
+)
 def test_every_kernel_agrees_with_its_twin_in_the_simulator(tests: str) -> None:
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"tests/kernels/cuda/{tests}"]
     environment = os.environ | {"NUMBA_ENABLE_CUDASIM": "1", "OMP_NUM_THREADS": "1"}
