@@ -172,7 +172,7 @@ class PageHandler(BaseHTTPRequestHandler):
         if not number.isdecimal() or len(number) > 9 or int(number) >= len(self.server.session.views):
             raise RefusedError(HTTPStatus.NOT_FOUND, "there is no such view")
         picture = self.server.session.picture(int(number), longest)
-        self._send(picture, "image/jpeg", headers={"Cache-Control": "private, max-age=3600"})
+        self._send(picture, "image/jpeg")
 
     def _send_json(self, value: Any, status: HTTPStatus = HTTPStatus.OK) -> None:
         self._send(json.dumps(value).encode(), "application/json", status)

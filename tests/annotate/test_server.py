@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 import socket
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -90,6 +91,17 @@ def test_without_the_key_there_is_nothing(path: str, server: AnnotationServer) -
 def test_an_outline_that_makes_no_sense_is_refused(outline: dict, server: AnnotationServer) -> None:
     status, body = ask(server, "/grab", outline)
     assert status == 400 and json.loads(body)["error"]
+
+
+@pytest.mark.parametrize("path", ["/photo/0", "/thumbnail/0"])
+def test_no_browser_keeps_a_photograph(path: str, server: AnnotationServer) -> None:
+    """The next capture is served at the same address, and numbers its photographs in the same way."""
+    host = f"127.0.0.1:{server.server_address[1]}"
+    request = urllib.request.Request(
+        f"http://{host}{path}", headers={"Cookie": f"{cookie_name(host)}={server.access.key}"}
+    )
+    with urllib.request.urlopen(request, timeout=30) as response:
+        assert response.headers["Cache-Control"] == "no-store"
 
 
 def test_another_name_for_this_computer_is_refused(server: AnnotationServer) -> None:
