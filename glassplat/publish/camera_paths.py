@@ -59,7 +59,8 @@ def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """A smooth way through the cameras, at an even pace from one to the next; the first and the last one are on it.
 
     Args:
-        cameras: at least two; lenses change on the way as poses do, the size is that of the first one.
+        cameras: at least two; lenses change on the way as poses do, the size is that of the first one, which others
+            are scaled and cut to.
         frames: how many cameras to return.
 
     Raises:
@@ -77,8 +78,7 @@ def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     turned = RotationSpline(knots, rotations)(times).as_matrix()
     places = CubicSpline(knots, np.stack([camera.center.double().cpu().numpy() for camera in cameras]))(times)
     first = cameras[0]
-    alike = [camera.resize(first.width, first.height) for camera in cameras]
-    lenses = np.array([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in alike])
+    lenses = np.array([_lens(camera, first.width, first.height) for camera in cameras])
     lens = np.stack([np.interp(times, knots, column) for column in lenses.T], axis=1)
     path = []
     for rotation, place, (fx, fy, cx, cy) in zip(turned, places, lens.tolist(), strict=True):
@@ -96,6 +96,13 @@ def fit_to_width(camera: Camera, width: int) -> Camera:
     """The camera with pictures of this width, and of the even height that fits best; encoders want both sides even."""
     height = max(2, 2 * round(width * camera.height / camera.width / 2))
     return camera.resize(width, height)
+
+
+def _lens(camera: Camera, width: int, height: int) -> tuple[float, float, float, float]:
+    """(fx, fy, cx, cy) of a camera in pictures of another size, which the middle of its own fills."""
+    scale = max(width / camera.width, height / camera.height)
+    cx, cy = width / 2 + scale * (camera.cx - camera.width / 2), height / 2 + scale * (camera.cy - camera.height / 2)
+    return scale * camera.fx, scale * camera.fy, cx, cy
 
 
 def _loop(spread: Tensor, distance: float) -> float:

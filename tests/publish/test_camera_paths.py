@@ -82,6 +82,17 @@ def test_an_interpolated_path_begins_and_ends_at_its_cameras(frames: int) -> Non
     assert fit_to_width(path[0], 321 + 1).width % 2 == 0 and fit_to_width(path[0], 322).height % 2 == 0
 
 
+def test_no_picture_of_a_path_is_stretched_by_a_camera_on_its_side() -> None:
+    wide = Camera.look_at((0.0, 0.0, -1.0), (0.0, 0.0, 0.0), up=UP, width=800, height=600)
+    tall = Camera.look_at((0.5, 0.0, -1.0), (0.0, 0.0, 0.0), up=UP, width=300, height=400)
+    *_, last = path = interpolate_cameras([wide, replace(tall, cx=160.0)], 5)
+    assert all(math.isclose(camera.fx, camera.fy) for camera in path)
+    # As wide as the photograph, the middle of its height; 10 pixels aside are more in a larger picture.
+    scale = 800 / 300
+    assert math.isclose(last.fx, scale * tall.fx) and math.isclose(last.cx, 400 + 10 * scale)
+    assert (last.width, last.height, last.cy) == (800, 600, 300)
+
+
 def test_one_camera_is_no_path() -> None:
     with pytest.raises(ValueError, match="at least two"):
         interpolate_cameras(AROUND[:1], 10)
