@@ -65,7 +65,7 @@ function makePanel(scene, navigation, changed) {
     compare: () => set('compare', !state.compare),
     before: () => standAt(navigation.neighbour(-1)),
     after: () => standAt(navigation.neighbour(1)),
-    home: () => { navigation.flyTo(scene.views[scene.first]); changed(); },
+    home: () => standAt(scene.views[scene.first]),
     full: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.()),
     help: () => element('help').toggleAttribute('hidden'),
     hide: () => body.classList.toggle('bare'),

@@ -175,6 +175,16 @@ def test_people_stay_near_the_photographs(opened: Browser) -> None:
     assert 0.5 < opened.evaluate(farthest) < 1.001
 
 
+@needs_browser
+def test_the_first_view_stands_in_the_address_too(opened: Browser) -> None:
+    opened.wait("glassplat.then(() => true)", "the page")
+    opened.keys("Right")
+    opened.keys("r")
+    first = opened.evaluate("glassplat.then(({ scene }) => scene.views[scene.first].name)")
+    assert opened.evaluate("document.getElementById('photo').textContent") == first
+    assert opened.evaluate("location.hash") == f"#view={first}"
+
+
 UNTIL = "const until = async (holds) => { while (!holds()) await new Promise((next) => setTimeout(next, 5)); };"
 
 
