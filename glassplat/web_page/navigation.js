@@ -5,7 +5,7 @@ const LEAST_SHOWN = 0.05;  // Share of a photograph that a pane fills where it i
 
 function makeNavigation(scene, changed) {
   const { views, up, focus, reach } = scene;
-  const steepest = 0.35;  // radians between the line of sight and the vertical
+  const steepest = 0.35;  // radians between the line of sight and the vertical, unless a photograph is steeper
   let pose, pivot, flight = null, drift = null;
   const velocity = { yaw: 0, pitch: 0 };
 
@@ -48,7 +48,7 @@ function makeNavigation(scene, changed) {
 
   function orbit(yaw, pitch) {
     const angle = Math.acos(clamped(dot(forward(), up), -1, 1));
-    const held = clamped(angle + pitch, steepest, Math.PI - steepest) - angle;
+    const held = clamped(angle + pitch, Math.min(angle, steepest), Math.max(angle, Math.PI - steepest)) - angle;
     const turn = product(rotationAbout(up, yaw), rotationAbout(row(pose.rotation, 0), -held));
     const arm = turned(turn, minus(centerOf(pose), pivot));
     const inverse = [turn[0], turn[3], turn[6], turn[1], turn[4], turn[7], turn[2], turn[5], turn[8]];

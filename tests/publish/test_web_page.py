@@ -185,6 +185,24 @@ def test_the_first_view_stands_in_the_address_too(opened: Browser) -> None:
     assert opened.evaluate("location.hash") == f"#view={first}"
 
 
+@needs_browser
+def test_a_camera_that_looks_straight_down_is_not_turned_up_by_a_touch(opened: Browser) -> None:
+    up = torch.tensor(opened.evaluate("glassplat.then(({ scene }) => scene.up)"), dtype=torch.float32)
+    right = torch.nn.functional.normalize(torch.tensor([0.0, -up[2], up[1]]), dim=0)
+    rows = [*right.tolist(), *torch.linalg.cross(-up, right).tolist(), *(-up).tolist()]
+    turned = """glassplat.then(({ navigation, scene }) => {
+      const before = navigation.pose(), rotation = ROWS, [x, y, z] = scene.views[0].position;
+      const offset = [0, 3, 6].map((k) => -(rotation[k] * x + rotation[k + 1] * y + rotation[k + 2] * z));
+      navigation.place({ rotation, offset });
+      navigation.orbit(0, 0);
+      const forward = navigation.pose().rotation.slice(6);
+      navigation.place(before);
+      return forward;
+    })"""
+    forward = torch.tensor(opened.evaluate(turned.replace("ROWS", str(rows))), dtype=torch.float32)
+    torch.testing.assert_close(forward, -up, atol=1e-5, rtol=0)
+
+
 UNTIL = "const until = async (holds) => { while (!holds()) await new Promise((next) => setTimeout(next, 5)); };"
 
 
