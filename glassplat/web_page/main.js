@@ -1,5 +1,10 @@
 // Loads the scene and joins what shows it with what moves it.
 
+function fail(text) {
+  document.body.classList.add('failed');
+  element('message').textContent = text;
+}
+
 async function start() {
   const scene = await loadedScene(), canvas = element('view'), renderer = makeRenderer(canvas, scene);
   let display = null;
@@ -8,6 +13,7 @@ async function start() {
   listenToPointers(canvas, navigation, () => document.body.classList.add('touched'));
   display = makeDisplay(canvas, scene, renderer, navigation, panel);
   await display.begin();
+  canvas.addEventListener('webglcontextlost', () => fail('The browser has taken the picture away; load the page again.'));
   document.body.classList.toggle('plain', renderer.isSoftware);
   document.body.classList.add('ready');
   if (!renderer.isSoftware && !matchMedia('(prefers-reduced-motion: reduce)').matches && !location.hash.includes('still')) navigation.sway();
@@ -15,7 +21,4 @@ async function start() {
 }
 
 window.glassplat = start();
-window.glassplat.catch((error) => {
-  document.body.classList.add('failed');
-  element('message').textContent = `This scene cannot be shown: ${error.message}`;
-});
+window.glassplat.catch((error) => fail(`This scene cannot be shown: ${error.message}`));

@@ -203,6 +203,17 @@ def test_a_camera_that_looks_straight_down_is_not_turned_up_by_a_touch(opened: B
     torch.testing.assert_close(forward, -up, atol=1e-5, rtol=0)
 
 
+@needs_browser
+def test_a_picture_that_the_browser_takes_away_is_not_lost_in_silence(tmp_path: Path) -> None:
+    write_page(tmp_path / "index.html", true_scene(), Planar(), CAMERAS, "Lost")
+    with Browser(tmp_path / "index.html", 320, 240) as browser:
+        browser.wait("document.body.classList.contains('ready')", "the page")
+        graphics = "document.getElementById('view').getContext('webgl2')"
+        browser.run(f"{graphics}.getExtension('WEBGL_lose_context').loseContext()")
+        browser.wait("document.body.classList.contains('failed')", "a word about it")
+        assert "load the page again" in browser.evaluate("document.getElementById('message').textContent")
+
+
 UNTIL = "const until = async (holds) => { while (!holds()) await new Promise((next) => setTimeout(next, 5)); };"
 
 
