@@ -53,6 +53,11 @@ def is_blue(color: np.ndarray) -> bool:
     return bool(color[2] > color[0] + 15)
 
 
+def complaints(page: Page) -> list[str]:
+    """What the page complained of; browsers may ask for an icon of their own accord."""
+    return [said for said in page.window.complaints() if not said.startswith("Failed to load resource")]
+
+
 def test_a_pane_is_marked_cut_and_written(page: Page) -> None:
     middle = true_corners(3).mean(axis=0)
     page.show(3)
@@ -174,6 +179,29 @@ def test_keys_choose_photographs_panes_and_brushes(page: Page) -> None:
     assert page.window.run("return document.querySelectorAll('.pane').length") == 2
 
 
+def test_the_mark_under_the_pointer_is_removed_after_a_drag(page: Page) -> None:
+    page.mark_true(0)
+    (start,) = page.on_screen(true_corners(0)[:1])
+    page.window.drag([start, (start[0] + 60, start[1] + 60)])
+    page.window.keys("Delete")
+    page.saved()
+    assert [len(places) for places in page.document()["corners"]] == [0, 1, 1, 1]
+
+
+def test_a_touch_that_the_browser_takes_over_lets_go(page: Page) -> None:
+    page.mark_true(0)
+    before = page.document()["corners"]
+    page.window.run(
+        "const [x, y] = arguments[0], canvas = document.getElementById('canvas');"
+        "canvas.setPointerCapture = () => {};"  # It knows no pointer of a script.
+        "for (const [kind, way] of [['down', 0], ['cancel', 0], ['move', 50]])"
+        "  canvas.dispatchEvent(new PointerEvent(`pointer${kind}`, { clientX: x + way, clientY: y + way }));",
+        page.on_screen(true_corners(0)[:1])[0],
+    )
+    page.saved()
+    assert page.document()["corners"] == before
+
+
 def test_edges_do_where_no_corner_shows(page: Page) -> None:
     for view in (0, 1, 2):
         corners = true_corners(view)
@@ -245,8 +273,7 @@ def test_done_ends_the_command(page: Page) -> None:
     page.window.wait("document.body.dataset.state === 'closed'", "the end")
     assert page.server.is_finished
     page.window.evaluate("new Promise((next) => setTimeout(next, 300))")
-    # Browsers may ask for an icon of their own accord.
-    assert [said for said in page.window.complaints() if not said.startswith("Failed to load resource")] == []
+    assert complaints(page) == []
     text = "const text = document.createRange(); text.selectNodeContents(document.body.firstElementChild);"
     assert page.window.run(f"{text} return text.getBoundingClientRect().height") < 30  # One line.
 

@@ -15,7 +15,7 @@ const HINTS = {
 };
 
 let capture, marking, drawing;
-let current = 0, tool = "corner", radius = 20, pending = null, drag = null, gestures = 0;
+let current = 0, tool = "corner", radius = 20, pending = null, drag = null, pointer = null, gestures = 0;
 let skipped = { corner: new Set(), edge: new Set() }; // In this photograph: what is not to be seen in it.
 let answers = {}, sending = false, waiting = false, saveTimer = null, spaceHeld = false;
 let revision = 0; // Counts changes.
@@ -244,9 +244,9 @@ function pressPolygon(place) {
 
 function moved(event) {
   const at = spot(event), place = drawing.toView(at);
+  pointer = at;
   if (!drag) {
     if (pending && pending.kind === "polygon") { pending.points[pending.points.length - 1] = place; draw(); }
-    drawing.pointer = place;
     return;
   }
   if (drag.kind === "move") { drawing.move([at[0] - drag.at[0], at[1] - drag.at[1]]); drag.at = at; }
@@ -323,7 +323,7 @@ const KEYS = {
   Enter: closePolygon,
   Escape: () => { pending = drag = null; draw(); },
   Tab: nextPane,
-  Delete: () => { if (drawing.pointer) marking.removeAt(view().name, drawing.pointer, REACH / drawing.scale, (stroke, place) => drawing.covers(stroke, place)); },
+  Delete: () => { if (pointer) marking.removeAt(view().name, drawing.toView(pointer), REACH / drawing.scale, (stroke, place) => drawing.covers(stroke, place)); },
 };
 KEYS.Backspace = KEYS.Delete;
 
@@ -385,6 +385,7 @@ function listen() {
   canvas.addEventListener("pointerdown", pressed);
   canvas.addEventListener("pointermove", moved);
   canvas.addEventListener("pointerup", released);
+  canvas.addEventListener("pointercancel", released);
   canvas.addEventListener("dblclick", closePolygon);
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   canvas.addEventListener("wheel", (event) => { event.preventDefault(); drawing.zoom(spot(event), Math.exp(-event.deltaY / 400)); draw(); }, { passive: false });
