@@ -202,6 +202,19 @@ def test_a_touch_that_the_browser_takes_over_lets_go(page: Page) -> None:
     assert page.document()["corners"] == before
 
 
+def test_a_corner_too_many_of_a_polygon_can_be_removed(page: Page) -> None:
+    page.window.run(
+        "const shape = document.querySelector('select[title=shape]');"
+        "shape.value = 'polygon'; shape.dispatchEvent(new Event('change'));"
+    )
+    page.mark(0, [*true_corners(0), (20, 20)])
+    assert len(page.document()["corners"]) == 5
+    page.window.keys("Delete")
+    page.mark_true(1)
+    assert len(page.document()["corners"]) == len(page.document()["edges"]) == 4
+    assert "pixels; the plane is sure to" in page.said()
+
+
 def test_edges_do_where_no_corner_shows(page: Page) -> None:
     for view in (0, 1, 2):
         corners = true_corners(view)

@@ -66,8 +66,9 @@ export class Drawing {
     this.context.lineWidth = isActive ? 2 : 1;
     if (!isActive) return;
     pane.edges.forEach((places) => { if (name in places) this.#line(places[name], color, []); });
-    if (answer && answer.lines) answer.lines.forEach((lines, corner) => {
-      if (lines[number] && !(name in pane.corners[corner])) this.#guide(lines[number], corner, color);
+    pane.corners.forEach((places, corner) => {
+      const line = answer?.lines?.[corner]?.[number];
+      if (line && !(name in places)) this.#guide(line, corner, color);
     });
     if (answer && answer.solved) answer.corners[number].forEach((place, corner) => {
       if (place && !(pane.corners[corner] && name in pane.corners[corner])) this.#corner(place, corner, color, false);

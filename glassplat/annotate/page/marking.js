@@ -111,9 +111,9 @@ export class Marking {
       const pane = this.pane;
       if (!pane) return;
       const corner = pane.corners.findIndex((places) => view in places && distance(places[view], place) < reach);
-      if (corner >= 0) { delete pane.corners[corner][view]; return; }
+      if (corner >= 0) { delete pane.corners[corner][view]; shorten(pane); return; }
       const edge = pane.edges.findIndex((places) => view in places && fromSegment(place, ...places[view]) < reach);
-      if (edge >= 0) { delete pane.edges[edge][view]; return; }
+      if (edge >= 0) { delete pane.edges[edge][view]; shorten(pane); return; }
       const strokes = pane.strokes[view] || [];
       for (let number = strokes.length - 1; number >= 0; number -= 1) {
         if (inside(strokes[number], place)) {
@@ -145,6 +145,15 @@ export function fromSegment(place, one, other) {
   const share = ((place[0] - one[0]) * along[0] + (place[1] - one[1]) * along[1]) / length;
   const inside = Math.min(1, Math.max(0, share));
   return distance(place, [one[0] + inside * along[0], one[1] + inside * along[1]]);
+}
+
+// Takes the last corners off a polygon where neither they nor the edges there have a mark.
+function shorten(pane) {
+  const isBare = (places) => !Object.keys(places).length;
+  while (pane.corners.length > 4 && isBare(pane.corners.at(-1)) && pane.edges.slice(pane.corners.length - 2).every(isBare)) {
+    pane.corners.pop();
+    pane.edges.splice(pane.corners.length);
+  }
 }
 
 function rounded(place) {
