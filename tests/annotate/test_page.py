@@ -215,6 +215,24 @@ def test_a_corner_too_many_of_a_polygon_can_be_removed(page: Page) -> None:
     assert "pixels; the plane is sure to" in page.said()
 
 
+def test_undo_gives_up_a_line_before_it_takes_back_marks(page: Page) -> None:
+    page.mark_true(0)
+    page.window.keys("3")
+    for place in page.on_screen(true_corners(0)[:3]):
+        page.window.click(*place)
+    page.window.keys("Control", "z")
+    page.window.keys("Enter")
+    page.saved()
+    assert page.document()["strokes"] == {}
+    assert [len(places) for places in page.document()["corners"]] == [1, 1, 1, 1]
+    for place in page.on_screen(true_corners(0)[:3]):
+        page.window.click(*place)
+    page.window.press(".pane h2 button")  # Removes the pane.
+    page.window.keys("Enter")
+    page.saved()
+    assert complaints(page) == []
+
+
 def test_edges_do_where_no_corner_shows(page: Page) -> None:
     for view in (0, 1, 2):
         corners = true_corners(view)

@@ -100,7 +100,8 @@ export class Marking {
 
   addStrokes(view, made, label = this.active) {
     this.change((document) => {
-      const { strokes } = document.panes.find((pane) => pane.label === label);
+      const strokes = document.panes.find((pane) => pane.label === label)?.strokes;
+      if (!strokes) return; // The pane was removed meanwhile.
       (strokes[view] = strokes[view] || []).push(...made.map((stroke) => ({ ...stroke, points: stroke.points.map(rounded) })));
     });
   }

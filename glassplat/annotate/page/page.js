@@ -285,14 +285,21 @@ async function grab(points) {
   tell("looking for the outline ...");
   try {
     const { outlines } = await ask("/grab", { view: current, points });
-    if (marking.document.panes.some((pane) => pane.label === label)) {
-      marking.addStrokes(name, outlines.map(cutting), label);
-    }
+    marking.addStrokes(name, outlines.map(cutting), label);
     document.body.dataset.grab = "done";
   } catch (error) {
     document.body.dataset.grab = "failed";
     tell(error.message, true);
   }
+}
+
+function giveUp() { pending = drag = null; draw(); }
+
+// A line that is being drawn goes first.
+function undo() {
+  const isDrawing = pending !== null;
+  giveUp();
+  if (!isDrawing) marking.undo();
 }
 
 function choose(name) { tool = name; pending = drag = null; refresh(); }
@@ -321,7 +328,7 @@ const KEYS = {
   "[": () => { radius = Math.max(2, radius / 1.25); tell(`brush of ${Math.round(radius)} pixels`); },
   "]": () => { radius = Math.min(300, radius * 1.25); tell(`brush of ${Math.round(radius)} pixels`); },
   Enter: closePolygon,
-  Escape: () => { pending = drag = null; draw(); },
+  Escape: giveUp,
   Tab: nextPane,
   Delete: () => { if (pointer) marking.removeAt(view().name, drawing.toView(pointer), REACH / drawing.scale, (stroke, place) => drawing.covers(stroke, place)); },
 };
@@ -331,7 +338,7 @@ function keyed(event) {
   if (event.target.closest("select, summary")) return;
   if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z") {
     event.preventDefault();
-    event.shiftKey ? marking.redo() : marking.undo();
+    event.shiftKey ? marking.redo() : undo();
     return;
   }
   if (event.ctrlKey || event.metaKey || event.altKey) return;
@@ -394,7 +401,7 @@ function listen() {
   window.addEventListener("beforeunload", (event) => { if (["changed", "failed"].includes(document.body.dataset.state)) event.preventDefault(); });
   resized.observe(canvas);
   document.querySelectorAll("[data-tool]").forEach((button) => button.addEventListener("click", () => choose(button.dataset.tool)));
-  for (const [id, act] of [["undo", () => marking.undo()], ["redo", () => marking.redo()], ["add", KEYS.a], ["write", write], ["close", close]]) {
+  for (const [id, act] of [["undo", undo], ["redo", () => marking.redo()], ["add", KEYS.a], ["write", write], ["close", close]]) {
     element(id).addEventListener("click", (event) => { act(); event.currentTarget.blur(); });
   }
 }
