@@ -219,7 +219,7 @@ def fit_pane(marks: Marks, cameras: Sequence[NumpyCamera], shape: Shape) -> Pane
     away = mark_residuals(marks, cameras, fitted)
     jacobian = _jacobian(marks, cameras, fitted)
     spread = max(1.0, float(np.sqrt((away**2).sum() / max(len(away) - fitted.freedom, 1))))
-    pixels = _pixel_distances(marks, cameras, fitted)
+    pixels = [(view, float(np.linalg.norm(away))) for view, away in _distances(marks, cameras, fitted)]
     largest = {view: max(one for number, one in pixels if number == view) for view in marks.views()}
     error = float(np.sqrt(np.mean([one**2 for _, one in pixels])))
     return PaneFit(fitted, error, largest, jacobian.T @ jacobian / spread**2)
@@ -286,10 +286,6 @@ def _across(line: Array, places: Array) -> Array:
     length = max(float(np.hypot(*along)), 1e-9)
     away = places - line[0]
     return np.asarray((along[0] * away[:, 1] - along[1] * away[:, 0]) / length)
-
-
-def _pixel_distances(marks: Marks, cameras: Sequence[NumpyCamera], shape: PaneShape) -> list[tuple[int, float]]:
-    return [(view, float(np.linalg.norm(away))) for view, away in _distances(marks, cameras, shape)]
 
 
 def _starts(marks: Marks, cameras: Sequence[NumpyCamera], shape: Shape) -> list[PaneShape]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -170,7 +170,8 @@ class TrainingProgress:
         elif isinstance(message, messages.StageEntered):
             standing.stage = message.stage
             self._pace.work()
-            self._say(f"step {message.step}: stage {message.stage}, {_counted(message.counts)}")
+            counts = ", ".join(f"{number} {name}" for name, number in message.counts.items())
+            self._say(f"step {message.step}: stage {message.stage}, {counts}")
         elif isinstance(message, messages.ActionDone) and not message.action.startswith(FREQUENT):
             self._say(f"step {message.step}: {message.action}")
         elif isinstance(message, messages.Working):
@@ -293,10 +294,6 @@ def in_words(seconds: float) -> str:
 
 def _smoothed(known: float, loss: float) -> float:
     return SMOOTHING * known + (1 - SMOOTHING) * loss if known else loss
-
-
-def _counted(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{number} {name}" for name, number in counts.items())
 
 
 PAUSE = 10.0

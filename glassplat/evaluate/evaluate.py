@@ -43,17 +43,15 @@ class PaneRegions(NamedTuple):
     planes: Planes | None = None
 
 
-def _true_region(view: View, frame: Frame, truth: TrueView | None) -> Tensor | str:
-    return NO_VIEW_TRUTH if truth is None else truth.labels > 0
-
-
 def _rendered_region(view: View, frame: Frame, truth: TrueView | None) -> Tensor | str:
     if "mask" in frame.layers:
         return frame.layers["mask"] > 0.5
     return f"{NO_TRUTH}, and the method renders no mask"
 
 
-TRUE_REGIONS = PaneRegions("ground-truth pane labels", _true_region)
+TRUE_REGIONS = PaneRegions(
+    "ground-truth pane labels", lambda view, frame, truth: NO_VIEW_TRUTH if truth is None else truth.labels > 0
+)
 RENDERED_REGIONS = PaneRegions("rendered mask > 0.5", _rendered_region)
 """As the method itself renders them, so that methods may be scored over different pixels."""
 

@@ -262,11 +262,6 @@ class Placement:
     scale: float = 1.0
     shift: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
 
-    @property
-    def is_identity(self) -> bool:
-        """Return whether it moves nothing."""
-        return self.scale == 1 and not bool(self.shift.any()) and not bool(self.quat[1:].any())
-
 
 def placement_of(node: Mapping[str, Any], outer: Placement, where: str) -> Placement:
     """Placement of a node, within the placement of its parent.
@@ -290,7 +285,7 @@ def placement_of(node: Mapping[str, Any], outer: Placement, where: str) -> Place
 
 def place_gaussians(gaussians: Gaussians, placement: Placement) -> Gaussians:
     """The Gaussians where a placement puts them, their harmonics turned along; the identity changes no bit."""
-    if placement.is_identity:
+    if placement.scale == 1 and not bool(placement.shift.any()) and not bool(placement.quat[1:].any()):
         return gaussians
     rotation = rotation_from_quat(placement.quat)
     means = placement.scale * (gaussians.means.double() @ rotation.T) + placement.shift

@@ -140,7 +140,8 @@ def capture_names(paths: Sequence[Path], folder: Path) -> dict[Path, str]:
 
     All differ without suffix, too, as masks need it. Names that are no text, or have line breaks, are made readable.
     """
-    spoken = {path: _readable(path.relative_to(folder).as_posix()) for path in paths}
+    unreadable = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
+    spoken = {path: unreadable.sub("_", path.relative_to(folder).as_posix()) for path in paths}
     # Two files may become one name, as when both held bytes that are no text.
     counts: Counter[str] = Counter()
     for path, name in spoken.items():
@@ -149,10 +150,6 @@ def capture_names(paths: Sequence[Path], folder: Path) -> dict[Path, str]:
             spoken[path] = f"{name}-{counts[name]}"
     pictures = images.picture_paths(list(spoken.values()))
     return {path: pictures[name].with_suffix(".jpg").as_posix() for path, name in spoken.items()}
-
-
-def _readable(name: str) -> str:
-    return re.sub(r"[\x00-\x1f\x7f\ud800-\udfff]", "_", name)
 
 
 def read_photograph(photograph: Photograph) -> NDArray[np.uint8]:
