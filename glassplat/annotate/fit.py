@@ -386,7 +386,7 @@ def _first_corners(marks: Marks, cameras: Sequence[NumpyCamera]) -> Array:
         point if point is not None else _on_plane(marks, number, cameras, plane.center, plane.frame[2])
         for number, point in enumerate(known)
     ]
-    return np.stack(_with_line_ends(completed, lines, marks))
+    return np.stack(_with_line_ends(completed, lines))
 
 
 def _missing(marks: Marks, known: int) -> str:
@@ -457,7 +457,7 @@ def _on_plane(marks: Marks, number: int, cameras: Sequence[NumpyCamera], center:
     return None
 
 
-def _with_line_ends(corners: list[Array | None], lines: Sequence, marks: Marks) -> list[Array]:
+def _with_line_ends(corners: list[Array | None], lines: Sequence) -> list[Array]:
     """All corners: those that nothing tells are ends of a marked edge, or the fourth of a parallelogram.
 
     Raises:

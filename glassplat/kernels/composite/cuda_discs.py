@@ -365,10 +365,10 @@ def composite_discs_gradients(
     sum_disc_rows(real)(
         blocks_for(sums.numel(), SUM_THREADS), SUM_THREADS, rows, bins.pair_slots, bins.splat_offsets, sums
     )  # fmt: skip
-    return _from_sums(sums, discs, num_channels, with_absgrad)
+    return _from_sums(sums, discs, with_absgrad)
 
 
-def _from_sums(sums: Tensor, discs: Discs, num_channels: int, with_absgrad: bool) -> tuple[Tensor | None, ...]:
+def _from_sums(sums: Tensor, discs: Discs, with_absgrad: bool) -> tuple[Tensor | None, ...]:
     """Gradients of each disc from the sums over its pixels; what no pixel shows stays zero, finite or not."""
     leading, size = discs.opacities.shape, sums.shape[0]
     by_row = sums[:, :AROUND].unflatten(1, (3, 3))
