@@ -116,11 +116,7 @@ def evaluate_run(
 
     show(Working(RENDERING, 0, len(stored.dataset.test)))
     evaluation: Evaluation = evaluate(
-        stored.scene,
-        with_photographer(stored.renderer, "beside"),
-        stored.dataset,
-        regions=regions,
-        listen=add,
+        stored.scene, with_photographer(stored.renderer, "beside"), stored.dataset, regions=regions, listen=add
     )
     results = {
         "method": stored.recipe.method,

@@ -399,10 +399,7 @@ def read_corrections(path: Path, kind: type[Correction]) -> Correction:
 
 
 def write_colmap(
-    folder: Path,
-    cameras: Iterable[tuple[str, Camera]],
-    positions: NDArray[np.floating],
-    colors: NDArray[np.uint8],
+    folder: Path, cameras: Iterable[tuple[str, Camera]], positions: NDArray[np.floating], colors: NDArray[np.uint8]
 ) -> None:
     """Writes `cameras.txt`, `images.txt` and `points3D.txt`; points have no tracks.
 

@@ -251,11 +251,7 @@ def normals_propagated(
     strengths = gaussians.channels["logit_strength"].clamp(min=logit(options.least_strength))
     grows = strengths >= logit(options.reflective)
     log_scales = gaussians.log_scales + math.log(options.growth) * (grows[:, None] & _within_surface(gaussians))
-    changed = {
-        "logit_opacities": opacities,
-        "logit_strength": strengths,
-        "log_scales": log_scales,
-    }
+    changed = {"logit_opacities": opacities, "logit_strength": strengths, "log_scales": log_scales}
     everything = torch.ones_like(grows)
     return gaussians.with_tensors(changed), forget(moments, [f"primary.{name}" for name in changed], everything)
 

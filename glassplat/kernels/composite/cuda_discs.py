@@ -120,9 +120,7 @@ def composite_discs_cotangents(real: type, num_channels: int = 6) -> Kernel:
     zero, one, two = real(0.0), real(1.0), real(2.0)
 
     @kernel(
-        f"composite_discs_cotangents_{num_channels}",
-        real,
-        "int1 real3 real4 real3 real4 real3 real3 real3 real3 real3",
+        f"composite_discs_cotangents_{num_channels}", real, "int1 real3 real4 real3 real4 real3 real3 real3 real3 real3"
     )
     def gather(active, finals, image, depth, v_image, v_alpha, v_depth, v_median, v_distortion, v_pixels):
         n, pixel = cuda.blockIdx.x, cuda.threadIdx.x
