@@ -190,10 +190,6 @@ def in_photograph_colors(frame: Frame, exposures: Exposures, name: str) -> Frame
     return replace(frame, layers={**frame.layers, "photographed": image})
 
 
-def _nobody(evaluated: EvaluatedView) -> None:
-    """Listens to nothing."""
-
-
 @dataclass(frozen=True)
 class _Measurement:
     """Contribution of one view; `reflection` holds rendered and true pane pixels until the gain is known."""
@@ -209,7 +205,7 @@ def evaluate(
     dataset: Dataset,
     *,
     regions: PaneRegions | None = None,
-    listen: ViewListener = _nobody,
+    listen: ViewListener = lambda evaluated: None,
 ) -> Evaluation:
     """Renders every test view and measures it, on uint8-quantised sRGB at the data set's resolution.
 

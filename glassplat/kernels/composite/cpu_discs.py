@@ -32,7 +32,7 @@ from glassplat.kernels.backend.cpu_vector import (
     vector_kind,
 )
 from glassplat.kernels.composite import cpu_tile as tile
-from glassplat.kernels.composite.cpu_tile import lane_of, list_block, place
+from glassplat.kernels.composite.cpu_tile import SPLATS, STOP_AFTER, lane_of, list_block, place
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar
 from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, meet_maths, meet_slopes
 from glassplat.kernels.records import REAL_OF, Discs, TileBins
@@ -138,10 +138,6 @@ def _cover(real: type) -> Scalar:
 
 # Planes of a tile's results; SUMS has one per channel.
 DEPTH_SUM, MIDDLE, DISTORTION, SUMS = (plane * tile.PIXELS for plane in range(4))
-STOP_AFTER = 8
-"""Discs after which a block looks whether all of its pixels have stopped."""
-SPLATS = 512
-"""Discs per task that packs them."""
 
 
 def _blend_block(real: type) -> Scalar:

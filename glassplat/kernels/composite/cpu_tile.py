@@ -56,6 +56,9 @@ T, LAST, T_GLASS, LAST_GLASS, STATE = 0, PIXELS, 2 * PIXELS, 3 * PIXELS, 4 * PIX
 GROUP = 4
 """Channels are blended four at a time."""
 
+STOP_AFTER = 8
+"""Splats after which a block looks whether all of its pixels have stopped."""
+
 TILES = 4
 """Tiles of a task, which asks for memory once for all of them."""
 

@@ -11,9 +11,7 @@ from torch import Tensor
 from glassplat.kernels.composite import BlendedDiscs, Composite
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from glassplat.kernels.maths.disc import LOW_PASS, MOST_DEVIATIONS
-from glassplat.kernels.records import LEAST_ALPHA, ON_MEAN, Deviation, Discs, Splats, TileBins
-
-TILE = 16
+from glassplat.kernels.records import LEAST_ALPHA, ON_MEAN, TILE, Deviation, Discs, Splats, TileBins
 
 
 def composite(
