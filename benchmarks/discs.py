@@ -16,7 +16,7 @@ from torch import Tensor
 from benchmarks.kernels import HEIGHT, WIDTH
 from benchmarks.scene import bench_camera, room
 from benchmarks.table import Table
-from benchmarks.timing import Work
+from benchmarks.timing import Work, interleaved_seconds
 from glassplat.kernels.composite import composite
 from glassplat.kernels.records import Splats
 from glassplat.kernels.tiles import bin_tiles
@@ -84,17 +84,6 @@ def discs(gaussians: Gaussians, camera: Camera) -> Primitive:
     return Primitive(works, len(bin_tiles(projected.outlines, camera.width, camera.height).pair_splats))
 
 
-def least_milliseconds(works: Sequence[Work]) -> list[float]:
-    """Least processor time of each piece of work, in turns after one round of warming up."""
-    least = [float("inf")] * len(works)
-    for turn in range(ROUNDS + 1):
-        for i, work in enumerate(works):
-            start = time.process_time()
-            work()
-            least[i] = min(least[i], 1e3 * (time.process_time() - start)) if turn else least[i]
-    return least
-
-
 def disc_costs() -> Table:
     """Milliseconds of both, and their ratio."""
     camera, gaussians = bench_camera(WIDTH, HEIGHT), room(COUNT)
@@ -106,7 +95,8 @@ def disc_costs() -> Table:
         "besides; processor time.",
     )
     for name, work in solid.works.items():
-        one, other = least_milliseconds([work, flat.works[name]])
+        seconds = interleaved_seconds({"solid": work, "flat": flat.works[name]}, ROUNDS, time.process_time)
+        one, other = (1e3 * min(taken) for taken in seconds.values())
         table.add(name, one, other, other / one)
     return table
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.methods import thread_count
 from benchmarks.peak import peak_multiply_adds
 from benchmarks.scene import bench_camera, room
 from benchmarks.table import Table
@@ -126,14 +126,8 @@ def backward(outputs: list[Tensor], weights: list[Tensor], inputs: list[Any]) ->
 
 def at_threads(work: Work, threads: int) -> float:
     """Median seconds on a number of threads."""
-    before, torch_before = numba.get_num_threads(), torch.get_num_threads()
-    numba.set_num_threads(threads)
-    torch.set_num_threads(threads)
-    try:
+    with thread_count(threads):
         return median_seconds(work)
-    finally:
-        numba.set_num_threads(before)
-        torch.set_num_threads(torch_before)
 
 
 def twin_ratios() -> Table:

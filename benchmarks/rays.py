@@ -13,7 +13,6 @@ import statistics
 import sysconfig
 import tempfile
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +22,7 @@ from torch import Tensor
 
 from benchmarks.kernels import backward
 from benchmarks.table import Table
-from benchmarks.timing import Work
+from benchmarks.timing import Work, interleaved_seconds, paired_ratio
 from benchmarks.twin import compiled_library
 from glassplat.kernels.records import Bvh, RawGaussians, Rays, Shapes
 from glassplat.kernels.trace import build_bvh, cpu, reach, shapes_of, trace
@@ -74,19 +73,6 @@ def mirrored_rays(width: int) -> Rays:
     places = eye + t[:, None] * d
     normals = places / CLEARANCE
     return Rays(places, d - 2 * (d * normals).sum(1, keepdim=True) * normals)
-
-
-def processor_seconds(work: Work) -> float:
-    """Processor time of a piece of work."""
-    start = time.process_time()
-    work()
-    return time.process_time() - start
-
-
-def in_turn(works: Mapping[str, Work], rounds: int) -> dict[str, list[float]]:
-    """Processor time of each piece of work, round by round after one to warm up."""
-    taken = [{name: processor_seconds(work) for name, work in works.items()} for _ in range(rounds + 1)][1:]
-    return {name: [one[name] for one in taken] for name in works}
 
 
 def own_works(case: Case) -> dict[str, Work]:
@@ -169,7 +155,7 @@ def case_of(count: int, width: int) -> Case:
 def add_case(tables: tuple[Table, Table], case: Case, embree: Embree | None, rounds: int) -> str:
     """Adds a row to both tables; says how far the two agree."""
     works, agreement = own_works(case), ""
-    found = cpu.trace(case.shapes, case.rays, case.bvh, flat=True, degree=-1, near=0.0)
+    found = cpu.trace(case.shapes, case.rays, case.bvh, flat=True, degree=-1, learning=False, near=0.0)
     if embree is not None:
         scene = embree.scene(case.shapes, robust=False)
         theirs = embree.trace(scene, case.rays)
@@ -178,13 +164,12 @@ def add_case(tables: tuple[Table, Table], case: Case, embree: Embree | None, rou
         agreement = f"{same:.2%} of the rays have as many hits, alphas differ by at most {furthest:.1e}"
         # Its hierarchy is built last: the discs that it reads are those of the last one.
         works |= {"embree": lambda: embree.trace(scene, case.rays), "embree build": lambda: embree.build(case.shapes)}
-    seconds = in_turn(works, rounds)
+    seconds = interleaved_seconds(works, rounds, time.process_time)
     count, rays = f"{len(case.shapes.means):,}", len(found[1])
     mean = {name: statistics.median(taken) for name, taken in seconds.items()}
     beside = ("", "")
     if embree is not None:
-        ratios = (a / b for a, b in zip(seconds["embree"], seconds["trace"], strict=True))
-        beside = (rays / mean["embree"] / 1e3, statistics.median(ratios))
+        beside = (rays / mean["embree"] / 1e3, paired_ratio(seconds, "embree", "trace"))
     tables[0].add(
         count, float(found[3].float().mean()), rays / mean["trace"] / 1e3, *beside, rays / mean["colored"] / 1e3,
         mean["backward"] / mean["colored"],

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from benchmarks.scene import bench_camera, room
 from benchmarks.table import Table
-from benchmarks.timing import Work
+from benchmarks.timing import Work, interleaved_seconds, paired_ratio
 from glassplat.kernels.composite import cpu_tile as tile
 from glassplat.kernels.composite.cpu import composite_forward
 from glassplat.kernels.composite.cpu_backward import composite_backward
@@ -142,20 +142,13 @@ def add_case(table: Table, library: ctypes.CDLL, case: tuple[int, int, int], rou
     image_weights = generator.standard_normal(bins.width * bins.height * CHANNELS, np.float32)
     weights = image_weights, generator.standard_normal(bins.width * bins.height, np.float32)
     own, twin = blending(splats, channels, bins), blending(splats, channels, bins)
-    works = kernel_works(own, bins, weights), twin_works(library, twin, bins, weights)
+    kernels, loops = kernel_works(own, bins, weights), twin_works(library, twin, bins, weights)
     name = f"{case[0]:,} Gaussians, {bins.width}x{bins.height}, {len(bins.pair_splats):,} pairs"
     for step in ("forward", "backward"):
-        times = [[processor_milliseconds(work[step]) for work in works] for _ in range(rounds + 1)][1:]
-        medians = (statistics.median(column) for column in zip(*times, strict=True))
-        table.add(name, step, *medians, statistics.median(kernel / other for kernel, other in times))
+        seconds = interleaved_seconds({"own": kernels[step], "C++": loops[step]}, rounds, time.process_time)
+        medians = (1e3 * statistics.median(taken) for taken in seconds.values())
+        table.add(name, step, *medians, paired_ratio(seconds, "own", "C++"))
     return float(np.abs(own.images[0] - twin.images[0]).max())
-
-
-def processor_milliseconds(work: Work) -> float:
-    """Processor time of a piece of work."""
-    start = time.process_time()
-    work()
-    return 1e3 * (time.process_time() - start)
 
 
 def main() -> None:

@@ -81,22 +81,13 @@ __all__ = [  # noqa: RUF022 - In the order in which the documentation tells of t
 ]
 
 HOMES = {
-    "captures.dataset": (
-        "Dataset",
-        "load_dataset",
-    ),
+    "captures.dataset": ("Dataset", "load_dataset"),
     "captures.view": ("View",),
     "errors": ("InputError",),
-    "methods.glossy_recipes": (
-        "DeferredRecipe",
-        "TracedRecipe",
-    ),
+    "methods.glossy_recipes": ("DeferredRecipe", "TracedRecipe"),
     "methods.planar_recipe": ("PlanarRecipe",),
     "methods.splat_recipe": ("SplatRecipe",),
-    "model.model": (
-        "Model",
-        "load",
-    ),
+    "model.model": ("Model", "load"),
     "model.training": ("Training",),
     "options": ("Cleaning",),
     "render.deferred": ("Deferred",),
@@ -108,19 +99,9 @@ HOMES = {
     "scene.camera": ("Camera",),
     "scene.gaussians": ("Gaussians",),
     "scene.panes": ("Planes",),
-    "scene.scene": (
-        "Environment",
-        "Scene",
-    ),
+    "scene.scene": ("Environment", "Scene"),
     "training.losses": ("LossTerm",),
-    "training.messages": (
-        "ActionDone",
-        "CheckpointWritten",
-        "RunBegun",
-        "StageEntered",
-        "StepDone",
-        "Working",
-    ),
+    "training.messages": ("ActionDone", "CheckpointWritten", "RunBegun", "StageEntered", "StepDone", "Working"),
     "training.stage": ("Stage",),
 }
 """Where each public name lives; its module is imported, and PyTorch with it, when the name is first used."""

@@ -62,10 +62,7 @@ PANE = Record(
         "strokes": Optional(ByName(Items(STROKE)), default={}),
     }
 )
-DOCUMENT: dict[str, Field] = {
-    "version": Choice((1,)),
-    "panes": Items(PANE),
-}
+DOCUMENT: dict[str, Field] = {"version": Choice((1,)), "panes": Items(PANE)}
 
 
 @dataclass(frozen=True)

@@ -219,7 +219,7 @@ def fit_pane(marks: Marks, cameras: Sequence[NumpyCamera], shape: Shape) -> Pane
     away = mark_residuals(marks, cameras, fitted)
     jacobian = _jacobian(marks, cameras, fitted)
     spread = max(1.0, float(np.sqrt((away**2).sum() / max(len(away) - fitted.freedom, 1))))
-    pixels = _pixel_distances(marks, cameras, fitted)
+    pixels = [(view, float(np.linalg.norm(away))) for view, away in _distances(marks, cameras, fitted)]
     largest = {view: max(one for number, one in pixels if number == view) for view in marks.views()}
     error = float(np.sqrt(np.mean([one**2 for _, one in pixels])))
     return PaneFit(fitted, error, largest, jacobian.T @ jacobian / spread**2)
@@ -286,10 +286,6 @@ def _across(line: Array, places: Array) -> Array:
     length = max(float(np.hypot(*along)), 1e-9)
     away = places - line[0]
     return np.asarray((along[0] * away[:, 1] - along[1] * away[:, 0]) / length)
-
-
-def _pixel_distances(marks: Marks, cameras: Sequence[NumpyCamera], shape: PaneShape) -> list[tuple[int, float]]:
-    return [(view, float(np.linalg.norm(away))) for view, away in _distances(marks, cameras, shape)]
 
 
 def _starts(marks: Marks, cameras: Sequence[NumpyCamera], shape: Shape) -> list[PaneShape]:
@@ -390,7 +386,7 @@ def _first_corners(marks: Marks, cameras: Sequence[NumpyCamera]) -> Array:
         point if point is not None else _on_plane(marks, number, cameras, plane.center, plane.frame[2])
         for number, point in enumerate(known)
     ]
-    return np.stack(_with_line_ends(completed, lines, marks))
+    return np.stack(_with_line_ends(completed, lines))
 
 
 def _missing(marks: Marks, known: int) -> str:
@@ -461,7 +457,7 @@ def _on_plane(marks: Marks, number: int, cameras: Sequence[NumpyCamera], center:
     return None
 
 
-def _with_line_ends(corners: list[Array | None], lines: Sequence, marks: Marks) -> list[Array]:
+def _with_line_ends(corners: list[Array | None], lines: Sequence) -> list[Array]:
     """All corners: those that nothing tells are ends of a marked edge, or the fourth of a parallelogram.
 
     Raises:

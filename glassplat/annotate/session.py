@@ -119,7 +119,7 @@ def merge_documents(base: Any, theirs: Any, ours: Any) -> Merged:
     Raises:
         ValueError: there are too many panes for both to be kept.
     """
-    before, there, here = (_by_label(document) for document in (base, theirs, ours))
+    before, there, here = ({pane["label"]: pane for pane in document["panes"]} for document in (base, theirs, ours))
     kept, renamed = dict(there), dict[int, int]()
     for label in sorted({*before, *here}):
         ours_now, old = here.get(label), before.get(label)
@@ -132,10 +132,6 @@ def merge_documents(base: Any, theirs: Any, ours: Any) -> Merged:
             kept[new] = {**ours_now, "label": new}
     panes = [pane for _, pane in sorted(kept.items()) if pane is not None]
     return Merged({**theirs, "panes": panes}, _changes(before, there), renamed)
-
-
-def _by_label(document: Any) -> dict[int, Any]:
-    return {pane["label"]: pane for pane in document["panes"]}
 
 
 def _free_label(used: set[int]) -> int:

@@ -252,7 +252,7 @@ def load_colmap(root: Path) -> Capture | None:
     return Capture(
         shots=shots,
         test_shots=None,
-        points=_points_or_none(model),
+        points=model.points if len(model.points) else None,
         format_name="COLMAP",
         warnings=_other_models(root, folder),
         cut_out=True,
@@ -281,10 +281,6 @@ def _shots(root: Path, model: Model) -> tuple[Shot, ...]:
         Shot(image.name, images / image.name, model.lenses[image.camera_id], pose_matrix(image))
         for image in model.images
     )
-
-
-def _points_or_none(model: Model) -> RawPoints | None:
-    return model.points if len(model.points) else None
 
 
 def _other_models(root: Path, used: Path) -> tuple[str, ...]:

@@ -269,7 +269,9 @@ def find_masks(
     """
     ignored = find_ignored(root, photographs)
     if panes is not None:
-        return CaptureMasks(_known_panes(root, panes, polarity), _join_masks(kept or {}, ignored))
+        # Of a format that says which file belongs to which photograph; greys are split at one half.
+        known = _understood(root, panes, "bright" if polarity == "auto" else polarity, read_mask_at_threshold)
+        return CaptureMasks(known, _join_masks(kept or {}, ignored))
     paths = _match(root / PANE_FOLDER, photographs)
     if not paths and (root / PANE_FOLDER).is_dir():
         raise InputError(f"{root / PANE_FOLDER} holds no mask images; add masks, or remove the folder")
@@ -373,11 +375,6 @@ def find_ignored(root: Path, photographs: Mapping[str, Path]) -> Mapping[str, Pa
     for mask in found.values():
         mask.labels()
     return found
-
-
-def _known_panes(root: Path, paths: Mapping[str, Path], polarity: Polarity) -> MaskSet:
-    """The panes of a format that says which file belongs to which photograph; greys are split at one half."""
-    return _understood(root, paths, "bright" if polarity == "auto" else polarity, read_mask_at_threshold)
 
 
 def _understood(

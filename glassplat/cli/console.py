@@ -251,13 +251,7 @@ BAD_INPUT = ("glassplat.panes.PlaneFitError", "glassplat.kernels.backend.devices
 FAILURES = ("glassplat.training.loop.TrainingDivergedError",)
 GPU_IS_FULL = ("torch.OutOfMemoryError",)
 """By name: this module is loaded before PyTorch, and also where PyTorch is what cannot be loaded."""
-BAD_PATH = (
-    FileNotFoundError,
-    FileExistsError,
-    NotADirectoryError,
-    IsADirectoryError,
-    PermissionError,
-)
+BAD_PATH = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 BAD_PATH_NUMBERS = (errno.ENAMETOOLONG, errno.ELOOP, errno.EROFS, errno.EINVAL)
 FULL = (errno.ENOSPC, errno.EDQUOT)
 OUT_OF_MEMORY = (

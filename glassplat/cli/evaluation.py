@@ -12,7 +12,6 @@ from rich.table import Table
 
 from glassplat.captures.dataset import Dataset
 from glassplat.cli.console import say
-from glassplat.cli.progress import Step
 from glassplat.cli.runs import StoredRun
 from glassplat.errors import InputError
 from glassplat.evaluate.evaluate import (
@@ -33,6 +32,7 @@ from glassplat.model.run_directory import write_text
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.render.planar import Planar, with_photographer
 from glassplat.training.checkpoint import recorded
+from glassplat.training.messages import Working
 
 if TYPE_CHECKING:
     from glassplat.cli.scene import Align, PaneSource
@@ -83,7 +83,7 @@ def evaluate_run(
     panes: PaneSource = "auto",
     *,
     align: Align = "auto",
-    show: Callable[[Step], None] = lambda step: None,
+    show: Callable[[Working], None] = lambda work: None,
 ) -> dict:
     """Evaluates a run, writes `results.json`, `per_view.json`, sheets and overview; returns the results.
 
@@ -102,7 +102,7 @@ def evaluate_run(
         photographed = with_photographer(stored.renderer, "present")
 
         def listen(done: int, total: int) -> None:
-            show(Step("aligning the cameras of test views", done, total))
+            show(Working("aligning the cameras of test views", done, total))
 
         stored = stored._replace(dataset=with_aligned_test_views(stored.scene, photographed, stored.dataset, listen))
     settings, path = stored.directory.settings(), stored.directory.path
@@ -112,15 +112,11 @@ def evaluate_run(
 
     def add(view: EvaluatedView) -> None:
         report.add(view)
-        show(Step(RENDERING, next(views), len(stored.dataset.test)))
+        show(Working(RENDERING, next(views), len(stored.dataset.test)))
 
-    show(Step(RENDERING, 0, len(stored.dataset.test)))
+    show(Working(RENDERING, 0, len(stored.dataset.test)))
     evaluation: Evaluation = evaluate(
-        stored.scene,
-        with_photographer(stored.renderer, "beside"),
-        stored.dataset,
-        regions=regions,
-        listen=add,
+        stored.scene, with_photographer(stored.renderer, "beside"), stored.dataset, regions=regions, listen=add
     )
     results = {
         "method": stored.recipe.method,

@@ -53,9 +53,7 @@ COMMANDS = {
         "scene", "View", "Look at a scene in the browser, layer by layer, with its panes as they are or edited."
     ),
     "video": Listed(
-        "scene",
-        "Video",
-        "Film a scene along a path: one layer, several side by side, or one wiped over another.",
+        "scene", "Video", "Film a scene along a path: one layer, several side by side, or one wiped over another."
     ),
     "export": Listed(
         "scene",

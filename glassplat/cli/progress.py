@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -13,7 +13,6 @@ from rich.console import Console
 
 from glassplat.cli.console import say, warn
 from glassplat.prepare.photographs import Note
-from glassplat.prepare.photographs import Progress as Step
 from glassplat.training import messages
 
 FIRST_PAUSE, LONGEST_PAUSE = 1.0, 10.0
@@ -171,7 +170,8 @@ class TrainingProgress:
         elif isinstance(message, messages.StageEntered):
             standing.stage = message.stage
             self._pace.work()
-            self._say(f"step {message.step}: stage {message.stage}, {_counted(message.counts)}")
+            counts = ", ".join(f"{number} {name}" for name, number in message.counts.items())
+            self._say(f"step {message.step}: stage {message.stage}, {counts}")
         elif isinstance(message, messages.ActionDone) and not message.action.startswith(FREQUENT):
             self._say(f"step {message.step}: {message.action}")
         elif isinstance(message, messages.Working):
@@ -296,10 +296,6 @@ def _smoothed(known: float, loss: float) -> float:
     return SMOOTHING * known + (1 - SMOOTHING) * loss if known else loss
 
 
-def _counted(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{number} {name}" for name, number in counts.items())
-
-
 PAUSE = 10.0
 """Seconds between two lines about the same work."""
 
@@ -336,7 +332,7 @@ class WorkProgress:
             with suppress(OSError):  # A terminal that was closed must not hide why the work ends.
                 self._bar.stop()
 
-    def show(self, message: Step | Note) -> None:
+    def show(self, message: messages.Working | Note) -> None:
         """Follows the work."""
         if isinstance(message, Note):
             warn(self._console, message.text)
@@ -346,7 +342,7 @@ class WorkProgress:
         else:
             self._show_line(message)
 
-    def _show_bar(self, bar: progress.Progress, step: Step) -> None:
+    def _show_bar(self, bar: progress.Progress, step: messages.Working) -> None:
         if step.what != self._what or self._task is None:
             if self._task is not None:
                 bar.remove_task(self._task)
@@ -354,7 +350,7 @@ class WorkProgress:
             self._what = step.what
         bar.update(self._task, completed=step.done)
 
-    def _show_line(self, step: Step) -> None:
+    def _show_line(self, step: messages.Working) -> None:
         now = self._clock()
         if step.what != self._what:
             self._what, self._begun, self._shown, self._first = step.what, now, now, step.done
@@ -363,7 +359,7 @@ class WorkProgress:
             self._shown = now
             say(self._console, f"{step.what}: {step.done} of {step.total}, {self._time_left(step, now)}")
 
-    def _time_left(self, step: Step, now: float) -> str:
+    def _time_left(self, step: messages.Working, now: float) -> str:
         done = step.done - self._first
         if done <= 0:
             return "time left is not known yet"

@@ -28,7 +28,6 @@ from glassplat.files.images import write_image
 from glassplat.files.sidecars import read_cameras, write_cameras
 from glassplat.files.writing import SPLAT_WRITERS, atomic_write, real_path, scene_source, splat_writer
 from glassplat.model.model import CAMERAS, ENVIRONMENT, GLASS, PANORAMA, PLANES, Model, save_page, write_beside
-from glassplat.prepare.photographs import Progress as Step
 from glassplat.publish.camera_paths import fit_to_width, interpolate_cameras, keyframes_of
 from glassplat.publish.film import side_by_side, wipe_pictures, write_film
 from glassplat.publish.web_page import MOST_GAUSSIANS, PREVIEW, Sharing, fits, write_preview
@@ -37,6 +36,7 @@ from glassplat.render.layers import layer_image
 from glassplat.render.planar import Planar, dereflected_photo
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene, without_glass
+from glassplat.training.messages import Working
 
 if TYPE_CHECKING:
     from glassplat.cli.scene import Clean, Dereflect, Export, Render, Video
@@ -170,10 +170,10 @@ def track_progress(
     what: str, pictures: Iterable[NDArray[np.uint8]], total: int, progress: WorkProgress
 ) -> Iterator[NDArray[np.uint8]]:
     """The pictures, with a progress shown as they are taken."""
-    progress.show(Step(what, 0, total))
+    progress.show(Working(what, 0, total))
     for number, picture in enumerate(pictures, start=1):
         yield picture
-        progress.show(Step(what, number, total))
+        progress.show(Working(what, number, total))
 
 
 def write_clean(command: Clean, console: Console) -> None:

@@ -43,17 +43,15 @@ class PaneRegions(NamedTuple):
     planes: Planes | None = None
 
 
-def _true_region(view: View, frame: Frame, truth: TrueView | None) -> Tensor | str:
-    return NO_VIEW_TRUTH if truth is None else truth.labels > 0
-
-
 def _rendered_region(view: View, frame: Frame, truth: TrueView | None) -> Tensor | str:
     if "mask" in frame.layers:
         return frame.layers["mask"] > 0.5
     return f"{NO_TRUTH}, and the method renders no mask"
 
 
-TRUE_REGIONS = PaneRegions("ground-truth pane labels", _true_region)
+TRUE_REGIONS = PaneRegions(
+    "ground-truth pane labels", lambda view, frame, truth: NO_VIEW_TRUTH if truth is None else truth.labels > 0
+)
 RENDERED_REGIONS = PaneRegions("rendered mask > 0.5", _rendered_region)
 """As the method itself renders them, so that methods may be scored over different pixels."""
 
@@ -192,10 +190,6 @@ def in_photograph_colors(frame: Frame, exposures: Exposures, name: str) -> Frame
     return replace(frame, layers={**frame.layers, "photographed": image})
 
 
-def _nobody(evaluated: EvaluatedView) -> None:
-    """Listens to nothing."""
-
-
 @dataclass(frozen=True)
 class _Measurement:
     """Contribution of one view; `reflection` holds rendered and true pane pixels until the gain is known."""
@@ -211,7 +205,7 @@ def evaluate(
     dataset: Dataset,
     *,
     regions: PaneRegions | None = None,
-    listen: ViewListener = _nobody,
+    listen: ViewListener = lambda evaluated: None,
 ) -> Evaluation:
     """Renders every test view and measures it, on uint8-quantised sRGB at the data set's resolution.
 

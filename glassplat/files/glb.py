@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.files import records
-from glassplat.files.ply import CHANNEL_PREFIXES, is_channel
+from glassplat.files.ply import CHANNEL_PREFIXES, as_numpy, as_tensor, is_channel
 from glassplat.files.writing import atomic_write
 from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.kernels.project.reference import sh_basis
@@ -262,11 +262,6 @@ class Placement:
     scale: float = 1.0
     shift: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
 
-    @property
-    def is_identity(self) -> bool:
-        """Return whether it moves nothing."""
-        return self.scale == 1 and not bool(self.shift.any()) and not bool(self.quat[1:].any())
-
 
 def placement_of(node: Mapping[str, Any], outer: Placement, where: str) -> Placement:
     """Placement of a node, within the placement of its parent.
@@ -290,7 +285,7 @@ def placement_of(node: Mapping[str, Any], outer: Placement, where: str) -> Place
 
 def place_gaussians(gaussians: Gaussians, placement: Placement) -> Gaussians:
     """The Gaussians where a placement puts them, their harmonics turned along; the identity changes no bit."""
-    if placement.is_identity:
+    if placement.scale == 1 and not bool(placement.shift.any()) and not bool(placement.quat[1:].any()):
         return gaussians
     rotation = rotation_from_quat(placement.quat)
     means = placement.scale * (gaussians.means.double() @ rotation.T) + placement.shift
@@ -421,16 +416,16 @@ def _glb_bytes(gaussians: Gaussians) -> bytes:
     diffuse = linear_from_srgb((turned.sh[:, 0] * SH_ZERO + 0.5).clamp(0, 1))
     writer = GltfWriter()
     attributes = {
-        "POSITION": writer.add(_numpy(turned.means), bounded=True),
-        "COLOR_0": writer.add(_numpy(torch.cat([diffuse, opacities[:, None]], dim=1))),
-        ROTATION: writer.add(_numpy(quats.roll(-1, dims=1))),
-        SCALE: writer.add(_numpy(turned.deviations)),
-        OPACITY: writer.add(_numpy(opacities)),
+        "POSITION": writer.add(as_numpy(turned.means), bounded=True),
+        "COLOR_0": writer.add(as_numpy(torch.cat([diffuse, opacities[:, None]], dim=1))),
+        ROTATION: writer.add(as_numpy(quats.roll(-1, dims=1))),
+        SCALE: writer.add(as_numpy(turned.deviations)),
+        OPACITY: writer.add(as_numpy(opacities)),
     }
     for index, name in enumerate(_harmonic_names(turned.sh.shape[1])):
-        attributes[name] = writer.add(_numpy(turned.sh[:, index]))
+        attributes[name] = writer.add(as_numpy(turned.sh[:, index]))
     for name, values in turned.channels.items():
-        attributes[CHANNEL + name.upper()] = writer.add(_numpy(values))
+        attributes[CHANNEL + name.upper()] = writer.add(as_numpy(values))
     splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
     primitive = {"mode": POINTS, "attributes": attributes, "extensions": {EXTENSION: splats}}
     return writer.file(
@@ -506,21 +501,21 @@ def _read_primitive(file: GltfReader, attributes: dict[str, int], where: str) ->
     }
     if len(set(counts.values())) > 1:
         raise ValueError(f"the attributes of {where} have {sorted(set(counts.values()))} rows; expected one number")
-    scales = _tensor(file.array(attributes[SCALE], 3))
+    scales = as_tensor(file.array(attributes[SCALE], 3))
     if bool((scales < 0).any()):
         raise ValueError(
             f"{where} has negative scales, as drafts of {EXTENSION} stored logarithms; expected the ratified form: "
             "export it with a newer version of the program that wrote it"
         )
     are_discs = bool((scales[:, 2] == 0).all()) and bool((scales[:, :DISC_SCALES] > 0).any())
-    shares = _tensor(file.array(attributes[OPACITY], 1))[:, 0]
+    shares = as_tensor(file.array(attributes[OPACITY], 1))[:, 0]
     return Gaussians(
-        means=_tensor(file.array(attributes["POSITION"], 3)),
-        quats=_tensor(file.array(attributes[ROTATION], 4)).roll(1, dims=1),
+        means=as_tensor(file.array(attributes["POSITION"], 3)),
+        quats=as_tensor(file.array(attributes[ROTATION], 4)).roll(1, dims=1),
         log_scales=scales[:, : DISC_SCALES if are_discs else 3].clamp(min=LEAST_SCALE).log(),
         logit_opacities=torch.logit(shares.double().clamp(LEAST_SHARE, 1 - LEAST_SHARE)).float(),
-        sh=torch.stack([_tensor(file.array(attributes[name], 3)) for name in names], dim=1),
-        channels={name: _tensor(file.array(attributes[stored], 1))[:, 0] for name, stored in channels.items()},
+        sh=torch.stack([as_tensor(file.array(attributes[name], 3)) for name in names], dim=1),
+        channels={name: as_tensor(file.array(attributes[stored], 1))[:, 0] for name, stored in channels.items()},
         active_sh_degree=degree,
     )
 
@@ -547,11 +542,3 @@ def _alike(part: Gaussians, coefficients: int, *, are_discs: bool) -> Gaussians:
     if part.are_discs and not are_discs:
         log_scales = torch.nn.functional.pad(log_scales, (0, 1), value=float(np.log(LEAST_SCALE)))
     return replace(part, sh=sh, log_scales=log_scales)
-
-
-def _numpy(tensor: Tensor) -> Any:
-    return tensor.detach().to("cpu", torch.float32).numpy()
-
-
-def _tensor(values: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))

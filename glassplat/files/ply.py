@@ -246,3 +246,13 @@ def _as_float32(values: NDArray) -> NDArray[np.float32]:
 
 def _stack_columns(columns: Mapping[str, Tensor], names: tuple[str, ...]) -> Tensor:
     return torch.stack([columns[name] for name in names], dim=1)
+
+
+def as_numpy(tensor: Tensor) -> NDArray[np.float32]:
+    """A tensor as an array of the CPU, in single precision."""
+    return tensor.detach().to("cpu", torch.float32).numpy()
+
+
+def as_tensor(values: NDArray) -> Tensor:
+    """An array as a tensor, in single precision."""
+    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))

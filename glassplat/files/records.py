@@ -115,7 +115,7 @@ def _check_nesting_and_text(value: Any, where: str) -> None:
     """Level by level, without recursion of its own."""
     level = [value]
     for _ in range(DEEPEST):
-        unprintable = next((text for text in level if isinstance(text, str) and not _is_encodable(text)), None)
+        unprintable = next((text for text in level if isinstance(text, str) and not is_encodable(text)), None)
         if unprintable is not None:
             raise ValueError(f"{where} holds the text {unprintable!r}, which is no valid Unicode; write it again")
         level = [inner for outer in level for inner in _inside(outer)]
@@ -130,7 +130,7 @@ def _inside(value: Any) -> list[Any]:
     return value if isinstance(value, list) else []
 
 
-def _is_encodable(text: str) -> bool:
+def is_encodable(text: str) -> bool:
     """Half of a surrogate pair can be written in JSON, but in no file name and on no screen."""
     return text.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in text)
 

@@ -123,17 +123,13 @@ def _file_identity(path: Path) -> tuple[int, int]:
 @contextmanager
 def _unicode_name(path: Path) -> Iterator[Path]:
     """A name that the library opens: of a path with bytes that are no text, which it refuses, a link to it."""
-    if _is_unicode(path):
+    if records.is_encodable(str(path)):
         yield path
         return
     with tempfile.TemporaryDirectory() as folder:
         link = Path(folder) / "link.safetensors"
         link.symlink_to(path.absolute())
         yield link
-
-
-def _is_unicode(path: Path) -> bool:
-    return not any("\ud800" <= letter <= "\udfff" for letter in str(path))
 
 
 EDIT_TOLERANCE = 1e-5
@@ -403,10 +399,7 @@ def read_corrections(path: Path, kind: type[Correction]) -> Correction:
 
 
 def write_colmap(
-    folder: Path,
-    cameras: Iterable[tuple[str, Camera]],
-    positions: NDArray[np.floating],
-    colors: NDArray[np.uint8],
+    folder: Path, cameras: Iterable[tuple[str, Camera]], positions: NDArray[np.floating], colors: NDArray[np.uint8]
 ) -> None:
     """Writes `cameras.txt`, `images.txt` and `points3D.txt`; points have no tracks.
 

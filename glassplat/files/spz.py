@@ -21,6 +21,7 @@ import zstandard
 from numpy.typing import NDArray
 from torch import Tensor
 
+from glassplat.files.ply import as_numpy, as_tensor
 from glassplat.files.records import reading
 from glassplat.files.writing import atomic_write
 from glassplat.scene.gaussians import Gaussians, half_turned
@@ -76,12 +77,12 @@ def packed_sections(gaussians: Gaussians, layout: Layout) -> list[Bytes]:
     gaussians = half_turned(gaussians, FLIP)
     opacities = torch.sigmoid(gaussians.logit_opacities)
     return [
-        _packed_positions(_numpy(gaussians.means), layout.fractional_bits),
-        _rounded(_numpy(opacities) * 255),
-        _rounded(_numpy(gaussians.sh[:, 0]) * (COLOR_SCALE * 255) + 127.5),
-        _rounded((_numpy(_three_log_scales(gaussians)) - LOWEST_LOG_SCALE) * STEPS_PER_LOG),
-        _packed_rotations(_numpy(gaussians.quats)),
-        _rounded(_numpy(gaussians.sh[:, 1:]) * 128 + 128),
+        _packed_positions(as_numpy(gaussians.means), layout.fractional_bits),
+        _rounded(as_numpy(opacities) * 255),
+        _rounded(as_numpy(gaussians.sh[:, 0]) * (COLOR_SCALE * 255) + 127.5),
+        _rounded((as_numpy(_three_log_scales(gaussians)) - LOWEST_LOG_SCALE) * STEPS_PER_LOG),
+        _packed_rotations(as_numpy(gaussians.quats)),
+        _rounded(as_numpy(gaussians.sh[:, 1:]) * 128 + 128),
     ]
 
 
@@ -100,11 +101,11 @@ def unpack_gaussians(sections: list[Bytes], layout: Layout) -> Gaussians:
     constant = (colors.reshape(count, 1, 3).astype(np.float32) / 255 - 0.5) / COLOR_SCALE
     shares = np.clip(opacities.astype(np.float32) / 255, 0.5 / 255, 1 - 0.5 / 255)
     stored = Gaussians(
-        means=_tensor(_unpacked_positions(positions, layout)),
-        quats=_tensor(_unpacked_rotations(rotations, layout)),
-        log_scales=_tensor(scales.reshape(count, 3).astype(np.float32) / STEPS_PER_LOG + LOWEST_LOG_SCALE),
-        logit_opacities=torch.logit(_tensor(shares)),
-        sh=_tensor(np.concatenate([constant, rest], axis=1)),
+        means=as_tensor(_unpacked_positions(positions, layout)),
+        quats=as_tensor(_unpacked_rotations(rotations, layout)),
+        log_scales=as_tensor(scales.reshape(count, 3).astype(np.float32) / STEPS_PER_LOG + LOWEST_LOG_SCALE),
+        logit_opacities=torch.logit(as_tensor(shares)),
+        sh=as_tensor(np.concatenate([constant, rest], axis=1)),
         active_sh_degree=min(layout.degree, 3),
     )
     return half_turned(stored, FLIP)
@@ -164,14 +165,6 @@ def _unpacked_rotations(section: Bytes, layout: Layout) -> NDArray[np.float32]:
 
 def _rounded(values: NDArray[np.float32]) -> Bytes:
     return np.rint(values).clip(0, 255).astype(np.uint8).reshape(-1)
-
-
-def _numpy(tensor: Tensor) -> NDArray[np.float32]:
-    return tensor.detach().to("cpu", torch.float32).numpy()
-
-
-def _tensor(values: NDArray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
 MAGIC = 0x5053474E

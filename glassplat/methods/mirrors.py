@@ -251,11 +251,7 @@ def normals_propagated(
     strengths = gaussians.channels["logit_strength"].clamp(min=logit(options.least_strength))
     grows = strengths >= logit(options.reflective)
     log_scales = gaussians.log_scales + math.log(options.growth) * (grows[:, None] & _within_surface(gaussians))
-    changed = {
-        "logit_opacities": opacities,
-        "logit_strength": strengths,
-        "log_scales": log_scales,
-    }
+    changed = {"logit_opacities": opacities, "logit_strength": strengths, "log_scales": log_scales}
     everything = torch.ones_like(grows)
     return gaussians.with_tensors(changed), forget(moments, [f"primary.{name}" for name in changed], everything)
 
@@ -338,7 +334,7 @@ class Propagate:
 
     def due(self, clock: Clock) -> bool:
         """Return whether to act after this step."""
-        return self._all_intervals.due(clock) or clock.step == self._last(clock)
+        return replace(self.when, skip_multiples_of=None).due(clock) or clock.step == self._last(clock)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state`, until propagation has ended."""
@@ -357,17 +353,6 @@ class Propagate:
         state.optimizer.paused["primary.logit_opacities"] = self.schedule.pause
         state.records[RAISED] = clock.step
         return True
-
-    @property
-    def _all_intervals(self) -> Every:
-        """All of them."""
-        return replace(self.when, skip_multiples_of=None)
-
-    def _raise_rates(self, state: TrainState, clock: Clock) -> None:
-        """Learns faster where there is no normal that this would spoil."""
-        state.optimizer.raised_rates = {
-            name: rate.at(0.0, 1.0, clock.iterations) for name, rate in self.matte_rates.items()
-        }
 
     def _first(self, clock: Clock) -> int:
         """The first step that is left to a reset.
@@ -407,7 +392,10 @@ class Propagate:
         state.records[ENDED] = clock.step
         share = max(self.search.reflective(state.scene, dataset.train), state.records.get(MOST, 0.0))
         if share < FOUND or self.raises_rates_found:
-            self._raise_rates(state, clock)
+            # Faster where there is no normal that this would spoil.
+            state.optimizer.raised_rates = {
+                name: rate.at(0.0, 1.0, clock.iterations) for name, rate in self.matte_rates.items()
+            }
         if share >= FOUND:
             log.info(
                 "step %d: normal propagation has ended, %.0f %% of what is seen is reflection", clock.step, 100 * share
@@ -454,14 +442,12 @@ class ResetRaised(ResetOpacity):
         """Edits `state`, where something is to be lowered and there is time to recover."""
         raised = state.records.get(RAISED, 0) > state.records.get(LOWERED, 0)
         wanted = raised if has_ended(state) else self.regular.due(clock)
-        if not wanted or clock.step + self._recovery(clock) > clock.iterations:
+        # Opacities come back in the steps between two resets.
+        recovery = self.when.interval(clock) * (self.when.only_multiples_of or 1)
+        if not wanted or clock.step + recovery > clock.iterations:
             return False
         state.records[LOWERED] = clock.step
         return super().apply(state, dataset, clock)
-
-    def _recovery(self, clock: Clock) -> int:
-        """Steps in which opacities come back: those between two resets."""
-        return self.when.interval(clock) * (self.when.only_multiples_of or 1)
 
 
 @dataclass(frozen=True)

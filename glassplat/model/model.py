@@ -19,7 +19,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from glassplat.captures.dataset import Dataset, with_corrected_cameras
+from glassplat.captures.dataset import EXTENT_MARGIN, Dataset, with_corrected_cameras
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files import writing
 from glassplat.files.ply import read_gaussians, write_gaussians
@@ -522,7 +522,6 @@ NamedCameras = tuple[tuple[str, Camera], ...]
 AXES: dict[str, tuple[int, int, int]] = {
     "x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1),
 }  # fmt: skip
-EXTENT_MARGIN = 1.1
 log = logging.getLogger(__name__)
 
 

@@ -52,7 +52,8 @@ EDGES_PER_VIEW = 100
 def report_masks(label: int, plane: FramedPlanes, views: Sequence[PaneView]) -> None:
     """Logs how well each mask of a pane fits the others on its plane, and warns of those that do not, by name."""
     meeting, overlap = meeting_of_each(plane, views), agreement_of_each(plane.planes, views)
-    found = [f"{view.name} {_percent(share)}" for view, share in zip(views, meeting, strict=True)]
+    shares = ["nothing to compare" if np.isnan(share) else f"{share:.0%}" for share in meeting]
+    found = [f"{view.name} {share}" for view, share in zip(views, shares, strict=True)]
     areas = ", ".join(f"{name} ({area:.2f})" for name, area in zip(found, overlap, strict=True))
     log.debug("pane %d: outlines of the masks that meet those of the others (and overlap): %s", label, areas)
     log.info(
@@ -65,10 +66,6 @@ def report_masks(label: int, plane: FramedPlanes, views: Sequence[PaneView]) -> 
             "that each belongs to its photograph, and that label %d means the same flat pane in it",
             label, len(odd), len(views), ", ".join(found[number] for number in odd), label,
         )  # fmt: skip
-
-
-def _percent(share: float) -> str:
-    return "nothing to compare" if np.isnan(share) else f"{share:.0%}"
 
 
 def odd_ones(meeting: Array) -> NDArray[np.bool_]:

@@ -24,7 +24,8 @@ from glassplat.captures import colmap_library as library
 from glassplat.errors import InputError
 from glassplat.files.writing import atomic_write
 from glassplat.options import short_repr
-from glassplat.prepare.photographs import Listener, Photograph, Progress, read_photograph
+from glassplat.prepare.photographs import Listener, Photograph, read_photograph
+from glassplat.training.messages import Working
 
 Result = TypeVar("Result")
 
@@ -138,7 +139,7 @@ class FeatureDatabase:
         targets = [self.pictures / name for name in self.picture_names]
         missing = [index for index, target in enumerate(targets) if not target.is_file()]
         for done, index in enumerate(missing):
-            listen(Progress("reading the photographs", done, len(missing)))
+            listen(Working("reading the photographs", done, len(missing)))
             with atomic_write(targets[index]) as temporary:
                 pixels = read_photograph(self.photographs[index])
                 Image.fromarray(pixels).convert("L").save(temporary, compress_level=1)
@@ -260,7 +261,7 @@ class _Watched(Generic[Item]):
     def look(self) -> None:
         """Looks for what was missing the last time, and tells."""
         self._missing = [item for item in self._missing if not self._exists(item)]
-        self._listen(Progress(self._what, self._total - len(self._missing), self._total))
+        self._listen(Working(self._what, self._total - len(self._missing), self._total))
 
 
 def _image_ids(database: Any) -> list[int]:
@@ -398,7 +399,7 @@ def place_photographs(
     """
     output = database.with_suffix(".models")
     output.mkdir(exist_ok=True)
-    listen(Progress("placing the photographs", 0, count))
+    listen(Working("placing the photographs", 0, count))
     if mapper == "incremental":
         work = _incremental(database, output, _incremental_options(options, threads), count, listen)
     else:
@@ -414,12 +415,12 @@ def _incremental(database: Path, output: Path, options: Any, count: int, listen:
     def begun() -> None:
         nonlocal placed_now
         placed_now = 2
-        listen(Progress("placing the photographs", placed_now, count))
+        listen(Working("placing the photographs", placed_now, count))
 
     def next_one() -> None:
         nonlocal placed_now
         placed_now = min(placed_now + 1, count)
-        listen(Progress("placing the photographs", placed_now, count))
+        listen(Working("placing the photographs", placed_now, count))
 
     def work(token: Any) -> dict:
         return library.pycolmap.incremental_mapping(

@@ -20,15 +20,7 @@ from PIL import ExifTags, Image, ImageOps
 from glassplat.errors import InputError, first_names
 from glassplat.files import images
 from glassplat.files.records import reading
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Progress of one part of the work; `done` counts from 0 to `total`."""
-
-    what: str
-    done: int
-    total: int
+from glassplat.training.messages import Working
 
 
 @dataclass(frozen=True)
@@ -38,7 +30,7 @@ class Note:
     text: str
 
 
-Listener = Callable[[Progress | Note], None]
+Listener = Callable[[Working | Note], None]
 
 UNREADABLE = (".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
 """Photographs that Pillow cannot read."""
@@ -85,7 +77,7 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
     twins: list[str] = []
     broken: dict[str, InputError] = {}
     for done, path in enumerate(paths):
-        listen(Progress("looking at the photographs", done, len(paths)))
+        listen(Working("looking at the photographs", done, len(paths)))
         try:
             photograph, contents = _examine(path, names[path], max_size)
         except InputError as error:
@@ -148,7 +140,8 @@ def capture_names(paths: Sequence[Path], folder: Path) -> dict[Path, str]:
 
     All differ without suffix, too, as masks need it. Names that are no text, or have line breaks, are made readable.
     """
-    spoken = {path: _readable(path.relative_to(folder).as_posix()) for path in paths}
+    unreadable = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
+    spoken = {path: unreadable.sub("_", path.relative_to(folder).as_posix()) for path in paths}
     # Two files may become one name, as when both held bytes that are no text.
     counts: Counter[str] = Counter()
     for path, name in spoken.items():
@@ -157,10 +150,6 @@ def capture_names(paths: Sequence[Path], folder: Path) -> dict[Path, str]:
             spoken[path] = f"{name}-{counts[name]}"
     pictures = images.picture_paths(list(spoken.values()))
     return {path: pictures[name].with_suffix(".jpg").as_posix() for path, name in spoken.items()}
-
-
-def _readable(name: str) -> str:
-    return re.sub(r"[\x00-\x1f\x7f\ud800-\udfff]", "_", name)
 
 
 def read_photograph(photograph: Photograph) -> NDArray[np.uint8]:
@@ -325,7 +314,7 @@ def frames_of(video: Path, folder: Path, most: int, listen: Listener) -> list[Pa
     missing = {number for number, path in paths.items() if not path.is_file()}
     for number, frame in enumerate(_frames(cv2, video) if missing else ()):
         if number in missing:
-            listen(Progress("taking photographs from the video", sorted(paths).index(number), len(paths)))
+            listen(Working("taking photographs from the video", sorted(paths).index(number), len(paths)))
             images.write_image(paths[number], frame[:, :, ::-1])
     return list(paths.values())
 
@@ -380,7 +369,7 @@ def _measure_motion(cv2: Any, video: Path, listen: Listener) -> Footage:
     total = _length(cv2, video)
     for number, frame in enumerate(_frames(cv2, video)):
         if number % 10 == 0:
-            listen(Progress("looking through the video", min(number, total), total))
+            listen(Working("looking through the video", min(number, total), total))
         small = _small_grey(cv2, frame)
         if before is not None:
             way += _motion(cv2, before, small)

@@ -324,12 +324,7 @@ class Preparation:
     def record(self) -> dict[str, Any]:
         """Inputs on which the work depends: an interrupted one goes on with the same only."""
         placing = {"lens": self.settings.lens, "mapper": self.settings.mapper}
-        return {
-            "input": str(real_path(self.source)),
-            "max-size": self.max_size,
-            "frames": self.frames,
-            **placing,
-        }
+        return {"input": str(real_path(self.source)), "max-size": self.max_size, "frames": self.frames, **placing}
 
 
 def prepare(task: Preparation, listen: Listener, *, resume: bool = False, force: bool = False) -> Report:

@@ -23,7 +23,8 @@ from glassplat.prepare.colmap import (
     chosen_pairs,
     place_photographs,
 )
-from glassplat.prepare.photographs import Listener, Note, Photograph, Progress, read_photograph
+from glassplat.prepare.photographs import Listener, Note, Photograph, read_photograph
+from glassplat.training.messages import Working
 
 FEWEST_FEATURES = 50
 """Of the middle photograph; with fewer nothing can be matched."""
@@ -173,7 +174,7 @@ def write_capture(solution: Solution, folder: Path, listen: Listener) -> None:
     images = image_numbers(model)
     for done, (number, image) in enumerate(sorted(images.items())):
         photograph = solution.database.photographs[number]
-        listen(Progress("writing photographs without distortion", done, len(images)))
+        listen(Working("writing photographs without distortion", done, len(images)))
         pixels = undistort(read_photograph(photograph), lenses[image.camera_id])
         colors.look(image, pixels)
         target = folder / "images" / photograph.name

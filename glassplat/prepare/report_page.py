@@ -99,11 +99,11 @@ def _points(pixels: Array, colors: NDArray[np.generic], behind: NDArray[np.bool_
     every = max(1, -(-len(pixels) // MOST_POINTS))
     inside = np.all((pixels >= 0) & (pixels <= np.array(SIZE)), axis=1).reshape(-1)
     shown = [int(row) for row in np.flatnonzero(inside)[::every]]
-    return [_dot(pixels[row], "#ff4fd8" if behind[row] else _hex(colors[row])) for row in shown]
-
-
-def _dot(place: Array, color: str) -> str:
-    return f'<circle cx="{place[0]:.1f}" cy="{place[1]:.1f}" r="1.3" fill="{color}"/>'
+    return [
+        f'<circle cx="{pixels[row][0]:.1f}" cy="{pixels[row][1]:.1f}" r="1.3" '
+        f'fill="{"#ff4fd8" if behind[row] else _hex(colors[row])}"/>'
+        for row in shown
+    ]
 
 
 def _hex(color: NDArray[np.generic]) -> str:

@@ -256,12 +256,7 @@ def write_page(
 
 @torch.no_grad()
 def page_text(
-    scene: Scene,
-    renderer: Renderer,
-    cameras: Sequence[tuple[str, Camera]],
-    title: str,
-    *,
-    sharing: Sharing = PRIVATE,
+    scene: Scene, renderer: Renderer, cameras: Sequence[tuple[str, Camera]], title: str, *, sharing: Sharing = PRIVATE
 ) -> str:
     """Text of the page."""
     settings = renderer.page_settings()

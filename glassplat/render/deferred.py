@@ -232,60 +232,43 @@ def seen_surface(
     depth: bool = True,
     with_absgrad: bool = False,
 ) -> Surface:
-    """Blends the surfaces of the primary Gaussians, which have a `logit_strength`: ellipsoids or discs.
+    """Blends the surfaces of the primary Gaussians, which have a `logit_strength`.
 
-    Without `depth`, ellipsoids have none; it costs them one more channel.
+    Depths of ellipsoids are those of their centres, and without `depth` there are none, which saves a channel; those of
+    discs are where rays meet them.
     """
-    if scene.primary.are_discs:
-        return _seen_discs(scene, camera, background, with_absgrad)
-    return _seen_ellipsoids(scene, camera, background, depth, with_absgrad)
-
-
-def _seen_ellipsoids(
-    scene: Scene, camera: Camera, background: tuple[float, float, float], deep: bool, with_absgrad: bool
-) -> Surface:
-    """Depths are those of the centres."""
-    projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
-    screen = (screen_pass("primary", projected),) if with_absgrad else ()
-    extra = projected.depths[0, :, None] if deep else None
-    channels = ellipsoid_channels(scene.primary, projected, camera, extra)
-    result = blended_ellipsoids(projected, channels[None], camera, screen=screen)
-    image, alpha = result.image[0], result.alpha[0]
-    # Split at once: a slice has a gradient as large as the image.
-    color, normal, strength, *depth = image.split((3, 3, 1, 1) if deep else (3, 3, 1), dim=2)
-    return Surface(
-        image=image,
-        color=color,
-        background=background,
-        normal=normal,
-        strength=strength.squeeze(2),
-        depth=mean_depth(depth[0].squeeze(2), alpha) if deep else alpha.new_zeros(0),
-        alpha=alpha,
-        direct=reaches_pixel(projected),
-        screen=screen,
-    )
-
-
-def _seen_discs(scene: Scene, camera: Camera, background: tuple[float, float, float], with_absgrad: bool) -> Surface:
-    """Depths are those of the places where rays meet the discs."""
     near = NEAR_PER_EXTENT * scene.extent
-    projected = projected_discs(scene.primary, camera, near=near)
-    screen = (screen_pass("primary", projected),) if with_absgrad else ()
-    strengths = torch.sigmoid(scene.primary.channels["logit_strength"])[None, :, None]
-    channels = torch.cat([projected.colors, projected.normals, strengths], dim=-1)
-    blended = blended_discs(projected, channels, camera, near=near, screen=screen)
-    image, extra = blended.image[0], disc_layers(blended, scene.extent)
-    alpha, depth = extra.pop("alpha"), extra.pop("depth")
-    color, normal, strength = image.split((3, 3, 1), dim=2)
+    extra: dict[str, Tensor] = {}
+    if scene.primary.are_discs:
+        discs = projected_discs(scene.primary, camera, near=near)
+        screen = (screen_pass("primary", discs),) if with_absgrad else ()
+        strengths = torch.sigmoid(scene.primary.channels["logit_strength"])[None, :, None]
+        channels = torch.cat([discs.colors, discs.normals, strengths], dim=-1)
+        blended = blended_discs(discs, channels, camera, near=near, screen=screen)
+        image, extra = blended.image[0], disc_layers(blended, scene.extent)
+        alpha, distance = extra.pop("alpha"), extra.pop("depth")
+        color, normal, strength = image.split((3, 3, 1), dim=2)
+        direct = reaches_pixel(discs)
+    else:
+        projected = project_gaussians(scene.primary, camera, near=near)
+        screen = (screen_pass("primary", projected),) if with_absgrad else ()
+        depths = projected.depths[0, :, None] if depth else None
+        channels = ellipsoid_channels(scene.primary, projected, camera, depths)
+        result = blended_ellipsoids(projected, channels[None], camera, screen=screen)
+        image, alpha = result.image[0], result.alpha[0]
+        # Split at once: a slice has a gradient as large as the image.
+        color, normal, strength, *last = image.split((3, 3, 1, 1) if depth else (3, 3, 1), dim=2)
+        distance = mean_depth(last[0].squeeze(2), alpha) if depth else alpha.new_zeros(0)
+        direct = reaches_pixel(projected)
     return Surface(
         image=image,
         color=color,
         background=background,
         normal=normal,
         strength=strength.squeeze(2),
-        depth=depth,
+        depth=distance,
         alpha=alpha,
-        direct=reaches_pixel(projected),
+        direct=direct,
         screen=screen,
         extra=extra,
     )

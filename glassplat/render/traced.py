@@ -23,14 +23,7 @@ from glassplat.render.deferred import (
     shaded_pixels,
     view_directions,
 )
-from glassplat.render.frame import (
-    MEDIAN_DEPTH,
-    NEAR_PER_EXTENT,
-    Frame,
-    SpacePass,
-    check_colored,
-    over_background,
-)
+from glassplat.render.frame import MEDIAN_DEPTH, NEAR_PER_EXTENT, Frame, SpacePass, check_colored, over_background
 from glassplat.scene import SH_ZERO
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians

@@ -154,11 +154,7 @@ class AddPhotographer:
             yield from carried_out(self.after(state, dataset))
         cameras = [view.camera for view in dataset.train]
         body = first_photographer(
-            state.scene.planes,
-            cameras,
-            count=self.options.count,
-            sh_degree=self.options.sh_degree,
-            seed=self.seed,
+            state.scene.planes, cameras, count=self.options.count, sh_degree=self.options.sh_degree, seed=self.seed
         )
         up = upward(cameras) if self.options.upright else None
         state.scene = replace(state.scene, photographer=body, up=up)

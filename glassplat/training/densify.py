@@ -485,12 +485,7 @@ MOST_LOGIT = 16.0
 
 @torch.no_grad()
 def relocate_and_grow(
-    options: McmcDensify,
-    gaussians: Gaussians,
-    moments: Moments,
-    *,
-    cap: int,
-    generator: torch.Generator,
+    options: McmcDensify, gaussians: Gaussians, moments: Moments, *, cap: int, generator: torch.Generator
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
     """A set of Gaussians and their moments after relocation and growth; what it renders stays nearly the same.
 
@@ -634,12 +629,7 @@ def _profile_coefficients() -> Tensor:
 
 @torch.no_grad()
 def perturb_opacities(
-    gaussians: Gaussians,
-    selected: Tensor,
-    *,
-    generator: torch.Generator,
-    amplitude: float,
-    bounds: tuple[float, float],
+    gaussians: Gaussians, selected: Tensor, *, generator: torch.Generator, amplitude: float, bounds: tuple[float, float]
 ) -> Gaussians:
     """Adds uniform noise to the opacity of the Gaussians that are seen through a pane.
 

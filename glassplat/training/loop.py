@@ -68,12 +68,7 @@ class Step(NamedTuple):
 
 
 def train(
-    stages: tuple[Stage, ...],
-    dataset: Dataset,
-    state: TrainState,
-    iterations: int,
-    *,
-    ranks: Ranks | None = None,
+    stages: tuple[Stage, ...], dataset: Dataset, state: TrainState, iterations: int, *, ranks: Ranks | None = None
 ) -> Iterator[Message]:
     """Trains until `iterations`, from wherever `state` stands.
 

@@ -52,7 +52,7 @@ class ActionDone:
 
 @dataclass(frozen=True)
 class Working:
-    """Something between two steps takes its time; the state is in the middle of a change and must not be saved.
+    """Something takes its time; between two steps the state is in the middle of a change and must not be saved.
 
     Attributes:
         what: is being done, as a gerund: "fitting planes".

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.render.frame import Frame, Renderer
+from glassplat.render.frame import Renderer
 from glassplat.render.layers import error_colors, layer_image
 from glassplat.render.planar import PHOTOGRAPHED
 from glassplat.scene.camera import Camera, quat_from_rotation, rotation_from_quat
@@ -164,7 +164,7 @@ def edit_scene(scene: Scene, request: ViewRequest) -> Scene:
 def draw_picture(scene: Scene, renderer: Renderer, request: ViewRequest, height: int) -> NDArray[np.uint8]:
     """The picture [H, W, 3] of a request; a layer that the scene does not have shows as the image itself."""
     frame = renderer.with_layers([request.layer])(edit_scene(scene, request), request.camera(height))
-    return _picture(layer_image(frame, request.layer if _has(frame, request.layer) else "rgb"))
+    return _picture(layer_image(frame, request.layer if request.layer in (*frame.layers, PHOTOGRAPHED) else "rgb"))
 
 
 @torch.no_grad()
@@ -217,10 +217,6 @@ def point_along(
     depth = float(frame.layers["depth"][row, column])
     point: NDArray[np.float64] = camera.center.double().numpy() + depth / z * direction
     return point
-
-
-def _has(frame: Frame, layer: str) -> bool:
-    return layer in frame.layers or layer in ("rgb", PHOTOGRAPHED)
 
 
 def _picture(image: Tensor) -> NDArray[np.uint8]:

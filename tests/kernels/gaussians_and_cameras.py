@@ -55,6 +55,28 @@ def needle_before_camera(angle: float, dtype: torch.dtype) -> tuple[RawGaussians
     return needle, CameraBatch(torch.eye(4, dtype=dtype)[None].requires_grad_(), intrinsics, size, size)
 
 
+HUGE = 0.4  # of the largest number that the type holds
+POISON = {
+    "means": [math.nan, math.inf, -math.inf, HUGE],
+    "quats": [math.nan, math.inf, HUGE],
+    "log_scales": [math.nan, math.inf, -math.inf, HUGE],
+    "logit_opacities": [math.nan, math.inf, -HUGE, -math.inf],
+    "sh": [math.nan, math.inf, -math.inf],
+}
+
+
+def poisoned(clean: RawGaussians, seen: Tensor) -> tuple[RawGaussians, list[int]]:
+    """The Gaussians, in one of those seen each of these values; and which these are."""
+    tensors, victims = [tensor.detach().clone() for tensor in clean], []
+    for name, values in POISON.items():
+        for value in values:
+            victim = int(seen[len(victims)])
+            value = value * torch.finfo(clean.means.dtype).max if abs(value) == HUGE else value
+            tensors[RawGaussians._fields.index(name)].view(len(clean.means), -1)[victim, 0] = value
+            victims.append(victim)
+    return RawGaussians(*(tensor.requires_grad_() for tensor in tensors)), victims
+
+
 def as_splats(projected: Projected) -> Splats:
     """What rasterisation needs, cut off from the graph."""
     fields = (projected.means2d, projected.conics, projected.opacities, projected.depths, projected.radii)

@@ -18,6 +18,7 @@ from tests.kernels.gaussians_and_cameras import (
     WIDTH,
     draw,
     needle_before_camera,
+    poisoned,
     random_cameras,
     random_gaussians,
 )
@@ -99,30 +100,13 @@ def test_the_ellipse_follows_the_tangent_only_near_the_image() -> None:
     torch.testing.assert_close(gradients(ours, gaussians, cameras), gradients(theirs, gaussians, cameras))
 
 
-HUGE = 0.4  # of the largest number that the type holds
-POISON = {
-    "means": [math.nan, math.inf, -math.inf, HUGE],
-    "quats": [math.nan, math.inf, HUGE],
-    "log_scales": [math.nan, math.inf, -math.inf, HUGE],
-    "logit_opacities": [math.nan, math.inf, -HUGE, -math.inf],
-    "sh": [math.nan, math.inf, -math.inf],
-}
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_poisoned_gaussian_culls_only_itself(dtype: torch.dtype) -> None:
     clean = random_gaussians(60, dtype=dtype)
     cameras = random_cameras(2, dtype=dtype)
     expected = project(clean, cameras, sh_degree=3, near=NEAR)
     seen = (expected.radii[..., 0] > 0).all(dim=0).nonzero()[:, 0]
-    poisoned, victims = [tensor.detach().clone() for tensor in clean], []
-    for name, values in POISON.items():
-        for value in values:
-            victim = int(seen[len(victims)])
-            value = value * torch.finfo(dtype).max if abs(value) == HUGE else value
-            poisoned[RawGaussians._fields.index(name)].view(60, -1)[victim, 0] = value
-            victims.append(victim)
-    gaussians = RawGaussians(*(tensor.requires_grad_() for tensor in poisoned))
+    gaussians, victims = poisoned(clean, seen)
     ours = project(gaussians, cameras, sh_degree=3, near=NEAR)
     found = gradients(ours, gaussians, cameras)
     healthy = torch.ones(60, dtype=torch.bool)

@@ -11,7 +11,7 @@ from torch import Tensor
 from glassplat.kernels.project import project_discs
 from glassplat.kernels.project.reference import project_discs as twin
 from glassplat.kernels.records import CameraBatch, ProjectedDiscs, RawGaussians
-from tests.kernels.gaussians_and_cameras import HEIGHT, WIDTH, draw, random_cameras, random_gaussians
+from tests.kernels.gaussians_and_cameras import HEIGHT, WIDTH, draw, poisoned, random_cameras, random_gaussians
 from tests.kernels.threads import assert_threads_change_no_bit
 
 NEAR = 0.2
@@ -115,29 +115,12 @@ def test_normals_face_the_camera() -> None:
     assert bool((towards[found.radii[..., 0] > 0] > 0).all())
 
 
-HUGE = 0.4  # of the largest number that the type holds
-POISON = {
-    "means": [math.nan, math.inf, -math.inf, HUGE],
-    "quats": [math.nan, math.inf, HUGE],
-    "log_scales": [math.nan, math.inf, -math.inf, HUGE],
-    "logit_opacities": [math.nan, math.inf, -HUGE, -math.inf],
-    "sh": [math.nan, math.inf, -math.inf],
-}
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_poisoned_disc_culls_only_itself(dtype: torch.dtype) -> None:
     clean, cameras = random_discs(60, dtype=dtype), random_cameras(2, dtype=dtype)
     expected = project_discs(clean, cameras, sh_degree=3, near=NEAR)
     seen = (expected.radii[..., 0] > 0).all(dim=0).nonzero()[:, 0]
-    poisoned, victims = [tensor.detach().clone() for tensor in clean], []
-    for name, values in POISON.items():
-        for value in values:
-            victim = int(seen[len(victims)])
-            value = value * torch.finfo(dtype).max if abs(value) == HUGE else value
-            poisoned[RawGaussians._fields.index(name)].view(60, -1)[victim, 0] = value
-            victims.append(victim)
-    discs = RawGaussians(*(tensor.requires_grad_() for tensor in poisoned))
+    discs, victims = poisoned(clean, seen)
     ours = project_discs(discs, cameras, sh_degree=3, near=NEAR)
     found = gradients(ours, discs, cameras)
     healthy = torch.ones(60, dtype=torch.bool)

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from glassplat.cli.train import SCENE
-from glassplat.prepare.photographs import Note, Progress
+from glassplat.prepare.photographs import Note
+from glassplat.training.messages import Working
 
 CONNECTED = ("0000", "0001", "0003", "0004", "0006", "0007", "0009", "0010", "0012", "0013")
 """Of the bundled scene, photographs that show enough of the same."""
@@ -30,11 +31,11 @@ def photographs(tmp_path: Path) -> Path:
 class Heard(list):
     """Keeps what a preparation says."""
 
-    def __call__(self, message: Progress | Note) -> None:
+    def __call__(self, message: Working | Note) -> None:
         self.append(message)
 
     def whats(self) -> set[str]:
-        return {message.what for message in self if isinstance(message, Progress)}
+        return {message.what for message in self if isinstance(message, Working)}
 
 
 @pytest.fixture

@@ -15,9 +15,10 @@ from glassplat.cli.main import main
 from glassplat.cli.train import SCENE
 from glassplat.errors import InputError
 from glassplat.prepare import colmap
-from glassplat.prepare.photographs import Note, Progress
+from glassplat.prepare.photographs import Note
 from glassplat.prepare.preparation import Preparation, prepare
 from glassplat.prepare.reconstruction import Settings
+from glassplat.training.messages import Working
 from tests.prepare.conftest import CONNECTED, Heard, copy_photographs
 
 
@@ -103,8 +104,8 @@ def test_a_capture_is_replaced_only_by_force(prepared: Path, capsys: pytest.Capt
 def test_what_was_interrupted_goes_on(phase: str, photographs: Path, tmp_path: Path, heard: Heard) -> None:
     task = Preparation(photographs, tmp_path / "capture")
 
-    def interrupt(message: Progress | Note) -> None:
-        if isinstance(message, Progress) and message.what.startswith(phase):
+    def interrupt(message: Working | Note) -> None:
+        if isinstance(message, Working) and message.what.startswith(phase):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -131,8 +132,8 @@ def test_only_one_sqlite_has_the_database_open_and_progress_is_read_from_it(
     monkeypatch.setattr(colmap, "LOOK_EVERY", 0.001)
     assert prepare(Preparation(photographs, tmp_path / "capture"), heard).registered == len(CONNECTED)
     for phase in ("looking for features", "matching photographs"):
-        told = [message.done for message in heard if isinstance(message, Progress) and message.what == phase]
-        total = next(m.total for m in heard if isinstance(m, Progress) and m.what == phase)
+        told = [message.done for message in heard if isinstance(message, Working) and message.what == phase]
+        total = next(m.total for m in heard if isinstance(m, Working) and m.what == phase)
         assert told == sorted(told) and len(set(told)) > 2 and told[-1] >= 0.9 * total
 
 

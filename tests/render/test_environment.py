@@ -6,7 +6,6 @@ import math
 
 import pytest
 import torch
-from torch import Tensor
 
 from glassplat.kernels.environment import cube_lookup
 from glassplat.render.deferred import (
@@ -31,10 +30,6 @@ def faces_only() -> Environment:
     """Each face in a colour of its own."""
     colors = torch.linspace(-2, 2, 18).reshape(6, 1, 1, 3)
     return Environment(colors.expand(6, 4, 4, 3).contiguous())
-
-
-def colors_in(environment: Environment, directions: Tensor) -> Tensor:
-    return torch.sigmoid(cube_lookup(environment.raw, directions.to(environment.raw)))
 
 
 def test_texel_directions_are_where_the_lookup_meets_texels() -> None:

@@ -15,7 +15,7 @@ from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.training.loop import train
 from glassplat.training.options import DefaultDensify
 from glassplat.training.stage import TrainState
-from tests.training.tiny_capture import tiny_capture, true_scene
+from tests.training.tiny_capture import place_true_planes, tiny_capture
 
 FACTORIES = {
     torch.zeros, torch.ones, torch.empty, torch.full, torch.eye, torch.arange, torch.linspace, torch.tensor,
@@ -57,12 +57,6 @@ class WithoutDevice(TorchFunctionMode):
             if "/glassplat/" in path and not any(part in path for part in ON_THE_CPU):
                 self.places.add(f"{path}:{frame.f_lineno}")
         return function(*args, **(kwargs or {}))
-
-
-def place_true_planes(state: TrainState, dataset: object) -> None:
-    """Stands in for the plane fit, which needs more masks than the tiny capture has."""
-    truth = true_scene()
-    state.scene = replace(state.scene, planes=truth.planes, glass=truth.glass)
 
 
 def trained(steps: int) -> TrainState:

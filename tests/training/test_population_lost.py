@@ -22,7 +22,7 @@ from glassplat.training.loop import NoGaussiansError, VisibilityCheck, train
 from glassplat.training.messages import Message, StepDone, Working
 from glassplat.training.options import DefaultDensify
 from glassplat.training.stage import Stage, TrainState
-from tests.training.tiny_capture import tiny_capture, true_scene, write_tiny_capture
+from tests.training.tiny_capture import place_true_planes, tiny_capture, write_tiny_capture
 
 
 def looking_away(view: View) -> View:
@@ -30,11 +30,6 @@ def looking_away(view: View) -> View:
     pose = view.camera.cam_from_world.clone()
     pose[2, 3] -= 1000
     return replace(view, camera=replace(view.camera, cam_from_world=pose))
-
-
-def place_true_planes(state: TrainState, dataset: object) -> None:
-    truth = true_scene()
-    state.scene = replace(state.scene, planes=truth.planes, glass=truth.glass)
 
 
 def stages_of(recipe: SplatRecipe | PlanarRecipe | DeferredRecipe) -> tuple[Stage, ...]:

@@ -28,7 +28,7 @@ from glassplat.training.stage import Clock, Stage, TrainState, stage_starts
 from tests.render.test_seen_panes import CAMERA, vitrine
 from tests.training.progress_of import finished
 from tests.training.test_default import edited, make_gaussians, seen
-from tests.training.tiny_capture import tiny_capture, true_scene
+from tests.training.tiny_capture import place_true_planes, tiny_capture, true_scene
 from tools.make_differences import REASONS, own_differences, with_table
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -109,11 +109,6 @@ def planeless(recipe: PlanarRecipe) -> Scene:
     """The first scene of a recipe, without the trial fit that the few points of the tiny capture do not do for."""
     dataset = tiny_capture()
     return Scene(planar_population(recipe).initial(dataset.points, recipe.sh_degree), dataset.extent)
-
-
-def place_true_planes(state: TrainState, dataset: object) -> None:
-    scene = true_scene()
-    state.scene = replace(state.scene, planes=scene.planes, glass=scene.glass)
 
 
 def moments(stages: tuple[Stage, ...], kind: type, iterations: int) -> list[list[int]]:

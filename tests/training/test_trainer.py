@@ -21,17 +21,11 @@ from glassplat.training.losses import LossTerm, PhotometricLoss
 from glassplat.training.messages import ActionDone, StageEntered, StepDone
 from glassplat.training.stage import Stage, TrainState
 from tests.training.progress_of import finished
-from tests.training.tiny_capture import tiny_capture, true_scene
+from tests.training.tiny_capture import place_true_planes, tiny_capture, true_scene
 
 
 def fresh_state(seed: int = 0) -> TrainState:
     return TrainState(SplatRecipe(sh_degree=1).initialise(tiny_capture()), seed)
-
-
-def place_true_planes(state: TrainState, dataset: object) -> None:
-    """Stands in for the plane fit, which needs more masks than the tiny capture has."""
-    truth = true_scene()
-    state.scene = replace(state.scene, planes=truth.planes, glass=truth.glass)
 
 
 def planar_stages() -> tuple[Stage, ...]:

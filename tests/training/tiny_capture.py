@@ -16,11 +16,18 @@ from glassplat.files.ply_table import write_table
 from glassplat.render.planar import Planar
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
+from glassplat.training.stage import TrainState
 from tests.render.tiny_scene import camera_at, in_single_precision, pane, showcase, shown_panes
 
 
 def true_scene() -> Scene:
     return in_single_precision(showcase(pane(2.0, half=0.8)))
+
+
+def place_true_planes(state: TrainState, dataset: object) -> None:
+    """Stands in for the plane fit, which needs more masks than the tiny capture has."""
+    truth = true_scene()
+    state.scene = replace(state.scene, planes=truth.planes, glass=truth.glass)
 
 
 @cache

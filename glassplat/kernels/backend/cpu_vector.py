@@ -103,7 +103,7 @@ def vector_kind(real: type, lanes: int) -> VectorKind:
             value.align = kind.element.bitwidth // 8
             return value
 
-        if _holds(array, kind):
+        if _is_flat(array, kind.element):
             return kind(array, types.intp), generate
 
     return VectorKind(full, load)
@@ -144,7 +144,7 @@ def store(typing, array, at, value):
         done.align = value.element.bitwidth // 8
         return context.get_dummy_value()
 
-    if isinstance(value, VectorType) and _holds(array, value):
+    if isinstance(value, VectorType) and _is_flat(array, value.element):
         return types.void(array, types.intp, value), generate
 
 
@@ -265,10 +265,6 @@ def _times_power_of_2(builder: Any, x: Any, exponent: Any, kind: VectorType) -> 
 def plain(result: Any, arguments: tuple[Any, ...], build: Callable[..., Any]) -> tuple[Any, Callable[..., Any]]:
     """Result of an intrinsic that needs only the values of its arguments."""
     return result(*arguments), lambda context, builder, sig, values: build(builder, *values)
-
-
-def _holds(array: Any, kind: VectorType) -> bool:
-    return isinstance(array, types.Array) and array.ndim == 1 and array.layout == "C" and array.dtype == kind.element
 
 
 def _pointer(context: Any, builder: Any, sig: Any, arguments: Any, kind: VectorType) -> Any:

@@ -11,15 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.backend.devices import kernels_for
 from glassplat.kernels.maths.disc import LOW_PASS, MAP
-from glassplat.kernels.records import (
-    LEAST_ALPHA,
-    MOST_CHANNELS,
-    Deviation,
-    Discs,
-    Splats,
-    TileBins,
-    check_tensors,
-)
+from glassplat.kernels.records import LEAST_ALPHA, MOST_CHANNELS, Deviation, Discs, Splats, TileBins, check_tensors
 
 
 def check_bins(channels: Tensor, bins: TileBins, cameras: int, count: int, these: str) -> None:

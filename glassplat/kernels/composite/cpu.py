@@ -30,6 +30,7 @@ from glassplat.kernels.composite.cpu_backward import composite_backward
 from glassplat.kernels.composite.cpu_discs import composite_discs, composite_discs_gradients
 from glassplat.kernels.composite.cpu_tile import (
     SPLATS,
+    STOP_AFTER,
     exponent,
     lane_of,
     list_block,
@@ -44,8 +45,6 @@ from glassplat.kernels.records import LEAST_ALPHA, ON_MEAN, REAL_OF, Deviation, 
 # Planes of a tile's results; SUMS has one per channel. T_AGAIN, CENTER, DEVIATION and LEAN belong to the second
 # traversal, which sums distances from the mean that the first one has found.
 MASK, T_AGAIN, CENTER, DEVIATION, LEAN, SUMS = (plane * tile.PIXELS for plane in range(6))
-STOP_AFTER = 8
-"""Splats after which a block looks whether all of its pixels have stopped."""
 
 
 def _blend_block(real: type, with_glass: bool) -> Scalar:

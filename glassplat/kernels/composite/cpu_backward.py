@@ -150,26 +150,16 @@ def _dot_more(real: type) -> Scalar:
 
 def _sum_more(real: type) -> Scalar:
     full, load = vector_kind(real, tile.LANES)
-    zero, LANES, PIXELS, VALUES, sided = real(0.0), tile.LANES, tile.PIXELS, tile.VALUES, _sided(real)
+    zero, LANES, VALUES, sided = real(0.0), tile.LANES, tile.VALUES, _sided(real)
+    sum_channels = tile.sum_channels_of(real, V_IMAGE, WEIGHT, PAIR_VALUES)
 
     @inlined
     def sum_more(planes, batch, splat, blocks, groups, deviating, rows, row, sums):
         """Adds to a row of sums what `unblend` leaves out, with the weights it kept; `sums` is scratch."""
-        none = full(zero)
-        for d in range(4, groups * 4, 4):
-            s0, s1, s2, s3, left = none, none, none, none, blocks
-            while left != 0:
-                i = lowest_bit(left) * LANES
-                left &= left - 1
-                v, weight = V_IMAGE + d * PIXELS + i, load(planes, WEIGHT + i)
-                s0, s1 = s0 + weight * load(planes, v), s1 + weight * load(planes, v + PIXELS)
-                s2, s3 = s2 + weight * load(planes, v + 2 * PIXELS), s3 + weight * load(planes, v + 3 * PIXELS)
-            four = (s0, s1, s2, s3, none, none, none, none, none, none, none, none, none, none, none, none)
-            store(sums, 0, sums_of(four))
-            for i in range(4):
-                rows[row + PAIR_VALUES + d + i] = sums[i]
+        sum_channels(planes, blocks, 1, groups, rows, row, sums)
         if deviating >= 0:
-            s0, left = none, blocks
+            none, left = full(zero), blocks
+            s0 = none
             while left != 0:
                 i = lowest_bit(left) * LANES
                 left &= left - 1
@@ -235,9 +225,9 @@ def _load_deviation(real: type) -> Scalar:
     PIXELS = tile.PIXELS
 
     @inlined
-    def load_deviation(planes, spread, keep, channel, through_mean, v_deviation, first, width, columns, rows):
+    def load_deviation(planes, spread, n, channel, through_mean, v_deviation, first, width, columns, rows):
         """Fills V_DEVIATION and CENTER, after the other gradients; False where the tile has no such gradient."""
-        wanted = False
+        wanted, keep = False, n * 2 * PIXELS
         for y in range(rows):
             for x in range(columns):
                 i, v = lane_of(x, y), v_deviation[first + y * width + x]
@@ -321,16 +311,7 @@ def composite_backward(real: type, with_absgrad: bool) -> Kernel:
                 load_gradients(planes, v_image, v_alpha, corner, image_width, columns, lines, num_channels)
                 deviating = channel
                 if channel >= 0 and not load_deviation(
-                    planes,
-                    spread,
-                    n * 2 * PIXELS,
-                    channel,
-                    through_mean,
-                    v_deviation,
-                    corner,
-                    image_width,
-                    columns,
-                    lines,
+                    planes, spread, n, channel, through_mean, v_deviation, corner, image_width, columns, lines
                 ):
                     deviating = -1
                 rows[(start + looked_at) * row_width : stop * row_width] = zero

@@ -32,7 +32,7 @@ from glassplat.kernels.backend.cpu_vector import (
     vector_kind,
 )
 from glassplat.kernels.composite import cpu_tile as tile
-from glassplat.kernels.composite.cpu_tile import lane_of, list_block, place
+from glassplat.kernels.composite.cpu_tile import SPLATS, STOP_AFTER, lane_of, list_block, place
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar
 from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, meet_maths, meet_slopes
 from glassplat.kernels.records import REAL_OF, Discs, TileBins
@@ -138,10 +138,6 @@ def _cover(real: type) -> Scalar:
 
 # Planes of a tile's results; SUMS has one per channel.
 DEPTH_SUM, MIDDLE, DISTORTION, SUMS = (plane * tile.PIXELS for plane in range(4))
-STOP_AFTER = 8
-"""Discs after which a block looks whether all of its pixels have stopped."""
-SPLATS = 512
-"""Discs per task that packs them."""
 
 
 def _blend_block(real: type) -> Scalar:
@@ -223,27 +219,6 @@ def _blend_channels(real: type) -> Scalar:
     return blend_channels
 
 
-def _begin_state(real: type) -> Scalar:
-    zero, one, never = real(0.0), real(1.0), real(-1.0)
-    BLOCK, ACROSS, LANES, BLOCKS = tile.BLOCK, tile.ACROSS, tile.LANES, tile.BLOCKS
-
-    @inlined
-    def begin(state, at, columns, rows):
-        """A fresh state; pixels beyond the image's edge start as stopped. Returns bits of blocks that run."""
-        state[at + LAST : at + FIRST] = never
-        state[at + FIRST : at + STATE] = zero
-        running = np.int64(0)
-        for b in range(BLOCKS):
-            x, y = b % ACROSS * BLOCK, b // ACROSS * BLOCK
-            running |= np.int64(x < columns and y < rows) << b
-            for i in range(LANES):
-                inside = x + i % BLOCK < columns and y + i // BLOCK < rows
-                state[at + T + b * LANES + i] = one if inside else zero
-        return running
-
-    return begin
-
-
 def _write_tile(real: type) -> Scalar:
     one, PIXELS = real(1.0), tile.PIXELS
 
@@ -269,8 +244,8 @@ def _write_tile(real: type) -> Scalar:
 def composite_discs_forward(real: type) -> Kernel:
     """Builds the kernel that blends all tiles."""
     pack, fetch, reached = _pack(real), _fetch(real), tile.reached_of(real)
-    blend_block, blend_channels, begin = _blend_block(real), _blend_channels(real), _begin_state(real)
-    write_tile, zero = _write_tile(real), real(0.0)
+    blend_block, blend_channels, begin = _blend_block(real), _blend_channels(real), tile.begin_state(real)
+    write_tile, zero, never = _write_tile(real), real(0.0), real(-1.0)
     BLOCK, ACROSS, BLOCKS, LANES, PIXELS = tile.BLOCK, tile.ACROSS, tile.BLOCKS, tile.LANES, tile.PIXELS
     CHUNK = tile.CHUNK
 
@@ -297,6 +272,8 @@ def composite_discs_forward(real: type) -> Kernel:
             start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
             at = n * STATE
             running = begin(state, at, columns, rows)
+            state[at + MEDIAN : at + FIRST] = never
+            state[at + FIRST : at + STATE] = zero
             if start == stop:
                 continue
             planes = np.empty(SUMS + groups * 4 * PIXELS, real)
@@ -437,30 +414,6 @@ def _unblend(real: type) -> Scalar:
     return unblend
 
 
-def _sum_channels(real: type) -> Scalar:
-    full, load = vector_kind(real, tile.LANES)
-    zero, LANES, PIXELS = real(0.0), tile.LANES, tile.PIXELS
-
-    @inlined
-    def sum_channels(planes, blocks, groups, rows, row, sums):
-        """Adds to a row of sums the gradients of the channels, with the weights that are kept; `sums` is scratch."""
-        none = full(zero)
-        for d in range(0, groups * 4, 4):
-            s0, s1, s2, s3, left = none, none, none, none, blocks
-            while left != 0:
-                i = lowest_bit(left) * LANES
-                left &= left - 1
-                v, weight = V_IMAGE + d * PIXELS + i, load(planes, WEIGHT + i)
-                s0, s1 = s0 + weight * load(planes, v), s1 + weight * load(planes, v + PIXELS)
-                s2, s3 = s2 + weight * load(planes, v + 2 * PIXELS), s3 + weight * load(planes, v + 3 * PIXELS)
-            four = (s0, s1, s2, s3, none, none, none, none, none, none, none, none, none, none, none, none)
-            store(sums, 0, sums_of(four))
-            for i in range(4):
-                rows[row + PAIR_VALUES + d + i] = sums[i]
-
-    return sum_channels
-
-
 def _begin_gradients(real: type) -> Scalar:
     zero, one, PIXELS = real(0.0), real(1.0), tile.PIXELS
 
@@ -492,7 +445,8 @@ def _begin_gradients(real: type) -> Scalar:
 def composite_discs_backward(real: type) -> Kernel:
     """Builds the kernel that fills one row of sums per pair, given the final state of each tile."""
     fetch = _fetch(real)
-    unblend, sum_channels, begin = _unblend(real), _sum_channels(real), _begin_gradients(real)
+    unblend, begin = _unblend(real), _begin_gradients(real)
+    sum_channels = tile.sum_channels_of(real, V_IMAGE, WEIGHT, PAIR_VALUES)
     zero = real(0.0)
     LANES, PIXELS, CHUNK = tile.LANES, tile.PIXELS, tile.CHUNK
     REACHED = (1 << tile.BLOCKS) - 1
@@ -530,7 +484,7 @@ def composite_discs_backward(real: type) -> Kernel:
                         rows[row : row + row_width] = zero
                         continue
                     unblend(planes, state, at, batch, splat, blocks, groups, near, sharpness, rows, row)
-                    sum_channels(planes, blocks, groups, rows, row, sums)
+                    sum_channels(planes, blocks, 0, groups, rows, row, sums)
 
     return backward
 

@@ -29,9 +29,11 @@ from glassplat.kernels.backend.cpu_vector import (
     exp,
     fraction,
     item,
+    lowest_bit,
     maximum,
     minimum,
     store,
+    sums_of,
     times_power_of_2,
     vector_kind,
 )
@@ -53,6 +55,9 @@ T, LAST, T_GLASS, LAST_GLASS, STATE = 0, PIXELS, 2 * PIXELS, 3 * PIXELS, 4 * PIX
 
 GROUP = 4
 """Channels are blended four at a time."""
+
+STOP_AFTER = 8
+"""Splats after which a block looks whether all of its pixels have stopped."""
 
 TILES = 4
 """Tiles of a task, which asks for memory once for all of them."""
@@ -266,6 +271,31 @@ SPLATS = 512
 # Columns of a pair's row: the sum of g = v_alpha alpha over its pixels, and of g times powers of the offset from the
 # mean; of |g| times the slope of the exponent to base 2, that of `absgrad`; and the gradients of its values.
 G, G_X, G_Y, G_XX, G_XY, G_YY, ABSGRAD_X, ABSGRAD_Y, PAIR_VALUES = range(9)
+
+
+def sum_channels_of(real: type, image: int, weight: int, values: int) -> Scalar:
+    """The step that sums gradients of channels, given the first planes of both and the first column of the sums."""
+    full, load = vector_kind(real, LANES)
+    zero = real(0.0)
+
+    @inlined
+    def sum_channels(planes, blocks, group, groups, rows, row, sums):
+        """Fills a pair's sums from a group of channels on; `sums` is scratch."""
+        none = full(zero)
+        for d in range(group * GROUP, groups * GROUP, GROUP):
+            s0, s1, s2, s3, left = none, none, none, none, blocks
+            while left != 0:
+                i = lowest_bit(left) * LANES
+                left &= left - 1
+                v, shown = image + d * PIXELS + i, load(planes, weight + i)
+                s0, s1 = s0 + shown * load(planes, v), s1 + shown * load(planes, v + PIXELS)
+                s2, s3 = s2 + shown * load(planes, v + 2 * PIXELS), s3 + shown * load(planes, v + 3 * PIXELS)
+            four = (s0, s1, s2, s3, none, none, none, none, none, none, none, none, none, none, none, none)
+            store(sums, 0, sums_of(four))
+            for i in range(4):
+                rows[row + values + d + i] = sums[i]
+
+    return sum_channels
 
 
 def new_pair_rows(bins: TileBins, num_values: int, real: type) -> NDArray[Any]:

@@ -16,13 +16,7 @@ from torch import Tensor
 
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.composite.cpu_tile import joined_cameras, place
-from glassplat.kernels.composite.cuda_backward import (
-    EXTRAS,
-    THREADS,
-    WARPS,
-    composite_backward,
-    composite_cotangents,
-)
+from glassplat.kernels.composite.cuda_backward import EXTRAS, THREADS, WARPS, composite_backward, composite_cotangents
 from glassplat.kernels.composite.cuda_discs import composite_discs, composite_discs_gradients
 from glassplat.kernels.composite.cuda_tile import (
     ALIGNMENT,

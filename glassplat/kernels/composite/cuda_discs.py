@@ -120,9 +120,7 @@ def composite_discs_cotangents(real: type, num_channels: int = 6) -> Kernel:
     zero, one, two = real(0.0), real(1.0), real(2.0)
 
     @kernel(
-        f"composite_discs_cotangents_{num_channels}",
-        real,
-        "int1 real3 real4 real3 real4 real3 real3 real3 real3 real3",
+        f"composite_discs_cotangents_{num_channels}", real, "int1 real3 real4 real3 real4 real3 real3 real3 real3 real3"
     )
     def gather(active, finals, image, depth, v_image, v_alpha, v_depth, v_median, v_distortion, v_pixels):
         n, pixel = cuda.blockIdx.x, cuda.threadIdx.x
@@ -365,10 +363,10 @@ def composite_discs_gradients(
     sum_disc_rows(real)(
         blocks_for(sums.numel(), SUM_THREADS), SUM_THREADS, rows, bins.pair_slots, bins.splat_offsets, sums
     )  # fmt: skip
-    return _from_sums(sums, discs, num_channels, with_absgrad)
+    return _from_sums(sums, discs, with_absgrad)
 
 
-def _from_sums(sums: Tensor, discs: Discs, num_channels: int, with_absgrad: bool) -> tuple[Tensor | None, ...]:
+def _from_sums(sums: Tensor, discs: Discs, with_absgrad: bool) -> tuple[Tensor | None, ...]:
     """Gradients of each disc from the sums over its pixels; what no pixel shows stays zero, finite or not."""
     leading, size = discs.opacities.shape, sums.shape[0]
     by_row = sums[:, :AROUND].unflatten(1, (3, 3))

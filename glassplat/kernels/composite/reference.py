@@ -11,9 +11,7 @@ from torch import Tensor
 from glassplat.kernels.composite import BlendedDiscs, Composite
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from glassplat.kernels.maths.disc import LOW_PASS, MOST_DEVIATIONS
-from glassplat.kernels.records import LEAST_ALPHA, ON_MEAN, Deviation, Discs, Splats, TileBins
-
-TILE = 16
+from glassplat.kernels.records import LEAST_ALPHA, ON_MEAN, TILE, Deviation, Discs, Splats, TileBins
 
 
 def composite(
@@ -27,7 +25,7 @@ def composite(
     images, alphas, masks, deviations = [], [], [], []
     for c in range(bins.num_cameras):
         image, alpha, mask, weights = _camera_composite(
-            splats_of_camera(splats, c),
+            Splats(*(tensor[c] for tensor in splats)),
             channels[c],
             bins,
             None if marks is None else marks[c],
@@ -123,11 +121,6 @@ def active_pixels(bins: TileBins) -> Tensor:
     tiles[bins.active.long()] = True
     pixels = tiles.reshape(bins.num_cameras, rows, columns).repeat_interleave(TILE, 1).repeat_interleave(TILE, 2)
     return pixels[:, : bins.height, : bins.width]
-
-
-def splats_of_camera(splats: Splats, camera: int) -> Splats:
-    """The splats of one camera, [G, ...]."""
-    return Splats(*(tensor[camera] for tensor in splats))
 
 
 class _Layer(NamedTuple):

@@ -119,11 +119,7 @@ def _ellipsoid(real: type) -> RayHitMaths:
         v_f = blend(two * v_squared * t, q, by_t, (e[0] - two * t * f[0], e[1] - two * t * f[1], e[2] - two * t * f[2]))
         v_offset = scaled_sum(v_e, frame[0], frame[1], frame[2])
         v_d = scaled_sum(v_f, frame[0], frame[1], frame[2])
-        v_frame = (
-            outer(v_e[0], v_f[0], offset, d),
-            outer(v_e[1], v_f[1], offset, d),
-            outer(v_e[2], v_f[2], offset, d),
-        )
+        v_frame = (outer(v_e[0], v_f[0], offset, d), outer(v_e[1], v_f[1], offset, d), outer(v_e[2], v_f[2], offset, d))
         return (-v_offset[0], -v_offset[1], -v_offset[2]), v_d, v_frame
 
     return RayHitMaths(meet, meet_gradient)
@@ -281,12 +277,7 @@ def box(m, p, q, deviations, squared, near, fx, fy):  # type: ignore[no-untyped-
         a, b = a / steepness, b / steepness
     u_x, u_y = np.float64(p[0] * deviations[0]), np.float64(p[1] * deviations[0])
     v_x, v_y = np.float64(q[0] * deviations[1]), np.float64(q[1] * deviations[1])
-    along_x, along_y, across_x, across_y = (
-        a * u_x + b * v_x,
-        a * u_y + b * v_y,
-        a * v_x - b * u_x,
-        a * v_y - b * u_y,
-    )
+    along_x, along_y, across_x, across_y = (a * u_x + b * v_x, a * u_y + b * v_y, a * v_x - b * u_x, a * v_y - b * u_y)
     x, y, spot = fx * m[0] / depth, fy * m[1] / depth, LOW_PASS * reach
     left, right, top, bottom = x - spot, x + spot, y - spot, y + spot
     for end in range(2):

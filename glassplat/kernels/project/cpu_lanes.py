@@ -232,11 +232,7 @@ def color_steps(real: type) -> tuple[Step, Step]:
         y, z = load(means, LANES) - lens[c, 5], load(means, 2 * LANES) - lens[c, 6]
         inverse_length = one / square_root(x * x + y * y + z * z)
         b = basis(x * inverse_length, y * inverse_length, z * inverse_length)
-        return (
-            channel(table, at, 0, degree, b),
-            channel(table, at, 1, degree, b),
-            channel(table, at, 2, degree, b),
-        )
+        return (channel(table, at, 0, degree, b), channel(table, at, 1, degree, b), channel(table, at, 2, degree, b))
 
     return tabulate, color
 

@@ -75,17 +75,14 @@ def _ellipses(gaussians: RawGaussians, cameras: CameraBatch, tangents: Tensor, d
     scale = focal / depths[..., None]
     linear = cameras.cam_from_world[:, None, :3, :3]
     footprint = scale[..., None] * (linear[..., :2, :] - held[..., None] * linear[..., 2:, :])
-    x, y = (footprint @ _axes(gaussians)).unbind(dim=-2)
+    # Columns are principal axes, each as long as its standard deviation.
+    axes = rotations(gaussians.quats) * torch.exp(gaussians.log_scales)[:, None, :]
+    x, y = (footprint @ axes).unbind(dim=-2)
     xx, xy, yy = (x * x).sum(-1), (x * y).sum(-1), (y * y).sum(-1)
     # Lagrange's identity: |x|^2 |y|^2 - (x.y)^2 = |x cross y|^2 does not cancel for needles.
     spread = torch.linalg.cross(x, y).square().sum(-1)
     determinant = spread + LOW_PASS * (xx + yy) + LOW_PASS**2
     return _Ellipses(xx + LOW_PASS, xy, yy + LOW_PASS, determinant)
-
-
-def _axes(gaussians: RawGaussians) -> Tensor:
-    """Principal axes as columns [N, 3, 3], each as long as its standard deviation."""
-    return rotations(gaussians.quats) * torch.exp(gaussians.log_scales)[:, None, :]
 
 
 def rotations(quats: Tensor) -> Tensor:

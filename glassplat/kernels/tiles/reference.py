@@ -10,9 +10,7 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.maths.blending import ALPHA_MIN
-from glassplat.kernels.records import Splats, TileBins
-
-TILE = 16
+from glassplat.kernels.records import TILE, Splats, TileBins
 
 
 @torch.no_grad()

@@ -19,15 +19,7 @@ from glassplat.kernels.backend.cpu_vector import bits_of, lowest_bit, maximum, m
 from glassplat.kernels.maths.blending import Scalar, blend_maths
 from glassplat.kernels.maths.disc import EDGE_ON, MOST_DEVIATIONS
 from glassplat.kernels.records import REAL_OF
-from glassplat.kernels.trace.steps import (
-    CHUNK,
-    LEVEL_BITS,
-    NODE,
-    SLACK,
-    WIDTH,
-    coverage_maths,
-    insert,
-)
+from glassplat.kernels.trace.steps import CHUNK, LEVEL_BITS, NODE, SLACK, WIDTH, coverage_maths, insert
 
 LEAF = 13 * WIDTH
 """Numbers of what a node of the lowest level holds: means, rows of frames and opacities, each for all its places."""
