@@ -233,6 +233,32 @@ def test_undo_gives_up_a_line_before_it_takes_back_marks(page: Page) -> None:
     assert complaints(page) == []
 
 
+def test_a_zoomed_photograph_stays_where_it_is_while_the_header_grows(page: Page) -> None:
+    def marks() -> list[int]:
+        return [len(places) for places in page.document()["corners"]]
+
+    middle = "const box = document.getElementById('canvas').getBoundingClientRect();"
+    middle += "const [x, y] = [box.left + box.width / 2, box.top + box.height / 2];"
+    page.show(0)
+    page.window.run(
+        middle + "const at = { clientX: x + 150, clientY: y, deltaY: -400 };"
+        "document.getElementById('canvas').dispatchEvent(new WheelEvent('wheel', at));"
+    )
+    page.window.click(*page.window.run(f"{middle} return [x, y];"))
+    page.saved()
+    page.window.run("document.querySelector('header').style.height = '200px'")
+    page.window.evaluate("new Promise((next) => requestAnimationFrame(() => requestAnimationFrame(next)))")
+    page.window.click(*page.window.run(f"{middle} return [x, y];"))
+    page.saved()
+    assert marks() == [1, 0, 0, 0]  # The same one was pressed.
+    page.window.keys("0")
+    page.window.run("document.querySelector('header').style.height = '100px'")
+    page.window.evaluate("new Promise((next) => requestAnimationFrame(() => requestAnimationFrame(next)))")
+    page.window.click(*page.on_screen([(20, 20)])[0])  # Seen whole, it is fitted again.
+    page.saved()
+    assert page.document()["corners"][1]["0.png"] == pytest.approx([20, 20], abs=1)
+
+
 def test_edges_do_where_no_corner_shows(page: Page) -> None:
     for view in (0, 1, 2):
         corners = true_corners(view)

@@ -372,7 +372,7 @@ async function settled() {
   if (document.body.dataset.state === "failed") throw new Error(element("status").textContent);
 }
 
-const resized = new ResizeObserver(() => { drawing.fit(); draw(); });
+const resized = new ResizeObserver(() => { drawing.resized(); draw(); });
 
 async function close() {
   try {
