@@ -259,6 +259,15 @@ def test_a_zoomed_photograph_stays_where_it_is_while_the_header_grows(page: Page
     assert page.document()["corners"][1]["0.png"] == pytest.approx([20, 20], abs=1)
 
 
+def test_space_is_let_go_when_the_window_loses_focus(page: Page) -> None:
+    page.show(0)
+    page.window.run("document.body.dispatchEvent(new KeyboardEvent('keydown', { key: ' ', bubbles: true }))")
+    page.window.run("window.dispatchEvent(new Event('blur'))")
+    page.window.click(*page.on_screen(true_corners(0)[:1])[0])
+    page.saved()
+    assert [len(places) for places in page.document()["corners"]] == [1, 0, 0, 0]
+
+
 def test_edges_do_where_no_corner_shows(page: Page) -> None:
     for view in (0, 1, 2):
         corners = true_corners(view)

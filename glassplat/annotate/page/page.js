@@ -398,6 +398,7 @@ function listen() {
   canvas.addEventListener("wheel", (event) => { event.preventDefault(); drawing.zoom(spot(event), Math.exp(-event.deltaY / 400)); draw(); }, { passive: false });
   window.addEventListener("keydown", keyed);
   window.addEventListener("keyup", (event) => { if (event.key === " ") spaceHeld = false; });
+  window.addEventListener("blur", () => { spaceHeld = false; });
   window.addEventListener("beforeunload", (event) => { if (["changed", "failed"].includes(document.body.dataset.state)) event.preventDefault(); });
   resized.observe(canvas);
   document.querySelectorAll("[data-tool]").forEach((button) => button.addEventListener("click", () => choose(button.dataset.tool)));
