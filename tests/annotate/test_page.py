@@ -268,6 +268,17 @@ def test_space_is_let_go_when_the_window_loses_focus(page: Page) -> None:
     assert [len(places) for places in page.document()["corners"]] == [1, 0, 0, 0]
 
 
+def test_space_presses_a_button_that_has_focus(page: Page) -> None:
+    chosen = "return document.querySelector('[aria-pressed=true]').dataset.tool"
+    page.window.run("document.querySelector('[data-tool=edge]').focus()")
+    page.window.keys(" ")
+    assert page.window.run(chosen) == "edge"
+    page.window.press("[data-tool=brush]")  # A mouse leaves no focus behind: Space moves the photograph then.
+    page.window.keys("1")
+    page.window.keys(" ")
+    assert page.window.run(chosen) == "corner"
+
+
 def test_edges_do_where_no_corner_shows(page: Page) -> None:
     for view in (0, 1, 2):
         corners = true_corners(view)
