@@ -188,8 +188,8 @@ async function show(number) {
   refresh();
   element("views").children[current].scrollIntoView({ block: "nearest" });
   document.body.dataset.view = "loading";
-  const image = await load(current);
-  if (image && view() === capture.views[drawing.view.number]) drawing.image = images.get(current);
+  await load(current);
+  drawing.image = images.get(current); // Of the photograph that is shown by now.
   document.body.dataset.view = images.has(current) ? String(current) : "failed";
   draw();
   load((current + 1) % capture.views.length);
