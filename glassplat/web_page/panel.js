@@ -20,6 +20,7 @@ function makePanel(scene, navigation, changed) {
     }
     element('compare').setAttribute('aria-pressed', String(state.compare));
     element('divider').hidden = !state.compare;
+    element('divider').ariaValueNow = Math.round(100 * state.divider);
     element('divider').style.left = `${100 * state.divider}%`;
     const first = chosen()[0];
     if (first !== undefined) {
@@ -34,6 +35,8 @@ function makePanel(scene, navigation, changed) {
     state[key] = value;
     show();
   }
+
+  function divide(share) { set('divider', clamped(share, 0.02, 0.98)); }
 
   function standAt(view) {
     navigation.flyTo(view);
@@ -96,15 +99,19 @@ function makePanel(scene, navigation, changed) {
   });
   element('divider').addEventListener('pointerdown', (event) => element('divider').setPointerCapture(event.pointerId));
   element('divider').addEventListener('pointermove', (event) => {
-    if (event.buttons) set('divider', clamped(event.clientX / window.innerWidth, 0.02, 0.98));
+    if (event.buttons) divide(event.clientX / window.innerWidth);
+  });
+  element('divider').addEventListener('keydown', ({ key }) => {
+    if (key.startsWith('Arrow')) divide(state.divider + (key === 'ArrowLeft' || key === 'ArrowDown' ? -0.02 : 0.02));
   });
 
   const walking = new Set();
   window.addEventListener('blur', () => walking.clear());
   window.addEventListener('keyup', (event) => walking.delete(event.key.toLowerCase()));
   window.addEventListener('keydown', (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
-    if (event.target.matches('input, textarea') && event.key !== 'Escape') return;
+    if (event.ctrlKey || event.metaKey || event.altKey || (event.repeat && !event.key.startsWith('Arrow'))) return;
+    const own = event.target.matches('textarea') || (event.target.matches('[type=range], [role=slider]') && event.key.length > 1);
+    if (own && event.key !== 'Escape') return;  // A slider has use for arrows, not for letters.
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
     if (!reflects && ('cgm'.includes(key) || LAYER_KEYS[Number(key) - 1])) return;
     if ('wasdqe'.includes(key)) { walking.add(key); navigation.still(); changed(); }

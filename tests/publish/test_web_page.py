@@ -112,6 +112,37 @@ def test_the_buttons_do_what_they_say(opened: Browser) -> None:
 
 
 @needs_browser
+def test_keys_of_a_slider_stay_its_own_and_others_work(opened: Browser) -> None:
+    state = "glassplat.then(({ panel: { state } }) => [state.compare, state.divider, state.reflectances[0]])"
+    photo = opened.evaluate("document.getElementById('photo').textContent")
+    *_, before = opened.evaluate(state)
+    opened.evaluate("document.getElementById('reflectance').focus()")
+    opened.keys("c")
+    opened.keys("Right")
+    compares, divider, brighter = opened.evaluate(state)
+    assert compares and brighter > before
+    opened.evaluate("document.getElementById('divider').focus()")
+    opened.keys("Left")
+    _, moved, same = opened.evaluate(state)
+    assert moved < divider and same == brighter
+    assert int(opened.evaluate("document.getElementById('divider').ariaValueNow")) == round(100 * moved)
+    opened.keys("c")
+    assert opened.evaluate("document.getElementById('photo').textContent") == photo
+    opened.evaluate("document.getElementById('reflectance').dispatchEvent(new Event('dblclick'))")
+    opened.evaluate("document.getElementById('view').focus()")
+
+
+@needs_browser
+def test_a_key_that_is_held_switches_once(opened: Browser) -> None:
+    pressed = "document.body.dispatchEvent(new KeyboardEvent('keydown', { key: 'c', bubbles: true, repeat: REPEAT }))"
+    compares = []
+    for repeat in ("false", "true", "true", "false"):
+        opened.evaluate(pressed.replace("REPEAT", repeat))
+        compares.append(opened.evaluate("glassplat.then(({ panel }) => panel.state.compare)"))
+    assert compares == [True, True, True, False]
+
+
+@needs_browser
 def test_glass_turns_into_a_mirror_by_degrees(opened: Browser) -> None:
     shares = opened.evaluate("""glassplat.then(({ panel }) => {
       const found = [], note = () => found.push(panel.wanted().reflectances[0]);
