@@ -50,10 +50,15 @@ function makePanel(scene, navigation, changed) {
     if (view && view.name !== element('photo').textContent) standAt(view);
   });
 
+  // Shows one box or hides it, and hides the other.
+  function toggle(box) {
+    for (const id of ['help', 'embed']) element(id).hidden = id !== box || !element(id).hidden;
+  }
+
   // Shows, selected, the tag of a frame with this page in it, and copies it where the browser lets it.
   function embed() {
     const code = document.querySelector('#embed textarea'), title = document.title.replace(/[&"<]/g, (c) => `&#${c.charCodeAt(0)};`);
-    element('embed').toggleAttribute('hidden');
+    toggle('embed');
     if (location.protocol === 'file:') {
       code.value = 'This page lies on your disk, where others cannot see it: upload it to a web server, open it there, and press Embed again.';
       return;
@@ -70,14 +75,14 @@ function makePanel(scene, navigation, changed) {
     after: () => standAt(navigation.neighbour(1)),
     home: () => standAt(scene.views[scene.first]),
     full: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.()),
-    help: () => element('help').toggleAttribute('hidden'),
+    help: () => toggle('help'),
     hide: () => body.classList.toggle('bare'),
   };
   const LAYER_KEYS = ['rgb', 'without_panes', 'reflection', 'strength'];
   const KEYS = {
     c: actions.compare, ArrowLeft: actions.before, ArrowRight: actions.after, Home: actions.home, r: actions.home,
     f: actions.full, '?': actions.help, h: actions.hide,
-    Escape: () => { for (const id of ['help', 'embed']) element(id).setAttribute('hidden', ''); },
+    Escape: () => toggle(null),
     g: () => set('glass', state.glass === 'none' ? 'real' : 'none'),
     m: () => set('glass', state.glass === 'mirror' ? 'real' : 'mirror'),
   };

@@ -457,8 +457,13 @@ def test_a_link_to_the_page_is_shown_with_a_picture_of_both_sides(url: str, tmp_
 def test_a_page_on_disk_has_to_be_uploaded_before_it_is_embedded(opened: Browser) -> None:
     opened.evaluate("document.querySelector('[data-do=embed]').click()")
     assert "upload it" in opened.evaluate("document.querySelector('#embed textarea').value")
+    shown = "['help', 'embed'].filter((id) => !document.getElementById(id).hidden)"
+    opened.evaluate("document.querySelector('[data-do=help]').click()")
+    assert opened.evaluate(shown) == ["help"]
+    opened.evaluate("document.querySelector('[data-do=embed]').click()")
+    assert opened.evaluate(shown) == ["embed"]
     opened.keys("Escape")
-    assert opened.evaluate("document.querySelector('#embed').hidden")
+    assert opened.evaluate(shown) == []
 
 
 class QuietHandler(SimpleHTTPRequestHandler):
