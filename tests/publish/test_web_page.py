@@ -188,6 +188,23 @@ def test_the_next_photograph_shows_a_pane_and_stands_in_the_address(tmp_path: Pa
 
 
 @needs_browser
+def test_photographs_from_one_point_come_one_after_the_other(tmp_path: Path) -> None:
+    first = CAMERAS[0][1]
+    cosine, sine = math.cos(0.05), math.sin(0.05)
+    turn = torch.tensor([[cosine, 0, sine, 0], [0, 1, 0, 0], [-sine, 0, cosine, 0], [0, 0, 0, 1]])
+    poses = [torch.linalg.matrix_power(turn, k) @ first.cam_from_world for k in range(4)]
+    cameras = [(f"{k}.png", replace(first, cam_from_world=pose)) for k, pose in enumerate(poses)]
+    write_page(tmp_path / "index.html", true_scene(), Planar(), cameras, "Round")
+    with Browser(tmp_path / "index.html", 320, 240) as browser:
+        stops = set()
+        for _ in cameras:
+            browser.wait("glassplat.then(({ navigation }) => navigation.advance(10) || true)", "the end of the flight")
+            browser.keys("Right")
+            stops.add(browser.evaluate("document.getElementById('photo').textContent"))
+        assert len(stops) == 4
+
+
+@needs_browser
 def test_people_stay_near_the_photographs(opened: Browser) -> None:
     farthest = """glassplat.then(({ navigation, scene }) => {
       let most = 0;
