@@ -26,6 +26,7 @@ from glassplat.publish.web_page import (
     fits,
     fitting,
     page_text,
+    preview_tags,
     write_page,
     write_preview,
 )
@@ -458,8 +459,14 @@ def test_the_page_is_one_file_of_little_script() -> None:
     assert sum(len(asset(name)) for name in (*SCRIPTS, *SHADERS)) <= LARGEST_SCRIPT
 
 
-@pytest.mark.parametrize("url", ["https://x.org/shop", "https://x.org/shop/", "https://x.org/shop/index.html"])
-def test_a_link_to_the_page_is_shown_with_a_picture_of_both_sides(url: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("rest", ["", "/", "/index.html", "?a=b", "/?a=b/c", "#top", "/index.html?a=b#view=1.png"])
+@pytest.mark.parametrize("folder", ["https://x.org", "https://x.org/shop", "https://x.org/shop/v1.2"])
+def test_a_link_has_its_picture_in_the_folder_of_the_page(folder: str, rest: str) -> None:
+    assert f'<meta property="og:image" content="{folder}/preview.jpg">' in preview_tags(folder + rest)
+
+
+def test_a_link_to_the_page_is_shown_with_a_picture_of_both_sides(tmp_path: Path) -> None:
+    url = "https://x.org/shop/index.html"
     page = page_text(true_scene(), Planar(), CAMERAS, "title", sharing=Sharing("A <person>, CC0", url))
     tags = dict(re.findall(r'<meta property="(og:[^"]+)" content="([^"]*)">', page))
     assert tags["og:title"] == "title" and tags["og:description"] and tags["og:url"] == url
