@@ -66,7 +66,7 @@ def plan(views: Sequence[View], points: PointCloud, behind: NDArray[np.bool_], p
 
 
 def _from_above(cameras: Sequence[NumpyCamera]) -> Array:
-    """[2, 3] to the right and down in the plan, of world points; down is where cameras look on average."""
+    """[2, 3] to the right and down in the plan, of world points; up is where cameras look on average."""
     up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
     up /= max(float(np.linalg.norm(up)), 1e-9)
     ahead = np.mean([camera.rotation[2] for camera in cameras], axis=0)
@@ -242,13 +242,14 @@ def _behind(dataset: Dataset, planes: Planes | None) -> NDArray[np.bool_]:
 
 
 def _cards(report: Mapping[str, Any], behind: NDArray[np.bool_], planes: Planes | None) -> list[str]:
+    share = behind.sum() / max(len(behind), 1)
     facts = {
         "photographs placed": f"{report['registered']} of {report['photographs']}",
         "points": f"{report['points']:,}",
         "pixels off, on average": f"{report['reprojection_error']:.2f}",
         "photographs per point": f"{report['track_length']:.1f}",
         "features of a photograph": f"{report['features']:,}",
-        "points behind panes": "no panes yet" if planes is None else f"{behind.sum():,} ({behind.mean():.0%})",
+        "points behind panes": "no panes yet" if planes is None else f"{behind.sum():,} ({share:.0%})",
         "attempt": f"{report['attempt']} ({report['attempts']} made)",
     }
     facts |= {f"camera {number}": camera for number, camera in enumerate(report["cameras"], start=1)}

@@ -12,12 +12,13 @@ import html
 import io
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import urljoin, urlsplit
+from urllib.parse import urlsplit
 
 import numpy as np
 import torch
@@ -304,8 +305,9 @@ def preview_tags(url: str | None) -> str:
     """Tags for previews of links to an address, which may be of the page or of its folder; none without an address."""
     if url is None:
         return ""
-    last = urlsplit(url).path.rpartition("/")[2]
-    picture = urljoin(url if not last or "." in last else url + "/", PREVIEW)
+    address = urlsplit(url)
+    folder = re.sub(r"/$|/[^/]*\.html?$", "", address.path, flags=re.IGNORECASE)
+    picture = address._replace(path=f"{folder}/{PREVIEW}", query="", fragment="").geturl()
     tags = {"og:url": url, "og:image": picture, "og:image:width": PREVIEW_WIDTH, "og:image:height": PREVIEW_HEIGHT}
     return "\n".join(f'<meta property="{name}" content="{html.escape(str(value))}">' for name, value in tags.items())
 

@@ -6,7 +6,7 @@ const LEAST_SHOWN = 0.05;  // Share of a photograph that a pane fills where it i
 function makeNavigation(scene, changed) {
   const { views, up, focus, reach } = scene;
   const steepest = 0.35;  // radians between the line of sight and the vertical, unless a photograph is steeper
-  let pose, pivot, flight = null, drift = null;
+  let pose, pivot, stop, flight = null, drift = null;
   const velocity = { yaw: 0, pitch: 0 };
 
   const poseOf = (view) => poseAt(view.rotation, view.position);
@@ -75,6 +75,7 @@ function makeNavigation(scene, changed) {
 
   function flyTo(view, seconds = 0.9) {
     still();
+    stop = view;
     flight = { view, from: pose, to: poseOf(view), pivots: [pivot, pivotOf(view)], seconds, passed: 0 };
   }
 
@@ -96,10 +97,13 @@ function makeNavigation(scene, changed) {
   const nearestTo = (position, among) => among.reduce((best, view) =>
     norm(minus(view.position, position)) < norm(minus(best.position, position)) ? view : best);
 
-  // The photograph so many steps along the route from where the camera is, or flies to.
+  // The photograph so many steps along the route from where the camera is, or flies to. Of those that were taken from
+  // there, it is the one that was flown to last.
   function neighbour(step) {
-    const at = flight ? flight.view : nearestTo(centerOf(pose), ordered);
-    return ordered[(Math.max(ordered.indexOf(at), 0) + step + ordered.length) % ordered.length];
+    const here = flight ? flight.view.position : centerOf(pose), nearest = nearestTo(here, ordered);
+    const isThere = norm(minus(stop.position, nearest.position)) < 1e-3 * reach;
+    const index = Math.max(ordered.indexOf(isThere ? stop : nearest), 0);
+    return ordered[(index + step + ordered.length) % ordered.length];
   }
 
   // A slow sway about the first view, so that reflections glide over the glass before anybody touches anything.
@@ -141,8 +145,9 @@ function makeNavigation(scene, changed) {
     return true;
   }
 
-  const begun = viewOfAddress(views) || views[scene.first], ordered = route();
-  set(poseOf(begun), pivotOf(begun));
+  const ordered = route();
+  stop = viewOfAddress(views) || views[scene.first];
+  set(poseOf(stop), pivotOf(stop));
   return {
     advance, orbit, pan, dolly, walk, flyTo, neighbour, sway, still, velocity, sight,
     place: (next) => { still(); set(next, pivot); },

@@ -20,6 +20,7 @@ function makePanel(scene, navigation, changed) {
     }
     element('compare').setAttribute('aria-pressed', String(state.compare));
     element('divider').hidden = !state.compare;
+    element('divider').ariaValueNow = Math.round(100 * state.divider);
     element('divider').style.left = `${100 * state.divider}%`;
     const first = chosen()[0];
     if (first !== undefined) {
@@ -35,6 +36,8 @@ function makePanel(scene, navigation, changed) {
     show();
   }
 
+  function divide(share) { set('divider', clamped(share, 0.02, 0.98)); }
+
   function standAt(view) {
     navigation.flyTo(view);
     element('photo').textContent = view.name;
@@ -47,10 +50,15 @@ function makePanel(scene, navigation, changed) {
     if (view && view.name !== element('photo').textContent) standAt(view);
   });
 
+  // Shows one box or hides it, and hides the other.
+  function toggle(box) {
+    for (const id of ['help', 'embed']) element(id).hidden = id !== box || !element(id).hidden;
+  }
+
   // Shows, selected, the tag of a frame with this page in it, and copies it where the browser lets it.
   function embed() {
     const code = document.querySelector('#embed textarea'), title = document.title.replace(/[&"<]/g, (c) => `&#${c.charCodeAt(0)};`);
-    element('embed').toggleAttribute('hidden');
+    toggle('embed');
     if (location.protocol === 'file:') {
       code.value = 'This page lies on your disk, where others cannot see it: upload it to a web server, open it there, and press Embed again.';
       return;
@@ -67,14 +75,14 @@ function makePanel(scene, navigation, changed) {
     after: () => standAt(navigation.neighbour(1)),
     home: () => standAt(scene.views[scene.first]),
     full: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.()),
-    help: () => element('help').toggleAttribute('hidden'),
+    help: () => toggle('help'),
     hide: () => body.classList.toggle('bare'),
   };
   const LAYER_KEYS = ['rgb', 'without_panes', 'reflection', 'strength'];
   const KEYS = {
     c: actions.compare, ArrowLeft: actions.before, ArrowRight: actions.after, Home: actions.home, r: actions.home,
     f: actions.full, '?': actions.help, h: actions.hide,
-    Escape: () => { for (const id of ['help', 'embed']) element(id).setAttribute('hidden', ''); },
+    Escape: () => toggle(null),
     g: () => set('glass', state.glass === 'none' ? 'real' : 'none'),
     m: () => set('glass', state.glass === 'mirror' ? 'real' : 'mirror'),
   };
@@ -96,15 +104,19 @@ function makePanel(scene, navigation, changed) {
   });
   element('divider').addEventListener('pointerdown', (event) => element('divider').setPointerCapture(event.pointerId));
   element('divider').addEventListener('pointermove', (event) => {
-    if (event.buttons) set('divider', clamped(event.clientX / window.innerWidth, 0.02, 0.98));
+    if (event.buttons) divide(event.clientX / window.innerWidth);
+  });
+  element('divider').addEventListener('keydown', ({ key }) => {
+    if (key.startsWith('Arrow')) divide(state.divider + (key === 'ArrowLeft' || key === 'ArrowDown' ? -0.02 : 0.02));
   });
 
   const walking = new Set();
   window.addEventListener('blur', () => walking.clear());
   window.addEventListener('keyup', (event) => walking.delete(event.key.toLowerCase()));
   window.addEventListener('keydown', (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
-    if (event.target.matches('input, textarea') && event.key !== 'Escape') return;
+    if (event.ctrlKey || event.metaKey || event.altKey || (event.repeat && !event.key.startsWith('Arrow'))) return;
+    const own = event.target.matches('textarea') || (event.target.matches('[type=range], [role=slider]') && event.key.length > 1);
+    if (own && event.key !== 'Escape') return;  // A slider has use for arrows, not for letters.
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
     if (!reflects && ('cgm'.includes(key) || LAYER_KEYS[Number(key) - 1])) return;
     if ('wasdqe'.includes(key)) { walking.add(key); navigation.still(); changed(); }

@@ -233,6 +233,52 @@ def test_undo_gives_up_a_line_before_it_takes_back_marks(page: Page) -> None:
     assert complaints(page) == []
 
 
+def test_a_zoomed_photograph_stays_where_it_is_while_the_header_grows(page: Page) -> None:
+    def marks() -> list[int]:
+        return [len(places) for places in page.document()["corners"]]
+
+    middle = "const box = document.getElementById('canvas').getBoundingClientRect();"
+    middle += "const [x, y] = [box.left + box.width / 2, box.top + box.height / 2];"
+    page.show(0)
+    page.window.run(
+        middle + "const at = { clientX: x + 150, clientY: y, deltaY: -400 };"
+        "document.getElementById('canvas').dispatchEvent(new WheelEvent('wheel', at));"
+    )
+    page.window.click(*page.window.run(f"{middle} return [x, y];"))
+    page.saved()
+    page.window.run("document.querySelector('header').style.height = '200px'")
+    page.window.evaluate("new Promise((next) => requestAnimationFrame(() => requestAnimationFrame(next)))")
+    page.window.click(*page.window.run(f"{middle} return [x, y];"))
+    page.saved()
+    assert marks() == [1, 0, 0, 0]  # The same one was pressed.
+    page.window.keys("0")
+    page.window.run("document.querySelector('header').style.height = '100px'")
+    page.window.evaluate("new Promise((next) => requestAnimationFrame(() => requestAnimationFrame(next)))")
+    page.window.click(*page.on_screen([(20, 20)])[0])  # Seen whole, it is fitted again.
+    page.saved()
+    assert page.document()["corners"][1]["0.png"] == pytest.approx([20, 20], abs=1)
+
+
+def test_space_is_let_go_when_the_window_loses_focus(page: Page) -> None:
+    page.show(0)
+    page.window.run("document.body.dispatchEvent(new KeyboardEvent('keydown', { key: ' ', bubbles: true }))")
+    page.window.run("window.dispatchEvent(new Event('blur'))")
+    page.window.click(*page.on_screen(true_corners(0)[:1])[0])
+    page.saved()
+    assert [len(places) for places in page.document()["corners"]] == [1, 0, 0, 0]
+
+
+def test_space_presses_a_button_that_has_focus(page: Page) -> None:
+    chosen = "return document.querySelector('[aria-pressed=true]').dataset.tool"
+    page.window.run("document.querySelector('[data-tool=edge]').focus()")
+    page.window.keys(" ")
+    assert page.window.run(chosen) == "edge"
+    page.window.press("[data-tool=brush]")  # A mouse leaves no focus behind: Space moves the photograph then.
+    page.window.keys("1")
+    page.window.keys(" ")
+    assert page.window.run(chosen) == "corner"
+
+
 def test_edges_do_where_no_corner_shows(page: Page) -> None:
     for view in (0, 1, 2):
         corners = true_corners(view)

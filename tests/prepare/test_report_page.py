@@ -17,7 +17,8 @@ from glassplat.cli.main import main
 from glassplat.cli.train import SCENE
 from glassplat.errors import InputError
 from glassplat.prepare.preparation import PAGE
-from glassplat.prepare.report_page import _bin, plan, write_page
+from glassplat.prepare.report_page import _bin, _cards, plan, write_page
+from tests.render.tiny_scene import pane
 
 RECORD: dict[str, Any] = {
     "command": "prepare",
@@ -79,6 +80,11 @@ def test_with_panes_the_points_behind_them_are_counted(capture: Path, capsys: py
     text = (capture / PAGE).read_text()
     assert f"<b>{int(told[1]):,} (" in text
     assert text.count('fill="#ff4fd8"') > 0 and text.count('stroke="#ffd24a"') == 1
+
+
+def test_without_points_none_is_behind_panes() -> None:
+    cards = _cards(RECORD["report"], np.zeros(0, dtype=bool), pane(2.0))
+    assert "<div><b>0 (0%)</b><span>points behind panes</span></div>" in cards
 
 
 def test_a_foreign_file_is_not_overwritten(capture: Path, tmp_path: Path) -> None:

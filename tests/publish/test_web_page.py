@@ -26,6 +26,7 @@ from glassplat.publish.web_page import (
     fits,
     fitting,
     page_text,
+    preview_tags,
     write_page,
     write_preview,
 )
@@ -112,6 +113,37 @@ def test_the_buttons_do_what_they_say(opened: Browser) -> None:
 
 
 @needs_browser
+def test_keys_of_a_slider_stay_its_own_and_others_work(opened: Browser) -> None:
+    state = "glassplat.then(({ panel: { state } }) => [state.compare, state.divider, state.reflectances[0]])"
+    photo = opened.evaluate("document.getElementById('photo').textContent")
+    *_, before = opened.evaluate(state)
+    opened.evaluate("document.getElementById('reflectance').focus()")
+    opened.keys("c")
+    opened.keys("Right")
+    compares, divider, brighter = opened.evaluate(state)
+    assert compares and brighter > before
+    opened.evaluate("document.getElementById('divider').focus()")
+    opened.keys("Left")
+    _, moved, same = opened.evaluate(state)
+    assert moved < divider and same == brighter
+    assert int(opened.evaluate("document.getElementById('divider').ariaValueNow")) == round(100 * moved)
+    opened.keys("c")
+    assert opened.evaluate("document.getElementById('photo').textContent") == photo
+    opened.evaluate("document.getElementById('reflectance').dispatchEvent(new Event('dblclick'))")
+    opened.evaluate("document.getElementById('view').focus()")
+
+
+@needs_browser
+def test_a_key_that_is_held_switches_once(opened: Browser) -> None:
+    pressed = "document.body.dispatchEvent(new KeyboardEvent('keydown', { key: 'c', bubbles: true, repeat: REPEAT }))"
+    compares = []
+    for repeat in ("false", "true", "true", "false"):
+        opened.evaluate(pressed.replace("REPEAT", repeat))
+        compares.append(opened.evaluate("glassplat.then(({ panel }) => panel.state.compare)"))
+    assert compares == [True, True, True, False]
+
+
+@needs_browser
 def test_glass_turns_into_a_mirror_by_degrees(opened: Browser) -> None:
     shares = opened.evaluate("""glassplat.then(({ panel }) => {
       const found = [], note = () => found.push(panel.wanted().reflectances[0]);
@@ -154,6 +186,23 @@ def test_the_next_photograph_shows_a_pane_and_stands_in_the_address(tmp_path: Pa
         position += " - view.position[c]); })"
         assert max(abs(value) for value in browser.evaluate(position)) < 1e-6
         assert browser.complaints() == []
+
+
+@needs_browser
+def test_photographs_from_one_point_come_one_after_the_other(tmp_path: Path) -> None:
+    first = CAMERAS[0][1]
+    cosine, sine = math.cos(0.05), math.sin(0.05)
+    turn = torch.tensor([[cosine, 0, sine, 0], [0, 1, 0, 0], [-sine, 0, cosine, 0], [0, 0, 0, 1]])
+    poses = [torch.linalg.matrix_power(turn, k) @ first.cam_from_world for k in range(4)]
+    cameras = [(f"{k}.png", replace(first, cam_from_world=pose)) for k, pose in enumerate(poses)]
+    write_page(tmp_path / "index.html", true_scene(), Planar(), cameras, "Round")
+    with Browser(tmp_path / "index.html", 320, 240) as browser:
+        stops = set()
+        for _ in cameras:
+            browser.wait("glassplat.then(({ navigation }) => navigation.advance(10) || true)", "the end of the flight")
+            browser.keys("Right")
+            stops.add(browser.evaluate("document.getElementById('photo').textContent"))
+        assert len(stops) == 4
 
 
 @needs_browser
@@ -410,8 +459,14 @@ def test_the_page_is_one_file_of_little_script() -> None:
     assert sum(len(asset(name)) for name in (*SCRIPTS, *SHADERS)) <= LARGEST_SCRIPT
 
 
-@pytest.mark.parametrize("url", ["https://x.org/shop", "https://x.org/shop/", "https://x.org/shop/index.html"])
-def test_a_link_to_the_page_is_shown_with_a_picture_of_both_sides(url: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("rest", ["", "/", "/index.html", "?a=b", "/?a=b/c", "#top", "/index.html?a=b#view=1.png"])
+@pytest.mark.parametrize("folder", ["https://x.org", "https://x.org/shop", "https://x.org/shop/v1.2"])
+def test_a_link_has_its_picture_in_the_folder_of_the_page(folder: str, rest: str) -> None:
+    assert f'<meta property="og:image" content="{folder}/preview.jpg">' in preview_tags(folder + rest)
+
+
+def test_a_link_to_the_page_is_shown_with_a_picture_of_both_sides(tmp_path: Path) -> None:
+    url = "https://x.org/shop/index.html"
     page = page_text(true_scene(), Planar(), CAMERAS, "title", sharing=Sharing("A <person>, CC0", url))
     tags = dict(re.findall(r'<meta property="(og:[^"]+)" content="([^"]*)">', page))
     assert tags["og:title"] == "title" and tags["og:description"] and tags["og:url"] == url
@@ -426,8 +481,13 @@ def test_a_link_to_the_page_is_shown_with_a_picture_of_both_sides(url: str, tmp_
 def test_a_page_on_disk_has_to_be_uploaded_before_it_is_embedded(opened: Browser) -> None:
     opened.evaluate("document.querySelector('[data-do=embed]').click()")
     assert "upload it" in opened.evaluate("document.querySelector('#embed textarea').value")
+    shown = "['help', 'embed'].filter((id) => !document.getElementById(id).hidden)"
+    opened.evaluate("document.querySelector('[data-do=help]').click()")
+    assert opened.evaluate(shown) == ["help"]
+    opened.evaluate("document.querySelector('[data-do=embed]').click()")
+    assert opened.evaluate(shown) == ["embed"]
     opened.keys("Escape")
-    assert opened.evaluate("document.querySelector('#embed').hidden")
+    assert opened.evaluate(shown) == []
 
 
 class QuietHandler(SimpleHTTPRequestHandler):

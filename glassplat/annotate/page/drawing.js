@@ -14,6 +14,8 @@ export class Drawing {
     this.view = null;
     this.scale = 1;
     this.shift = [0, 0];
+    this.size = [0, 0]; // Of the canvas in the window.
+    this.isWhole = true; // Until it is zoomed or moved.
     this.upcoming = null; // The corner that the next click marks: where it may lie is drawn stronger.
     this.layer = document.createElement("canvas");
   }
@@ -30,6 +32,14 @@ export class Drawing {
     const room = 1 + 2 * ROOM;
     this.scale = Math.min(box.width / (this.view.width * room), box.height / (this.view.height * room));
     this.shift = [(box.width - this.view.width * this.scale) / 2, (box.height - this.view.height * this.scale) / 2];
+    this.isWhole = true;
+  }
+
+  // What was zoomed or moved keeps its scale, and its middle in the middle.
+  resized() {
+    const { width, height } = this.canvas.getBoundingClientRect();
+    if (this.isWhole) this.fit(); else this.move([(width - this.size[0]) / 2, (height - this.size[1]) / 2]);
+    this.size = [width, height];
   }
 
   toView(place) { return [(place[0] - this.shift[0]) / this.scale, (place[1] - this.shift[1]) / this.scale]; }
@@ -40,10 +50,13 @@ export class Drawing {
     const before = this.toView(place);
     this.scale = Math.min(40, Math.max(0.02, this.scale * factor));
     const after = this.toCanvas(before);
-    this.shift = [this.shift[0] + place[0] - after[0], this.shift[1] + place[1] - after[1]];
+    this.move([place[0] - after[0], place[1] - after[1]]);
   }
 
-  move(way) { this.shift = [this.shift[0] + way[0], this.shift[1] + way[1]]; }
+  move(way) {
+    this.shift = [this.shift[0] + way[0], this.shift[1] + way[1]];
+    this.isWhole = false;
+  }
 
   draw(panes, answers, active, pending) {
     const { canvas, context } = this;

@@ -188,8 +188,8 @@ async function show(number) {
   refresh();
   element("views").children[current].scrollIntoView({ block: "nearest" });
   document.body.dataset.view = "loading";
-  const image = await load(current);
-  if (image && view() === capture.views[drawing.view.number]) drawing.image = images.get(current);
+  await load(current);
+  drawing.image = images.get(current); // Of the photograph that is shown by now.
   document.body.dataset.view = images.has(current) ? String(current) : "failed";
   draw();
   load((current + 1) % capture.views.length);
@@ -327,6 +327,7 @@ const KEYS = {
   6: () => choose("restore"),
   "[": () => { radius = Math.max(2, radius / 1.25); tell(`brush of ${Math.round(radius)} pixels`); },
   "]": () => { radius = Math.min(300, radius * 1.25); tell(`brush of ${Math.round(radius)} pixels`); },
+  " ": () => { spaceHeld = true; },
   Enter: closePolygon,
   Escape: giveUp,
   Tab: nextPane,
@@ -342,9 +343,8 @@ function keyed(event) {
     return;
   }
   if (event.ctrlKey || event.metaKey || event.altKey) return;
-  if (event.key === " ") { spaceHeld = true; event.preventDefault(); return; }
   const act = KEYS[event.key] || KEYS[event.key.toLowerCase()];
-  if (!act || (event.target.closest("button") && ["Enter", "Tab"].includes(event.key))) return;
+  if (!act || (event.target.closest("button") && ["Enter", "Tab", " "].includes(event.key))) return;
   event.preventDefault();
   act();
 }
@@ -372,7 +372,7 @@ async function settled() {
   if (document.body.dataset.state === "failed") throw new Error(element("status").textContent);
 }
 
-const resized = new ResizeObserver(() => { drawing.fit(); draw(); });
+const resized = new ResizeObserver(() => { drawing.resized(); draw(); });
 
 async function close() {
   try {
@@ -398,11 +398,14 @@ function listen() {
   canvas.addEventListener("wheel", (event) => { event.preventDefault(); drawing.zoom(spot(event), Math.exp(-event.deltaY / 400)); draw(); }, { passive: false });
   window.addEventListener("keydown", keyed);
   window.addEventListener("keyup", (event) => { if (event.key === " ") spaceHeld = false; });
+  window.addEventListener("blur", () => { spaceHeld = false; });
   window.addEventListener("beforeunload", (event) => { if (["changed", "failed"].includes(document.body.dataset.state)) event.preventDefault(); });
   resized.observe(canvas);
+  // Space and Enter are the photograph's again after a click; a button that a key has pressed keeps the focus.
+  window.addEventListener("click", (event) => { if (event.detail) event.target.closest("button")?.blur(); });
   document.querySelectorAll("[data-tool]").forEach((button) => button.addEventListener("click", () => choose(button.dataset.tool)));
   for (const [id, act] of [["undo", undo], ["redo", () => marking.redo()], ["add", KEYS.a], ["write", write], ["close", close]]) {
-    element(id).addEventListener("click", (event) => { act(); event.currentTarget.blur(); });
+    element(id).addEventListener("click", act);
   }
 }
 
@@ -413,7 +416,7 @@ async function begin() {
   element("views").replaceChildren(...capture.views.map((one, number) => {
     const image = make("img", { src: `/thumbnail/${number}`, loading: "lazy", alt: "" });
     const button = make("button", { title: one.name }, image, make("span", { textContent: one.name }), make("b"));
-    button.addEventListener("click", () => { show(number); button.blur(); });
+    button.addEventListener("click", () => show(number));
     return button;
   }));
   marking = new Marking(capture.document, changed);
