@@ -37,9 +37,9 @@ LEAST_COVERAGE = 0.95
 """Coverage of the mirrored image from which a pixel counts; a rough first scene has holes, which are no dark things."""
 WINDOW = 0.15
 """Side of the window whose mean is taken off, as a share of the image width: it removes differences in brightness."""
-FEWEST_PIXELS, LEAST_SHARE = 200, 0.03
-"""Of a pane's pixels, how many must be covered by what it would mirror for it to be judged: by a hundredth
-of a glass front, chosen by what is known of its surroundings, it may well look like a mirror."""
+FEWEST_PIXELS, LEAST_SHARE = 200, 0.1
+"""Of a pane's pixels, how many must be covered by what it would mirror for it to be judged: by a few hundredths of a
+glass front, chosen by what is known of its surroundings, it may look like a mirror. Of mirrors 15 % and more are."""
 INNER_SHARE = 0.8
 """Share of a rectangle's sides that is compared: its rim shows the frame, mirrored as well as directly."""
 MOST_PHOTOGRAPHS, REDUCED_WIDTH = 40, 200
