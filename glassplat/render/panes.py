@@ -176,9 +176,9 @@ def mirrored_views(planes: Planes, camera: Camera) -> MirroredViews:
     pose = camera.cam_from_world
     if waits(planes.centers.device):
         return pane_kernels.mirrored_views(planes.centers, planes.raw_normals, pose)
-    poses = pose @ mirror_matrices(planes.centers, planes.normals)
+    normals = planes.normals
+    poses = pose @ mirror_matrices(planes.centers, normals)
     with torch.no_grad():
-        normals = planes.normals
         side = torch.sign(((camera.center - planes.centers) * normals).sum(-1, keepdim=True))
         facing = normals * side
         half_spaces = torch.cat([facing, -(facing * planes.centers).sum(-1, keepdim=True)], dim=1)

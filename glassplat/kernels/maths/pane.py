@@ -21,6 +21,11 @@ PANE, SCHLICK = LAWS.index("pane"), LAWS.index("schlick")
 LEAST_COSINE = 1e-6
 """Two surfaces are not asked for more grazing rays: a pane that reflects nothing would divide 0 by 0."""
 
+DARKEST = 0.05
+"""sRGB value from which on the slope of linear light is taken to grow as the value, as of a gamma of 2."""
+MOST_HELD = 2.0
+"""Times what a pane adds, up to which a transmission may hold the edges of a reflection."""
+
 
 class PaneMaths(NamedTuple):
     """Scalar functions of panes for one floating-point type.
@@ -63,6 +68,22 @@ def pane_maths(real: type) -> PaneMaths:
         return real(math.sqrt(x * x + y * y + one))
 
     return PaneMaths(strength, strength_slopes, ray_length)
+
+
+def counting(real: type) -> Scalar:
+    """How shared edges of a cell count; `kernels.panes.gradient_conflict` says why."""
+    zero, one, two, most = real(0.0), real(1.0), real(2.0), real(MOST_HELD)
+
+    @inlined
+    def counted(edges, held, full, is_told):  # type: ignore[no-untyped-def]
+        """The cell's part of the sum, and its derivative by the edges; the weight of the cell is constant."""
+        weight = one
+        if is_told and held != zero:
+            weight = min(max(two - abs(held) / (most * full), zero), one)
+        slope = weight if edges > zero else -weight
+        return weight * abs(edges), slope if edges != zero else zero
+
+    return counted
 
 
 def mixing(real: type) -> tuple[Scalar, Scalar]:

@@ -311,12 +311,6 @@ def slopes_at(slopes: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> 
     return found
 
 
-DARKEST = 0.05
-"""sRGB value from which on the slope of linear light is taken to grow as the value, as of a gamma of 2."""
-MOST_HELD = 2.0
-"""Times what a pane adds, up to which a transmission may hold the edges of a reflection."""
-
-
 def gradient_conflict(
     transmission: Tensor, reflection: Tensor, hit: Tensor, strength: Tensor | None = None, *, cell: int = 1
 ) -> Tensor:

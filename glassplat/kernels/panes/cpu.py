@@ -32,8 +32,7 @@ from glassplat.kernels.backend.cpu_vector import (
 )
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.images import color_space_maths
-from glassplat.kernels.maths.pane import mixing, pane_maths
-from glassplat.kernels.panes import DARKEST, MOST_HELD
+from glassplat.kernels.maths.pane import DARKEST, counting, mixing, pane_maths
 from glassplat.kernels.records import DAZZLING, REAL_OF, TILE, PaneHits
 
 
@@ -550,7 +549,7 @@ def conflict_forward(real: type) -> Kernel:
 
     Columns are added up first, and then cells, so that the loops over pixels are of one piece.
     """
-    zero, one, two, darkest, most = real(0.0), real(1.0), real(2.0), real(DARKEST), real(MOST_HELD)
+    zero, one, two, darkest, counted = real(0.0), real(1.0), real(2.0), real(DARKEST), counting(real)
 
     @kernel("gradient_conflict_forward", real)
     def forward(transmission, reflection, hit, strength, is_told, cell, slopes, sums):
@@ -599,12 +598,8 @@ def conflict_forward(real: type) -> Kernel:
                         edges += shared[CHANNELS * x + d]
                         holds += held[CHANNELS * x + d]
                         could += full[CHANNELS * x + d]
-                    counted = one
-                    if is_told and holds != zero:
-                        counted = min(max(two - abs(holds) / (most * could), zero), one)
-                    total += counted * abs(edges)
-                    factor = counted if edges > zero else -counted
-                    factor = factor if edges != zero else zero
+                    added, factor = counted(edges, holds, could, is_told)
+                    total += added
                     for x in range(left, right):
                         factors[CHANNELS * x + d] = factor
             for row in range(top, bottom):

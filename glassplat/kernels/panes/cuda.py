@@ -18,8 +18,7 @@ from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.images import color_space_maths
-from glassplat.kernels.maths.pane import mixing, pane_maths
-from glassplat.kernels.panes import DARKEST, MOST_HELD
+from glassplat.kernels.maths.pane import DARKEST, counting, mixing, pane_maths
 from glassplat.kernels.panes.cpu import CHANNELS, conflict_count
 from glassplat.kernels.records import DAZZLING, REAL_OF, TILE, PaneHits
 
@@ -519,7 +518,7 @@ def sobel_at(image, y, x, d):
 @cache
 def conflict_forward(real: type) -> Kernel:
     """Fills the sum of each cell and channel, and slopes [2, H - 2, W - 2, 3], its derivatives by Sobel's images."""
-    zero, one, two, darkest, most = real(0.0), real(1.0), real(2.0), real(DARKEST), real(MOST_HELD)
+    zero, one, darkest, counted = real(0.0), real(1.0), real(DARKEST), counting(real)
 
     @kernel("gradient_conflict_forward", real, "real3 real3 real2 real2 int real4 real1")
     def forward(transmission, reflection, hit, strength, cell, slopes, sums):
@@ -552,13 +551,9 @@ def conflict_forward(real: type) -> Kernel:
                 fills[t] += fills[t + step]
             step //= 2
         cuda.syncthreads()
-        total, counted = edges[0], one
-        if strength.size > 0 and holds[0] != zero:
-            counted = min(max(two - abs(holds[0]) / (most * fills[0]), zero), one)
+        added, factor = counted(edges[0], holds[0], fills[0], strength.size > 0)
         if t == 0:
-            sums[cuda.blockIdx.x] = counted * abs(total)
-        factor = counted if total > zero else -counted
-        factor = factor if total != zero else zero
+            sums[cuda.blockIdx.x] = added
         for i in range(t, rows * columns, CELL_THREADS):
             y, x = top + i // columns, left + i % columns
             r_x, r_y = sobel_at(reflection, y, x, d)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from glassplat.kernels import Fresnel
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
-from glassplat.kernels.panes import DARKEST, MOST_HELD
+from glassplat.kernels.maths.pane import DARKEST, MOST_HELD
 from glassplat.kernels.records import DAZZLING, TILE, BlendedPanes, PaneHits, Panes
 
 

@@ -19,6 +19,7 @@ if SIMULATED and hasattr(os, "sched_setaffinity"):
 
 DEVICE = torch.device("cpu" if SIMULATED else "cuda")
 DTYPES = [torch.float64, torch.float32]
+WIDTH, HEIGHT = (20, 17) if SIMULATED else (203, 117)
 TOLERANCE = {torch.float64: 1e-9, torch.float32: 2e-4}
 
 

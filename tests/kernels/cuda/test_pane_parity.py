@@ -10,7 +10,6 @@ from torch import Tensor
 
 from glassplat.kernels import Fresnel
 from glassplat.kernels import panes as panes_operation
-from glassplat.kernels.backend.devices import SIMULATED
 from glassplat.kernels.panes import cpu as panes_on_the_cpu
 from glassplat.kernels.panes import reference as panes_twin
 from glassplat.kernels.records import Panes
@@ -20,6 +19,8 @@ from glassplat.scene.panes import Planes
 from tests.kernels.cuda.agreement import (
     DEVICE,
     DTYPES,
+    HEIGHT,
+    WIDTH,
     check_gradients,
     close,
     many,
@@ -30,8 +31,6 @@ from tests.kernels.gaussians_and_cameras import draw, random_cameras
 from tests.kernels.test_gradient_conflict import pictures
 
 on_a_device_or_skipped()
-
-WIDTH, HEIGHT = (20, 17) if SIMULATED else (203, 117)
 
 
 def two_panes(dtype: torch.dtype) -> tuple[Panes, Tensor]:

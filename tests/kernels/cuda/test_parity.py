@@ -33,6 +33,8 @@ from glassplat.kernels.tiles import reference as tiles_twin
 from tests.kernels.cuda.agreement import (
     DEVICE,
     DTYPES,
+    HEIGHT,
+    WIDTH,
     check_gradients,
     close,
     many,
@@ -48,8 +50,6 @@ pytestmark = [
     # The simulator computes with NumPy's scalars, which warn where a GPU gives infinity, and in threads.
     pytest.mark.filterwarnings("ignore::RuntimeWarning"),
 ]
-
-WIDTH, HEIGHT = (20, 17) if SIMULATED else (203, 117)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
