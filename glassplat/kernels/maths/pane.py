@@ -71,7 +71,7 @@ def pane_maths(real: type) -> PaneMaths:
 
 
 def counting(real: type) -> Scalar:
-    """How shared edges of a cell count; `kernels.panes.gradient_conflict` says why."""
+    """The weight of a cell of shared edges; `kernels.panes.gradient_conflict` gives the reason."""
     zero, one, two, most = real(0.0), real(1.0), real(2.0), real(MOST_HELD)
 
     @inlined
