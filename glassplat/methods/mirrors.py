@@ -391,6 +391,7 @@ class Propagate:
         """Notes the end and says what was found."""
         state.records[ENDED] = clock.step
         share = max(self.search.reflective(state.scene, dataset.train), state.records.get(MOST, 0.0))
+        state.records[MOST] = share
         if share < FOUND or self.raises_rates_found:
             # Faster where there is no normal that this would spoil.
             state.optimizer.raised_rates = {
@@ -505,3 +506,8 @@ class RefineEnvironment:
 def has_ended(state: TrainState) -> bool:
     """Return whether normal propagation is over."""
     return ENDED in state.records
+
+
+def found_nothing(state: TrainState) -> bool:
+    """Return whether normal propagation is over, and nothing reflects."""
+    return has_ended(state) and state.records[MOST] < FOUND

@@ -31,8 +31,8 @@ class NoGaussiansError(TrainingDivergedError):
     """There is nothing to train: no Gaussians, or none that a view shows."""
 
 
-SET_UP = "set up"
-"""Name in `TrainState.records`: the first step of the stage whose setup was carried out last."""
+ENTERED = "set up"
+"""Name in `TrainState.records`: the stage that was entered last, by the step at which it begins if none ends early."""
 WHERE_TO_LOOK = (
     "Expected cameras that look at the points: check their poses and focal lengths, and whether the points are those "
     "of this capture; photographs of a few pixels (--downscale) or high learning rates end like this too"
@@ -94,24 +94,27 @@ def train(
     ranks = ranks or Ranks()
     check_population(state)
     visibility = VisibilityCheck(len(dataset.train))
-    starts = stage_starts(stages, iterations)
+    starts, is_early = stage_starts(stages, iterations), False
     for stage, start, end in zip(stages, starts, starts[1:], strict=False):
         if state.step >= end:
             continue
-        if state.step == start:
-            if stage.setup is not None and state.records.get(SET_UP) != start:
+        is_new = state.records.get(ENTERED) != start
+        if state.step == start or (is_early and is_new):
+            if is_new:
                 state.is_whole = False
-                yield from carried_out(stage.setup(state, with_corrected_cameras(dataset, state.scene)))
-                state.records[SET_UP] = start
+                if stage.setup is not None:
+                    yield from carried_out(stage.setup(state, with_corrected_cameras(dataset, state.scene)))
+                state.records[ENTERED] = start
                 state.is_whole = True
                 ranks.settle(state)
             yield StageEntered(state.step, stage.name, counts_of(state.scene))
-        while state.step < end:
+        while state.step < end and not stage.is_over(state):
             coming = scheduled_views(dataset, state, (1 + dataset.memory.ahead) * ranks.batch)
             for view in coming[ranks.rank :: ranks.count]:
                 view.read_ahead()
             views = scheduled_views(dataset, state, min(ranks.batch, end - state.step))
             yield from advance(stage, dataset, state, iterations, views, ranks, visibility)
+        is_early = state.step < end
 
 
 def advance(

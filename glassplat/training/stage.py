@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import zlib
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Protocol
@@ -301,6 +301,7 @@ class Stage:
         post_steps: what follows the optimiser at every step, before the actions.
         setup: what to do once when the stage begins.
         densify_until: share of the run until which screen gradients are collected, for whoever densifies by them.
+        until: whether the stage is over before its share is; the next one then begins at once. Asked before every step.
     """
 
     name: str
@@ -312,6 +313,11 @@ class Stage:
     post_steps: tuple[PostStep, ...] = ()
     setup: Setup | None = None
     densify_until: float = 0.0
+    until: Callable[[TrainState], bool] | None = None
+
+    def is_over(self, state: TrainState) -> bool:
+        """Return whether the stage ends early."""
+        return self.until is not None and self.until(state)
 
 
 def stage_starts(stages: tuple[Stage, ...], iterations: int) -> list[int]:

@@ -257,6 +257,9 @@ def test_where_nothing_reflects_the_rates_rise_and_the_log_says_so(
         state, _ = propagated(Told(reflects=(share,), turns=turns), PropagationSchedule(patience=2))
     warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert state.optimizer.raised_rates == ({} if said is None else {"primary.sh": 3.0})
+    _, reflection, refinement = DeferredRecipe().stages(seed=0)
+    assert reflection.is_over(state) == (said is not None)
+    assert {term.name for term in reflection.losses} - {term.name for term in refinement.losses} == {"consistency"}
     assert len(warnings) == (said is not None)
     if said is not None:
         assert re.search(rf"nothing reflective was found.*{said}", warnings[0])

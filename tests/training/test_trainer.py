@@ -148,6 +148,27 @@ def test_a_setup_is_carried_out_once_whoever_leaves_after_it(begins: int, is_sav
     assert_same_scene(whole.scene, left.scene)
 
 
+@pytest.mark.parametrize("pause", [3, 5])
+def test_a_stage_that_is_over_early_leaves_its_steps_to_the_next(pause: int, tmp_path: Path) -> None:
+    def grow(state: TrainState, dataset: object) -> None:
+        state.scene.primary.log_scales.add_(0.1)
+
+    (stage,) = SplatRecipe(sh_degree=1).stages(seed=0)
+    stages = (
+        replace(stage, name="first", share=0.5, until=lambda state: state.step >= 3),
+        replace(stage, name="second", share=0.5, setup=grow),
+    )
+    whole, left = fresh_state(), fresh_state()
+    entered = [m for m in train(stages, tiny_capture(), whole, 8) if isinstance(m, StageEntered)]
+    assert [(message.step, message.stage) for message in entered] == [(0, "first"), (3, "second")]
+    run(left, stages, 8, until=pause)
+    save_checkpoint(tmp_path / "checkpoint.safetensors", left)
+    left = load_checkpoint(tmp_path / "checkpoint.safetensors")
+    entered = [m for m in train(stages, tiny_capture(), left, 8) if isinstance(m, StageEntered)]
+    assert [message.step for message in entered] == [3] * (pause == 3)
+    assert_same_scene(whole.scene, left.scene)
+
+
 def test_a_loss_that_is_not_finite_stops_training_and_is_named() -> None:
     broken = Stage(
         name="broken",
