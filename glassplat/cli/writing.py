@@ -7,13 +7,12 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import track
 from torch import Tensor
 
 from glassplat.captures.view import View
@@ -41,6 +40,8 @@ from glassplat.training.messages import Working
 if TYPE_CHECKING:
     from glassplat.cli.scene import Clean, Dereflect, Export, Render, Video
 
+Thing = TypeVar("Thing")
+
 
 def write_layers(command: Render, console: Console) -> None:
     """Renders every layer of every view into its file."""
@@ -57,12 +58,14 @@ def write_layers(command: Render, console: Console) -> None:
             console,
             f"adding to {command.output}, which `glassplat render` wrote earlier; images of one name are replaced",
         )
-    for view in track(views, "rendering", console=console):
-        frame, _ = timed_render(renderer, scene, view)
-        for layer in command.layers:
-            image = layer_image(frame, layer)
-            write_image(command.output / layer / paths[view.name], image)
-    say(console, f"{len(views)} views x {len(command.layers)} layers -> {command.output}")
+    with WorkProgress(console) as progress:
+        for view in track_progress("rendering", views, len(views), progress):
+            frame, _ = timed_render(renderer, scene, view)
+            for layer in command.layers:
+                image = layer_image(frame, layer)
+                write_image(command.output / layer / paths[view.name], image)
+    made = f"{count_noun(len(views), 'view')} x {count_noun(len(command.layers), 'layer')}"
+    say(console, f"{made} -> {command.output}")
 
 
 def write_dereflected(command: Dereflect, console: Console) -> None:
@@ -76,9 +79,10 @@ def write_dereflected(command: Dereflect, console: Console) -> None:
         say(console, f"replacing the images of an earlier run of this command in {command.output}")
     for warning in mirror_warnings(stored):
         warn(console, warning)
-    for view in track(views, "taking reflections off", console=console):
-        write_image(command.output / paths[view.name], dereflect_view(command, stored, renderer, view))
-    say(console, f"{len(views)} images without reflections -> {command.output}")
+    with WorkProgress(console) as progress:
+        for view in track_progress("taking reflections off", views, len(views), progress):
+            write_image(command.output / paths[view.name], dereflect_view(command, stored, renderer, view))
+    say(console, f"{count_noun(len(views), 'image')} without reflections -> {command.output}")
 
 
 def dereflect_view(command: Dereflect, stored: StoredRun, renderer: Planar, view: View) -> Tensor:
@@ -166,13 +170,11 @@ def _picture(image: torch.Tensor) -> NDArray[np.uint8]:
     return picture
 
 
-def track_progress(
-    what: str, pictures: Iterable[NDArray[np.uint8]], total: int, progress: WorkProgress
-) -> Iterator[NDArray[np.uint8]]:
-    """The pictures, with a progress shown as they are taken."""
+def track_progress(what: str, things: Iterable[Thing], total: int, progress: WorkProgress) -> Iterator[Thing]:
+    """The things, such as pictures or views, with a progress shown as they are taken."""
     progress.show(Working(what, 0, total))
-    for number, picture in enumerate(pictures, start=1):
-        yield picture
+    for number, thing in enumerate(things, start=1):
+        yield thing
         progress.show(Working(what, number, total))
 
 

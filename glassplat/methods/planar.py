@@ -388,7 +388,9 @@ def seed_reflection(state: TrainState, dataset: Dataset, panes: Planes) -> Work:
     seeds = mirrored_gaussians(seeds_of(state.scene.primary, behind), panes.centers[0], panes.normals[0])
     add_primary(state, seeds)
     log.info(
-        "no photograph shows what is mirrored by %s: %d points behind mirrored", name_panes(panes, "pane"), len(seeds)
+        "no photograph shows what is mirrored by %s: %d points from behind added, mirrored, in front",
+        name_panes(panes, "pane"),
+        len(seeds),
     )
     return True
 

@@ -381,6 +381,9 @@ class Mapping:
     least_matches: int = 30
 
 
+PLACING = "placing the photographs"
+
+
 def place_photographs(
     database: Path, mapper: Mapper, options: Mapping, *, count: int, listen: Listener, threads: int
 ) -> list[Any]:
@@ -399,7 +402,7 @@ def place_photographs(
     """
     output = database.with_suffix(".models")
     output.mkdir(exist_ok=True)
-    listen(Working("placing the photographs", 0, count))
+    listen(Working(PLACING, 0, count))
     if mapper == "incremental":
         work = _incremental(database, output, _incremental_options(options, threads), count, listen)
     else:
@@ -410,17 +413,22 @@ def place_photographs(
 
 
 def _incremental(database: Path, output: Path, options: Any, count: int, listen: Listener) -> Callable[[Any], dict]:
-    placed_now = 0
+    group = placed_now = 0
+
+    def tell() -> None:
+        # Each group is work of its own: its time left is not that of the whole.
+        what = PLACING if group <= 1 else f"{PLACING}, group {group}"
+        listen(Working(what, placed_now, count))
 
     def begun() -> None:
-        nonlocal placed_now
-        placed_now = 2
-        listen(Working("placing the photographs", placed_now, count))
+        nonlocal group, placed_now
+        group, placed_now = group + 1, 2
+        tell()
 
     def next_one() -> None:
         nonlocal placed_now
         placed_now = min(placed_now + 1, count)
-        listen(Working("placing the photographs", placed_now, count))
+        tell()
 
     def work(token: Any) -> dict:
         return library.pycolmap.incremental_mapping(

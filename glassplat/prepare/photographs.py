@@ -295,7 +295,7 @@ def frames_of(video: Path, folder: Path, most: int, listen: Listener) -> list[Pa
     Args:
         video: the file.
         folder: where to; frames that are there already are kept, so that an interrupted choice goes on.
-        most: number of frames wanted.
+        most: number of frames wanted; a video that moves little has fewer.
         listen: is told how far it is.
 
     Raises:
@@ -323,7 +323,8 @@ def chosen_frames(footage: Footage, most: int) -> NDArray[np.int64]:
     """The sharpest frame of every stretch of equal motion; stretches are at least `LEAST_SPACING` long."""
     path = footage.travelled
     spacing = max(float(path[-1] - path[0]) / most, LEAST_SPACING)
-    stretch = np.floor((path - path[0]) / spacing).astype(np.int64)
+    # The last frame ends the last stretch and begins none.
+    stretch = np.minimum(np.floor((path - path[0]) / spacing).astype(np.int64), most - 1)
     order = np.lexsort((-footage.sharpness, stretch))
     firsts = np.unique(stretch[order], return_index=True)[1]
     return np.sort(order[firsts])

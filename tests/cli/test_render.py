@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from glassplat.cli import progress
 from glassplat.cli.main import main
 from glassplat.cli.places import SceneEdits
 from glassplat.errors import InputError
@@ -77,6 +78,29 @@ def test_layers_that_a_method_lacks_are_refused_before_anything_is_rendered(
     said = capsys.readouterr()
     assert words in said.err and "rendering" not in said.out
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "work", "end"),
+    [
+        ("render", "rendering", "1 view x 1 layer -> "),
+        ("dereflect --split test", "taking reflections off", "1 image without reflections -> "),
+    ],
+)
+def test_a_log_is_told_how_far_it_is(
+    command: str,
+    work: str,
+    end: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(progress, "PAUSE", 0)
+    name, *options = command.split()
+    run = write_run(tmp_path / "run")
+    assert main([name, str(run), "--output", str(tmp_path / "out"), *options]) == 0
+    said = capsys.readouterr().out
+    assert f"{work} (1)\n{work}: 1 of 1, 0 s left\n{end}" in said
 
 
 def test_a_scene_without_panes_cannot_be_edited() -> None:

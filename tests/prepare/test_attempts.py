@@ -8,10 +8,12 @@ from typing import Any
 
 import pytest
 
-from glassplat.prepare import reconstruction
-from glassplat.prepare.colmap import Features
+from glassplat.captures import colmap_library as library
+from glassplat.prepare import colmap, reconstruction
+from glassplat.prepare.colmap import Features, Mapping
 from glassplat.prepare.photographs import Note
 from glassplat.prepare.reconstruction import MANY, USUAL, Settings, best_solution
+from glassplat.training.messages import Working
 
 
 @dataclass(frozen=True)
@@ -66,3 +68,18 @@ def test_more_features_only_where_too_few_are_placed(
     assert tried == features
     assert (solution.registered, solution.tried) == (best, len(sizes))
     assert len(notes) == len(sizes) - 1 and all(isinstance(note, Note) for note in notes)
+
+
+def test_a_second_group_is_work_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    def mapping(*unused: object, initial_image_pair_callback: Any, next_image_callback: Any, **also: object) -> dict:
+        for more in (3, 1):
+            initial_image_pair_callback()
+            for _ in range(more):
+                next_image_callback()
+        return {}
+
+    monkeypatch.setattr(library.pycolmap, "incremental_mapping", mapping)
+    heard: list[Any] = []
+    colmap._incremental(Path("d"), Path("o"), Mapping(), 9, heard.append)(None)
+    first, second = "placing the photographs", "placing the photographs, group 2"
+    assert heard == [Working(first, done, 9) for done in (2, 3, 4, 5)] + [Working(second, done, 9) for done in (2, 3)]

@@ -64,6 +64,11 @@ def test_the_sharpest_of_each_stretch_is_chosen() -> None:
     assert chosen_frames(footage, 3).tolist() == [1, 4, 5]
 
 
+@pytest.mark.parametrize("most", [8, 16, 20])
+def test_no_more_frames_than_wanted_are_chosen(most: int) -> None:
+    assert len(chosen_frames(Footage(np.linspace(0, 3, 70), np.ones(70)), most)) == most
+
+
 @pytest.mark.parametrize("still", [True, False])
 def test_a_video_of_nothing_is_refused(still: bool, tmp_path: Path, heard: Heard) -> None:
     path = tmp_path / "nothing.avi"
