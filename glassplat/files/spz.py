@@ -189,7 +189,7 @@ def write_spz(path: Path | str, gaussians: Gaussians, version: int = 3) -> None:
         version: 3 or 4.
 
     Raises:
-        ValueError: another version, no colours, or a value that is not finite.
+        ValueError: another version, no colours, a value that is not finite, or a position that is too far away.
     """
     data = spz_bytes(gaussians, version)
     with atomic_write(path) as temporary:
@@ -205,6 +205,12 @@ def spz_bytes(gaussians: Gaussians, version: int = 3) -> bytes:
     broken = [name for name, tensor in gaussians.tensors().items() if not bool(tensor.isfinite().all())]
     if broken:
         raise ValueError(f"Gaussians whose {', '.join(broken)} are not all finite cannot be written as SPZ")
+    farthest = float(gaussians.means.abs().max()) if len(gaussians) else 0.0
+    if farthest > LARGEST_POSITION:
+        raise ValueError(
+            f"a Gaussian lies {farthest:.3g} units from the origin, and SPZ ends at {LARGEST_POSITION}; take it out "
+            "with `glassplat clean`, or write another format"
+        )
     gaussians = replace(gaussians, sh=gaussians.sh[:, : (gaussians.active_sh_degree + 1) ** 2])
     layout = Layout(version, len(gaussians), gaussians.max_sh_degree, fractional_bits_for(gaussians.means))
     sections = [section.tobytes() for section in packed_sections(gaussians, layout)]

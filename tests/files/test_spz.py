@@ -133,6 +133,7 @@ def test_no_gaussians_at_all(tmp_path: Path) -> None:
         ({"version": 5}, "version 5"),
         ({"sh": torch.zeros(50, 0, 3)}, "colours"),
         ({"means": torch.full((50, 3), torch.nan)}, "means"),
+        ({"means": torch.full((50, 3), -9e6)}, r"9e\+06 units from the origin, and SPZ ends at 8388607"),
     ],
 )
 def test_what_cannot_be_written_is_refused(change: dict, words: str, tmp_path: Path) -> None:
