@@ -9,6 +9,7 @@ turn it.
 
 from __future__ import annotations
 
+import logging
 import struct
 import zlib
 from dataclasses import replace
@@ -25,6 +26,8 @@ from glassplat.files.ply import as_numpy, as_tensor
 from glassplat.files.records import reading
 from glassplat.files.writing import atomic_write
 from glassplat.scene.gaussians import Gaussians, half_turned
+
+log = logging.getLogger(__name__)
 
 Bytes = NDArray[np.uint8]
 
@@ -213,6 +216,14 @@ def spz_bytes(gaussians: Gaussians, version: int = 3) -> bytes:
         )
     gaussians = replace(gaussians, sh=gaussians.sh[:, : (gaussians.active_sh_degree + 1) ** 2])
     layout = Layout(version, len(gaussians), gaussians.max_sh_degree, fractional_bits_for(gaussians.means))
+    step = 2.0**-layout.fractional_bits
+    if len(gaussians) and step > float(gaussians.log_scales.amax(dim=1).median().exp()):
+        log.warning(
+            "SPZ rounds positions to %g units, which is more than half of the Gaussians measure, because one lies %.3g "
+            "units from the origin; take it out with `glassplat clean`, or write another format",
+            step,
+            farthest,
+        )
     sections = [section.tobytes() for section in packed_sections(gaussians, layout)]
     head = (MAGIC, version, layout.number, layout.degree, layout.fractional_bits, 0)
     if version == 4:

@@ -144,6 +144,15 @@ def test_what_cannot_be_written_is_refused(change: dict, words: str, tmp_path: P
     assert not (tmp_path / "a.spz").exists()
 
 
+def test_positions_that_are_rounded_by_more_than_a_gaussian_are_told_of(caplog: pytest.LogCaptureFixture) -> None:
+    far = typical().means.clone()
+    spz_bytes(typical())
+    assert not caplog.messages
+    far[0, 1] = 1e5
+    spz_bytes(typical().with_tensors({"means": far, "log_scales": torch.full((50, 3), -5.0)}))
+    assert "rounds positions to 0.015625 units" in caplog.text and "lies 1e+05 units from" in caplog.text
+
+
 def streamed(count: int, table: list[tuple[int, int]], body: bytes = b"", offset: int = STREAMED_HEADER.size) -> bytes:
     head = STREAMED_HEADER.pack(MAGIC, 4, count, 0, 12, 0, len(table), offset)
     return head + b"".join(STREAM.pack(*row) for row in table) + body
