@@ -98,6 +98,8 @@ def test_bad_input_ends_with_one_message(tmp_path: Path, capsys: pytest.CaptureF
     empty = tmp_path / "empty"
     empty.mkdir()
     fails_with(["train", "splat", "--data", str(empty), *output], capsys, "error:", "Looked for")
+    itself = str(empty / ".." / "empty")
+    fails_with(["train", "splat", "--data", str(empty), "--output", itself], capsys, "is the capture itself; choose")
     fails_with(
         ["train", "splat", "--data", str(SCENE), *output, "--iterations", "0"], capsys, "--iterations is 0; expected"
     )
