@@ -76,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     141 when nobody reads the output any more.
 
     Raises:
-        SystemExit: after help (0) and without a command (2).
+        SystemExit: after help.
     """
     try:
         return run_guarded(sys.argv[1:] if arguments is None else list(arguments), is_program=arguments is None)
@@ -156,8 +156,8 @@ def parse_arguments(arguments: list[str]) -> Any:
     """The command that the arguments describe.
 
     Raises:
-        InputError: an option is none, missing or out of range.
-        SystemExit: they ask for help or the version, or name no command.
+        InputError: there is no such command, or an option is none, missing or out of range.
+        SystemExit: they ask for help or the version.
     """
     import tyro
 
@@ -173,10 +173,10 @@ def parse_arguments(arguments: list[str]) -> Any:
         command = parse_options(name, arguments[1:])
         check_options(command)
         return command
-    if name and not name.startswith("-"):
+    complete = name.startswith("--tyro-")
+    if not complete and name not in ("-h", "--help"):
         raise InputError(no_such("command", name, COMMANDS, "glassplat --help"))
     # Nothing is left to run after the list of commands; only a shell's completions need to know every option.
-    complete = name.startswith("--tyro-")
     kinds = {known: command_line(known, [])[0] if complete else stub(known) for known in COMMANDS}
     tyro.cli(overview(kinds), prog="glassplat", description=DESCRIPTION, args=arguments, config=settings())
     raise SystemExit(USAGE_CODE)
