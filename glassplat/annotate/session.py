@@ -307,14 +307,14 @@ class Session:
             return SolvedPane(pane, None, f"{error}; check the order of the corners")
 
     def finish(self) -> dict[str, Any]:
-        """Writes masks and planes of everything that is marked; says what was written.
+        """Writes masks and planes of everything that is marked, here or by another program; says what was written.
 
         Where nothing is marked any more, what was written before is removed.
 
         Raises:
             InputError: no pane is known yet, or a folder of masks holds some that were not made here.
         """
-        panes = parsed_document(self._document, "the document")
+        panes = parsed_document(self._current()["document"], "the document")
         solved = [(one.pane, one.fit) for one in map(self.solve, panes) if one.fit is not None]
         if not solved:
             is_marked = any(places for pane in panes for places in (*pane.corners, *pane.edges))

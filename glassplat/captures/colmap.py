@@ -119,6 +119,12 @@ def _records_of(path: Path) -> list[Any]:
         raise InputError(str(error)) from error
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+    except UnicodeDecodeError as error:
+        name = error.object[: error.start].rpartition(b" ")[2] + error.object[error.start :].partition(b"\n")[0]
+        raise InputError(
+            f"{path} holds the name {name[:80]!r}, which is no UTF-8; rename the photograph, there and in its folder, "
+            "or export the COLMAP model again"
+        ) from error
     except (struct.error, EOFError, ValueError, IndexError, OverflowError) as error:
         raise InputError(f"{path} is cut off or damaged ({error}); export the COLMAP model again") from error
 

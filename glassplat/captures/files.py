@@ -13,6 +13,7 @@ from glassplat.captures.capture import Capture, Loader, Shot
 from glassplat.captures.masks import IgnoredMask, MaskSet, Polarity, find_masks
 from glassplat.errors import InputError, UnknownFormatError, first_names
 from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
+from glassplat.files.records import is_encodable, readable_name
 from glassplat.files.writing import check_capture_folder
 
 LOADERS: tuple[tuple[Loader, str], ...] = (
@@ -75,6 +76,8 @@ def read_poses(root: Path | str) -> CaptureFiles:
         InputError: a format that is not known, or a capture that cannot be used; the message says why.
     """
     root = Path(root)
+    if not is_encodable(whole := str(root.resolve())):  # Runs record it.
+        raise InputError(f"the path {readable_name(whole)} is no UTF-8; rename the folders in it")
     capture = _load_capture(root)
     shots = tuple(sorted((*capture.shots, *(capture.test_shots or ())), key=lambda shot: shot.name))
     _check_names(shots)

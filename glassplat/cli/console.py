@@ -401,6 +401,8 @@ def no_such(what: str, word: str, known: Iterable[str], command: str) -> str:
     return f"there is no {what} {word!r}; {guess} {', '.join(known)}: see {command}"
 
 
+BOX = re.compile(r"\x1b\[[0-9;]*m|[│─╭╮╰╯]|-{5,}")
+"""What frames and colours tyro's messages."""
 NUMBERS = {"INT": "whole number", "FLOAT": "number"}
 """Of tyro's signs for what an option takes, those that it explains in Python's words."""
 NOT_A_NUMBER = re.compile(
@@ -408,10 +410,17 @@ NOT_A_NUMBER = re.compile(
 )
 
 
+def refused_options(said: str) -> str:
+    """tyro's message about a command line as one line, without its box, its title and its pointer to the help."""
+    title, _, text = BOX.sub("", said).strip().partition("\n")
+    text = " ".join(text.partition("For full helptext")[0].split()).removeprefix("Error parsing ")
+    text = re.sub(r"\.? \(required\)", ";", text).rstrip(".;")
+    return f"{text[:1].lower()}{text[1:]}" or title.strip()
+
+
 def wrong_number(said: str, arguments: Sequence[str]) -> str | None:
     """In place of tyro's message about an option that takes numbers, what it takes and what came; None for others."""
-    plain = " ".join(re.sub(r"\x1b\[[0-9;]*m|[│─╭╮╰╯]", "", said).split())
-    if (found := NOT_A_NUMBER.search(plain)) is None:
+    if (found := NOT_A_NUMBER.search(" ".join(BOX.sub("", said).split()))) is None:
         return None
     names = found[1].split("/")
     place = max((at for at, word in enumerate(arguments) if word.partition("=")[0] in names), default=-1)

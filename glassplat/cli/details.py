@@ -21,7 +21,6 @@ from glassplat.model.model import PLANES
 from glassplat.model.run_directory import RunDirectory, RunSettings
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.material import virtual_points
-from glassplat.prepare.preparation import PAGE, RECORD
 from glassplat.prepare.report_page import write_page
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
@@ -59,15 +58,7 @@ def remaining_parts(files: CaptureFiles) -> Iterator[Finding]:
 
 
 def write_capture_page(path: Path, target: Path) -> None:
-    """Writes the report of a prepared capture, with the panes that are marked in it.
-
-    Raises:
-        InputError: it is no such capture, or the file is somebody's.
-    """
-    if not (path / RECORD).is_file():
-        raise InputError(f"{path} was not made by `glassplat prepare`: there is no {RECORD} to report on")
-    if target.exists() and target.resolve() != (path / PAGE).resolve():
-        raise InputError(f"{target} exists; choose another name for --page")
+    """Writes the report of a prepared capture, with the panes that are marked in it."""
     dataset = load_dataset(path)
     marked = bool(dataset.pane_labels) or dataset.planes is not None
     write_page(path, target, fitted_planes(dataset, None, PlaneFit()) if marked else None)

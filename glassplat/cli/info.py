@@ -17,10 +17,10 @@ from glassplat.cli.console import count_noun, import_held, say, shell_word, warn
 from glassplat.errors import InputError, UnknownFormatError, first_names, input_checked
 from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
 from glassplat.files.records import Text, check_fields, read_json
-from glassplat.files.writing import SCENE, SPLAT_SUFFIXES, scene_source
+from glassplat.files.writing import SCENE, SPLAT_SUFFIXES, check_folder, scene_source
 from glassplat.model.run_directory import RunDirectory
 from glassplat.prepare.photographs import LEAST_SIDE, VIDEO_SUFFIXES, NoOpenCVError, broken_photographs, video_facts
-from glassplat.prepare.preparation import RECORD
+from glassplat.prepare.preparation import PAGE, RECORD
 
 KINDS = f"a capture, photographs, a video, a run, an exported scene, or a splat file ({', '.join(SPLAT_SUFFIXES)})"
 """What there is to be found."""
@@ -254,8 +254,15 @@ class Info:
     page: Path | None = None
 
     def ready(self) -> None:
-        """Refuses what is not known."""
+        """Refuses what is not known, and a page of what has no report or in the place of something else."""
         finder_of(self.path)
+        if self.page is None:
+            return
+        if not (self.path / RECORD).is_file():
+            raise InputError(f"{self.path} was not made by `glassplat prepare`: there is no {RECORD} to report on")
+        if self.page.exists() and self.page.resolve() != (self.path / PAGE).resolve():
+            raise InputError(f"{self.page} exists; choose another name for --page")
+        check_folder(self.page.parent)
 
     def run(self, console: Console) -> None:
         """Looks, and tells what is found as soon as it is."""

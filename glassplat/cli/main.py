@@ -76,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     141 when nobody reads the output any more.
 
     Raises:
-        SystemExit: after help (0) and after options that cannot be understood (2).
+        SystemExit: after help.
     """
     try:
         return run_guarded(sys.argv[1:] if arguments is None else list(arguments), is_program=arguments is None)
@@ -121,9 +121,7 @@ def run_to_exit_code(arguments: list[str], *, is_program: bool) -> int:
             run(command)
         except KeyboardInterrupt as stop:
             return report_interrupt(stop, command)
-        except SystemExit as end:
-            if is_training and end.code:
-                tell("error", "the options of the command cannot be understood", USAGE_CODE)
+        except SystemExit:
             raise
         except BrokenPipeError:
             console.drop_output()
@@ -146,7 +144,7 @@ def prepare_command(arguments: list[str]) -> Any:
     """The command that the arguments describe, once it has refused what it can and imported what it works with.
 
     Raises:
-        InputError, OSError: an option is out of range, there is nothing at a path, or something that must stay.
+        InputError, OSError: an option is none or out of range, there is nothing at a path, or something that must stay.
         SystemExit: as in `parse_arguments`.
     """
     command = parse_arguments(arguments)
@@ -158,8 +156,8 @@ def parse_arguments(arguments: list[str]) -> Any:
     """The command that the arguments describe.
 
     Raises:
-        InputError: an option is out of range.
-        SystemExit: they ask for help or the version, or cannot be understood.
+        InputError: there is no such command, or an option is none, missing or out of range.
+        SystemExit: they ask for help or the version.
     """
     import tyro
 
@@ -175,10 +173,10 @@ def parse_arguments(arguments: list[str]) -> Any:
         command = parse_options(name, arguments[1:])
         check_options(command)
         return command
-    if name and not name.startswith("-"):
+    complete = name.startswith("--tyro-")
+    if not complete and name not in ("-h", "--help"):
         raise InputError(no_such("command", name, COMMANDS, "glassplat --help"))
     # Nothing is left to run after the list of commands; only a shell's completions need to know every option.
-    complete = name.startswith("--tyro-")
     kinds = {known: command_line(known, [])[0] if complete else stub(known) for known in COMMANDS}
     tyro.cli(overview(kinds), prog="glassplat", description=DESCRIPTION, args=arguments, config=settings())
     raise SystemExit(USAGE_CODE)
@@ -195,12 +193,12 @@ def parse_options(name: str, arguments: list[str]) -> Any:
     """The command of this name that the arguments describe.
 
     Raises:
-        InputError: there is no such option or method, or a number is none.
-        SystemExit: they ask for help, something is missing, or a choice is none.
+        InputError: there is no such option or method, a value is none that it takes, or something is missing.
+        SystemExit: they ask for help.
     """
     import tyro
 
-    from glassplat.cli.console import message_console, say, wrong_number
+    from glassplat.cli.console import refused_options, wrong_number
 
     kind, options = command_line(name, arguments)
     said = StringIO()
@@ -210,12 +208,13 @@ def parse_options(name: str, arguments: list[str]) -> Any:
                 kind, prog=f"glassplat {name}", args=options, config=settings(), return_unknown_args=True
             )
     except SystemExit as end:
-        if wrong := wrong_number(said.getvalue(), options):
+        if not end.code:
+            raise
+        wrong, _, others = refused_options(said.getvalue()).partition("Unrecognized options: ")
+        unknown = others.split()
+        if not unknown:
+            wrong = wrong_number(said.getvalue(), options) or wrong
             raise InputError(f"{wrong}; {pointer(name, options)}") from None
-        sys.stderr.write(said.getvalue())
-        if end.code and name == "train":
-            say(message_console(stderr=True), pointer(name, options))
-        raise
     if unknown:
         raise InputError(unknown_option(name, options, unknown))
     return command

@@ -22,7 +22,7 @@ from glassplat.cli.console import import_now, message_console, no_such, say
 from glassplat.cli.places import check_targets
 from glassplat.errors import InputError, input_checked
 from glassplat.files.records import read_text
-from glassplat.files.writing import check_folder
+from glassplat.files.writing import check_folder, real_path
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.recipe import RECIPES, Preset, Recipe, recipe_from_json, recipe_of
@@ -75,6 +75,8 @@ class Train(Generic[RecipeKind]):
         Raises:
             InputError: among others, the run is too short for its stages.
         """
+        if real_path(self.output) == real_path(self.data):
+            raise InputError(f"{self.output} is the capture itself; choose another folder for --output")
         check_output(RunDirectory(self.output), resume=self.resume)
         say(message_console(), self.files)
         import_now("glassplat.cli.runs")

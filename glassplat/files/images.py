@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import struct
 import unicodedata
 import warnings
 from collections import Counter
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageCms
+from PIL import ExifTags, Image, ImageCms
 
 from glassplat.files.writing import atomic_write
 
@@ -178,9 +179,10 @@ NEARLY_SRGB = 1
 def in_srgb(image: Image.Image) -> Image.Image:
     """The image in eight bits, with the colours that its embedded profile says, in sRGB.
 
-    One without a profile, with that of sRGB, or with one that is broken or for other pixels stays as it is.
+    Without a profile, cameras say by their tags alone that it is Adobe RGB. One that says nothing, has the profile of
+    sRGB, or one that is broken or for other pixels stays as it is.
     """
-    profile = image.info.get("icc_profile")
+    profile = image.info.get("icc_profile") or (adobe_rgb_profile() if _is_adobe_rgb(image) else None)
     image = _in_eight_bits(image)
     known = _to_srgb(profile) if profile and isinstance(profile, bytes) else None
     own = "CMYK" if image.mode == "CMYK" else "L" if image.mode in ("1", "L", "LA") else "RGB"
@@ -191,6 +193,37 @@ def in_srgb(image: Image.Image) -> Image.Image:
     if image.has_transparency_data:
         converted.putalpha(image.convert("RGBA").getchannel("A"))
     return converted
+
+
+def _is_adobe_rgb(image: Image.Image) -> bool:
+    """Return whether the EXIF tags say so, in the way of DCF 2.0."""
+    try:
+        return bool(image.getexif().get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex) == "R03")
+    except Exception:  # noqa: BLE001 - Damaged tags raise whatever they lead to, and are no reason to refuse a picture.
+        return False
+
+
+ADOBE_GAMMA = 2.19921875
+ADOBE_PRIMARIES = {
+    b"rXYZ": (0.60974, 0.31111, 0.01947),
+    b"gXYZ": (0.20528, 0.62567, 0.06087),
+    b"bXYZ": (0.14919, 0.06322, 0.74457),
+}
+"""Under D50, as the profile of Adobe RGB (1998) has them."""
+
+
+@cache
+def adobe_rgb_profile() -> bytes:
+    """The profile of Adobe RGB (1998): that of sRGB with other primaries, and a power for its curve."""
+    profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    (count,) = struct.unpack_from(">I", profile, 128)
+    for index in range(count):
+        tag, offset, _ = struct.unpack_from(">4sII", profile, 132 + 12 * index)
+        if tag in ADOBE_PRIMARIES:
+            struct.pack_into(">3i", profile, offset + 8, *(round(65536 * value) for value in ADOBE_PRIMARIES[tag]))
+        elif tag.endswith(b"TRC"):
+            struct.pack_into(">4sIHH5i", profile, offset, b"para", 0, 3, 0, round(65536 * ADOBE_GAMMA), 65536, 0, 0, 0)
+    return bytes(profile)
 
 
 @lru_cache(maxsize=8)

@@ -135,6 +135,11 @@ def is_encodable(text: str) -> bool:
     return text.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
+def readable_name(path: Path | str) -> str:
+    """A path as text that JSON may hold; bytes that are none stand there as hexadecimal numbers."""
+    return os.fsencode(path).decode("utf-8", "backslashreplace")
+
+
 def _too_deep(where: str) -> str:
     return f"{where} is nested more than {DEEPEST} levels deep; expected a file that such a program wrote"
 

@@ -9,6 +9,7 @@ turn it.
 
 from __future__ import annotations
 
+import logging
 import struct
 import zlib
 from dataclasses import replace
@@ -25,6 +26,8 @@ from glassplat.files.ply import as_numpy, as_tensor
 from glassplat.files.records import reading
 from glassplat.files.writing import atomic_write
 from glassplat.scene.gaussians import Gaussians, half_turned
+
+log = logging.getLogger(__name__)
 
 Bytes = NDArray[np.uint8]
 
@@ -189,7 +192,7 @@ def write_spz(path: Path | str, gaussians: Gaussians, version: int = 3) -> None:
         version: 3 or 4.
 
     Raises:
-        ValueError: another version, no colours, or a value that is not finite.
+        ValueError: another version, no colours, a value that is not finite, or a position that is too far away.
     """
     data = spz_bytes(gaussians, version)
     with atomic_write(path) as temporary:
@@ -205,8 +208,22 @@ def spz_bytes(gaussians: Gaussians, version: int = 3) -> bytes:
     broken = [name for name, tensor in gaussians.tensors().items() if not bool(tensor.isfinite().all())]
     if broken:
         raise ValueError(f"Gaussians whose {', '.join(broken)} are not all finite cannot be written as SPZ")
+    farthest = float(gaussians.means.abs().max()) if len(gaussians) else 0.0
+    if farthest > LARGEST_POSITION:
+        raise ValueError(
+            f"a Gaussian lies {farthest:.3g} units from the origin, and SPZ ends at {LARGEST_POSITION}; take it out "
+            "with `glassplat clean`, or write another format"
+        )
     gaussians = replace(gaussians, sh=gaussians.sh[:, : (gaussians.active_sh_degree + 1) ** 2])
     layout = Layout(version, len(gaussians), gaussians.max_sh_degree, fractional_bits_for(gaussians.means))
+    step = 2.0**-layout.fractional_bits
+    if len(gaussians) and step > float(gaussians.log_scales.amax(dim=1).median().exp()):
+        log.warning(
+            "SPZ rounds positions to %g units, which is more than half of the Gaussians measure, because one lies %.3g "
+            "units from the origin; take it out with `glassplat clean`, or write another format",
+            step,
+            farthest,
+        )
     sections = [section.tobytes() for section in packed_sections(gaussians, layout)]
     head = (MAGIC, version, layout.number, layout.degree, layout.fractional_bits, 0)
     if version == 4:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import importlib
 import math
-import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,7 +18,7 @@ from PIL import ExifTags, Image, ImageOps
 
 from glassplat.errors import InputError, first_names
 from glassplat.files import images
-from glassplat.files.records import reading
+from glassplat.files.records import readable_name, reading
 from glassplat.training.messages import Working
 
 
@@ -107,9 +106,8 @@ def file_states(source: Path) -> dict[str, list[int]]:
     folder, paths = (source.parent, [source]) if source.is_file() else (source, _photograph_paths(source))
     found = {}
     for path in paths:
-        name = os.fsencode(path.relative_to(folder)).decode("utf-8", "backslashreplace")
         state = path.stat()
-        found[name] = [state.st_size, state.st_mtime_ns]
+        found[readable_name(path.relative_to(folder))] = [state.st_size, state.st_mtime_ns]
     return found
 
 

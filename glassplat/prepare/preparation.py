@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 from glassplat import __version__
 from glassplat.captures.colmap_library import quiet_pycolmap
 from glassplat.errors import InputError, first_names
-from glassplat.files.records import read_json
+from glassplat.files.records import read_json, readable_name
 from glassplat.files.writing import atomic_write, check_folder, make_folder, missing_folders, real_path, remove_empty
 from glassplat.prepare.photographs import (
     FEWEST,
@@ -227,13 +227,13 @@ class Report:
 def report_of(solution: Solution) -> Report:
     """The figures of a solution; one without any model has zeros."""
     photographs = solution.database.photographs
-    missing = solution.missing()
+    missing = [readable_name(one.path.name) for one in solution.missing()]
     model = solution.models[0] if solution.models else None
     features = int(np.median(solution.database.feature_counts()))
     figures = Report(
         photographs=len(photographs),
         registered=solution.registered,
-        missing=tuple(one.path.name for one in missing),
+        missing=tuple(missing),
         groups=_groups(solution),
         points=int(model.num_points3D()) if model else 0,
         reprojection_error=float(model.compute_mean_reprojection_error()) if model else 0.0,
@@ -269,12 +269,12 @@ def _describe_lenses(model: Any) -> list[str]:
     ]
 
 
-def _advice(figures: Report, missing: Sequence[Photograph], solution: Solution) -> list[str]:
+def _advice(figures: Report, missing: list[str], solution: Solution) -> list[str]:
     advice = []
     if missing:
         advice.append(
-            f"photograph once more around {first_names([one.path.name for one in missing], 3)}: steps of half a metre, "
-            "each picture sharing two thirds with the one before, and some that show what stands next to the glass"
+            f"photograph once more around {first_names(missing, 3)}: steps of half a metre, each picture sharing two "
+            "thirds with the one before, and some that show what stands next to the glass"
         )
     if len(figures.groups) > 1:
         advice.append(
@@ -324,7 +324,8 @@ class Preparation:
     def record(self) -> dict[str, Any]:
         """Inputs on which the work depends: an interrupted one goes on with the same only."""
         placing = {"lens": self.settings.lens, "mapper": self.settings.mapper}
-        return {"input": str(real_path(self.source)), "max-size": self.max_size, "frames": self.frames, **placing}
+        source = readable_name(real_path(self.source))
+        return {"input": source, "max-size": self.max_size, "frames": self.frames, **placing}
 
 
 def prepare(task: Preparation, listen: Listener, *, resume: bool = False, force: bool = False) -> Report:

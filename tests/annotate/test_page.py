@@ -233,6 +233,24 @@ def test_undo_gives_up_a_line_before_it_takes_back_marks(page: Page) -> None:
     assert complaints(page) == []
 
 
+@pytest.mark.parametrize("switch", ["Tab", "Control+z", "remove"])
+def test_a_line_does_not_go_over_to_another_pane(switch: str, page: Page) -> None:
+    """However the pane changes; a line that undo has given up is not there to be drawn on either."""
+    page.mark_true(0)
+    page.window.keys("a")
+    page.window.keys("3")
+    for place in page.on_screen(true_corners(0)[:3]):
+        page.window.click(*place)
+    if switch == "remove":
+        page.window.press(".pane.active h2 button")
+    else:
+        page.window.keys(*switch.split("+"))
+    page.window.keys("Enter")
+    page.saved()
+    panes = json.loads((page.root / "annotations.json").read_text())["panes"]
+    assert [pane["strokes"] for pane in panes] == [{}] * len(panes)
+
+
 def test_a_zoomed_photograph_stays_where_it_is_while_the_header_grows(page: Page) -> None:
     def marks() -> list[int]:
         return [len(places) for places in page.document()["corners"]]
@@ -349,6 +367,8 @@ def test_done_ends_the_command(page: Page) -> None:
     page.window.press("#close")
     page.window.wait("document.body.dataset.state === 'closed'", "the end")
     assert page.server.is_finished
+    for key in ("Enter", "Tab", "a", "0", "Right", "]"):
+        page.window.keys(key)
     page.window.evaluate("new Promise((next) => setTimeout(next, 300))")
     assert complaints(page) == []
     text = "const text = document.createRange(); text.selectNodeContents(document.body.firstElementChild);"

@@ -191,6 +191,15 @@ def test_a_record_of_earlier_versions_tells_of_masks_only(room: Path) -> None:
     assert not (room / "panes").exists() and (room / "planes.json").exists()
 
 
+def test_what_another_program_has_saved_is_what_is_written(room: Path) -> None:
+    session = opened_session(room)
+    saved(session, marked_document())
+    (room / "annotations.json").write_text(json.dumps(marked_document((0, 1, 2, 3))))
+    assert session.finish()["masks"] == NAMES[:4]
+    (room / "annotations.json").unlink()
+    assert session.finish()["told"].startswith("no pane is marked; removed what was written")
+
+
 def test_without_a_pane_nothing_is_written(room: Path) -> None:
     with pytest.raises(InputError, match="no pane is known yet"):
         finish(room, marked_document((0,)))

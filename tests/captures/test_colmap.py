@@ -191,6 +191,14 @@ def test_damaged_text_is_named(capture, name: str, line: str, message: str) -> N
         load_dataset(capture.root)
 
 
+@pytest.mark.parametrize("binary", [True, False])
+def test_a_name_that_is_no_utf8_is_shown(capture, *, binary: bool) -> None:
+    path = next(capture.write_colmap(binary=binary).glob("images.*"))
+    path.write_bytes(path.read_bytes().replace(b"0002.png", b"caf\xe9.png"))
+    with pytest.raises(InputError, match=r"images\.(bin|txt) holds the name b'caf\\xe9\.png', which is no UTF-8;"):
+        load_dataset(capture.root)
+
+
 def test_points_that_are_not_finite_are_left_out(capture) -> None:
     path = capture.write_colmap(binary=False) / "points3D.txt"
     path.write_text(path.read_text() + "99 nan 0 0 1 2 3 0\n")

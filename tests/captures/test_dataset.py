@@ -24,6 +24,11 @@ def test_every_eighth_image_by_name_is_held_out(capture) -> None:
     assert data.split == "every 8th image by name"
 
 
+def test_a_path_that_no_run_can_record_is_refused(capture) -> None:
+    with pytest.raises(InputError, match=r"caf.* is no UTF-8; rename"):
+        load_dataset(capture.root / "caf\udce9")
+
+
 def test_extent_is_the_radius_of_the_training_cameras(capture) -> None:
     capture.write_colmap()
     data = load_dataset(capture.root)

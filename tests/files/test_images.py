@@ -9,7 +9,7 @@ import numpy as np
 import PIL
 import pytest
 import torch
-from PIL import Image
+from PIL import ExifTags, Image
 
 from glassplat.files.images import (
     image_size,
@@ -151,6 +151,14 @@ def test_colours_of_another_profile_become_srgb(tmp_path: Path, mode: str) -> No
     expected = [*IN_SRGB, 7] if mode == "RGBA" else list(IN_SRGB)
     np.testing.assert_allclose(read_colors(tmp_path / "a.png")[2, 3], expected, atol=1)
     assert read_image(tmp_path / "a.png")[2, 3, :3].tolist() == list(IN_P3)
+
+
+@pytest.mark.parametrize(("index", "expected"), [("R03", (230, 79, 56)), ("R98", (200, 80, 60))])
+def test_adobe_rgb_that_only_tags_tell_of_becomes_srgb(tmp_path: Path, index: str, expected: tuple) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.IFD.Interop] = {ExifTags.Interop.InteropIndex: index}
+    Image.new("RGB", (16, 16), (200, 80, 60)).save(tmp_path / "a.jpg", quality=100, subsampling=0, exif=exif)
+    np.testing.assert_allclose(read_colors(tmp_path / "a.jpg")[3, 3], expected, atol=2)
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "I;16"])

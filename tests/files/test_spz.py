@@ -133,6 +133,7 @@ def test_no_gaussians_at_all(tmp_path: Path) -> None:
         ({"version": 5}, "version 5"),
         ({"sh": torch.zeros(50, 0, 3)}, "colours"),
         ({"means": torch.full((50, 3), torch.nan)}, "means"),
+        ({"means": torch.full((50, 3), -9e6)}, r"9e\+06 units from the origin, and SPZ ends at 8388607"),
     ],
 )
 def test_what_cannot_be_written_is_refused(change: dict, words: str, tmp_path: Path) -> None:
@@ -141,6 +142,15 @@ def test_what_cannot_be_written_is_refused(change: dict, words: str, tmp_path: P
     with pytest.raises(ValueError, match=words):
         write_spz(tmp_path / "a.spz", gaussians, version)
     assert not (tmp_path / "a.spz").exists()
+
+
+def test_positions_that_are_rounded_by_more_than_a_gaussian_are_told_of(caplog: pytest.LogCaptureFixture) -> None:
+    far = typical().means.clone()
+    spz_bytes(typical())
+    assert not caplog.messages
+    far[0, 1] = 1e5
+    spz_bytes(typical().with_tensors({"means": far, "log_scales": torch.full((50, 3), -5.0)}))
+    assert "rounds positions to 0.015625 units" in caplog.text and "lies 1e+05 units from" in caplog.text
 
 
 def streamed(count: int, table: list[tuple[int, int]], body: bytes = b"", offset: int = STREAMED_HEADER.size) -> bytes:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import json
+import os
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +14,9 @@ import pytest
 from rich.console import Console
 
 from glassplat.cli.capture import Prepare
+from glassplat.files.records import read_json
 from glassplat.prepare.photographs import Photograph
-from glassplat.prepare.preparation import report_of
+from glassplat.prepare.preparation import Preparation, report_of
 from glassplat.prepare.reconstruction import Solution
 
 
@@ -69,6 +73,17 @@ class FakeModel:
 
 def report(models: list[Any], *, count: int = 10, features: int = 3000) -> Any:
     return report_of(Solution(FakeDatabase(count, features), models, "the usual settings", 1))  # type: ignore[arg-type]
+
+
+def test_names_that_are_no_text_can_be_read_again(tmp_path: Path) -> None:
+    solution = Solution(FakeDatabase(4, 3000), [FakeModel(range(3))], "", 1)  # type: ignore[arg-type]
+    folder = tmp_path / os.fsdecode(b"caf\xe9")
+    solution.database.photographs[3] = Photograph(folder / os.fsdecode(b"\xe9.jpg"), "_.jpg", 640, 480, "", None)
+    record = {"report": asdict(report_of(solution)), **Preparation(folder, tmp_path).record()}
+    (tmp_path / "record.json").write_text(json.dumps(record))
+    found = read_json(tmp_path / "record.json")
+    assert found["report"]["missing"] == [r"\xe9.jpg"] and found["input"].endswith(r"caf\xe9")
+    assert r"once more around \xe9.jpg" in found["report"]["advice"][0]
 
 
 def test_a_good_preparation_needs_no_advice() -> None:

@@ -90,13 +90,15 @@ def test_without_points_none_is_behind_panes() -> None:
 def test_a_foreign_file_is_not_overwritten(capture: Path, tmp_path: Path) -> None:
     target = tmp_path / "mine.html"
     target.write_text("mine")
-    assert main(["info", str(capture), "--page", str(target)]) == 2
+    for page in (target, target / "page.html", tmp_path):
+        assert main(["info", str(capture), "--page", str(page)]) == 2
     assert target.read_text() == "mine"
 
 
 def test_a_capture_of_others_has_no_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", str(SCENE), "--page", str(tmp_path / "page.html")]) == 2
-    assert "was not made by `glassplat prepare`" in capsys.readouterr().err
+    told = capsys.readouterr()
+    assert "was not made by `glassplat prepare`" in told.err and not told.out, "before it is looked through"
     assert not (tmp_path / "page.html").exists()
 
 

@@ -19,6 +19,7 @@ let current = 0, tool = "corner", radius = 20, pending = null, drag = null, poin
 let skipped = { corner: new Set(), edge: new Set() }; // In this photograph: what is not to be seen in it.
 let answers = {}, sending = false, waiting = false, saveTimer = null, spaceHeld = false;
 let revision = 0; // Counts changes.
+let shownPane = null; // The pane that a line being drawn, and what is skipped, belong to.
 const images = new Map();
 
 async function ask(path, body) {
@@ -30,6 +31,7 @@ async function ask(path, body) {
 }
 
 function tell(text, isBad = false) {
+  if (document.body.dataset.state === "closed") return; // Its place is gone.
   element("status").textContent = text;
   element("status").className = isBad ? "bad" : "";
 }
@@ -81,6 +83,7 @@ function takeOver(answer, message) {
 }
 
 function refresh() {
+  if (shownPane !== marking.active) { shownPane = marking.active; pending = drag = null; unskip(); }
   drawViews();
   drawPanes();
   element("undo").disabled = !marking.done.length;
@@ -160,7 +163,7 @@ function drawPanes() {
     remove.addEventListener("click", (event) => { event.stopPropagation(); marking.removePane(pane.label); });
     const card = make("div", { className: `pane ${pane.label === marking.active ? "active" : ""}` },
       make("h2", {}, swatch, `pane ${pane.label}`, remove), choice(pane, "material", ["glass", "mirror", "screen"]), " ", choice(pane, "shape", ["rectangle", "polygon"]));
-    card.addEventListener("click", () => { if (marking.active !== pane.label) { marking.active = pane.label; unskip(); refresh(); } });
+    card.addEventListener("click", () => { if (marking.active !== pane.label) { marking.active = pane.label; refresh(); } });
     for (const [text, kind] of judgement(answer)) card.append(make("p", { textContent: text, className: kind }));
     return card;
   }));
@@ -308,7 +311,6 @@ function nextPane() {
   const labels = marking.document.panes.map((pane) => pane.label);
   if (!labels.length) return;
   marking.active = labels[(labels.indexOf(marking.active) + 1) % labels.length];
-  unskip();
   refresh();
 }
 
@@ -316,7 +318,7 @@ const KEYS = {
   ArrowLeft: () => show(current - 1),
   ArrowRight: () => show(current + 1),
   s: () => { const next = suggested()[0]; if (next) show(next.view); },
-  a: () => { marking.addPane(); unskip(); refresh(); },
+  a: () => marking.addPane(),
   n: skip,
   0: () => { drawing.fit(); draw(); },
   1: () => choose("corner"),
@@ -368,7 +370,7 @@ async function write() {
 // Resolves when the server knows everything; an error if it refuses that once more.
 async function settled() {
   if (document.body.dataset.state === "failed") await send();
-  while (document.body.dataset.state === "changed" || sending) await new Promise((next) => setTimeout(next, 50));
+  while (document.body.dataset.state === "changed" || document.body.dataset.grab === "looking" || sending) await new Promise((next) => setTimeout(next, 50));
   if (document.body.dataset.state === "failed") throw new Error(element("status").textContent);
 }
 
@@ -383,6 +385,7 @@ async function close() {
     return;
   }
   resized.disconnect();
+  window.removeEventListener("keydown", keyed);
   document.body.replaceChildren(make("p", { textContent: "Saved. The command has ended; this page can be closed." }));
   document.body.dataset.state = "closed";
 }

@@ -62,6 +62,7 @@ def test_a_planar_frame_waits_for_two_lists_and_for_which_panes_it_shows(waits: 
         waits.places.clear()
         with waits, torch.no_grad():
             Planar()(scene, view.camera)
+    assert {"panes_in_camera", "mirrored_views"} <= waits.asked
     assert sorted(place.partition(":")[0] for place in waits.places) == [
         "kernel bin_tiles",
         "kernel bin_tiles",

@@ -10,11 +10,13 @@ from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from glassplat.kernels.backend import devices
 from glassplat.scene import camera
+from glassplat.scene.panes import Planes
 from glassplat.training import densify
 from tests.kernels.test_screen_statistics import add_views_in_torch
 
@@ -30,11 +32,12 @@ KERNEL_WAITS = {"bin_tiles": 1, "trace_gradients": 1}
 
 
 class Waits(TorchDispatchMode):
-    """Notes where the package would wait for a GPU, or copy numbers to it and wait for that."""
+    """Notes where the package would wait for a GPU, or copy numbers to it and wait for that; and which kernels run."""
 
     def __init__(self) -> None:
         super().__init__()
         self.places: list[str] = []
+        self.asked: set[str] = set()
         self.pauses = 0
         self.reads = Reads(self)
 
@@ -92,24 +95,54 @@ class Reads(TorchFunctionMode):
             return function(*args, **(kwargs or {}))
 
 
+def mirrored_views(centers: Tensor, raw_normals: Tensor, pose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """As the kernel of that name, which there is for GPUs only."""
+    normals = torch.nn.functional.normalize(raw_normals, dim=1)
+    eye = -pose[:3, :3].T @ pose[:3, 3]
+    facing = normals * ((eye - centers) * normals).sum(1, keepdim=True).sign()
+    half_spaces = torch.cat([facing, -(facing * centers).sum(1, keepdim=True)], dim=1)
+    return pose @ camera.mirror_matrices(centers, normals), normals @ pose[:3, :3].T, half_spaces
+
+
+def mirrored_views_gradients(*tensors: Tensor) -> tuple[Tensor, ...]:
+    *inputs, v_poses, v_normals = tensors
+    with torch.enable_grad():
+        leaves = [tensor.clone().requires_grad_() for tensor in inputs]
+        return torch.autograd.grad(mirrored_views(*leaves)[:2], leaves, [v_poses, v_normals])
+
+
+def panes_in_camera(
+    centers: Tensor, raw_normals: Tensor, tangents: Tensor, pose: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As the kernel of that name."""
+    rest = centers[:, 0], tangents, centers[:, :2], tuple(range(1, 1 + len(centers)))
+    planes, rotation = Planes(centers, raw_normals, *rest), pose[:3, :3]
+    return centers @ rotation.T + pose[:3, 3], planes.normals @ rotation.T, torch.stack(planes.axes(), 1) @ rotation.T
+
+
+GPU_ONLY = {"panes": (mirrored_views, mirrored_views_gradients, panes_in_camera)}
+
+
 def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch, waits: Waits) -> None:
     """Lets the program choose as on a GPU, count for its kernels what theirs do, and copy without waiting."""
     module_of = devices._module
 
     def counted(operation: str, folder: str) -> SimpleNamespace:
-        module = module_of(operation, folder)
+        known = {**vars(module_of(operation, folder)), **{one.__name__: one for one in GPU_ONLY.get(operation, ())}}
 
         def run(name: str) -> Callable[..., Any]:
             def call(*args: Any, **kwargs: Any) -> Any:
+                waits.asked.add(name)
                 waits.places += [f"kernel {name}"] * KERNEL_WAITS.get(name, 0)
                 with waits.paused():
-                    return getattr(module, name)(*args, **kwargs)
+                    return known[name](*args, **kwargs)
 
             return call
 
-        return SimpleNamespace(**{name: run(name) for name, value in vars(module).items() if callable(value)})
+        return SimpleNamespace(**{name: run(name) for name, value in known.items() if callable(value)})
 
     monkeypatch.setattr(devices, "_module", counted)
     # Its kernel is not asked for on a CPU.
     monkeypatch.setattr(densify, "add_views", add_views_in_torch)
-    monkeypatch.setattr(camera, "waits", lambda device: True)
+    # The function itself, as others import it by its name.
+    monkeypatch.setattr(camera.waits, "__code__", (lambda device: True).__code__)
