@@ -49,12 +49,16 @@ def torchrun(count: int, *arguments: str, timeout: float = 240) -> subprocess.Co
 
 
 def main() -> None:
-    """Trains as one of the ranks."""
-    name, iterations, folder = sys.argv[1:]
+    """Trains as one of the ranks, once for each `NAME:ITERATIONS`: processes that start take longer than this."""
+    *trainings, root = sys.argv[1:]
     ranks = join()
-    state, messages = trained(name, ranks, int(iterations))
-    save_checkpoint(Path(folder) / f"{ranks.rank}.safetensors", state)
-    (Path(folder) / f"{ranks.rank}.json").write_text(json.dumps(losses_of(messages)))
+    for training in trainings:
+        name, iterations = training.split(":")
+        state, messages = trained(name, ranks, int(iterations))
+        folder = Path(root) / f"{name}_{iterations}"
+        folder.mkdir(exist_ok=True)
+        save_checkpoint(folder / f"{ranks.rank}.safetensors", state)
+        (folder / f"{ranks.rank}.json").write_text(json.dumps(losses_of(messages)))
 
 
 if __name__ == "__main__":

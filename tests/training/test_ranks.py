@@ -10,8 +10,9 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -107,15 +108,31 @@ def said(done: subprocess.CompletedProcess[str]) -> list[str]:
     return [line for line in done.stderr.splitlines() if line.startswith(("error:", "stopped:", "usage:"))]
 
 
+@pytest.fixture(scope="module")
+def trained_by(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Path]:
+    """A function that gives the folder of what so many ranks have learned, a folder for each training."""
+
+    @cache
+    def folder_of(count: int) -> Path:
+        folder = tmp_path_factory.mktemp(f"{count}_ranks")
+        trainings = [f"planar:{ITERATIONS}", f"planar:{count}", *([f"mcmc:{ITERATIONS}"] if count == 2 else [])]
+        done = torchrun(count, "tests.training.rank_process", *trainings, str(folder))
+        assert done.returncode == 0, done.stderr
+        return folder
+
+    return folder_of
+
+
 @pytest.mark.parametrize(("name", "count"), [("planar", 2), ("planar", 3), ("mcmc", 2)])
-def test_ranks_agree_with_one_process_that_accumulates_their_views(name: str, count: int, tmp_path: Path) -> None:
-    done = torchrun(count, "tests.training.rank_process", name, str(ITERATIONS), str(tmp_path))
-    assert done.returncode == 0, done.stderr
-    first, *others = (load_checkpoint(tmp_path / f"{rank}.safetensors") for rank in range(count))
+def test_ranks_agree_with_one_process_that_accumulates_their_views(
+    name: str, count: int, trained_by: Callable[[int], Path]
+) -> None:
+    folder = trained_by(count) / f"{name}_{ITERATIONS}"
+    first, *others = (load_checkpoint(folder / f"{rank}.safetensors") for rank in range(count))
     alone, messages = trained(name, Ranks(batch=count), ITERATIONS)
     assert any(isinstance(message, ActionDone) for message in messages)
     assert first.step == alone.step == ITERATIONS
-    losses = [json.loads((tmp_path / f"{rank}.json").read_text()) for rank in range(count)]
+    losses = [json.loads((folder / f"{rank}.json").read_text()) for rank in range(count)]
     assert losses[0] == pytest.approx(losses_of(messages), rel=2e-3)
     assert all(of_rank == losses[0] for of_rank in losses)
     for tensor_name, expected in alone.scene.parameters().items():
@@ -129,11 +146,9 @@ def test_ranks_agree_with_one_process_that_accumulates_their_views(name: str, co
 
 
 @pytest.mark.parametrize("count", [2, 3])
-def test_gradients_of_ranks_are_the_means_over_their_views(count: int, tmp_path: Path) -> None:
+def test_gradients_of_ranks_are_the_means_over_their_views(count: int, trained_by: Callable[[int], Path]) -> None:
     """Moments are linear in the gradients; Adam makes a whole step of a gradient that is rounding alone."""
-    done = torchrun(count, "tests.training.rank_process", "planar", str(count), str(tmp_path))
-    assert done.returncode == 0, done.stderr
-    found = load_checkpoint(tmp_path / "0.safetensors").optimizer
+    found = load_checkpoint(trained_by(count) / f"planar_{count}" / "0.safetensors").optimizer
     expected = trained("planar", Ranks(batch=count), count)[0].optimizer
     assert found.updates == expected.updates
     for name, (first, _) in expected.moments.items():

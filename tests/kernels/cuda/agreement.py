@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,9 +12,10 @@ from torch import Tensor
 from glassplat.kernels.backend.devices import SIMULATED, cuda_problem
 from tests.kernels.gaussians_and_cameras import draw
 
-if SIMULATED and hasattr(os, "sched_setaffinity"):
-    # The simulator has a Python thread for each of CUDA's; on several cores they fight over the interpreter.
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+if SIMULATED:
+    from tests.kernels.cuda.taking_turns import take_turns
+
+    take_turns()
 
 DEVICE = torch.device("cpu" if SIMULATED else "cuda")
 DTYPES = [torch.float64, torch.float32]

@@ -47,7 +47,7 @@ from tests.kernels.test_screen_statistics import add_views_in_torch
 on_a_device_or_skipped()
 
 pytestmark = [
-    # The simulator computes with NumPy's scalars, which warn where a GPU gives infinity, and in threads.
+    # The simulator computes with NumPy's scalars, which warn where a GPU gives infinity.
     pytest.mark.filterwarnings("ignore::RuntimeWarning"),
 ]
 
@@ -246,7 +246,7 @@ def check_composite(splats: Splats, glass: int, mean: bool | None, size: Size) -
     ("mean", "dtype", "size"),
     [
         (None, torch.float64, (WIDTH, HEIGHT)),
-        # In the simulator every row of a tile takes a second.
+        # Few rows are enough for the simulator.
         (True, torch.float64, (19, 2)),
         (False, torch.float32, (18, 2)),
     ]
