@@ -77,7 +77,6 @@ REASONS: dict[str, dict[str, str]] = {
         "moving_mean": "Gaussians move towards the mean depth; the mean itself is not pulled towards stray ones.",
         "perturbation.stop": "What was perturbed has time to settle.",
         "perturbation.bounds": "Opacities that were lowered by mistake can recover.",
-        "early_growth": "Early Gaussians build the reflected room behind the pane (MCMC).",
         "early_resets": "Planes are fitted to transparent Gaussians otherwise: -1.1 dB.",
         "densify_by": "Things are small in a mirror and need no splitting.",
     },

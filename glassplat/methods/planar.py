@@ -410,7 +410,7 @@ def first_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
         )
     if dataset.measured_points:
         fitted_planes(dataset, None, recipe.plane_fit)
-    scene = Scene(planar_population(recipe).initial(dataset.points, recipe.sh_degree), dataset.extent)
+    scene = Scene(population_of(recipe).initial(dataset.points, recipe.sh_degree), dataset.extent)
     return corrections_begun(recipe, scene, dataset)
 
 
@@ -437,7 +437,7 @@ def finished_renderer(recipe: PlanarRecipe) -> Planar:
 def stages_of(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
     """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
     first, second, third = recipe.stage_shares
-    population = planar_population(recipe)
+    population = population_of(recipe)
     setup = PaneSetup(
         recipe.plane_fit,
         recipe.glass_count,
@@ -482,7 +482,7 @@ def plane_rates(factor: float = 1.0) -> dict[str, Rate]:
 
 def _adjustment(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> Stage:
     """Stage 2: the reflection's gradient reaches the planes, not the Gaussians."""
-    population = planar_population(recipe)
+    population = population_of(recipe)
     return Stage(
         name="2 plane adjustment",
         share=share,
@@ -495,7 +495,6 @@ def _adjustment(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> Stage:
             Densify(recipe.densify, part="glass"),
             *_missing(recipe, recipe.stage_shares[0] / sum(recipe.stage_shares) + ADJUSTED_AFTER),
             *_early_resets(recipe, population),
-            *_clearing(recipe),
         ),
         post_steps=(*_glass_post_steps(recipe), *population.post_steps),
         setup=setup,
@@ -505,7 +504,7 @@ def _adjustment(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> Stage:
 
 def _joint(recipe: PlanarRecipe, share: float) -> Stage:
     """Stage 3: everything learns, opacities are perturbed, planes move slowly."""
-    population = planar_population(recipe)
+    population = population_of(recipe)
     perturb_at = Every(
         recipe.intervals.opacity, 0.0, recipe.perturbation.stop, recipe.intervals.least, skip_multiples_of=3
     )
@@ -548,12 +547,6 @@ def _joint_terms(recipe: PlanarRecipe, population: Population) -> tuple[LossTerm
     return (image_term(recipe.ssim_weight), *reflection_terms(recipe), *glass, *population.terms)
 
 
-def planar_population(recipe: PlanarRecipe) -> Population:
-    """Contribution of the strategy to every stage; under `mcmc` the set grows late unless the recipe says otherwise."""
-    start = recipe.mcmc.start if recipe.early_growth else max(recipe.mcmc.start, _joint_start(recipe))
-    return population_of(recipe, replace(recipe.mcmc, start=start))
-
-
 def _early_resets(recipe: PlanarRecipe, population: Population) -> tuple[ResetOpacity, ...]:
     """The resets of the first two stages, if there are to be any."""
     return population.resets if recipe.early_resets else ()
@@ -570,16 +563,21 @@ looked for: as soon as it is known where panes are, behind which nothing is to b
 
 
 def _missing(recipe: PlanarRecipe, moment: float) -> tuple[SeedUnexplained, ...]:
-    """The search for what is missing, if there is to be any; not under `mcmc`, which moves its own."""
-    wanted = recipe.seed_unexplained and recipe.strategy == "default"
-    return (SeedUnexplained(moment, finished_renderer(recipe)),) if wanted else ()
+    """The search for what is missing, if there is to be any."""
+    return (SeedUnexplained(moment, finished_renderer(recipe)),) if recipe.seed_unexplained else ()
+
+
+CLEARED_AFTER = 0.02
+"""Share of a run after the beginning of joint optimisation at which `mcmc` resets opacities: reflections behind glass,
+which are looked for by what hides them, have been turned round by then."""
 
 
 def _clearing(recipe: PlanarRecipe) -> tuple[ResetOpacity, ...]:
-    """The one reset under `mcmc`, where joint optimisation begins; `default` has its own."""
+    """The one reset under `mcmc`; `default` has its own."""
+    moment = _joint_start(recipe) + CLEARED_AFTER
     # A second one would come after the stop.
-    once = Every(_joint_start(recipe), stop=1.5 * _joint_start(recipe))
-    return (ResetOpacity(once),) if recipe.strategy == "mcmc" and not recipe.early_growth else ()
+    once = Every(moment, stop=1.5 * moment)
+    return (ResetOpacity(once),) if recipe.strategy == "mcmc" and recipe.turn_reflections else ()
 
 
 def _joint_start(recipe: PlanarRecipe) -> float:

@@ -100,8 +100,7 @@ class PlanarRecipe:
             what no Gaussian stands for halfway through the run.
         turn_reflections: move what was built behind glass, for what that mirrors, to its front in the joint stage, and
             make lamps as bright as their reflections are.
-        seed_unexplained: add Gaussians where photographs agree on something that the scene lacks, twice early in a run;
-            not under `mcmc`, which moves its own.
+        seed_unexplained: add Gaussians where photographs agree on something that the scene lacks, twice early in a run.
         tint: panes may be tinted: each learns what share of red, green and blue light gets through (not in the paper).
         tint_weight: of the mean square of the logarithm of that share in the objective.
         glass_count: glass Gaussians placed on each pane.
@@ -115,9 +114,7 @@ class PlanarRecipe:
         plane_fit: how planes are found from masks.
         intervals: when opacities are reset and the SH degree grows.
         strategy: what decides how many primary Gaussians there are and where: densification, or MCMC (Eq. 20), under
-            which the set grows in the joint stage only, and opacities are reset once before it.
-        early_growth: under `mcmc`, let the set grow from the first stage on, and reset no opacities, as in the paper.
-            Many Gaussians then build the reflected room behind the panes, and no pruning removes it later.
+            which opacities are reset once, after reflections were turned round.
         early_resets: reset opacities in the first two stages too, at the intervals of the third, as in the paper.
         densify_by: the views by which primary Gaussians are densified: those that show them directly, or their mirror
             images where none does, each counting by what panes leave of it; or all views and mirror images alike.
@@ -154,7 +151,6 @@ class PlanarRecipe:
     plane_fit: PlaneFit = field(default_factory=PlaneFit)
     intervals: Intervals = field(default_factory=Intervals)
     strategy: Annotated[Strategy, ESSENTIAL] = "default"
-    early_growth: Internal[bool] = False
     early_resets: Internal[bool] = False
     densify_by: Internal[Literal["direct", "all"]] = "direct"
     densify: DefaultDensify = field(default_factory=DefaultDensify)
@@ -183,7 +179,6 @@ class PlanarRecipe:
             perturbation=Perturbation(stop=29 / 30, bounds=(1e-6, 1 - 1e-6)),
             rates=GaussianRates(short_run_power=0.0),
             intervals=Intervals(averaged_passes=0.0),
-            early_growth=True,
             early_resets=True,
             densify_by="all",
             densify=DefaultDensify.published(),

@@ -13,7 +13,7 @@ from glassplat.training.actions import GrowSh, Population, SeedUnexplained, defa
 from glassplat.training.corrections import corrections_begun, corrections_learnt
 from glassplat.training.densify import as_discs
 from glassplat.training.losses import LossTerm, PhotometricLoss, disc_normals, distortion
-from glassplat.training.options import PUBLISHED_ITERATIONS, McmcDensify
+from glassplat.training.options import PUBLISHED_ITERATIONS
 from glassplat.training.stage import AverageLast, Every, Stage
 
 if TYPE_CHECKING:
@@ -75,10 +75,10 @@ def _missing(recipe: SplatRecipe) -> tuple[SeedUnexplained, ...]:
     return tuple(SeedUnexplained(moment, _bare(recipe)) for moment in SEED_AT if wanted)
 
 
-def population_of(recipe: SplatRecipe | PlanarRecipe | DeferredRecipe, mcmc: McmcDensify | None = None) -> Population:
-    """Contribution of the recipe's strategy; `mcmc` takes the place of its options of that strategy."""
+def population_of(recipe: SplatRecipe | PlanarRecipe | DeferredRecipe) -> Population:
+    """Contribution of the recipe's strategy."""
     if recipe.strategy == "mcmc":
-        population = mcmc_population(mcmc or recipe.mcmc, recipe.rates.of("primary")["primary.means"])
+        population = mcmc_population(recipe.mcmc, recipe.rates.of("primary")["primary.means"])
     else:
         population = default_population(recipe.densify, recipe.intervals)
     if recipe.intervals.averaged_passes == 0:
