@@ -108,7 +108,7 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         post_steps=population.post_steps,
         setup=first_reflections(recipe),
         densify_until=population.densify_until,
-        # Normals that nothing shows need not keep to the depths, which costs a matte scene 0.4 dB (lab/glossy.md).
+        # Normals that nothing shows need not keep to the depths (lab/glossy.md).
         until=found_nothing,
     )
     refinement = replace(
