@@ -32,7 +32,7 @@ class NoGaussiansError(TrainingDivergedError):
 
 
 ENTERED = "set up"
-"""Name in `TrainState.records`: the stage that was entered last, by the step at which it begins if none ends early."""
+"""Name in `TrainState.records`: the stage last set up, or entered early, by the step at which it was to begin."""
 WHERE_TO_LOOK = (
     "Expected cameras that look at the points: check their poses and focal lengths, and whether the points are those "
     "of this capture; photographs of a few pixels (--downscale) or high learning rates end like this too"
@@ -100,7 +100,7 @@ def train(
             continue
         is_new = state.records.get(ENTERED) != start
         if state.step == start or (is_early and is_new):
-            if is_new:
+            if is_new and (is_early or stage.setup is not None):
                 state.is_whole = False
                 if stage.setup is not None:
                     yield from carried_out(stage.setup(state, with_corrected_cameras(dataset, state.scene)))

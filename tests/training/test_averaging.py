@@ -14,7 +14,7 @@ from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import train
 from glassplat.training.messages import StepDone
 from glassplat.training.options import Intervals
-from glassplat.training.stage import STEPS, AverageLast, Clock, Stage, TrainState
+from glassplat.training.stage import AverageLast, Clock, Stage, TrainState
 from tests.training.tiny_capture import tiny_capture
 
 ITERATIONS, LAST = 40, 4
@@ -51,7 +51,7 @@ def test_the_scene_is_the_mean_of_the_last_steps() -> None:
         torch.testing.assert_close(tensor, expected)
     assert not torch.equal(averaged[-1]["primary.sh"], single[-1]["primary.sh"])
     assert not state.means
-    assert STEPS not in state.records
+    assert not state.records
 
 
 def test_what_does_not_change_keeps_every_bit() -> None:
