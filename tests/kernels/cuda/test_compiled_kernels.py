@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import cache
 from typing import Any
 
 import pytest
@@ -21,11 +22,16 @@ KERNELS = all_kernels()
 NAMED = {kernel.name: kernel for kernel in KERNELS}
 
 
+@cache
+def compiled(name: str) -> dict[tuple[int, int], str]:
+    """PTX of a kernel for each generation; to compile one takes seconds."""
+    return dict(zip(CAPABILITIES, ptx_of(NAMED[name]), strict=True))
+
+
 @pytest.mark.filterwarnings("ignore::numba.core.errors.NumbaPerformanceWarning")
 @pytest.mark.parametrize("kernel", KERNELS, ids=lambda kernel: kernel.name)
 def test_the_kernel_compiles_and_fits(kernel) -> None:
-    texts = ptx_of(kernel)
-    for text, capability in zip(texts, CAPABILITIES, strict=True):
+    for capability, text in compiled(kernel.name).items():
         assert f".target sm_{capability[0]}{capability[1]}" in text
         found = linked(text, capability)
         print(f"{kernel.name} sm_{capability[0]}{capability[1]}: {found}")
@@ -52,7 +58,7 @@ def test_the_linkers_report_is_read() -> None:
 
 @pytest.mark.filterwarnings("ignore::numba.core.errors.NumbaPerformanceWarning")
 def test_a_pair_is_emitted_without_float64() -> None:
-    emitted, counted = (ptx_of(NAMED[name], [(9, 0)])[0] for name in ("emit_tiles_int16", "count_tiles_float32"))
+    emitted, counted = (compiled(name)[9, 0] for name in ("emit_tiles_int16", "count_tiles_float32"))
     assert ".f64" not in emitted
     assert ".f64" in counted, "what is counted for each splat is, which shows that it would be seen"
 
@@ -98,7 +104,7 @@ def agree(pattern: Tree, other: Tree, known: dict[str, Tree]) -> bool:
 @pytest.mark.filterwarnings("ignore::numba.core.errors.NumbaPerformanceWarning")
 @pytest.mark.parametrize("other", ["composite_deviation_float32", "composite_backward_4_absgrad_float32"])
 def test_every_pass_computes_the_same_coverage(other: str) -> None:
-    first, second = (exponent_of(ptx_of(NAMED[name], [(8, 9)])[0]) for name in ("composite_forward_4_float32", other))
+    first, second = (exponent_of(compiled(name)[9, 0]) for name in ("composite_forward_4_float32", other))
     assert agree(first, second, {}), (first, second)
     # Nothing is left to the linker, which could fuse a product and a sum.
     assert str(first).count("fma.rn.f32") == 2
