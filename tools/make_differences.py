@@ -78,7 +78,7 @@ REASONS: dict[str, dict[str, str]] = {
         "perturbation.stop": "What was perturbed has time to settle.",
         "perturbation.bounds": "Opacities that were lowered by mistake can recover.",
         "early_resets": "Planes are fitted to transparent Gaussians otherwise: -1.1 dB.",
-        "densify_by": "Things are small in a mirror and need no splitting.",
+        "densify_by": "Views and mirror images would hide each other's needs.",
     },
     "deferred": GLOSSY
     | {

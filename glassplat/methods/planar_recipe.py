@@ -117,7 +117,8 @@ class PlanarRecipe:
             which opacities are reset once, after reflections were turned round.
         early_resets: reset opacities in the first two stages too, at the intervals of the third, as in the paper.
         densify_by: the views by which primary Gaussians are densified: those that show them directly, or their mirror
-            images where none does, each counting by what panes leave of it; or all views and mirror images alike.
+            images if these need more detail, each counting by what panes leave of it; or all views and mirror images
+            alike.
         densify: when and how Gaussians are added and pruned under `default`.
         mcmc: when and how Gaussians are relocated and added under `mcmc`.
         exposure: whether the exposure of each photograph is learned.

@@ -314,8 +314,9 @@ class ScreenStatistics:
 
     Gradients are in normalised device coordinates, in which the image spans [-1, 1] both ways: thresholds do not
     depend on its resolution. Sums and counts have two rows, over all views and over those that see the Gaussian
-    directly. In a mirror it is farther away: whether it is too coarse is seen where it is close, and in mirrors only
-    where no view shows it directly.
+    directly. Mirror images are averaged apart from these, and the larger mean counts. Taken together they would hide
+    each other: in a mirror a thing is farther away, but what most photographs show from far off or in passing may be
+    seen best in a mirror.
 
     Attributes:
         gradient_sum: [2, N] sum over views of the norm of the loss gradient with respect to the centre on screen.
@@ -369,7 +370,9 @@ class ScreenStatistics:
 
     @property
     def mean_gradient(self) -> Tensor:
-        """[N] mean gradient norm over the views that saw the Gaussian, direct ones if there are any; 0 if none did."""
+        """[N] mean gradient norm over the views that saw the Gaussian directly, or over its mirror images, whichever is
+        larger; 0 if none saw it.
+        """
         return self._mean(self.gradient_sum)
 
     @property
@@ -378,8 +381,9 @@ class ScreenStatistics:
         return self._mean(self.absgrad_sum)
 
     def _mean(self, total: Tensor) -> Tensor:
-        over_all, over_direct = total / self.view_count.clamp(min=1)
-        return torch.where(self.view_count[1] > 0, over_direct, over_all)
+        (over_all, direct), (views, direct_views) = total, self.view_count
+        mirrored = (over_all - direct) / (views - direct_views).clamp(min=1)
+        return torch.maximum(direct / direct_views.clamp(min=1), mirrored)
 
 
 @torch.no_grad()

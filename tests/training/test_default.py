@@ -36,16 +36,18 @@ def edited(options: DefaultDensify, gaussians: Gaussians, statistics: ScreenStat
     return densify(options, gaussians, {}, statistics, extent=EXTENT, generator=rng, **extra)[0]
 
 
-def test_mirror_images_count_only_for_what_is_not_seen_directly() -> None:
-    statistics, radii = ScreenStatistics.zeros(2), torch.full((1, 2, 2), 6.0)
-    for weight, gradients in ((1.0, [8.0, 0.0]), (1.0, [4.0, 0.0]), (0.5, [90.0, 3.0])):
+def test_views_and_mirror_images_count_apart_and_the_larger_mean_decides() -> None:
+    statistics, radii = ScreenStatistics.zeros(4), torch.full((1, 4, 2), 6.0)
+    direct = ([8.0, 8.0, 0.0, 8.0], [4.0, 4.0, 0.0, 4.0])
+    mirrored = ([2.0, 6.0, 3.0, 0.0], [3.0, 8.0, 3.0, 0.0], [1.0, 7.0, 3.0, 0.0])
+    for weight, gradients in (*((1.0, row) for row in direct), *((0.5, row) for row in mirrored)):
         gradient = torch.tensor(gradients)[None, :, None] * torch.tensor([0.01, 0.0])
-        seen_here = radii * (gradient != 0).any(dim=-1, keepdim=True) if weight == 1 else radii
+        seen_here = radii * (gradient != 0).any(dim=-1, keepdim=True)
         statistics.add(Views(gradient, 2 * gradient, seen_here, 200, 100, weight, direct=weight == 1))
-    assert statistics.view_count.tolist() == [[2.5, 0.5], [2, 0]]
-    # The first one is seen twice directly, the second only in the mirror.
-    assert statistics.mean_gradient.tolist() == pytest.approx([6, 3])
-    assert statistics.mean_absgrad.tolist() == pytest.approx([12, 6])
+    assert statistics.view_count.tolist() == [[3.5, 3.5, 1.5, 2], [2, 2, 0, 2]]
+    # Two views see all but the third directly: 6 in the mean. Three half mirror images show all but the fourth.
+    assert statistics.mean_gradient.tolist() == pytest.approx([6, 14, 6, 6])
+    assert statistics.mean_absgrad.tolist() == pytest.approx([12, 28, 12, 12])
 
 
 def test_statistics_do_not_depend_on_the_resolution() -> None:
