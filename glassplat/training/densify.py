@@ -315,8 +315,9 @@ class ScreenStatistics:
     Gradients are in normalised device coordinates, in which the image spans [-1, 1] both ways: thresholds do not
     depend on its resolution. Sums and counts have two rows, over all views and over those that see the Gaussian
     directly. Mirror images are averaged apart from these, and the larger mean counts. Taken together they would hide
-    each other: in a mirror a thing is farther away, but what most photographs show from far off or in passing may be
-    seen best in a mirror.
+    each other: in a mirror a thing is farther away, but what photographs show from far off or in passing may be seen
+    best in a mirror. Images in glass, little of which is left in a photograph, are averaged over as many as there are
+    direct views.
 
     Attributes:
         gradient_sum: [2, N] sum over views of the norm of the loss gradient with respect to the centre on screen.
@@ -370,8 +371,8 @@ class ScreenStatistics:
 
     @property
     def mean_gradient(self) -> Tensor:
-        """[N] mean gradient norm over the views that saw the Gaussian directly, or over its mirror images, whichever is
-        larger; 0 if none saw it.
+        """[N] the larger of two mean gradient norms, 0 if no view saw the Gaussian: over direct views, and over mirror
+        images, as many of these as there are direct views at least.
         """
         return self._mean(self.gradient_sum)
 
@@ -382,8 +383,8 @@ class ScreenStatistics:
 
     def _mean(self, total: Tensor) -> Tensor:
         (over_all, direct), (views, direct_views) = total, self.view_count
-        mirrored = (over_all - direct) / (views - direct_views).clamp(min=1)
-        return torch.maximum(direct / direct_views.clamp(min=1), mirrored)
+        mirrored, images = over_all - direct, torch.maximum(views - direct_views, direct_views)
+        return torch.maximum(direct / direct_views.clamp(min=1), mirrored / images.clamp(min=1))
 
 
 @torch.no_grad()
