@@ -211,27 +211,26 @@ class PaneView:
     def project(self, points: Array) -> tuple[Array, Mask]:
         """Pixel positions [..., 2] of world points [..., 3], and whether the image holds them."""
         fx, fy, cx, cy = self.intrinsics
-        in_camera = points @ self.cam_from_world[:3, :3].T + self.cam_from_world[:3, 3]
-        depth = in_camera[..., 2]
-        safe = np.where(depth > 0, depth, np.inf)
-        x, y = fx * in_camera[..., 0] / safe + cx, fy * in_camera[..., 1] / safe + cy
+        # Each coordinate lies in one piece: this is run for millions of points.
+        x, y, depth = self.cam_from_world[:3, :3] @ points.reshape(-1, 3).T + self.cam_from_world[:3, 3:]
+        scale = 1 / np.where(depth > 0, depth, np.inf)
+        x, y = fx * x * scale + cx, fy * y * scale + cy
         height, width = self.mask.shape
         held = (depth > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        return np.stack([x, y], axis=-1), held
+        return np.stack([x, y], axis=-1).reshape(*points.shape[:-1], 2), held.reshape(points.shape[:-1])
 
     def covers(self, pixels: Array, held: Mask) -> Mask:
         """[...] whether pixel positions [..., 2] lie on the pane; false where `held` is false."""
-        found = np.zeros(held.shape, dtype=bool)
-        column, row = np.floor(pixels[held]).astype(np.int64).T
-        found[held] = self.mask[row, column]
-        return found
+        return held & self._read(self.mask, pixels, held)
 
     def tells(self, pixels: Array, held: Mask) -> Mask:
         """[...] whether it is known if the pane is at pixel positions [..., 2]; false where `held` is false."""
-        known = held.copy()
-        column, row = np.floor(pixels[held]).astype(np.int64).T
-        known[held] = ~self.hidden[row, column]
-        return known
+        return held & ~self._read(self.hidden, pixels, held)
+
+    def _read(self, image: Mask, pixels: Array, held: Mask) -> Mask:
+        """[...] the image at pixel positions [..., 2]; anything where `held` is false."""
+        column, row = (np.where(held, pixels[..., axis], 0).astype(np.int64) for axis in (0, 1))
+        return image.ravel()[row * image.shape[1] + column]
 
     def edge_distance(self, pixels: Array) -> Array:
         """[P] signed distance to the mask's edge at pixel positions [P, 2], interpolated."""

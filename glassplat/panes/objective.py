@@ -64,7 +64,7 @@ class EdgeMatches:
         """[V, H, P] distances that frames [H] of some height leave unexplained, in units of the tolerance."""
         hidden = frames[:, None] * self.shifts
         # A frame is not equally high all round.
-        return (self.distances - hidden) / np.hypot(tolerance, UNEVEN_FRAME * hidden)
+        return (self.distances - hidden) / np.sqrt(tolerance**2 + (UNEVEN_FRAME * hidden) ** 2)
 
 
 def edge_matches(planes: PlaneEquations, views: Sequence[PaneView], *, edges_per_view: int) -> EdgeMatches:
@@ -76,21 +76,26 @@ def edge_matches(planes: PlaneEquations, views: Sequence[PaneView], *, edges_per
         edges_per_view: number of edge points followed from each view.
     """
     points, outward, hits, source_of = _edges_on(planes, views, edges_per_view)
-    sizes, hidden = np.zeros((len(views), *hits.shape)), np.zeros((len(views), *hits.shape))
+    passing = np.einsum("hpd,hpd->hp", points, outward)
+    sizes, hidden = np.zeros((2, len(views), *hits.shape))
+    own_size, own_hidden = np.zeros((2, *hits.shape))
     for number, view in enumerate(views):
-        sizes[number], hidden[number] = _pixel_and_frame(planes, view, points, outward)
-    column = np.arange(len(source_of))
-    own_size, own_hidden = sizes[source_of, :, column].T, hidden[source_of, :, column].T
+        sizes[number], hidden[number] = _pixel_and_frame(planes, view, points, outward, passing)
+        own = source_of == number
+        own_size[:, own], own_hidden[:, own] = sizes[number][:, own], hidden[number][:, own]
 
-    distances, compared = np.zeros_like(sizes), np.zeros(sizes.shape, dtype=bool)
+    distances, shifts = np.zeros((2, *sizes.shape))
+    compared = np.zeros(sizes.shape, dtype=bool)
     for number, target in enumerate(views):
         landed, held = target.project(points)
         compared[number] = held & hits & (source_of != number)
-        distances[number, compared[number]] = target.edge_distance(landed[compared[number]]) / target.diagonal
-    doubt = np.sqrt((1 + (own_size / sizes) ** 2) / 2)
-    diagonals = np.array([view.diagonal for view in views])[:, None, None]
-    shifts = np.where(compared, (own_hidden - hidden) / (sizes * diagonals * doubt), 0)
-    return EdgeMatches(distances / doubt, shifts, compared, _turns(planes, outward), source_of)
+        pairs = np.flatnonzero(compared[number])
+        distances[number].ravel()[pairs] = target.edge_distance(landed.reshape(-1, 2)[pairs])
+        # A doubt of one pixel in both views; its size here times the image's diagonal.
+        doubt = target.diagonal * np.sqrt((1 + (own_size / sizes[number]) ** 2) / 2)
+        distances[number] /= doubt
+        shifts[number] = np.where(compared[number], (own_hidden - hidden[number]) / (sizes[number] * doubt), 0)
+    return EdgeMatches(distances, shifts, compared, _turns(planes, outward), source_of)
 
 
 def _turns(planes: PlaneEquations, outward: Array) -> Array:
@@ -131,14 +136,24 @@ def _edges_on(
     )
 
 
-def _pixel_and_frame(planes: PlaneEquations, view: PaneView, points: Array, outward: Array) -> tuple[Array, Array]:
-    """Size on the plane of a pixel across an edge, and of what a frame of height one hides; [H, P] each."""
+def _pixel_and_frame(
+    planes: PlaneEquations, view: PaneView, points: Array, outward: Array, passing: Array
+) -> tuple[Array, Array]:
+    """Size on the plane of a pixel across an edge, and of what a frame of height one hides; [H, P] each.
+
+    Args:
+        planes: H planes.
+        view: that looks at the edge.
+        points: [H, P, 3] places on the edge.
+        outward: [H, P, 3] unit directions off the pane there.
+        passing: [H, P] products of the two.
+    """
     height = np.abs(planes.normals @ view.center - planes.offsets)[:, None]
     height = np.maximum(height, np.finfo(np.float64).tiny)
-    beyond = np.einsum("hpd,hpd->hp", view.center - points, outward)
-    depth = np.abs((points - view.center) @ view.cam_from_world[2, :3])
-    pixel = depth * np.hypot(1, beyond / height) / np.sqrt(view.intrinsics[0] * view.intrinsics[1])
-    return np.maximum(pixel, np.finfo(np.float64).tiny), np.clip(beyond / height, 0, STEEPEST)
+    steep = (outward @ view.center - passing) / height
+    depth = np.abs(points @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3])
+    pixel = depth * np.sqrt(1 + steep**2) / np.sqrt(view.intrinsics[0] * view.intrinsics[1])
+    return np.maximum(pixel, np.finfo(np.float64).tiny), np.clip(steep, 0, STEEPEST)
 
 
 NEAREST, FARTHEST = 0.05, 20.0
