@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels import Fresnel
-from glassplat.kernels.composite import color_and_depth, composite, join_channels
+from glassplat.kernels.composite import composite, mean_depth
 from glassplat.kernels.panes import layer_slopes, slopes_at
 from glassplat.kernels.project import GradientSum
 from glassplat.kernels.records import Deviation, PaneHits, Panes, Splats
@@ -200,7 +200,8 @@ class Planar:
         glass = project_gaussians(scene.glass, camera, near=near)
         splats = joined_splats(primary, glass)
         bins = bin_tiles(splats, camera.width, camera.height)
-        channels = join_channels(primary.colors, primary.depths, more=len(scene.glass))
+        channels = torch.cat([primary.colors, primary.depths[..., None]], dim=-1)
+        channels = torch.nn.functional.pad(channels, (0, 0, 0, len(scene.glass)))
         marks = torch.sigmoid(scene.glass.channels["logit_mark"])[None]
         deviation = None
         if self.deviation:
@@ -217,12 +218,12 @@ class Planar:
             absgrad=joined_absgrad(screen),
         )
         alpha = result.alpha.squeeze(0)
-        # Squeezed, because the gradient of an indexed image is a whole one of zeros first.
-        image, depth = color_and_depth(result.image.squeeze(0), alpha, self.background)
+        # Squeezed and split, because the gradient of an indexed image is a whole one of zeros first.
+        color, depth = result.image.squeeze(0).split((3, 1), dim=-1)
         return FirstPass(
-            image=image,
+            image=over_background(color.contiguous(), alpha, self.background),
             alpha=alpha,
-            depth=depth,
+            depth=mean_depth(depth.squeeze(-1), alpha),
             mask=result.mask.squeeze(0),
             deviation=result.deviation.squeeze(0) if deviation else None,
             splats=splats,
@@ -241,7 +242,7 @@ class Planar:
         projected = project_mirrored(primary, camera, seen, near=NEAR_PER_EXTENT * scene.extent, total=total)
         # By how much it departs from 1: what is behind all Gaussians has 0 then, and needs no blending.
         gain = torch.expm1(primary.channels["log_intensity"])[None].expand(len(seen.planes), -1)
-        channels = join_channels(projected.colors, gain)
+        channels = torch.cat([projected.colors, gain[..., None]], dim=-1)
         mirrored = [projected]
         screen: tuple[ScreenPass, ...] = (screen_pass("primary", projected, direct=False),) if with_absgrad else ()
         if self.photographer == "present" and len(scene.photographer):
