@@ -137,7 +137,8 @@ def cameras_of_test_views(stored: StoredRun, aligned: bool) -> str:
     """Description of the cameras of test views."""
     if aligned:
         return "aligned with their photographs"
-    return "moved as the neighbouring photographs', in the order of names" if len(stored.scene.poses) else UNMOVED
+    moved = stored.scene.poses.reaches(view.name for view in stored.dataset.test)
+    return "moved as the neighbouring photographs', in the order of names" if moved else UNMOVED
 
 
 def train_seconds(stored: StoredRun) -> float | None:

@@ -409,11 +409,12 @@ def _means(per_view: list[dict[str, metrics.Outcome]]) -> dict[str, metrics.Outc
 def _description(scene: Scene, dataset: Dataset) -> dict[str, Any]:
     """Description of the measurement."""
     sizes = dict.fromkeys(f"{view.camera.width}x{view.camera.height}" for view in dataset.test)
+    is_exposed = scene.exposures.reaches(view.name for view in dataset.test)
     return {
         "resolution": ", ".join(sizes),
         "split": dataset.split,
         "num_test_views": len(dataset.test),
-        "test_exposures": NEIGHBOURS_COLORS if len(scene.exposures) else SCENE_COLORS,
+        "test_exposures": NEIGHBOURS_COLORS if is_exposed else SCENE_COLORS,
         "num_gaussians": scene.num_gaussians,
         "num_glass_gaussians": len(scene.glass),
         "num_surroundings_gaussians": len(scene.surroundings),

@@ -120,24 +120,18 @@ def comparison_sheet(
 
 
 def compose_sheet(rows: Sequence[Row], title: str, subtitle: str) -> NDArray[np.uint8]:
-    """Panels of one size in rows, with captions and a title line."""
-    height, width = next(panel for row in rows for panel in row if panel).image.shape[:2]
-    panel_size = _panel_size(width, height)
-    columns = max(len(row) for row in rows)
-    row_height = CAPTION_HEIGHT + panel_size[1] + GAP
-    size = (
-        2 * MARGIN + columns * panel_size[0] + (columns - 1) * GAP,
-        2 * MARGIN + TITLE_HEIGHT + len(rows) * row_height - GAP,
-    )
-    canvas = Image.new("RGB", size, BACKGROUND)
-    _draw_title(ImageDraw.Draw(canvas), title, subtitle, size[0])
-    for row_index, row in enumerate(rows):
+    """Panels in rows, with captions and a title line; those of a row have the size of its first one."""
+    sizes = [_panel_size(*next(panel for panel in row if panel).image.shape[1::-1]) for row in rows]
+    width = max(len(row) * (size[0] + GAP) - GAP for row, size in zip(rows, sizes, strict=True))
+    height = sum(CAPTION_HEIGHT + size[1] + GAP for size in sizes) - GAP
+    canvas = Image.new("RGB", (2 * MARGIN + width, 2 * MARGIN + TITLE_HEIGHT + height), BACKGROUND)
+    _draw_title(ImageDraw.Draw(canvas), title, subtitle, canvas.width)
+    y = MARGIN + TITLE_HEIGHT
+    for row, size in zip(rows, sizes, strict=True):
         for column, panel in enumerate(row):
-            if panel is None:
-                continue
-            x = MARGIN + column * (panel_size[0] + GAP)
-            y = MARGIN + TITLE_HEIGHT + row_index * row_height
-            _draw_panel(canvas, panel, (x, y), panel_size)
+            if panel is not None:
+                _draw_panel(canvas, panel, (MARGIN + column * (size[0] + GAP), y), size)
+        y += CAPTION_HEIGHT + size[1] + GAP
     return np.array(canvas)
 
 

@@ -31,7 +31,7 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import Densify, GrowSh, ResetOpacity
 from glassplat.training.densify import Moments, forget
-from glassplat.training.losses import residual
+from glassplat.training.losses import counted_pixels, residual
 from glassplat.training.options import MirrorSearch, NormalPropagation, PropagationSchedule, Rate
 from glassplat.training.stage import Clock, Every, TrainState
 
@@ -87,12 +87,17 @@ def in_region(scene: Scene) -> Tensor:
 
 
 def residual_spreads(scene: Scene, views: Sequence[View], renderer: Renderer) -> tuple[Tensor, Tensor]:
-    """Of each primary Gaussian what the views show, in pixels, and how its residual spreads over them; [N] each."""
+    """Of each primary Gaussian what the views show, in pixels, and how its residual spreads over them; [N] each.
+
+    Pixels that a view ignores say nothing: a residual of 0 there would look like one that turns with the view.
+    """
     count, device = len(scene.primary), scene.primary.means.device
     shown, squares = torch.zeros(2, count, device=device)
     sums = torch.zeros(count, 3, device=device)
     for view in views:
-        weights, residuals = contributions(scene, view.camera), residual_sums(scene, view, renderer)
+        counted = counted_pixels(view, device).to(shown.dtype)
+        weights = gather_pixels(scene, view.camera, counted[..., None])[:, 0]
+        residuals = residual_sums(scene, view, renderer)
         shown += weights
         sums += residuals
         squares += residuals.square().sum(dim=1) / weights.clamp(min=1e-6)

@@ -46,7 +46,7 @@ from glassplat.training.actions import (
     seeds_of,
 )
 from glassplat.training.corrections import corrections_begun, corrections_learnt, photographer_learnt
-from glassplat.training.densify import append, apply_edit, keep
+from glassplat.training.densify import NEIGHBOURS, append, apply_edit, keep
 from glassplat.training.losses import (
     LossTerm,
     ReflectanceDeparture,
@@ -102,6 +102,8 @@ class PaneSetup:
         scene = replace(state.scene, planes=planes, glass=glass)
         if self.detect_mirrors or self.fit.mirror_labels:
             planes = yield from self._with_mirrors_found(scene, dataset)
+            # On the planes as they are now: mirrors have been aligned.
+            scene = replace(scene, glass=glass_gaussians(planes, count=self.glass_count, seed=self.seed))
         if not self.fixed_mirrors:
             planes = replace(planes, mirrors=())
         state.scene = replace(scene, planes=planes.that_may_tint() if self.tint else planes)
@@ -345,12 +347,12 @@ class FillUnseen:
         of_glass = surfaces(state.scene.planes, mirrors=False)
         for done, panes in enumerate(of_glass):
             yield Working(f"looking for what {name_panes(panes, 'pane')} can mirror", done, len(of_glass))
-            places, color = unseen_places(state.scene, panes, cameras)
+            places, color, cell = unseen_places(state.scene, panes, cameras)
             if 0 < len(places) < MOST_ADDED * len(state.scene.primary):
                 colors = (255 * color).round().to(torch.uint8).expand(len(places), 3)
-                seeds = seeds_of(state.scene.primary, PointCloud(places.cpu(), colors.cpu()), opacity=0.7, spread=0.7)
-                add_primary(state, seeds)
-                added += len(seeds)
+                cloud = PointCloud(places.cpu(), colors.cpu())
+                add_primary(state, seeds_of(state.scene.primary, cloud, opacity=0.7, size=0.7 * cell))
+                added += len(places)
         if added:
             log.info("%d Gaussians added where panes mirror what nothing shows", added)
         return added > 0
@@ -382,7 +384,7 @@ def seed_reflection(state: TrainState, dataset: Dataset, panes: Planes) -> Work:
     points = dataset.points
     device = panes.centers.device
     virtual = virtual_points(points.positions.to(device), panes, cameras).cpu()
-    if not bool(virtual.any()):
+    if int(virtual.sum()) <= NEIGHBOURS:  # Too few to tell how large they are.
         return False
     behind = replace(points, positions=points.positions[virtual], colors=points.colors[virtual])
     seeds = mirrored_gaussians(seeds_of(state.scene.primary, behind), panes.centers[0], panes.normals[0])

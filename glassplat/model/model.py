@@ -38,6 +38,7 @@ from glassplat.publish.web_page import PRIVATE, Sharing, best_view, bounding_bal
 from glassplat.render.deferred import equirect_from_environment
 from glassplat.render.frame import Frame, Renderer, check_layers
 from glassplat.render.layers import layer_image
+from glassplat.render.planar import with_photographer
 from glassplat.scene import scene
 from glassplat.scene.camera import LEAST_SINE, Camera
 from glassplat.scene.corrections import DEFAULT_UP, upward
@@ -182,7 +183,8 @@ class Model:
         """
         from glassplat.evaluate.evaluate import evaluate  # Training imports this file, and may never need it.
 
-        return evaluate(self.scene, self.renderer, with_corrected_cameras(dataset, self.scene)).results
+        renderer = with_photographer(self.renderer, "beside")
+        return evaluate(self.scene, renderer, with_corrected_cameras(dataset, self.scene)).results
 
     def to(self, device: torch.device | str) -> Model:
         """The same on another device."""

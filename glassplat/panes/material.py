@@ -604,10 +604,11 @@ BEYOND = 0.05
 
 
 class Unseen(NamedTuple):
-    """Places [P, 3] that panes mirror and no photograph shows, and their likely colour [3], sRGB."""
+    """Places [P, 3] that panes mirror and no photograph shows, their likely colour [3], sRGB, and their distance."""
 
     places: Tensor
     color: Tensor
+    cell: float
 
 
 @torch.no_grad()
@@ -635,10 +636,12 @@ def unseen_places(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Uns
             places.append(_ends_of_rays(pane, camera, image.seen & (image.coverage < UNCOVERED), middle, radius))
     found, known = torch.cat(places), torch.cat(colors)
     # In the axes of a camera, so that it does not matter which way the world is turned.
-    cells = ((found - middle) @ cameras[0].cam_from_world[:3, :3].T / (2 * radius / CELLS_ACROSS)).floor().long()
+    size = 2 * radius / CELLS_ACROSS
+    cells = ((found - middle) @ cameras[0].cam_from_world[:3, :3].T / size).floor().long()
     _, cell = torch.unique(cells, dim=0, return_inverse=True)
     first = torch.full_like(cell, len(found)).scatter_reduce_(0, cell, torch.arange(len(found), device=device), "amin")
-    return Unseen(found[first[first < len(found)]], known.mean(dim=0) if len(known) else known.new_full((3,), 0.5))
+    color = known.mean(dim=0) if len(known) else known.new_full((3,), 0.5)
+    return Unseen(found[first[first < len(found)]], color, float(size))
 
 
 def _ends_of_rays(pane: Planes, camera: Camera, hole: Tensor, middle: Tensor, radius: Tensor) -> Tensor:

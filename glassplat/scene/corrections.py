@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from typing import ClassVar, Self
@@ -80,6 +80,10 @@ class ByPhotograph:
             return self
         mean = self.values[rows].mean(dim=0, keepdim=True)
         return replace(self, values=torch.cat([self.values, mean]), names=(*self.names, name))
+
+    def reaches(self, names: Iterable[str]) -> bool:
+        """Return whether any of these photographs has values, its own or its neighbours'."""
+        return any(name in self.interpolate(name).names for name in names)
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name."""

@@ -34,7 +34,15 @@ from glassplat.training.densify import (
     reset_opacity,
     sgld_noise,
 )
-from glassplat.training.losses import LossTerm, mean_opacity, mean_scale, of_all, residual, weighted_terms
+from glassplat.training.losses import (
+    LossTerm,
+    counted_pixels,
+    mean_opacity,
+    mean_scale,
+    of_all,
+    residual,
+    weighted_terms,
+)
 from glassplat.training.messages import Working
 from glassplat.training.options import DefaultDensify, Intervals, McmcDensify, Rate
 from glassplat.training.stage import Action, Clock, Every, PostStep, TrainState, Work
@@ -435,15 +443,23 @@ class SeedUnexplained:
         primary = state.scene.primary
         if not 0 < len(cloud) < MOST_ADDED * len(primary):
             return False
-        seeds = seeds_of(primary, cloud, opacity=0.5)
-        add_primary(state, seeds.with_tensors({"log_scales": torch.full_like(seeds.log_scales, math.log(size))}))
-        log.info("Gaussians added where photographs agree on something that was not there: %d", len(seeds))
+        add_primary(state, seeds_of(primary, cloud, opacity=0.5, size=size))
+        log.info("Gaussians added where photographs agree on something that was not there: %d", len(cloud))
         return True
 
 
-def seeds_of(primary: Gaussians, points: PointCloud, *, opacity: float = 0.1, spread: float = 1.0) -> Gaussians:
-    """Gaussians like the primary ones, from points; what points do not tell of a channel is the median there."""
-    seeds = gaussians_from_points(points, sh_degree=primary.max_sh_degree, opacity=opacity, spread=spread)
+def seeds_of(primary: Gaussians, points: PointCloud, *, opacity: float = 0.1, size: float | None = None) -> Gaussians:
+    """Gaussians like the primary ones, from points; what points do not tell of a channel is the median there.
+
+    Args:
+        primary: those that are there.
+        points: at least one.
+        opacity: of each.
+        size: standard deviation of each; as far as points are apart if None.
+    """
+    seeds = gaussians_from_points(points, sh_degree=primary.max_sh_degree, opacity=opacity)
+    if size is not None:
+        seeds = seeds.with_tensors({"log_scales": torch.full_like(seeds.log_scales, math.log(size))})
     seeds = seeds.to(primary.means.device)
     usual = {name: values.median().expand(len(seeds)).clone() for name, values in primary.channels.items()}
     channels = {name: seeds.channels.get(name, values) for name, values in usual.items()}
@@ -478,7 +494,7 @@ def unexplained_places(
         pixels = nearest_pixels(camera.project(places)[0], camera)
         frame = renderer(scene, camera)
         looks = in_image(places, camera) & ~crosses_pane(places, scene.planes, camera.center)
-        looks &= _past_panes(frame)[pixels]
+        looks &= (_past_panes(frame) & counted_pixels(view, device))[pixels]
         missing = _missing_pixels(residual(frame, view, scene))[pixels] & looks
         color = to_device(view.photo, device)[pixels].float() / 255 * missing[:, None]
         looking, agreeing = looking + looks, agreeing + missing

@@ -140,10 +140,9 @@ def advance(
     state.step += len(views)
     for post_step in stage.post_steps:
         post_step(state, clocks[-1], found.visible)
+    due = [(clock, action) for clock, action in itertools.product(clocks, stage.actions) if action.due(clock)]
     done = []
-    for clock, action in itertools.product(clocks, stage.actions):
-        if not action.due(clock):
-            continue
+    for clock, action in due:
         if (yield from carried_out(action.apply(state, with_corrected_cameras(dataset, state.scene), clock))):
             done.append(action)
     check_population(state)
@@ -153,7 +152,8 @@ def advance(
     yield StepDone(state.step, names, sum(losses.values()), losses, counts_of(state.scene))
     for action in done:
         yield ActionDone(state.step, action.name, counts_of(state.scene))
-    if done:
+    if due:
+        # Even where nothing was done: another rank may have rounded a number to the other side.
         ranks.settle(state)
 
 

@@ -203,6 +203,13 @@ def _where_counted(errors: Tensor, view: View) -> Tensor:
     return errors if view.ignored is None else errors.masked_fill(to_device(view.ignored, errors.device), 0)
 
 
+def counted_pixels(view: View, device: torch.device) -> Tensor:
+    """[H, W] bool: which pixels the view does not ignore."""
+    if view.ignored is None:
+        return torch.ones(view.photo.shape[:2], dtype=torch.bool, device=device)
+    return ~view.ignored.to(device)
+
+
 def residual(frame: Frame, view: View, scene: Scene) -> Tensor:
     """[H, W, 3] photograph minus render, sRGB, 0 where the view is ignored."""
     image = scene.exposures.apply(frame.rgb.detach(), view.name)

@@ -245,6 +245,8 @@ def test_test_views_are_compared_as_their_neighbours_were_exposed(case) -> None:
     results = evaluate(scene, case.renderer, case.dataset, listen=seen.append).results
     plainly = evaluate(case.scene, case.renderer, case.dataset).results
     assert "neighbouring" in results["test_exposures"] and "scene" in plainly["test_exposures"]
+    elsewhere = replace(scene, exposures=Exposures(affine, ("train/a1.jpg", "train/z.jpg")))
+    assert "scene" in evaluate(elsewhere, case.renderer, case.dataset).results["test_exposures"]
     offsets = [float((e.photographed.photographed - e.frame.rgb).mean()) for e in seen]
     # Before a1, and twice between a1 and z.
     assert offsets == pytest.approx([0.06, 0.04, 0.04], abs=1e-6)

@@ -131,6 +131,15 @@ def test_a_name_with_a_line_break_is_drawn_on_one_line(case) -> None:
     np.testing.assert_array_equal(broken, whole)
 
 
+def test_each_row_keeps_the_shape_of_its_pictures() -> None:
+    """Portrait below landscape: 300 x 400 pixels, then 400 x 300."""
+    rows = [[Panel("a", torch.full((300, 400, 3), 0.5))], [Panel("b", torch.full((400, 300, 3), 0.9))]]
+    sheet = compose_sheet(rows, "", "")
+    assert sheet.shape[:2] == (2 * MARGIN + TITLE_HEIGHT + 2 * CAPTION_HEIGHT + 300 + 400 + 10, 2 * MARGIN + 400)
+    bright = (sheet == 230).all(axis=2)  # 0.9 of 255.
+    assert int(bright.any(axis=1).sum()) == 400 and int(bright.any(axis=0).sum()) == 300
+
+
 def test_rows_follow_what_is_known(case) -> None:
     full, view = case.renderer.frames[40.0], case.dataset.test[0]
     bare = replace(full, layers={})

@@ -10,8 +10,16 @@ import pytest
 import torch
 
 from glassplat.captures.view import PointCloud
-from glassplat.methods.planar import TurnReflections, mirrors_among, seed_reflection, surfaces, turn_virtual_scene_round
-from glassplat.panes import material
+from glassplat.methods import planar
+from glassplat.methods.planar import (
+    PaneSetup,
+    TurnReflections,
+    mirrors_among,
+    seed_reflection,
+    surfaces,
+    turn_virtual_scene_round,
+)
+from glassplat.panes import PlaneFit, material
 from glassplat.panes.fit import with_mirrors
 from glassplat.panes.material import JudgedPane, Likeness, mostly_reflections, reflections_behind, virtual_points
 from glassplat.scene.camera import mirror_matrices
@@ -73,6 +81,33 @@ def test_a_capture_from_the_front_gets_the_mirrored_points() -> None:
     assert bool((added[:, 2] < 2.0).all())
     points = mirrored(tiny_capture().points.positions)
     assert bool(torch.isclose(added[:, None], points, atol=1e-5).all(dim=-1).any(dim=1).all())
+
+
+def test_few_points_behind_a_pane_say_nothing() -> None:
+    """Three of them would become Gaussians as large as they are apart."""
+    scene, capture = true_scene(), tiny_capture()
+    case = scene.primary.select(scene.primary.means[:, 2] > 1.5)
+    behind = virtual_points(capture.points.positions, PANE, [view.camera for view in capture.train]).nonzero()[:3, 0]
+    few = replace(capture.points, positions=capture.points.positions[behind], colors=capture.points.colors[behind])
+    assert not finished(seed_reflection(state_of(replace(scene, primary=case)), replace(capture, points=few), PANE))
+
+
+def test_glass_lies_where_a_mirror_has_been_aligned(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = true_scene()
+    state = state_of(replace(scene, planes=Planes.empty(), glass=scene.glass.select(torch.zeros(0).long())))
+
+    def judged(scene: Scene, dataset: Any, labels: Any) -> Any:
+        yield from ()
+        aligned = material.moved_pane(scene, torch.tensor([0.02, 0.01, 0.05])).planes
+        return {aligned.labels[0]: JudgedPane(aligned, Likeness(0.9, 0.9), 1000, 1000)}
+
+    monkeypatch.setattr(planar, "judged_panes", judged)
+    monkeypatch.setattr(planar, "fitted_planes", lambda *_: PANE)
+    finished(PaneSetup(PlaneFit(), glass_count=50, seed=0)(state, tiny_capture()))
+    planes, glass = state.scene.planes, state.scene.glass
+    assert planes.mirrors == planes.labels
+    heights = (glass.means - planes.centers[0]) @ planes.normals[0]
+    assert float(heights.abs().max()) < 1e-3 * scene.extent
 
 
 def split_in_two(whole: Planes) -> Planes:

@@ -77,6 +77,16 @@ def test_a_residual_that_turns_has_the_spread_of_the_photographs() -> None:
     assert float(spreads[1]) < 0.01
 
 
+def test_what_views_ignore_says_nothing() -> None:
+    """A residual that is the same wherever it is known does not turn, however many views are masked."""
+    plain, *masked = views(0.3, 0.3, 0.3, 0.3)
+    everything = torch.ones(SIZE, SIZE, dtype=torch.bool)
+    masked = [replace(view, read_ignored=lambda: everything) for view in masked]
+    shown, spreads = residual_spreads(two_discs(), [plain, *masked], Deferred())
+    torch.testing.assert_close(shown, contributions(two_discs(), camera()))
+    assert spreads.max() < 0.01
+
+
 def test_only_what_does_not_reflect_yet_can_be_overlooked() -> None:
     turning = views(0.3, -0.3, 0.3, -0.3)
     assert Search().turning(two_discs(), turning, Deferred()) == pytest.approx(0.5, abs=1e-3)

@@ -19,6 +19,7 @@ from glassplat.model.model import by_name
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Environment
 from tests.cli.tiny_run import write_run
+from tests.render.tiny_scene import random_gaussians
 from tests.training.tiny_capture import tiny_capture, true_scene
 
 LABEL = 1
@@ -284,6 +285,16 @@ def test_a_camera_looks_where_it_should() -> None:
 
 def test_metrics_are_those_of_the_test_views() -> None:
     assert model().evaluate(tiny_capture())["psnr"] > 40
+
+
+def test_metrics_are_of_what_photographs_show_somebody_in_the_glass_too() -> None:
+    plain = model()
+    drawn = random_gaussians(40, (0.0, 0.0, 0.0), seed=5)
+    somebody = drawn.with_tensors({name: tensor.float() for name, tensor in drawn.tensors().items()})
+    somebody = somebody.with_tensors({"log_scales": somebody.log_scales + 1})
+    with_somebody = plain.with_scene(dataclasses.replace(plain.scene, photographer=somebody))
+    psnr = [one.evaluate(tiny_capture())["psnr"] for one in (plain, with_somebody)]
+    assert psnr[1] < psnr[0] - 1
 
 
 def test_gaussians_of_a_model_are_plain_data() -> None:

@@ -156,6 +156,8 @@ def test_what_a_pane_mirrors_unseen_is_filled_once() -> None:
     state, action = state_of(scene), FillUnseen(0.5)
     assert finished(action.apply(state, capture_of(scene), Clock(50, 100, 5)))
     added = len(state.scene.primary) - len(scene.primary)
+    size = 0.7 * unseen_places(scene, scene.planes, CAMERAS).cell
+    assert bool(torch.isclose(state.scene.primary.log_scales[-added:].exp(), torch.tensor(size)).all())
     assert added > 10 and not bool(state.optimizer.moments["primary.means"][0][-added:].any())
     images = [mirrored_image(one, CAMERAS[2]) for one in (scene, state.scene)]
     holes = [int((image.seen & (image.coverage < 0.5)).sum()) for image in images]

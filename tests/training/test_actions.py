@@ -211,6 +211,17 @@ def missing_in(scene: Scene, views: Sequence[View], renderer: Renderer) -> torch
             return end.value[0].positions
 
 
+def test_views_that_ignore_a_place_do_not_say_that_nothing_is_missing_there() -> None:
+    whole = Scene(balls([(0.3, -0.2, 0.1), (0.0, 0.4, 0.0)], [250, 30], -1.8), 2.0)
+    ground = Scene(whole.primary.select(torch.tensor([False, True])), 2.0)
+    views = list(views_of(whole).train)
+    found = missing_in(ground, views, Splat())
+    everything = torch.ones(views[0].photo.shape[:2], dtype=torch.bool)
+    for number in (0, 3, 6, 9):
+        views[number] = replace(views[number], read_ignored=lambda: everything)
+    assert len(missing_in(ground, views, Splat())) > 0.9 * len(found) > 5
+
+
 def test_nothing_is_added_where_the_scene_explains_the_photographs() -> None:
     whole = Scene(balls([(0.0, 0.0, 0.0), (0.5, 0.2, 0.3)], [200, 90], -1.8), 2.0)
     state = TrainState(whole, seed=0)
