@@ -150,7 +150,10 @@ def trained_part(directory: RunDirectory) -> Finding:
             finding.problems.append(str(error))
             finding.next.append("the train command that began it, again")
             return finding
-        finding.problems.append(f"it was interrupted at step {reached} of {directory.settings().iterations}")
+        if reached < directory.settings().iterations:
+            finding.problems.append(f"it was interrupted at step {reached} of {directory.settings().iterations}")
+        else:
+            finding.problems.append(f"its scene is damaged, and can be written again: {error}")
         finding.next.append(resume_command(directory))
         return finding
     finding.facts["trained to"] = step

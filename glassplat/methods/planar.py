@@ -401,14 +401,20 @@ def first_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
     """The first scene: one Gaussian per point, no planes yet.
 
     Raises:
-        PlaneFitError: the masks do not do. The planes are fitted to the measured points once and forgotten,
-            because a bad mask should end a run before the first iteration and not at the second stage.
+        PlaneFitError: a mirror is named that is none of the panes, or the masks do not do. The planes are fitted to
+            the measured points once and forgotten, because a bad mask should end a run before the first iteration and
+            not at the second stage.
     """
     if not dataset.pane_labels and dataset.planes is None:
         raise PlaneFitError(
             f"{_lack_of_masks(dataset)}, and planar needs to know where the panes are: expected masks of 3 to "
             f"10 photographs in {dataset.root / 'panes'}, named <photograph's name>.png, each pixel the label 1, "
             "2, ... of a pane, or 0 (`glassplat annotate` writes them). `glassplat train splat` needs none"
+        )
+    known = (*dataset.pane_labels, *(() if dataset.planes is None else dataset.planes.labels))
+    if unknown := [label for label in recipe.plane_fit.mirror_labels if label not in known]:
+        raise PlaneFitError(
+            f"plane_fit.mirror_labels names pane {unknown[0]}; expected some of {', '.join(map(str, known))}"
         )
     if dataset.measured_points:
         fitted_planes(dataset, None, recipe.plane_fit)

@@ -142,14 +142,19 @@ class Model:
             layers: which ones the frame has.
 
         Raises:
-            InputError: the method renders no such layer, or no camera has that name; says which there are.
+            InputError: the method renders no such layer, or no camera has that name; says which there are. Or the
+                camera or the layers are of another type.
         """
         frame = self._frame(camera, layers)
         return replace(frame, layers={name: layer for name, layer in frame.layers.items() if name in layers})
 
     def _frame(self, camera: Camera | str, layers: Sequence[str]) -> Frame:
         """The frame with these layers, and with what else the renderer makes on the way."""
+        if isinstance(layers, str):
+            raise InputError(f"layers is {layers!r}; expected a sequence of names, such as ({layers!r},)")
         check_layers(self.renderer, self.scene, layers, self.recipe.method)
+        if not isinstance(camera, (str, Camera)):
+            raise InputError(f"camera is {camera!r}; expected a Camera, or the name of one of `cameras`")
         if isinstance(camera, str):
             if camera not in self.cameras:
                 raise InputError(f"no camera is called {camera!r}; expected one of {first_names(list(self.cameras))}")

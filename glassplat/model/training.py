@@ -25,6 +25,7 @@ from glassplat.kernels.backend.devices import DeviceName, chosen_device, compile
 from glassplat.methods.recipe import RECIPES, Recipe, recipe_to_json, resolve_background
 from glassplat.model import run_directory
 from glassplat.model.model import Model
+from glassplat.options import check_value
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import train
 from glassplat.training.messages import (
@@ -442,16 +443,20 @@ class Training:
 
         Raises:
             CudaUnavailableError: the GPU was asked for and cannot be used.
-            InputError: no method has that name; `output` holds something else, or nothing to go on from; the run is too
-                short for its stages; or the photographs lie over another background than the recipe's.
+            InputError: no method has that name; an option has a value that it cannot have; `output` holds something
+                else, or nothing to go on from; the run is too short for its stages; or the photographs lie over
+                another background than the recipe's.
         """
         chosen = chosen_recipe(recipe)
+        if type(chosen) in RECIPES.values():  # A recipe of one's own may hold anything.
+            check_value(type(chosen), chosen, "")
         self._ranks = join()
         root = str(dataset.root.resolve())  # The run may be looked at from another folder than it was started in.
         self.iterations, self._dataset = iterations, dataset
         self._settings = run_directory.RunSettings(
             root, iterations, dataset.downscale, seed, str(chosen_device(device)), dataset.mask_polarity
         )
+        check_value(run_directory.RunSettings, self._settings, "")
         self._run: Run | None = None
         self._state: TrainState | None = None
         if output is None:

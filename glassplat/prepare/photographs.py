@@ -64,12 +64,18 @@ class Photograph:
     focal: float | None
 
 
+CAPTURE_FOLDERS = ("sparse", "panes", "gt", "ignore")
+
+
 def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photograph]:
     """The photographs below a folder in the order in which they were numbered; every one is decoded once, to check it.
 
     Raises:
-        InputError: there are too few, some are broken or too small, or they are of a kind that cannot be read.
+        InputError: there are too few, some are broken or too small, or they are of a kind that cannot be read; or the
+            folder is a capture, whose masks would be taken for photographs.
     """
+    if (folder / "images").is_dir() and any((folder / name).is_dir() for name in CAPTURE_FOLDERS):
+        raise InputError(f"{folder} is a capture; expected a folder of photographs, such as {folder / 'images'}")
     paths = _photograph_paths(folder)
     names = capture_names(paths, folder)
     found: dict[bytes, Photograph] = {}

@@ -144,6 +144,21 @@ def test_what_was_interrupted_goes_on(tmp_path: Path, capsys: pytest.CaptureFixt
         assert "report it" not in capsys.readouterr().err
 
 
+def test_a_finished_run_whose_scene_is_damaged_says_what_is_wrong(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_tiny_capture(tmp_path / "capture")
+    run = tmp_path / "run"
+    settings = RunSettings(str(tmp_path / "capture"), 12, seed=3)
+    Run(SplatRecipe(sh_degree=1), settings, RunDirectory(run), load_dataset(settings.data)).to_the_end(lambda _: None)
+    (scene,) = run.glob("point_cloud/*/point_cloud.ply")
+    scene.write_bytes(scene.read_bytes()[:-100])
+    found = told(run, capsys)
+    (problem,) = found["problems"]
+    assert "point_cloud.ply" in problem and "interrupted" not in problem
+    assert any("--resume" in line for line in found["next"])
+
+
 def test_an_interrupted_run_says_its_step_and_the_command_that_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

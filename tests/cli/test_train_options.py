@@ -64,6 +64,11 @@ def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     return " ".join(said.err.split())
 
 
+def test_a_limit_of_another_strategy_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    begun = ["train", "planar", "--data", str(SCENE), "--output", str(tmp_path / "run"), "--cap", "10"]
+    assert "--densify.cap" in refused(begun, capsys)
+
+
 @pytest.mark.parametrize("arguments", WRONG, ids=" ".join)
 def test_a_wrong_option_ends_with_one_message(
     arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -63,6 +63,10 @@ def test_every_layer_is_an_image(tmp_path: Path) -> None:
         image = whole.image("2.png", layer)
         assert image.shape == (28, 40, 3) and not image.requires_grad
         assert 0 <= float(image.min()) <= float(image.max()) <= 1
+    with pytest.raises(InputError, match=r"layers is 'depth'; expected a sequence"):
+        whole.render("2.png", layers="depth")
+    with pytest.raises(InputError, match="camera is 3; expected a Camera, or the name"):
+        whole.render(3)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"planar renders no layer base; expected .*reflection"):
         whole.image("2.png", "base")
     with pytest.raises(InputError, match=r"no camera is called 'nobody\.png'; expected one of .*0\.png"):

@@ -155,6 +155,11 @@ def test_what_cannot_be_trained_is_refused_at_once(tmp_path: Path) -> None:
         Training(tiny_capture(), "nerf")
     with pytest.raises(InputError, match="expected at least"):
         Training(tiny_capture(), "planar", iterations=2)
+    for wrong in (SplatRecipe(strategy="foo"), SplatRecipe(ssim_weight=-3.0)):  # type: ignore[arg-type]
+        with pytest.raises(InputError, match=r"(strategy is 'foo'|ssim_weight is -3\.0); expected"):
+            Training(tiny_capture(), wrong)
+    with pytest.raises(InputError, match=r"iterations is 20\.5; expected"):
+        Training(tiny_capture(), "splat", iterations=20.5)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="needs the output"):
         Training(tiny_capture(), "splat", resume=True)
     (tmp_path / "file").touch()

@@ -209,9 +209,16 @@ def nothing(folder: Path) -> None:
     (folder / "notes.txt").write_text("")
 
 
+def a_capture(folder: Path) -> None:
+    (folder / "images").mkdir()
+    (folder / "panes").mkdir()
+    (folder / "panes" / "0.png").write_bytes((folder / "0.png").read_bytes())
+
+
 @pytest.mark.parametrize(
     ("spoil", "expected"),
     [
+        (a_capture, r"in is a capture; expected a folder of photographs, such as .*images"),
         (broken, r"cannot read .*1\.png as an image"),
         (several, r"2 of 3 photographs cannot be used \(1\.png, 2\.png\).*Of the first: cannot read .*1\.png as"),
         (no_picture, r"cannot read .*1\.png as an image"),

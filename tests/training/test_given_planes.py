@@ -104,6 +104,13 @@ def test_without_masks_and_rectangles_it_says_how_to_mark_panes(capture: Path) -
         PlanarRecipe().initialise(load_dataset(capture))
 
 
+def test_a_mirror_that_is_no_pane_is_refused() -> None:
+    """It would also keep mirrors from being recognised."""
+    recipe = PlanarRecipe(plane_fit=PlaneFit(mirror_labels=(5,)))
+    with pytest.raises(PlaneFitError, match="names pane 5; expected some of 1"):
+        recipe.initialise(tiny_capture())
+
+
 def test_a_pane_that_only_a_test_photograph_shows_is_refused_by_name(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path / "capture")
     held_out = root / "panes" / load_dataset(root).test[0].name
