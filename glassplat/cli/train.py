@@ -77,7 +77,8 @@ class Train(Generic[RecipeKind]):
         """
         if real_path(self.output) == real_path(self.data):
             raise InputError(f"{self.output} is the capture itself; choose another folder for --output")
-        if self.recipe.strategy != "mcmc" and self.recipe.mcmc.cap is not None:
+        recipe: Any = self.recipe
+        if recipe.strategy != "mcmc" and recipe.mcmc.cap is not None:
             raise InputError("--cap belongs to --strategy mcmc; expected that strategy, or --densify.cap")
         check_output(RunDirectory(self.output), resume=self.resume)
         say(message_console(), self.files)
