@@ -17,7 +17,7 @@ from glassplat.files.records import read_json
 from glassplat.files.scene_folder import read_scene, read_splats
 from glassplat.files.sidecars import read_planes
 from glassplat.methods.planar import fitted_planes
-from glassplat.model.model import PLANES
+from glassplat.model.model import CAMERAS, PLANES
 from glassplat.model.run_directory import RunDirectory, RunSettings
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.material import virtual_points
@@ -157,6 +157,9 @@ def trained_part(directory: RunDirectory) -> Finding:
         finding.next.append(resume_command(directory))
         return finding
     finding.facts["trained to"] = step
+    if not (directory.path / CAMERAS).is_file():
+        finding.problems.append(f"{CAMERAS} is missing, which view, video and export need")
+        finding.next.append(resume_command(directory))
     _describe_scene(scene, finding)
     _describe_results(directory, finding)
     return finding

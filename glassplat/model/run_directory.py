@@ -240,18 +240,18 @@ class RunDirectory:
             remove_unfinished(folder, (".ply", ".json", ".safetensors", ".png"))
 
     def write_refined(self, dataset: Dataset, scene: Scene) -> None:
-        """Replaces the recorded cameras by those that training found, if it looked for them.
+        """Writes the recorded cameras again, as training found them if it looked for them.
 
-        `sparse/0` is the same as a COLMAP model, of the photographs as training saw them: undistorted and reduced.
+        Then `sparse/0` is the same as a COLMAP model, of the photographs as training saw them: undistorted and reduced.
         """
         from glassplat.captures.dataset import with_corrected_cameras
         from glassplat.files.sidecars import write_cameras, write_colmap
 
-        if not len(scene.poses):
-            return
         refined = with_corrected_cameras(dataset, scene)
         cameras = [(view.name, view.camera) for view in (*refined.train, *refined.test)]
         write_cameras(self.path / "cameras.json", cameras)
+        if not len(scene.poses):
+            return
         positions, colors = dataset.points.positions.numpy(), dataset.points.colors.numpy()
         write_colmap(self.path / "sparse" / "0", sorted(cameras, key=itemgetter(0)), positions, colors)
 

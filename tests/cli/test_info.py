@@ -151,12 +151,17 @@ def test_a_finished_run_whose_scene_is_damaged_says_what_is_wrong(
     run = tmp_path / "run"
     settings = RunSettings(str(tmp_path / "capture"), 12, seed=3)
     Run(SplatRecipe(sh_degree=1), settings, RunDirectory(run), load_dataset(settings.data)).to_the_end(lambda _: None)
+    (run / "cameras.json").unlink()
+    assert "cameras.json is missing" in told(run, capsys)["problems"][0]
     (scene,) = run.glob("point_cloud/*/point_cloud.ply")
     scene.write_bytes(scene.read_bytes()[:-100])
     found = told(run, capsys)
     (problem,) = found["problems"]
     assert "point_cloud.ply" in problem and "interrupted" not in problem
-    assert any("--resume" in line for line in found["next"])
+    (command,) = (line for line in found["next"] if "--resume" in line)
+    assert main([*shlex.split(command)[1:], "--device", "cpu"]) == 0
+    capsys.readouterr()
+    assert told(run, capsys)["problems"] == [] and (run / "cameras.json").is_file()
 
 
 def test_an_interrupted_run_says_its_step_and_the_command_that_goes_on(
