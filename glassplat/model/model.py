@@ -576,6 +576,8 @@ def extent_of(gaussians: Gaussians, cameras: NamedCameras) -> float:
 def _planes(file: Path, planes_file: Path | None) -> Planes:
     beside = file.with_name("planes.json")
     if planes_file is None and not beside.is_file():
+        if file.with_name(GLASS).is_file():
+            log.warning("%s has panes no more: next to it is %s, but no %s", file, GLASS, PLANES)
         return Planes.empty()
     return read_planes(planes_file or beside)
 

@@ -35,6 +35,15 @@ def test_what_was_exported_comes_back(tmp_path: Path) -> None:
         assert list(again.cameras) == list(before.cameras)
 
 
+def test_glass_without_its_panes_is_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    command = ["export", str(write_run(tmp_path / "run")), "--output", str(tmp_path / "out"), "--formats", "ply"]
+    assert main(command) == 0
+    (tmp_path / "out" / "planes.json").unlink()
+    with caplog.at_level(logging.WARNING, "glassplat"):
+        assert not load(tmp_path / "out" / "scene.ply", device="cpu").panes
+    assert "no planes.json" in caplog.text
+
+
 def test_a_file_of_discs_is_drawn_as_discs(tmp_path: Path) -> None:
     solid = true_scene().primary
     discs = replace(solid, log_scales=solid.log_scales[:, :2].contiguous())
