@@ -97,15 +97,11 @@ class PaneSetup:
     def __call__(self, state: TrainState, dataset: Dataset) -> Work:
         """Edits `state`, and tells how far it is."""
         yield Working("fitting planes to the masks", 0, 1)
-        planes = fitted_planes(dataset, state.scene.primary.means, self.fit)
-        glass = glass_gaussians(planes, count=self.glass_count, seed=self.seed)
-        scene = replace(state.scene, planes=planes, glass=glass)
+        scene = self._with_glass(state.scene, fitted_planes(dataset, state.scene.primary.means, self.fit))
         if self.detect_mirrors or self.fit.mirror_labels:
-            planes = yield from self._with_mirrors_found(scene, dataset)
-            # On the planes as they are now: mirrors have been aligned.
-            scene = replace(scene, glass=glass_gaussians(planes, count=self.glass_count, seed=self.seed))
-        if not self.fixed_mirrors:
-            planes = replace(planes, mirrors=())
+            # Finding mirrors aligns them.
+            scene = self._with_glass(scene, (yield from self._with_mirrors_found(scene, dataset)))
+        planes = scene.planes if self.fixed_mirrors else replace(scene.planes, mirrors=())
         state.scene = replace(scene, planes=planes.that_may_tint() if self.tint else planes)
         state.statistics.clear()
         for mirrors in surfaces(planes, mirrors=True):
@@ -114,6 +110,10 @@ class PaneSetup:
         for panes in surfaces(planes, mirrors=False) if self.seed_reflections else ():
             yield from seed_reflection(state, dataset, panes)
         return True
+
+    def _with_glass(self, scene: Scene, planes: Planes) -> Scene:
+        """The scene with these planes, and glass on them."""
+        return replace(scene, planes=planes, glass=glass_gaussians(planes, count=self.glass_count, seed=self.seed))
 
     def _with_mirrors_found(self, scene: Scene, dataset: Dataset) -> Generator[Working, None, Planes]:
         """The scene's planes, with those as mirrors that look like it, each where the photographs show it.

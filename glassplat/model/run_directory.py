@@ -239,7 +239,7 @@ class RunDirectory:
         for folder in self.path.glob("point_cloud/iteration_*"):
             remove_unfinished(folder, (".ply", ".json", ".safetensors", ".png"))
 
-    def write_refined(self, dataset: Dataset, scene: Scene) -> None:
+    def write_trained_cameras(self, dataset: Dataset, scene: Scene) -> None:
         """Writes the recorded cameras again, as training found them if it looked for them.
 
         Then `sparse/0` is the same as a COLMAP model, of the photographs as training saw them: undistorted and reduced.

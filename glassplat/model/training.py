@@ -218,7 +218,7 @@ class Run:
     def _export(self) -> None:
         assert self.state is not None
         self._directory.export(self.state.scene, self.state.step)
-        self._directory.write_refined(self._dataset, self.state.scene)
+        self._directory.write_trained_cameras(self._dataset, self.state.scene)
 
 
 def first_state(recipe: Any, settings: run_directory.RunSettings, dataset: Dataset) -> TrainState:

@@ -206,7 +206,7 @@ def _where_counted(errors: Tensor, view: View) -> Tensor:
 def counted_pixels(view: View, device: torch.device) -> Tensor:
     """[H, W] bool: which pixels the view does not ignore."""
     if view.ignored is None:
-        return torch.ones(view.photo.shape[:2], dtype=torch.bool, device=device)
+        return torch.ones(view.camera.height, view.camera.width, dtype=torch.bool, device=device)
     return ~view.ignored.to(device)
 
 
