@@ -29,6 +29,8 @@ from glassplat.training.options import DefaultDensify, McmcDensify
 NEIGHBOURS = 3
 SMALLEST_SCALE = 1e-6
 """Floor of the standard deviation, as a share of the cloud's size: points that coincide would have none."""
+DARKEST = 0.25
+"""Least value of a channel of a point's colour, of 255. What is black from the start gets no gradient and stays so."""
 
 
 def gaussians_from_points(
@@ -37,8 +39,8 @@ def gaussians_from_points(
     """One isotropic Gaussian for every point, in Morton order, so that neighbours in space are neighbours in memory.
 
     The standard deviation is `spread` times the mean distance to the three nearest points, the constant SH coefficient
-    reproduces the point's colour, all other coefficients are zero. The channel `log_intensity` starts at zero
-    (intensity one).
+    reproduces the point's colour (0 as `DARKEST`), all other coefficients are zero. The channel `log_intensity` starts
+    at zero (intensity one).
 
     Args:
         points: at least one.
@@ -63,7 +65,7 @@ def gaussians_from_points(
     means = points.positions[order]
     count, device = len(points), means.device
     sh = torch.zeros(count, (sh_degree + 1) ** 2, 3, device=device)
-    sh[:, 0] = (points.colors[order].float() / 255 - 0.5) / SH_ZERO
+    sh[:, 0] = (points.colors[order].float().clamp(min=DARKEST) / 255 - 0.5) / SH_ZERO
     return Gaussians(
         means=means,
         quats=torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).repeat(count, 1),

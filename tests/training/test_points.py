@@ -10,6 +10,8 @@ import torch
 
 from glassplat.captures.capture import RawPoints
 from glassplat.captures.view import PointCloud
+from glassplat.kernels.project import project
+from glassplat.kernels.records import CameraBatch, RawGaussians
 from glassplat.scene import SH_ZERO
 from glassplat.training.densify import gaussians_from_points
 
@@ -34,6 +36,18 @@ def test_every_point_is_one_gaussian_of_its_colour() -> None:
     assert set(gaussians.channels) == {"log_intensity"}
     assert not gaussians.channels["log_intensity"].any()
     assert all(tensor.dtype == torch.float32 and tensor.is_contiguous() for tensor in gaussians.tensors().values())
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_black_points_learn_their_colour(degree: int) -> None:
+    black = PointCloud.of(RawPoints.from_arrays(np.eye(3) + np.array([0, 0, 4]), np.zeros((3, 3), np.int64)))
+    gaussians = gaussians_from_points(black, opacity=0.9)
+    raw = RawGaussians(**{name: getattr(gaussians, name) for name in RawGaussians._fields})
+    raw.sh.requires_grad_()
+    cameras = CameraBatch(torch.eye(4)[None], torch.tensor([[40.0, 40.0, 20.0, 20.0]]), 40, 40)
+    project(raw, cameras, sh_degree=degree, near=0.1).colors.sum().backward()
+    assert raw.sh.grad is not None
+    assert bool((raw.sh.grad[:, 0] > 0).all())
 
 
 def test_scale_is_the_mean_distance_to_three_neighbours() -> None:

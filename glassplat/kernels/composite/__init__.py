@@ -11,7 +11,16 @@ from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.backend.devices import kernels_for
 from glassplat.kernels.maths.disc import LOW_PASS, MAP
-from glassplat.kernels.records import LEAST_ALPHA, MOST_CHANNELS, Deviation, Discs, Splats, TileBins, check_tensors
+from glassplat.kernels.records import (
+    LEAST_ALPHA,
+    MOST_CHANNELS,
+    Deviation,
+    Discs,
+    Splats,
+    TileBins,
+    check_device,
+    check_tensors,
+)
 
 
 def check_bins(channels: Tensor, bins: TileBins, cameras: int, count: int, these: str) -> None:
@@ -19,7 +28,9 @@ def check_bins(channels: Tensor, bins: TileBins, cameras: int, count: int, these
 
     Raises:
         ValueError: shapes disagree.
+        TypeError: channels and bins are on different devices.
     """
+    check_device("bins", bins.pair_splats, "channels", channels)
     if channels.ndim != 3 or not 1 <= channels.shape[2] <= MOST_CHANNELS:
         raise ValueError(f"channels has shape {list(channels.shape)}, expected [C, G, D] with D in 1..{MOST_CHANNELS}")
     if bins.num_cameras != cameras or len(bins.splat_offsets) != cameras * count + 1:

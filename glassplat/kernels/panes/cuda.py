@@ -314,7 +314,7 @@ def blend_panes_forward(real: type) -> Kernel:
             return
         row, column = i // mask.shape[1], i % mask.shape[1]
         k, marked = pane[row, column], mask[row, column]
-        shown = k >= 0 and marked > zero
+        shown = 0 <= k < normals.shape[0] and marked > zero
         share, gain = zero, one
         if shown:
             raw, _, _, _, _ = shine(row, column, k, normals, bases, intrinsics, law)
@@ -349,7 +349,7 @@ def blend_panes_backward(real: type) -> Kernel:
             return
         row, column = i // mask.shape[1], i % mask.shape[1]
         k, marked = pane[row, column], mask[row, column]
-        if not (k >= 0 and marked > zero):
+        if not (0 <= k < normals.shape[0] and marked > zero):
             for d in range(3):
                 v_transmission[row, column, d] = v_rgb[row, column, d]
             return

@@ -1,10 +1,11 @@
-"""Binning on the GPU: one pass over the splats to count their tiles, one to list their rows of tiles, two over the
-pairs; torch scans and sorts. There are few steps, as to start one takes longer than a small one itself.
+"""Binning on the GPU: three passes over the splats to count their tiles, order the counts and list their rows of tiles,
+two over the pairs; torch scans and sorts. There are few steps, as to start one takes longer than a small one itself.
 
 Splats are sorted by depth first. Their pairs are written in that order, so that one stable sort of the pairs by tile,
-an integer of 16 bits for all but very large images, leaves each tile's splats nearest first. Each pair has a thread,
-which searches the sums of the counts for its splat, then those of the splat's rows: no thread waits for one that covers
-the whole image. Only the passes over the splats compute in float64, which most GPUs do 32 or 64 times slower.
+an integer of 16 bits up to 32,767 tiles of all cameras, leaves each tile's splats nearest first. Each pair has a
+thread, which searches the sums of the counts for its splat, then those of the splat's rows: no thread waits for one
+that covers the whole image. Only the passes over the splats compute in float64, which most GPUs do 32 or 64 times
+slower.
 """
 
 from __future__ import annotations
