@@ -20,7 +20,7 @@ COMMON = "splat"
 """Differences that every method shares stand on the page of this one."""
 
 ALL = {
-    "rates.short_run_power": "Runs of n < 30,000 iterations learn (30,000 / n)^0.5 times as fast.",
+    "rates.short_run_power": "Short runs learn faster: by (30,000 / n)^0.5 in n >= 3,000 iterations; not opacities.",
     "intervals.averaged_passes": "The mean over the last pass is better than the last step.",
     "densify.split_by": "Gradients of single pixels (AbsGS) find what a large Gaussian smears.",
     "densify.whole_passes": "Every Gaussian is seen before it is judged.",

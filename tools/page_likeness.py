@@ -5,11 +5,11 @@ python -m tools.page_likeness runs/showcase out/index.html
 
 from __future__ import annotations
 
+import argparse
 import base64
 import json
 import os
 import statistics
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -128,7 +128,10 @@ def walked(browser: Browser) -> Walk:
 
 def main() -> None:
     """Prints both."""
-    run, page = map(Path, sys.argv[1:3])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, help="a trained run")
+    parser.add_argument("page", type=Path, help="its exported page")
+    run, page = vars(parser.parse_args()).values()
     model = load(run, device="cpu")
     with Browser(page, 640, 480) as browser:
         found = likenesses(browser, model)

@@ -29,7 +29,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from shlex import quote
 from types import FrameType
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, NoReturn
 
 from rich.console import Console
 from rich.control import Control, ControlType
@@ -42,16 +42,25 @@ UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 """Control characters but for tabs and line breaks, and the bytes of a file name that are not text."""
 
 
+class MessageConsole(Console):
+    """Rich's console; it leaves it to the command how to end when nobody reads the output any more."""
+
+    def on_broken_pipe(self) -> NoReturn:
+        """Raises BrokenPipeError again."""
+        raise BrokenPipeError
+
+
 def message_console(*, stderr: bool = False) -> Console:
     """The console of a command: strings are shown as they are, and break only in a terminal."""
-    console = Console(stderr=stderr, markup=False, emoji=False, highlight=False)
+    console = MessageConsole(stderr=stderr, markup=False, emoji=False, highlight=False)
     console.soft_wrap = not console.is_terminal
     return console
 
 
 def shell_word(path: object) -> str:
-    """A path as it is typed in a command."""
-    return quote(str(path))
+    """A path as it is typed in a command, where a leading dash would begin an option."""
+    word = str(path)
+    return quote(f"./{word}" if word.startswith("-") else word)
 
 
 def count_noun(number: int, noun: str) -> str:
@@ -60,7 +69,7 @@ def count_noun(number: int, noun: str) -> str:
 
 
 def say(console: Console, text: object, *, label: str = "", style: str = "") -> None:
-    """Prints a line as it is.
+    """Prints a line as it is; a terminal breaks it, so that a command in it is copied as one line.
 
     Args:
         console: where to; any console, also one that reads markup.
@@ -70,7 +79,7 @@ def say(console: Console, text: object, *, label: str = "", style: str = "") -> 
     """
     line = Text(f"{label}:" if label else "", style=style)
     line.append(f"{' ' if label else ''}{printable(str(text))}", style="default")
-    console.print(line, soft_wrap=not console.is_terminal)
+    console.print(line, soft_wrap=True)
 
 
 def warn(console: Console, text: object) -> None:

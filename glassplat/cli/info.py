@@ -274,7 +274,7 @@ class Info:
         if self.page is not None:
             import_held(DETAILS).write_capture_page(self.path, self.page)
         if self.json:
-            say(console, json.dumps({"path": str(self.path), **whole.as_json()}, indent=1))
+            console.file.write(json.dumps({"path": str(self.path), **whole.as_json()}, indent=1) + "\n")
             return
         for problem in whole.problems:
             warn(console, problem)

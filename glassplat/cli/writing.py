@@ -24,6 +24,7 @@ from glassplat.errors import InputError, first_names, input_checked
 from glassplat.evaluate.evaluate import timed_render
 from glassplat.evaluate.metrics import quantize
 from glassplat.files.images import write_image
+from glassplat.files.records import readable_name
 from glassplat.files.sidecars import read_cameras, write_cameras
 from glassplat.files.writing import SPLAT_WRITERS, atomic_write, real_path, scene_source, splat_writer
 from glassplat.model.model import CAMERAS, ENVIRONMENT, GLASS, PANORAMA, PLANES, Model, save_page, write_beside
@@ -253,7 +254,8 @@ def _write_page(command: Export, model: Model, console: Console) -> list[Path]:
         warn(
             console, f"a page holds {MOST_GAUSSIANS:,} Gaussians: this one shows those that cover most of a photograph"
         )
-    save_page(model, path, command.title or model.name, sharing=Sharing(command.credit, command.url))
+    title, credit = readable_name(command.title or model.name), command.credit and readable_name(command.credit)
+    save_page(model, path, title, sharing=Sharing(credit, command.url))
     written = [path]
     if command.url is not None:
         write_preview(command.output / PREVIEW, model.scene, model.renderer, tuple(model.cameras.items()))

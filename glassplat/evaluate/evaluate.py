@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 import sys
 import time
@@ -324,8 +325,8 @@ def _measure(
         "psnr": _counted_psnr(image, photo, counted),
         "corrected_psnr": _counted_psnr(metrics.color_corrected(image, photo, region=counted), photo, counted),
         "right_half_psnr": _right_half_psnr(image, photo, counted),
-        "ssim": metrics.ssim(image, photo),
-        "lpips": _lpips(lpips, image, photo),
+        "ssim": ALL_IGNORED if _too_few(counted) else metrics.ssim(image, photo),
+        "lpips": ALL_IGNORED if _too_few(counted) else _lpips(lpips, image, photo),
         "pane_psnr": pane if isinstance(pane, str) else _region_psnr(image, photo, pane, TOO_FEW),
         "transmission_psnr": _transmission_psnr(frame, *truth),
         **metrics.surface_metrics(frame, photo, surface),
@@ -349,13 +350,20 @@ def _counted_psnr(image: Tensor, photo: Tensor, counted: Tensor | None) -> metri
 def _right_half_psnr(image: Tensor, photo: Tensor, counted: Tensor | None) -> metrics.Outcome:
     """Of the right half, in the colours that the left half tells (as is done for NeRF in the Wild)."""
     middle = max(photo.shape[1] // 2, 1)
+    if counted is not None and _too_few(counted[:, :middle]):
+        return "all but fewer than 100 pixels of the left half are ignored"
     corrected = metrics.color_corrected(image, photo, slice(0, middle), counted)
     right = slice(min(middle, photo.shape[1] - 1), None)
     return _counted_psnr(corrected[:, right], photo[:, right], None if counted is None else counted[:, right])
 
 
 def _region_psnr(image: Tensor, target: Tensor, region: Tensor, reason: str) -> metrics.Outcome:
-    return metrics.psnr(image, target, region) if int(region.sum()) >= metrics.SMALLEST_REGION else reason
+    return reason if _too_few(region) else metrics.psnr(image, target, region)
+
+
+def _too_few(region: Tensor | None) -> bool:
+    """Return whether there is a region [H, W] that is too small to measure anything in it."""
+    return region is not None and int(region.sum()) < metrics.SMALLEST_REGION
 
 
 def _transmission_psnr(frame: Frame, truth: GroundTruth | None, true_view: TrueView | None) -> metrics.Outcome:
@@ -396,13 +404,14 @@ def _add_reflection(measurements: Iterable[_Measurement]) -> float | None:
 
 
 def _means(per_view: list[dict[str, metrics.Outcome]]) -> dict[str, metrics.Outcome]:
-    """Mean of every metric over the views that have it, or all reasons why none has."""
+    """Mean of every metric over the views that have it and are not perfect, or all reasons why none has."""
     means: dict[str, metrics.Outcome] = {}
     for name in per_view[0]:
         outcomes = [of_view[name] for of_view in per_view]
         values = [outcome for outcome in outcomes if not isinstance(outcome, str)]
         reasons = dict.fromkeys(outcome for outcome in outcomes if isinstance(outcome, str))
-        means[name] = statistics.fmean(values) if values else "; ".join(reasons)
+        imperfect = [value for value in values if value != math.inf]
+        means[name] = statistics.fmean(imperfect or values) if values else "; ".join(reasons)
     return means
 
 

@@ -66,7 +66,7 @@ METRICS = {
     ),
     "ssim": Metric("SSIM", "{:.4f}", "structural similarity, 1 for equal images; higher is better"),
     "lpips": Metric("LPIPS", "{:.4f}", "perceptual distance by a trained network, 0 for equal images; lower is better"),
-    "pane_psnr": Metric("PSNR, pane", "{:.2f} dB", "the same of the pixels that show a pane"),
+    "pane_psnr": Metric("PSNR, pane", "{:.2f} dB", "PSNR of the pixels that show a pane; higher is better"),
     "transmission_psnr": Metric(
         "PSNR, transmission", "{:.2f} dB", "of what is seen through the panes, against the truth"
     ),

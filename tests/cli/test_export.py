@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
@@ -33,6 +34,14 @@ def test_all_that_the_scene_has_is_written(tmp_path: Path) -> None:
     assert torch.equal(read_planes(output / "planes.json").centers, scene.planes.centers)
     assert len(read_gaussians(output / "glass.ply")) == len(scene.glass)
     torch.testing.assert_close(read_spz(output / "scene.spz").means, scene.primary.means, rtol=0, atol=1e-4)
+
+
+def test_names_that_are_no_text_are_titles(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run").rename(tmp_path / os.fsdecode(b"caf\xe9"))
+    for title in ([], ["--title", os.fsdecode(b"Caf\xe9"), "--credit", os.fsdecode(b"\xe9")]):
+        assert main(["export", str(run), "--output", str(tmp_path / "out"), "--formats", "html", *title]) == 0
+        page = (tmp_path / "out" / "index.html").read_text("utf-8")
+        assert ("Caf" if title else "caf") + "\\xe9" in page
 
 
 def test_the_photographs_need_not_be_there(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import shutil
 import signal
@@ -186,9 +187,10 @@ def test_an_interrupted_run_says_its_step_and_the_command_that_goes_on(
     assert told(tmp_path / "run", capsys)["facts"]["trained to"] == 12
 
 
-def test_what_is_for_programs_has_no_line_of_the_log_in_it() -> None:
+def test_what_is_for_programs_has_no_colours_and_no_line_of_the_log_in_it() -> None:
     command = [sys.executable, "-m", "glassplat", "info", str(SCENE), "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    colourful = os.environ | {"FORCE_COLOR": "1", "COLUMNS": "40"}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True, env=colourful)
     assert json.loads(done.stdout)["path"] == str(SCENE) and "pane 1: " in done.stderr
 
 

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from glassplat.cli.console import complain, heard_by, message_console, printable, say, warn
+from glassplat.cli.console import complain, heard_by, message_console, printable, say, shell_word, warn
 
 AWKWARD = [
     "/data/[bold]/run",
@@ -45,12 +45,6 @@ def test_a_console_that_reads_markup_shows_them_too(text: str) -> None:
     assert file.getvalue() == f"{text}\n"
 
 
-def test_only_a_terminal_breaks_lines() -> None:
-    file = io.StringIO()
-    say(Console(file=file, force_terminal=True, width=20, color_system=None), "one two three four five six seven")
-    assert file.getvalue().count("\n") > 1
-
-
 @pytest.mark.parametrize(
     ("text", "shown"),
     [
@@ -65,6 +59,17 @@ def test_what_no_terminal_should_get_is_written_out(text: str, shown: str, capsy
     assert printable(text) == shown
     complain("stopped", text)
     assert "".join(capsys.readouterr().err.split()) == "".join(f"stopped: {shown}".split())
+
+
+def test_a_terminal_breaks_lines_itself() -> None:
+    terminal = Console(file=io.StringIO(), force_terminal=True, color_system=None, width=20)
+    command = "next: glassplat train planar --data /a/rather/long/path --output somewhere"
+    say(terminal, command)
+    assert terminal.file.getvalue() == command + "\n"
+
+
+def test_a_leading_dash_begins_no_option() -> None:
+    assert [shell_word(path) for path in ("-run", "a run", "run-1")] == ["./-run", "'a run'", "run-1"]
 
 
 def test_tables_show_names_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:

@@ -272,10 +272,11 @@ def test_output_that_is_closed_full_or_narrow_changes_no_exit_code(line: str, ex
     assert (done.returncode, done.stderr) == expected
 
 
-def test_a_reader_that_leaves_ends_the_command_in_silence() -> None:
+@pytest.mark.parametrize("words", [["--help"], ["info", str(Path(glassplat.__file__).parent / "demo_scene")]])
+def test_a_reader_that_leaves_ends_the_command_in_silence(words: list[str]) -> None:
     read, write = os.pipe()
     os.close(read)
-    command = [sys.executable, "-m", "glassplat", "--help"]
+    command = [sys.executable, "-m", "glassplat", *words]
     done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
     os.close(write)
     assert (done.returncode, done.stderr) == (141, "")

@@ -230,6 +230,35 @@ def test_plain_gives_a_reason_for_every_missing_number() -> None:
     assert json_values({"a": math.inf})["a"] is None
 
 
+def test_a_view_that_is_ignored_altogether_counts_in_no_mean(case) -> None:
+    first, *others = case.dataset.test
+    whole = replace(first, read_ignored=lambda: torch.ones_like(first.photo[..., 0], dtype=torch.bool))
+    results = evaluate(case.scene, case.renderer, replace(case.dataset, test=(whole, *others))).results
+    expected = evaluate(case.scene, case.renderer, replace(case.dataset, test=tuple(others))).results
+    for name in ("psnr", "ssim", "right_half_psnr", "corrected_psnr"):
+        assert results[name] == expected[name], name
+
+
+def test_right_halves_need_a_left_half_that_counts(case) -> None:
+    view = case.dataset.test[0]
+    columns = torch.arange(view.camera.width).expand_as(view.photo[..., 0])
+    halved = replace(view, read_ignored=lambda: columns < view.camera.width // 2)
+    results = evaluate(case.scene, case.renderer, replace(case.dataset, test=(halved,))).results
+    assert results["right_half_psnr"] is None and "left half" in results["right_half_psnr_reason"]
+    assert results["psnr"] is not None
+
+
+def test_a_perfect_view_does_not_hide_the_mean_of_the_others(case) -> None:
+    view, *others = case.dataset.test
+    exact = (case.renderer.frames[view.camera.fx].rgb.clamp(0, 1) * 255).round().to(torch.uint8)
+    perfect = replace(view, read_photo=lambda: exact)
+    results = evaluate(case.scene, case.renderer, replace(case.dataset, test=(perfect, *others))).results
+    without = evaluate(case.scene, case.renderer, replace(case.dataset, test=tuple(others))).results
+    assert results["psnr"] == without["psnr"]
+    alone = evaluate(case.scene, case.renderer, replace(case.dataset, test=(perfect,))).results
+    assert alone["psnr"] is None and "infinite" in alone["psnr_reason"]
+
+
 def test_peak_memory_is_a_number_where_the_system_tells_it(monkeypatch: pytest.MonkeyPatch) -> None:
     peak = peak_memory_mib()
     assert isinstance(peak, float) and 50 < peak < 1e6
