@@ -256,8 +256,9 @@ def _examine(path: Path, name: str, max_size: int, least_side: int = LEAST_SIDE)
 
 
 def _device(tags: dict) -> str:
-    """Maker, model, lens and zoom, as far as the file tells."""
-    kinds = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.LensModel, ExifTags.Base.FocalLength)
+    """Maker, model, lens and zoom, as far as the file tells; digital zoom shows only in the length on 35 mm film."""
+    lens = (ExifTags.Base.LensModel, ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
+    kinds = (ExifTags.Base.Make, ExifTags.Base.Model, *lens)
     return " ".join(str(tags[kind]).strip("\0 ") for kind in kinds if tags.get(kind))
 
 

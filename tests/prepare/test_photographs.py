@@ -10,6 +10,7 @@ import pytest
 from PIL import ExifTags, Image
 
 from glassplat.errors import InputError
+from glassplat.prepare.colmap import _camera_key
 from glassplat.prepare.photographs import Photograph, capture_names, photographs_in, read_photograph
 from tests.files.profiles import IN_P3, IN_SRGB, p3_profile
 from tests.prepare.conftest import Heard
@@ -129,6 +130,19 @@ def test_devices_are_told_apart(tmp_path: Path, heard: Heard) -> None:
         picture(seed).save(folder / f"{seed}.jpg", exif=exif)
     shots = found(folder, heard)
     assert shots["5.jpg"].device == shots["6.jpg"].device != shots["7.jpg"].device
+
+
+def test_digital_zoom_is_another_lens(tmp_path: Path, heard: Heard) -> None:
+    folder = three(tmp_path / "in")
+    for seed, focal in enumerate((26, 26, 52), start=5):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Model] = "telephone"
+        tags = exif.get_ifd(ExifTags.IFD.Exif)
+        tags[ExifTags.Base.FocalLength], tags[ExifTags.Base.LensModel] = 5.96, "back camera 5.96mm f/1.6"
+        tags[ExifTags.Base.FocalLengthIn35mmFilm] = focal
+        picture(seed).save(folder / f"{seed}.jpg", exif=exif)
+    keys = {name: _camera_key(shot) for name, shot in found(folder, heard).items()}
+    assert keys["5.jpg"] == keys["6.jpg"] != keys["7.jpg"]
 
 
 def test_numbers_are_sorted_by_value_and_folders_stay(tmp_path: Path, heard: Heard) -> None:
@@ -260,7 +274,7 @@ def test_photographs_of_a_telephone_are_read_upright_under_any_name(tmp_path: Pa
     assert sorted(seen) == ["0.png", "1.png", "2.png", "IMG_1.HEIC", "IMG_2.jpg"]
     for name in ("IMG_1.HEIC", "IMG_2.jpg"):
         photograph = seen[name]
-        assert (photograph.width, photograph.height, photograph.device) == (72, 96, "Maker Telephone")
+        assert (photograph.width, photograph.height, photograph.device) == (72, 96, "Maker Telephone 26")
         assert photograph.focal == pytest.approx(26 / np.hypot(36, 24) * np.hypot(72, 96))
         pixels = read_photograph(photograph).astype(int)
         np.testing.assert_allclose(pixels[2, -3], (0, 255, 80), atol=12)
