@@ -18,7 +18,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.images import (
@@ -87,17 +86,16 @@ def read_mask_at_threshold(path: Path) -> MaskValues:
 
 
 def _read_shades(path: Path) -> NDArray[np.uint8]:
-    """[H, W] grey values, or the indices of a palette."""
+    """[H, W] grey values, or the indices of a palette that shows labels in colours."""
     with input_checked():
         image = open_image(path)
     image.info.pop("transparency", None)  # It says nothing about panes, and Pillow warns of some ways to store it.
-    if image.mode == "P" and not _is_black_and_white(image):
-        return np.array(image).astype(np.uint8)
     if image.mode in SHADES_16:
         return _in_eight_bits(np.array(image), path)
-    if image.mode in ("1", "L", "LA", "P"):
+    if image.mode in ("1", "L", "LA"):
         return np.array(image.convert("L"))
-    return _one_colour(np.array(image.convert("RGB")), path)
+    colors = np.array(image.convert("RGB"))
+    return _palette_shades(np.array(image), colors, path) if image.mode == "P" else _one_colour(colors, path)
 
 
 def _in_eight_bits(values: NDArray[np.integer], path: Path) -> NDArray[np.uint8]:
@@ -113,10 +111,20 @@ def _in_eight_bits(values: NDArray[np.integer], path: Path) -> NDArray[np.uint8]
     return (values // SIXTEEN_TO_EIGHT).astype(np.uint8)
 
 
-def _is_black_and_white(image: Image.Image) -> bool:
-    """Return whether a palette shows nothing but black and white, so that its colours count and not its indices."""
-    colours = {colour for _, colour in image.convert("RGB").getcolors(image.width * image.height) or []}
-    return colours <= {(0, 0, 0), (WHITE, WHITE, WHITE)}
+def _palette_shades(indices: NDArray[np.uint8], colors: NDArray[np.uint8], path: Path) -> NDArray[np.uint8]:
+    """Greys where all are; 0 and 255 for black and one colour, where 0 is not black; else the indices of a palette."""
+    if not np.ptp(colors, axis=2).any():
+        return colors[:, :, 0]  # Programs that shrink PNGs make such palettes, in which an index means nothing.
+    lit = colors.max(axis=2) > 0
+    colored_zero = bool(lit[indices == 0].any())
+    if (colored_zero or indices.all()) and not lit.all() and len(np.unique(indices)) == 2:
+        return np.where(lit, WHITE, 0).astype(np.uint8)
+    if colored_zero:
+        raise InputError(
+            f"{path} has a palette in which 0, no pane, is a colour; expected black there, as in a label image (0 no "
+            "pane, 1..K the pane), or black and one colour: save it in shades of grey"
+        )
+    return indices
 
 
 def _one_colour(pixels: NDArray[np.uint8], path: Path) -> NDArray[np.uint8]:
@@ -327,13 +335,9 @@ def _why_panes(root: Path, masks: Mapping[str, Path], *, marked: bool) -> str | 
 
 def _highest_value(path: Path) -> int:
     """The highest shade of a mask."""
-    with input_checked():
-        image = open_image(path)
     brightest = int(_brightness(path).max())
     if path.suffix.lower() in LOSSY_SUFFIXES:
         return int(brightest > LOSSY_NOISE) * WHITE
-    if image.mode == "P" and not np.ptp(np.array(image.convert("RGB")), axis=2).any():
-        return brightest  # Greys in a palette, as programs that shrink PNGs store them: its indices mean nothing.
     return brightest and int(_read_shades(path).max())
 
 
@@ -348,7 +352,7 @@ def _brightness(path: Path) -> NDArray[np.uint8]:
             if alpha.min() < WHITE:
                 return alpha
         image.info.pop("transparency", None)
-        return np.array(image.convert("RGB").convert("L") if image.mode == "P" else image.convert("L"))
+        return np.array(image.convert("RGB")).max(axis=2)
 
 
 def _join_masks(kept: Mapping[str, Path], ignored: Mapping[str, PaneMask]) -> dict[str, tuple[IgnoredMask, ...]]:

@@ -193,6 +193,60 @@ def test_colour_table_keeps_labels(capture) -> None:
     np.testing.assert_array_equal(labels_of(load_dataset(capture.root)), INSIDE * 2)
 
 
+def black_and(color: tuple[int, int, int]) -> Image.Image:
+    """A picture of one colour inside on black."""
+    return Image.fromarray(INSIDE[:, :, None] * np.array(color, dtype=np.uint8))
+
+
+def in_palette(*colors: tuple[int, int, int]) -> Image.Image:
+    """The last colour inside on the first; further ones at the corner."""
+    image = Image.new("P", (WIDTH, HEIGHT))
+    image.putpalette([value for color in colors for value in color])
+    image.paste(len(colors) - 1, (8, 6, 20, 18))
+    for index in range(1, len(colors) - 1):
+        image.putpixel((index, 0), index)
+    return image
+
+
+@pytest.mark.parametrize(
+    "stored",
+    [
+        black_and((255, 255, 255)).quantize(2),
+        black_and((255, 0, 0)).quantize(2),
+        black_and((255, 0, 0)).convert("P", palette=Image.Palette.ADAPTIVE, colors=2),
+        in_palette((255, 0, 0), (0, 0, 0)),
+    ],
+)
+@pytest.mark.parametrize("folder", ["panes", "ignore", "masks"])
+def test_indices_of_black_and_a_colour_mean_nothing(capture, folder: str, stored: Image.Image) -> None:
+    capture.write_colmap()
+    (capture.root / folder).mkdir()
+    stored.save(capture.root / folder / "0001.png")
+    data = load_dataset(capture.root, mask_polarity="bright")
+    lit = np.array(stored.convert("RGB")).any(axis=2)
+    if folder == "panes":
+        np.testing.assert_array_equal(labels_of(data), lit)
+        return
+    view = next(view for view in (*data.train, *data.test) if view.ignored is not None)
+    np.testing.assert_array_equal(view.ignored, lit if folder == "ignore" else ~lit)
+
+
+def test_greys_of_a_palette_are_shades(capture) -> None:
+    capture.write_colmap()
+    shades = np.array(in_palette((255,) * 3, *((shade,) * 3 for shade in range(250, 0, -50)), (0, 0, 0)).convert("L"))
+    (capture.root / "panes").mkdir()
+    Image.fromarray(shades).convert("RGB").quantize(16).save(capture.root / "panes" / "0001.png")
+    np.testing.assert_array_equal(labels_of(load_dataset(capture.root, mask_polarity="bright")), shades >= 128)
+
+
+def test_a_palette_whose_0_is_a_colour_is_refused(capture) -> None:
+    capture.write_colmap()
+    (capture.root / "panes").mkdir()
+    in_palette((200, 0, 0), (0, 200, 0), (0, 0, 0)).save(capture.root / "panes" / "0001.png")
+    with pytest.raises(InputError, match=r"0001\.png has a palette in which 0, no pane, is a colour; expected black"):
+        load_dataset(capture.root)
+
+
 @pytest.mark.parametrize(
     ("pixels", "message"),
     [
