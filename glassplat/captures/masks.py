@@ -18,6 +18,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.images import (
@@ -25,6 +26,7 @@ from glassplat.files.images import (
     SHADES_16,
     is_hidden,
     leads_out,
+    opacity,
     open_image,
     picture_paths,
     read_image,
@@ -86,16 +88,23 @@ def read_mask_at_threshold(path: Path) -> MaskValues:
 
 
 def _read_shades(path: Path) -> NDArray[np.uint8]:
-    """[H, W] grey values, or the indices of a palette that shows labels in colours."""
-    with input_checked():
-        image = open_image(path)
-    image.info.pop("transparency", None)  # It says nothing about panes, and Pillow warns of some ways to store it.
+    """[H, W] grey values, or the indices of a palette that shows labels in colours; transparency goes before them."""
+    image = _open_mask(path)
     if image.mode in SHADES_16:
         return _in_eight_bits(np.array(image), path)
     if image.mode in ("1", "L", "LA"):
         return np.array(image.convert("L"))
     colors = np.array(image.convert("RGB"))
     return _palette_shades(np.array(image), colors, path) if image.mode == "P" else _one_colour(colors, path)
+
+
+def _open_mask(path: Path) -> Image.Image:
+    """The mask; where any pixel is transparent, white on those that are opaque by half and black elsewhere."""
+    with input_checked():
+        image = open_image(path)
+        opaque = None if image.mode in SHADES_16 else opacity(image)
+    image.info.pop("transparency", None)  # Pillow warns of some ways to store it.
+    return image if opaque is None else Image.fromarray(np.where(opaque < THRESHOLD, 0, WHITE).astype(np.uint8))
 
 
 def _in_eight_bits(values: NDArray[np.integer], path: Path) -> NDArray[np.uint8]:
@@ -343,16 +352,10 @@ def _highest_value(path: Path) -> int:
 
 def _brightness(path: Path) -> NDArray[np.uint8]:
     """[H, W] how bright a mask is, or how opaque where it has transparent pixels."""
-    with input_checked():
-        image = open_image(path)
-        if image.mode in SHADES_16:
-            return _in_eight_bits(np.array(image), path)
-        if image.mode in ("LA", "RGBA"):
-            alpha = np.array(image.getchannel("A"))
-            if alpha.min() < WHITE:
-                return alpha
-        image.info.pop("transparency", None)
-        return np.array(image.convert("RGB")).max(axis=2)
+    image = _open_mask(path)
+    if image.mode in SHADES_16:
+        return _in_eight_bits(np.array(image), path)
+    return np.array(image.convert("RGB")).max(axis=2)
 
 
 def _join_masks(kept: Mapping[str, Path], ignored: Mapping[str, PaneMask]) -> dict[str, tuple[IgnoredMask, ...]]:

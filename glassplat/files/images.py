@@ -84,11 +84,16 @@ def is_transparent(path: Path) -> bool:
         ValueError: the file is no image, is cut off or too large.
     """
     with checked_image(path) as image:
-        if not image.has_transparency_data:
-            return False
-        with_alpha = image if "A" in image.getbands() else image.convert("RGBA")
-        least, _ = with_alpha.getchannel("A").getextrema()
-        return bool(least < 255)  # type: ignore[operator]
+        return opacity(image) is not None
+
+
+def opacity(image: Image.Image) -> NDArray[np.uint8] | None:
+    """[H, W] how opaque each pixel is; None where all are, whether the image stores that or not."""
+    if not image.has_transparency_data:
+        return None
+    with_alpha = image if "A" in image.getbands() else image.convert("RGBA")
+    alpha = np.array(with_alpha.getchannel("A"))
+    return alpha if alpha.min() < 255 else None
 
 
 def read_image(path: Path | str) -> NDArray[np.uint8]:

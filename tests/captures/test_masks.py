@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageOps
 
 from glassplat.captures.dataset import Dataset, load_dataset
 from glassplat.captures.masks import CaptureMasks, MaskSet, find_masks, mask_paths
@@ -208,27 +208,43 @@ def in_palette(*colors: tuple[int, int, int]) -> Image.Image:
     return image
 
 
-@pytest.mark.parametrize(
-    "stored",
-    [
-        black_and((255, 255, 255)).quantize(2),
-        black_and((255, 0, 0)).quantize(2),
-        black_and((255, 0, 0)).convert("P", palette=Image.Palette.ADAPTIVE, colors=2),
-        in_palette((255, 0, 0), (0, 0, 0)),
-    ],
-)
+def opaque_inside(color: tuple[int, int, int] = (0, 90, 0)) -> Image.Image:
+    """One colour everywhere, transparent outside."""
+    image = Image.new("RGB", (WIDTH, HEIGHT), color)
+    image.putalpha(Image.fromarray(INSIDE * 255))
+    return image
+
+
+WAYS = {
+    "grey": (Image.fromarray(INSIDE * 255), {}),
+    "white": (black_and((255, 255, 255)).quantize(2), {}),
+    "red": (black_and((255, 0, 0)), {}),
+    "quantized": (black_and((255, 0, 0)).quantize(2), {}),
+    "adaptive": (black_and((255, 0, 0)).convert("P", palette=Image.Palette.ADAPTIVE, colors=2), {}),
+    "red at 0": (ImageOps.invert(Image.fromarray(INSIDE * 255)).convert("P"), {}),
+    "transparent": (opaque_inside(), {}),
+    "transparent grey": (opaque_inside().convert("LA"), {}),
+    "transparent grey value": (Image.fromarray(INSIDE * 9), {"transparency": 0}),
+    "transparent palette": (opaque_inside().quantize(4), {}),
+    "transparent index": (in_palette((9, 9, 9), (200, 0, 0)), {"transparency": bytes([0, 255])}),
+    "half transparent": (in_palette((0, 0, 0), (255, 255, 255)), {"transparency": bytes([0, 128])}),
+}
+WAYS["red at 0"][0].putpalette([255, 0, 0] + 255 * [0, 0, 0])
+
+
+@pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("folder", ["panes", "ignore", "masks"])
-def test_indices_of_black_and_a_colour_mean_nothing(capture, folder: str, stored: Image.Image) -> None:
+def test_every_way_to_store_a_mask_reads_the_same(capture, folder: str, way: str) -> None:
     capture.write_colmap()
     (capture.root / folder).mkdir()
-    stored.save(capture.root / folder / "0001.png")
-    data = load_dataset(capture.root, mask_polarity="bright")
-    lit = np.array(stored.convert("RGB")).any(axis=2)
+    image, options = WAYS[way]
+    image.save(capture.root / folder / "0001.png", **options)
+    data = load_dataset(capture.root)
     if folder == "panes":
-        np.testing.assert_array_equal(labels_of(data), lit)
+        np.testing.assert_array_equal(labels_of(data), INSIDE)
         return
     view = next(view for view in (*data.train, *data.test) if view.ignored is not None)
-    np.testing.assert_array_equal(view.ignored, lit if folder == "ignore" else ~lit)
+    np.testing.assert_array_equal(view.ignored, INSIDE if folder == "ignore" else 1 - INSIDE)
 
 
 def test_greys_of_a_palette_are_shades(capture) -> None:
@@ -280,16 +296,6 @@ def test_a_mask_of_one_pixel_is_no_reduced_mask(capture) -> None:
     capture.write_mask("panes/0001.png", np.ones((1, 1), dtype=np.uint8))
     with pytest.raises(InputError, match="is 1x1 pixels large, its photograph 32x24"):
         load_dataset(capture.root)
-
-
-def test_transparency_of_a_colour_table_says_nothing_about_panes(capture) -> None:
-    capture.write_colmap()
-    image = Image.new("P", (WIDTH, HEIGHT))
-    image.putpalette([0, 0, 0, 255, 255, 255])
-    image.paste(1, (8, 6, 20, 18))
-    (capture.root / "panes").mkdir()
-    image.save(capture.root / "panes" / "0001.png", transparency=bytes([0, 128]))
-    np.testing.assert_array_equal(labels_of(load_dataset(capture.root)), INSIDE)
 
 
 @pytest.mark.parametrize("pixels", [INSIDE.astype(np.uint16) * 3, INSIDE.astype(np.uint16) * 3 * 257])
