@@ -18,7 +18,7 @@ from glassplat.files import records, sidecars
 from glassplat.files.glb import MAGIC, read_glb
 from glassplat.files.ply import is_compressed, read_compressed, read_gaussians, write_gaussians
 from glassplat.files.ply_table import read_table
-from glassplat.files.spz import GZIP, read_spz
+from glassplat.files.spz import GZIP, read_spz, three_log_scales
 from glassplat.files.writing import FORGED_SUFFIXES, SCENE, SPLAT_SUFFIXES, atomic_write
 from glassplat.scene import SH_ZERO
 from glassplat.scene.corrections import Direction, Exposures, PoseCorrections
@@ -266,17 +266,25 @@ def read_forged(path: Path) -> Gaussians:
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder) / "scene.ply"
         plain.write_bytes(_convert(forge, data, kind, "ply", path))
-        return read_gaussians(plain)
+        try:
+            return read_gaussians(plain)
+        except ValueError as error:
+            raise ValueError(str(error).replace(str(plain), str(path))) from error
 
 
 def write_forged(path: Path, gaussians: Gaussians) -> None:
-    """Writes a .sog or .ksplat.
+    """Writes a .sog or .ksplat; discs become as flat as SPZ can say.
 
     Raises:
-        ValueError: gaussforge is not installed, or cannot write these Gaussians.
+        ValueError: gaussforge is not installed, or cannot write these Gaussians; or there are none.
         OSError: the file cannot be written; an older one is unchanged.
     """
     forge = _forge(path)
+    if not len(gaussians):
+        raise ValueError(f"there are no Gaussians to write as {path}; expected one at least")
+    # SOG leaves out the largest component of a rotation, which its length of one tells.
+    quats = torch.nn.functional.normalize(gaussians.quats, dim=1)
+    gaussians = replace(gaussians, quats=quats, log_scales=three_log_scales(gaussians))
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder) / "scene.ply"
         write_gaussians(plain, gaussians)

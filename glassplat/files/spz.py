@@ -83,13 +83,13 @@ def packed_sections(gaussians: Gaussians, layout: Layout) -> list[Bytes]:
         _packed_positions(as_numpy(gaussians.means), layout.fractional_bits),
         _rounded(as_numpy(opacities) * 255),
         _rounded(as_numpy(gaussians.sh[:, 0]) * (COLOR_SCALE * 255) + 127.5),
-        _rounded((as_numpy(_three_log_scales(gaussians)) - LOWEST_LOG_SCALE) * STEPS_PER_LOG),
+        _rounded((as_numpy(three_log_scales(gaussians)) - LOWEST_LOG_SCALE) * STEPS_PER_LOG),
         _packed_rotations(as_numpy(gaussians.quats)),
         _rounded(as_numpy(gaussians.sh[:, 1:]) * 128 + 128),
     ]
 
 
-def _three_log_scales(gaussians: Gaussians) -> Tensor:
+def three_log_scales(gaussians: Gaussians) -> Tensor:
     """[N, 3] log scales; the format knows no discs, which become as flat as it can say."""
     if not gaussians.are_discs:
         return gaussians.log_scales

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import gsply
@@ -12,8 +13,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from glassplat.files import scene_folder
 from glassplat.files.ply import BOUNDS, COLOR_BOUNDS, write_gaussians
-from glassplat.files.scene_folder import SPLAT_ROW, drawable, read_splats
+from glassplat.files.scene_folder import SPLAT_ROW, drawable, read_splats, write_forged
 from glassplat.files.spz import write_spz
 from glassplat.kernels.project.reference import rotations
 from glassplat.scene import SH_ZERO
@@ -128,3 +130,41 @@ def test_mutated_files_are_read_or_refused(tmp_path_factory: pytest.TempPathFact
     with suppress(ValueError):
         kept, _ = drawable(read_splats(path), path)
         assert all(bool(tensor.isfinite().all()) for tensor in kept.tensors().values())
+
+
+def forged(gaussians: Gaussians, path: Path) -> Gaussians:
+    """What comes back from a file of gaussforge, which sorts them."""
+    pytest.importorskip("gaussforge")
+    write_forged(path, gaussians)
+    read = read_splats(path)
+    return read.select(torch.cdist(gaussians.means, read.means).argmin(dim=1))
+
+
+@pytest.mark.parametrize("length", [0.3, 1.0, 3.0])
+@pytest.mark.parametrize("kind", ["sog", "ksplat"])
+def test_rotations_of_any_length_survive_other_programs_files(tmp_path: Path, kind: str, length: float) -> None:
+    before = typical(count=200)
+    before = before.with_tensors({"quats": length * torch.nn.functional.normalize(before.quats, dim=1)})
+    after = forged(before, tmp_path / f"a.{kind}")
+    turned = rotations(before.quats.double()).transpose(1, 2) @ rotations(after.quats.double())
+    angles = torch.rad2deg(torch.arccos(((turned.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1)))
+    assert float(angles.max()) < 1
+
+
+@pytest.mark.parametrize("kind", ["sog", "ksplat"])
+def test_other_programs_files_hold_discs_and_are_never_empty(tmp_path: Path, kind: str) -> None:
+    discs = replace(typical(), log_scales=typical().log_scales[:, :2])
+    after = forged(discs, tmp_path / f"a.{kind}")
+    torch.testing.assert_close(after.log_scales[:, :2], discs.log_scales, rtol=0, atol=0.05)
+    assert float(after.log_scales[:, 2].max()) < -9
+    with pytest.raises(ValueError, match=rf"no Gaussians to write as .*a\.{kind}; expected one at least"):
+        write_forged(tmp_path / f"a.{kind}", discs.select(torch.zeros(len(discs), dtype=torch.bool)))
+
+
+def test_messages_name_the_file_of_another_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scene_folder, "_forge", lambda path: None)
+    monkeypatch.setattr(scene_folder, "_convert", lambda *_: b"ply\n")
+    (tmp_path / "a.sog").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"the header of .*a\.sog has") as caught:
+        read_splats(tmp_path / "a.sog")
+    assert "scene.ply" not in str(caught.value)
