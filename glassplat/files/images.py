@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, ImageCms
+from PIL import ExifTags, Image, ImageCms, ImageFile, ImageOps
 
 from glassplat.files.writing import atomic_write
 
@@ -66,7 +66,7 @@ def open_image(path: Path) -> Image.Image:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height; reads the header only.
+    """Width and height as stored; reads the header only, but of a TIFF with an orientation tag everything.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -165,6 +165,7 @@ def checked_image(path: Path) -> Iterator[Image.Image]:
             if image.width * image.height > MOST_PIXELS:
                 size = f"{image.width}x{image.height} pixels large"
                 raise ValueError(f"it is {size}; expected at most {MOST_PIXELS / 1e6:.0f} megapixels: reduce it")
+            _turn_back(image)
             yield image
     except FileNotFoundError as error:
         raise FileNotFoundError(f"no image {path}; expected it there") from error
@@ -173,6 +174,21 @@ def checked_image(path: Path) -> Iterator[Image.Image]:
     except Exception as error:  # Its parsers raise whatever damaged bytes lead to, from KeyError to struct.error.
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error) or type(error).__name__
         raise ValueError(f"cannot read {path} as an image ({reason}); replace the file or remove it") from error
+
+
+BACK = {2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}
+"""The EXIF orientation that undoes another."""
+
+
+def _turn_back(image: ImageFile.ImageFile) -> None:
+    """Pillow turns TIFFs, and no others, as their tag says, and removes it; here both become what the file holds."""
+    orientation = image.getexif().get(ExifTags.Base.Orientation) if image.format == "TIFF" else None
+    if orientation in BACK:
+        image.filename = ""  # By its name, Pillow would map a file of grey into memory, in the size that it has turned.
+        image.load()
+        image.getexif()[ExifTags.Base.Orientation] = BACK[orientation]
+        ImageOps.exif_transpose(image, in_place=True)
+        image.getexif()[ExifTags.Base.Orientation] = orientation
 
 
 SPACES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}

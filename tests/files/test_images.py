@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import PIL
@@ -74,6 +75,21 @@ def test_orientation_tag_is_not_applied(tmp_path: Path) -> None:
     exif[0x0112] = 6
     Image.new("RGB", (8, 4)).save(tmp_path / "a.jpg", exif=exif)
     assert read_image(tmp_path / "a.jpg").shape == (4, 8, 3)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("options", [{}, {"compression": "tiff_lzw"}, {"icc_profile": p3_profile()}])
+def test_a_tiff_is_read_as_a_png_with_the_same_tag(tmp_path: Path, orientation: int, options: dict[str, Any]) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    image = Image.fromarray(GENERATOR.integers(0, 256, (4, 6, 3), dtype=np.uint8))
+    image.save(tmp_path / "a.tif", exif=exif, **options)
+    image.save(tmp_path / "a.png", exif=exif, icc_profile=options.get("icc_profile"))
+    assert image_size(tmp_path / "a.tif") == open_image(tmp_path / "a.tif").size == (6, 4)
+    for read in (read_image, read_colors):
+        np.testing.assert_array_equal(read(tmp_path / "a.tif"), read(tmp_path / "a.png"))
+    Image.fromarray(np.asarray(image.convert("L")).astype(np.uint16) * 257).save(tmp_path / "b.tif", exif=exif)
+    np.testing.assert_array_equal(read_image(tmp_path / "b.tif")[:, :, 0], np.asarray(image.convert("L")))
 
 
 @pytest.mark.parametrize("read", [read_image, read_colors, read_image_float, image_size, open_image, is_transparent])

@@ -44,7 +44,8 @@ def corner(photograph: Photograph) -> tuple[int, ...]:
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_photographs_stand_upright(orientation: int, tmp_path: Path, heard: Heard) -> None:
+@pytest.mark.parametrize("name", ["turned.jpg", "turned.tif"])
+def test_photographs_stand_upright(orientation: int, name: str, tmp_path: Path, heard: Heard) -> None:
     folder, upright = three(tmp_path / "in"), picture(9)
     undone = {
         2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -58,9 +59,10 @@ def test_photographs_stand_upright(orientation: int, tmp_path: Path, heard: Hear
     stored = upright.transpose(undone[orientation]) if orientation in undone else upright
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = orientation
-    stored.save(folder / "turned.jpg", exif=exif, quality=95)
-    photograph = found(folder, heard)["turned.jpg"]
-    assert (photograph.width, photograph.height) == SIZE
+    exif[ExifTags.Base.Model] = "camera"
+    stored.save(folder / name, exif=exif, quality=95)
+    photograph = found(folder, heard)[name]
+    assert (photograph.width, photograph.height, photograph.device) == (*SIZE, "camera")
     assert corner(photograph)[0] > 200 and corner(photograph)[1] < 60
 
 
