@@ -210,7 +210,7 @@ def shots_of(root: Path, settings: Settings, file_name: str) -> dict[str, Shot]:
 
 def image_path(root: Path, frame: Settings) -> Path:
     """The photograph of one frame; Blender leaves its suffix out."""
-    path = normpath(root / frame["file_path"].replace("\\", "/"))
+    path = normpath(root / _plain_path(frame["file_path"]))
     candidates = [path, *(path + suffix for suffix in IMAGE_SUFFIXES)]
     return Path(next((candidate for candidate in candidates if isfile(candidate)), path))
 
@@ -316,7 +316,7 @@ def _load_split(root: Path) -> Capture:
 def _mask_paths(root: Path, file: str, settings: Settings, shots: Mapping[str, Shot]) -> dict[str, Path]:
     """The masks that the frames of a file name, by name of the photograph."""
     paths = {
-        shots[frame["file_path"]].name: Path(normpath(root / frame["mask_path"].replace("\\", "/")))
+        shots[frame["file_path"]].name: Path(normpath(root / _plain_path(frame["mask_path"])))
         for frame in settings["frames"]
         if frame.get("mask_path")
     }
@@ -350,15 +350,24 @@ def _is_blender(settings: Settings) -> bool:
 def _own_split(
     shots: Mapping[str, Shot], settings: Settings
 ) -> tuple[tuple[Shot, ...], tuple[Shot, ...] | None, list[str]]:
-    """Training and test photographs as nerfstudio lists them in the file, or all and None; and warnings."""
-    train_names = settings.get("train_filenames")
-    test_names = settings.get("test_filenames") or settings.get("val_filenames")
-    if not train_names or not test_names:
+    """Training and test photographs as nerfstudio lists them in the file, or all and None; and warnings.
+
+    Without training photographs, all others are; without test photographs, there are none.
+    """
+    listed = settings.get("train_filenames"), settings.get("test_filenames") or settings.get("val_filenames")
+    train_names, test_names = ([_plain_path(name) for name in names or ()] for names in listed)
+    if not train_names and not test_names:
         return tuple(shots.values()), None, []
-    unknown = sorted({*train_names, *test_names} - set(shots))
+    by_path = {_plain_path(name): shot for name, shot in shots.items()}
+    unknown = sorted({*train_names, *test_names} - set(by_path))
     if unknown:
         raise InputError(f"the split of {WHOLE} names photographs that have no frame: {first_names(unknown)}")
-    test = tuple(shots[name] for name in test_names)
-    train = tuple(shots[name] for name in train_names if name not in set(test_names))
+    test = tuple(by_path[name] for name in test_names)
+    train = tuple(by_path[name] for name in train_names or by_path if name not in set(test_names))
     left_out = len(shots) - len(train) - len(test)
     return train, test, [f"{left_out} photographs are in neither part of the split and left out."] if left_out else []
+
+
+def _plain_path(name: str) -> str:
+    """A path in one of its spellings, so that `./images/1.png` is `images/1.png`."""
+    return normpath(name.replace("\\", "/"))

@@ -117,6 +117,19 @@ def test_split_named_in_the_file(capture) -> None:
     assert "1 photographs are in neither" in found.warnings[0]
 
 
+@pytest.mark.parametrize("prefix", ["images/", "./images/", ".\\images\\", "images/../images/"])
+def test_a_split_with_one_side_alone(capture, prefix: str) -> None:
+    names = [f"{prefix}{name}" for name in capture.names]
+    found = load(capture, test_filenames=names[:3])
+    assert [shot.name for shot in found.test_shots or ()] == capture.names[:3]
+    assert [shot.name for shot in found.shots] == capture.names[3:] and not found.warnings
+    found = load(capture, train_filenames=names[:6], test_filenames=[])
+    assert [shot.name for shot in found.shots] == capture.names[:6] and found.test_shots == ()
+    assert "4 photographs are in neither" in found.warnings[0]
+    data = load_dataset(capture.root)
+    assert (len(data.train), len(data.test)) == (6, 0)
+
+
 def test_split_that_names_no_frame(capture) -> None:
     with pytest.raises(InputError, match=r"names photographs that have no frame: nothing.png"):
         load(capture, train_filenames=["nothing.png"], test_filenames=["images/0001.png"])
