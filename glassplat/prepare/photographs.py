@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
 
+from glassplat.captures.masks import MASK_MARK
 from glassplat.errors import InputError, first_names
 from glassplat.files import images
 from glassplat.files.records import readable_name, reading
@@ -64,6 +65,8 @@ class Photograph:
     focal: float | None
 
 
+PICTURE_SUFFIX = ".jpg"
+"""Of photographs as they are written into a capture."""
 CAPTURE_FOLDERS = ("sparse", "panes", "gt", "ignore")
 
 
@@ -153,7 +156,14 @@ def capture_names(paths: Sequence[Path], folder: Path) -> dict[Path, str]:
         if counts[name] > 1:
             spoken[path] = f"{name}-{counts[name]}"
     pictures = images.picture_paths(list(spoken.values()))
-    return {path: pictures[name].with_suffix(".jpg").as_posix() for path, name in spoken.items()}
+    return {path: pictures[name].with_suffix(PICTURE_SUFFIX).as_posix() for path, name in spoken.items()}
+
+
+def masks_among(paths: Sequence[Path]) -> list[Path]:
+    """Files that are named as the mask of another one next to them: `x_mask.png` of `x.jpg`."""
+    plain = {path.with_suffix("") for path in paths}
+    named = [path for path in paths if path.stem.endswith(MASK_MARK)]
+    return [path for path in named if path.with_name(path.stem.removesuffix(MASK_MARK)) in plain]
 
 
 def read_photograph(photograph: Photograph) -> NDArray[np.uint8]:

@@ -19,11 +19,13 @@ from glassplat.files.records import read_json, readable_name
 from glassplat.files.writing import atomic_write, check_folder, make_folder, missing_folders, real_path, remove_empty
 from glassplat.prepare.photographs import (
     FEWEST,
+    PICTURE_SUFFIX,
     VIDEO_SUFFIXES,
     Listener,
     Photograph,
     file_states,
     frames_of,
+    masks_among,
     photographs_in,
 )
 from glassplat.prepare.reconstruction import Settings, Solution, best_solution, image_numbers, write_capture
@@ -34,8 +36,8 @@ PAGE = "prepare.html"
 """In the capture: the same for people."""
 PHOTOGRAPHS = "photographs"
 """In the settings of an interrupted preparation: the states of the files that it was begun with."""
-HAND_MADE = ("panes", "masks", "ignore", "planes.json", "annotations.json")
-"""In a capture: what somebody spent time on."""
+MADE = ("images", "sparse", RECORD, PAGE)
+"""In a capture: all that comes from here; whatever else is there, somebody spent time on."""
 
 
 @dataclass(frozen=True)
@@ -142,11 +144,14 @@ class Workplace:
                 f"{self.output} holds a capture that was prepared before; choose a new folder for --output, or replace "
                 "it with --force"
             )
-        made = [name for name in HAND_MADE if name in found]
-        if made:
+        others = [name for name in found if name not in MADE]
+        pictures = [path for path in (self.output / "images").rglob("*") if path.is_file()]
+        added = {path for path in pictures if path.suffix != PICTURE_SUFFIX} | set(masks_among(pictures))
+        others += sorted(path.relative_to(self.output).as_posix() for path in added)
+        if others:
             raise InputError(
-                f"{self.output} holds {first_names(made)}, which somebody made and which would not fit new poses; move "
-                "the folder away, or choose a new one for --output"
+                f"{self.output} holds {first_names(others)}, which somebody made and --force would remove; expected "
+                "only what `glassplat prepare` makes: move the folder away, or choose a new one for --output"
             )
 
     def _known_settings(self) -> dict[str, Any] | None:

@@ -8,6 +8,8 @@ import pytest
 from PIL import Image
 
 from glassplat.cli.main import main
+from glassplat.errors import InputError
+from glassplat.prepare.preparation import PAGE, RECORD, Workplace
 
 
 def refused(source: Path, output: Path, capsys: pytest.CaptureFixture[str]) -> str:
@@ -79,3 +81,18 @@ def test_a_link_to_itself_is_no_place_for_a_capture(
 ) -> None:
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     assert "expected a folder" in refused(photographs, tmp_path / "loop", capsys)
+
+
+@pytest.mark.parametrize("name", ["normals/a.png", "notes.txt", "panes/a.png", "images/a_mask.jpg", "images/b/c.png"])
+def test_force_removes_only_what_was_prepared(tmp_path: Path, name: str) -> None:
+    output = tmp_path / "capture"
+    for made in ("images/a.jpg", "images/b/c.jpg", "images/wall_mask.jpg", "sparse/0/cameras.bin", RECORD, PAGE, name):
+        (output / made).parent.mkdir(parents=True, exist_ok=True)
+        (output / made).write_text("{}")
+    named = name if name.startswith("images/") else name.partition("/")[0]
+    with pytest.raises(InputError, match=rf"capture holds {named}, which somebody made and --force would remove"):
+        Workplace(output).begin({}, resume=False, force=True)
+    (output / name).unlink()
+    if named != name:
+        (output / named).rmdir()
+    Workplace(output).begin({}, resume=False, force=True)
