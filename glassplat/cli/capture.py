@@ -14,7 +14,7 @@ from rich.console import Console
 from glassplat.captures.colmap_library import quiet_pycolmap
 from glassplat.cli.console import import_now, say, shell_word
 from glassplat.cli.progress import WorkProgress
-from glassplat.files.writing import check_capture_folder
+from glassplat.files.writing import check_capture_folder, real_path
 from glassplat.options import Range, Share
 from glassplat.prepare.colmap import LensName, Mapper
 from glassplat.prepare.preparation import PAGE, Preparation, Workplace, check_places, prepare
@@ -55,8 +55,13 @@ class Prepare:
     def _task(self) -> Preparation:
         settings = Settings(lens=self.lens, mapper=self.mapper)
         return Preparation(
-            self.input, self.output, self.max_size, self.frames, self.least_registered, settings=settings
+            self.input, self._output, self.max_size, self.frames, self.least_registered, settings=settings
         )
+
+    @cached_property
+    def _output(self) -> Path:
+        """The output as it was at first: a finished capture replaces the folder, which may be the current one."""
+        return real_path(self.output)
 
     @cached_property
     def _has_finished(self) -> threading.Event:
@@ -73,17 +78,17 @@ class Prepare:
             say(console, line.removeprefix("advice: "), label=label, style="yellow")
         from glassplat.prepare.report_page import write_page  # PyTorch, which nothing before needs.
 
-        write_page(self.output, self.output / PAGE)
-        say(console, f"capture: {self.output}, report: {self.output / PAGE}")
-        say(console, f"next: glassplat annotate {shell_word(self.output)}")
+        write_page(self._output, self._output / PAGE)
+        say(console, f"capture: {self._output}, report: {self._output / PAGE}")
+        say(console, f"next: glassplat annotate {shell_word(self._output)}")
 
     def left_behind(self) -> str:
         """Text after an interrupt: the state on disk, and how to go on."""
         if self._has_finished.is_set():
-            page = f"glassplat info {shell_word(self.output)} --page {shell_word(self.output / PAGE)}"
-            return f"the capture in {self.output} is whole; `{page}` writes its report"
-        if Workplace(self.output).folder.exists():
-            return f"repeat the command with --resume to go on; what is done so far lies in {self.output}.partial"
+            page = f"glassplat info {shell_word(self._output)} --page {shell_word(self._output / PAGE)}"
+            return f"the capture in {self._output} is whole; `{page}` writes its report"
+        if (partial := Workplace(self._output).folder).exists():
+            return f"repeat the command with --resume to go on; what is done so far lies in {partial}"
         return "nothing was written: repeat the command to begin again"
 
 

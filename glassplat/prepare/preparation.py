@@ -348,7 +348,7 @@ def prepare(task: Preparation, listen: Listener, *, resume: bool = False, force:
     """
     check_places(task)
     quiet_pycolmap()
-    workplace = Workplace(task.output)
+    workplace = Workplace(real_path(task.output))
     settings = {**task.record(), PHOTOGRAPHS: file_states(task.source)}
     missing = missing_folders(workplace.folder.parent)
     workplace.begin(settings, resume=resume, force=force)
@@ -384,6 +384,10 @@ def check_places(task: Preparation) -> None:
     if output == source or source in output.parents:
         raise InputError(
             f"the output {task.output} lies inside of the photographs' folder {task.source}; choose a folder next to it"
+        )
+    if os.path.ismount(output):
+        raise InputError(
+            f"a disk is mounted at {task.output}, which a finished capture cannot replace; choose a new folder in it"
         )
 
 

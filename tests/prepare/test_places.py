@@ -9,7 +9,8 @@ from PIL import Image
 
 from glassplat.cli.main import main
 from glassplat.errors import InputError
-from glassplat.prepare.preparation import PAGE, RECORD, Workplace
+from glassplat.prepare import preparation, report_page
+from glassplat.prepare.preparation import PAGE, RECORD, Report, Workplace
 
 
 def refused(source: Path, output: Path, capsys: pytest.CaptureFixture[str]) -> str:
@@ -96,3 +97,36 @@ def test_force_removes_only_what_was_prepared(tmp_path: Path, name: str) -> None
     if named != name:
         (output / named).rmdir()
     Workplace(output).begin({}, resume=False, force=True)
+
+
+def test_a_mounted_disk_is_no_output(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "disk").mkdir()
+    monkeypatch.setattr("os.path.ismount", lambda path: Path(path) == tmp_path / "disk")
+    assert "a disk is mounted at" in refused(photographs, tmp_path / "disk", capsys)
+    assert not (tmp_path / "disk.partial").exists()
+
+
+def finish(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Has preparations write an empty capture at once."""
+    monkeypatch.setattr(preparation, "best_solution", lambda *_: None)
+    monkeypatch.setattr(preparation, "report_of", lambda _: Report(3, 3, (), (3,), 9, 0.1, 3.0, 9, (), "", 1, ()))
+    monkeypatch.setattr(preparation, "write_capture", lambda _, folder, *__: (folder / "images").mkdir(parents=True))
+
+
+@pytest.mark.parametrize("output", ["link", "."])
+def test_an_output_may_be_a_link_or_the_current_folder(
+    output: str, photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    finish(monkeypatch)
+    monkeypatch.setattr(report_page, "write_page", lambda capture, target: target.write_text(capture.name))
+    folder = tmp_path / "disk" / "shop"
+    folder.mkdir(parents=True)
+    (folder.parent / "link").symlink_to(folder)
+    monkeypatch.chdir(folder if output == "." else folder.parent)
+    assert main(["prepare", str(photographs), "--output", output]) == 0
+    monkeypatch.chdir(tmp_path)
+    assert (folder.parent / "link").is_symlink()
+    assert sorted(path.name for path in folder.iterdir()) == ["images", PAGE, RECORD]
+    assert sorted(path.name for path in folder.parent.iterdir()) == ["link", "shop"]
