@@ -60,8 +60,8 @@ class Workplace:
         """The capture while it is written."""
         return self.folder / "capture"
 
-    def begin(self, settings: Mapping[str, Any], *, resume: bool, force: bool) -> None:
-        """Makes the folder, or finds the one of an interrupted preparation.
+    def begin(self, settings: Mapping[str, Any], *, resume: bool, force: bool) -> bool:
+        """Makes the folder, or finds the one of an interrupted preparation; returns whether it is a new one.
 
         Args:
             settings: what the work depends on; an interrupted one goes on with the same only.
@@ -87,6 +87,7 @@ class Workplace:
             make_folder(self.folder)
             with atomic_write(self.folder / "settings.json") as temporary:
                 temporary.write_text(json.dumps(settings, indent=1), encoding="utf-8")
+        return known is None
 
     def finish(self, record: Mapping[str, Any]) -> None:
         """Writes the record into the finished capture and moves it to the output."""
@@ -351,11 +352,13 @@ def prepare(task: Preparation, listen: Listener, *, resume: bool = False, force:
     workplace = Workplace(real_path(task.output))
     settings = {**task.record(), PHOTOGRAPHS: file_states(task.source)}
     missing = missing_folders(workplace.folder.parent)
-    workplace.begin(settings, resume=resume, force=force)
+    begun = workplace.begin(settings, resume=resume, force=force)
     try:
         photographs = _photographs(task, workplace, listen)
     except InputError:
-        remove_empty(missing)
+        if begun:  # What an earlier call left is worth more than these photographs, which may be away for a moment.
+            workplace.discard()
+            remove_empty(missing)
         raise
     solution = best_solution(photographs, workplace.folder, task.settings, task.least_registered, listen)
     report = report_of(solution)
@@ -395,17 +398,13 @@ def _photographs(task: Preparation, workplace: Workplace, listen: Listener) -> l
     """Those of the folder or the video.
 
     Raises:
-        InputError: they cannot be used; nothing is left behind, as nothing can go on from there.
+        InputError: they cannot be used.
     """
-    try:
-        if not is_video(task.source):
-            return photographs_in(task.source, task.max_size, listen)
-        frames = workplace.folder / "frames"
-        frames_of(task.source, frames, task.frames, listen)
-        return photographs_in(frames, task.max_size, listen)
-    except InputError:
-        workplace.discard()
-        raise
+    if not is_video(task.source):
+        return photographs_in(task.source, task.max_size, listen)
+    frames = workplace.folder / "frames"
+    frames_of(task.source, frames, task.frames, listen)
+    return photographs_in(frames, task.max_size, listen)
 
 
 def _check_enough(report: Report, task: Preparation) -> None:

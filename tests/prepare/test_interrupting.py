@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ import pytest
 from glassplat.cli import capture
 from glassplat.cli.main import main
 from glassplat.errors import InputError
-from glassplat.prepare import report_page
+from glassplat.prepare import preparation, report_page
 from glassplat.prepare.colmap import interruptible
 from glassplat.prepare.preparation import PAGE, RECORD, Preparation, prepare
 from tests.prepare.conftest import Heard
@@ -122,6 +123,22 @@ def test_work_on_other_photographs_is_not_gone_on_with(
         prepare(task, interrupt, force=True)
     with pytest.raises(KeyboardInterrupt):
         prepare(task, interrupt, resume=True)
+
+
+def test_work_outlives_photographs_that_cannot_be_read_for_a_moment(
+    photographs: Path, tmp_path: Path, heard: Heard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = begun(photographs, tmp_path / "capture")
+    features = tmp_path / "capture.partial" / "features-4096.db"
+    features.write_text("hours of work")
+    refuse = Mock(side_effect=InputError("cannot read 3.jpg (Input/output error)"))
+    monkeypatch.setattr(preparation, "photographs_in", refuse)
+    with pytest.raises(InputError, match="Input/output error"):
+        prepare(task, heard, resume=True)
+    assert features.read_text() == "hours of work"
+    with pytest.raises(InputError, match="Input/output error"):
+        prepare(task, heard, force=True)
+    assert not features.parent.exists()
 
 
 def test_work_that_does_not_name_its_photographs_is_not_gone_on_with(
