@@ -496,7 +496,8 @@ def unexplained_places(
         looks = in_image(places, camera) & ~crosses_pane(places, scene.planes, camera.center)
         looks &= (_past_panes(frame) & counted_pixels(view, device))[pixels]
         missing = _missing_pixels(residual(frame, view, scene))[pixels] & looks
-        color = to_device(view.photo, device)[pixels].float() / 255 * missing[:, None]
+        photographed = scene.exposures.undone(to_device(view.photo, device)[pixels].float() / 255, view.name)
+        color = photographed.clamp(0, 1) * missing[:, None]
         looking, agreeing = looking + looks, agreeing + missing
         colors, squares = colors + color, squares + color.square()
         sides += torch.nn.functional.normalize(camera.center - places, dim=1) * missing[:, None]

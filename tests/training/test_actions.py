@@ -19,6 +19,7 @@ from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene import SH_ZERO
 from glassplat.scene.camera import Camera
+from glassplat.scene.corrections import Exposures
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene, glass_gaussians, without_glass
@@ -220,6 +221,19 @@ def test_views_that_ignore_a_place_do_not_say_that_nothing_is_missing_there() ->
     for number in (0, 3, 6, 9):
         views[number] = replace(views[number], read_ignored=lambda: everything)
     assert len(missing_in(ground, views, Splat())) > 0.9 * len(found) > 5
+
+
+def test_exposures_do_not_hide_what_photographs_agree_on() -> None:
+    whole = Scene(balls([(0.3, -0.2, 0.1), (0.0, 0.4, 0.0)], [180, 30], -1.8), 2.0)
+    ground = Scene(whole.primary.select(torch.tensor([False, True])), 2.0)
+    views = list(views_of(whole).train)
+    found = missing_in(ground, views, Splat())
+    exposures = Exposures.neutral(tuple(view.name for view in views))
+    exposures.values[:, :, :3] = torch.tensor([-0.25, 0.25]).repeat(5)[:, None, None] * torch.eye(3)
+    for number, view in enumerate(views):
+        brightened = (exposures.apply(view.photo / 255, view.name).clamp(0, 1) * 255).round().to(torch.uint8)
+        views[number] = View.in_memory(view.name, view.camera, photo=brightened)
+    assert len(missing_in(replace(ground, exposures=exposures), views, Splat())) > 0.9 * len(found) > 5
 
 
 def test_nothing_is_added_where_the_scene_explains_the_photographs() -> None:
