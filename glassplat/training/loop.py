@@ -15,7 +15,8 @@ from glassplat.captures.dataset import Dataset, with_corrected_cameras
 from glassplat.captures.view import View
 from glassplat.kernels.screen_statistics import Views
 from glassplat.render.frame import Frame, ScreenPass, SpacePass
-from glassplat.scene.camera import constant
+from glassplat.scene.camera import constant, to_device
+from glassplat.scene.panes import nearest_pixels
 from glassplat.scene.scene import Scene
 from glassplat.training.densify import ScreenStatistics
 from glassplat.training.messages import ActionDone, Message, StageEntered, StepDone
@@ -340,12 +341,21 @@ def collect(statistics: dict[str, ScreenStatistics], result: Differentiated, vie
     size = view.camera.width, view.camera.height
     for record, v_means, v_absgrad in result.screen:
         known = statistics_of(statistics, record.part, v_means.shape[1], v_means.device)
-        known.add(Views(v_means, v_absgrad, record.radii, *size, record.weight, record.direct))
+        known.add(Views(v_means, v_absgrad, counted_radii(record, view), *size, record.weight, record.direct))
     for traced, met in result.space:
         gradient = result.gradients.get(f"{traced.part}.means")
         if gradient is not None:
             known = statistics_of(statistics, traced.part, gradient.shape[0], gradient.device)
             known.add_in_space(gradient, met)
+
+
+def counted_radii(record: ScreenPass, view: View) -> Tensor:
+    """The radii [C, N, 2] of a pass, 0 where the centre lies on a pixel that the view ignores."""
+    if view.ignored is None:
+        return record.radii
+    pixels = nearest_pixels(record.means2d.detach().flatten(0, 1), view.camera)
+    ignored = to_device(view.ignored, record.radii.device)[pixels].view(record.radii.shape[:2])
+    return record.radii.masked_fill(ignored[..., None], 0)
 
 
 def statistics_of(

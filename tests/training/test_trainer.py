@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from glassplat.captures.view import View
 from glassplat.errors import InputError
 from glassplat.methods.planar import PaneSetup
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.scene.scene import Scene
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
-from glassplat.training.densify import gaussians_from_points
-from glassplat.training.loop import TrainingDivergedError, differentiate, train
+from glassplat.training.densify import ScreenStatistics, gaussians_from_points
+from glassplat.training.loop import TrainingDivergedError, collect, differentiate, train
 from glassplat.training.losses import LossTerm, PhotometricLoss
 from glassplat.training.messages import ActionDone, StageEntered, StepDone
 from glassplat.training.stage import Stage, TrainState
@@ -113,6 +115,38 @@ def test_collecting_screen_gradients_changes_no_other_gradient() -> None:
     assert results[0].losses == results[1].losses
     for name, gradient in results[0].gradients.items():
         assert torch.allclose(gradient, results[1].gradients[name], rtol=1e-4, atol=1e-9), name
+
+
+def statistics_of_views(views: Sequence[View]) -> dict[str, ScreenStatistics]:
+    state = fresh_state()
+    place_true_planes(state, None)
+    found: dict[str, ScreenStatistics] = {}
+    for view in views:
+        collect(found, differentiate(planar_stages()[-1], state.scene, view, with_absgrad=True), view)
+    return found
+
+
+def ignoring(view: View, pixels: torch.Tensor) -> View:
+    return replace(view, read_ignored=lambda: pixels)
+
+
+def test_views_that_are_ignored_do_not_count_for_densification() -> None:
+    views, nothing = tiny_capture().train, torch.zeros(tiny_capture().train[0].photo.shape[:2], dtype=torch.bool)
+    whole = statistics_of_views([ignoring(view, ~nothing if i < 2 else nothing) for i, view in enumerate(views)])
+    without = statistics_of_views(views[2:])
+    assert bool(whole["primary"].view_count[0].gt(whole["primary"].view_count[1]).any())
+    for part, known in whole.items():
+        for name, sums in vars(known).items():
+            assert torch.equal(sums, vars(without[part])[name]), (part, name)
+
+
+def test_only_what_stands_on_ignored_pixels_is_not_counted() -> None:
+    view = tiny_capture().train[1]
+    left = (torch.arange(view.camera.width) < view.camera.width // 2).expand(view.photo.shape[:2])
+    everywhere, right = (statistics_of_views([v])["primary"].view_count[1] for v in (view, ignoring(view, left)))
+    is_left = view.camera.project(fresh_state().scene.primary.means)[0][:, 0] < view.camera.width // 2
+    assert 0 < int((everywhere * is_left).count_nonzero()) < int(everywhere.count_nonzero())
+    assert torch.equal(right, everywhere * ~is_left)
 
 
 @pytest.mark.parametrize("pause", [3, 4, 7])
