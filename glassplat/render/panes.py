@@ -269,6 +269,15 @@ def tint_by_panes(image: Tensor, mask: Tensor, pane: Tensor, transmittances: Ten
     return torch.where(shown[..., None], encode(decode(image) * (1 - mask[..., None] * (1 - through))), image)
 
 
+@torch.no_grad()
+def tint_of_panes(seen: SeenPanes, masks: Sequence[Tensor], transmittances: Tensor) -> Tensor:
+    """[H, W, 3] share of the light that gets through the glass of all panes on a ray, where light adds up."""
+    tint = torch.ones_like(masks[0][..., None]).expand(-1, -1, 3)
+    for mask, pane in zip(masks, seen.order, strict=True):
+        tint = tint_by_panes(tint, mask, pane, transmittances, "srgb")  # As it is: shares have no curve.
+    return tint
+
+
 def _all_of_them(strengths: Sequence[Tensor]) -> Tensor:
     """[H, W] how much of what is seen panes of these strengths add, the farthest first."""
     share, *nearer = strengths

@@ -43,6 +43,7 @@ from glassplat.render.panes import (
     project_mirrored,
     project_photographer,
     seen_panes,
+    tint_of_panes,
     visibilities,
 )
 from glassplat.render.splat import with_normals
@@ -102,8 +103,8 @@ class Planar:
 
     Layers: `transmission`, `reflection` [H, W, 3]; `strength`, `mask`, `depth`, `alpha` [H, W]; `pane` [H, W]
     int32, the pane whose rectangle is nearest, -1 for none; `without_panes` [H, W, 3], the image were there no panes,
-    and `share` [H, W], how much of what is seen the panes add, all of them together; `deviation` [H, W] (Eq. 14) if
-    asked for.
+    and `share` [H, W], how much of what is seen the panes add, all of them together; `tint` [H, W, 3], the share of
+    light that their glass lets through, where it is tinted; `deviation` [H, W] (Eq. 14) if asked for.
 
     A photograph also shows who took it, in the panes: `Scene.photographer`, Gaussians in a frame that goes along with
     the camera. They are drawn among those that a pane mirrors, through the camera mirrored about it, and nowhere else.
@@ -164,6 +165,8 @@ class Planar:
             with_body = replace(self, photographer="present")._second_pass(scene, camera, seen, False, first.total)
             layers["photographed"] = self._composite_panes(first, seen, masks, with_body, camera).rgb
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
+        if seen.planes.transmittances is not None:
+            layers["tint"] = tint_of_panes(seen, masks, seen.planes.transmittances)
         screen = self._screen(first, second, hits, result) if with_absgrad else ()
         return Frame(result.rgb, layers, first.direct, second.mirrored, screen)
 
@@ -358,6 +361,8 @@ TRUSTED_PART, DISTRUSTED_PART = 0.3, 0.8
 TRUST_WINDOW = 5
 """Pixels over which trust is averaged, so that noise does not switch it from pixel to pixel."""
 DARKEST = 1e-3
+DARKEST_GLASS = 0.1
+"""Least share of the light through tinted glass that counts: detail and noise are brightened by ten at most."""
 
 
 def dereflected_photo(
@@ -365,16 +370,16 @@ def dereflected_photo(
 ) -> Tensor:
     """The photograph [H, W, 3] uint8 with the reflection taken off where the frame shows a pane.
 
-    Solves Eq. 1, C = (1 - R) C_t + R C_r, for C_t from the photographed C and the rendered R and R C_r, so
-    that detail the scene does not hold survives. Of panes seen through one another it takes off all: C_t is the image
-    without panes, and R and R C_r are what they add together. The rendered C_t takes over smoothly where most of the
-    light is reflected, and where the photograph is clipped and the reflection can be seen; there, the
-    difference would show the errors of the rendered reflection instead. Pixels without a pane are the
+    Solves Eq. 1, C = (1 - R) C_t + R C_r, for C_t from the photographed C and the rendered R and R C_r, so that detail
+    the scene does not hold survives. What tinted glass takes away is given back. Of panes seen through one another it
+    takes off all: C_t is the image without panes, and R and R C_r are what they add together. The rendered C_t takes
+    over smoothly where most of the light is reflected, and where the photograph is clipped and the reflection can be
+    seen; there, the difference would show the errors of the rendered reflection instead. Pixels without a pane are the
     photograph's, bit for bit.
 
     Args:
-        frame: a view rendered by `planar`, with `without_panes` and `share`; on the CPU. Where
-            it has the layer `photographed`, who took the photograph is taken off as well.
+        frame: a view rendered by `planar`, with `without_panes`, `share`, and `tint` where glass is tinted; on the CPU.
+            Where it has the layer `photographed`, who took the photograph is taken off as well.
         photo: [H, W, 3] uint8, of that view.
         blend: the space in which the run holds Eq. 1.
         exposures: of the photographs of the run; it is in the scene's colours that layers add up.
@@ -392,9 +397,10 @@ def dereflected_photo(
     # Clipping is the camera's, all else the scene's.
     clipped = photographed
     photographed = exposures.undone(photographed, name).clamp(0, 1)
-    light, reflected = decode(photographed), decode(frame.photographed) - (1 - share) * decode(without_panes)
+    tint = frame.layers.get("tint", torch.ones(())).clamp(min=DARKEST_GLASS)
+    light, reflected = decode(photographed), decode(frame.photographed) - (1 - share) * tint * decode(without_panes)
     # The trust is almost zero before this division would blow up noise.
-    solved = (light - reflected) / (1 - share).clamp(min=1 - DISTRUSTED_STRENGTH)
+    solved = (light - reflected) / ((1 - share).clamp(min=1 - DISTRUSTED_STRENGTH) * tint)
     rendered = decode(without_panes.clamp(0, 1))
     trust = _trust(clipped, light, reflected, share[..., 0])
     behind = rendered + trust[..., None] * (solved - rendered)

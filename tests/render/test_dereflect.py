@@ -23,29 +23,40 @@ def uint8(image: torch.Tensor) -> torch.Tensor:
     return torch.round(image.clamp(0, 1) * 255).to(torch.uint8)
 
 
-def mixed(behind: torch.Tensor, mirrored: torch.Tensor, share: torch.Tensor, blend: Blend) -> torch.Tensor:
+CLEAR = torch.ones(3)
+
+
+def mixed(
+    behind: torch.Tensor, mirrored: torch.Tensor, share: torch.Tensor, blend: Blend, tint: torch.Tensor = CLEAR
+) -> torch.Tensor:
     if blend == "srgb":
-        return (1 - share) * behind + share * mirrored
-    return srgb_from_linear((1 - share) * linear_from_srgb(behind) + share * linear_from_srgb(mirrored))
+        return (1 - share) * tint * behind + share * mirrored
+    return srgb_from_linear((1 - share) * tint * linear_from_srgb(behind) + share * linear_from_srgb(mirrored))
 
 
-def model(behind: torch.Tensor, mirrored: torch.Tensor, share: torch.Tensor, blend: Blend) -> Frame:
+def model(
+    behind: torch.Tensor, mirrored: torch.Tensor, share: torch.Tensor, blend: Blend, tint: torch.Tensor = CLEAR
+) -> Frame:
     """A rendered view [H, W, 3] of something behind panes that add a share [H, W] of light."""
-    layers = {"without_panes": behind, "share": share}
-    return Frame(mixed(behind, mirrored, share[..., None], blend), layers)
+    layers = {"without_panes": behind, "share": share} | ({} if tint is CLEAR else {"tint": tint})
+    return Frame(mixed(behind, mirrored, share[..., None], blend, tint), layers)
 
 
-def case(strength: float, blend: Blend, reflection: float = 0.3) -> tuple[Frame, torch.Tensor, torch.Tensor]:
+def case(
+    strength: float, blend: Blend, reflection: float = 0.3, glass: torch.Tensor = CLEAR
+) -> tuple[Frame, torch.Tensor, torch.Tensor]:
     """A blurred model of a pane in the left half, a photograph, and what is really behind the pane."""
     truth, mirrored = 0.3 + 0.4 * torch.rand(*SIZE, 3), torch.full((*SIZE, 3), reflection)
     share = torch.where(torch.arange(SIZE[1]) < 16, strength, 0.0).expand(*SIZE)
-    frame = model(truth.mean(dim=(0, 1), keepdim=True).expand(*SIZE, 3), mirrored, share, blend)
-    return frame, uint8(mixed(truth, mirrored, share[..., None], blend)), truth
+    tint = CLEAR if glass is CLEAR else torch.where(share[..., None] > 0, glass, CLEAR)
+    frame = model(truth.mean(dim=(0, 1), keepdim=True).expand(*SIZE, 3), mirrored, share, blend, tint)
+    return frame, uint8(mixed(truth, mirrored, share[..., None], blend, tint)), truth
 
 
+@pytest.mark.parametrize("glass", [CLEAR, torch.tensor([0.6, 0.9, 0.7])], ids=["clear", "tinted"])
 @pytest.mark.parametrize("blend", BLENDS)
-def test_detail_that_the_scene_does_not_hold_survives(blend: Blend) -> None:
-    frame, photo, truth = case(0.1, blend)
+def test_detail_that_the_scene_does_not_hold_survives(blend: Blend, glass: torch.Tensor) -> None:
+    frame, photo, truth = case(0.1, blend, glass=glass)
     result = dereflected_photo(frame, photo, blend).float() / 255
     torch.testing.assert_close(result, truth, rtol=0, atol=2.5 / 255)
     assert float((photo.float() / 255 - truth).abs().max()) > 4 / 255

@@ -44,11 +44,23 @@ def test_what_is_behind_is_darker_by_the_transmittance_and_nothing_else_changes(
     behind, through = (linear_from_srgb(f.layers["transmission"][shown]) for f in (plain, frame))
     left = 1 - plain.layers["mask"][shown][:, None] * (1 - GREENISH)
     torch.testing.assert_close(through, left * behind, atol=1e-4, rtol=0)
+    torch.testing.assert_close(frame.layers["tint"][shown], left)
+    assert "tint" not in plain.layers
     assert float((behind - through).max()) > 0.02
     for name in ("reflection", "strength", "without_panes", "mask", "depth"):
         assert torch.equal(frame.layers[name], plain.layers[name]), name
     outside = plain.layers["mask"] == 0
     assert torch.equal(frame.rgb[outside], plain.rgb[outside])
+    assert bool((frame.layers["tint"][outside] == 1).all())
+
+
+def test_of_panes_that_reflect_nothing_the_tint_is_all_that_is_left() -> None:
+    planes = of_glass(pane(2.0, half=0.8).concat(pane(1.2, half=0.5, label=2)))
+    planes = planes.with_tensors({"logit_reflectances": torch.full((2,), -50.0, dtype=torch.float64)})
+    layers = (frame := Planar(blend="srgb")(showcase(planes), CAMERA)).layers
+    torch.testing.assert_close(layers["tint"] * layers["without_panes"], frame.rgb)
+    one = Planar(blend="srgb")(showcase(planes.select([0])), CAMERA).layers["tint"]
+    assert float((one - layers["tint"]).amax()) > 0.01
 
 
 def test_layers_recombine_to_the_image() -> None:
