@@ -253,7 +253,8 @@ def traced_stages_of(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHE
     setup = first_reflections(recipe.distant())
     around = AddSurroundings(recipe.surroundings.start, recipe.surroundings.sh_degree)
     setup = replace(setup, surroundings=around, harmonics_wait=not recipe.harmonics_from_start)
-    setup = replace(setup, environment=None) if recipe.mirrors == "surroundings" else setup
+    if recipe.mirrors == "surroundings":
+        setup = replace(setup, environment=replace(setup.environment, texels=0))
     near = replace(_tracing(recipe, distant), setup=setup)
     return bootstrap, near, _tracing(recipe, refinement)
 

@@ -168,7 +168,7 @@ class AddEnvironment:
     """Surrounds the scene with an environment of noise, drawn by the run's seed.
 
     Attributes:
-        texels: along the edge of a face.
+        texels: along the edge of a face; 0 for no environment but its region, where only near things are mirrored.
         region: centre and radius of the sphere that holds all that may reflect, world units; None for everywhere.
         find_region: without a region, take the place that the cameras stand around, if there is one.
     """
@@ -179,7 +179,9 @@ class AddEnvironment:
 
     def __call__(self, state: TrainState, dataset: Dataset) -> None:
         """Edits `state`."""
-        environment = Environment.random(self.texels, generator=state.generator("environment"))
+        environment = state.scene.environment
+        if self.texels:
+            environment = Environment.random(self.texels, generator=state.generator("environment"))
         region = self.region
         if region is None and self.find_region:
             region = reflective_region([view.camera for view in dataset.train])
@@ -253,7 +255,7 @@ class BeginReflections:
     """Adds what is there to be mirrored, and takes for mirrors what looks like them.
 
     Attributes:
-        environment: adds an environment; None where only near things are mirrored.
+        environment: adds an environment, and says where anything may reflect.
         surroundings: adds what is near; None where only the environment is mirrored.
         mirrors: what looks like a mirror.
         renderer: that of the stage before.
@@ -261,7 +263,7 @@ class BeginReflections:
             what they had learnt by then is what those mirrors show.
     """
 
-    environment: AddEnvironment | None
+    environment: AddEnvironment
     surroundings: AddSurroundings | None
     mirrors: MirrorSearch
     renderer: Renderer
@@ -269,8 +271,7 @@ class BeginReflections:
 
     def __call__(self, state: TrainState, dataset: Dataset) -> Generator[Working, None, bool]:
         """Edits `state`."""
-        if self.environment is not None:
-            self.environment(state, dataset)
+        self.environment(state, dataset)
         if self.surroundings is None and not self.mirrors.begin_found:
             return True
         yield Working("looking for mirrors", 0, 1)

@@ -214,7 +214,7 @@ def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     check_shapes(planes, PLANE_SHAPES | further, "planes")
     distant = under(tensors, "scene/environment/")
     check_shapes(distant, {"raw": None} if distant else {}, "environment")
-    environment = Environment(**distant, region=header["region"]) if distant else empty.environment
+    environment = Environment(**(distant or empty.environment.tensors()), region=header["region"])
     exposed = under(tensors, "scene/exposures/")
     check_shapes(exposed, {"affine": (3, 4)} if exposed else {}, "exposures")
     moved = under(tensors, "scene/poses/")

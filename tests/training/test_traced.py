@@ -110,6 +110,15 @@ def test_with_surroundings_alone_there_is_no_environment_to_refine() -> None:
     assert isinstance(propagate.renderer, Traced)
 
 
+def test_only_what_is_in_the_region_may_reflect_without_an_environment_too(tmp_path: Path) -> None:
+    state = fresh_state(PAPER)
+    steps = [message for message in run(PAPER, state) if isinstance(message, StepDone)]
+    assert PAPER.outside_weight > 0 and "outside" in steps[-1].losses
+    assert state.scene.environment.is_empty and state.scene.environment.region == PAPER.region
+    save_checkpoint(tmp_path / "checkpoint.safetensors", state)
+    assert load_checkpoint(tmp_path / "checkpoint.safetensors").scene.environment.region == PAPER.region
+
+
 def test_surroundings_learn_grow_and_are_pruned() -> None:
     state = fresh_state()
     messages = run(RECIPE, state)
