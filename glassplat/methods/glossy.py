@@ -103,7 +103,7 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
             _propagate(recipe, propagate_at, renderer),
             GrowShAfterPropagation(Every(recipe.intervals.sh)),
             *_resets(recipe, population),
-            RefineEnvironment(doublings(recipe.first_texels, recipe.texels), recipe.texels),
+            RefineEnvironment(doublings(recipe.first_texels, recipe.texels, recipe.bootstrap), recipe.texels),
         ),
         post_steps=population.post_steps,
         setup=first_reflections(recipe),
@@ -209,14 +209,19 @@ def _matte_rates(recipe: DeferredRecipe) -> dict[str, Rate]:
 
 FIRST_DOUBLING, LAST_DOUBLING = 0.45, 0.65
 """Shares of the run at which the environment's edge length doubles for the first and for the last time."""
+LEAST_WAIT = 0.1
+"""Share of what is left of the run after the bootstrap that passes before the first time, at least."""
 
 
-def doublings(first_texels: int, texels: int) -> tuple[float, ...]:
-    """The shares of the run, evenly from the first to the last, at which an edge length doubles until it is reached."""
+def doublings(first_texels: int, texels: int, bootstrap: float) -> tuple[float, ...]:
+    """The shares of the run, evenly from the first to the last, at which an edge length doubles until it is reached.
+
+    They come later after a long bootstrap, during which there is no environment.
+    """
     count = max(math.ceil(math.log2(texels / first_texels)), 0)
-    return tuple(
-        FIRST_DOUBLING + (LAST_DOUBLING - FIRST_DOUBLING) * number / max(count - 1, 1) for number in range(count)
-    )
+    first = max(FIRST_DOUBLING, bootstrap + LEAST_WAIT * (1 - bootstrap))
+    last = max(LAST_DOUBLING, first)
+    return tuple(first + (last - first) * number / max(count - 1, 1) for number in range(count))
 
 
 NORMAL_TERMS = ("consistency", "monocular normals")

@@ -411,6 +411,15 @@ def test_the_environment_reaches_any_size_between_its_first_and_last_refinement(
     assert len(sizes) < 3 or list(reached.values())[-1] == 65
 
 
+@pytest.mark.parametrize("bootstrap", [0.0, 0.45, 0.5, 0.7])
+def test_the_environment_reaches_its_size_after_a_bootstrap_of_any_length(bootstrap: float) -> None:
+    recipe = replace(RECIPE, bootstrap=bootstrap, texels=8, schedule=PropagationSchedule(stop=0.9))
+    state = fresh_state()
+    for _ in train(recipe.stages(seed=0), tiny_capture(), state, iterations=40):
+        pass
+    assert state.scene.environment.size == 8
+
+
 @pytest.mark.parametrize("iterations", [1, 3, 10])
 def test_the_shortest_run_refines_its_environment_in_full(iterations: int) -> None:
     recipe = DeferredRecipe(texels=256)
