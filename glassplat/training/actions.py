@@ -213,6 +213,7 @@ def put_in_order(state: TrainState, gaussians: Gaussians, moments: Moments, part
     # Of a set that has vanished, a scene has no parameters.
     known = state.scene.parameters()
     state.optimizer.moments = {name: pair for name, pair in moments.items() if name in known}
+    state.means = {}  # Of rows that are others now, even where their number is the same.
 
 
 def cap_of(densifier: McmcDensify, dataset: Dataset) -> int:
