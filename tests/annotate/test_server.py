@@ -71,6 +71,21 @@ def test_the_key_becomes_a_cookie_and_leaves_the_address(server: AnnotationServe
     assert ask(server, "/?key=guessed")[0] == 403
 
 
+ODD_COOKIES = (
+    'prefs={"a":"b"}', "note=hello world", "version=3", "path=/x", "name=Zoë", "a[b]=1", 'q="open', "flag", "=bare",
+)  # fmt: skip
+"""Of other programs on this computer: a browser sends them to every port."""
+
+
+@pytest.mark.parametrize("odd", ODD_COOKIES)
+def test_cookies_of_other_programs_do_not_lock_out(odd: str, server: AnnotationServer) -> None:
+    name = cookie_name(f"127.0.0.1:{server.server_address[1]}")
+    for value, status in ((server.access.key, 200), ("guessed", 403)):
+        ours = f"{name}={value}"
+        for cookies in (f"{odd}; {ours}", f"{ours}; {odd}", f"{odd}; {ours}; {odd}"):
+            assert ask(server, "/capture", Cookie=cookies)[0] == status, cookies
+
+
 @pytest.mark.parametrize("path", ["/", "/page.js", "/capture", "/photo/0", "/thumbnail/0", "/nothing"])
 def test_without_the_key_there_is_nothing(path: str, server: AnnotationServer) -> None:
     for key in ("", "guessed"):
