@@ -34,10 +34,11 @@ function makeNavigation(scene, changed) {
     return least <= reach ? position : plus(best, unit(minus(position, best)), reach);
   }
 
+  const isAllowed = (position) => norm(minus(allowed(position), position)) <= 1e-6 * reach;
+
   function moveTo(position, rotation, target) {
     const kept = allowed(position);
-    const stopped = norm(minus(kept, position)) > 1e-6 * reach;
-    set(poseAt(stopped ? lookingAt(kept, target, levelUp(rotation)) : rotation, kept), target);
+    set(poseAt(isAllowed(position) ? rotation : lookingAt(kept, target, levelUp(rotation)), kept), target);
   }
 
   // The up that keeps how the camera is rolled: that of the place, unless the camera looks along it.
@@ -61,10 +62,15 @@ function makeNavigation(scene, changed) {
     set(poseAt(pose.rotation, moved), plus(pivot, taken));
   }
 
+  // As far along the line of sight as it may go; from a place beside that, the camera would look past its pivot.
   function dolly(factor) {
     const center = centerOf(pose), distance = clamped(sight() * factor, 0.15 * reach, 1e3 * reach);
-    const next = allowed(minus(pivot, scaled(unit(minus(pivot, center)), distance)));
-    set(poseAt(pose.rotation, next), pivot);
+    const wanted = minus(pivot, scaled(unit(minus(pivot, center)), distance));
+    let share = isAllowed(wanted) ? 1 : 0;
+    for (let step = 0.5; share < 1 && step > 1e-6; step /= 2) {
+      if (isAllowed(mixed(center, wanted, share + step))) share += step;
+    }
+    set(poseAt(pose.rotation, mixed(center, wanted, share)), pivot);
   }
 
   function walk(ahead, right, rise) {

@@ -225,6 +225,21 @@ def test_people_stay_near_the_photographs(opened: Browser) -> None:
 
 
 @needs_browser
+@pytest.mark.parametrize("notch", [0.12, -0.12])
+def test_a_drag_goes_on_from_where_the_wheel_came_to_its_limit(notch: float, opened: Browser) -> None:
+    turned = """glassplat.then(({ navigation, scene }) => {
+      navigation.flyTo(scene.views[scene.first]);
+      navigation.advance(1);
+      navigation.orbit(0.4, 0);
+      for (let k = 0; k < 30; k++) navigation.dolly(Math.exp(NOTCH));
+      const forward = () => navigation.pose().rotation.slice(6), before = forward();
+      navigation.orbit(0.003, 0);
+      return Math.acos(Math.min(1, forward().reduce((sum, x, k) => sum + x * before[k], 0)));
+    })"""
+    assert math.degrees(opened.evaluate(turned.replace("NOTCH", str(notch)))) < 0.5
+
+
+@needs_browser
 def test_the_first_view_stands_in_the_address_too(opened: Browser) -> None:
     opened.wait("glassplat.then(() => true)", "the page")
     opened.keys("Right")
