@@ -385,3 +385,10 @@ def test_what_another_tab_marks_is_kept_beside_what_is_marked_here(page: Page) -
     both = json.loads((page.root / "annotations.json").read_text())["panes"]
     assert [(pane["label"], pane["material"]) for pane in both] == [(1, "mirror"), (2, "glass")]
     assert all(len(places) == 2 for places in both[1]["corners"])
+    page.window.keys("Control", "z")
+    page.saved()
+    assert json.loads((page.root / "annotations.json").read_text())["panes"] == both
+    page.window.keys("a")
+    page.window.press("#undo")  # What follows can be taken back.
+    page.saved()
+    assert json.loads((page.root / "annotations.json").read_text())["panes"] == both

@@ -29,9 +29,10 @@ export class Marking {
     this.changed();
   }
 
-  // A document that the server has put together of this one and another; earlier steps lead to before that.
+  // A document that the server has put together of this one and another. No step leads back to before that: it would
+  // take away what another page has saved.
   takeOver(together, renamed) {
-    this.change((document) => { Object.assign(document, together); });
+    [this.document, this.done, this.undone, this.gesture] = [together, [], [], null];
     this.active = renamed[this.active] || this.active; // Who goes on marking marks the same pane.
     if (!this.pane) this.active = this.document.panes.length ? this.document.panes[0].label : null;
   }
