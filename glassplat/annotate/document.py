@@ -213,21 +213,21 @@ def _before_camera(points: Array) -> Array:
 
 
 def fill_polygon(outline: Array, size: tuple[int, int]) -> Mask:
-    """[H, W] the pixels whose centres a polygon [P, 2] holds; `size` is width and height."""
+    """[H, W] the pixels whose centres a polygon [P, 2] winds round, as on the page; `size` is width and height."""
     width, height = size
     if len(outline) < 3:
         return np.zeros((height, width), dtype=bool)
     y = np.arange(height) + 0.5
     x = np.arange(width) + 0.5
-    inside = np.zeros((height, width), dtype=bool)
+    turns = np.zeros((height, width), dtype=np.int16)
     for one, other in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         low, high = sorted((one[1], other[1]))
         rows = np.flatnonzero((y >= low) & (y < high))
         if not len(rows):
             continue
         crossing = one[0] + (y[rows] - one[1]) / (other[1] - one[1]) * (other[0] - one[0])
-        inside[rows] ^= x[None, :] >= crossing[:, None]
-    return inside
+        turns[rows] += np.int16(1 if other[1] > one[1] else -1) * (x[None, :] >= crossing[:, None])
+    return turns != 0
 
 
 def depths(camera: NumpyCamera, corners: Array) -> Array:

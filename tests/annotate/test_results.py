@@ -265,6 +265,16 @@ def test_put_back_restores_no_more_than_there_was() -> None:
     assert found[20, 20] and not found[14, 20] and not found[20, 33] and not (found & ~mask).any()
 
 
+@pytest.mark.parametrize("way", [1, -1])
+def test_a_cut_that_crosses_itself_is_cut_whole(way: int) -> None:
+    """As the page shows it: the middle of a pentagram is inside, and so is what two loops hold."""
+    angles = way * 2 * 2 * np.pi / 5 * np.arange(5)
+    star = 50 + 40 * np.stack([np.sin(angles), -np.cos(angles)], axis=1)
+    found = fill_polygon(star, (100, 100))
+    assert found[45:55, 45:55].all() and found[15, 50] and not found[80, 50] and not found[2, 2]
+    np.testing.assert_array_equal(fill_polygon(np.concatenate([star, star]), (100, 100)), found)
+
+
 def test_masks_of_bent_photographs_are_bent_too(room: Path) -> None:
     transforms = json.loads((room / "transforms.json").read_text()) | {"k1": -0.2, "k2": 0.02, "p1": 0.0, "p2": 0.0}
     (room / "transforms.json").write_text(json.dumps(transforms))
