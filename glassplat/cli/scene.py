@@ -194,7 +194,7 @@ class Video:
         """Refuses everything that can be known to be wrong before it takes long, and imports what renders."""
         try:
             with input_checked():
-                check_encoder(self.output)
+                check_encoder(self.output, self.fps)
         except ImportError as error:
             raise InputError(
                 f"{self.output.suffix} needs OpenCV ({error}); pip install 'glassplat[video]', or end --output in .webp"

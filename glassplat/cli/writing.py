@@ -133,8 +133,8 @@ def film(command: Video, console: Console) -> None:
     cameras = _cameras(command, model)
     with WorkProgress(console) as progress, atomic_write(command.output) as temporary:
         pictures = track_progress("filming", _pictures(command, model, cameras), len(cameras), progress)
-        count = write_film(temporary, pictures, command.fps)
-    say(console, f"{count} pictures, {command.output.stat().st_size / 1e6:.2f} MB -> {command.output}")
+        write_film(temporary, pictures, count=len(cameras), fps=command.fps)
+    say(console, f"{len(cameras)} pictures, {command.output.stat().st_size / 1e6:.2f} MB -> {command.output}")
 
 
 def _cameras(command: Video, model: Model) -> list[Camera]:

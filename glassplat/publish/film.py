@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -20,14 +20,17 @@ CODECS = {".mp4": "vp09"}
 ANIMATIONS = (".webp", ".gif")
 SUFFIXES = (*CODECS, *ANIMATIONS)
 WEBP_QUALITY = 80
+MOST_IN_GIF = 50
+"""Pictures per second: a GIF counts in hundredths, and browsers show one hundredth as ten."""
 
 
-def write_film(path: Path, pictures: Iterable[Picture], fps: int) -> int:
-    """Writes a film; returns the number of its pictures.
+def write_film(path: Path, pictures: Iterable[Picture], *, count: int, fps: int) -> None:
+    """Writes a film.
 
     Args:
         path: the file, new; its suffix is one of `SUFFIXES`.
         pictures: [H, W, 3] each, of one size with even sides; taken one at a time.
+        count: how many pictures there are.
         fps: pictures per second.
 
     Raises:
@@ -39,19 +42,25 @@ def write_film(path: Path, pictures: Iterable[Picture], fps: int) -> int:
     first = next(stream, None)
     if first is None or path.suffix not in SUFFIXES:
         raise ValueError(f"a film needs a picture and a name that ends in one of {', '.join(SUFFIXES)}")
-    write = _write_animation if path.suffix in ANIMATIONS else _write_video
-    return write(path, first, stream, fps)
+    if path.suffix in ANIMATIONS:
+        _write_animation(path, first, stream, _durations(path, count, fps))
+    else:
+        _write_video(path, first, stream, fps)
 
 
-def check_encoder(path: Path) -> None:
+def check_encoder(path: Path, fps: int) -> None:
     """Looks whether a film of this name can be written here, before anything is rendered.
 
     Raises:
         ImportError: OpenCV is needed and not installed.
-        ValueError: the suffix is none of `SUFFIXES`.
+        ValueError: the suffix is none of `SUFFIXES`, or a GIF cannot show so many pictures per second.
     """
     if path.suffix not in SUFFIXES:
         raise ValueError(f"{path.name} is no name of a film; expected it to end in one of {', '.join(SUFFIXES)}")
+    if path.suffix == ".gif" and fps > MOST_IN_GIF:
+        raise ValueError(
+            f"a .gif shows at most {MOST_IN_GIF} pictures per second, not {fps}; lower --fps, or end the name in .webp"
+        )
     if path.suffix in CODECS:
         import cv2  # noqa: F401
 
@@ -69,23 +78,22 @@ def wipe_pictures(left: Picture, right: Picture, share: float) -> Picture:
     return picture
 
 
-def _write_animation(path: Path, first: Picture, rest: Iterator[Picture], fps: int) -> int:
-    count = 1
+def _durations(path: Path, count: int, fps: int) -> list[int]:
+    """Milliseconds of each picture, rounded in sum, so that the film takes as long as it should."""
+    step = 10 if path.suffix == ".gif" else 1
+    ends = [step * round(1000 * k / fps / step) for k in range(count + 1)]
+    return [after - before for before, after in pairwise(ends)]
 
-    def images() -> Iterator[Image.Image]:
-        nonlocal count
-        for picture in rest:
-            count += 1
-            yield Image.fromarray(picture)
 
-    options = {"duration": round(1000 / fps), "loop": 0, "quality": WEBP_QUALITY}
+def _write_animation(path: Path, first: Picture, rest: Iterator[Picture], durations: list[int]) -> None:
+    images = (Image.fromarray(picture) for picture in rest)
     with path.open("wb") as file:  # Pillow leaves a file open that it opens itself, where Ctrl-C ends it.
         kind = path.suffix.removeprefix(".").upper()
-        Image.fromarray(first).save(file, kind, save_all=True, append_images=images(), **options)
-    return count
+        options = {"duration": durations, "loop": 0, "quality": WEBP_QUALITY}
+        Image.fromarray(first).save(file, kind, save_all=True, append_images=images, **options)
 
 
-def _write_video(path: Path, first: Picture, rest: Iterator[Picture], fps: int) -> int:
+def _write_video(path: Path, first: Picture, rest: Iterator[Picture], fps: int) -> None:
     import cv2
 
     height, width = first.shape[:2]
@@ -102,7 +110,6 @@ def _write_video(path: Path, first: Picture, rest: Iterator[Picture], fps: int) 
     # The encoder says nothing of a disk that is full.
     if _pictures_in(path) != count:
         raise OSError(f"the film could not be written whole to {path}; is the disk full?")
-    return count
 
 
 def _pictures_in(path: Path) -> int:

@@ -64,6 +64,7 @@ def test_an_interrupted_film_leaves_nothing(
         ("--output film.webp --path keyframes", "belong together"),
         ("--output film.webp --layers base", "renders no layer base"),
         ("--output film.webp --seconds 0", "--seconds"),
+        ("--output film.gif --fps 60", "at most 50 pictures per second, not 60"),
     ],
 )
 def test_what_makes_no_sense_is_refused_before_anything_is_rendered(
@@ -74,7 +75,7 @@ def test_what_makes_no_sense_is_refused_before_anything_is_rendered(
     (tmp_path / "there.webp").write_text("mine")
     assert main(["video", str(run), *options.split()]) == 2
     assert words in " ".join(capsys.readouterr().err.split())
-    assert not (tmp_path / "film.webp").exists() and (tmp_path / "there.webp").read_text() == "mine"
+    assert not list(tmp_path.glob("film.*")) and (tmp_path / "there.webp").read_text() == "mine"
 
 
 def test_a_link_to_nothing_is_in_the_way_of_a_film_until_it_is_forced(

@@ -34,20 +34,35 @@ def seek(film: Image.Image, index: int) -> Image.Image:
 @pytest.mark.parametrize("suffix", [".mp4", ".webp", ".gif"])
 def test_every_picture_is_in_the_film(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"film{suffix}"
-    assert write_film(path, iter(PICTURES), fps=10) == len(PICTURES)
+    write_film(path, iter(PICTURES), count=len(PICTURES), fps=10)
     colors = mean_colors(path)
     assert len(colors) == len(PICTURES)
     for color, picture in zip(colors, PICTURES, strict=True):
         np.testing.assert_allclose(color, picture[0, 0], atol=8)
 
 
+@pytest.mark.parametrize(
+    ("suffix", "fps"), [*((".gif", fps) for fps in (1, 24, 30, 50)), *((".webp", fps) for fps in (7, 24, 60, 120))]
+)
+def test_a_film_takes_as_long_as_its_pictures_per_second_say(suffix: str, fps: int, tmp_path: Path) -> None:
+    path = tmp_path / f"film{suffix}"
+    write_film(path, iter(PICTURES * 8), count=48, fps=fps)
+    with Image.open(path) as film:
+        shown = sum(seek(film, k).info["duration"] for k in range(film.n_frames))
+    assert shown == pytest.approx(1000 * 48 / fps, abs=10)
+
+
 def test_what_is_no_film_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="avi is no name of a film"):
-        check_encoder(tmp_path / "film.avi")
+        check_encoder(tmp_path / "film.avi", 10)
+    with pytest.raises(ValueError, match=r"at most 50 pictures per second, not 51; lower --fps"):
+        check_encoder(tmp_path / "film.gif", 51)
+    check_encoder(tmp_path / "film.gif", 50)
+    check_encoder(tmp_path / "film.webp", 120)
     with pytest.raises(ValueError, match="needs a picture"):
-        write_film(tmp_path / "film.webp", iter([]), fps=10)
+        write_film(tmp_path / "film.webp", iter([]), count=1, fps=10)
     with pytest.raises(OSError, match="VP9"):
-        write_film(tmp_path / "none" / "film.mp4", iter(PICTURES), fps=10)
+        write_film(tmp_path / "none" / "film.mp4", iter(PICTURES), count=6, fps=10)
 
 
 def test_a_wipe_shows_both() -> None:
