@@ -29,7 +29,7 @@ from glassplat.files.sidecars import read_cameras, write_cameras
 from glassplat.files.writing import SPLAT_WRITERS, atomic_write, real_path, scene_source, splat_writer
 from glassplat.model.model import CAMERAS, ENVIRONMENT, GLASS, PANORAMA, PLANES, Model, save_page, write_beside
 from glassplat.publish.camera_paths import fit_to_width, interpolate_cameras, keyframes_of
-from glassplat.publish.film import side_by_side, wipe_pictures, write_film
+from glassplat.publish.film import check_size, side_by_side, wipe_pictures, write_film
 from glassplat.publish.web_page import MOST_GAUSSIANS, PREVIEW, Sharing, fits, write_preview
 from glassplat.render.frame import check_layers
 from glassplat.render.layers import layer_image
@@ -131,6 +131,9 @@ def film(command: Video, console: Console) -> None:
     check_layers(model.renderer, model.scene, command.layers, model.recipe.method)
     model = model.with_scene(command.edits.apply(model.scene))
     cameras = _cameras(command, model)
+    beside = 1 if command.layout == "wipe" else len(command.layers)
+    with input_checked():
+        check_size(command.output, beside * cameras[0].width, cameras[0].height)
     with WorkProgress(console) as progress, atomic_write(command.output) as temporary:
         pictures = track_progress("filming", _pictures(command, model, cameras), len(cameras), progress)
         write_film(temporary, pictures, count=len(cameras), fps=command.fps)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from itertools import chain, pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ Picture = NDArray[np.uint8]
 CODECS = {".mp4": "vp09"}
 ANIMATIONS = (".webp", ".gif")
 SUFFIXES = (*CODECS, *ANIMATIONS)
-WEBP_QUALITY = 80
+WEBP_QUALITY, LARGEST_WEBP = 80, 16383
 MOST_IN_GIF = 50
 """Pictures per second: a GIF counts in hundredths, and browsers show one hundredth as ten."""
 
@@ -65,6 +66,19 @@ def check_encoder(path: Path, fps: int) -> None:
         import cv2  # noqa: F401
 
 
+def check_size(path: Path, width: int, height: int) -> None:
+    """Looks whether the format of a film has room for its pictures, before anything is rendered.
+
+    Raises:
+        ValueError: a WebP cannot be so large.
+    """
+    if path.suffix == ".webp" and max(width, height) > LARGEST_WEBP:
+        raise ValueError(
+            f"a .webp has at most {LARGEST_WEBP} pixels a side, not {width} x {height}; lower --width, or end the name "
+            "in .mp4"
+        )
+
+
 def side_by_side(pictures: list[Picture]) -> Picture:
     """Pictures of one size next to each other."""
     return np.concatenate(pictures, axis=1)
@@ -85,12 +99,30 @@ def _durations(path: Path, count: int, fps: int) -> list[int]:
     return [after - before for before, after in pairwise(ends)]
 
 
+class _LaterPictures:
+    """All pictures but the first, as one image of many frames: of several images, Pillow would keep all in memory."""
+
+    def __init__(self, pictures: Iterator[Picture], count: int) -> None:
+        self.n_frames = count
+        self._pictures = pictures
+        self._image: Image.Image | None = None
+
+    def seek(self, frame: int) -> None:
+        """Goes on to the next picture; Pillow asks for them in order."""
+        if frame >= self.n_frames:
+            raise EOFError
+        self._image = Image.fromarray(next(self._pictures))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._image, name)
+
+
 def _write_animation(path: Path, first: Picture, rest: Iterator[Picture], durations: list[int]) -> None:
-    images = (Image.fromarray(picture) for picture in rest)
+    later = _LaterPictures(rest, len(durations) - 1)
     with path.open("wb") as file:  # Pillow leaves a file open that it opens itself, where Ctrl-C ends it.
         kind = path.suffix.removeprefix(".").upper()
         options = {"duration": durations, "loop": 0, "quality": WEBP_QUALITY}
-        Image.fromarray(first).save(file, kind, save_all=True, append_images=images, **options)
+        Image.fromarray(first).save(file, kind, save_all=True, append_images=[later], **options)
 
 
 def _write_video(path: Path, first: Picture, rest: Iterator[Picture], fps: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from pathlib import Path
 
 import cv2
@@ -50,6 +51,22 @@ def test_a_film_takes_as_long_as_its_pictures_per_second_say(suffix: str, fps: i
     with Image.open(path) as film:
         shown = sum(seek(film, k).info["duration"] for k in range(film.n_frames))
     assert shown == pytest.approx(1000 * 48 / fps, abs=10)
+
+
+def test_pictures_of_a_webp_do_not_stay_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[weakref.ref[Image.Image]] = []
+    most = 0
+
+    def noted(picture: np.ndarray) -> Image.Image:
+        nonlocal most
+        image = Image.frombytes("RGB", picture.shape[1::-1], picture.tobytes())
+        made.append(weakref.ref(image))
+        most = max(most, sum(one() is not None for one in made))
+        return image
+
+    monkeypatch.setattr(Image, "fromarray", noted)
+    write_film(tmp_path / "film.webp", iter(PICTURES * 8), count=48, fps=10)
+    assert len(made) == 48 and most <= 3
 
 
 def test_what_is_no_film_is_refused(tmp_path: Path) -> None:
