@@ -10,7 +10,7 @@ Masks in `masks/`, or `x_mask.png` next to a photograph `x.png`, mean what they 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, replace
 from os.path import lexists, normpath
 from pathlib import Path, PurePosixPath
@@ -292,9 +292,7 @@ def find_masks(
     paths = _match(root / PANE_FOLDER, photographs)
     if not paths and (root / PANE_FOLDER).is_dir():
         raise InputError(f"{root / PANE_FOLDER} holds no mask images; add masks, or remove the folder")
-    masks, warnings = _found_masks(root, photographs)
-    named = {normpath(path) for path in (kept or {}).values()}
-    masks = {name: path for name, path in masks.items() if normpath(path) not in named}
+    masks, warnings = _found_masks(root, photographs, {normpath(path) for path in (kept or {}).values()})
     earlier = _why_panes(root, masks, marked=bool(paths))
     if earlier is not None:
         found = _understood(root, masks, polarity, read_mask_values)
@@ -307,15 +305,17 @@ def find_masks(
     )
 
 
-def _found_masks(root: Path, photographs: Mapping[str, Path]) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """Masks in `masks/` and next to the photographs, and a warning where some belong to none."""
+def _found_masks(
+    root: Path, photographs: Mapping[str, Path], named: Set[str]
+) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """Masks in `masks/` and next to the photographs but those that the format names; a warning if some are nobody's."""
     unmatched: list[str] = []
-    masks = _match(root / MASK_FOLDER, photographs, beside=_beside, unmatched=unmatched)
+    masks = _match(root / MASK_FOLDER, photographs, beside=_beside, unmatched=unmatched, named=named)
     if not unmatched:
-        if not masks and (root / MASK_FOLDER).is_dir():
+        if not (masks or named) and (root / MASK_FOLDER).is_dir():
             raise InputError(f"{root / MASK_FOLDER} holds no mask images; add masks, or remove the folder")
         return masks, ()
-    if not masks:
+    if not (masks or named):
         raise InputError(_no_photograph(root / MASK_FOLDER, unmatched, photographs))
     return masks, (f"{len(unmatched)} masks belong to no photograph ({first_names(sorted(unmatched))}).",)
 
@@ -420,15 +420,18 @@ def _match(
     *,
     beside: Callable[[Path], list[Path]] = lambda path: [],
     unmatched: list[str] | None = None,
+    named: Set[str] = frozenset(),
 ) -> dict[str, Path]:
     """Mask path by name of the photograph, in the order of the names; in the folder, or next to the photographs.
 
-    What belongs to no photograph is appended to `unmatched`, or refused.
+    What belongs to no photograph is appended to `unmatched`, or refused; files of the paths `named` are passed over.
     """
     found: dict[str, list[Path]] = defaultdict(list)
     keys = _owners_by_key(photographs if folder.is_dir() else ())
     strangers: list[str] = []
     for path in _image_files(folder, keys[0]):
+        if normpath(path) in named:
+            continue
         owners = _owners(path.relative_to(folder), keys)
         if len(owners) > 1:
             raise InputError(
@@ -443,7 +446,7 @@ def _match(
         raise InputError(_no_photograph(folder, strangers, photographs))
     if unmatched is not None:
         unmatched.extend(strangers)
-    taken = {normpath(path) for path in photographs.values()}
+    taken = {*named, *(normpath(path) for path in photographs.values())}
     for name, path in photographs.items():
         found[name].extend(mask for mask in beside(path) if normpath(mask) not in taken)
     for name, several in found.items():

@@ -119,10 +119,10 @@ def test_frames_name_their_masks(tmp_path: Path) -> None:
         load_dataset(root)
 
 
-def name_mask(root: Path, file: str) -> None:
+def name_mask(root: Path, file: str, mask: str = "masks/1.png") -> None:
     """Has a transforms file name a mask of one photograph."""
     settings = json.loads((root / file).read_text())
-    next(frame for frame in settings["frames"] if frame["file_path"] == "images/1.png")["mask_path"] = "masks/1.png"
+    next(frame for frame in settings["frames"] if frame["file_path"] == "images/1.png")["mask_path"] = mask
     (root / file).write_text(json.dumps(settings))
 
 
@@ -132,6 +132,16 @@ def test_masks_that_frames_name_are_no_panes_whatever_their_values(tmp_path: Pat
     write_shades(root / "masks/1.png", KEPT > 0)
     name_mask(root, "transforms.json")
     assert load_dataset(root).pane_labels == () and torch.equal(ignored_of(root)["1.png"], DROPPED)
+
+
+@pytest.mark.parametrize("mask", ["masks/mask_of_first.png", "masks/lens.png", "images/2_mask.png"])
+def test_masks_that_frames_name_may_have_any_name(tmp_path: Path, mask: str) -> None:
+    root = write_tiny_capture(tmp_path / "capture")
+    write_shades(root / mask, KEPT)
+    name_mask(root, "transforms.json", mask)
+    assert list(ignored_of(root)) == ["1.png"] and load_dataset(root).warnings == ()
+    write_shades(root / "masks/elsewhere.png", KEPT)
+    assert any("1 masks belong to no photograph (elsewhere.png)" in text for text in load_dataset(root).warnings)
 
 
 def test_frames_of_a_file_for_training_name_their_masks_too(tmp_path: Path) -> None:
