@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.files.ply_table import PlyTable, read_table, write_table
+from glassplat.files.ply_table import PlyTable, point_colors, read_table, write_table
 from glassplat.scene import SH_ZERO
 from glassplat.scene.gaussians import DISC_SCALES, PER_GAUSSIAN, Gaussians
 
@@ -169,9 +169,9 @@ def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
 def read_gaussians(path: Path | str) -> Gaussians:
     """Reads a 3DGS PLY, or one of 2DGS with two scales, as raw float32 tensors, bit for bit as stored.
 
-    Properties may come in any order, in ascii or either byte order, with SH degree 0 to 3 or no colour
-    at all. Properties that begin with `log_`, `logit_` or `raw_` become channels; normals and other
-    foreign properties are ignored. `active_sh_degree` is the highest degree stored.
+    Properties may come in any order, in ascii or either byte order, with SH degree 0 to 3, with red, green and blue
+    in place of harmonics, or no colour at all. Properties that begin with `log_`, `logit_` or `raw_` become channels;
+    normals and other foreign properties are ignored. `active_sh_degree` is the highest degree stored.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -181,7 +181,10 @@ def read_gaussians(path: Path | str) -> Gaussians:
     table = read_table(path)
     _check_is_splat(table, path)
     columns = {name: torch.from_numpy(_as_float32(values)) for name, values in table.columns.items()}
+    plain = point_colors(table.columns)
     sh = _read_sh(columns, path)
+    if plain is not None and sh.shape[1] == 0:
+        sh = (torch.from_numpy(_as_float32(plain))[:, None] / 255 - 0.5) / SH_ZERO
     return Gaussians(
         means=_stack_columns(columns, POSITION),
         quats=_stack_columns(columns, ROTATION),

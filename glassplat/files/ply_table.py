@@ -95,6 +95,19 @@ def read_table(path: Path, name: str = "vertex") -> PlyTable:
         return PlyTable(header, _read_binary(stream, element, earlier, BYTE_ORDERS[header.format], path))
 
 
+def point_colors(columns: Mapping[str, NDArray]) -> NDArray | None:
+    """[N, 3] the columns red, green and blue, from 0 to 255; None where one is missing.
+
+    Fractions that are nowhere above one are shares of 255, as some programs write them.
+    """
+    names = ("red", "green", "blue")
+    if not columns.keys() >= set(names):
+        return None
+    colors = np.stack([columns[name] for name in names], axis=1)
+    shares = np.issubdtype(colors.dtype, np.floating) and colors.max(initial=0) <= 1
+    return colors * 255 if shares else colors
+
+
 def write_table(path: Path, names: list[str], rows: NDArray[np.float32]) -> None:
     """Writes one `vertex` table [N, P] of float properties, binary little endian, atomically.
 

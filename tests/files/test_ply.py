@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from glassplat.files.ply import read_gaussians, write_gaussians
+from glassplat.scene import SH_ZERO
 from glassplat.scene.gaussians import Gaussians
 
 COUNT = 7
@@ -95,6 +96,23 @@ def test_any_order_and_any_format(tmp_path: Path, ply_format: str) -> None:
     np.testing.assert_array_equal(read.quats, values[:, [names.index(f"rot_{i}") for i in range(4)]])
     assert list(read.channels) == ["log_intensity"]
     assert read.sh.shape == (COUNT, 0, 3)
+
+
+@pytest.mark.parametrize(("kind", "white"), [("u1", 255), ("f4", 1)])
+def test_plain_colours_stand_in_for_harmonics(tmp_path: Path, kind: str, white: int) -> None:
+    """nerfstudio writes them with `--ply-color-mode rgb`."""
+    geometry = [*"xyz", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    row = np.dtype([*((name, "<f4") for name in geometry), *((name, f"<{kind}") for name in ("red", "green", "blue"))])
+    rows = np.ones(2, dtype=row)
+    rows["red"], rows["green"] = white, 0
+    rows["blue"] = 51 if kind == "u1" else 0.2
+    names = {"u1": "uchar", "f4": "float"}
+    header = ["ply", "format binary_little_endian 1.0", "element vertex 2"]
+    header += [f"property {names[row[name].str[-2:]]} {name}" for name in row.names or ()] + ["end_header", ""]
+    (tmp_path / "a.ply").write_bytes("\n".join(header).encode() + rows.tobytes())
+    read = read_gaussians(tmp_path / "a.ply")
+    assert read.active_sh_degree == 0
+    torch.testing.assert_close(read.sh[:, 0] * SH_ZERO + 0.5, torch.tensor([[1, 0, 0.2]] * 2), rtol=0, atol=1e-6)
 
 
 def test_doubles_and_an_element_in_front_are_read(tmp_path: Path) -> None:
