@@ -18,7 +18,7 @@ from glassplat.captures.cameras import LARGEST_SIDE, Lens, make_lens, rigid_pose
 from glassplat.captures.capture import Capture, RawPoints, Shot
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.images import IMAGE_SUFFIXES, image_size
-from glassplat.files.ply_table import read_table
+from glassplat.files.ply_table import point_colors, read_table
 from glassplat.files.records import (
     COORDINATE,
     Choice,
@@ -253,12 +253,9 @@ def read_points(root: Path, settings: Settings) -> RawPoints | None:
             f"{path} has no vertex property {first_names(lacking)}; expected a point cloud with x, y and z"
         )
     positions = np.stack([columns[axis] for axis in "xyz"], axis=1)
-    rgb = [columns.get(colour) for colour in ("red", "green", "blue")]
-    colors = (
-        np.full(positions.shape, GREY)
-        if any(c is None for c in rgb)
-        else np.stack([c for c in rgb if c is not None], 1)
-    )
+    colors = point_colors(columns)
+    if colors is None:
+        colors = np.full(positions.shape, GREY)
     with input_checked(path):
         return RawPoints.from_arrays(positions, colors) if len(positions) else None
 

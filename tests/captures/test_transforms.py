@@ -169,6 +169,16 @@ def test_points_beside_the_file(capture, name: str, binary: bool) -> None:
     np.testing.assert_array_equal(points.colors[order], capture.colors[expected])
 
 
+def test_points_may_have_colours_as_shares(capture) -> None:
+    capture.root.mkdir()
+    header = ["ply", "format ascii 1.0", "element vertex 2", *(f"property float {n}" for n in "xyz")]
+    header += [*(f"property float {n}" for n in ("red", "green", "blue")), "end_header"]
+    (capture.root / "cloud.ply").write_text("\n".join([*header, "0 0 0 1 0.4 0", "1 1 1 0 0.2 1", ""]))
+    points = load(capture, ply_file_path="cloud.ply").points
+    assert points is not None
+    np.testing.assert_array_equal(points.colors, [[255, 102, 0], [0, 51, 255]])
+
+
 def test_random_points_are_where_the_cameras_look(capture) -> None:
     load(capture)
     first, second = load_dataset(capture.root).points, load_dataset(capture.root).points
