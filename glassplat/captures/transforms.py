@@ -83,6 +83,8 @@ def _ball(centers: NDArray[np.float64], forward: NDArray[np.float64]) -> tuple[N
 FISHEYE = "OPENCV_FISHEYE"
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+LISTED = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""The order of `distortion_params`, as nerfstudio has it."""
 LENS: dict[str, Field] = {
     "camera_model": Optional(Choice((*PERSPECTIVE, FISHEYE))),
     "is_fisheye": Optional(Flag(), default=False),
@@ -91,6 +93,7 @@ LENS: dict[str, Field] = {
     **dict.fromkeys(("camera_angle_x", "camera_angle_y"), Optional(Number(above=0, most=math.pi))),
     **dict.fromkeys(("cx", "cy"), Optional(Number())),
     **dict.fromkeys(COEFFICIENTS, Optional(Number(), default=0.0)),
+    "distortion_params": Optional(Items(Number(), len(LISTED))),
 }
 
 
@@ -99,7 +102,7 @@ def lens_from_settings(settings: Mapping[str, Any], image_path: Path, name: str)
 
     Focal length: `fl_x`, `fl_y`, or the opening angles `camera_angle_x`, `camera_angle_y` in radians. Principal
     point: `cx`, `cy`, or the middle. Size: `w`, `h`, or that of the image. Distortion: `k1` ... `k6`, `p1`, `p2`, as
-    in OpenCV.
+    in OpenCV; or `distortion_params`, a list of k1 to k4, p1 and p2, which goes before them.
 
     Raises:
         InputError: no focal length, a value that is no number, an unknown camera model; names the photograph.
@@ -108,6 +111,7 @@ def lens_from_settings(settings: Mapping[str, Any], image_path: Path, name: str)
         found = check_fields(settings, LENS, f"the lens of {name}")
         width, height = _size(found, image_path)
         fx, fy = _focal_lengths(found, width, height, name)
+    found |= zip(LISTED, found["distortion_params"] or (), strict=False)
     model = found["camera_model"] or (FISHEYE if found["is_fisheye"] else "OPENCV")
     middle = [half if at is None else at for at, half in ((found["cx"], width / 2), (found["cy"], height / 2))]
     try:

@@ -51,6 +51,12 @@ def test_same_cameras_as_colmap(capture) -> None:
         ({"k1": 0.1, "k4": 0.2, "is_fisheye": True}, "OPENCV_FISHEYE", [30, 31, 15, 12.5, 0.1, 0, 0, 0.2]),
         ({"camera_model": "OPENCV_FISHEYE", "k2": 0.2}, "OPENCV_FISHEYE", [30, 31, 15, 12.5, 0, 0.2, 0, 0]),
         ({"camera_model": "PINHOLE", "w": 32.0}, "PINHOLE", [30, 31, 15, 12.5]),
+        ({"distortion_params": [0.1, 0.2, 0, 0, 0.3, 0.4]}, "OPENCV", [30, 31, 15, 12.5, 0.1, 0.2, 0.3, 0.4]),
+        (
+            {"distortion_params": [0.1, 0, 0, 0.2, 0, 0], "is_fisheye": True},
+            "OPENCV_FISHEYE",
+            [30, 31, 15, 12.5, 0.1, 0, 0, 0.2],
+        ),
     ],
 )
 def test_distortion_chooses_the_model(capture, settings: dict, model: str, parameters: list[float]) -> None:
@@ -217,6 +223,7 @@ def test_missing_photographs_are_named(capture) -> None:
         ({"train_filenames": 5}, r"train_filenames of .*transforms\.json is 5; expected a list of values"),
         ({"train_filenames": [{}]}, r"entry 1 of train_filenames of .* is \{\}; expected a text"),
         ({"test_filenames": ["a", 5]}, "entry 2 of test_filenames of .* is 5; expected a text"),
+        ({"distortion_params": [0.1, 0.2]}, "distortion_params of .*0000.png .*expected a list of 6 values"),
         ({"ply_file_path": 3}, r"ply_file_path of .*transforms\.json is 3; expected a text"),
         ({"frames": [3]}, r"frame 1 of .* is 3; expected an object with file_path, transform_matrix"),
         ({"frames": [{"file_path": "/", "transform_matrix": [[0] * 4] * 4}]}, "1 of 1 photographs .* are missing"),
