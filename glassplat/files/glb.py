@@ -392,9 +392,11 @@ def read_glb(path: Path | str) -> Gaussians:
     count = sum(file.count(primitive.get("POSITION", 0)) for primitive, _, _ in shown)
     if count > max(PLAIN_COUNT, file.size / BYTES_PER_GAUSSIAN):
         raise ValueError(f"{path} shows {count} Gaussians out of {file.size} bytes; no scene does: it is damaged")
-    found = [
-        place_gaussians(_read_primitive(file, primitive, where), placement) for primitive, where, placement in shown
-    ]
+    found = []
+    for primitive, where, placement in shown:
+        if isinstance(placement, ValueError):
+            raise placement
+        found.append(place_gaussians(_read_primitive(file, primitive, where), placement))
     if not found:
         raise ValueError(f"{path} shows no splats: expected a primitive of points with {EXTENSION} in its scene")
     most = max(part.sh.shape[1] for part in found)
@@ -440,28 +442,37 @@ def _glb_bytes(gaussians: Gaussians) -> bytes:
     )
 
 
-def _placed_meshes(file: GltfReader) -> list[tuple[int, Placement]]:
-    """The meshes that the scene shows, each with where; a file without scenes shows all its nodes."""
+def _placed_meshes(file: GltfReader) -> list[tuple[int, Placement | ValueError]]:
+    """The meshes that the scene shows, each with where; a file without scenes shows all its nodes.
+
+    Meshes without splats may lie anywhere, so what cannot be placed comes with the reason, for who needs to.
+    """
     scenes = file.list_of("scenes")
     chosen = file.document.get("scene", 0)
     if scenes:
         index = chosen if isinstance(chosen, int) and 0 <= chosen < len(scenes) else len(scenes)
-        pending = [(node, Placement()) for node in file.entry("scenes", index, SCENE)["nodes"]]
+        roots = file.entry("scenes", index, SCENE)["nodes"]
     else:
-        pending = [(node, Placement()) for node in range(len(file.list_of("nodes")))]
-    found: list[tuple[int, Placement]] = []
+        every = range(len(file.list_of("nodes")))
+        below = {child for node in every for child in file.entry("nodes", node, NODE)["children"]}
+        roots = [node for node in every if node not in below]
+    pending: list[tuple[int, Placement | ValueError]] = [(node, Placement()) for node in roots]
+    found: list[tuple[int, Placement | ValueError]] = []
     seen: set[int] = set()
     while pending:
-        number, outer = pending.pop()
+        number, placement = pending.pop()
         if number in seen:
             raise ValueError(f"node {number} of {file.path} hangs below two others; expected a tree: it is damaged")
         seen.add(number)
         node = file.entry("nodes", number, NODE)
-        placement = placement_of(node, outer, f"node {number} of {file.path}")
+        if isinstance(placement, Placement):
+            try:
+                placement = placement_of(node, placement, f"node {number} of {file.path}")
+            except ValueError as error:
+                placement = error
         if node["mesh"] is not None:
             found.append((node["mesh"], placement))
-        if scenes:
-            pending += [(child, placement) for child in node["children"]]
+        pending += [(child, placement) for child in node["children"]]
     return found
 
 

@@ -185,6 +185,32 @@ def test_nodes_place_splats(tmp_path: Path) -> None:
     torch.testing.assert_close(*colors, atol=1e-4, rtol=1e-3)
 
 
+def test_nodes_that_lead_to_no_splats_may_be_placed_in_any_way(tmp_path: Path) -> None:
+    def decorate(document: dict[str, Any]) -> None:
+        document["meshes"].append({"primitives": [{"attributes": {"POSITION": 0}, "mode": 4}]})
+        document["nodes"] += [{"camera": 0, "scale": [1, 1, -1], "children": [2]}, {"mesh": 1, "scale": [2, 1, 1]}]
+        document["scenes"][0]["nodes"].append(1)
+
+    def hang(document: dict[str, Any]) -> None:
+        decorate(document)
+        document["nodes"][2]["mesh"] = 0
+
+    path, before = written(tmp_path), read_glb(written(tmp_path))
+    assert torch.equal(read_glb(edited(path, decorate)).means, before.means)
+    with pytest.raises(ValueError, match=r"node 1 of .* skews, mirrors or stretches splats"):
+        read_glb(edited(written(tmp_path), hang))
+
+
+def test_a_file_without_scenes_shows_its_nodes_where_their_parents_put_them(tmp_path: Path) -> None:
+    def hang(document: dict[str, Any]) -> None:
+        del document["scenes"], document["scene"]
+        document["nodes"] = [{"mesh": 0}, {"children": [0], "translation": [10, 0, 0]}]
+
+    path, before = written(tmp_path), read_glb(written(tmp_path))
+    after = read_glb(edited(path, hang))
+    torch.testing.assert_close(after.means, before.means + torch.tensor([10.0, 0, 0]) * FLIP)
+
+
 def test_quantised_attributes_are_read(tmp_path: Path) -> None:
     path = written(tmp_path, typical(1))
     count = len(typical())
