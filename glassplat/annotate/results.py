@@ -20,7 +20,7 @@ from glassplat.captures.files import read_poses, with_masks
 from glassplat.captures.masks import PANE_FOLDER, PLANES, mask_paths
 from glassplat.captures.view import PhotoFile, View
 from glassplat.errors import InputError, first_names
-from glassplat.files.images import image_size, is_hidden, leads_out, write_image
+from glassplat.files.images import files_below, image_size, is_hidden, leads_out, write_image
 from glassplat.files.records import read_json
 from glassplat.files.sidecars import write_planes
 from glassplat.files.writing import atomic_write, remove_empty, remove_unfinished
@@ -208,7 +208,7 @@ def earlier_masks(root: Path) -> set[str]:
     if not folder.is_dir():
         return set()
     known, _ = _made_here(folder)
-    found = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file()]
+    found = [path.relative_to(folder) for path in files_below(folder) if path.is_file()]
     seen = {path.as_posix() for path in found if not is_hidden(path) and path.name != RECORD}
     others = sorted(seen - known)
     if others:

@@ -24,6 +24,7 @@ from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.images import (
     IMAGE_SUFFIXES,
     SHADES_16,
+    files_below,
     is_hidden,
     leads_out,
     opacity,
@@ -473,11 +474,11 @@ def _image_files(folder: Path, hidden: Container[str]) -> Iterator[Path]:
         if lexists(folder):
             raise InputError(f"{folder} is no folder that can be read; expected one of mask images, or none")
         return
-    for path in sorted(folder.rglob("*")):
+    for path in sorted(files_below(folder)):
         relative = path.relative_to(folder)
         if is_hidden(relative) and relative.with_suffix("").as_posix() not in hidden:
             continue
-        if path.suffix.lower() not in IMAGE_SUFFIXES or path.is_dir():
+        if path.suffix.lower() not in IMAGE_SUFFIXES:
             continue
         if not path.is_file():
             raise InputError(f"mask {path} is no file that can be read; replace or remove it")

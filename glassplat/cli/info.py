@@ -15,7 +15,7 @@ from rich.console import Console
 from glassplat.captures.files import CaptureFiles, read_capture
 from glassplat.cli.console import count_noun, import_held, say, shell_word, warn
 from glassplat.errors import InputError, UnknownFormatError, first_names, input_checked
-from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
+from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES, files_below
 from glassplat.files.records import Text, check_fields, read_json
 from glassplat.files.writing import SCENE, SPLAT_SUFFIXES, check_folder, scene_source
 from glassplat.model.run_directory import RunDirectory
@@ -114,7 +114,7 @@ def photographs_finding(path: Path) -> Iterator[Finding]:
     Raises:
         InputError: there are none.
     """
-    found = sorted(one for one in path.rglob("*") if is_photograph(one) and one.is_file())
+    found = sorted(one for one in files_below(path) if is_photograph(one) and one.is_file())
     if not found:
         names = first_names(sorted(one.name for one in path.iterdir()), 8) or "nothing"
         raise InputError(f"{path} is nothing that is known; expected {KINDS}; it holds {names}")

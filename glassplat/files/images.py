@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import struct
 import unicodedata
 import warnings
@@ -310,6 +311,16 @@ def _to_uint8(pixels: NDArray[np.generic]) -> NDArray[np.uint8]:
     if not np.isfinite(values).all():
         raise ValueError("the image holds values that are not finite; expected numbers in [0, 1]")
     return np.ascontiguousarray(np.round(np.clip(values, 0, 1) * 255).astype(np.uint8))
+
+
+def files_below(folder: Path) -> Iterator[Path]:
+    """The files below a folder, also in folders that are links, but for links to a folder that they lie in."""
+    around = {str(folder): frozenset[str]()}
+    for where, folders, names in os.walk(folder, followlinks=True):
+        inside = around.pop(where) | {os.path.realpath(where)}
+        folders[:] = [name for name in folders if os.path.realpath(os.path.join(where, name)) not in inside]
+        around.update((os.path.join(where, name), inside) for name in folders)
+        yield from (Path(where, name) for name in names)
 
 
 def is_hidden(relative: PurePath) -> bool:

@@ -202,7 +202,8 @@ def _photograph_paths(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise InputError(f"no folder or video {folder}; expected a folder of photographs, or a video file")
-    files = [path for path in folder.rglob("*") if path.is_file() and not images.is_hidden(path.relative_to(folder))]
+    below = images.files_below(folder)
+    files = [path for path in below if path.is_file() and not images.is_hidden(path.relative_to(folder))]
     unreadable = {path.name: kind for path in sorted(files) if (kind := _unreadable_kind(path))}
     if unreadable:
         kinds = "/".join(sorted(set(unreadable.values())))

@@ -126,6 +126,14 @@ def test_hidden_folders_are_left_out(capture, folder: str) -> None:
     assert load_dataset(capture.root).warnings == ()
 
 
+def test_masks_in_a_linked_folder_are_found(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    Image.fromarray(INSIDE).save(tmp_path / "elsewhere" / "1.png")
+    (tmp_path / "panes").mkdir()
+    (tmp_path / "panes" / "left").symlink_to(tmp_path / "elsewhere")
+    assert masks_of(tmp_path, ["2.png"], ["left/1.jpg", "2.jpg"]) == {"left/1.jpg": "left/1.png", "2.jpg": "2.png"}
+
+
 def test_masks_of_hidden_photographs_are_not(tmp_path: Path) -> None:
     assert masks_of(tmp_path, [".cam/1.png", ".cam/2-checkpoint.png"], [".cam/1.jpg", "2.jpg"]) == {
         ".cam/1.jpg": ".cam/1.png"

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from glassplat.files.images import files_below
 from glassplat.files.writing import SPLAT_WRITERS, check_folder, make_folder, scene_source
 
 
@@ -51,3 +52,16 @@ def test_a_folder_that_export_wrote_holds_a_scene_whatever_its_format(
     monkeypatch.setitem(SPLAT_WRITERS, "new", "somewhere:write")
     (tmp_path / f"scene.{kind}").touch()
     assert scene_source(tmp_path) == tmp_path / f"scene.{kind}"
+
+
+def test_files_are_found_in_folders_that_are_links_and_no_circle_is_endless(tmp_path: Path) -> None:
+    for name in ("outside/1.png", "folder/a/2.png", "folder/3.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    folder = tmp_path / "folder"
+    for name, target in (("b", "outside"), ("c", "folder/a"), ("a/up", "folder"), ("a/self", "folder/a")):
+        (folder / name).symlink_to(tmp_path / target)
+    (tmp_path / "outside" / "back").symlink_to(folder)
+    (folder / "4.png").symlink_to("/nowhere")
+    found = [path.relative_to(folder).as_posix() for path in files_below(folder)]
+    assert sorted(found) == ["3.png", "4.png", "a/2.png", "b/1.png", "c/2.png"]

@@ -161,6 +161,12 @@ def test_numbers_are_sorted_by_value_and_folders_stay(tmp_path: Path, heard: Hea
     assert names == [*flat, "left/0.jpg", "left/1.jpg", "left/2.jpg", "left/10.jpg"]
 
 
+def test_folders_may_be_links(tmp_path: Path, heard: Heard) -> None:
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "left").symlink_to(three(tmp_path / "elsewhere"))
+    assert [one.name for one in photographs_in(tmp_path / "in", 1600, heard)] == [f"left/{n}.jpg" for n in range(3)]
+
+
 def test_names_differ_without_suffix_too(tmp_path: Path) -> None:
     paths = [tmp_path / name for name in ("a.jpg", "a.png", "b.tif", "c\n.jpg", "B.tif")]
     names = capture_names(paths, tmp_path)
