@@ -1,8 +1,14 @@
 // The controls around the picture. They change a state and say that it changed; drawing is not their business.
 
 const element = (id) => document.getElementById(id);
-const viewOfAddress = (views) => views.find((view) => location.hash === `#view=${encodeURIComponent(view.name)}`);
 const STATE = { layer: 'rgb', compare: false, divider: 0.5, glass: 'real', pane: 'all' };
+
+// The photograph that the address names, encoded or as somebody typed it.
+function viewOfAddress(views) {
+  const asked = [location.hash];
+  try { asked.push(decodeURIComponent(location.hash)); } catch { /* A % that encodes nothing. */ }
+  return views.find((view) => asked.includes(`#view=${view.name}`));
+}
 
 function makePanel(scene, navigation, changed) {
   const state = { ...STATE, reflectances: scene.panes.map((pane) => pane.reflectance) };

@@ -10,6 +10,7 @@ from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
+from urllib.parse import quote, unquote
 
 import pytest
 import torch
@@ -247,6 +248,19 @@ def test_the_first_view_stands_in_the_address_too(opened: Browser) -> None:
     first = opened.evaluate("glassplat.then(({ scene }) => scene.views[scene.first].name)")
     assert opened.evaluate("document.getElementById('photo').textContent") == first
     assert opened.evaluate("location.hash") == f"#view={first}"
+
+
+@needs_browser
+def test_the_address_may_name_a_photograph_as_it_is_typed(tmp_path: Path) -> None:
+    names = ["left/1 é.png", "50%.png"]
+    cameras = list(zip(names, (camera for _, camera in CAMERAS), strict=False))
+    write_page(tmp_path / "index.html", true_scene(), Planar(), cameras, "Typed")
+    with Browser(tmp_path / "index.html", 320, 240, query="#view=" + names[0]) as browser:
+        browser.wait("glassplat.then(() => true)", "the page")
+        for typed in (names[1], names[0], quote(names[1]), quote(names[0], safe="")):
+            browser.evaluate(f"location.hash = '#view={typed}'")
+            shown = f"document.getElementById('photo').textContent === '{unquote(typed)}'"
+            browser.wait(shown, f"the photograph at #view={typed}")
 
 
 @needs_browser
