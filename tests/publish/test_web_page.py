@@ -264,6 +264,16 @@ def test_the_address_may_name_a_photograph_as_it_is_typed(tmp_path: Path) -> Non
 
 
 @needs_browser
+def test_every_control_can_be_reached_on_a_narrow_screen(opened: Browser) -> None:
+    left = """(() => {
+      const controls = [...document.querySelectorAll('#dock button, #dock input')].filter((one) => one.offsetParent);
+      document.getElementById('dock').scrollLeft = -1e4;
+      return Math.min(...controls.map((one) => one.getBoundingClientRect().left));
+    })()"""
+    assert opened.evaluate(left) >= 0
+
+
+@needs_browser
 def test_a_camera_that_looks_straight_down_is_not_turned_up_by_a_touch(opened: Browser) -> None:
     up = torch.tensor(opened.evaluate("glassplat.then(({ scene }) => scene.up)"), dtype=torch.float32)
     right = torch.nn.functional.normalize(torch.tensor([0.0, -up[2], up[1]]), dim=0)
