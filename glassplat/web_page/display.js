@@ -21,8 +21,9 @@ function makeDisplay(canvas, scene, renderer, navigation, panel) {
 
   // Whether the window has changed its size.
   function fit() {
-    const ratio = Math.min(window.devicePixelRatio || 1, 2);
-    return renderer.resize(...[canvas.clientWidth, canvas.clientHeight].map((side) => Math.max(1, Math.round(side * ratio))));
+    const sides = [canvas.clientWidth, canvas.clientHeight];
+    const ratio = Math.min(window.devicePixelRatio || 1, 2, renderer.largest / Math.max(...sides));
+    return renderer.resize(...sides.map((side) => Math.max(1, Math.round(side * ratio))));
   }
 
   function viewOf(scale, moving) {

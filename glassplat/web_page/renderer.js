@@ -204,5 +204,6 @@ function makeRenderer(canvas, scene) {
     return data;
   }
 
-  return { drawing, resize, setOrder, pixels, isSoftware, fence: graphics.fence, isLost: () => gl.isContextLost() };
+  const largest = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+  return { drawing, resize, setOrder, pixels, isSoftware, largest, fence: graphics.fence, isLost: () => gl.isContextLost() };
 }

@@ -274,6 +274,17 @@ def test_every_control_can_be_reached_on_a_narrow_screen(opened: Browser) -> Non
 
 
 @needs_browser
+def test_a_window_wider_than_textures_shows_a_coarser_picture(tmp_path: Path) -> None:
+    write_page(tmp_path / "index.html", true_scene(), Planar(), CAMERAS, "Wide")
+    with Browser(tmp_path / "index.html", 8400, 100) as browser:
+        browser.wait("document.body.classList.contains('ready')", "the page")
+        canvas = "document.getElementById('view')"
+        limit = browser.evaluate(f"{canvas}.getContext('webgl2').getParameter(0x0d33)")  # MAX_TEXTURE_SIZE
+        assert browser.evaluate(f"{canvas}.width") == min(limit, 8400) < 8400
+        assert browser.complaints() == []
+
+
+@needs_browser
 def test_a_camera_that_looks_straight_down_is_not_turned_up_by_a_touch(opened: Browser) -> None:
     up = torch.tensor(opened.evaluate("glassplat.then(({ scene }) => scene.up)"), dtype=torch.float32)
     right = torch.nn.functional.normalize(torch.tensor([0.0, -up[2], up[1]]), dim=0)
