@@ -416,7 +416,10 @@ class PhotographControls:
 
     def show_nearest(self, index: int) -> None:
         """Shows a photograph, unless it is there already; where it is gone or broken, says so in its place."""
-        name = self._state.cameras[index][0]
+        cameras = self._state.cameras
+        if torch.equal(cameras[index][1].cam_from_world, cameras[self._at][1].cam_from_world):
+            index = self._at  # Of those that were taken from one place, the one that was chosen.
+        name = cameras[index][0]
         if self._photo is None or index == self._on_screen or name not in self._state.photographs:
             return
         self._at = self._on_screen = index

@@ -1,4 +1,4 @@
-"""Keyframes that are set, removed and played at once, as viser's threads do after quick clicks."""
+"""Keyframes that are set, removed and played at once, as by quick clicks; steps from photograph to photograph."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ import time
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
+
+import torch
 
 from glassplat.scene.camera import Camera
-from glassplat.viewer.controls import MOST_KEYFRAMES, KeyframeControls
+from glassplat.viewer.controls import MOST_KEYFRAMES, KeyframeControls, PhotographControls
+from glassplat.viewer.drawing import Viewpoints
 from tests.training.tiny_capture import tiny_capture
 
 CAMERAS = [view.camera for view in tiny_capture().train]
@@ -97,3 +101,28 @@ def test_nothing_moves_the_camera_once_playing_was_stopped_even_in_the_middle_of
     moves = len(moved)
     time.sleep(0.5)
     assert moves and len(moved) == moves
+
+
+def test_steps_lead_past_photographs_from_one_place() -> None:
+    """Standing at one of them, another is as near."""
+    cameras = [(f"{k}.png", camera) for k, camera in enumerate((CAMERAS[0], CAMERAS[0], *CAMERAS[1:3]))]
+    photo = torch.zeros(48, 64, 3, dtype=torch.uint8)
+    gui, viewpoints = MagicMock(), Viewpoints([camera for _, camera in cameras], 1.0)
+    photographs = {name: lambda: photo for name, _ in cameras}
+    controls = PhotographControls(gui, SimpleNamespace(cameras=cameras, photographs=photographs), 0)
+    stops, labels = [], []
+
+    def stand_at(index: int) -> None:
+        controls.stands_at(index)
+        controls.show_nearest(index)
+        pose = cameras[index][1].cam_from_world.double()
+        controls.show_nearest(viewpoints.nearest((-pose[:3, :3].T @ pose[:3, 3]).numpy(), pose[2, :3].numpy()))
+        stops.append(index)
+        labels.append(gui.add_image.return_value.label)
+
+    controls.listen(stand_at)
+    gui.add_button_group.return_value.value = "next"
+    for _ in range(5):
+        gui.add_button_group.return_value.on_click.call_args[0][0](None)
+    assert stops == [1, 2, 3, 0, 1]
+    assert labels == [f"Nearest photograph: {index}.png" for index in stops]
