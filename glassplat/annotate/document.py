@@ -121,14 +121,11 @@ def parsed_document(value: Any, where: str) -> tuple[MarkedPane, ...]:
         raise ValueError(f"{where} has the labels {labels}; expected every label once")
     for pane in panes:
         strokes = [stroke for several in pane.strokes.values() for stroke in several]
-        if (
-            len(pane.corners) > MOST_CORNERS
-            or len(strokes) > MOST_STROKES
-            or sum(len(stroke.points) for stroke in strokes) > MOST_PLACES
-        ):
+        places = sum(len(stroke.points) for stroke in strokes)
+        if len(pane.corners) > MOST_CORNERS or len(strokes) > MOST_STROKES or places > MOST_PLACES:
             raise ValueError(
-                f"pane {pane.label} of {where} has {len(pane.corners)} corners and {len(strokes)} strokes; expected at "
-                f"most {MOST_CORNERS} and {MOST_STROKES}, of {MOST_PLACES} points"
+                f"pane {pane.label} of {where} has {len(pane.corners)} corners and {len(strokes)} strokes of {places} "
+                f"points; expected at most {MOST_CORNERS} and {MOST_STROKES}, of {MOST_PLACES} points"
             )
     return panes
 

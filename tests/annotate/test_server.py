@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from glassplat.access import cookie_name
-from glassplat.annotate.document import MOST_CORNERS
+from glassplat.annotate.document import MOST_CORNERS, MOST_PLACES
 from glassplat.annotate.server import LARGEST_BODY, AnnotationServer
 from glassplat.annotate.session import opened_session
 from glassplat.errors import InputError
@@ -194,6 +194,12 @@ def test_nonsense_changes_nothing(body: Any, status: int, server: AnnotationServ
         found, message = save(server, body)
     assert found == status and message["error"]
     assert server.session.document == marked_document()
+
+
+def test_more_points_than_fit_are_counted_in_the_refusal(server: AnnotationServer) -> None:
+    stroke = {"kind": "brush", "effect": "cut", "radius": 5, "points": [[1, 1]] * (MOST_PLACES + 1)}
+    _, answer = save(server, marked_document(strokes={"0.png": [stroke]}))
+    assert "1 strokes of 20001 points; expected at most 32 and 500, of 20000 points" in answer["error"]
 
 
 def panes(*labels: int, **more: Any) -> dict:
