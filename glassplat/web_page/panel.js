@@ -128,6 +128,7 @@ function makePanel(scene, navigation, changed) {
     if ('wasdqe'.includes(key)) { walking.add(key); navigation.still(); changed(); }
     else if (LAYER_KEYS[Number(key) - 1]) set('layer', LAYER_KEYS[Number(key) - 1]);
     else if (KEYS[key]) KEYS[key](); else return;
+    body.classList.add('touched');
     event.preventDefault();
   });
 

@@ -118,11 +118,19 @@ def test_keys_of_a_slider_stay_its_own_and_others_work(opened: Browser) -> None:
     state = "glassplat.then(({ panel: { state } }) => [state.compare, state.divider, state.reflectances[0]])"
     photo = opened.evaluate("document.getElementById('photo').textContent")
     *_, before = opened.evaluate(state)
-    opened.evaluate("document.getElementById('reflectance').focus()")
+    opened.evaluate("document.getElementById('reflectance').focus() || document.body.classList.remove('touched')")
     opened.keys("c")
+    assert opened.evaluate("document.body.classList.contains('touched')")
     opened.keys("Right")
     compares, divider, brighter = opened.evaluate(state)
     assert compares and brighter > before
+    over = """glassplat.then(({ panel }) => {
+      const { x, y } = document.querySelector('nav [data-do=help]').getBoundingClientRect();
+      panel.set('divider', x / innerWidth);
+      return document.elementFromPoint(x + 5, y + 5).closest('nav') !== null;
+    })"""
+    assert opened.evaluate(over), "the divider does not lie over the buttons"
+    opened.evaluate(f"glassplat.then(({{ panel }}) => panel.set('divider', {divider}))")
     opened.evaluate("document.getElementById('divider').focus()")
     opened.keys("Left")
     _, moved, same = opened.evaluate(state)
@@ -259,8 +267,7 @@ def test_the_address_may_name_a_photograph_as_it_is_typed(tmp_path: Path) -> Non
         browser.wait("glassplat.then(() => true)", "the page")
         for typed in (names[1], names[0], quote(names[1]), quote(names[0], safe="")):
             browser.evaluate(f"location.hash = '#view={typed}'")
-            shown = f"document.getElementById('photo').textContent === '{unquote(typed)}'"
-            browser.wait(shown, f"the photograph at #view={typed}")
+            browser.wait(f"document.getElementById('photo').textContent === '{unquote(typed)}'", typed)
 
 
 @needs_browser
@@ -280,8 +287,7 @@ def test_a_window_wider_than_textures_shows_a_coarser_picture(tmp_path: Path) ->
         browser.wait("document.body.classList.contains('ready')", "the page")
         canvas = "document.getElementById('view')"
         limit = browser.evaluate(f"{canvas}.getContext('webgl2').getParameter(0x0d33)")  # MAX_TEXTURE_SIZE
-        assert browser.evaluate(f"{canvas}.width") == min(limit, 8400) < 8400
-        assert browser.complaints() == []
+        assert browser.evaluate(f"{canvas}.width") == limit and browser.complaints() == []
 
 
 @needs_browser
@@ -505,7 +511,7 @@ def test_what_shines_mirrors_what_surrounds_it(mirrored: str, tmp_path: Path) ->
 def test_the_page_is_one_file_of_little_script() -> None:
     page = page_text(true_scene(), Planar(), CAMERAS, "title")
     outside = re.findall(r"(?:src|href|url)\s*[=(]\s*[\"']?(?!data:)[a-z]+:", page)
-    assert not outside and "http://" not in page and "https://" not in page
+    assert not outside and "http://" not in page and "https://" not in page and "<noscript>" in page
     assert sum(len(asset(name)) for name in (*SCRIPTS, *SHADERS)) <= LARGEST_SCRIPT
 
 
