@@ -80,7 +80,6 @@ vec3 layerOf(int layer, vec3 seen, vec3 behind, vec4 mirror, float mask) {
   if (layer == 1) return behind;
   if (layer == 2) return encoded(mirror.rgb) * mask;
   if (layer == 3) return vec3(mirror.a);
-  if (layer == 4) return vec3(mask);
   return seen;
 }
 

@@ -1,7 +1,7 @@
 // Draws a view: transmission, each visible pane's mask and what it mirrors, then the sum of all.
 
 const LAWS = ['pane', 'schlick', 'none'];
-const LAYERS = { rgb: 0, without_panes: 1, reflection: 2, strength: 3, mask: 4 };
+const LAYERS = { rgb: 0, without_panes: 1, reflection: 2, strength: 3 };
 
 function makeRenderer(canvas, scene) {
   const graphics = makeGraphics(canvas), { gl, formats, use, isSoftware } = graphics;
