@@ -202,6 +202,7 @@ class Session:
         self._lock = Lock()
         self._pictures: OrderedDict[tuple[int, int], bytes] = OrderedDict()
         self._versions: OrderedDict[str, Any] = OrderedDict()
+        self._answers: dict[int, tuple[str, dict[str, Any]]] = {}
         with input_checked():
             self._document: Any = read_document(self.root)
         self._remember(self._document)
@@ -265,7 +266,7 @@ class Session:
                 raise ChangedElsewhereError(merge_documents(base, there, document), version_of(there))
             write_document(self.root, document)
             self._remember(document)
-        return {"panes": [self._answer(self.solve(pane)) for pane in panes], "version": version_of(document)}
+        return {"panes": [self._answer(pane) for pane in panes], "version": version_of(document)}
 
     def _current(self) -> dict[str, Any]:
         """The document on disk and its version: what another program has saved counts."""
@@ -330,8 +331,15 @@ class Session:
             "planes": [{"label": pane.label, "uncertainty": fit.uncertainty} for pane, fit in solved],
         }
 
-    def _answer(self, solved: SolvedPane) -> dict[str, Any]:
-        """Record of a pane for the page."""
+    def _answer(self, pane: MarkedPane) -> dict[str, Any]:
+        """Record of a pane for the page; the last one where its corners, edges and shape are still the same."""
+        marked, known = repr((pane.corners, pane.edges, pane.shape)), self._answers.get(pane.label)
+        if known is None or known[0] != marked:
+            known = self._answers[pane.label] = marked, self._record(self.solve(pane))
+        return known[1]
+
+    def _record(self, solved: SolvedPane) -> dict[str, Any]:
+        """Record of a pane and its fit for the page."""
         pane, fit = solved.pane, solved.fit
         marks = pane.marks(self._numbers)
         if fit is None:

@@ -327,3 +327,20 @@ def test_the_suggested_photograph_lowers_the_doubt(room: Path) -> None:
     assert best["uncertainty"] < two["uncertainty"]
     three = saved(session, marked_document((0, 2, best["view"])))["panes"][0]
     assert three["uncertainty"] == pytest.approx(best["uncertainty"], rel=0.3)
+
+
+def test_only_panes_that_have_changed_are_fitted_again(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fitted = []
+    monkeypatch.setattr("glassplat.annotate.session.fit_pane", lambda *given: fitted.append(given) or fit_pane(*given))
+    opened, document = opened_session(room), marked_document()
+    document["panes"] += marked_document(label=2)["panes"]
+    first = saved(opened, document)["panes"]
+    assert len(fitted) == 2 and [answer["label"] for answer in first] == [1, 2]
+    document["panes"][0]["strokes"] = {"0.png": [EVERYTHING]}
+    assert saved(opened, document)["panes"] == first and len(fitted) == 2
+    document["panes"][1]["corners"][0]["0.png"][0] += 3
+    again = saved(opened, document)["panes"]
+    assert again[0] == first[0] and again[1]["error"] > first[1]["error"] and len(fitted) == 3
+    document["panes"][1]["shape"] = "polygon"
+    saved(opened, document)
+    assert len(fitted) == 4
