@@ -80,6 +80,12 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
     if (folder / "images").is_dir() and any((folder / name).is_dir() for name in CAPTURE_FOLDERS):
         raise InputError(f"{folder} is a capture; expected a folder of photographs, such as {folder / 'images'}")
     paths = _photograph_paths(folder)
+    masks = masks_among(paths)
+    if masks:
+        listen(
+            Note(f"{len(masks)} files are masks by their names and left out: {first_names([p.name for p in masks])}.")
+        )
+        paths = [path for path in paths if path not in masks]
     names = capture_names(paths, folder)
     found: dict[bytes, Photograph] = {}
     twins: list[str] = []

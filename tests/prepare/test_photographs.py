@@ -11,7 +11,7 @@ from PIL import ExifTags, Image
 
 from glassplat.errors import InputError
 from glassplat.prepare.colmap import _camera_key
-from glassplat.prepare.photographs import Photograph, capture_names, photographs_in, read_photograph
+from glassplat.prepare.photographs import Note, Photograph, capture_names, photographs_in, read_photograph
 from tests.files.profiles import IN_P3, IN_SRGB, p3_profile
 from tests.prepare.conftest import Heard
 
@@ -159,6 +159,15 @@ def test_numbers_are_sorted_by_value_and_folders_stay(tmp_path: Path, heard: Hea
     names = [one.name for one in photographs_in(folder, 1600, heard)]
     flat = ["0.jpg", "1.jpg", "2.jpg", "9.jpg", "10.jpg"]
     assert names == [*flat, "left/0.jpg", "left/1.jpg", "left/2.jpg", "left/10.jpg"]
+
+
+def test_masks_next_to_photographs_are_no_photographs(tmp_path: Path, heard: Heard) -> None:
+    folder = three(tmp_path / "in")
+    for seed, name in enumerate(("1_mask.jpg", "2_mask.png", "wall_mask.png"), start=5):
+        picture(seed).save(folder / name)
+    assert sorted(found(folder, heard)) == ["0.png", "1.png", "2.png", "wall_mask.png"]
+    notes = [message.text for message in heard if isinstance(message, Note)]
+    assert notes == ["2 files are masks by their names and left out: 1_mask.jpg, 2_mask.png."]
 
 
 def test_folders_may_be_links(tmp_path: Path, heard: Heard) -> None:
