@@ -45,7 +45,8 @@ HEADER: dict[str, records.Field] = {
     "up": records.Optional(DIRECTION),
     "files": records.Optional(records.Items(records.Choice(FILES))),
 }
-"""`files` is what the scene consists of, so that one that is lost is missed; folders of earlier versions lack it."""
+"""`files` is what the scene consists of, so that one that is lost is missed, and one of an earlier scene is not read;
+folders of earlier versions lack it."""
 
 
 def write_scene(folder: Path, scene: Scene) -> None:
@@ -94,21 +95,23 @@ def read_scene(folder: Path) -> Scene:
     for name in header["files"] or ():
         if not os.path.isfile(folder / name):
             raise FileNotFoundError(f"no {name} in {folder}; {SCENE} says that the scene has one: export it again")
+    files = FILES if header["files"] is None else header["files"]
+    listed = [name for name in files if (folder / name).is_file()]
     scene = Scene(_colored(folder, PRIMARY, header["active_sh_degree"]), header["extent"])
-    if (folder / PLANES).is_file():
+    if PLANES in listed:
         scene = replace(scene, glass=_glass(folder / GLASS), planes=sidecars.read_planes(folder / PLANES))
-    if (folder / ENVIRONMENT).is_file():
+    if ENVIRONMENT in listed:
         scene = replace(scene, environment=sidecars.read_environment(folder / ENVIRONMENT))
-    if (folder / SURROUNDINGS).is_file():
+    if SURROUNDINGS in listed:
         scene = replace(scene, surroundings=_colored(folder, SURROUNDINGS, header["surroundings_sh_degree"]))
-    if (folder / PHOTOGRAPHER).is_file():
+    if PHOTOGRAPHER in listed:
         photographer = _ellipsoids(
             _colored(folder, PHOTOGRAPHER, header["photographer_sh_degree"]), folder / PHOTOGRAPHER
         )
         scene = replace(scene, photographer=photographer, up=direction(header["up"], str(folder / SCENE)))
-    if (folder / EXPOSURES).is_file():
+    if EXPOSURES in listed:
         scene = replace(scene, exposures=sidecars.read_corrections(folder / EXPOSURES, Exposures))
-    if (folder / POSES).is_file():
+    if POSES in listed:
         scene = replace(scene, poses=sidecars.read_corrections(folder / POSES, PoseCorrections))
     return scene
 

@@ -33,6 +33,14 @@ def test_a_scene_survives_bit_for_bit(tmp_path: Path, panes: bool, environment: 
     assert (tmp_path / "environment.safetensors").is_file() != environment.is_empty
 
 
+def test_a_scene_does_not_take_over_what_an_earlier_one_left(tmp_path: Path) -> None:
+    whole = replace(in_single_precision(showcase()), environment=lit())
+    write_scene(tmp_path, whole)
+    write_scene(tmp_path, Scene(whole.primary, whole.extent))
+    bare = read_scene(tmp_path)
+    assert not len(bare.planes) and not len(bare.glass) and bare.environment.is_empty
+
+
 def surrounded() -> Scene:
     """A scene whose surroundings use fewer harmonics than they hold."""
     scene = in_single_precision(showcase())
