@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 import zlib
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Container, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -38,7 +38,7 @@ from glassplat.training.messages import (
     Working,
 )
 from glassplat.training.ranks import Ranks, is_launched, join
-from glassplat.training.stage import Stage, TrainState, check_length
+from glassplat.training.stage import Stage, TrainState, check_length, stage_starts
 
 Listener = Callable[[Message], None]
 STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
@@ -327,10 +327,12 @@ class TrainingSession:
         with stop_on_interrupt() as self._stop, photographs_read(dataset) as check_photographs:
             self._ranks.asked = lambda: self._stop.requested
             messages = train(stages, dataset, self._state, iterations, ranks=self._ranks)
+            starts = zip(stages, stage_starts(stages, iterations), strict=False)
+            setups = {start for stage, start in starts if stage.setup is not None}
             for message in self._saved_where_it_fails(messages, check_photographs):
                 yield from self.deliver(message)
                 if isinstance(message, StepDone):
-                    yield from self._saved_in_time(message, iterations)
+                    yield from self._saved_in_time(message, iterations, setups)
 
     def _saved_where_it_fails(self, messages: Iterator[Message], check: Callable[[], None]) -> Iterator[Message]:
         """Passes messages on; where a rank is lost or a photograph cannot be read, what was trained is saved first."""
@@ -348,10 +350,15 @@ class TrainingSession:
             step = self._state.step
             raise InputError(f"{error}; step {step} is saved; mend that, then repeat with --resume") from error
 
-    def _saved_in_time(self, message: StepDone, iterations: int) -> Generator[Message, None, None]:
-        """Writes a checkpoint where it is time for one, and ends training where it was asked to end."""
+    def _saved_in_time(
+        self, message: StepDone, iterations: int, setups: Container[int] = ()
+    ) -> Generator[Message, None, None]:
+        """Writes a checkpoint where it is time for one, and ends training where it was asked to end.
+
+        It is time before a setup, too, at whichever of these steps: a setup may refuse what it is given, such as masks.
+        """
         is_last, is_ending = message.step == iterations, self._ranks.is_ending
-        is_time = self._record is not None and self._is_time(self._record.every)
+        is_time = self._record is not None and (message.step in setups or self._is_time(self._record.every))
         if is_ending or is_last or is_time:
             self.save()
             yield from self.deliver(CheckpointWritten(message.step))

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 import glassplat
 from glassplat import Frame, InputError, LossTerm, Scene, SplatRecipe, Stage, StageEntered, StepDone, Training, View
 from glassplat.captures.dataset import load_dataset
 from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
 from glassplat.methods.planar_recipe import PlanarRecipe
+from glassplat.panes import PlaneFitError
 from glassplat.training.messages import Message
 from tests.training.tiny_capture import tiny_capture, write_tiny_capture
 
@@ -89,6 +92,25 @@ def test_who_leaves_the_loop_where_a_stage_begins_can_go_on_there(recipe: Any, t
     found, whole = resumed.model.scene.parameters(), training().run().scene.parameters()
     assert found.keys() == whole.keys()
     assert all(torch.equal(tensor, whole[name]) for name, tensor in found.items())
+
+
+def test_masks_that_make_no_pane_cost_nothing_that_was_learned_before(tmp_path: Path) -> None:
+    dataset = replace(load_dataset(write_tiny_capture(tmp_path / "capture")), measured_points=False)
+
+    def elsewhere(number: int) -> Tensor:
+        labels = torch.zeros(dataset.train[0].photo.shape[:2], dtype=torch.uint8)
+        labels[4 * number : 4 * number + 6, 7 * number : 7 * number + 6] = 1
+        return labels
+
+    views = tuple(replace(v, read_pane_labels=partial(elsewhere, i)) for i, v in enumerate(dataset.train))
+    broken = replace(dataset, train=views)
+    options: Any = {"iterations": 10, "device": "cpu", "output": tmp_path / "run"}
+    with pytest.raises(PlaneFitError, match="no plane brings its masks together"):
+        Training(broken, PANES, **options).run()
+    resumed = Training(dataset, PANES, resume=True, **options)
+    assert steps(resumed) == [5, 6, 7, 8, 9, 10]
+    whole = Training(dataset, PANES, iterations=10, device="cpu").run()
+    assert torch.equal(resumed.model.scene.primary.means, whole.scene.primary.means)
 
 
 def test_a_training_that_goes_on_can_be_left_and_gone_on_with_again(tmp_path: Path) -> None:
