@@ -327,9 +327,6 @@ class PerturbOpacity:
         for done, view in enumerate(dataset.train):
             yield Working("looking for what is seen through panes", done, len(dataset.train))
             selected |= behind_panes(means, planes, [view.camera])
-        if "logit_strength" in state.scene.primary.channels:
-            # What mirrors is there.
-            selected &= state.scene.primary.channels["logit_strength"] < 0
         perturbed = perturb_opacities(
             state.scene.primary,
             selected,
