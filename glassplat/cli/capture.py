@@ -60,8 +60,9 @@ class Prepare:
 
     @cached_property
     def _output(self) -> Path:
-        """The output as it was at first: a finished capture replaces the folder, which may be the current one."""
-        return real_path(self.output)
+        """The output; absolute where the current folder is in it, which a finished capture replaces."""
+        output = real_path(self.output)
+        return output if Path.cwd().is_relative_to(output) else self.output
 
     @cached_property
     def _has_finished(self) -> threading.Event:
@@ -87,7 +88,7 @@ class Prepare:
         if self._has_finished.is_set():
             page = f"glassplat info {shell_word(self._output)} --page {shell_word(self._output / PAGE)}"
             return f"the capture in {self._output} is whole; `{page}` writes its report"
-        if (partial := Workplace(self._output).folder).exists():
+        if (partial := Workplace(real_path(self._output)).folder).exists():
             return f"repeat the command with --resume to go on; what is done so far lies in {partial}"
         return "nothing was written: repeat the command to begin again"
 

@@ -145,8 +145,8 @@ class Workplace:
                 f"{self.output} holds a capture that was prepared before; choose a new folder for --output, or replace "
                 "it with --force"
             )
-        others = [name for name in found if name not in MADE]
-        pictures = [path for path in (self.output / "images").rglob("*") if path.is_file()]
+        others = [name for name in found if name not in MADE and not name.startswith(".")]
+        pictures = [path for path in (self.output / "images").rglob("[!.]*") if path.is_file()]
         added = {path for path in pictures if path.suffix != PICTURE_SUFFIX} | set(masks_among(pictures))
         others += sorted(path.relative_to(self.output).as_posix() for path in added)
         if others:

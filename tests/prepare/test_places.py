@@ -87,7 +87,9 @@ def test_a_link_to_itself_is_no_place_for_a_capture(
 @pytest.mark.parametrize("name", ["normals/a.png", "notes.txt", "panes/a.png", "images/a_mask.jpg", "images/b/c.png"])
 def test_force_removes_only_what_was_prepared(tmp_path: Path, name: str) -> None:
     output = tmp_path / "capture"
-    for made in ("images/a.jpg", "images/b/c.jpg", "images/wall_mask.jpg", "sparse/0/cameras.bin", RECORD, PAGE, name):
+    hidden = (".DS_Store", "images/.DS_Store")  # Of macOS, for looking at the folder.
+    pictures = ("images/a.jpg", "images/b/c.jpg", "images/wall_mask.jpg")
+    for made in (*pictures, *hidden, "sparse/0/cameras.bin", RECORD, PAGE, name):
         (output / made).parent.mkdir(parents=True, exist_ok=True)
         (output / made).write_text("{}")
     named = name if name.startswith("images/") else name.partition("/")[0]
