@@ -60,7 +60,7 @@ def model_suffix(folder: Path) -> str | None:
 
 
 def read_model(folder: Path) -> Model:
-    """Read cameras, images and points; a folder without points gives none.
+    """Read cameras, images and points, which may be stored in the other way; a folder without points gives none.
 
     Raises:
         InputError: a file is cut off or holds what no model holds; names the file.
@@ -72,7 +72,8 @@ def read_model(folder: Path) -> Model:
     images = tuple(_records_of(folder / f"images{suffix}"))
     if not images:
         raise InputError(f"{folder / f'images{suffix}'} registers no photograph; expected a finished reconstruction")
-    points_path = folder / f"points3D{suffix}"
+    candidates = [folder / f"points3D{kind}" for kind in (suffix, ".bin", ".txt")]
+    points_path = next(filter(lexists, candidates), candidates[0])
     rows = _records_of(points_path) if lexists(points_path) else []
     table = np.array(rows, dtype=np.float64).reshape(-1, 6)
     with input_checked(points_path):

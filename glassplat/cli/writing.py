@@ -182,6 +182,10 @@ def track_progress(what: str, things: Iterable[Thing], total: int, progress: Wor
         progress.show(Working(what, number, total))
 
 
+LARGEST_FACTOR = 1e6
+"""Of what one unit of a scene may be in metres, either way; beyond, files could not be read again."""
+
+
 def write_clean(command: Clean, console: Console) -> None:
     """Writes the clean scene, and says what went."""
     model = command.file.open(command.scene, command.device)
@@ -193,6 +197,11 @@ def write_clean(command: Clean, console: Console) -> None:
     if command.scale is not None:
         *points, metres = command.scale
         factor = metres / math.dist(points[:3], points[3:])
+        if not 1 / LARGEST_FACTOR <= factor <= LARGEST_FACTOR:
+            raise InputError(
+                f"--scale makes the scene {factor:.3g} times as large; expected {1 / LARGEST_FACTOR:g} to "
+                f"{LARGEST_FACTOR:g}: give two places in the scene's own units, and their distance in metres"
+            )
         tidy = tidy.scale(factor)
         say(console, f"one unit is a metre now; it was {factor:.4g} m")
     tidy.save(command.output)

@@ -207,6 +207,21 @@ def test_points_that_are_not_finite_are_left_out(capture) -> None:
     assert any("1 points that are not finite or beyond 1e+12" in warning for warning in data.warnings)
 
 
+@pytest.mark.parametrize("binary", [True, False])
+def test_points_may_be_stored_in_the_other_way(capture, *, binary: bool) -> None:
+    folder = capture.write_colmap(binary=not binary)
+    (points,) = folder.glob("points3D.*")
+    kept = points.read_bytes()
+    points.unlink()
+    capture.write_colmap(binary=binary)
+    (points.with_suffix(".bin" if binary else ".txt")).unlink()
+    points.write_bytes(kept)
+    if not binary:
+        for name in ("cameras.bin", "images.bin"):
+            (folder / name).unlink()
+    assert len(load_dataset(capture.root).points) == len(capture.points)
+
+
 def test_model_without_points_gets_random_ones(capture) -> None:
     (capture.write_colmap() / "points3D.bin").unlink()
     data = load_dataset(capture.root)

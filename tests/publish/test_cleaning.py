@@ -124,3 +124,7 @@ def test_the_command_writes_another_scene_in_metres(tmp_path: Path, capsys: pyte
     assert main(["clean", str(run), "--output", str(run)]) == 2
     assert main(["clean", str(run), "--output", str(tmp_path / "no"), "--scale", *"1231234"]) == 2
     assert "expected two points" in " ".join(capsys.readouterr().err.split())
+    for metres in ("1e-12", "1e30"):
+        assert main(["clean", str(run), "--output", str(tmp_path / "no"), "--scale", *"000001", metres]) == 2
+        assert "expected 1e-06 to 1e+06" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "no").exists()
