@@ -151,7 +151,8 @@ class Run:
     def start(self) -> subprocess.Popen[bytes]:
         """Begins the training, or goes on with it."""
         self.directory.mkdir(parents=True, exist_ok=True)
-        (self.directory / COMMAND).write_text(json.dumps(self.train, indent=2) + "\n", encoding="utf-8")
+        with atomic_write(self.directory / COMMAND) as temporary:  # Other processes look at it meanwhile.
+            temporary.write_text(json.dumps(self.train, indent=2) + "\n", encoding="utf-8")
         begun = ["--resume"] if (self.directory / "checkpoint.safetensors").is_file() else []
         return self._glassplat("train", *self.train, "--output", str(self.directory), *begun)
 
@@ -264,7 +265,12 @@ def execute(runs: Sequence[Run], jobs: int, after_each: Callable[[], object], fi
                 elif run.results() is not None:
                     lock.release()  # Another process has just finished it.
                 else:
-                    running[run] = Working("train", time.monotonic(), run.start(), lock)
+                    try:
+                        running[run] = Working("train", time.monotonic(), run.start(), lock)
+                    except OSError as error:
+                        failures.append(f"{run.title}: train could not begin: {error}")
+                        print(f"failed: {failures[-1]}", flush=True)
+                        lock.release()
             time.sleep(0.1 if running else PATIENCE if waiting else 0)
             for run, work in list(running.items()):
                 if (code := work.process.poll()) is None:

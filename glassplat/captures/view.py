@@ -19,7 +19,7 @@ import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cache, partial
@@ -129,7 +129,7 @@ class Spool:
                 self._file.write(values.tobytes())
                 self._file.flush()
             except OSError:
-                self._is_full = True
+                self._give_back()  # Under a quota, a checkpoint would not have the room that all this takes.
                 return
             self._places[source] = place, values.shape, values.dtype
 
@@ -150,11 +150,15 @@ class Spool:
     def close(self) -> None:
         """Gives the room on disk back."""
         with self._lock:
-            self._places.clear()
-            self._is_full = True
-            if self._file is not None:
-                self._file.close()
-                self._file = None
+            self._give_back()
+
+    def _give_back(self) -> None:
+        self._places.clear()
+        self._is_full = True
+        file, self._file = self._file, None
+        if file is not None:
+            with suppress(OSError):  # What could not be written is written again here.
+                file.close()
 
 
 class Memory:

@@ -26,7 +26,7 @@ from glassplat.evaluate.metrics import quantize
 from glassplat.files.images import write_image
 from glassplat.files.records import readable_name
 from glassplat.files.sidecars import read_cameras, write_cameras
-from glassplat.files.writing import SPLAT_WRITERS, atomic_write, real_path, scene_source, splat_writer
+from glassplat.files.writing import SPLAT_WRITERS, atomic_write, real_path, scene_source, write_splats
 from glassplat.model.model import CAMERAS, ENVIRONMENT, GLASS, PANORAMA, PLANES, Model, save_page, write_beside
 from glassplat.publish.camera_paths import fit_to_width, interpolate_cameras, keyframes_of
 from glassplat.publish.film import check_size, side_by_side, wipe_pictures, write_film
@@ -223,7 +223,7 @@ def write_files(command: Export, console: Console) -> None:
     for kind in (kind for kind in splats if kind in command.formats):
         options = {"version": command.spz_version} if kind == "spz" else {}
         with input_checked():
-            splat_writer(kind)(splats[kind], model.scene.primary, **options)
+            write_splats(kind, splats[kind], model.scene.primary, **options)
         written.append(splats[kind])
         say(console, f"{splats[kind].stat().st_size / 1e6:.2f} MB -> {splats[kind]}")
     if "html" in command.formats:

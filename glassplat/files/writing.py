@@ -6,9 +6,11 @@ import errno
 import importlib
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 FORGED_SUFFIXES = (".sog", ".ksplat")
@@ -29,11 +31,11 @@ WRITTEN = (*SPLAT_WRITERS, "html")
 """All formats of `export` and `Model.save`; the page is written of a whole model."""
 
 
-def splat_writer(kind: str) -> Callable[..., None]:
-    """The function that writes Gaussians in a format of `SPLAT_WRITERS`."""
+def write_splats(kind: str, path: Path, gaussians: Any, **options: Any) -> None:
+    """Writes Gaussians in a format of `SPLAT_WRITERS`, with the harmonics that are active."""
     module, _, name = SPLAT_WRITERS[kind].partition(":")
-    writer: Callable[..., None] = getattr(importlib.import_module(module), name)
-    return writer
+    shown = replace(gaussians, sh=gaussians.sh[:, : (gaussians.active_sh_degree + 1) ** 2])
+    getattr(importlib.import_module(module), name)(path, shown, **options)
 
 
 UNFINISHED = re.compile(r"\..{0,32}\.[0-9a-f]{12}\.tmp(\..{1,31})?")

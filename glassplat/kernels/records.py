@@ -26,9 +26,8 @@ def check_tensors(expected: dict[str, tuple[Tensor, tuple[int, ...]]]) -> None:
         if tensor.shape != shape:
             raise ValueError(f"{name} has shape {tuple(tensor.shape)}; expected {shape}")
         if tensor.dtype != dtype or not is_real:
-            raise TypeError(
-                f"{name} is {tensor.dtype} and {first_name} is {dtype}; expected float32 or float64 throughout"
-            )
+            other = "" if tensor.dtype == dtype else f" and {first_name} is {dtype}"
+            raise TypeError(f"{name} is {tensor.dtype}{other}; expected float32 or float64 throughout")
         if tensor.device != device or not has_kernels:
             check_device(name, tensor, first_name, first)
 

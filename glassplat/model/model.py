@@ -413,7 +413,7 @@ def save_model(model: Model, path: Path, *, overwrite: bool) -> Path:
         save_page(model, path, model.name or path.stem)
         return path
     with input_checked():
-        writing.splat_writer(kind)(path, model.scene.primary)
+        writing.write_splats(kind, path, model.scene.primary)
     if lost := left_out(model, kind):
         log.warning("%s leaves out %s; a folder, saved without a suffix, holds everything", path, ", ".join(lost))
     write_beside(path.parent, model.scene)
@@ -438,6 +438,8 @@ def left_out(model: Model, kind: str) -> list[str]:
         lost.append("how bright Gaussians are in panes")
     if len(scene.surroundings) or not scene.environment.is_empty:
         lost.append("what shiny things mirror")
+    if kind == "spz" and scene.primary.are_discs:
+        lost.append("that Gaussians are discs")
     return [*lost, "the photographer"] if len(scene.photographer) else lost
 
 

@@ -37,7 +37,7 @@ from glassplat.training.messages import (
     StepDone,
     Working,
 )
-from glassplat.training.ranks import Ranks, is_launched, join
+from glassplat.training.ranks import Ranks, join
 from glassplat.training.stage import Stage, TrainState, check_length, stage_starts
 
 Listener = Callable[[Message], None]
@@ -80,7 +80,7 @@ def stop_on_interrupt() -> Iterator[StopRequest]:
 
     def ask(number: int, frame: FrameType | None) -> None:
         if request.requested:
-            if is_launched():
+            if "TORCHELASTIC_RUN_ID" in os.environ:  # Also where it has started a single process.
                 return
             request.end()
         request.number, request.answer = number, previous[number]
@@ -335,17 +335,17 @@ class TrainingSession:
                     yield from self._saved_in_time(message, iterations, setups)
 
     def _saved_where_it_fails(self, messages: Iterator[Message], check: Callable[[], None]) -> Iterator[Message]:
-        """Passes messages on; where a rank is lost or a photograph cannot be read, what was trained is saved first."""
+        """Passes messages on; where a rank is lost, or a photograph cannot be read or is gone, it saves first."""
         begun = self._state.step
         try:
             for message in messages:
                 check()
                 yield message
-        except (RankLostError, InputError) as error:
+        except (RankLostError, InputError, OSError) as error:
             if not self._state.is_whole or self._state.step == begun:
                 raise
             self.save()
-            if isinstance(error, RankLostError):
+            if not isinstance(error, InputError):
                 raise
             step = self._state.step
             raise InputError(f"{error}; step {step} is saved; mend that, then repeat with --resume") from error

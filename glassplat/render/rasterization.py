@@ -78,7 +78,7 @@ def rasterization(
         backgrounds: [C, D] values behind everything; nothing is behind depths.
         render_mode: `D` is the depth weighted by coverage, `ED` the expected depth; it comes after the colours.
         sparse_grad: has to be False.
-        absgrad: the backward pass sets `meta["means2d"].absgrad`, [C, N, 2].
+        absgrad: `loss.backward()` sets `meta["means2d"].absgrad`, [C, N, 2], where a shape or a camera has gradients.
         rasterize_mode: `antialiased` makes Gaussians fainter by what `eps2d` widens them.
         channel_chunk: so many channels are blended at once, at most 32.
         distributed: has to be False.

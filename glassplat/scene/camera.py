@@ -132,12 +132,21 @@ class Camera:
     height: int
 
     def __post_init__(self) -> None:
+        pose = self.cam_from_world
+        if not isinstance(pose, Tensor) or pose.shape != (4, 4):
+            raise ValueError(
+                f"cam_from_world is a {type(pose).__name__}; expected a tensor [4, 4], such as torch.eye(4)"
+            )
         lengths = self.fx, self.fy, self.width, self.height
         if not all(0 < length < math.inf for length in lengths) or not math.isfinite(self.cx + self.cy):
             raise ValueError(
                 f"a camera of {self.width}x{self.height} pixels with fx={self.fx}, fy={self.fy}, cx={self.cx}, "
                 f"cy={self.cy}; expected finite numbers, sizes and focal lengths above 0"
             )
+        if self.width != int(self.width) or self.height != int(self.height):
+            raise ValueError(f"an image of {self.width}x{self.height} pixels; expected whole numbers")
+        object.__setattr__(self, "width", int(self.width))
+        object.__setattr__(self, "height", int(self.height))
 
     @staticmethod
     def look_at(

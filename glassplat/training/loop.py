@@ -320,6 +320,10 @@ def loss_terms(stage: Stage, frame: Frame, view: View, scene: Scene) -> tuple[di
     """Every loss term that applies to the view, and the weights of these terms, in the same order."""
     values = {term.name: term.function(frame, view, scene) for term in stage.losses}
     terms = {name: value for name, value in values.items() if value is not None}
+    for name, value in terms.items():
+        if not isinstance(value, Tensor) or value.dim():
+            found = f"shape {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+            raise ValueError(f"the loss term {name!r} gave {found}; expected a tensor of one number, or None")
     weights = tuple(term.weight for term in stage.losses if term.name in terms)
     return terms, constant(weights, frame.rgb.dtype, frame.rgb.device)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -107,6 +108,24 @@ def test_processes_that_share_an_output_do_nothing_twice_and_take_up_what_a_dead
     assert compare.execute(runs, 1, elsewhere, first=2) == []
     assert begun == ["c train", "c eval", "a train", "a eval", "b train", "b eval"]
     assert main(arguments) == 0 and len(begun) == 6
+
+
+def test_a_run_whose_folder_cannot_be_written_stops_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    scenes = [str(tmp_path / name) for name in ("a", "b")]
+    runs = planned_runs(parsed([*scenes, "--methods", "splat", "--output", str(tmp_path / "runs")]))
+
+    def work(run: compare.Run, command: str, *_: str) -> subprocess.Popen[bytes]:
+        if run.scene == "a":
+            raise OSError(errno.EDQUOT, "Disk quota exceeded")
+        (run.directory / RESULTS).write_text('{"psnr": 1.0}')
+        return subprocess.Popen([sys.executable, "-c", ""])
+
+    monkeypatch.setattr(compare.Run, "_glassplat", work)
+    (failure,) = compare.execute(runs, 1, lambda: None)
+    assert "a, splat, seed 0: train could not begin: " in failure and "quota" in failure
+    assert runs[0].claimed() is not None and runs[1].results() == {"psnr": 1.0}
 
 
 def test_a_failure_elsewhere_is_told_and_not_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -87,6 +87,9 @@ class Failing(io.BytesIO):
     def readinto(self, buffer) -> int:
         raise OSError("input/output error")
 
+    def write(self, data) -> int:
+        raise OSError("no space left on device")
+
 
 @pytest.fixture
 def slow_files(monkeypatch: pytest.MonkeyPatch) -> Files:
@@ -145,6 +148,19 @@ def test_a_disk_without_room_or_with_errors_costs_time_only(
             memory._spool._file.truncate(WHOLE // 2)
         assert numbers(memory, slow_files) == list(range(20))
     assert set(slow_files.times.values()) == {2}
+
+
+def test_a_disk_on_which_nothing_more_fits_gets_its_room_back(slow_files: Files, tmp_path: Path) -> None:
+    memory = Memory(1, largest=SIZE)
+    with memory.spool_to(tmp_path):
+        numbers(memory, slow_files)
+        spool = memory._spool
+        assert len(spool._places) > 10
+        spool._file.close()
+        spool._file = Failing()
+        spool.put(Source(lambda: torch.zeros(SIZE)), torch.zeros(SIZE))
+        assert spool._file is None and not spool._places
+        assert numbers(memory, slow_files) == list(range(20))
 
 
 def test_reading_ahead_saves_the_wait_and_two_who_ask_read_once() -> None:

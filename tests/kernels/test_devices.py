@@ -7,6 +7,7 @@ import logging
 import tomllib
 import warnings
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -34,6 +35,13 @@ def test_auto_takes_the_gpu_and_says_so(gpu: pytest.MonkeyPatch, caplog: pytest.
         assert chosen_device("auto") == torch.device("cuda", 0)
     assert "running on A GPU" in caplog.text
     assert chosen_device("cpu") == torch.device("cpu")
+
+
+@pytest.mark.parametrize("name", ["gpu", "cuda:1", "", None, 0])
+def test_other_devices_are_refused_and_not_taken_for_auto(gpu: pytest.MonkeyPatch, name: Any) -> None:
+    assert chosen_device(torch.device("cpu")) == torch.device("cpu")
+    with pytest.raises(ValueError, match=f"device is '{name}'; expected auto, cpu or cuda"):
+        chosen_device(name)
 
 
 def test_a_torch_without_cuda_is_explained(gpu: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:

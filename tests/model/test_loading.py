@@ -15,7 +15,7 @@ from glassplat import InputError, load
 from glassplat.cli.main import main
 from glassplat.files.ply import write_gaussians
 from glassplat.files.sidecars import write_planes
-from glassplat.files.writing import FORGED_SUFFIXES, SPLAT_SUFFIXES, SPLAT_WRITERS, splat_writer
+from glassplat.files.writing import FORGED_SUFFIXES, SPLAT_SUFFIXES, SPLAT_WRITERS, write_splats
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.options import BLACK
 from tests.cli.tiny_run import write_run
@@ -114,8 +114,16 @@ def test_hostile_files_get_one_message(suffix: str, tmp_path: Path, capsys: pyte
 def test_every_format_that_is_written_is_read(kind: str, tmp_path: Path) -> None:
     if f".{kind}" in FORGED_SUFFIXES:
         pytest.importorskip("gaussforge")
-    splat_writer(kind)(tmp_path / f"a.{kind}", typical())
-    assert len(load(tmp_path / f"a.{kind}", device="cpu").scene.primary) == len(typical())
+    write_splats(kind, tmp_path / f"a.{kind}", typical())
+    read = load(tmp_path / f"a.{kind}", device="cpu").scene.primary
+    assert (len(read), read.active_sh_degree) == (len(typical()), typical().active_sh_degree)
+
+
+@pytest.mark.parametrize("kind", ["ply", "spz", "glb"])
+def test_harmonics_that_are_not_shown_are_not_written(kind: str, tmp_path: Path) -> None:
+    assert typical().active_sh_degree > 0
+    write_splats(kind, tmp_path / f"a.{kind}", replace(typical(), active_sh_degree=0))
+    assert load(tmp_path / f"a.{kind}", device="cpu").scene.primary.active_sh_degree == 0
 
 
 @pytest.mark.parametrize("suffix", FORGED_SUFFIXES)
@@ -137,4 +145,4 @@ def test_without_gaussforge_it_is_said_how_to_get_it(
     with pytest.raises(InputError, match=r"pip install 'glassplat\[formats\]'"):
         load(tmp_path / f"a{suffix}", device="cpu")
     with pytest.raises(ValueError, match=r"pip install 'glassplat\[formats\]'"):
-        splat_writer(suffix[1:])(tmp_path / f"b{suffix}", typical())
+        write_splats(suffix[1:], tmp_path / f"b{suffix}", typical())

@@ -18,6 +18,7 @@ from glassplat import Camera, Gaussians, InputError, Model, Planar, PlanarRecipe
 from glassplat.model.model import by_name
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Environment
+from glassplat.training.densify import as_discs
 from tests.cli.tiny_run import write_run
 from tests.render.tiny_scene import random_gaussians
 from tests.training.tiny_capture import tiny_capture, true_scene
@@ -171,6 +172,7 @@ def test_what_is_saved_is_loaded_again(name: str, tolerance: float, tmp_path: Pa
     assert not [left for left in path.parent.iterdir() if left.name.startswith(".")]
 
 
+DISCS = {"primary": as_discs(true_scene().primary)}
 NO_PANES, PLAIN = {"planes": Planes.empty()}, PlanarRecipe(background=(0.0, 0.0, 0.0))
 
 
@@ -185,6 +187,8 @@ NO_PANES, PLAIN = {"planes": Planes.empty()}, PlanarRecipe(background=(0.0, 0.0,
         ("a.ply", SplatRecipe(background=(1.0, 1.0, 1.0)), NO_PANES, "background=(1.0, 1.0, 1.0)"),
         ("a.ply", PLAIN, {"surroundings": true_scene().primary}, "what shiny things mirror"),
         ("a.ply", PLAIN, {"photographer": true_scene().primary}, "the photographer"),
+        ("a.spz", SplatRecipe(background=(0.0, 0.0, 0.0)), NO_PANES | DISCS, "that Gaussians are discs"),
+        ("a.glb", SplatRecipe(background=(0.0, 0.0, 0.0)), NO_PANES | DISCS, None),
     ],
 )
 def test_what_a_splat_file_leaves_out_is_said(

@@ -163,6 +163,15 @@ def brightness(frame: Frame, view: View, scene: Scene) -> torch.Tensor:
     return (1 - frame.rgb).square().mean()
 
 
+@pytest.mark.parametrize("given", [lambda rgb: 0.5, lambda rgb: rgb, lambda rgb: rgb.mean()[None]])
+def test_a_loss_term_that_is_no_number_is_named(given: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(globals(), "brightness", lambda frame, view, scene: given(frame.rgb))
+    with pytest.raises(
+        ValueError, match=r"the loss term 'brightness' gave .*; expected a tensor of one number, or None"
+    ):
+        list(Training(tiny_capture(), Brighter(), iterations=4, device="cpu"))
+
+
 def test_a_recipe_of_ones_own_is_trained() -> None:
     losses = []
     for message in Training(tiny_capture(), Brighter(), iterations=4, device="cpu"):

@@ -72,6 +72,17 @@ def test_a_camera_without_a_size_or_a_focal_length_is_refused(name: str, value: 
         replace(tiny_capture().train[1].camera, **{name: value})
 
 
+def test_a_camera_needs_a_pose_and_whole_pixels() -> None:
+    camera = tiny_capture().train[1].camera
+    for pose in (camera.cam_from_world.numpy(), camera.cam_from_world.tolist(), camera.cam_from_world[:3]):
+        with pytest.raises(ValueError, match=r"expected a tensor \[4, 4\]"):
+            replace(camera, cam_from_world=pose)
+    with pytest.raises(ValueError, match=r"20\.5x15 pixels; expected whole numbers"):
+        camera.resize(20.5, 15)  # type: ignore[arg-type]
+    halved = camera.resize(camera.width / 2, camera.height / 2)  # type: ignore[arg-type]
+    assert (type(halved.width), type(halved.height)) == (int, int)
+
+
 @pytest.mark.parametrize("name", ["cx", "cy"])
 def test_a_camera_has_its_middle_somewhere(name: str) -> None:
     with pytest.raises(ValueError, match="expected finite numbers"):

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 if TYPE_CHECKING:
     import torch
@@ -137,14 +137,18 @@ def _module(operation: str, folder: str) -> Any:
     return importlib.import_module(f"glassplat.kernels.{operation}.{folder}")
 
 
-def chosen_device(name: DeviceName) -> torch.device:
+def chosen_device(name: DeviceName | torch.device) -> torch.device:
     """The device for a name of the command line; `auto` is the GPU where it can be used. Says which in the log.
 
     Raises:
         CudaUnavailableError: `cuda` was asked for and cannot be used.
+        ValueError: the name is none of these.
     """
     import torch
 
+    name = cast(DeviceName, str(name))
+    if name not in get_args(DeviceName):
+        raise ValueError(f"device is {name!r}; expected auto, cpu or cuda, which is PyTorch's current GPU")
     problem = None if name == "cpu" else cuda_problem()
     if name == "cuda" and problem is not None:
         raise CudaUnavailableError(problem)
