@@ -385,6 +385,8 @@ def test_wrong_inputs_are_named(random_splats: MakeSplats) -> None:
         composite(splats, channels.float(), bins)
     with pytest.raises(TypeError, match="channels is on meta, but only the CPU"):
         composite(splats, channels.to("meta"), bins)
+    with pytest.raises(TypeError, match="channels is on cpu and bins on meta"):
+        composite(splats, channels, bins._replace(pair_splats=bins.pair_splats.to("meta")))
     fewer = Splats(*(tensor[:, :4] for tensor in splats))
     with pytest.raises(ValueError, match="bin these very splats"):
         composite(fewer, channels[:, :4], bins)

@@ -30,7 +30,7 @@ def check_bins(channels: Tensor, bins: TileBins, cameras: int, count: int, these
         ValueError: shapes disagree.
         TypeError: channels and bins are on different devices.
     """
-    check_device("bins", bins.pair_splats, "channels", channels)
+    check_device("channels", channels, "bins", bins.pair_splats)
     if channels.ndim != 3 or not 1 <= channels.shape[2] <= MOST_CHANNELS:
         raise ValueError(f"channels has shape {list(channels.shape)}, expected [C, G, D] with D in 1..{MOST_CHANNELS}")
     if bins.num_cameras != cameras or len(bins.splat_offsets) != cameras * count + 1:
