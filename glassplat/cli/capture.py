@@ -88,7 +88,7 @@ class Prepare:
         if self._has_finished.is_set():
             page = f"glassplat info {shell_word(self._output)} --page {shell_word(self._output / PAGE)}"
             return f"the capture in {self._output} is whole; `{page}` writes its report"
-        if (partial := Workplace(real_path(self._output)).folder).exists():
+        if (partial := Workplace(self._output).folder).exists():
             return f"repeat the command with --resume to go on; what is done so far lies in {partial}"
         return "nothing was written: repeat the command to begin again"
 

@@ -132,6 +132,7 @@ def aligned_camera(scene: Scene, renderer: Renderer, view: View) -> Camera:
 MIRROR_STRENGTH = 0.999
 """From this true strength on, nothing is transmitted."""
 ALL_IGNORED = f"all but fewer than {metrics.SMALLEST_REGION} pixels are ignored"
+LEFT_IGNORED = f"all but fewer than {metrics.SMALLEST_REGION} pixels of the left half are ignored"
 TOO_FEW = f"fewer than {metrics.SMALLEST_REGION} pixels show a pane"
 
 SCENE_COLORS, NEIGHBOURS_COLORS = "the scene's own", "mean of the neighbouring photographs, in the order of names"
@@ -351,7 +352,7 @@ def _right_half_psnr(image: Tensor, photo: Tensor, counted: Tensor | None) -> me
     """Of the right half, in the colours that the left half tells (as is done for NeRF in the Wild)."""
     middle = max(photo.shape[1] // 2, 1)
     if counted is not None and _too_few(counted[:, :middle]):
-        return "all but fewer than 100 pixels of the left half are ignored"
+        return LEFT_IGNORED
     corrected = metrics.color_corrected(image, photo, slice(0, middle), counted)
     right = slice(min(middle, photo.shape[1] - 1), None)
     return _counted_psnr(corrected[:, right], photo[:, right], None if counted is None else counted[:, right])
@@ -370,7 +371,7 @@ def _transmission_psnr(frame: Frame, truth: GroundTruth | None, true_view: TrueV
     if true_view is None:
         return NO_TRUTH if truth is None else NO_VIEW_TRUTH
     pane = true_view.labels > 0
-    reason = "the pane is a mirror, which transmits nothing" if int(pane.sum()) >= metrics.SMALLEST_REGION else TOO_FEW
+    reason = TOO_FEW if _too_few(pane) else "the pane is a mirror, which transmits nothing"
     image = frame.layers.get("transmission", frame.rgb)
     return _region_psnr(image, true_view.transmission, pane & (true_view.strength < MIRROR_STRENGTH), reason)
 
@@ -384,7 +385,7 @@ def _reflection_pixels(
     if true_view is None:
         return NO_TRUTH if truth is None else NO_VIEW_TRUTH
     pane = true_view.labels > 0
-    if int(pane.sum()) < metrics.SMALLEST_REGION:
+    if _too_few(pane):
         return TOO_FEW
     return frame.layers["reflection"][pane], true_view.reflection[pane].to(torch.float32) / 255
 

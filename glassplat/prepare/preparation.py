@@ -45,10 +45,13 @@ class Workplace:
     """The folder in which a capture is made.
 
     Attributes:
-        output: where the capture will be.
+        output: where the capture will be; of a link, the folder that it leads to.
     """
 
     output: Path
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "output", real_path(self.output))
 
     @property
     def folder(self) -> Path:
@@ -349,7 +352,7 @@ def prepare(task: Preparation, listen: Listener, *, resume: bool = False, force:
     """
     check_places(task)
     quiet_pycolmap()
-    workplace = Workplace(real_path(task.output))
+    workplace = Workplace(task.output)
     settings = {**task.record(), PHOTOGRAPHS: file_states(task.source)}
     missing = missing_folders(workplace.folder.parent)
     begun = workplace.begin(settings, resume=resume, force=force)
