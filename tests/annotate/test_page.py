@@ -378,7 +378,14 @@ def test_done_ends_the_command(page: Page) -> None:
 def test_what_another_tab_marks_is_kept_beside_what_is_marked_here(page: Page) -> None:
     page.mark_true(0)
     saved(page.server.session, marked_document(material="mirror"))
-    page.mark_true(1)
+    page.show(1)
+    page.window.run(  # Else the first corner may be saved before the last is clicked.
+        "window.asked = window.fetch; const whole = new Promise((go) => { window.release = go; });"
+        "window.fetch = async (...request) => { await whole; return window.asked(...request); };"
+    )
+    for place in page.on_screen(true_corners(1)):
+        page.window.click(*place)
+    page.window.run("window.release()")
     page.window.wait("document.querySelectorAll('#panes .pane').length === 2", "both panes")
     page.saved()
     assert "pane 1 changed" in page.window.run("return document.getElementById('elsewhere').textContent")

@@ -103,7 +103,7 @@ FAST_MATH = frozenset({"contract", "reassoc", "nsz", "arcp", "afn"})
 
 # Forced, because the compiler balks at functions of many arrays, where a call costs more than the body. Without
 # reference counting too: one atomic increment per array and call, of counters that all threads share.
-inlined = register_jitable(forceinline=True, _nrt=False, fastmath=set(FAST_MATH), error_model="numpy")
+inlined = register_jitable(forceinline=True, _nrt=False, no_cfunc_wrapper=True, fastmath=set(FAST_MATH), error_model="numpy")
 """Marks a scalar function that kernels call; it must not create arrays. Compiles for the CPU and for CUDA."""
 
 
@@ -145,7 +145,7 @@ def kernel(name: str, real: type, *, parallel: bool = True) -> Callable[[Callabl
         full_name = f"{name}_{np.dtype(real).name}"
         function.__name__ = full_name
         function.__qualname__ = full_name
-        compiled = numba.njit(parallel=parallel, fastmath=set(FAST_MATH), error_model="numpy")
+        compiled = numba.njit(parallel=parallel, no_cfunc_wrapper=True, fastmath=set(FAST_MATH), error_model="numpy")
         dispatcher = compiled(function)
         dispatcher._cache = KernelCache(function, compiled, flags=f"parallel={parallel} {HOW}")
         return Kernel(dispatcher, full_name, parallel=parallel)
