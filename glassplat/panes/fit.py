@@ -85,8 +85,8 @@ def meeting_of_each(plane: FramedPlanes, views: Sequence[PaneView]) -> Array:
     views = [_without_shared_edges(view) for view in views]
     tolerance = max(MIDDLE, *(1 / view.diagonal for view in views))
     matches = edge_matches(plane.planes, views, edges_per_view=EDGES_PER_VIEW)
-    met = 1 / (1 + matches.residuals(plane.frames, tolerance)[:, 0] ** 2)
-    compared = matches.compared[:, 0] & ~np.isnan(met)
+    met = 1 / (1 + matches.residuals(plane.frames, tolerance)[0] ** 2)
+    compared = matches.compared[0] & ~np.isnan(met)
     shares = np.full(len(views), np.nan)
     for number in range(len(views)):
         concerned = compared & (matches.sources == number)

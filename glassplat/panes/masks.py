@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from glassplat.kernels.plane_search import Cameras, Rays, overlaps
 from glassplat.scene.camera import Camera
 
 Array = NDArray[np.float64]
@@ -248,6 +249,16 @@ class PaneView:
         return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
+def cameras_of(views: Sequence[PaneView]) -> Cameras:
+    """The cameras of views, at least one."""
+    return Cameras(
+        np.stack([view.cam_from_world for view in views]),
+        np.stack([view.center for view in views]),
+        np.stack([view.intrinsics for view in views]),
+        np.array([view.mask.shape for view in views]),
+    )
+
+
 def pane_view(camera: Camera, labels: Tensor, label: int, *, name: str = "") -> PaneView:
     """One pane of one annotated view.
 
@@ -459,34 +470,29 @@ def mask_agreement(planes: PlaneEquations, views: Sequence[PaneView], *, pixels_
         pixels_per_view: number of rays that are followed from each view.
     """
     both, either = _overlaps(planes, views, pixels_per_view)
-    agreement: Array = both.sum(axis=(0, 1)) / np.maximum(either.sum(axis=(0, 1)), 1)
+    agreement: Array = both.sum(axis=(1, 2)) / np.maximum(either.sum(axis=(1, 2)), 1)
     return agreement
 
 
 def agreement_of_each(plane: PlaneEquations, views: Sequence[PaneView]) -> Array:
     """[V] how well the mask of each view agrees with those of all others on one plane; as `mask_agreement`."""
-    both, either = (pairs[..., 0] + pairs[..., 0].T for pairs in _overlaps(plane, views, RAYS_PER_VIEW))
+    both, either = (pairs[0] + pairs[0].T for pairs in _overlaps(plane, views, RAYS_PER_VIEW))
     agreement: Array = both.sum(axis=1) / np.maximum(either.sum(axis=1), 1)
     return agreement
 
 
 def _overlaps(planes: PlaneEquations, views: Sequence[PaneView], pixels_per_view: int) -> tuple[Array, Array]:
-    """Pixels of each view on the pane in another one as well, and on it in either; [V, V, H], from and to."""
-    count = len(views)
-    both, either = np.zeros((2, count, count, len(planes)))
-    for number, source in enumerate(views):
-        pixels = source.grid(pixels_per_view)
-        pixels = pixels[source.tells(pixels, np.ones(len(pixels), dtype=bool))]
-        on_pane = source.covers(pixels, np.ones(len(pixels), dtype=bool))
-        points, hit = meet(planes, source.center, source.directions(pixels))
-        for other, target in enumerate(views):
-            if target is not source:
-                landed, held = target.project(points)
-                held = target.tells(landed, held & hit)
-                covered = target.covers(landed, held)
-                both[number, other] = (covered & on_pane).sum(axis=1)
-                unknown = (hit & on_pane & ~held).sum(axis=1)
-                # A plane behind the camera cannot hold a pane that the camera sees.
-                missed = (on_pane & ~hit).sum(axis=1)
-                either[number, other] = (held & (covered | on_pane)).sum(axis=1) + missed + UNKNOWN_WEIGHT * unknown
-    return both, either
+    """Pixels of each view on the pane in another one as well, and on it in either; [H, V, V], from and to."""
+    seen = []
+    for view in views:
+        pixels = view.grid(pixels_per_view)
+        seen.append(pixels[view.tells(pixels, np.ones(len(pixels), dtype=bool))])
+    rays = Rays(
+        np.repeat(np.arange(len(views)), [len(pixels) for pixels in seen]),
+        np.concatenate([view.directions(pixels) for view, pixels in zip(views, seen, strict=True)]),
+        np.concatenate(
+            [view.covers(pixels, np.ones(len(pixels), dtype=bool)) for view, pixels in zip(views, seen, strict=True)]
+        ),
+    )
+    masks, hidden = [view.mask for view in views], [view.hidden for view in views]
+    return overlaps(planes.normals, planes.offsets, cameras_of(views), rays, masks, hidden, UNKNOWN_WEIGHT)

@@ -17,12 +17,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from glassplat.kernels.plane_search import Edges, follow_edges
 from glassplat.panes.masks import (
     UNKNOWN_WEIGHT,
     FramedPlanes,
     PaneView,
     PlaneEquations,
     Rectangle,
+    cameras_of,
     in_plane_axes,
     mask_agreement,
     meet,
@@ -35,8 +37,6 @@ Mask = NDArray[np.bool_]
 
 UNEVEN_FRAME = 0.15
 """By how much the height of a frame may differ from place to place, as a share of it."""
-STEEPEST = 8.0
-"""Largest a / h that is told apart: farther out a camera looks along the pane."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,10 @@ class EdgeMatches:
     """Mask edges of V views, followed over H planes into each other.
 
     Attributes:
-        distances: [V, H, P] how far edge point p lands from the edge in view v, in image diagonals, positive on the
+        distances: [H, V, P] how far edge point p lands from the edge in view v, in image diagonals, positive on the
             pane; scaled so that a doubt of one pixel in both views counts alike on every plane and in every pair.
-        shifts: [V, H, P] the part of that distance which a frame hides, per world unit of its height.
-        compared: [V, H, P] whether there is anything to compare: the edge point lands inside of the image of another
+        shifts: [H, V, P] the part of that distance which a frame hides, per world unit of its height.
+        compared: [H, V, P] whether there is anything to compare: the edge point lands inside of the image of another
             view. The distance is 0 where there is not.
         turns: [H, P] by how much the edge at point p is turned against the pane's sides, if it is a rectangle:
             the sine of twice the angle.
@@ -61,8 +61,8 @@ class EdgeMatches:
     sources: NDArray[np.int64]
 
     def residuals(self, frames: Array, tolerance: float) -> Array:
-        """[V, H, P] distances that frames [H] of some height leave unexplained, in units of the tolerance."""
-        hidden = frames[:, None] * self.shifts
+        """[H, V, P] distances that frames [H] of some height leave unexplained, in units of the tolerance."""
+        hidden = frames[:, None, None] * self.shifts
         # A frame is not equally high all round.
         return (self.distances - hidden) / np.sqrt(tolerance**2 + (UNEVEN_FRAME * hidden) ** 2)
 
@@ -75,27 +75,16 @@ def edge_matches(planes: PlaneEquations, views: Sequence[PaneView], *, edges_per
         views: V annotated views of one pane.
         edges_per_view: number of edge points followed from each view.
     """
-    points, outward, hits, source_of = _edges_on(planes, views, edges_per_view)
-    passing = np.einsum("hpd,hpd->hp", points, outward)
-    sizes, hidden = np.zeros((2, len(views), *hits.shape))
-    own_size, own_hidden = np.zeros((2, *hits.shape))
-    for number, view in enumerate(views):
-        sizes[number], hidden[number] = _pixel_and_frame(planes, view, points, outward, passing)
-        own = source_of == number
-        own_size[:, own], own_hidden[:, own] = sizes[number][:, own], hidden[number][:, own]
-
-    distances, shifts = np.zeros((2, *sizes.shape))
-    compared = np.zeros(sizes.shape, dtype=bool)
-    for number, target in enumerate(views):
-        landed, held = target.project(points)
-        compared[number] = held & hits & (source_of != number)
-        pairs = np.flatnonzero(compared[number])
-        distances[number].ravel()[pairs] = target.edge_distance(landed.reshape(-1, 2)[pairs])
-        # A doubt of one pixel in both views; its size here times the image's diagonal.
-        doubt = target.diagonal * np.sqrt((1 + (own_size / sizes[number]) ** 2) / 2)
-        distances[number] /= doubt
-        shifts[number] = np.where(compared[number], (own_hidden - hidden[number]) / (sizes[number] * doubt), 0)
-    return EdgeMatches(distances, shifts, compared, _turns(planes, outward), source_of)
+    thinned = [slice(None, None, max(len(view.edge) // edges_per_view, 1)) for view in views]
+    points = [view.edge[chosen] for view, chosen in zip(views, thinned, strict=True)]
+    across = [view.outward[chosen] for view, chosen in zip(views, thinned, strict=True)]
+    edges = Edges(
+        np.repeat(np.arange(len(views)), [len(found) for found in points]),
+        np.concatenate([view.directions(found) for view, found in zip(views, points, strict=True)]),
+        np.concatenate([view.sight_limits(*found) for view, *found in zip(views, points, across, strict=True)]),
+    )
+    found = follow_edges(planes.normals, planes.offsets, cameras_of(views), edges, [view.distance for view in views])
+    return EdgeMatches(found.distances, found.shifts, found.compared, _turns(planes, found.outward), edges.sources)
 
 
 def _turns(planes: PlaneEquations, outward: Array) -> Array:
@@ -111,49 +100,6 @@ def _turns(planes: PlaneEquations, outward: Array) -> Array:
     sides *= np.where((twofold.mean(axis=1) * sides).real < 0, -1, 1)
     turned: Array = (twofold * sides[:, None]).imag
     return turned
-
-
-def _edges_on(
-    planes: PlaneEquations, views: Sequence[PaneView], edges_per_view: int
-) -> tuple[Array, Array, Mask, NDArray[np.int64]]:
-    """Edge points on the planes [H, P, 3], unit directions off the pane [H, P, 3], hits [H, P], their views [P]."""
-    points, outward, hits, sources = [], [], [], []
-    for number, source in enumerate(views):
-        chosen = slice(None, None, max(len(source.edge) // edges_per_view, 1))
-        found, hit = meet(planes, source.center, source.directions(source.edge[chosen]))
-        limits = source.sight_limits(source.edge[chosen], source.outward[chosen])
-        along = planes.normals @ limits.T
-        across = limits - along[..., None] * planes.normals[:, None]
-        points.append(found)
-        hits.append(hit)
-        outward.append(across / np.maximum(np.linalg.norm(across, axis=2, keepdims=True), 1e-9))
-        sources.append(np.full(found.shape[1], number))
-    return (
-        np.concatenate(points, axis=1),
-        np.concatenate(outward, axis=1),
-        np.concatenate(hits, axis=1),
-        np.concatenate(sources),
-    )
-
-
-def _pixel_and_frame(
-    planes: PlaneEquations, view: PaneView, points: Array, outward: Array, passing: Array
-) -> tuple[Array, Array]:
-    """Size on the plane of a pixel across an edge, and of what a frame of height one hides; [H, P] each.
-
-    Args:
-        planes: H planes.
-        view: that looks at the edge.
-        points: [H, P, 3] places on the edge.
-        outward: [H, P, 3] unit directions off the pane there.
-        passing: [H, P] products of the two.
-    """
-    height = np.abs(planes.normals @ view.center - planes.offsets)[:, None]
-    height = np.maximum(height, np.finfo(np.float64).tiny)
-    steep = (outward @ view.center - passing) / height
-    depth = np.abs(points @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3])
-    pixel = depth * np.sqrt(1 + steep**2) / np.sqrt(view.intrinsics[0] * view.intrinsics[1])
-    return np.maximum(pixel, np.finfo(np.float64).tiny), np.clip(steep, 0, STEEPEST)
 
 
 NEAREST, FARTHEST = 0.05, 20.0
@@ -320,10 +266,10 @@ class Objective:
         tolerance = max(tolerance, *(1 / view.diagonal for view in self.views))
         matches = edge_matches(planes.planes, self.views, edges_per_view=max(edges // len(self.views), 1))
         hypotheses = len(planes)
-        known = matches.compared.sum(axis=(0, 2))
+        known = matches.compared.sum(axis=(1, 2))
         unknown = UNKNOWN_WEIGHT * (matches.turns.shape[1] * (len(self.views) - 1) - known)
         each = 1 / np.maximum(known + unknown, 1)
-        met = matches.residuals(planes.frames, tolerance).swapaxes(0, 1).reshape(hypotheses, -1)
+        met = matches.residuals(planes.frames, tolerance).reshape(hypotheses, -1)
         away = planes.planes.distances(self.points) / self.distance
         frames = planes.frames[:, None] / (USUAL_FRAME * self.extent)
         residuals = (met, matches.turns / OUTLINE_TOLERANCE, away, frames)

@@ -6,12 +6,13 @@ Where a pane mirrors many measured points, these place it, too.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from glassplat.kernels.plane_search import Field, sum_mirrored
 from glassplat.panes.masks import FramedPlanes, PlaneEquations, join_planes, random_planes
 from glassplat.panes.objective import (
     COARSE,
@@ -400,7 +401,7 @@ def plane_of_images(plane: PlaneEquations, middle: Array, behind: Array, others:
 
     behind = behind[np.random.default_rng(0).permutation(len(behind))[:MOST_IMAGES]]
     tolerance = IMAGE_TOLERANCE * extent
-    far = _distance_field(others, tolerance / 2)
+    near = _closeness(others, tolerance)
     turns = np.tan(np.radians(np.arange(-IMAGE_TURN, IMAGE_TURN + 1e-9, IMAGE_TURN_STEP)))
     shifts = extent * np.arange(-IMAGE_SHIFT, IMAGE_SHIFT + 1e-9, IMAGE_SHIFT_STEP)
 
@@ -408,13 +409,14 @@ def plane_of_images(plane: PlaneEquations, middle: Array, behind: Array, others:
         index = np.zeros(len(steps), np.int64)
         return move_planes(plane.select(index), middle[None][index], steps)
 
-    def pairs(steps: Array, distance: Callable[[Array], Array]) -> Array:
+    def pairs(steps: Array) -> Array:
         planes = tried(steps)
         images = behind - 2 * planes.distances(behind)[..., None] * planes.normals[:, None]
-        return np.asarray(np.exp(-0.5 * (distance(images) / tolerance) ** 2).sum(axis=1))
+        return np.asarray(np.exp(-0.5 * (tree.query(images)[0] / tolerance) ** 2).sum(axis=1))
 
     steps = np.stack(np.meshgrid(turns, turns, shifts, indexing="ij"), axis=-1)
-    counts = np.stack([pairs(row.reshape(-1, 3), far) for row in steps]).reshape(steps.shape[:3])
+    planes = tried(steps.reshape(-1, 3))
+    counts = sum_mirrored(planes.normals, planes.offsets, behind, near).reshape(steps.shape[:3])
     best = steps[np.unravel_index(counts.argmax(), counts.shape)]
     tilts = np.arctan(steps[..., :2]) - np.arctan(best[:2])
     elsewhere = counts[np.linalg.norm(tilts, axis=-1) > np.radians(PEAK_WIDTH)].max()
@@ -424,29 +426,24 @@ def plane_of_images(plane: PlaneEquations, middle: Array, behind: Array, others:
     for _ in range(HALVINGS):
         size = size / 2
         around = best + size * (np.indices((3, 3, 3)).reshape(3, -1).T - 1)
-        best = around[pairs(around, lambda images: tree.query(images)[0]).argmax()]
-    found, before = pairs(np.stack([best, np.zeros(3)]), lambda images: tree.query(images)[0])
+        best = around[pairs(around).argmax()]
+    found, before = pairs(np.stack([best, np.zeros(3)]))
     peak = counts.max() / max(elsewhere, np.finfo(np.float64).tiny)
     return Images(tried(best[None]), float(found), float(before), float(peak))
 
 
-def _distance_field(points: Array, cell: float) -> Callable[[Array], Array]:
-    """Distances [...] of places [..., 3] to the nearest of the points, but for the outermost ones; inf beyond."""
+def _closeness(points: Array, tolerance: float) -> Field:
+    """How near places are to a point, from 1 on it to 0 far off, a tolerance being one standard deviation; 0 around the
+    outermost points.
+    """
     from scipy import ndimage
 
     low, high = np.percentile(points, (1, 99), axis=0)
     inner = points[((points >= low) & (points <= high)).all(axis=1)]
-    cell = max(cell, float((high - low).max()) / MOST_CELLS)
+    cell = max(tolerance / 2, float((high - low).max()) / MOST_CELLS)
     corner = low - 4 * cell
     shape = np.ceil((high - corner) / cell).astype(np.int64) + 5
     empty = np.ones(shape, np.bool_)
     empty[tuple(((inner - corner) / cell).astype(np.int64).T)] = False
-    field = (cell * ndimage.distance_transform_edt(empty)).astype(np.float32)
-
-    def distance(places: Array) -> Array:
-        index = np.floor((places - corner) / cell).astype(np.int64)
-        known = ((index >= 0) & (index < shape)).all(axis=-1)
-        index = np.where(known[..., None], index, 0)
-        return np.where(known, field[index[..., 0], index[..., 1], index[..., 2]], np.inf)
-
-    return distance
+    away = (cell / tolerance) * ndimage.distance_transform_edt(empty)
+    return Field(np.exp(-0.5 * away**2).astype(np.float32), corner, cell)

@@ -103,7 +103,9 @@ FAST_MATH = frozenset({"contract", "reassoc", "nsz", "arcp", "afn"})
 
 # Forced, because the compiler balks at functions of many arrays, where a call costs more than the body. Without
 # reference counting too: one atomic increment per array and call, of counters that all threads share.
-inlined = register_jitable(forceinline=True, _nrt=False, no_cfunc_wrapper=True, fastmath=set(FAST_MATH), error_model="numpy")
+inlined = register_jitable(
+    forceinline=True, _nrt=False, no_cfunc_wrapper=True, fastmath=set(FAST_MATH), error_model="numpy"
+)
 """Marks a scalar function that kernels call; it must not create arrays. Compiles for the CPU and for CUDA."""
 
 
@@ -172,15 +174,17 @@ def even_stride(count):
 def array_at(real: type) -> Callable[..., Any]:
     """The function that makes an array of type `real` of the `count` elements from `first` on behind an address.
 
+    `real` may be `np.bool_`, too.
+
     Nothing keeps what lies there: the caller holds the tensors until the kernel has returned.
     """
-    kind = types.Array(types.float64 if real is np.float64 else types.float32, 1, "C")
+    kind = types.Array(numba.from_dtype(np.dtype(real)), 1, "C")
 
     @intrinsic
     def at(typing, address, first, count):
         def generate(context, builder, sig, arguments):
             array = context.make_array(kind)(context, builder)
-            size = context.get_constant(types.intp, kind.dtype.bitwidth // 8)
+            size = context.get_constant(types.intp, np.dtype(real).itemsize)
             begin = builder.inttoptr(arguments[0], context.get_data_type(kind.dtype).as_pointer())
             data = builder.gep(begin, [arguments[1]])
             populate_array(array, data=data, shape=[arguments[2]], strides=[size], itemsize=size, meminfo=None)
