@@ -13,7 +13,7 @@ from torch import Tensor
 
 from glassplat.captures.view import View, evenly
 from glassplat.kernels.maths.images import linear_from_srgb
-from glassplat.render.layers import gather_pixels, gathered_mirrored
+from glassplat.render.layers import gather_pixels, gathered_mirrored, window_sums
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene import SH_ZERO, logit
@@ -342,20 +342,6 @@ def about_local_mean(image: Tensor, region: Tensor) -> Tensor:
     return image - (sums[..., :3] / sums[..., 3:].clamp(min=1)).to(image.dtype)
 
 
-def window_sums(image: Tensor, reach: int) -> Tensor:
-    """[H, W, D] float64 sums over the square of pixels up to `reach` away, cut off at the image's border.
-
-    Differences of running sums, one axis after the other: as much work for a window of any size.
-    """
-    sums = image.double()
-    for axis in (0, 1):
-        running = torch.cat([torch.zeros_like(sums.narrow(axis, 0, 1)), sums.cumsum(axis)], dim=axis)
-        places = torch.arange(image.shape[axis], device=image.device)
-        after, before = (places + reach + 1).clamp(max=len(places)), (places - reach).clamp(min=0)
-        sums = running.index_select(axis, after) - running.index_select(axis, before)
-    return sums
-
-
 def likeness(mirrored: Tensor, photographed: Tensor) -> Likeness:
     """Regression of photographed on mirrored values [P, 3], both about their means."""
     covariance = (mirrored * photographed).sum()
@@ -572,7 +558,7 @@ def _images_of(scene: Scene, seen: Sequence[LitPixels], photographs: Sequence[Ph
     near, through = means.new_zeros(2, len(means))
     for photograph, (glass, lit) in zip(photographs, seen, strict=True):
         rim = max(round(LAMP_RIM * glass.shape[1]), 1)
-        lit = glass & (torch.nn.functional.max_pool2d(lit[None].float(), 2 * rim + 1, 1, rim)[0] > 0)
+        lit = glass & (window_sums(lit[..., None], rim)[..., 0] > 0)
         shown = gather_pixels(scene, photograph.camera, torch.stack([lit, glass], dim=-1).float())
         shown = shown * crosses_pane(means, scene.planes, photograph.camera.to(means.device).center)[:, None]
         near, through = near + shown[:, 0], through + shown[:, 1]

@@ -1,4 +1,4 @@
-"""Layers as pictures in false colours, and what each Gaussian adds to a view."""
+"""Layers as pictures in false colours, sums over windows, and what each Gaussian adds to a view."""
 
 from __future__ import annotations
 
@@ -190,3 +190,17 @@ def _disc_sums(discs: Gaussians, camera: Camera, near: float, values: Tensor) ->
         image = blended_discs(projected, ones, camera, near=near).image
         (sums,) = torch.autograd.grad((image * values).sum(), ones)
     return sums[0]
+
+
+def window_sums(image: Tensor, reach: int) -> Tensor:
+    """[H, W, D] float64 sums over the square of pixels up to `reach` away, cut off at the image's border.
+
+    Differences of running sums, one axis after the other: as much work for a window of any size.
+    """
+    sums = image.double()
+    for axis in (0, 1):
+        running = torch.cat([torch.zeros_like(sums.narrow(axis, 0, 1)), sums.cumsum(axis)], dim=axis)
+        places = torch.arange(image.shape[axis], device=image.device)
+        after, before = (places + reach + 1).clamp(max=len(places)), (places - reach).clamp(min=0)
+        sums = running.index_select(axis, after) - running.index_select(axis, before)
+    return sums

@@ -21,6 +21,7 @@ from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene, glass_gaussians
 from glassplat.training.densify import gaussians_from_points
 from glassplat.training.stage import Clock, TrainState
+from tests.panes.test_material import CountedElements
 from tests.render.tiny_scene import concatenated
 from tests.training.progress_of import finished
 
@@ -77,7 +78,8 @@ def photographs_of(scene: Scene) -> list[Photograph]:
 def test_the_image_of_a_lamp_is_found_and_the_lamp_gets_its_radiance() -> None:
     photographs = photographs_of(scene_of(wall(4.0), shining(panel(LAMP))))
     first = scene_of(wall(4.0), panel(LAMP), panel(IMAGE))
-    lamps = mirrored_lamps(first, first.planes, photographs)
+    with CountedElements():
+        lamps = mirrored_lamps(first, first.planes, photographs)
     assert lamps is not None
     before, lamp = len(wall(4.0)), len(panel(LAMP))
     assert bool(lamps.images[before + lamp :].float().mean() > 0.7) and not bool(lamps.images[: before + lamp].any())

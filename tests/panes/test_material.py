@@ -25,8 +25,8 @@ from glassplat.panes.material import (
     likeness,
     photographs_of,
     reduced_photograph,
-    window_sums,
 )
+from glassplat.render.layers import window_sums
 from glassplat.render.planar import Planar
 from glassplat.scene.corrections import Exposures
 from glassplat.scene.scene import Scene, glass_gaussians
@@ -212,5 +212,5 @@ class CountedElements(TorchDispatchMode):
     ) -> Any:
         assert "pool" not in func.name() and "conv" not in func.name(), "work that grows with the window"
         result = func(*args, **(kwargs or {}))
-        self.elements += result.numel()
+        self.elements += result.numel() if isinstance(result, torch.Tensor) else 0
         return result

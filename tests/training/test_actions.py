@@ -27,6 +27,7 @@ from glassplat.training.actions import Densify, PruneIdle, SeedUnexplained, limi
 from glassplat.training.densify import ScreenStatistics, fog_around, gaussians_from_points, hangs_in_air
 from glassplat.training.options import DefaultDensify
 from glassplat.training.stage import Clock, TrainState
+from tests.panes.test_material import CountedElements
 from tests.render.tiny_scene import concatenated
 from tests.training.progress_of import finished
 from tests.training.tiny_capture import tiny_capture
@@ -221,6 +222,14 @@ def test_views_that_ignore_a_place_do_not_say_that_nothing_is_missing_there() ->
     for number in (0, 3, 6, 9):
         views[number] = replace(views[number], read_ignored=lambda: everything)
     assert len(missing_in(ground, views, Splat())) > 0.9 * len(found) > 5
+
+
+def test_what_is_missing_is_not_looked_for_in_every_window_by_itself() -> None:
+    """On photographs of two megapixels, windows of their size took half a minute for each."""
+    whole = Scene(balls([(0.3, -0.2, 0.1), (0.0, 0.4, 0.0)], [250, 30], -1.8), 2.0)
+    ground = Scene(whole.primary.select(torch.tensor([False, True])), 2.0)
+    with CountedElements():
+        assert len(missing_in(ground, views_of(whole).train, Splat())) > 5
 
 
 def test_exposures_do_not_hide_what_photographs_agree_on() -> None:
