@@ -445,8 +445,7 @@ def _seen_middle(views: Sequence[PaneView]) -> Array:
     """[3] the point nearest to the rays through the middles of the masks."""
     system, right = np.zeros((3, 3)), np.zeros(3)
     for view in views:
-        row, column = np.nonzero(view.mask)
-        ray = view.directions(np.array([[np.median(column) + 0.5, np.median(row) + 0.5]]))[0]
+        ray = view.directions(view.middle)[0]
         across: Array = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
         system = system + across
         right = right + across @ view.center

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -184,6 +185,12 @@ class PaneView:
     def center(self) -> Array:
         """[3] camera centre in the world."""
         return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
+
+    @cached_property
+    def middle(self) -> Array:
+        """[1, 2] where the middle of the mask's pixels is (medians of x and of y)."""
+        row, column = np.nonzero(self.mask)
+        return np.array([[np.median(column) + 0.5, np.median(row) + 0.5]])
 
     @property
     def diagonal(self) -> float:

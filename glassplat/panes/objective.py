@@ -141,9 +141,7 @@ def pane_centers(planes: PlaneEquations, views: Sequence[PaneView]) -> Array:
     """[H, 3] a point near the middle of the pane on each plane, from the middles of the masks."""
     found, seen = np.zeros((len(planes), 3)), np.zeros(len(planes))
     for view in views:
-        row, column = np.nonzero(view.mask)
-        middle = np.array([[np.median(column) + 0.5, np.median(row) + 0.5]])
-        points, hit = meet(planes, view.center, view.directions(middle))
+        points, hit = meet(planes, view.center, view.directions(view.middle))
         # A view that hardly sees the plane puts its middle far away.
         rays = points[:, 0] - view.center
         squared = np.maximum(np.einsum("hd,hd->h", rays, rays), np.finfo(np.float64).tiny)
