@@ -20,7 +20,7 @@ FIRST_PAUSE, LONGEST_PAUSE = 1.0, 10.0
 SPEED_SECONDS = 60.0
 """How far back the speed is measured from which the time left follows."""
 LONG_WORK = 5.0
-"""Seconds of work between two steps from which on it is no part of the speed: as at the beginning of a stage."""
+"""Seconds of work between two steps from which on it is no part of the speed. What begins a stage never is."""
 SMOOTHING = 0.98
 WIDE = 110
 """Columns of a terminal from which on the last checkpoint has room in the bar."""
@@ -83,19 +83,23 @@ class Pace:
     def __init__(self, plan: Plan, clock: Callable[[], float] = time.monotonic) -> None:
         self._plan, self._clock = plan, clock
         self._passed: deque[tuple[float, int]] = deque()
-        self._is_forecast = self._has_worked = False
+        self._is_forecast = self._has_worked = self._has_entered = False
         self._stepped = clock()
 
     def work(self) -> None:
         """Notes that there is more between two steps than the step."""
         self._has_worked = True
 
+    def enter_stage(self) -> None:
+        """Notes that what comes between two steps comes once, and that the next step may compile."""
+        self._has_entered = True
+
     def step(self, number: int) -> None:
         """Notes a step, now and then."""
         now = self._clock()
-        if self._has_worked and now - self._stepped >= LONG_WORK:
+        if self._has_entered or (self._has_worked and now - self._stepped >= LONG_WORK):
             self._passed.clear()
-        self._stepped, self._has_worked = now, False
+        self._stepped, self._has_worked, self._has_entered = now, False, False
         if not self._passed or now - self._passed[-1][0] >= FIRST_PAUSE:
             self._passed.append((now, number))
         while len(self._passed) > 2 and now - self._passed[1][0] > SPEED_SECONDS:
@@ -169,7 +173,7 @@ class TrainingProgress:
             self._begin(message)
         elif isinstance(message, messages.StageEntered):
             standing.stage = message.stage
-            self._pace.work()
+            self._pace.enter_stage()
             counts = ", ".join(f"{number} {name}" for name, number in message.counts.items())
             self._say(f"step {message.step}: stage {message.stage}, {counts}")
         elif isinstance(message, messages.ActionDone) and not message.action.startswith(FREQUENT):

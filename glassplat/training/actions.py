@@ -489,16 +489,20 @@ def unexplained_places(
     for done, view in enumerate(views):
         yield Working("looking for what is missing", done, len(views))
         camera = view.camera.to(device)
-        pixels = nearest_pixels(camera.project(places)[0], camera)
+        rows = in_image(places, camera).nonzero()[:, 0]
+        here = places[rows]
+        pixels = nearest_pixels(camera.project(here)[0], camera)
         frame = renderer(scene, camera)
-        looks = in_image(places, camera) & ~crosses_pane(places, scene.planes, camera.center)
-        looks &= (_past_panes(frame) & counted_pixels(view, device))[pixels]
+        looks = (_past_panes(frame) & counted_pixels(view, device))[pixels]
+        looks &= ~crosses_pane(here, scene.planes, camera.center)
         missing = _missing_pixels(residual(frame, view, scene))[pixels] & looks
         photographed = scene.exposures.undone(to_device(view.photo, device)[pixels].float() / 255, view.name)
         color = photographed.clamp(0, 1) * missing[:, None]
-        looking, agreeing = looking + looks, agreeing + missing
-        colors, squares = colors + color, squares + color.square()
-        sides += torch.nn.functional.normalize(camera.center - places, dim=1) * missing[:, None]
+        looking[rows] += looks
+        agreeing[rows] += missing
+        colors[rows] += color
+        squares[rows] += color.square()
+        sides[rows] += torch.nn.functional.normalize(camera.center - here, dim=1) * missing[:, None]
     mean = colors / agreeing.clamp(min=1)[:, None]
     spread = (squares / agreeing.clamp(min=1)[:, None] - mean.square()).clamp(min=0).mean(dim=1).sqrt()
     found = (agreeing >= FEWEST_AGREEING) & (agreeing >= LEAST_AGREEING * looking) & (spread < MOST_SPREAD)

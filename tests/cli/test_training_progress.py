@@ -127,6 +127,10 @@ def test_what_takes_long_at_the_beginning_of_a_stage_is_no_part_of_the_speed(wor
     assert left_after(work, 300.0) == left_after([], 0.0) == "7 min left"
 
 
+def test_what_begins_a_stage_is_no_part_of_the_speed_even_if_it_is_short() -> None:
+    assert left_after([Working("fitting planes", 0, 1), StageEntered(100, "2", COUNTS)], 4.0) == "7 min left"
+
+
 def test_what_recurs_between_steps_is_part_of_the_speed() -> None:
     assert left_after([Working("looking for Gaussians that no view needs", 0, 2)], 4.0) == "8 min left"
 
