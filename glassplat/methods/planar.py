@@ -43,10 +43,11 @@ from glassplat.training.actions import (
     ResetOpacity,
     SeedUnexplained,
     add_primary,
+    keep_some,
     seeds_of,
 )
 from glassplat.training.corrections import corrections_begun, corrections_learnt, photographer_learnt
-from glassplat.training.densify import NEIGHBOURS, append, apply_edit, keep
+from glassplat.training.densify import NEIGHBOURS
 from glassplat.training.losses import (
     LossTerm,
     ReflectanceDeparture,
@@ -284,7 +285,6 @@ class TurnReflections:
             yield Working(f"looking behind {name_panes(panes, 'pane')} for what it mirrors", done, len(of_glass))
             moved += turn_round(state, reflections_behind(state.scene, panes, cameras), panes)
         if moved:
-            state.statistics.pop("primary", None)
             log.info("%d Gaussians behind glass moved to the front", moved)
         return moved > 0
 
@@ -317,10 +317,8 @@ class LightLamps:
         if lamps is None:
             return False
         log_gains = scene.primary.channels["log_intensity"] + lamps.gains.log()
-        primary = scene.primary.with_tensors({"log_intensity": log_gains})
-        primary, state.optimizer.moments = apply_edit(primary, state.optimizer.moments, keep(~lamps.images))
-        state.scene = replace(scene, primary=primary)
-        state.statistics.pop("primary", None)
+        state.scene = replace(scene, primary=scene.primary.with_tensors({"log_intensity": log_gains}))
+        keep_some(state, ~lamps.images)
         count, lit = int(lamps.images.sum()), lamps.gains > 1
         log.info("%d Gaussians behind glass were images of lamps; %d of these shine brighter", count, int(lit.sum()))
         return True
@@ -362,11 +360,9 @@ def turn_round(state: TrainState, virtual: Tensor, panes: Planes) -> int:
     """Mirrors some primary Gaussians at panes in one plane; returns how many."""
     count = int(virtual.sum())
     if count:
-        primary, moments = state.scene.primary, state.optimizer.moments
-        turned = mirrored_gaussians(primary.select(virtual), panes.centers[0], panes.normals[0])
-        primary, moments = apply_edit(primary, moments, keep(~virtual))
-        primary, state.optimizer.moments = append(primary, moments, turned)
-        state.scene = replace(state.scene, primary=primary)
+        turned = mirrored_gaussians(state.scene.primary.select(virtual), panes.centers[0], panes.normals[0])
+        keep_some(state, ~virtual)
+        add_primary(state, turned)
     return count
 
 

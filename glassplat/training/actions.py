@@ -199,9 +199,7 @@ class PruneIdle:
         # A scene without Gaussians is reported; surroundings that nothing mirrors yet may still be needed.
         if bool(busy.all()) or (self.part != "primary" and not bool(busy.any())):
             return False
-        kept, state.optimizer.moments = apply_edit(gaussians, state.optimizer.moments, keep(busy), part=self.part)
-        state.scene = state.scene.with_gaussians(self.part, kept)
-        state.statistics.pop(self.part, None)
+        keep_some(state, busy, self.part)
         return True
 
 
@@ -465,10 +463,23 @@ def seeds_of(primary: Gaussians, points: PointCloud, *, opacity: float = 0.1, si
 
 
 def add_primary(state: TrainState, seeds: Gaussians) -> None:
-    """Adds Gaussians to the primary ones, whose statistics begin anew."""
+    """Adds Gaussians to the primary ones, of which moments and statistics stay."""
     primary, state.optimizer.moments = append(state.scene.primary, state.optimizer.moments, seeds)
     state.scene = replace(state.scene, primary=primary)
-    state.statistics.pop("primary", None)
+    if "primary" in state.statistics:
+        state.statistics["primary"] = state.statistics["primary"].with_new(len(seeds))
+
+
+def keep_some(state: TrainState, kept: Tensor, part: str = "primary") -> None:
+    """Removes Gaussians but those where `kept` [N] is true, of which moments and statistics stay.
+
+    Else an action of this kind at the step of a densification would take its place (lab/gaussians.md).
+    """
+    gaussians = state.scene.gaussian_sets()[part]
+    gaussians, state.optimizer.moments = apply_edit(gaussians, state.optimizer.moments, keep(kept), part=part)
+    state.scene = state.scene.with_gaussians(part, gaussians)
+    if part in state.statistics:
+        state.statistics[part] = state.statistics[part].select(kept)
 
 
 @torch.no_grad()

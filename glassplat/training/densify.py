@@ -338,6 +338,14 @@ class ScreenStatistics:
         """Statistics of `count` Gaussians that no view has seen."""
         return ScreenStatistics(*torch.zeros(3, 2, count, device=device))
 
+    def select(self, kept: Tensor) -> ScreenStatistics:
+        """Those of the Gaussians where `kept` [N] is true."""
+        return ScreenStatistics(*(sums[:, kept] for sums in self.sums))
+
+    def with_new(self, count: int) -> ScreenStatistics:
+        """Those of the Gaussians, followed by `count` that no view has seen."""
+        return ScreenStatistics(*(torch.nn.functional.pad(sums, (0, count)) for sums in self.sums))
+
     def add(self, views: Views) -> None:
         """Adds the views of one training step, in place."""
         add_views(self.sums, views)

@@ -19,7 +19,9 @@ from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene, glass_gaussians
-from glassplat.training.densify import gaussians_from_points
+from glassplat.training.actions import Densify
+from glassplat.training.densify import ScreenStatistics, gaussians_from_points
+from glassplat.training.options import DefaultDensify
 from glassplat.training.stage import Clock, TrainState
 from tests.panes.test_material import CountedElements
 from tests.render.tiny_scene import concatenated
@@ -153,11 +155,25 @@ def test_lamps_are_lit_at_their_moments_and_their_images_go() -> None:
     assert not finished(action.apply(state_of(mirrors), capture, Clock(40, 100, 5)))
 
 
+def test_lamps_that_are_lit_when_gaussians_grow_do_not_keep_them_from_it() -> None:
+    capture = capture_of(scene_of(wall(4.0), shining(panel(LAMP))))
+    state = state_of(scene_of(wall(4.0), panel(LAMP), panel(IMAGE)))
+    state.statistics["primary"] = ScreenStatistics(*torch.ones(3, 2, len(state.scene.primary)))
+    assert finished(LightLamps((0.5,)).apply(state, capture, Clock(50, 100, 5)))
+    left = len(state.scene.primary)
+    eager = DefaultDensify(gradient_threshold=0.1, absgrad_threshold=0.1, per_pixel=0)
+    assert Densify(eager).apply(state, capture, Clock(50, 100, 5))
+    assert len(state.scene.primary) > 1.5 * left
+
+
 def test_what_a_pane_mirrors_unseen_is_filled_once() -> None:
     scene = scene_of(wall(4.0), wall(-3.0, 120).select(wall(-3.0).means[:, 0] < 1))
     state, action = state_of(scene), FillUnseen(0.5)
+    state.statistics["primary"] = ScreenStatistics(*torch.ones(3, 2, len(scene.primary)))
     assert finished(action.apply(state, capture_of(scene), Clock(50, 100, 5)))
     added = len(state.scene.primary) - len(scene.primary)
+    for sums in state.statistics["primary"].sums:
+        assert bool((sums[:, :-added] == 1).all()) and not bool(sums[:, -added:].any())
     size = 0.7 * unseen_places(scene, scene.planes, CAMERAS).cell
     assert bool(torch.isclose(state.scene.primary.log_scales[-added:].exp(), torch.tensor(size)).all())
     assert added > 10 and not bool(state.optimizer.moments["primary.means"][0][-added:].any())

@@ -46,10 +46,14 @@ def state_with_one_out_of_sight() -> TrainState:
 def test_what_no_view_needs_is_removed_with_its_moments() -> None:
     state, action = state_with_one_out_of_sight(), PruneIdle(DefaultDensify(least_contribution=1e-3))
     before = state.scene.primary.means
+    gathered = torch.arange(2 * len(before), dtype=torch.float32).reshape(2, -1)
+    state.statistics["primary"] = ScreenStatistics(gathered, 2 * gathered, 3 * gathered)
     assert finished(action.apply(state, tiny_capture(), Clock(50, 100, 5)))
     kept = state.optimizer.moments["primary.means"][0][:, 0].long()
     assert 0 < len(kept) < len(before) and 3 not in kept.tolist()
     assert torch.equal(state.scene.primary.means, before[kept])
+    for times, sums in enumerate(state.statistics["primary"].sums, start=1):
+        assert torch.equal(sums, times * gathered[:, kept])
     assert not finished(action.apply(state, tiny_capture(), Clock(80, 100, 5)))
 
 
