@@ -1,4 +1,4 @@
-"""What the search for a pane's plane asks: where masks land in other views, and points on others when mirrored.
+"""The inner loops of the search for a pane's plane: masks followed to other views, points mirrored onto others.
 
 A search tries thousands of planes on some hundred rays or points. For each plane and ray there are a few products
 and one look into an image: little enough to be done as it comes, without arrays in between. All is in double
@@ -134,7 +134,7 @@ def sum_mirrored(normals: Array, offsets: Array, points: Array, field: Field) ->
 
 @inlined
 def along_ray(normal, offset, center, ray):  # type: ignore[no-untyped-def]
-    """How far along a ray a plane is; not positive behind its origin."""
+    """Distance along a ray to a plane; not positive behind its origin."""
     slope = normal[0] * ray[0] + normal[1] * ray[1] + normal[2] * ray[2]
     if abs(slope) < PARALLEL:
         slope = PARALLEL

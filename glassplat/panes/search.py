@@ -433,8 +433,9 @@ def plane_of_images(plane: PlaneEquations, middle: Array, behind: Array, others:
 
 
 def _closeness(points: Array, tolerance: float) -> Field:
-    """How near places are to a point, from 1 on it to 0 far off, a tolerance being one standard deviation; 0 around the
-    outermost points.
+    """Nearness of places to the points, from 1 on one to 0 far off, a tolerance being one standard deviation.
+
+    The outermost points are left out.
     """
     from scipy import ndimage
 
