@@ -450,10 +450,12 @@ class Training:
 
         Raises:
             CudaUnavailableError: the GPU was asked for and cannot be used.
-            InputError: no method has that name; an option has a value that it cannot have; `output` holds something
-                else, or nothing to go on from; the run is too short for its stages; or the photographs lie over
-                another background than the recipe's.
+            InputError: `dataset` is something else; no method has that name; an option has a value that it cannot
+                have; `output` holds something else, or nothing to go on from; the run is too short for its stages; or
+                the photographs lie over another background than the recipe's.
         """
+        if not isinstance(dataset, Dataset):
+            raise InputError(f"dataset is {dataset!r}; expected what `glassplat.load_dataset` returns for a capture")
         chosen = chosen_recipe(recipe)
         if type(chosen) in RECIPES.values():  # A recipe of one's own may hold anything.
             check_value(type(chosen), chosen, "")

@@ -182,6 +182,8 @@ def test_a_recipe_of_ones_own_is_trained() -> None:
 
 
 def test_what_cannot_be_trained_is_refused_at_once(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="dataset is 'captures/shop'; expected what"):
+        Training("captures/shop", "splat")
     with pytest.raises(InputError, match="no method is called 'nerf'; expected splat, planar"):
         Training(tiny_capture(), "nerf")
     with pytest.raises(InputError, match="expected at least"):
