@@ -559,6 +559,7 @@ def test_on_the_web_the_page_gives_the_frame_that_embeds_it(opened: Browser, tmp
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(QuietHandler, directory=tmp_path)) as server:
         Thread(target=server.serve_forever, daemon=True).start()
         with Browser(f"http://127.0.0.1:{server.server_address[1]}/index.html", 320, 240) as window:
+            window.wait("document.body.classList.contains('ready')", "the page")
             window.evaluate("document.querySelector('[data-do=embed]').click()")
             code = window.evaluate("document.querySelector('#embed textarea').value")
         server.shutdown()
