@@ -83,7 +83,7 @@ class Pace:
     def __init__(self, plan: Plan, clock: Callable[[], float] = time.monotonic) -> None:
         self._plan, self._clock = plan, clock
         self._passed: deque[tuple[float, int]] = deque()
-        self._is_forecast = self._has_worked = self._has_entered = False
+        self._is_forecast = self._has_worked = False
         self._stepped = clock()
 
     def work(self) -> None:
@@ -91,15 +91,15 @@ class Pace:
         self._has_worked = True
 
     def enter_stage(self) -> None:
-        """Notes that what comes between two steps comes once, and that the next step may compile."""
-        self._has_entered = True
+        """Measures the speed anew: what comes before a stage comes once, and its first step may compile."""
+        self._passed.clear()
 
     def step(self, number: int) -> None:
         """Notes a step, now and then."""
         now = self._clock()
-        if self._has_entered or (self._has_worked and now - self._stepped >= LONG_WORK):
+        if self._has_worked and now - self._stepped >= LONG_WORK:
             self._passed.clear()
-        self._stepped, self._has_worked, self._has_entered = now, False, False
+        self._stepped, self._has_worked = now, False
         if not self._passed or now - self._passed[-1][0] >= FIRST_PAUSE:
             self._passed.append((now, number))
         while len(self._passed) > 2 and now - self._passed[1][0] > SPEED_SECONDS:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from glassplat.captures.view import View, evenly
 from glassplat.kernels.maths.images import linear_from_srgb
-from glassplat.render.layers import gather_pixels, gathered_mirrored, window_sums
+from glassplat.render.layers import gather_pixels, gathered_mirrored, window_means, window_sums
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene import SH_ZERO, logit
@@ -337,9 +337,7 @@ def mirrored_coverage(scene: Scene, pane: Planes, camera: Camera) -> tuple[float
 def about_local_mean(image: Tensor, region: Tensor) -> Tensor:
     """An image [H, W, 3] minus its mean over the part of a square window that lies in the region [H, W]."""
     reach = max(round(WINDOW * image.shape[1] / 2), 1)
-    inside = region.to(image.dtype)[..., None]
-    sums = window_sums(torch.cat([image * inside, inside], dim=-1), reach)
-    return image - (sums[..., :3] / sums[..., 3:].clamp(min=1)).to(image.dtype)
+    return image - window_means(image, region, reach).to(image.dtype)
 
 
 def likeness(mirrored: Tensor, photographed: Tensor) -> Likeness:

@@ -409,11 +409,6 @@ def plane_of_images(plane: PlaneEquations, middle: Array, behind: Array, others:
         index = np.zeros(len(steps), np.int64)
         return move_planes(plane.select(index), middle[None][index], steps)
 
-    def pairs(steps: Array) -> Array:
-        planes = tried(steps)
-        images = behind - 2 * planes.distances(behind)[..., None] * planes.normals[:, None]
-        return np.asarray(np.exp(-0.5 * (tree.query(images)[0] / tolerance) ** 2).sum(axis=1))
-
     steps = np.stack(np.meshgrid(turns, turns, shifts, indexing="ij"), axis=-1)
     planes = tried(steps.reshape(-1, 3))
     counts = sum_mirrored(planes.normals, planes.offsets, behind, near).reshape(steps.shape[:3])
@@ -422,6 +417,12 @@ def plane_of_images(plane: PlaneEquations, middle: Array, behind: Array, others:
     elsewhere = counts[np.linalg.norm(tilts, axis=-1) > np.radians(PEAK_WIDTH)].max()
     # The cells of the field are coarse; the distances themselves place the plane within a step.
     tree = cKDTree(others)
+
+    def pairs(steps: Array) -> Array:
+        planes = tried(steps)
+        images = behind - 2 * planes.distances(behind)[..., None] * planes.normals[:, None]
+        return np.asarray(np.exp(-0.5 * (tree.query(images)[0] / tolerance) ** 2).sum(axis=1))
+
     size = np.array([np.radians(IMAGE_TURN_STEP), np.radians(IMAGE_TURN_STEP), extent * IMAGE_SHIFT_STEP])
     for _ in range(HALVINGS):
         size = size / 2

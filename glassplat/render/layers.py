@@ -192,6 +192,13 @@ def _disc_sums(discs: Gaussians, camera: Camera, near: float, values: Tensor) ->
     return sums[0]
 
 
+def window_means(image: Tensor, region: Tensor, reach: int) -> Tensor:
+    """[H, W, D] float64 means over that part of a window, as of `window_sums`, which lies in a region [H, W]."""
+    inside = region.to(image.dtype)[..., None]
+    sums = window_sums(torch.cat([image * inside, inside], dim=-1), reach)
+    return sums[..., :-1] / sums[..., -1:].clamp(min=1)
+
+
 def window_sums(image: Tensor, reach: int) -> Tensor:
     """[H, W, D] float64 sums over the square of pixels up to `reach` away, cut off at the image's border.
 

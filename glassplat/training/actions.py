@@ -13,7 +13,7 @@ from torch import Tensor
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import PointCloud, View, evenly
 from glassplat.render.frame import Frame, Renderer
-from glassplat.render.layers import contributions, window_sums
+from glassplat.render.layers import contributions, window_means
 from glassplat.scene.camera import Camera, to_device
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import behind_panes, crosses_pane, in_image, nearest_pixels
@@ -539,8 +539,7 @@ def grid_around(cameras: Sequence[Camera], extent: float) -> tuple[Tensor, float
 def _missing_pixels(error: Tensor) -> Tensor:
     """[H, W] bool: pixels of a residual [H, W, 3] in which more than detail is missing."""
     reach = max(round(WINDOW / 2 * error.shape[1]), 1)
-    sums = window_sums(torch.cat([error, torch.ones_like(error[..., :1])], dim=-1), reach)
-    mean = sums[..., :3] / sums[..., 3:]
+    mean = window_means(error, torch.ones_like(error[..., 0]), reach)
     return mean.abs().mean(dim=-1) > UNEXPLAINED
 
 
