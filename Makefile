@@ -61,7 +61,7 @@ lint: $(STAMP)
 	$(BIN)/python -m tools.check_prose
 
 test: lint
-	$(BIN)/python -m pytest --numprocesses=2 --dist=worksteal --durations=15
+	$(BIN)/python -m pytest --numprocesses=logical --maxprocesses=8 --dist=worksteal --durations=15
 
 portable: $(STAMP)
 	$(BIN)/python -m pytest $(PORTABLE_TESTS)

@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path, PurePosixPath
 from threading import Lock
-from typing import IO, TypeVar
+from typing import IO, Any, TypeVar
 
 import numpy as np
 import torch
@@ -177,6 +177,7 @@ class Memory:
             largest: pixels of the largest view.
         """
         self.budget = default_budget() if budget is None else budget
+        self._largest = largest
         view = max(largest * PIXEL_BYTES, 1)
         self.ahead = int(max(min(self.budget * AHEAD_SHARE / view - 1, MOST_AHEAD), 1))
         self._room = self.budget - (self.ahead + 1) * view
@@ -187,6 +188,10 @@ class Memory:
         self._pending: dict[Source, Future[Tensor]] = {}
         self._spool: Spool | None = None
         self._lock = Lock()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Holds nothing in a copy or in another process, where pixels are read anew."""
+        return partial(Memory, self.budget, largest=self._largest), ()
 
     @property
     def is_full(self) -> bool:

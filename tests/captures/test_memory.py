@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import os
+import pickle
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -195,6 +196,17 @@ def test_another_reader_of_a_view_of_the_same_name_is_another_photograph(capture
     other = replace(view, read_photo=lambda: torch.zeros_like(view.photo))
     assert view.photo.any()
     assert not other.photo.any()
+
+
+def test_a_capture_goes_to_another_process_without_the_pixels_that_were_read(capture) -> None:
+    capture.write_colmap()
+    dataset = load_dataset(capture.root, memory=1.0)
+    dataset.train[0].photo.zero_()
+    other = pickle.loads(pickle.dumps(dataset))
+    assert other.train[0].photo.any()
+    assert other.train[1].memory is other.memory
+    assert other.memory.budget == dataset.memory.budget
+    assert other.memory.ahead == dataset.memory.ahead
 
 
 def test_the_machine_has_memory_and_processes_share_it(monkeypatch: pytest.MonkeyPatch) -> None:
