@@ -1,7 +1,8 @@
 """Ray tracing on the CPU: the hierarchy of boxes, the rays, and their gradients.
 
 Boxes are fitted one level after the other, from the lowest up. Rays are traced in blocks of neighbouring ones, each ray
-in chunks of its nearest hits. Blocks have a fixed size, whatever the number of threads.
+in chunks of its nearest hits: sixteen that end most rays, then four times as many, because a search begins at the root
+of the tree each time. Blocks have a fixed size, whatever the number of threads.
 
 Gradients have the same bits for any number of threads, without atomics. What rays meet is written down, ray by ray:
 few hits by the forward pass; rays that meet more are traced again. Then every block of rays keeps a row of sums for
@@ -86,8 +87,12 @@ def fit_boxes(real: type, flat: bool) -> Kernel:
     return fit
 
 
+BLOCK = 64
+"""Rays per task of the forward pass."""
 GRADIENT_BLOCK = 256
 """Rays per task of the backward pass, whose sums share rows."""
+LATER_CHUNK = 64
+"""Hits that a search returns at most where a ray has gone on through the first ones."""
 SUM_CHUNK = 512
 """Gaussians per task of the last sum."""
 
@@ -150,7 +155,8 @@ def trace_collect(real: type, flat: bool) -> Kernel:
         for task in prange(num_blocks):
             block = task * stride % num_blocks
             seen = places[numba.get_thread_id(), 0]
-            ts, alphas, ids = np.empty((CHUNK,), real), np.empty((CHUNK,), real), np.empty((CHUNK,), np.int32)
+            ts, alphas = np.empty((LATER_CHUNK,), real), np.empty((LATER_CHUNK,), real)
+            ids = np.empty((LATER_CHUNK,), np.int32)
             entries, squares = np.empty((WIDTH,), real), np.empty((WIDTH,), real)
             stack, waiting = np.empty((STACK,), np.int64), np.empty((STACK,), real)
             different = 0
@@ -158,18 +164,18 @@ def trace_collect(real: type, flat: bool) -> Kernel:
                 begin, end = hit_offsets[r], hit_offsets[r + 1]
                 if end - begin <= kept.shape[1]:
                     for k in range(end - begin):
-                        met[begin + k] = kept[r, k]
+                        met[begin + k] = kept[r // BLOCK, k, r % BLOCK]
                 else:
                     o, d, inverse, _, _ = ray(origins, directions, r)
                     first, first_id, place = near, 2147483647, begin
                     while place < end:
                         known = next_hits(
-                            o, d, inverse, leaves, order, boxes, offsets, first, first_id,
+                            o, d, inverse, leaves, order, boxes, offsets, first, first_id, LATER_CHUNK,
                             ts, ids, alphas, entries, squares, stack, waiting,
                         )  # fmt: skip
                         for k in range(min(known, end - place)):
                             met[place + k] = ids[k]
-                        first, first_id, place = ts[CHUNK - 1], ids[CHUNK - 1], place + CHUNK
+                        first, first_id, place = ts[LATER_CHUNK - 1], ids[LATER_CHUNK - 1], place + LATER_CHUNK
                 for place in range(begin, end):
                     g = met[place]
                     if seen[g] != block:
@@ -293,19 +299,18 @@ def sum_block_rows(real: type) -> Kernel:
     return total
 
 
-BLOCK = 64
-"""Rays per task."""
-
-
-MOST_KEPT, KEPT_BYTES = 64, 2**26
-"""Hits of a ray that the forward pass keeps at most, and bytes for those of all rays."""
+MOST_KEPT, KEPT_BYTES = 256, 2**27
+"""Hits of a ray that the forward pass keeps at most, and bytes for those of all rays, of which few are written to."""
 
 
 def trace(
     shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tensor],
     *, flat: bool, degree: int, near: float, learning: bool,
 ) -> tuple[Tensor, ...]:  # fmt: skip
-    """Fields of `Traced`, and [R, K] int32 each ray's nearest Gaussians for its gradients; degree -1 is no colour."""
+    """Fields of `Traced`, and [blocks, K, BLOCK] int32 each ray's nearest Gaussians for its gradients.
+
+    Degree -1 is no colour.
+    """
     origins = rays[0]
     count, real = origins.shape[0], REAL_OF[origins.dtype]
     num_kept = min(MOST_KEPT, KEPT_BYTES // (4 * max(count, 1))) if learning else 0
@@ -314,7 +319,7 @@ def trace(
         origins.new_empty(count),
         origins.new_empty(count),
         torch.empty(count, dtype=torch.int32),
-        torch.empty(count, num_kept, dtype=torch.int32),
+        torch.empty(-(-count // BLOCK), num_kept, BLOCK, dtype=torch.int32),
     )
     trace_forward(real, flat)(
         packed_leaves(shapes, bvh[0]),
@@ -344,27 +349,29 @@ def trace_forward(real: type, flat: bool) -> Kernel:
         stride = even_stride(num_blocks)
         for task in prange(num_blocks):
             block = task * stride % num_blocks
-            ts, found, ids = np.empty((CHUNK,), real), np.empty((CHUNK,), real), np.empty((CHUNK,), np.int32)
+            ts, found = np.empty((LATER_CHUNK,), real), np.empty((LATER_CHUNK,), real)
+            ids = np.empty((LATER_CHUNK,), np.int32)
             entries, squares = np.empty((WIDTH,), real), np.empty((WIDTH,), real)
             stack, waiting = np.empty((STACK,), np.int64), np.empty((STACK,), real)
             for r in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
                 o, d, inverse, length, usable = ray(origins, directions, r)
                 red = green = blue = depth = zero
                 left, blended = one, 0
-                first, first_id, known = near, 2147483647, CHUNK
-                while usable and known == CHUNK:
+                first, first_id, most, ended = near, 2147483647, CHUNK, not usable
+                while not ended:
                     known = next_hits(
-                        o, d, inverse, leaves, order, boxes, offsets, first, first_id,
+                        o, d, inverse, leaves, order, boxes, offsets, first, first_id, most,
                         ts, ids, found, entries, squares, stack, waiting,
                     )  # fmt: skip
+                    ended = known < most
                     for k in range(known):
                         after = left * (one - found[k])
                         if after < least:
-                            known = 0
+                            ended = True
                             break
                         g, weight = ids[k], found[k] * left
                         if blended < kept.shape[1]:
-                            kept[r, blended] = g
+                            kept[block, blended, r - block * BLOCK] = g
                         if degree >= 0:
                             x, y, z = d[0] / length, d[1] / length, d[2] / length
                             c = color(sh, g, degree, x, y, z)
@@ -373,7 +380,7 @@ def trace_forward(real: type, flat: bool) -> Kernel:
                             blue += weight * max(c[2] + half, zero)
                         depth += weight * (ts[k] * length)
                         left, blended = after, blended + 1
-                    first, first_id = ts[CHUNK - 1], ids[CHUNK - 1]
+                    first, first_id, most = ts[most - 1], ids[most - 1], LATER_CHUNK
                 colors[r, 0], colors[r, 1], colors[r, 2] = red, green, blue
                 alphas[r], depths[r], hits[r] = one - left, depth, blended
 

@@ -1,7 +1,7 @@
 """Finding a ray's next hits, front to back, through the hierarchy of boxes.
 
-Each search returns the nearest `CHUNK` hits beyond the last one that is known, ordered by (t, Gaussian), and leaves out
-boxes that begin behind the farthest of those found so far (Knoll et al. 2019; EnvGS, Section 4.2).
+Each search returns the nearest hits beyond the last one that is known, ordered by (t, Gaussian), and leaves out boxes
+that begin behind the farthest of those found so far (Knoll et al. 2019; EnvGS, Section 4.2).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from glassplat.kernels.backend.cpu_vector import bits_of, lowest_bit, maximum, m
 from glassplat.kernels.maths.blending import Scalar, blend_maths
 from glassplat.kernels.maths.disc import EDGE_ON, MOST_DEVIATIONS
 from glassplat.kernels.records import REAL_OF
-from glassplat.kernels.trace.steps import CHUNK, LEVEL_BITS, NODE, SLACK, WIDTH, coverage_maths, insert
+from glassplat.kernels.trace.steps import LEVEL_BITS, NODE, SLACK, WIDTH, coverage_maths, insert
 
 LEAF = 13 * WIDTH
 """Numbers of what a node of the lowest level holds: means, rows of frames and opacities, each for all its places."""
@@ -145,14 +145,14 @@ def packed_leaves(shapes: Sequence[Tensor], order: Tensor) -> NDArray[Any]:
 
 
 def next_hits_maths(real: type, flat: bool) -> Scalar:
-    """Builds `next_hits`, which fills (ts, ids, alphas) with a ray's next hits and returns their number."""
+    """Builds `next_hits`, which fills (ts, ids, alphas) with at most `most` next hits of a ray and returns how many."""
     enter, meet = _entry(real), _lanes(real, flat)
     coverage = coverage_maths(real, blend_maths(real).exp2)
     zero, nowhere, sooner = real(0.0), real("inf"), real(1.0 - SLACK)
 
     @inlined
     def next_hits(  # type: ignore[no-untyped-def]
-        o, d, inverse, leaves, order, boxes, offsets, first, first_id, ts, ids, alphas,
+        o, d, inverse, leaves, order, boxes, offsets, first, first_id, most, ts, ids, alphas,
         entries, squares, stack, waiting,
     ):  # fmt: skip
         count, top = 0, 0
@@ -191,9 +191,9 @@ def next_hits_maths(real: type, flat: bool) -> Scalar:
                     continue
                 _, alpha = coverage(leaves[node * LEAF + 12 * WIDTH + k], squares[k])
                 if alpha > zero:
-                    count = insert(ts, ids, alphas, count, t, g, alpha)
-                    if count == CHUNK:
-                        farthest, farthest_id = ts[CHUNK - 1], ids[CHUNK - 1]
+                    count = insert(ts, ids, alphas, count, most, t, g, alpha)
+                    if count == most:
+                        farthest, farthest_id = ts[most - 1], ids[most - 1]
         return count
 
     return next_hits

@@ -202,7 +202,7 @@ def next_hits_maths(real: type, flat: bool) -> Scalar:
                     continue
                 _, alpha = coverage(opacities[g], squared)
                 if alpha > zero:
-                    count = insert(ts, ids, alphas, count, t, g, alpha)
+                    count = insert(ts, ids, alphas, count, CHUNK, t, g, alpha)
                     if count == CHUNK:
                         farthest, farthest_id = ts[CHUNK - 1], ids[CHUNK - 1]
         return count

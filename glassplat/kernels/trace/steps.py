@@ -10,7 +10,7 @@ from glassplat.kernels.maths.disc import MOST_DEVIATIONS
 from glassplat.kernels.maths.harmonics import color_maths
 
 CHUNK = 16
-"""Hits that a search returns at most."""
+"""Hits that a ray's first search returns at most."""
 WIDTH = 8
 """Children of a node."""
 NODE = 6 * WIDTH
@@ -103,11 +103,11 @@ def color_backward(real: type) -> Scalar:
 
 
 @inlined
-def insert(ts, ids, alphas, count, t, g, alpha):  # type: ignore[no-untyped-def]
-    """Puts a hit in its place among the nearest, ordered by (t, Gaussian); returns how many there are."""
-    place = count if count < CHUNK else CHUNK - 1
+def insert(ts, ids, alphas, count, most, t, g, alpha):  # type: ignore[no-untyped-def]
+    """Puts a hit in its place among the `most` nearest, ordered by (t, Gaussian); returns how many there are."""
+    place = count if count < most else most - 1
     while place > 0 and (ts[place - 1] > t or (ts[place - 1] == t and ids[place - 1] > g)):
         ts[place], ids[place], alphas[place] = ts[place - 1], ids[place - 1], alphas[place - 1]
         place -= 1
     ts[place], ids[place], alphas[place] = t, g, alpha
-    return count + 1 if count < CHUNK else count
+    return count + 1 if count < most else count
