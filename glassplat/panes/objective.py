@@ -93,6 +93,8 @@ def _turns(planes: PlaneEquations, outward: Array) -> Array:
     Its sign is that against the side across which most edges lie, whatever axes the plane has: with another sign after
     a small move there would be no slope to follow.
     """
+    if not outward.shape[1]:
+        return np.zeros(outward.shape[:2])
     first, second = in_plane_axes(planes)
     along, across = np.einsum("hpd,hd->hp", outward, first), np.einsum("hpd,hd->hp", outward, second)
     twofold = (along + 1j * across) ** 2
@@ -191,6 +193,8 @@ USUAL_FRAME, FRAME_WEIGHT = 0.02, 0.01
 """Height of a frame over its glass that is not unlikely, scene extents, and the weight of that against the edges."""
 EDGES = 600
 """Edge points that are followed, in all views together."""
+MOST_EDGES = 4 * EDGES
+"""The same of all panes in one plane."""
 PIXELS = 600
 """Pixels whose rays are followed to compare masks, in all views together."""
 
@@ -308,8 +312,9 @@ class JointObjective:
         return self._mean([part.reach(planes) for part in self.parts])
 
     def terms(self, planes: FramedPlanes, tolerance: float, *, edges: int = EDGES) -> Terms:
-        """The residuals of H planes; as `Objective.terms`, with so many edge points for each pane."""
-        terms = [part.terms(planes, tolerance, edges=edges) for part in self.parts]
+        """The residuals of H planes; as `Objective.terms`, with so many edge points for each pane, or fewer of many."""
+        each = edges * min(len(self.parts), MOST_EDGES // EDGES) // len(self.parts)
+        terms = [part.terms(planes, tolerance, edges=each) for part in self.parts]
         return Terms(
             np.concatenate([term.residuals for term in terms], axis=1),
             np.concatenate([term.weights for term in terms], axis=1) / len(terms),

@@ -159,6 +159,8 @@ ROUNDS = ((0.3, 0.1, 2 * COARSE), (0.1, 0.03, COARSE))
 """Spread of these (radians, distances of the cameras from the pane) and tolerance of the edges, for each round."""
 SHAKE = (0.03, 0.01, MIDDLE)
 """The same for the last round, between two refinements."""
+MOST_STARTS = 6
+"""Planes from which that of several panes is looked for."""
 FRAME_SPREAD = 0.5
 """Standard deviation of the logarithm of the height of frames in each round."""
 COARSE_EDGES = 200
@@ -201,10 +203,11 @@ def best_joint_plane(objective: JointObjective, starts: FramedPlanes, rng: np.ra
 
     Args:
         objective: what is known about the panes.
-        starts: the plane of each, fitted alone.
+        starts: the plane of each, fitted alone; of many, those are followed on which all masks coincide best.
         rng: source of randomness.
     """
-    beam = starts
+    costs = contradiction(starts, objective, (COARSE,), edges=COARSE_EDGES) if len(starts) > MOST_STARTS else None
+    beam = starts if costs is None else starts.select(np.argsort(costs, kind="stable")[:MOST_STARTS])
     for tilt, shift, tolerance in (*ROUNDS[1:], SHAKE):
         beam = join_planes([beam, _follow_beam(beam, objective, (tilt, shift), tolerance, rng)])
     finished = _possible(refine_planes(beam, objective, (COARSE, MIDDLE, FINE)), objective)

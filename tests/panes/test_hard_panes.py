@@ -1,6 +1,7 @@
 """Planes of panes that are hard to measure: few, ragged or oversized masks, bare frames, steep views, cut outlines."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import torch
 
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.fit import fit_planes
+from glassplat.panes.objective import JointObjective, Terms
 from glassplat.scene.camera import Camera, rotation_from_quat
 from tests.panes.pane_scene import (
     EYES,
@@ -207,6 +209,38 @@ def test_an_ill_measured_pane_of_a_front_is_placed_by_all_masks_together() -> No
     assert normal_error(alone, 0, panes[1]) > 1
     assert normal_error(together, 1, panes[1]) < 0.7
     torch.testing.assert_close(together.normals[0], together.normals[1])
+
+
+def muntined(columns: int, rows: int) -> list[Pane]:
+    """A shop front of panes that touch."""
+    half = 0.8 / columns, 0.5 / rows
+    places = [(x, y) for y in range(rows) for x in range(columns)]
+    middles = [
+        FRONT.at(np.array([(2 * x + 1) / columns - 1]), np.array([(2 * y + 1) / rows - 1]))[0] for x, y in places
+    ]
+    return [replace(FRONT, center=middle, half_sizes=half) for middle in middles]
+
+
+def test_a_front_of_many_panes_lies_in_one_plane_found_by_steps_no_larger_than_those_of_few(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    terms, work = JointObjective.terms, []
+
+    def counted(*arguments: Any, **options: Any) -> Terms:
+        found = terms(*arguments, **options)
+        work.append(found.residuals.size)
+        return found
+
+    monkeypatch.setattr(JointObjective, "terms", counted)
+    largest = {}
+    for columns in (2, 4):
+        panes = muntined(columns, 3)
+        planes = fit_planes(BARE, scene_of(panes, (*EYES, (0.3, 0.6, -1.1))), extent=EXTENT, options=QUICK)
+        assert max(normal_error(planes, index, FRONT) for index in range(len(panes))) < 0.5
+        torch.testing.assert_close(planes.normals, planes.normals[:1].expand_as(planes.normals))
+        largest[columns] = max(work)
+        work.clear()
+    assert largest[4] < 1.1 * largest[2]
 
 
 def test_panes_that_are_turned_against_each_other_keep_planes_of_their_own() -> None:
