@@ -23,7 +23,7 @@ from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.material import virtual_points
 from glassplat.prepare.report_page import write_page
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.panes import Planes
+from glassplat.scene.panes import Planes, name_labels
 from glassplat.scene.scene import Scene
 from glassplat.training.checkpoint import recorded
 
@@ -79,8 +79,8 @@ def _describe_panes(path: Path, dataset: Dataset) -> Finding:
         return finding
     given = () if dataset.planes is None else dataset.planes.labels
     labels = sorted({*dataset.pane_labels, *given})
-    finding.facts["panes"] = f"{', '.join(map(str, labels))}; masks of {annotated} training photographs" + (
-        f", planes.json gives {', '.join(map(str, given))}" if given else ""
+    finding.facts["panes"] = f"{name_labels(labels)}; masks of {annotated} training photographs" + (
+        f", planes.json gives {name_labels(given)}" if given else ""
     )
     if annotated < FEW_MASKS and not given:
         finding.problems.append(f"{annotated} masks are few; three to ten, from places well apart, do better")

@@ -32,7 +32,7 @@ from glassplat.render.splat import Splat
 from glassplat.scene import logit
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import mirrored_gaussians
-from glassplat.scene.panes import Planes, coplanar_groups
+from glassplat.scene.panes import Planes, coplanar_groups, name_labels
 from glassplat.scene.scene import Scene, glass_gaussians
 from glassplat.training.actions import (
     MOST_ADDED,
@@ -126,7 +126,7 @@ class PaneSetup:
         judged = yield from judged_panes(scene, dataset, untold)
         alike = mirrors_among(scene.planes, judged)
         mirrors = tuple(dict.fromkeys((*given.mirrors, *(self.fit.mirror_labels or alike))))
-        log.info("mirrors among the panes: %s", ", ".join(map(str, mirrors)) or "none")
+        log.info("mirrors among the panes: %s", name_labels(mirrors) or "none")
         aligned = [judged[label].pane for label in alike if label in mirrors]
         return with_mirrors(with_poses_of(scene.planes, aligned), mirrors, self.fit.mirror_reflectance)
 
@@ -235,9 +235,8 @@ def surfaces(planes: Planes, *, mirrors: bool) -> list[Planes]:
 
 
 def name_panes(panes: Planes, kind: str) -> str:
-    """Name of panes in messages: "pane 2", "panes 2, 3"."""
-    labels = ", ".join(map(str, sorted(panes.labels)))
-    return f"{kind}s {labels}" if len(panes) > 1 else f"{kind} {labels}"
+    """Name of panes in messages: "pane 2", "panes 2, 3", "panes 1 to 24"."""
+    return f"{kind}s {name_labels(panes.labels)}" if len(panes) > 1 else f"{kind} {name_labels(panes.labels)}"
 
 
 def reflects_little(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Work:

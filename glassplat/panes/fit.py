@@ -39,7 +39,7 @@ from glassplat.panes.search import (
 )
 from glassplat.scene import logit
 from glassplat.scene.camera import Camera, NumpyCamera
-from glassplat.scene.panes import Planes, linked_groups
+from glassplat.scene.panes import Planes, linked_groups, name_labels
 
 Array = NDArray[np.float64]
 log = logging.getLogger("glassplat.panes")
@@ -382,7 +382,7 @@ def _joint(panes: Sequence[_Found], seed: int) -> list[_Found]:
         plane = best_joint_plane(objective, join_planes([pane.plane for pane in panes]), rng)
         losses = [_loss(pane, plane) for pane in panes]
         if max(losses) <= MOST_LOSS:
-            labels, turned = ", ".join(str(pane.label) for pane in panes), max(angle(p.plane, plane) for p in panes)
+            labels, turned = name_labels(pane.label for pane in panes), max(angle(p.plane, plane) for p in panes)
             log.info("panes %s lie in one plane, within %.2f degrees", labels, np.degrees(turned))
             return [replace(pane, plane=plane, is_settled=True) for pane in panes]
         del panes[int(np.argmax(losses))]

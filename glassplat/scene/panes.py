@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -16,6 +16,19 @@ LEAST_SINE = 1e-6
 """Of the angle between a pane's normal and its tangent."""
 HIGHEST_LABEL = 255
 PANE_TENSORS = ("centers", "raw_normals", "logit_reflectances", "log_transmittances")
+LONGEST_LIST = 3
+"""Labels that follow each other, of which messages name every one."""
+
+
+def name_labels(labels: Iterable[int]) -> str:
+    """Labels in order, as messages name them: "2, 3, 5", "1 to 24, 30"."""
+    runs: list[list[int]] = []
+    for label in sorted(labels):
+        if runs and label == runs[-1][-1] + 1:
+            runs[-1].append(label)
+        else:
+            runs.append([label])
+    return ", ".join(f"{run[0]} to {run[-1]}" if len(run) > LONGEST_LIST else ", ".join(map(str, run)) for run in runs)
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
+import pytest
 import torch
 
-from glassplat.scene.panes import Planes, coplanar_groups
+from glassplat.scene.panes import Planes, coplanar_groups, name_labels
 
 
 def at(x: float, offset: float = 0.0, turn_deg: float = 0.0, half: float = 0.5, label: int = 1) -> Planes:
@@ -41,3 +42,10 @@ def test_a_third_pane_joins_two_that_are_too_far_apart_for_their_angle() -> None
     planes = front(at(0.0), at(2.0, offset=0.03, turn_deg=0.0), at(1.0, offset=0.015))
     assert coplanar_groups(planes, [0, 1]) == [[0], [1]]
     assert coplanar_groups(planes, range(3)) == [[0, 1, 2]]
+
+
+@pytest.mark.parametrize(
+    ("labels", "named"), [((), ""), ((4,), "4"), ((3, 1, 2), "1, 2, 3"), ((2, 3, 4, 5, 9, 8, 1), "1 to 5, 8, 9")]
+)
+def test_labels_that_follow_each_other_are_named_together(labels: tuple[int, ...], named: str) -> None:
+    assert name_labels(labels) == named
