@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from glassplat.captures.view import View, evenly
+from glassplat.kernels.adam import Update, adam
 from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.render.layers import gather_pixels, gathered_mirrored, window_means, window_sums
-from glassplat.render.planar import Planar
+from glassplat.render.planar import FirstPass, Planar
 from glassplat.render.splat import Splat
 from glassplat.scene import SH_ZERO, logit
 from glassplat.scene.camera import Camera, mirror_matrices
@@ -212,19 +213,19 @@ def aligned_pane(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> 
         scene: with one pane.
         telling: photographs, and the pixels [H, W] of each that are compared.
     """
-    start = tilted_best(scene, telling[:: max(1, len(telling) // TILT_PHOTOGRAPHS)])
-    offsets = start.clone().requires_grad_()
-    optimizer = torch.optim.Adam([offsets], lr=ALIGN_RATE)
+    offsets = tilted_best(scene, telling[:: max(1, len(telling) // TILT_PHOTOGRAPHS)])
+    moments, taken = (torch.zeros_like(offsets), torch.zeros_like(offsets)), 0
     for step in range(ALIGN_STEPS):
+        moving = offsets.clone().requires_grad_()
         # Strides that share no factor with the number visit all of them, neighbours far apart.
-        like = agreement(moved_pane(scene, offsets), *telling[step * 7919 % len(telling)])
+        like = agreement(moved_pane(scene, moving), *telling[step * 7919 % len(telling)])
         if not like.requires_grad:
             continue
-        optimizer.zero_grad()
-        (-like).backward()
-        optimizer.step()
-        optimizer.param_groups[0]["lr"] = ALIGN_RATE * (1 - step / ALIGN_STEPS)
-    aligned = moved_pane(scene, offsets.detach())
+        (slope,) = torch.autograd.grad(-like, moving)
+        taken += 1
+        # Not `torch.optim`, whose first optimiser imports PyTorch's compiler, which takes longer than all of this.
+        adam([Update(offsets, slope, *moments, ALIGN_RATE * (1 - step / ALIGN_STEPS), taken)], eps=1e-8)
+    aligned = moved_pane(scene, offsets)
     return aligned if agrees_better(aligned, scene, telling) else scene
 
 
@@ -238,7 +239,7 @@ def polished_pane(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) ->
     some = telling[:: max(1, len(telling) // POLISH_PHOTOGRAPHS)]
 
     def agreed(offsets: Tensor) -> float:
-        return mean_agreement(moved_pane(scene, offsets), some)
+        return mean_agreements([moved_pane(scene, offsets)], some)[0]
 
     best = scene.primary.means.new_zeros(3)
     most, axes = agreed(best), torch.eye(3).to(best)
@@ -256,7 +257,7 @@ def polished_pane(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) ->
 @torch.no_grad()
 def agrees_better(aligned: Scene, fitted: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> bool:
     """Return whether photographs agree so much better with the aligned pane that the fitted plane must be wrong."""
-    found = (mean_agreement(scene, telling) for scene in (aligned, fitted))
+    found = mean_agreements([aligned, fitted], telling)
     # By Fisher's transform, from 0.9 to 0.97 is as far as from 0.3 to 0.7.
     other, own = (math.atanh(max(-PERFECT, min(value, PERFECT))) for value in found)
     return other > LEAST_GAIN_OF_ALIGNING * own
@@ -268,7 +269,8 @@ def tilted_best(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> T
     means = scene.primary.means
     tilts = [math.radians(degrees) for degrees in TILTS_DEG]
     candidates = [means.new_tensor([first, second, 0.0]) for first in tilts for second in tilts]
-    return max(candidates, key=lambda offsets: mean_agreement(moved_pane(scene, offsets), telling))
+    found = mean_agreements([moved_pane(scene, offsets) for offsets in candidates], telling)
+    return candidates[found.index(max(found))]
 
 
 def moved_pane(scene: Scene, offsets: Tensor) -> Scene:
@@ -291,20 +293,32 @@ def moved_pane(scene: Scene, offsets: Tensor) -> Scene:
     )
 
 
-def agreement(scene: Scene, photograph: Photograph, region: Tensor) -> Tensor:
-    """Correlation of what the scene's only pane mirrors with the photograph, over a region [H, W]."""
-    mirrored = Planar(BLACK, intensity=False, reflection_gradient="planes")(scene, photograph.camera)
-    first, second = (
-        about_local_mean(image, region)[region] for image in (mirrored.layers["reflection"], photograph.pixels)
-    )
-    tiny = torch.finfo(first.dtype).tiny
-    return (first * second).sum() / torch.sqrt(((first * first).sum() * (second * second).sum()).clamp(min=tiny))
+MIRRORING = Planar(BLACK, intensity=False, reflection_gradient="planes")
+"""Renders what a pane mirrors."""
+
+
+def agreement(scene: Scene, photograph: Photograph, region: Tensor, first: FirstPass | None = None) -> Tensor:
+    """Correlation of what the scene's only pane mirrors with the photograph, over a region [H, W].
+
+    `first` is what is seen directly, if that is known already.
+    """
+    (mirrored,) = MIRRORING.reflections(scene, photograph.camera, (BLACK,), first)
+    one, other = (about_local_mean(image, region)[region] for image in (mirrored, photograph.pixels))
+    tiny = torch.finfo(one.dtype).tiny
+    return (one * other).sum() / torch.sqrt(((one * one).sum() * (other * other).sum()).clamp(min=tiny))
 
 
 @torch.no_grad()
-def mean_agreement(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> float:
-    """Mean of `agreement` over photographs, each with its region [H, W]; at least one."""
-    return sum(float(agreement(scene, *one)) for one in telling) / len(telling)
+def mean_agreements(scenes: Sequence[Scene], telling: Sequence[tuple[Photograph, Tensor]]) -> list[float]:
+    """Mean of `agreement` over photographs, each with its region [H, W], at least one: of each of several scenes that
+    differ in where their only pane stands.
+    """
+    sums = [0.0] * len(scenes)
+    for photograph, region in telling:
+        first = MIRRORING.first_pass(scenes[0], photograph.camera)
+        for number, scene in enumerate(scenes):
+            sums[number] += float(agreement(scene, photograph, region, first))
+    return [total / len(telling) for total in sums]
 
 
 class MirroredImage(NamedTuple):
@@ -320,9 +334,7 @@ class MirroredImage(NamedTuple):
 
 def mirrored_image(scene: Scene, camera: Camera) -> MirroredImage:
     """Renders before black and before white, whose difference is what is not covered."""
-    before_black, before_white = (
-        Planar(background=color, intensity=False)(scene, camera).layers["reflection"] for color in (BLACK, WHITE)
-    )
+    before_black, before_white = Planar(intensity=False).reflections(scene, camera, (BLACK, WHITE))
     seen = before_white.amax(dim=-1) > 0
     return MirroredImage(before_black, torch.where(seen, 1 - (before_white - before_black).mean(dim=-1), 0), seen)
 

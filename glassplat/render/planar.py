@@ -15,7 +15,7 @@ from glassplat.kernels.panes import layer_slopes, slopes_at
 from glassplat.kernels.project import GradientSum
 from glassplat.kernels.records import Deviation, PaneHits, Panes, Splats
 from glassplat.kernels.tiles import bin_tiles
-from glassplat.options import Blend
+from glassplat.options import BLACK, Blend, Rgb
 from glassplat.render.frame import (
     NEAR_PER_EXTENT,
     Drawing,
@@ -77,9 +77,10 @@ class FirstPass(NamedTuple):
 
 
 class SecondPass(NamedTuple):
-    """Images in the panes: colours and intensity minus 1 [K, H, W, 4] of each."""
+    """Images in the panes: colours and intensity minus 1 [K, H, W, 4] of each, and their coverage [K, H, W]."""
 
     reflections: Tensor
+    alpha: Tensor
     mirrored: Tensor
     screen: tuple[ScreenPass, ...]
 
@@ -145,14 +146,11 @@ class Planar:
         """
         check_panes(scene)
         camera = camera.to(scene.primary.means.device)
-        rectangles = panes_in_camera(scene.planes, camera)
-        first = self._first_pass(scene, camera, rectangles, with_absgrad)
+        first, hits, seen = self._direct(scene, camera, with_absgrad=with_absgrad)
         layers = {"without_panes": first.image, "depth": first.depth, "alpha": first.alpha, "mask": first.mask}
-        hits = nearest_hits(rectangles, camera, first.mask)
         layers["pane"] = hits.pane
         if first.deviation is not None:
             layers["deviation"] = first.deviation
-        seen = seen_panes(scene.planes, camera, hits, first.mask, most=1 if self.nearest_only else None)
         if seen is None:
             nothing = torch.zeros_like(first.mask)
             layers |= {"transmission": first.image, "reflection": torch.zeros_like(first.image)}
@@ -169,6 +167,29 @@ class Planar:
             layers["tint"] = tint_of_panes(seen, masks, seen.planes.transmittances)
         screen = self._screen(first, second, hits, result) if with_absgrad else ()
         return Frame(result.rgb, layers, first.direct, second.mirrored, screen)
+
+    def reflections(
+        self, scene: Scene, camera: Camera, backgrounds: Sequence[Rgb], first: FirstPass | None = None
+    ) -> list[Tensor]:
+        """The layer `reflection` [H, W, 3] before each of several backgrounds.
+
+        `first` is what is seen directly, if that is known already.
+        """
+        check_panes(scene)
+        camera = camera.to(scene.primary.means.device)
+        first, _, seen = self._direct(scene, camera, first=first)
+        if seen is None:
+            return [torch.zeros_like(first.image) for _ in backgrounds]
+        second = replace(self, background=BLACK)._second_pass(scene, camera, seen, False, first.total)
+        masks = self._visibilities(scene, camera, seen, first)
+        images = (over_background(second.reflections, second.alpha, (*color, 0.0)) for color in backgrounds)
+        passes = (second._replace(reflections=image) for image in images)
+        return [self._composite_panes(first, seen, masks, one, camera).reflection for one in passes]
+
+    def first_pass(self, scene: Scene, camera: Camera) -> FirstPass:
+        """What is seen directly: the same wherever the planes of the panes are."""
+        camera = camera.to(scene.primary.means.device)
+        return self._direct(scene, camera)[0]
 
     def check(self, scene: Scene) -> None:
         """Raises ValueError where a scene lacks colours, or its panes what they need; there may be no panes."""
@@ -196,6 +217,15 @@ class Planar:
             "intensity": self.intensity,
             "nearest": self.nearest_only,
         }
+
+    def _direct(
+        self, scene: Scene, camera: Camera, *, with_absgrad: bool = False, first: FirstPass | None = None
+    ) -> tuple[FirstPass, PaneHits, SeenPanes | None]:
+        """What is seen directly, the nearest panes, and all that are visible; None where none is."""
+        rectangles = panes_in_camera(scene.planes, camera)
+        first = self._first_pass(scene, camera, rectangles, with_absgrad) if first is None else first
+        hits = nearest_hits(rectangles, camera, first.mask)
+        return first, hits, seen_panes(scene.planes, camera, hits, first.mask, most=1 if self.nearest_only else None)
 
     def _first_pass(self, scene: Scene, camera: Camera, rectangles: Panes, with_absgrad: bool) -> FirstPass:
         near, total = NEAR_PER_EXTENT * scene.extent, GradientSum()
@@ -260,7 +290,7 @@ class Planar:
         bins = bin_tiles(splats, camera.width, camera.height, seen.tiles)
         result = composite(splats, channels, bins, absgrad=joined_absgrad(screen))
         reflections = over_background(result.image, result.alpha, (*self.background, 0.0))
-        return SecondPass(reflections, reaches_pixel(projected), screen)
+        return SecondPass(reflections, result.alpha, reaches_pixel(projected), screen)
 
     def _composite_panes(
         self, first: FirstPass, seen: SeenPanes, masks: Sequence[Tensor], second: SecondPass, camera: Camera
