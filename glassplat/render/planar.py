@@ -187,7 +187,7 @@ class Planar:
         return [self._composite_panes(first, seen, masks, one, camera).reflection for one in passes]
 
     def first_pass(self, scene: Scene, camera: Camera) -> FirstPass:
-        """What is seen directly: the same wherever the planes of the panes are."""
+        """The first pass: all that is seen directly, the same wherever the planes of the panes are."""
         camera = camera.to(scene.primary.means.device)
         return self._direct(scene, camera)[0]
 
@@ -221,7 +221,7 @@ class Planar:
     def _direct(
         self, scene: Scene, camera: Camera, *, with_absgrad: bool = False, first: FirstPass | None = None
     ) -> tuple[FirstPass, PaneHits, SeenPanes | None]:
-        """What is seen directly, the nearest panes, and all that are visible; None where none is."""
+        """The first pass, the nearest panes, and all panes that are visible, None if there are none."""
         rectangles = panes_in_camera(scene.planes, camera)
         first = self._first_pass(scene, camera, rectangles, with_absgrad) if first is None else first
         hits = nearest_hits(rectangles, camera, first.mask)
