@@ -113,6 +113,17 @@ class Photograph(NamedTuple):
     labels: Tensor | None
 
 
+class ComparedPart(NamedTuple):
+    """A part of a photograph in which a pane may mirror.
+
+    camera: of the photograph; region [H, W] bool; pixels [P, 3] of the region, about their local means.
+    """
+
+    camera: Camera
+    region: Tensor
+    pixels: Tensor
+
+
 def photographs_of(scene: Scene, views: Sequence[View]) -> list[Photograph]:
     """At most `MOST_PHOTOGRAPHS` of the views, evenly spread, none wider than `REDUCED_WIDTH`."""
     return [reduced_photograph(scene, view) for view in evenly(views, MOST_PHOTOGRAPHS)]
@@ -153,7 +164,7 @@ def judged_pane(scene: Scene, label: int, photographs: Sequence[Photograph]) -> 
     fitted = replace(scene, planes=replace(pane, half_sizes=INNER_SHARE * pane.half_sizes))
     regions = [compared_region(fitted, photograph) for photograph in photographs]
     telling = [
-        (photograph, region)
+        ComparedPart(photograph.camera, region, about_local_mean(photograph.pixels, region)[region])
         for photograph, region in zip(photographs, regions, strict=True)
         if int(region.sum()) >= FEWEST_IN_VIEW
     ]
@@ -206,19 +217,19 @@ def compared_pixels(scene: Scene, photograph: Photograph) -> tuple[Tensor, Tenso
     return first, second, int(shown.sum())
 
 
-def aligned_pane(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> Scene:
+def aligned_pane(scene: Scene, telling: Sequence[ComparedPart]) -> Scene:
     """The scene with its only pane turned and shifted to where it is most like a mirror; itself if that gains little.
 
     Args:
         scene: with one pane.
-        telling: photographs, and the pixels [H, W] of each that are compared.
+        telling: parts of photographs to compare it with.
     """
     offsets = tilted_best(scene, telling[:: max(1, len(telling) // TILT_PHOTOGRAPHS)])
     moments, taken = (torch.zeros_like(offsets), torch.zeros_like(offsets)), 0
     for step in range(ALIGN_STEPS):
         moving = offsets.clone().requires_grad_()
         # Strides that share no factor with the number visit all of them, neighbours far apart.
-        like = agreement(moved_pane(scene, moving), *telling[step * 7919 % len(telling)])
+        like = agreement(moved_pane(scene, moving), telling[step * 7919 % len(telling)])
         if not like.requires_grad:
             continue
         (slope,) = torch.autograd.grad(-like, moving)
@@ -230,7 +241,7 @@ def aligned_pane(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> 
 
 
 @torch.no_grad()
-def polished_pane(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> Scene:
+def polished_pane(scene: Scene, telling: Sequence[ComparedPart]) -> Scene:
     """The scene with its only pane where photographs agree best nearby: ever smaller steps along one axis at a time.
 
     Gradient ascent, one photograph a step, leaves a mirror up to 2 % of the extent away from that place, and training
@@ -255,7 +266,7 @@ def polished_pane(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) ->
 
 
 @torch.no_grad()
-def agrees_better(aligned: Scene, fitted: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> bool:
+def agrees_better(aligned: Scene, fitted: Scene, telling: Sequence[ComparedPart]) -> bool:
     """Return whether photographs agree so much better with the aligned pane that the fitted plane must be wrong."""
     found = mean_agreements([aligned, fitted], telling)
     # By Fisher's transform, from 0.9 to 0.97 is as far as from 0.3 to 0.7.
@@ -264,7 +275,7 @@ def agrees_better(aligned: Scene, fitted: Scene, telling: Sequence[tuple[Photogr
 
 
 @torch.no_grad()
-def tilted_best(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> Tensor:
+def tilted_best(scene: Scene, telling: Sequence[ComparedPart]) -> Tensor:
     """[3] the offsets of `moved_pane` whose tilts, of those in `TILTS_DEG`, agree best with photographs."""
     means = scene.primary.means
     tilts = [math.radians(degrees) for degrees in TILTS_DEG]
@@ -297,27 +308,27 @@ MIRRORING = Planar(BLACK, intensity=False, reflection_gradient="planes")
 """Renders what a pane mirrors."""
 
 
-def agreement(scene: Scene, photograph: Photograph, region: Tensor, first: FirstPass | None = None) -> Tensor:
-    """Correlation of what the scene's only pane mirrors with the photograph, over a region [H, W].
+def agreement(scene: Scene, part: ComparedPart, first: FirstPass | None = None) -> Tensor:
+    """Correlation of what the scene's only pane mirrors with a part of a photograph.
 
     `first` is what is seen directly, if that is known already.
     """
-    (mirrored,) = MIRRORING.reflections(scene, photograph.camera, (BLACK,), first)
-    one, other = (about_local_mean(image, region)[region] for image in (mirrored, photograph.pixels))
+    (mirrored,) = MIRRORING.reflections(scene, part.camera, (BLACK,), first)
+    one, other = about_local_mean(mirrored, part.region)[part.region], part.pixels
     tiny = torch.finfo(one.dtype).tiny
     return (one * other).sum() / torch.sqrt(((one * one).sum() * (other * other).sum()).clamp(min=tiny))
 
 
 @torch.no_grad()
-def mean_agreements(scenes: Sequence[Scene], telling: Sequence[tuple[Photograph, Tensor]]) -> list[float]:
-    """Mean of `agreement` over photographs, each with its region [H, W], at least one: of each of several scenes that
-    differ in where their only pane stands.
+def mean_agreements(scenes: Sequence[Scene], telling: Sequence[ComparedPart]) -> list[float]:
+    """Mean of `agreement` over parts of photographs, at least one: of each of several scenes that differ in where their
+    only pane stands.
     """
     sums = [0.0] * len(scenes)
-    for photograph, region in telling:
-        first = MIRRORING.first_pass(scenes[0], photograph.camera)
+    for part in telling:
+        first = MIRRORING.first_pass(scenes[0], part.camera)
         for number, scene in enumerate(scenes):
-            sums[number] += float(agreement(scene, photograph, region, first))
+            sums[number] += float(agreement(scene, part, first))
     return [total / len(telling) for total in sums]
 
 
