@@ -78,8 +78,8 @@ def _describe_panes(path: Path, dataset: Dataset) -> Finding:
         finding.next.append(f"glassplat train splat --data {shell_word(path)} --output RUN    needs none")
         return finding
     given = () if dataset.planes is None else dataset.planes.labels
-    labels = sorted({*dataset.pane_labels, *given})
-    finding.facts["panes"] = f"{name_labels(labels)}; masks of {annotated} training photographs" + (
+    labels = name_labels((*dataset.pane_labels, *given))
+    finding.facts["panes"] = f"{labels}; masks of {annotated} training photographs" + (
         f", planes.json gives {name_labels(given)}" if given else ""
     )
     if annotated < FEW_MASKS and not given:

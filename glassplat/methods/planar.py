@@ -236,7 +236,7 @@ def surfaces(planes: Planes, *, mirrors: bool) -> list[Planes]:
 
 def name_panes(panes: Planes, kind: str) -> str:
     """Name of panes in messages: "pane 2", "panes 2, 3", "panes 1 to 24"."""
-    return f"{kind}s {name_labels(panes.labels)}" if len(panes) > 1 else f"{kind} {name_labels(panes.labels)}"
+    return f"{kind}{'s' if len(panes) > 1 else ''} {name_labels(panes.labels)}"
 
 
 def reflects_little(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Work:
@@ -408,9 +408,7 @@ def first_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
         )
     known = (*dataset.pane_labels, *(() if dataset.planes is None else dataset.planes.labels))
     if unknown := [label for label in recipe.plane_fit.mirror_labels if label not in known]:
-        raise PlaneFitError(
-            f"plane_fit.mirror_labels names pane {unknown[0]}; expected some of {', '.join(map(str, known))}"
-        )
+        raise PlaneFitError(f"plane_fit.mirror_labels names pane {unknown[0]}; expected some of {name_labels(known)}")
     if dataset.measured_points:
         fitted_planes(dataset, None, recipe.plane_fit)
     scene = Scene(population_of(recipe).initial(dataset.points, recipe.sh_degree), dataset.extent)

@@ -193,8 +193,8 @@ USUAL_FRAME, FRAME_WEIGHT = 0.02, 0.01
 """Height of a frame over its glass that is not unlikely, scene extents, and the weight of that against the edges."""
 EDGES = 600
 """Edge points that are followed, in all views together."""
-MOST_EDGES = 4 * EDGES
-"""The same of all panes in one plane."""
+WHOLE_PARTS = 4
+"""Panes in one plane that have so many each; more of them share as many."""
 PIXELS = 600
 """Pixels whose rays are followed to compare masks, in all views together."""
 
@@ -313,7 +313,7 @@ class JointObjective:
 
     def terms(self, planes: FramedPlanes, tolerance: float, *, edges: int = EDGES) -> Terms:
         """The residuals of H planes; as `Objective.terms`, with so many edge points for each pane, or fewer of many."""
-        each = edges * min(len(self.parts), MOST_EDGES // EDGES) // len(self.parts)
+        each = edges * min(len(self.parts), WHOLE_PARTS) // len(self.parts)
         terms = [part.terms(planes, tolerance, edges=each) for part in self.parts]
         return Terms(
             np.concatenate([term.residuals for term in terms], axis=1),

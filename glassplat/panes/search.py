@@ -206,8 +206,10 @@ def best_joint_plane(objective: JointObjective, starts: FramedPlanes, rng: np.ra
         starts: the plane of each, fitted alone; of many, those are followed on which all masks coincide best.
         rng: source of randomness.
     """
-    costs = contradiction(starts, objective, (COARSE,), edges=COARSE_EDGES) if len(starts) > MOST_STARTS else None
-    beam = starts if costs is None else starts.select(np.argsort(costs, kind="stable")[:MOST_STARTS])
+    beam = starts
+    if len(starts) > MOST_STARTS:
+        costs = contradiction(starts, objective, (COARSE,), edges=COARSE_EDGES)
+        beam = starts.select(np.argsort(costs, kind="stable")[:MOST_STARTS])
     for tilt, shift, tolerance in (*ROUNDS[1:], SHAKE):
         beam = join_planes([beam, _follow_beam(beam, objective, (tilt, shift), tolerance, rng)])
     finished = _possible(refine_planes(beam, objective, (COARSE, MIDDLE, FINE)), objective)

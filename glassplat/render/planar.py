@@ -189,7 +189,7 @@ class Planar:
     def first_pass(self, scene: Scene, camera: Camera) -> FirstPass:
         """The first pass: all that is seen directly, the same wherever the planes of the panes are."""
         camera = camera.to(scene.primary.means.device)
-        return self._direct(scene, camera)[0]
+        return self._first_pass(scene, camera, panes_in_camera(scene.planes, camera), False)
 
     def check(self, scene: Scene) -> None:
         """Raises ValueError where a scene lacks colours, or its panes what they need; there may be no panes."""

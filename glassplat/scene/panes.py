@@ -21,9 +21,9 @@ LONGEST_LIST = 3
 
 
 def name_labels(labels: Iterable[int]) -> str:
-    """Labels in order, as messages name them: "2, 3, 5", "1 to 24, 30"."""
+    """Different labels in order, as messages name them: "2, 3, 5", "1 to 24, 30"."""
     runs: list[list[int]] = []
-    for label in sorted(labels):
+    for label in sorted(set(labels)):
         if runs and label == runs[-1][-1] + 1:
             runs[-1].append(label)
         else:

@@ -15,7 +15,7 @@ from glassplat.scene import among_known, logit
 from glassplat.scene.camera import quat_from_rotation, quat_product, rotation_from_quat
 from glassplat.scene.corrections import Direction, Exposures, PoseCorrections
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.panes import PANE_TENSORS, Planes, nearest_panes
+from glassplat.scene.panes import PANE_TENSORS, Planes, name_labels, nearest_panes
 
 ENVIRONMENT_TENSORS = ("raw",)
 FACES = 6
@@ -326,7 +326,7 @@ def row_of(planes: Planes, label: int) -> int:
         ValueError: there is none; lists the labels there are.
     """
     if label not in planes.labels:
-        there_are = f"the panes are {', '.join(map(str, sorted(planes.labels)))}" if len(planes) else "it has no panes"
+        there_are = f"the panes are {name_labels(planes.labels)}" if len(planes) else "it has no panes"
         raise ValueError(f"the scene has no pane {label}; {there_are}")
     return planes.labels.index(label)
 
