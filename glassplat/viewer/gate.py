@@ -14,16 +14,17 @@ import logging
 import re
 import threading
 from collections.abc import Callable, Mapping
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from http import HTTPStatus
 from typing import Any
 
 import msgspec
 import viser
 from websockets.asyncio import server as websockets_server
-from websockets.asyncio.server import ServerConnection
+from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
+from websockets.protocol import State
 
 from glassplat.access import Access, RefusedError
 from glassplat.errors import InputError
@@ -40,6 +41,8 @@ POSITION, TURN = Items(COORDINATE, 3), Items(Number(-MOST_TURN, MOST_TURN), 4)
 PAGE_PATH = re.compile(r"/|(/[\w@+-][\w@+.,-]{0,199}){1,8}", re.ASCII)
 """Path of a file of viser's page: no part begins with a dot, and nothing is escaped."""
 HEADERS = {"X-Frame-Options": "DENY", "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
+TURNS_TO_ANNOUNCE = 4
+"""Turns of asyncio's loop from accepting a connection until its handler runs."""
 _SERVE = threading.Lock()
 logger = logging.getLogger(__name__)
 
@@ -123,6 +126,29 @@ class GuardedConnection(ServerConnection):
         return message
 
 
+class GuardedServe(serve):
+    """A server that ends when every connection it has accepted is closed."""
+
+    async def __aexit__(self, *raised: Any) -> None:
+        """Accepts nothing more, drops what has asked for nothing yet, and closes the rest.
+
+        asyncio announces a connection some turns of its loop after it accepted it. If the server closes in between,
+        the socket is left to the garbage collector, which warns of it.
+        """
+        loop = asyncio.get_running_loop()
+        with suppress(NotImplementedError):  # Windows has no readers to remove.
+            for listening in self.server.sockets:
+                loop.remove_reader(listening.fileno())
+        for _ in range(TURNS_TO_ANNOUNCE):
+            await asyncio.sleep(0)
+        idle = {by: task for by, task in self.server.handlers.items() if by.protocol.state is State.CONNECTING}
+        for connection, task in idle.items():
+            connection.transport.abort()
+            task.cancel()
+        self.server.close()
+        await self.server.wait_closed()
+
+
 def admission(access: Access, page: Callable[..., Any] | None) -> Callable[[ServerConnection, Request], Any]:
     """A function for `process_request` that answers with `page` whoever may come in, and refuses others."""
 
@@ -177,21 +203,21 @@ def guarded_server(access: Access, *, host: str, port: int, title: str) -> viser
     """
     made: list[str] = []
     with _SERVE, redirect_stdout(io.StringIO()):  # viser prints a table of addresses; the commands say them.
-        serve: Any = websockets_server.serve
+        usual: Any = websockets_server.serve
 
         def guarded(handler: Callable[..., Any], *where: Any, **options: Any) -> Any:
             if not (getattr(handler, "__module__", None) or "").startswith("viser."):
-                return serve(handler, *where, **options)
+                return usual(handler, *where, **options)
             made.append(handler.__module__)
             page = admission(access, options.get("process_request"))
             more = {"create_connection": GuardedConnection, "process_request": page, "max_size": LARGEST_MESSAGE}
-            return serve(handler, *where, **options | more)
+            return GuardedServe(handler, *where, **options | more)
 
         websockets_server.serve = guarded  # type: ignore[assignment, misc]
         try:
             found = viser.ViserServer(host=host, port=port, label=title, verbose=False)
         finally:
-            websockets_server.serve = serve  # type: ignore[misc]
+            websockets_server.serve = usual  # type: ignore[misc]
         if not made:
             found.stop()
             raise InputError(

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import math
+import socket
+import warnings
 from collections.abc import Awaitable, Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -277,3 +281,22 @@ def test_a_viser_that_cannot_be_guarded_is_not_served(monkeypatch: pytest.Monkey
     with pytest.raises(InputError, match="cannot guard"):
         Viewer(STATE, "127.0.0.1", free_port())
     assert stopped and gate.websockets_server.serve is serve
+
+
+def test_a_server_that_ends_leaves_no_connection_open() -> None:
+    """Not even one that it has only just accepted, or that asks for nothing."""
+
+    async def knocked(turns: int) -> socket.socket:
+        async with gate.GuardedServe(lambda connection: asyncio.sleep(0), "127.0.0.1", 0) as server:
+            knocking = socket.create_connection(server.sockets[0].getsockname(), timeout=10)
+            for _ in range(turns):
+                await asyncio.sleep(0)
+        return knocking
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", ResourceWarning)
+        for turns in range(8):
+            with asyncio.run(knocked(turns)) as left, suppress(ConnectionResetError):
+                assert left.recv(1) == b""
+        gc.collect()
+    assert not [str(one.message) for one in caught if issubclass(one.category, ResourceWarning)]

@@ -74,8 +74,6 @@ def watch(output: Path) -> Iterator[Watch]:
     found = Watch(output)
     try:
         yield found
-        for viewer in found.viewers:  # A server that ends before a browser has left leaves its connection open.
-            eventually(lambda left=viewer: not left._server.get_clients())
     finally:
         found.is_enough, found.watched._is_paused = True, False
         found.thread.join()
