@@ -267,7 +267,7 @@ def planes_of(panes: Solved, cameras: Sequence[NumpyCamera]) -> Planes:
     return Planes(
         centers=centers,
         raw_normals=normals,
-        logit_reflectances=torch.tensor([logit(value) for value in reflectances]),
+        logit_reflectances=torch.tensor([logit(value) for value in reflectances], dtype=torch.float32),
         tangents=tangents,
         half_sizes=half_sizes,
         labels=tuple(pane.label for pane, _ in panes),

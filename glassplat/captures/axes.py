@@ -119,7 +119,7 @@ def _double(camera: Camera) -> Camera:
 
 def _indices(count: int, most: int) -> Tensor:
     """At most so many of the indices below a count, evenly spread."""
-    return torch.linspace(0, count - 1, min(count, most)).round().long()
+    return torch.linspace(0, count - 1, min(count, most), dtype=torch.float32).round().long()
 
 
 def _spread(items: Sequence[Item], most: int) -> list[Item]:

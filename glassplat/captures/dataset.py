@@ -70,7 +70,7 @@ def given_planes(root: Path, cameras: Sequence[Camera]) -> Planes | None:
 def rectangle_points(plane: Planes) -> torch.Tensor:
     """[P, 3] points spread evenly over the rectangle of one plane, its corners among them."""
     (tangent,), (bitangent,) = plane.axes()
-    steps = torch.linspace(-1, 1, SAMPLES)
+    steps = torch.linspace(-1, 1, SAMPLES, dtype=torch.float32)
     u, v = torch.meshgrid(steps, steps, indexing="ij")
     half_u, half_v = plane.half_sizes[0]
     return plane.centers[0] + u.reshape(-1, 1) * half_u * tangent + v.reshape(-1, 1) * half_v * bitangent

@@ -242,6 +242,7 @@ class Memory:
             return self._passing[source]
         return None
 
+    @torch.inference_mode(False)  # Who looks first may not need gradients; a later one may.
     def _read(self, source: Source, future: Future[Tensor]) -> None:
         spool = self._spool
         try:
@@ -377,8 +378,20 @@ class View:
 
     @staticmethod
     def in_memory(name: str, camera: Camera, *, photo: Tensor, pane_labels: Tensor | None = None) -> View:
-        """A view of pixels at hand, such as a rendered one."""
-        return View(name, camera, Path(name), lambda: photo, None if pane_labels is None else lambda: pane_labels)
+        """A view of pixels at hand, such as a rendered one: a `photo` [H, W, 3] and `pane_labels` [H, W], of uint8.
+
+        Raises:
+            ValueError: they are no tensors.
+        """
+        for given in (photo, pane_labels):
+            if given is not None and not isinstance(given, Tensor):
+                raise ValueError(f"the pixels of {name} are a {type(given).__name__}; expected a tensor of uint8")
+        labels = None if pane_labels is None else partial(_at_hand, pane_labels)
+        return View(name, camera, Path(name), partial(_at_hand, photo), labels)
+
+
+def _at_hand(pixels: Tensor) -> Tensor:
+    return pixels
 
 
 @dataclass(frozen=True)
@@ -584,7 +597,7 @@ def normals_in_file(path: Path, camera: Camera) -> Tensor:
     in_picture = torch.from_numpy(vectors).permute(2, 0, 1)[None]
     small = torch.nn.functional.interpolate(in_picture, (camera.height, camera.width), mode="area")[0].permute(1, 2, 0)
     known = small.norm(dim=-1, keepdim=True) > LEAST_LENGTH
-    unit = torch.nn.functional.normalize(small, dim=-1) * torch.tensor(CAMERA_FROM_PICTURE)
+    unit = torch.nn.functional.normalize(small, dim=-1) * torch.tensor(CAMERA_FROM_PICTURE, dtype=torch.float32)
     return torch.where(known, unit, 0)
 
 

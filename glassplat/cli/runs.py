@@ -117,7 +117,7 @@ def _without_photographs(directory: RunDirectory) -> Dataset:
         raise InputError(f"{directory.path} has no photographs; this command needs those it shows")
 
     views = tuple(View(name, camera, directory.path / name, no_photograph) for name, camera in cameras)
-    points = PointCloud(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))
+    points = PointCloud(torch.zeros(0, 3, dtype=torch.float32), torch.zeros(0, 3, dtype=torch.uint8))
     test = views[::TEST_EVERY]
     train = tuple(view for view in views if view not in test)
     return Dataset(directory.path, train, test, points, extent=1.0)

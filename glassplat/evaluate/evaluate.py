@@ -110,7 +110,7 @@ def aligned_camera(scene: Scene, renderer: Renderer, view: View) -> Camera:
     still = scene.with_parameters({name: tensor.detach() for name, tensor in scene.parameters().items()})
     camera, photo = view.camera.to(device), view.photo.to(device)
     exposures = still.exposures.interpolate(view.name)
-    twist = torch.zeros(6, device=device, requires_grad=True)
+    twist = torch.zeros(6, device=device, requires_grad=True, dtype=torch.float32)
     optimizer = torch.optim.Adam([twist], lr=FIRST_STEP, betas=(0.8, 0.95))
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST_STEP / FIRST_STEP) ** (1 / STEPS))
     best, lowest = torch.zeros_like(twist), torch.inf

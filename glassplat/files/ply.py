@@ -211,7 +211,7 @@ def _read_sh(columns: Mapping[str, Tensor], path: Path) -> Tensor:
     rest_names = [f"f_rest_{i}" for i in range(rest_count)]
     has_color = any(name in columns for name in COLOR)
     if not has_color and rest_count == 0:
-        return torch.zeros(columns["x"].shape[0], 0, 3)
+        return torch.zeros(columns["x"].shape[0], 0, 3, dtype=torch.float32)
     missing = [name for name in (*COLOR, *rest_names) if name not in columns]
     if missing:
         raise ValueError(f"{path} lacks the colour properties {missing}; expected f_dc_0..2 and f_rest_* without gaps")

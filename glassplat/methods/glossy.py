@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 def first_scene(recipe: DeferredRecipe, dataset: Dataset) -> Scene:
     """The first scene: one Gaussian per point that hardly reflects, and no environment yet."""
     primary = population_of(recipe).initial(dataset.points, recipe.sh_degree)
-    strengths = torch.full((len(primary),), logit(recipe.first_strength))
+    strengths = torch.full((len(primary),), logit(recipe.first_strength), dtype=torch.float32)
     primary = replace(primary, channels={"logit_strength": strengths})
     return corrections_begun(recipe, Scene(primary, dataset.extent), dataset)
 

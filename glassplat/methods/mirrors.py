@@ -60,7 +60,10 @@ class Search:
     @torch.no_grad()
     def reflective(self, scene: Scene, views: Sequence[View]) -> float:
         """Share of what is seen that is reflection: the mean strength."""
-        shown = sum((contributions(scene, view.camera) for view in evenly(views, self.views)), torch.zeros(()))
+        shown = sum(
+            (contributions(scene, view.camera) for view in evenly(views, self.views)),
+            torch.zeros((), dtype=torch.float32),
+        )
         return mean_in_region(scene, shown, torch.sigmoid(scene.primary.channels["logit_strength"]))
 
     @torch.no_grad()
@@ -92,8 +95,8 @@ def residual_spreads(scene: Scene, views: Sequence[View], renderer: Renderer) ->
     Pixels that a view ignores say nothing: a residual of 0 there would look like one that turns with the view.
     """
     count, device = len(scene.primary), scene.primary.means.device
-    shown, squares = torch.zeros(2, count, device=device)
-    sums = torch.zeros(count, 3, device=device)
+    shown, squares = torch.zeros(2, count, device=device, dtype=torch.float32)
+    sums = torch.zeros(count, 3, device=device, dtype=torch.float32)
     for view in views:
         counted = counted_pixels(view, device).to(shown.dtype)
         weights = gather_pixels(scene, view.camera, counted[..., None])[:, 0]
@@ -268,7 +271,7 @@ def colors_disturbed(
     """Noise on the constant colour of what does not reflect yet, which hinders it from explaining reflections."""
     if options.sabotage == 0:
         return gaussians, dict(moments)
-    unit = torch.rand(gaussians.sh[:, 0].shape, generator=generator, device=gaussians.sh.device)
+    unit = torch.rand(gaussians.sh[:, 0].shape, generator=generator, device=gaussians.sh.device, dtype=torch.float32)
     dull = gaussians.channels["logit_strength"] <= logit(options.sabotaged)
     sh = gaussians.sh.clone()
     sh[:, 0] += torch.where(dull[:, None], options.sabotage * (2 * unit - 1) / SH_ZERO, 0)

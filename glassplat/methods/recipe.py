@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
@@ -48,6 +49,10 @@ class Recipe(Protocol):
         ...
 
 
+log = logging.getLogger("glassplat.training")
+
+OWN = "recipe"
+"""Name, in JSON, of the class of a recipe of the user's own."""
 REMEDY = "Train again, or use the version that wrote it"
 Preset = Literal["glassplat", "paper"]
 RECIPES: dict[str, type] = {
@@ -62,12 +67,15 @@ def recipe_of(method: str, preset: Preset = "glassplat") -> Any:
 
 
 def recipe_to_json(recipe: Any) -> str:
-    """A recipe as readable JSON."""
-    return json.dumps({"method": recipe.method, **dataclasses.asdict(recipe)}, indent=2)
+    """A recipe as readable JSON; of one of the user's own also the name of its class."""
+    name = {} if type(recipe) in RECIPES.values() else {OWN: type(recipe).__name__}
+    return json.dumps({"method": recipe.method, **name, **dataclasses.asdict(recipe)}, indent=2)
 
 
 def recipe_from_json(text: str, where: str = "the recipe") -> Any:
     """The recipe that `recipe_to_json` wrote; `where` names the text in messages.
+
+    One of the user's own comes back as that of its method, without the options that it adds.
 
     Raises:
         InputError: not a recipe, or written by a version with other fields; says which value is wrong.
@@ -77,8 +85,13 @@ def recipe_from_json(text: str, where: str = "the recipe") -> Any:
     method = fields.pop("method", None) if isinstance(fields, dict) else None
     if not isinstance(method, str) or method not in RECIPES:
         raise InputError(f"{where}: the method is {short_repr(method)}; expected one of {', '.join(RECIPES)}. {REMEDY}")
+    kind: Any = RECIPES[method]
+    if (own := fields.pop(OWN, None)) is not None:
+        log.warning("%s is of a recipe of one's own, %s; taken as %s", where, short_repr(own), kind.__name__)
+        known = {field.name for field in dataclasses.fields(kind)}
+        fields = {name: value for name, value in fields.items() if name in known}
     try:
-        return options_from_json(RECIPES[method], fields)
+        return options_from_json(kind, fields)
     except InputError as error:
         raise InputError(f"{where} is not one that this version can read: {error}. {REMEDY}") from error
 

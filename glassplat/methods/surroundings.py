@@ -119,7 +119,9 @@ def surroundings_in_box(
     size = (high - low) / cells
     along = torch.arange(cells, dtype=low.dtype, device=low.device)
     corners = torch.cartesian_prod(along, along, along).repeat_interleave(per_cell, dim=0)
-    means = low + (corners + torch.rand(corners.shape, generator=generator, device=low.device)) * size
+    means = (
+        low + (corners + torch.rand(corners.shape, generator=generator, device=low.device, dtype=torch.float32)) * size
+    )
     count = means.shape[0]
     # Of points at random with density rho the nearest one is 0.554 rho^(-1/3) away on average.
     spread = 0.554 * (float(size.prod()) / per_cell) ** (1 / 3)

@@ -134,6 +134,8 @@ class Model:
     def render(self, camera: Camera | str, *, layers: Sequence[str] = ("rgb",)) -> Frame:
         """Renders the image and its layers; differentiable in every tensor of the scene and in the camera's pose.
 
+        Kernels have first derivatives only: a gradient of a gradient, as with `create_graph=True`, would be wrong.
+
         `frame.rgb` is [H, W, 3] in sRGB, not clamped; `frame.layers` are further images by name, [H, W] or [H, W, 3].
         Under `torch.no_grad()` it is faster.
 
@@ -145,6 +147,7 @@ class Model:
             InputError: the method renders no such layer, or no camera has that name; says which there are. Or the
                 camera or the layers are of another type.
         """
+        layers = layers if isinstance(layers, str) else tuple(layers)
         frame = self._frame(camera, layers)
         return replace(frame, layers={name: layer for name, layer in frame.layers.items() if name in layers})
 
@@ -322,8 +325,8 @@ class Model:
         things mirror. A warning says what of this model is left out.
 
         Args:
-            path: without a suffix a folder whose tensors are loaded bit for bit, like a run's; .ply, .spz or .glb for
-                other programs, with the panes next to it as `planes.json` and `glass.ply`, the cameras as
+            path: without a suffix a folder, like a run's, whose float32 tensors are loaded bit for bit; .ply, .spz or
+                .glb for other programs, with the panes next to it as `planes.json` and `glass.ply`, the cameras as
                 `cameras.json`, and an environment, which only other programs read, as `environment.png` and `.json`;
                 .html for a page that shows it with live panes in a browser, and is not loaded again.
             overwrite: replace files that are there.
@@ -500,7 +503,7 @@ def write_as_run(folder: Path, model: Model, source: Path | None) -> None:
 
 
 def save_folder(model: Model, folder: Path, *, overwrite: bool = False) -> Path:
-    """Writes a model as a run of its own, whose tensors are loaded bit for bit; returns the folder.
+    """Writes a model as a run of its own, whose float32 tensors are loaded bit for bit; returns the folder.
 
     Raises:
         FileExistsError: something is there, and it is no saved model that may be replaced; nothing was written.
@@ -596,6 +599,8 @@ def _glass(file: Path, planes: Planes, *, own: bool) -> Gaussians:
 
 
 def _cameras(file: Path, gaussians: Gaussians, up: Up) -> NamedCameras:
+    if up not in AXES:
+        raise InputError(f"up is {up!r}; expected one of {', '.join(AXES)}")
     beside = file.with_name("cameras.json")
     cameras = read_cameras(beside) if beside.is_file() else []
     return tuple(cameras or cameras_around(gaussians, torch.tensor(AXES[up], dtype=torch.float64)))

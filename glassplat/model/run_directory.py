@@ -269,7 +269,7 @@ class RunDirectory:
         """
         from glassplat.methods.recipe import recipe_to_json
 
-        return self.recipe() == recipe and self.written_recipe() == json.loads(recipe_to_json(recipe))
+        return bool(self.written_recipe() == json.loads(recipe_to_json(recipe)))
 
     def written_recipe(self) -> Any:
         """The recorded recipe's options as they were written."""

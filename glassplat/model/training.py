@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import signal
@@ -25,7 +26,7 @@ from glassplat.kernels.backend.devices import DeviceName, chosen_device, compile
 from glassplat.methods.recipe import RECIPES, Recipe, recipe_to_json, resolve_background
 from glassplat.model import run_directory
 from glassplat.model.model import Model
-from glassplat.options import check_value
+from glassplat.options import check_value, short_repr
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import train
 from glassplat.training.messages import (
@@ -45,7 +46,7 @@ STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SI
 """Ctrl-C, what a shut-down or a job scheduler sends before it kills, and what a closed terminal leaves behind."""
 
 
-@dataclass
+@dataclass(eq=False)
 class StopRequest:
     """Set when the user asks a run to stop; the run ends after the current step.
 
@@ -69,29 +70,54 @@ class StopRequest:
         raise KeyboardInterrupt
 
 
+_asked: list[StopRequest] = []
+"""Of the runs that go on in the main thread; there may be several, followed by turns."""
+_before: dict[int, Any] = {}
+"""Handlers of the signals as they were before these runs."""
+
+
 @contextmanager
 def stop_on_interrupt() -> Iterator[StopRequest]:
     """Turns the first Ctrl-C, termination or hang-up into a request to stop after the step; a second one interrupts.
 
-    What is ignored stays ignored, as a hang-up is under `nohup`. Only the main thread can be asked. `torchrun` passes
-    on what a scheduler may have sent already; there, a second signal says nothing new.
+    What is ignored stays ignored, as a hang-up is under `nohup`. Only the main thread can be asked.
     """
     request = StopRequest()
-
-    def ask(number: int, frame: FrameType | None) -> None:
-        if request.requested:
-            if "TORCHELASTIC_RUN_ID" in os.environ:  # Also where it has started a single process.
-                return
-            request.end()
-        request.number, request.answer = number, previous[number]
-
-    main = threading.current_thread() is threading.main_thread()
-    heard = [number for number in STOP_SIGNALS if main and signal.getsignal(number) != signal.SIG_IGN]
-    previous = {number: signal.signal(number, ask) for number in heard}
+    if threading.current_thread() is threading.main_thread():
+        _asked.append(request)
+        for number in STOP_SIGNALS:
+            if (handler := signal.getsignal(number)) not in (None, signal.SIG_IGN, _ask):
+                _before[number] = handler
+                signal.signal(number, _ask)
     try:
         yield request
     finally:
-        for number, handler in previous.items():
+        if request in _asked:
+            _asked.remove(request)
+        if not _asked and threading.current_thread() is threading.main_thread():
+            _put_handlers_back()
+
+
+def _ask(number: int, frame: FrameType | None) -> None:
+    """Asks all runs to stop; once they have been asked, interrupts.
+
+    `torchrun` passes on what a scheduler may have sent already; there, a second signal says nothing new.
+    """
+    if not _asked:  # The last run ended in another thread, where handlers cannot be set.
+        is_own = signal.getsignal(number) is _ask
+        _put_handlers_back()
+        if is_own:
+            signal.raise_signal(number)
+    elif not all(request.requested for request in _asked):
+        for request in _asked:
+            request.number, request.answer = number, _before[number]
+    elif "TORCHELASTIC_RUN_ID" not in os.environ:  # It is set where `torchrun` has started a single process, too.
+        _asked[-1].end()
+
+
+def _put_handlers_back() -> None:
+    for number, handler in _before.items():
+        if signal.getsignal(number) is _ask:
             signal.signal(number, handler)
 
 
@@ -150,8 +176,9 @@ class Run:
         assert self.state is not None
         return self.state
 
+    @torch.inference_mode(False)  # It needs gradients, also where the caller has switched them off.
     def messages(self) -> Generator[Message, None, None]:
-        """Trains from one message to the next.
+        """Trains from one message to the next; begun again after it ended, from the checkpoint on.
 
         Raises:
             InputError: the run was recorded with other settings or photographs, or a photograph cannot be read, of the
@@ -174,20 +201,22 @@ class Run:
 
     def _leading(self) -> Generator[Message, None, None]:
         directory, settings = self._directory, self._settings
-        if not self._resume:
+        resume = self._resume or (self.state is not None and directory.checkpoint.is_file())
+        state = None
+        if not resume:
             yield Working("preparing the first scene", 0, 1)
-            self.state = first_state(self.recipe, settings, self._dataset)
+            state = first_state(self.recipe, settings, self._dataset)
         make_folder(directory.path)
         with run_directory.run_lock(directory.path):
             directory.clear()
             # Another training may have ended here meanwhile.
-            anew = directory.is_begun and not self._resume
-            if self._resume:
-                self.state = resumed_state(self.recipe, settings, directory, self._dataset)
+            anew = directory.is_begun and not resume
+            if state is None:
+                state = resumed_state(self.recipe, settings, directory, self._dataset)
             else:
                 directory.check_vacant()
                 directory.begin(self.recipe, settings, self._dataset)
-            self.state = self._ranks.broadcast(self.state, settings.device)
+            self.state = self._ranks.broadcast(state, settings.device)
             with run_directory.open_log(directory.log, self.state.step) as log:
                 self._session = TrainingSession(self.state, self._ranks, Record(directory.checkpoint, log, self._every))
                 yield from self._session.deliver(RunBegun(self.state.step, settings.iterations, anew))
@@ -277,8 +306,9 @@ def changes_of_recipe(directory: run_directory.RunDirectory, recipe: Any) -> lis
     recorded = directory.recipe()
     if recorded.method != recipe.method:  # The options of two methods have little in common.
         return differences({"method": recorded.method}, {"method": recipe.method})
-    of_both = (recorded, directory.written_recipe()), (recipe, json.loads(recipe_to_json(recipe)))
-    return differences(*({**dict(_values(options, "")), "recipe": type(one).__name__} for one, options in of_both))
+    of_both = directory.written_recipe(), json.loads(recipe_to_json(recipe))
+    kind = type(recorded).__name__
+    return differences(*({"recipe": kind, **dict(_values(options, ""))} for options in of_both))
 
 
 def differences(before: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
@@ -416,7 +446,8 @@ class Training:
     Started by `torchrun`, several processes train together, one view of each step for each.
     Between two messages, from the first `StepDone` on, `model` is the scene as trained so far. With an `output` the run
     is written as `glassplat train` writes it, `for` may be left with `break`, Ctrl-C ends it after a step, and either
-    way `resume=True` goes on. Without one, everything stays in memory.
+    way `resume=True` goes on. Without one, everything stays in memory, and a `break` at a `Working` message loses the
+    edit that it tells of.
 
     Attributes:
         recipe: how to train, with the background that the photographs have.
@@ -450,12 +481,14 @@ class Training:
 
         Raises:
             CudaUnavailableError: the GPU was asked for and cannot be used.
-            InputError: `dataset` is something else; no method has that name; an option has a value that it cannot
-                have; `output` holds something else, or nothing to go on from; the run is too short for its stages; or
-                the photographs lie over another background than the recipe's.
+            InputError: `dataset` is something else, or has no training views; no method has that name; an option has a
+                value that it cannot have; `output` holds something else, or nothing to go on from; the run is too short
+                for its stages; or the photographs lie over another background than the recipe's.
         """
         if not isinstance(dataset, Dataset):
             raise InputError(f"dataset is {dataset!r}; expected what `glassplat.load_dataset` returns for a capture")
+        if not dataset.train:
+            raise InputError(f"{dataset.root} has no training views; expected one or more in `dataset.train`")
         chosen = chosen_recipe(recipe)
         if type(chosen) in RECIPES.values():  # A recipe of one's own may hold anything.
             check_value(type(chosen), chosen, "")
@@ -564,6 +597,7 @@ class Training:
             raise RuntimeError("this training has no output to save to; use `training.model.save(path)`")
         self._run.save()
 
+    @torch.inference_mode(False)
     def _in_memory(self) -> Generator[Message, None, None]:
         self._ranks.check_alike(traits(self.recipe, self._settings, self._dataset))
         if self._state is None:
@@ -577,13 +611,16 @@ def chosen_recipe(recipe: str | Recipe) -> Any:
     """The recipe, or that of a method's name.
 
     Raises:
-        InputError: no method has that name.
+        InputError: no method has that name, or it is no recipe.
     """
-    if not isinstance(recipe, str):
-        return recipe
-    if recipe not in RECIPES:
-        raise InputError(f"no method is called {recipe!r}; expected {', '.join(RECIPES)}, or a recipe")
-    return RECIPES[recipe]()
+    given: Any = recipe
+    if isinstance(given, str):
+        if given not in RECIPES:
+            raise InputError(f"no method is called {given!r}; expected {', '.join(RECIPES)}, or a recipe")
+        return RECIPES[given]()
+    if isinstance(given, type) or not dataclasses.is_dataclass(given) or not hasattr(given, "stages"):
+        raise InputError(f"recipe is {short_repr(given)}; expected a method's name, or a recipe such as SplatRecipe()")
+    return given
 
 
 def _nobody(message: Message) -> None:

@@ -549,7 +549,7 @@ def _planes(panes: Sequence[_Pane], labels: Sequence[int], options: PlaneFit) ->
     planes = Planes(
         centers=stacked([pane.center for pane in panes]),
         raw_normals=stacked([pane.normal for pane in panes]),
-        logit_reflectances=torch.full((len(labels),), logit(glass)),
+        logit_reflectances=torch.full((len(labels),), logit(glass), dtype=torch.float32),
         tangents=stacked([pane.tangent for pane in panes]),
         half_sizes=stacked([pane.half_sizes for pane in panes]),
         labels=tuple(labels),

@@ -253,7 +253,7 @@ def polished_pane(scene: Scene, telling: Sequence[ComparedPart]) -> Scene:
         return mean_agreements([moved_pane(scene, offsets)], some)[0]
 
     best = scene.primary.means.new_zeros(3)
-    most, axes = agreed(best), torch.eye(3).to(best)
+    most, axes = agreed(best), torch.eye(3, dtype=torch.float32).to(best)
     for step in POLISH_STEPS:
         for _ in range(POLISH_ROUNDS):
             before = most
@@ -390,7 +390,7 @@ def virtual_points(points: Tensor, mirrors: Planes, cameras: Sequence[Camera]) -
     """
     if len(mirrors) == 0:
         return torch.zeros(points.shape[0], dtype=torch.bool, device=points.device)
-    held, through = (torch.zeros(points.shape[0], device=points.device) for _ in range(2))
+    held, through = (torch.zeros(points.shape[0], device=points.device, dtype=torch.float32) for _ in range(2))
     for camera in (camera.to(points.device) for camera in cameras):
         inside = in_image(points, camera)
         held += inside
@@ -634,7 +634,7 @@ def unseen_places(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Uns
     middle = torch.stack([camera.center for camera in cameras]).mean(dim=0)
     away = (scene.primary.means - middle).norm(dim=1).sort().values
     radius = away[int((1 - BEYOND) * (len(away) - 1))]
-    places, colors = [], [torch.zeros(0, 3, device=device)]
+    places, colors = [], [torch.zeros(0, 3, device=device, dtype=torch.float32)]
     for camera in cameras:
         for row in range(len(panes)):
             pane = panes.select([row])

@@ -279,7 +279,9 @@ def page_text(
     kept = f"{len(scene.primary):,}" + (f" of {drawable:,}" if len(scene.primary) < drawable else "")
     subtitle = f"{kept} Gaussians" + (f" · {count} pane{'s' if count > 1 else ''}" if count else "")
     # Glass has no colour; a constant one makes an SPZ file of it.
-    glass = replace(scene.glass, sh=torch.zeros(len(scene.glass), 1, 3), channels={}, active_sh_degree=0)
+    glass = replace(
+        scene.glass, sh=torch.zeros(len(scene.glass), 1, 3, dtype=torch.float32), channels={}, active_sh_degree=0
+    )
     return fill_template(
         asset("page.html"),
         {
@@ -378,12 +380,16 @@ def jpeg(image: Tensor) -> bytes:
 
 def channel_bytes(scene: Scene) -> tuple[bytes, list[float]]:
     """Intensities of the primary Gaussians, marks of the glass and the pane that it is part of; and lowest and step."""
-    logs = scene.primary.channels.get("log_intensity", torch.zeros(len(scene.primary)))
+    logs = scene.primary.channels.get("log_intensity", torch.zeros(len(scene.primary), dtype=torch.float32))
     low, high = (float(logs.min()), float(logs.max())) if len(logs) else (0.0, 0.0)
     step = (high - low) / 255
     intensities = torch.round((logs - low) / (step or 1)).clamp(0, 255)
     marks = torch.round(255 * torch.sigmoid(scene.glass.channels["logit_mark"]))
-    owners = nearest_panes(scene.glass.means, scene.planes) if len(scene.planes) else torch.zeros(len(scene.glass))
+    owners = (
+        nearest_panes(scene.glass.means, scene.planes)
+        if len(scene.planes)
+        else torch.zeros(len(scene.glass), dtype=torch.float32)
+    )
     parts = [part.to(torch.uint8).numpy().tobytes() for part in (intensities, marks, owners)]
     return b"".join(parts), [low, step]
 
@@ -401,7 +407,7 @@ def cube_bytes(scene: Scene, settings: Mapping[str, Any]) -> bytes:
     """
     near, environment = settings["mirrored"] == "near", scene.environment
     size = CUBE_SIZE if near else min(environment.size, CUBE_SIZE)
-    directions = cube_directions(size).reshape(-1, 3) * torch.tensor(FLIP)
+    directions = cube_directions(size).reshape(-1, 3) * torch.tensor(FLIP, dtype=torch.float32)
     if near and len(scene.surroundings):
         weights = torch.sigmoid(scene.primary.logit_opacities) * torch.sigmoid(scene.primary.channels["logit_strength"])
         middle = (weights[:, None] * scene.primary.means).sum(0) / weights.sum()
@@ -414,7 +420,7 @@ def cube_bytes(scene: Scene, settings: Mapping[str, Any]) -> bytes:
 
 def cube_directions(size: int) -> Tensor:
     """Directions [6, S, S, 3] of the texels of a cube map, in the order and the axes of WebGL."""
-    centers = (2 * torch.arange(size) + 1) / size - 1
+    centers = (2 * torch.arange(size, dtype=torch.float32) + 1) / size - 1
     t, s = torch.meshgrid(centers, centers, indexing="ij")
     one = torch.ones_like(s)
     faces = [(one, -t, -s), (-one, -t, s), (s, one, t), (s, -one, -t), (s, -t, one), (-s, -t, -one)]
@@ -457,7 +463,7 @@ def described_pane(planes: Planes, index: int) -> dict[str, Any]:
 
 def described_view(name: str, camera: Camera) -> dict[str, Any]:
     """One photograph's camera in the page's world; the rotation by rows."""
-    rotation = camera.cam_from_world[:3, :3].cpu() * torch.tensor(FLIP)
+    rotation = camera.cam_from_world[:3, :3].cpu() * torch.tensor(FLIP, dtype=torch.float32)
     return {
         "name": name,
         "rotation": [round(value, 6) for value in rotation.flatten().tolist()],

@@ -75,7 +75,7 @@ def depth_colors(depth: Tensor, alpha: Tensor | None = None) -> Tensor:
     if alpha is not None:
         shown &= alpha > COVERED
     if not bool(shown.any()):
-        return torch.zeros(*depth.shape, 3, device=depth.device)
+        return torch.zeros(*depth.shape, 3, device=depth.device, dtype=torch.float32)
     inverse = torch.where(shown, 1 / torch.where(shown, depth, torch.ones_like(depth)), torch.zeros_like(depth))
     # Every n-th pixel is enough for percentiles, and `quantile` takes no more than 16 million.
     sample = inverse[shown]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -102,10 +102,11 @@ class Planar:
     pane is the C of the pane behind it (the paper shows the nearest only). The layers R, C_r and C_t are those of the
     nearest one that is more than `FAINT`ly visible; see `glassplat.render.panes.composite_panes`.
 
-    Layers: `transmission`, `reflection` [H, W, 3]; `strength`, `mask`, `depth`, `alpha` [H, W]; `pane` [H, W]
-    int32, the pane whose rectangle is nearest, -1 for none; `without_panes` [H, W, 3], the image were there no panes,
-    and `share` [H, W], how much of what is seen the panes add, all of them together; `tint` [H, W, 3], the share of
-    light that their glass lets through, where it is tinted; `deviation` [H, W] (Eq. 14) if asked for.
+    Layers: `transmission`, `reflection` [H, W, 3]; `strength`, `mask`, `depth`, `alpha` [H, W]; `without_panes`
+    [H, W, 3], the image were there no panes. Who calls the renderer also gets `pane` [H, W] int32, the pane whose
+    rectangle is nearest, -1 for none; `share` [H, W], how much of what is seen the panes add, all of them together;
+    `tint` [H, W, 3], the share of light that their glass lets through, where it is tinted; `deviation` [H, W] (Eq. 14)
+    if asked for.
 
     A photograph also shows who took it, in the panes: `Scene.photographer`, Gaussians in a frame that goes along with
     the camera. They are drawn among those that a pane mirrors, through the camera mirrored about it, and nowhere else.
@@ -137,6 +138,10 @@ class Planar:
     nearest_only: bool = False
     photographer: PhotographerMode = "absent"
     tells_mirrored: bool = True
+
+    def __post_init__(self) -> None:
+        if self.blend not in get_args(Blend):
+            raise ValueError(f"blend is {self.blend!r}; expected one of {get_args(Blend)}")
 
     def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are.
@@ -427,7 +432,7 @@ def dereflected_photo(
     # Clipping is the camera's, all else the scene's.
     clipped = photographed
     photographed = exposures.undone(photographed, name).clamp(0, 1)
-    tint = frame.layers.get("tint", torch.ones(())).clamp(min=DARKEST_GLASS)
+    tint = frame.layers.get("tint", torch.ones((), dtype=torch.float32)).clamp(min=DARKEST_GLASS)
     light, reflected = decode(photographed), decode(frame.photographed) - (1 - share) * tint * decode(without_panes)
     # The trust is almost zero before this division would blow up noise.
     solved = (light - reflected) / ((1 - share).clamp(min=1 - DISTRUSTED_STRENGTH) * tint)

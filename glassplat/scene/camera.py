@@ -145,8 +145,8 @@ class Camera:
             )
         if self.width != int(self.width) or self.height != int(self.height):
             raise ValueError(f"an image of {self.width}x{self.height} pixels; expected whole numbers")
-        object.__setattr__(self, "width", int(self.width))
-        object.__setattr__(self, "height", int(self.height))
+        for name, kind in (("fx", float), ("fy", float), ("cx", float), ("cy", float), ("width", int), ("height", int)):
+            object.__setattr__(self, name, kind(getattr(self, name)))  # A tensor could change under its camera.
 
     @staticmethod
     def look_at(
@@ -169,8 +169,10 @@ class Camera:
             height: of the image, pixels.
 
         Raises:
-            ValueError: the camera stands where it looks, or looks straight up or down.
+            ValueError: the camera stands where it looks, or looks straight up or down, or sees nothing.
         """
+        if not 0 < fov_rad < math.pi:
+            raise ValueError(f"fov_rad is {fov_rad}; expected radians between 0 and pi")
         pose = look_at(*(torch.as_tensor(vector, dtype=torch.float64) for vector in (eye, target, up)))
         focal = height / 2 / math.tan(fov_rad / 2)
         return Camera(pose, focal, focal, width / 2, height / 2, width, height)

@@ -101,7 +101,7 @@ class ByPhotograph:
     @classmethod
     def neutral(cls, names: tuple[str, ...] = ()) -> Self:
         """All photographs taken as they are."""
-        return cls(torch.zeros(len(names), *cls.SHAPE), names)
+        return cls(torch.zeros(len(names), *cls.SHAPE, dtype=torch.float32), names)
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class Exposures(ByPhotograph):
         if own is None:
             return photo
         own = own.to(photo)
-        return (photo - own[:, 3]) @ torch.linalg.inv(torch.eye(3).to(photo) + own[:, :3].T)
+        return (photo - own[:, 3]) @ torch.linalg.inv(torch.eye(3, dtype=torch.float32).to(photo) + own[:, :3].T)
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,11 @@ class Gaussians:
     active_sh_degree: int = 0
 
     def __post_init__(self) -> None:
+        for name, tensor in self.tensors().items():
+            if not isinstance(tensor, Tensor):
+                raise TypeError(
+                    f"{name} is a {type(tensor).__name__}; expected a tensor (`torch.from_numpy` makes one)"
+                )
         count = self.means.shape[0]
         for name, tensor in self.tensors().items():
             if tensor.shape[0] != count:
@@ -102,12 +107,12 @@ class Gaussians:
     def empty(sh_coefficients: int = 0, channels: tuple[str, ...] = ()) -> Gaussians:
         """A set of no Gaussians."""
         return Gaussians(
-            means=torch.zeros(0, 3),
-            quats=torch.zeros(0, 4),
-            log_scales=torch.zeros(0, 3),
-            logit_opacities=torch.zeros(0),
-            sh=torch.zeros(0, sh_coefficients, 3),
-            channels={name: torch.zeros(0) for name in channels},
+            means=torch.zeros(0, 3, dtype=torch.float32),
+            quats=torch.zeros(0, 4, dtype=torch.float32),
+            log_scales=torch.zeros(0, 3, dtype=torch.float32),
+            logit_opacities=torch.zeros(0, dtype=torch.float32),
+            sh=torch.zeros(0, sh_coefficients, 3, dtype=torch.float32),
+            channels={name: torch.zeros(0, dtype=torch.float32) for name in channels},
         )
 
 

@@ -68,6 +68,8 @@ class Planes:
                 )
         if wrong := [label for label in self.labels if not 1 <= label <= HIGHEST_LABEL]:
             raise ValueError(f"there are planes with the labels {wrong}; expected 1 to {HIGHEST_LABEL}, as in masks")
+        if len(set(self.labels)) < len(self.labels):
+            raise ValueError(f"there are planes with the labels {self.labels}; expected another one for each plane")
         if not set(self.mirrors) <= set(self.labels):
             raise ValueError(f"mirrors {self.mirrors} are not all among the plane labels {self.labels}")
 
@@ -174,7 +176,7 @@ class Planes:
             torch.tensor(list(values), dtype=torch.float32) for values in (center, normal, half_sizes)
         )
         if tangent is None:
-            axis = torch.eye(3)[int(across.abs().argmin())]
+            axis = torch.eye(3, dtype=torch.float32)[int(across.abs().argmin())]
         else:
             axis = torch.tensor(list(tangent), dtype=torch.float32)
         shapes = [tuple(vector.shape) for vector in (middle, across, axis, half)]
@@ -185,12 +187,19 @@ class Planes:
             raise ValueError(f"a pane of {center}, {normal}, {half_sizes}; expected finite numbers, sizes above 0")
         if float(torch.linalg.cross(across, axis).norm()) <= LEAST_SINE * float(across.norm() * axis.norm()):
             raise ValueError(f"a pane with the normal {normal} and the tangent {tangent}; expected two directions")
-        return Planes(middle[None], across[None], torch.zeros(1), axis[None], half[None], (label,))
+        return Planes(middle[None], across[None], torch.zeros(1, dtype=torch.float32), axis[None], half[None], (label,))
 
     @staticmethod
     def empty() -> Planes:
         """No planes at all."""
-        return Planes(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3), torch.zeros(0, 2), ())
+        return Planes(
+            torch.zeros(0, 3, dtype=torch.float32),
+            torch.zeros(0, 3, dtype=torch.float32),
+            torch.zeros(0, dtype=torch.float32),
+            torch.zeros(0, 3, dtype=torch.float32),
+            torch.zeros(0, 2, dtype=torch.float32),
+            (),
+        )
 
 
 LARGEST_ANGLE = math.radians(1.0)

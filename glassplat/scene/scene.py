@@ -73,7 +73,7 @@ class Environment:
     @staticmethod
     def empty() -> Environment:
         """No environment."""
-        return Environment(torch.zeros(FACES, 0, 0, 3))
+        return Environment(torch.zeros(FACES, 0, 0, 3, dtype=torch.float32))
 
     @staticmethod
     def random(size: int, *, generator: torch.Generator) -> Environment:
@@ -84,7 +84,7 @@ class Environment:
         """
         if size < 1:
             raise ValueError(f"the environment's size is {size}; expected at least 1 texel along a face")
-        uniform = torch.rand(FACES, size, size, 3, generator=generator, device=generator.device)
+        uniform = torch.rand(FACES, size, size, 3, generator=generator, device=generator.device, dtype=torch.float32)
         return Environment((2 * uniform - 1) * NOISE)
 
 
@@ -266,6 +266,7 @@ def tilt_pane(scene: Scene, label: int, about_tangent: float, about_bitangent: f
     """
     row = row_of(scene.planes, label)
     _check_finite(label, about_tangent, about_bitangent)
+    about_tangent, about_bitangent = float(about_tangent), float(about_bitangent)
     angle = math.radians(math.hypot(about_tangent, about_bitangent))
     if angle == 0:
         return scene
@@ -399,9 +400,9 @@ def glass_gaussians(planes: Planes, *, count: int = 1000, seed: int = 0, opacity
         means=means,
         quats=quats,
         log_scales=log_scales,
-        logit_opacities=torch.full((number,), logit(opacity)),
-        sh=torch.zeros(number, 0, 3),
-        channels={"logit_mark": torch.full((number,), logit(MARK))},
+        logit_opacities=torch.full((number,), logit(opacity), dtype=torch.float32),
+        sh=torch.zeros(number, 0, 3, dtype=torch.float32),
+        channels={"logit_mark": torch.full((number,), logit(MARK), dtype=torch.float32)},
     )
     return glass.with_tensors({name: tensor.to(planes.centers) for name, tensor in glass.tensors().items()})
 
@@ -438,7 +439,7 @@ def with_intensity(gaussians: Gaussians) -> Gaussians:
 def _pane_discs(planes: Planes, index: int, *, count: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
     """Means [M, 3], quats [M, 4] and log scales [M, 3] of the discs on one pane."""
     half = planes.half_sizes[index].detach().cpu()
-    places = SobolEngine(dimension=2, scramble=True, seed=seed + index).draw(count)
+    places = SobolEngine(dimension=2, scramble=True, seed=seed + index).draw(count, dtype=torch.float32)
     tangent, bitangent = (axis[index].detach().cpu() for axis in planes.axes())
     in_plane = (2 * places - 1) * half
     means = planes.centers[index].detach().cpu() + in_plane @ torch.stack([tangent, bitangent])
@@ -446,5 +447,5 @@ def _pane_discs(planes: Planes, index: int, *, count: int, seed: int) -> tuple[T
     frame = torch.stack([tangent, bitangent, planes.normals[index].detach().cpu()], dim=1)
     quat = quat_from_rotation(frame).float()
     along = OVERLAP * math.sqrt(float(4 * half.prod()) / count)
-    log_scales = torch.tensor([along, along, THICKNESS * along]).log()
+    log_scales = torch.tensor([along, along, THICKNESS * along], dtype=torch.float32).log()
     return means, quat.repeat(len(means), 1), log_scales.repeat(len(means), 1)

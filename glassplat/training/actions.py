@@ -532,7 +532,10 @@ def grid_around(cameras: Sequence[Camera], extent: float) -> tuple[Tensor, float
     low, high = centers.amin(dim=0) - extent, centers.amax(dim=0) + extent
     cell = float((high - low).amax()) / CELLS
     numbers = ((high - low) / cell).round().clamp(min=1).int().tolist()
-    along = [start + cell * (torch.arange(number) + 0.5) for start, number in zip(low, numbers, strict=True)]
+    along = [
+        start + cell * (torch.arange(number, dtype=torch.float32) + 0.5)
+        for start, number in zip(low, numbers, strict=True)
+    ]
     return torch.stack(torch.meshgrid(*along, indexing="ij"), dim=-1).reshape(-1, 3) @ axes, cell
 
 

@@ -110,17 +110,17 @@ def first_photographer(
     generator = torch.Generator().manual_seed(seed)
     distance = distance_to_panes(planes, cameras)
     low, high = math.log(NEAREST * distance), math.log(FARTHEST * distance)
-    radii = torch.exp(low + (high - low) * torch.rand(count, generator=generator))
-    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    radii = torch.exp(low + (high - low) * torch.rand(count, generator=generator, dtype=torch.float32))
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float32), dim=1)
     # Behind the camera; where the face is, all around it.
     directions[:, 2] = -directions[:, 2].abs()
     device = planes.centers.device
     found = Gaussians(
         means=radii[:, None] * directions,
-        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float32).repeat(count, 1),
         log_scales=torch.log(SPREAD * radii)[:, None].repeat(1, 3),
-        logit_opacities=torch.full((count,), logit(OPACITY)),
-        sh=torch.zeros(count, (sh_degree + 1) ** 2, 3),
+        logit_opacities=torch.full((count,), logit(OPACITY), dtype=torch.float32),
+        sh=torch.zeros(count, (sh_degree + 1) ** 2, 3, dtype=torch.float32),
     )
     return found.to(device)
 

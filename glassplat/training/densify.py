@@ -64,22 +64,22 @@ def gaussians_from_points(
     order = in_morton_order(points.positions.double()).source
     means = points.positions[order]
     count, device = len(points), means.device
-    sh = torch.zeros(count, (sh_degree + 1) ** 2, 3, device=device)
+    sh = torch.zeros(count, (sh_degree + 1) ** 2, 3, device=device, dtype=torch.float32)
     sh[:, 0] = (points.colors[order].float().clamp(min=DARKEST) / 255 - 0.5) / SH_ZERO
     return Gaussians(
         means=means,
-        quats=torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).repeat(count, 1),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0], device=device, dtype=torch.float32).repeat(count, 1),
         log_scales=torch.log(spread * _spacing(means)).float()[:, None].repeat(1, 3),
-        logit_opacities=torch.full((count,), logit(opacity), device=device),
+        logit_opacities=torch.full((count,), logit(opacity), device=device, dtype=torch.float32),
         sh=sh,
-        channels={"log_intensity": torch.zeros(count, device=device)},
+        channels={"log_intensity": torch.zeros(count, device=device, dtype=torch.float32)},
     )
 
 
 def as_discs(spheres: Gaussians, *, seed: int = 0) -> Gaussians:
     """Discs as large as the spheres, turned at random: nothing is known yet of the surface that they lie on."""
     generator = torch.Generator().manual_seed(seed)
-    quats = torch.randn(spheres.quats.shape, generator=generator).to(spheres.quats)
+    quats = torch.randn(spheres.quats.shape, generator=generator, dtype=torch.float32).to(spheres.quats)
     log_scales = spheres.log_scales[:, :DISC_SCALES].contiguous()
     return replace(spheres, quats=torch.nn.functional.normalize(quats, dim=1), log_scales=log_scales)
 
@@ -336,7 +336,7 @@ class ScreenStatistics:
     @staticmethod
     def zeros(count: int, *, device: torch.device | str = "cpu") -> ScreenStatistics:
         """Statistics of `count` Gaussians that no view has seen."""
-        return ScreenStatistics(*torch.zeros(3, 2, count, device=device))
+        return ScreenStatistics(*torch.zeros(3, 2, count, device=device, dtype=torch.float32))
 
     def select(self, kept: Tensor) -> ScreenStatistics:
         """Those of the Gaussians where `kept` [N] is true."""

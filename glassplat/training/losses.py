@@ -136,8 +136,8 @@ def normals_of_depths(depth: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Te
 
     Zero where it is empty. In that layout every operation runs over a contiguous image.
     """
-    x = (torch.arange(camera.width, device=depth.device) + 0.5 - camera.cx) / camera.fx
-    y = (torch.arange(camera.height, device=depth.device) + 0.5 - camera.cy) / camera.fy
+    x = (torch.arange(camera.width, dtype=depth.dtype, device=depth.device) + 0.5 - camera.cx) / camera.fx
+    y = (torch.arange(camera.height, dtype=depth.dtype, device=depth.device) + 0.5 - camera.cy) / camera.fy
     points = depth * x.to(depth), depth * y.to(depth)[:, None], depth
     a_x, a_y, a_z = (p[1:-1, 2:] - p[1:-1, :-2] for p in points)
     d_x, d_y, d_z = (p[2:, 1:-1] - p[:-2, 1:-1] for p in points)

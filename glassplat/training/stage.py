@@ -315,6 +315,11 @@ class Stage:
     densify_until: float = 0.0
     until: Callable[[TrainState], bool] | None = None
 
+    def __post_init__(self) -> None:
+        names = [term.name for term in self.losses]
+        if len(set(names)) < len(names):
+            raise ValueError(f"the stage {self.name!r} has the loss terms {names}; expected another name for each")
+
     def is_over(self, state: TrainState) -> bool:
         """Return whether the stage ends early."""
         return self.until is not None and self.until(state)

@@ -146,3 +146,9 @@ def test_without_gaussforge_it_is_said_how_to_get_it(
         load(tmp_path / f"a{suffix}", device="cpu")
     with pytest.raises(ValueError, match=r"pip install 'glassplat\[formats\]'"):
         write_splats(suffix[1:], tmp_path / f"b{suffix}", typical())
+
+
+def test_a_direction_that_is_not_up_is_refused(tmp_path: Path) -> None:
+    write_gaussians(tmp_path / "scene.ply", true_scene().primary)
+    with pytest.raises(InputError, match="up is 'w'; expected one of"):
+        load(tmp_path / "scene.ply", device="cpu", up="w")  # type: ignore[arg-type]

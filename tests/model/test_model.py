@@ -5,16 +5,18 @@ from __future__ import annotations
 import base64
 import dataclasses
 import io
+import pickle
 from pathlib import Path
 from typing import Any
 from urllib.request import HTTPCookieProcessor, build_opener
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 import glassplat
-from glassplat import Camera, Gaussians, InputError, Model, Planar, PlanarRecipe, Scene, SplatRecipe
+from glassplat import Camera, Gaussians, InputError, Model, Planar, PlanarRecipe, Scene, SplatRecipe, View
 from glassplat.model.model import by_name
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Environment
@@ -44,6 +46,8 @@ def test_a_run_is_loaded_and_rendered_as_its_renderer_does(tmp_path: Path) -> No
     frame = loaded.render("2.png", layers=["reflection", "depth"])
     torch.testing.assert_close(frame.rgb, Planar()(true_scene(), loaded.cameras["2.png"]).rgb)
     assert {"reflection", "depth"} == set(frame.layers), "what was not asked for stays inside"
+    again = loaded.render("2.png", layers=(name for name in ("reflection", "depth")))  # type: ignore[arg-type]
+    assert torch.equal(again.layers["depth"], frame.layers["depth"])
 
 
 def test_gradients_reach_the_scene_and_the_camera() -> None:
@@ -308,3 +312,15 @@ def test_metrics_are_of_what_photographs_show_somebody_in_the_glass_too() -> Non
 def test_gaussians_of_a_model_are_plain_data() -> None:
     primary = model().scene.primary
     assert isinstance(primary, Gaussians) and len(primary.concat(primary)) == 2 * len(primary)
+
+
+def test_a_view_in_memory_is_kept_and_what_is_no_tensor_and_no_angle_is_refused() -> None:
+    scene, camera = true_scene(), model().cameras["2.png"]
+    with pytest.raises(TypeError, match="means is a ndarray; expected a tensor"):
+        dataclasses.replace(scene.primary, means=scene.primary.means.numpy())
+    kept = pickle.loads(pickle.dumps(tiny_capture().train[0]))
+    assert torch.equal(kept.photo, tiny_capture().train[0].photo)
+    with pytest.raises(ValueError, match="the pixels of a are a ndarray; expected a tensor"):
+        View.in_memory("a", camera, photo=np.zeros((28, 40, 3), np.uint8))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="fov_rad is 0; expected radians between 0 and pi"):
+        Camera.look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0), fov_rad=0)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import threading
+import time
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -181,11 +185,26 @@ def test_a_recipe_of_ones_own_is_trained() -> None:
     assert losses[-1]["brightness"] < losses[0]["brightness"]
 
 
+def test_a_loss_term_with_a_name_that_is_taken_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Brighter, "stages", lambda self, seed, iterations: twice(SplatRecipe.stages(self, seed)))
+    with pytest.raises(ValueError, match=r"loss terms .*; expected another name for each"):
+        Training(tiny_capture(), Brighter(), iterations=4, device="cpu")
+
+
+def twice(stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+    return tuple(replace(stage, losses=(*stage.losses, *stage.losses)) for stage in stages)
+
+
 def test_what_cannot_be_trained_is_refused_at_once(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="dataset is 'captures/shop'; expected what"):
         Training("captures/shop", "splat")
     with pytest.raises(InputError, match="no method is called 'nerf'; expected splat, planar"):
         Training(tiny_capture(), "nerf")
+    with pytest.raises(InputError, match="no training views"):
+        Training(replace(tiny_capture(), train=()), "splat")
+    for nothing in (SplatRecipe, None, {"sh_degree": 1}):
+        with pytest.raises(InputError, match=r"recipe is .*; expected a method's name, or a recipe such as"):
+            Training(tiny_capture(), nothing)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="expected at least"):
         Training(tiny_capture(), "planar", iterations=2)
     for wrong in (SplatRecipe(strategy="foo"), SplatRecipe(ssim_weight=-3.0)):  # type: ignore[arg-type]
@@ -198,3 +217,109 @@ def test_what_cannot_be_trained_is_refused_at_once(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(NotADirectoryError):
         Training(tiny_capture(), "splat", output=tmp_path / "file")
+
+
+@pytest.mark.parametrize("switched_off", [torch.no_grad, torch.inference_mode])
+def test_a_training_learns_where_gradients_are_switched_off(switched_off: Any) -> None:
+    dataset = replace(tiny_capture(), train=tuple(replace(view) for view in tiny_capture().train))
+    whole = Training(tiny_capture(), RECIPE, iterations=4, device="cpu").run()
+    with switched_off():
+        for message in (training := Training(dataset, RECIPE, iterations=4, device="cpu")):
+            assert not torch.is_grad_enabled()
+            if isinstance(message, StepDone):
+                assert torch.isfinite(training.model.image("2.png")).all()
+    assert torch.equal(training.model.scene.primary.means, whole.scene.primary.means)
+    training.model.render("2.png").rgb.mean()
+    assert not training.model.scene.primary.means.is_inference()
+
+
+def test_photographs_first_looked_at_without_gradients_can_be_learned_from(tmp_path: Path) -> None:
+    dataset = load_dataset(write_tiny_capture(tmp_path / "capture"))
+    with torch.inference_mode():
+        assert all(float(view.photo.float().mean()) > 0 for view in dataset.train)
+    assert steps(Training(dataset, RECIPE, iterations=2, device="cpu")) == [1, 2]
+
+
+@pytest.mark.parametrize("recipe", [RECIPE, *SETUPS.values()], ids=["splat", *SETUPS])
+def test_the_precision_that_tensors_have_by_default_changes_nothing(recipe: Any, tmp_path: Path) -> None:
+    capture = write_tiny_capture(tmp_path / "capture")
+
+    def found(folder: Path) -> tuple[dict[str, Tensor], Tensor]:
+        model = Training(load_dataset(capture), recipe, iterations=10, device="cpu").run()
+        model.save(folder)
+        return glassplat.load(folder, device="cpu").scene.parameters(), model.image("2.png")
+
+    usual, picture = found(tmp_path / "single")
+    torch.set_default_dtype(torch.float64)
+    try:
+        other, same = found(tmp_path / "double")
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert torch.equal(picture, same) and usual.keys() == other.keys()
+    assert all(torch.equal(tensor, other[name]) for name, tensor in usual.items())
+
+
+@dataclass(frozen=True)
+class Weighted(SplatRecipe):
+    """With an option of its own."""
+
+    brightness: float = 10.0
+
+
+def test_a_run_of_a_recipe_of_ones_own_is_gone_on_with_and_loaded(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def training(recipe: Any, **options: bool) -> Training:
+        return Training(tiny_capture(), recipe, iterations=4, device="cpu", output=tmp_path / "run", **options)
+
+    for message in training(Weighted(sh_degree=1)):
+        if isinstance(message, StepDone):
+            break
+    for other, changed in (
+        (RECIPE, r"recipe was Weighted and is SplatRecipe, brightness was 10\.0 and is unknown"),
+        (Weighted(sh_degree=1, brightness=2.0), r"brightness was 10\.0 and is 2\.0"),
+    ):
+        with pytest.raises(InputError, match=f"options: .*{changed}"):
+            training(other, resume=True).run()
+    trained = training(Weighted(sh_degree=1), resume=True).run()
+    loaded = glassplat.load(tmp_path / "run", device="cpu")
+    assert torch.equal(loaded.image("2.png"), trained.image("2.png")) and type(loaded.recipe) is SplatRecipe
+    assert "of a recipe of one's own, 'Weighted'; taken as SplatRecipe" in caplog.text
+
+
+def test_a_training_that_is_run_again_keeps_what_it_has_trained(tmp_path: Path) -> None:
+    training = Training(tiny_capture(), RECIPE, iterations=4, device="cpu", output=tmp_path / "run")
+    first = training.run().scene.primary.means.clone()
+    assert torch.equal(training.run().scene.primary.means, first) and training.step == 4
+    other = Training(tiny_capture(), RECIPE, iterations=4, device="cpu", output=tmp_path / "taken")
+    Training(tiny_capture(), RECIPE, iterations=4, device="cpu", output=tmp_path / "taken").run()
+    with pytest.raises(InputError, match="already holds a run"):
+        other.run()
+    assert other.step == 0
+
+
+def test_trainings_that_take_turns_leave_signals_as_they_were(tmp_path: Path) -> None:
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    runs = [Training(tiny_capture(), RECIPE, iterations=6, device="cpu", output=tmp_path / name) for name in "ab"]
+    first, second = (iter(training) for training in runs)
+    for _ in range(6):
+        next(first), next(second)
+    os.kill(os.getpid(), signal.SIGTERM)  # Both are asked, and end after their step.
+    assert all(training.is_stopping for training in runs)
+    for messages, training in zip((first, second), runs, strict=True):
+        with pytest.raises(SystemExit if callable(before[1]) else KeyboardInterrupt):
+            list(messages)
+        assert 0 < training.step < 6 and (tmp_path / "a" / "checkpoint.safetensors").is_file()
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_a_training_that_ends_in_another_thread_leaves_signals_to_the_next(tmp_path: Path) -> None:
+    messages = iter(Training(tiny_capture(), RECIPE, iterations=6, device="cpu", output=tmp_path / "run"))
+    for _ in range(6):
+        next(messages)
+    (closing := threading.Thread(target=messages.close)).start()
+    closing.join()
+    with pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(1)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

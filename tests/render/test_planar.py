@@ -292,3 +292,8 @@ def test_detached_cuts_every_tensor_off() -> None:
     scene = showcase()
     trainable = scene.primary.with_tensors({"means": scene.primary.means.clone().requires_grad_()})
     assert not detach_gaussians(trainable).means.requires_grad
+
+
+def test_a_space_to_blend_in_that_there_is_not_is_refused() -> None:
+    with pytest.raises(ValueError, match="blend is 'Linear'; expected one of"):
+        Planar(blend="Linear")  # type: ignore[arg-type]

@@ -197,3 +197,16 @@ def test_an_infinite_motion_is_refused() -> None:
         move_pane(showcase(), 1, (1, 0, 0, 0), (0, float("nan"), 0))
     with pytest.raises(ValueError, match="quaternion of no length"):
         move_pane(showcase(), 1, (0, 0, 0, 0), (0, 0, 0))
+
+
+def test_a_label_names_one_pane() -> None:
+    twice = Planes.rectangle((0.0, 0.0, 2.0), (0.0, 0.0, -1.0), (0.5, 0.5))
+    with pytest.raises(ValueError, match=r"labels \(1, 1\); expected another one for each plane"):
+        twice.concat(twice)
+
+
+def test_a_number_is_read_from_a_tensor_once() -> None:
+    focal = torch.tensor(50.0)
+    camera = replace(CAMERA, fx=focal, fy=focal)
+    focal += 30
+    assert camera.intrinsics[0] == 50 and replace(CAMERA, fx=focal).intrinsics[0] == 80
