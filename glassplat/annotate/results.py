@@ -22,7 +22,7 @@ from glassplat.captures.view import PhotoFile, View
 from glassplat.errors import InputError, first_names
 from glassplat.files.images import files_below, image_size, is_hidden, leads_out, write_image
 from glassplat.files.records import read_json
-from glassplat.files.sidecars import write_planes
+from glassplat.files.sidecars import planes_json, write_planes
 from glassplat.files.writing import atomic_write, remove_empty, remove_unfinished
 from glassplat.options import CLEAR_GLASS
 from glassplat.panes.masks import min_area_rectangle
@@ -116,24 +116,39 @@ def write_results(root: Path, views: Sequence[View], cameras: Sequence[NumpyCame
     A mask tells of every pane what of it a photograph shows, also of panes that were not marked in this one.
 
     Raises:
-        InputError: the folder holds masks that were not made here.
+        InputError: the folder holds masks that were not made here, or the planes were not, or changed since.
         OSError: something cannot be written.
     """
     folder = root / PANE_FOLDER
     earlier = earlier_masks(root)
+    planes = planes_of(panes, cameras)
+    _check_planes(root)
     marked = set().union(*(pane.views() for pane, _ in panes))
     paths = mask_paths(view.name for view in views)
     shown = [(view, camera) for view, camera in zip(views, cameras, strict=True) if view.name in marked]
     new = {paths[view.name].as_posix() for view, _ in shown}
     # First: after an interrupt, all that is there is known to be ours.
-    _write_record(folder, earlier | new, _made_here(folder)[1])
+    _write_record(
+        folder, earlier | new, [*_made_here(folder)[1], hashlib.sha256(planes_json(planes).encode()).hexdigest()]
+    )
     for view, camera in shown:
         write_image(folder / paths[view.name], in_photograph(view, pane_labels(view.name, camera, panes)))
     for name in earlier - new:
         (folder / name).unlink(missing_ok=True)
-    write_planes(root / PLANES, planes_of(panes, cameras))
-    _write_record(folder, new, _digest(root / PLANES))
+    write_planes(root / PLANES, planes)
+    _write_record(folder, new, [_digest(root / PLANES)])
     return sorted(new)
+
+
+def _check_planes(root: Path) -> None:
+    """Refuse to replace planes that somebody else wrote; earlier versions did not record which were theirs."""
+    masks, digests = _made_here(root / PANE_FOLDER)
+    written = _digest(root / PLANES)
+    if written and written not in digests and (digests or not masks):
+        raise InputError(
+            f"{root / PLANES} was not made by `glassplat annotate`, or somebody has changed it since; nothing was "
+            "written. Move it away and write again; what it had besides can be added to the new one"
+        )
 
 
 def remove_results(root: Path) -> list[str]:
@@ -144,8 +159,8 @@ def remove_results(root: Path) -> list[str]:
         OSError: something cannot be removed.
     """
     folder = root / PANE_FOLDER
-    masks, planes = [folder / name for name in sorted(earlier_masks(root))], _made_here(folder)[1]
-    ours = [*([root / PLANES] if planes == _digest(root / PLANES) else ()), *masks]
+    masks, digests = [folder / name for name in sorted(earlier_masks(root))], _made_here(folder)[1]
+    ours = [*([root / PLANES] if _digest(root / PLANES) in digests else ()), *masks]
     removed = [path for path in ours if path.is_file()]
     for path in (*removed, folder / RECORD):  # The record last: after an interrupt, the rest is known to be ours.
         path.unlink(missing_ok=True)
@@ -156,20 +171,22 @@ def remove_results(root: Path) -> list[str]:
     return [path.relative_to(root).as_posix() for path in removed]
 
 
-def _write_record(folder: Path, masks: Set[str], planes: str) -> None:
-    """Notes which masks of a folder were made here, and the digest of the planes that were."""
+def _write_record(folder: Path, masks: Set[str], digests: Sequence[str]) -> None:
+    """Notes which masks of a folder were made here, and the digests of the planes that were, or are about to be."""
     with atomic_write(folder / RECORD) as temporary:
-        temporary.write_text(json.dumps({"masks": sorted(masks), "planes": planes}, indent=1), encoding="utf-8")
+        temporary.write_text(
+            json.dumps({"masks": sorted(masks), "planes": " ".join(digests)}, indent=1), encoding="utf-8"
+        )
 
 
-def _made_here(folder: Path) -> tuple[set[str], str]:
-    """Masks of a folder and digest of planes, as recorded; a list of masks alone where an earlier version did it."""
+def _made_here(folder: Path) -> tuple[set[str], list[str]]:
+    """Masks of a folder and digests of planes, as recorded; a list of masks alone where an earlier version did it."""
     try:
         record = read_json(folder / RECORD)
         masks, planes = (record["masks"], record["planes"]) if isinstance(record, dict) else (record, "")
-        return {str(name) for name in masks}, str(planes)
+        return {str(name) for name in masks}, str(planes).split()
     except (OSError, ValueError, TypeError, KeyError):
-        return set(), ""
+        return set(), []
 
 
 def _digest(path: Path) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from os.path import isfile, lexists, normpath
+from os.path import abspath, commonpath, dirname, isfile, lexists, normpath, realpath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -203,8 +203,7 @@ def shots_of(root: Path, settings: Settings, file_name: str) -> dict[str, Shot]:
             "copy them to where file_path says, or delete their entries from `frames`"
         )
     shots = {}
-    for frame, path in zip(settings["frames"], paths, strict=True):
-        name = _name(root, path)
+    for frame, path, name in zip(settings["frames"], paths, _names(root, paths), strict=True):
         lens = lens_from_settings({**settings, **frame}, path, name)
         if frame["file_path"] in shots:
             raise InputError(f"{root / file_name} has two frames for {frame['file_path']}; keep one")
@@ -219,12 +218,25 @@ def image_path(root: Path, frame: Settings) -> Path:
     return Path(next((candidate for candidate in candidates if isfile(candidate)), path))
 
 
+def _names(root: Path, paths: Sequence[Path]) -> list[str]:
+    """The photographs' names; where some elsewhere have the same, relative to the folder that holds them all."""
+    names = [_name(root, path) for path in paths]
+    if len(set(names)) == len(set(paths)):
+        return names
+    whole = [abspath(path) for path in paths]
+    return [Path(path).relative_to(commonpath(map(dirname, whole))).as_posix() for path in whole]
+
+
 def _name(root: Path, path: Path) -> str:
-    """The photograph's name, relative to the folder of images, or to the capture, where it lies in there."""
-    plain_root = Path(normpath(root))
-    for folder in (plain_root / "images", plain_root):
-        if path.is_relative_to(folder):
-            return path.relative_to(folder).as_posix()
+    """The photograph's name, relative to the folder of images, or to the capture, where it lies in there.
+
+    It does not matter how either is written: relative, whole, or by way of a link.
+    """
+    for spelled in (normpath, abspath, realpath):
+        folder, photograph = Path(spelled(root)), Path(spelled(path))
+        for above in (folder / "images", folder):
+            if photograph.is_relative_to(above):
+                return photograph.relative_to(above).as_posix()
     return path.name
 
 

@@ -236,7 +236,8 @@ def _look_at(gaussians: Gaussians, finding: Finding) -> None:
 def _describe_results(directory: RunDirectory, finding: Finding) -> None:
     path = directory.path
     if not directory.results.is_file():
-        finding.next.append(f"glassplat eval {shell_word(path)}    measures it on its test views")
+        data = "" if Path(directory.settings().data).is_dir() else " --data CAPTURE"
+        finding.next.append(f"glassplat eval {shell_word(path)}{data}    measures it on its test views")
     else:
         try:
             results = read_json(directory.results)

@@ -15,12 +15,12 @@ from rich.console import Console
 from glassplat.captures.files import CaptureFiles, read_capture
 from glassplat.cli.console import count_noun, import_held, say, shell_word, warn
 from glassplat.errors import InputError, UnknownFormatError, first_names, input_checked
-from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES, files_below
+from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES, files_below, is_hidden
 from glassplat.files.records import Text, check_fields, read_json
 from glassplat.files.writing import SCENE, SPLAT_SUFFIXES, check_folder, scene_source
 from glassplat.model.run_directory import RunDirectory
 from glassplat.prepare.photographs import LEAST_SIDE, VIDEO_SUFFIXES, NoOpenCVError, broken_photographs, video_facts
-from glassplat.prepare.preparation import PAGE, RECORD
+from glassplat.prepare.preparation import PAGE, RECORD, Preparation
 
 KINDS = f"a capture, photographs, a video, a run, an exported scene, or a splat file ({', '.join(SPLAT_SUFFIXES)})"
 """What there is to be found."""
@@ -114,7 +114,8 @@ def photographs_finding(path: Path) -> Iterator[Finding]:
     Raises:
         InputError: there are none.
     """
-    found = sorted(one for one in files_below(path) if is_photograph(one) and one.is_file())
+    below = [one for one in files_below(path) if not is_hidden(one.relative_to(path))]
+    found = sorted(one for one in below if is_photograph(one) and one.is_file())
     if not found:
         names = first_names(sorted(one.name for one in path.iterdir()), 8) or "nothing"
         raise InputError(f"{path} is nothing that is known; expected {KINDS}; it holds {names}")
@@ -162,11 +163,15 @@ def preparation_finding(path: Path) -> Iterator[Finding]:
     """The folder of a preparation that was interrupted."""
     settings = path / "settings.json"
     with input_checked():
-        source = check_fields(read_json(settings), {"input": Text()}, str(settings))["input"]
+        given = read_json(settings)
+        source = check_fields(given, {"input": Text()}, str(settings))["input"]
     output = str(path).removesuffix(".partial")
+    usual = Preparation(Path(source), Path(output)).record()
+    others = {name: given[name] for name in usual if given.get(name, usual[name]) != usual[name] and name != "input"}
+    options = "".join(f" --{name} {shell_word(str(value))}" for name, value in others.items())
     finding = Finding("an interrupted preparation", {"of": source})
     finding.problems.append("it is not finished")
-    finding.next.append(f"glassplat prepare {shell_word(source)} --output {shell_word(output)} --resume")
+    finding.next.append(f"glassplat prepare {shell_word(source)} --output {shell_word(output)}{options} --resume")
     yield finding
 
 

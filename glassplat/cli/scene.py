@@ -50,6 +50,7 @@ class Evaluate:
     def ready(self) -> None:
         """Refuses what is no run, and imports what renders."""
         RunDirectory(self.run_directory).check_begun()
+        check_folder(self.run_directory)
         say_scene(self.run_directory)
         import_now("glassplat.cli.evaluation")
 
@@ -199,8 +200,11 @@ class Video:
             raise InputError(
                 f"{self.output.suffix} needs OpenCV ({error}); pip install 'glassplat[video]', or end --output in .webp"
             ) from error
+        if self.output.is_dir():
+            raise InputError(f"{self.output} is a folder; expected a name for a film as --output")
         if os.path.lexists(self.output) and not self.force:
             raise InputError(f"{self.output} is already there; pass --force to replace it, or choose another --output")
+        check_folder(self.output.parent)
         if self.layout == "wipe" and len(self.layers) != 2:
             raise InputError(f"a wipe takes two --layers, not {len(self.layers)}, such as rgb transmission")
         if (self.path == "keyframes") != (self.keyframes is not None):

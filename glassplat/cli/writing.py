@@ -35,6 +35,7 @@ from glassplat.render.frame import check_layers
 from glassplat.render.layers import layer_image
 from glassplat.render.planar import Planar, dereflected_photo
 from glassplat.scene.camera import Camera
+from glassplat.scene.corrections import in_order
 from glassplat.scene.scene import Scene, without_glass
 from glassplat.training.messages import Working
 
@@ -146,7 +147,9 @@ def _cameras(command: Video, model: Model) -> list[Camera]:
         if command.keyframes is not None:
             cameras = interpolate_cameras([camera for _, camera in read_cameras(command.keyframes)], frames)
         elif command.path == "interpolate":
-            cameras = interpolate_cameras(keyframes_of([model.cameras[name] for name in sorted(model.cameras)]), frames)
+            cameras = interpolate_cameras(
+                keyframes_of([model.cameras[name] for name in sorted(model.cameras, key=in_order)]), frames
+            )
         else:
             cameras = model.orbit(frames)
     return [fit_to_width(camera, command.width + command.width % 2) for camera in cameras]

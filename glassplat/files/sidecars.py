@@ -158,7 +158,18 @@ PLANE: dict[str, records.Field] = {
 
 
 def write_planes(path: Path | str, planes: Planes) -> None:
-    """Writes planes as a JSON list, atomically; `read_planes` gives back the same float32 bits.
+    """Writes `planes_json`, atomically; `read_planes` gives back the same float32 bits.
+
+    Raises:
+        ValueError: a plane holds a value that is not finite.
+    """
+    text = planes_json(planes)
+    with atomic_write(path) as temporary_path:
+        temporary_path.write_text(text, encoding="utf-8", newline="\n")
+
+
+def planes_json(planes: Planes) -> str:
+    """Planes as a JSON list.
 
     Each entry has label, mirror, center, normal (unit), tangent, half_sizes and base_reflectance for people
     and other programs (world units, the capture's frame), and the raw values raw_normal and
@@ -175,8 +186,7 @@ def write_planes(path: Path | str, planes: Planes) -> None:
             raise ValueError(
                 f"plane {entry['label']} cannot be written: {', '.join(broken)} must be finite, but is not"
             )
-    with atomic_write(path) as temporary_path:
-        temporary_path.write_text(json.dumps(entries, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return json.dumps(entries, indent=1, allow_nan=False) + "\n"
 
 
 def read_planes(path: Path | str) -> Planes:

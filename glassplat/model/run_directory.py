@@ -30,6 +30,7 @@ from glassplat.training.ranks import leads
 
 if TYPE_CHECKING:
     from glassplat.captures.dataset import Dataset
+    from glassplat.scene.camera import Camera
     from glassplat.scene.scene import Scene
 
 log = logging.getLogger("glassplat.training")
@@ -38,6 +39,10 @@ NAME = "train.lock"
 """The file stays behind, empty; the lock on it ends with the process, however that ends."""
 WITHOUT_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
 """What file systems answer that know no locks."""
+
+
+def _is_near(recorded: Camera, camera: Camera, extent: float) -> bool:
+    return float((recorded.center - camera.center).norm()) <= MOST_MOVED * extent
 
 
 @contextmanager
@@ -294,29 +299,46 @@ class RunDirectory:
 
     def has_cameras_of(self, dataset: Dataset) -> bool:
         """Return whether the recorded cameras are the capture's, give or take what pose refinement may move them."""
-        from glassplat.files.sidecars import read_cameras
-
-        try:
-            recorded = dict(read_cameras(self.path / "cameras.json"))
-        except (OSError, ValueError):
-            return False
+        recorded = self._cameras()
         cameras = {view.name: view.camera for view in (*dataset.train, *dataset.test)}
         return recorded.keys() == cameras.keys() and all(
-            float((recorded[name].center - camera.center).norm()) <= MOST_MOVED * dataset.extent
+            _is_near(recorded[name], camera, dataset.extent)
             and (recorded[name].width, recorded[name].height) == (camera.width, camera.height)
             for name, camera in cameras.items()
         )
 
+    def _check_poses(self, dataset: Dataset) -> None:
+        """Refuse a capture most of whose cameras are elsewhere: its world is another one than that of the scene."""
+        recorded = self._cameras()
+        known = {v.name: v.camera for v in (*dataset.train, *dataset.test) if v.name in recorded}
+        moved = [name for name, camera in known.items() if not _is_near(recorded[name], camera, dataset.extent)]
+        if 2 * len(moved) > len(known):
+            raise InputError(
+                f"{len(moved)} of {len(known)} cameras of {dataset.root} are elsewhere than when {self.path} was "
+                f"trained: {first_names(sorted(moved))}. Has the capture been prepared again? Give the capture as it "
+                "was to --data, or train again"
+            )
+
+    def _cameras(self) -> dict[str, Camera]:
+        """The recorded cameras by name; none where they cannot be read."""
+        from glassplat.files.sidecars import read_cameras
+
+        try:
+            return dict(read_cameras(self.path / "cameras.json"))
+        except (OSError, ValueError):
+            return {}
+
     def check_photographs(self, dataset: Dataset) -> None:
-        """Refuse a capture of other photographs than the run was trained on.
+        """Refuse a capture of other photographs than the run was trained on, or with other poses.
 
         Which of them are for testing follows from all of them; with one more or less, they would be others.
 
         Raises:
-            InputError: says which ones only the run or only the capture has.
+            InputError: says which ones only the run or only the capture has, or that the cameras are elsewhere.
         """
         trained, found = self.photographs(), {view.name for view in (*dataset.train, *dataset.test)}
         if trained is None or trained == found:
+            self._check_poses(dataset)
             return
         only = [
             f"{first_names(sorted(names))} only in {where}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import os
 import signal
 import threading
@@ -27,6 +28,7 @@ from glassplat.methods.recipe import RECIPES, Recipe, recipe_to_json, resolve_ba
 from glassplat.model import run_directory
 from glassplat.model.model import Model
 from glassplat.options import check_value, short_repr
+from glassplat.scene.panes import name_labels
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import train
 from glassplat.training.messages import (
@@ -40,6 +42,8 @@ from glassplat.training.messages import (
 )
 from glassplat.training.ranks import Ranks, join
 from glassplat.training.stage import Stage, TrainState, check_length, stage_starts
+
+log = logging.getLogger("glassplat.training")
 
 Listener = Callable[[Message], None]
 STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
@@ -280,6 +284,13 @@ def resumed_state(
     )
     if has_moved:
         directory.write_settings(replace(written, data=settings.data))
+    known = state.scene.planes.labels
+    if known and (later := [label for label in dataset.pane_labels if label not in known]):
+        log.warning(
+            "the planes of this run were fitted before pane %s was marked: it is learned like all else; to have it as "
+            "a pane, train again",
+            name_labels(later),
+        )
     return state.to(settings.device)
 
 

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import logging
 import os
 import shutil
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 from glassplat import __version__
 from glassplat.captures.colmap_library import quiet_pycolmap
@@ -29,6 +34,8 @@ from glassplat.prepare.photographs import (
     photographs_in,
 )
 from glassplat.prepare.reconstruction import Settings, Solution, best_solution, image_numbers, write_capture
+
+log = logging.getLogger(__name__)
 
 RECORD = "prepare.json"
 """In the capture: that it was prepared here, and the report."""
@@ -62,6 +69,29 @@ class Workplace:
     def capture(self) -> Path:
         """The capture while it is written."""
         return self.folder / "capture"
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Holds the output against other preparations on this machine, where it knows locks.
+
+        Raises:
+            InputError: another one is making this capture.
+        """
+        user = os.getuid() if hasattr(os, "getuid") else ""
+        name = hashlib.sha256(os.fsencode(self.output)).hexdigest()[:16]
+        lock = FileLock(Path(tempfile.gettempdir()) / f"glassplat-prepare-{user}-{name}.lock", blocking=False)
+        try:
+            lock.acquire()
+        except Timeout as error:
+            raise InputError(
+                f"another preparation is making {self.output}; wait until it has ended, or choose another --output"
+            ) from error
+        except OSError as error:
+            log.debug("%s is not locked: %s", self.output, error)
+        try:
+            yield
+        finally:
+            lock.release()
 
     def begin(self, settings: Mapping[str, Any], *, resume: bool, force: bool) -> bool:
         """Makes the folder, or finds the one of an interrupted preparation; returns whether it is a new one.
@@ -353,6 +383,11 @@ def prepare(task: Preparation, listen: Listener, *, resume: bool = False, force:
     check_places(task)
     quiet_pycolmap()
     workplace = Workplace(task.output)
+    with workplace.alone():
+        return _prepare(task, workplace, listen, resume=resume, force=force)
+
+
+def _prepare(task: Preparation, workplace: Workplace, listen: Listener, *, resume: bool, force: bool) -> Report:
     settings = {**task.record(), PHOTOGRAPHS: file_states(task.source)}
     missing = missing_folders(workplace.folder.parent)
     begun = workplace.begin(settings, resume=resume, force=force)

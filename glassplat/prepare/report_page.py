@@ -24,6 +24,7 @@ from glassplat.files.writing import atomic_write
 from glassplat.panes.material import virtual_points
 from glassplat.prepare.preparation import RECORD
 from glassplat.scene.camera import NumpyCamera
+from glassplat.scene.corrections import in_order
 from glassplat.scene.panes import Planes
 
 Array = NDArray[np.float64]
@@ -212,7 +213,7 @@ def _read_report(path: Path) -> dict[str, Any]:
 
 
 def _page(report: Mapping[str, Any], dataset: Dataset, model: Any, planes: Planes | None, title: str) -> str:
-    views = sorted((*dataset.train, *dataset.test), key=lambda view: view.name)
+    views = sorted((*dataset.train, *dataset.test), key=lambda view: in_order(view.name))
     behind = _behind(dataset, planes)
     points = list(model.points3D.values())
     tracks = np.array([point.track.length() for point in points])

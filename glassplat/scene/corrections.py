@@ -21,17 +21,17 @@ def neighbours(name: str, names: Sequence[str]) -> list[int]:
     Numbers in names count as numbers: 9 comes before 10. Photographs of other folders are no neighbours, since nobody
     knows when they were taken; the list is empty where there are no others.
     """
-    folder, here = PurePosixPath(name).parent, _in_order(name)
+    folder, here = PurePosixPath(name).parent, in_order(name)
     beside = [row for row, known in enumerate(names) if PurePosixPath(known).parent == folder and known != name]
-    before = [row for row in beside if _in_order(names[row]) < here]
-    after = [row for row in beside if _in_order(names[row]) > here]
+    before = [row for row in beside if in_order(names[row]) < here]
+    after = [row for row in beside if in_order(names[row]) > here]
     return [
-        *([max(before, key=lambda row: _in_order(names[row]))] if before else []),
-        *([min(after, key=lambda row: _in_order(names[row]))] if after else []),
+        *([max(before, key=lambda row: in_order(names[row]))] if before else []),
+        *([min(after, key=lambda row: in_order(names[row]))] if after else []),
     ]
 
 
-def _in_order(name: str) -> tuple[list[tuple[int, str]], str]:
+def in_order(name: str) -> tuple[list[tuple[int, str]], str]:
     """Sort key of names: their parts without suffix, numbers by value, so that `a.jpg` comes before `a1.jpg`."""
     parts = re.findall(r"\d+|\D+", str(PurePosixPath(name).with_suffix("")))
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts], name

@@ -184,6 +184,20 @@ def test_unmarking_removes_nothing_that_was_not_written_here(room: Path) -> None
     assert not (room / "panes").exists() and (room / "planes.json").read_text() == planes + " "
 
 
+@pytest.mark.parametrize("changed", ["before", "since"])
+def test_planes_that_somebody_else_wrote_are_not_replaced(changed: str, room: Path) -> None:
+    if changed == "since":
+        finish(room, marked_document())
+        assert finish(room, marked_document()), "what was made here is"
+    own = [{"label": 2, "center": [0, 0, 2], "normal": [0, 0, -1], "tangent": [1, 0, 0], "half_sizes": [1, 1]}]
+    (room / "planes.json").write_text(json.dumps(own))
+    with pytest.raises(InputError, match=r"planes\.json was not made by .*; nothing was written\. Move it away"):
+        finish(room, marked_document())
+    assert json.loads((room / "planes.json").read_text()) == own
+    (room / "planes.json").unlink()
+    assert finish(room, marked_document())["masks"] == NAMES[:3]
+
+
 def test_a_record_of_earlier_versions_tells_of_masks_only(room: Path) -> None:
     finish(room, marked_document())
     (room / "panes" / "annotated.json").write_text(json.dumps(NAMES[:3]))

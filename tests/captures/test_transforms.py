@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -315,3 +316,25 @@ def test_points_that_are_a_link_to_nowhere_are_not_replaced_by_random_ones(captu
     points.mkdir()
     with pytest.raises(InputError, match=r"points3D\.\w+ cannot be read \(it is a folder"):
         load_dataset(capture.root)
+
+
+@pytest.mark.parametrize("spelled", ["whole", "relative", "by a link"])
+def test_names_do_not_depend_on_how_the_capture_is_spelled(
+    spelled: str, capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture.names = [f"{side}/{name}" for side, name in zip(("left", "right") * 5, capture.names, strict=True)]
+    capture.write_images()
+    capture.write_transforms({**LENS, "frames": capture.frames(f"{capture.root}/images/")})
+    monkeypatch.chdir(capture.root.parent)
+    (capture.root.parent / "link").symlink_to(capture.root)
+    root = {"whole": capture.root, "relative": Path(capture.root.name), "by a link": Path("link")}[spelled]
+    found = load_transforms(root)
+    assert found is not None and [shot.name for shot in found.shots] == capture.names
+
+
+def test_photographs_elsewhere_with_one_name_in_two_folders_have_their_folders_names(capture) -> None:
+    capture.names = [f"{side}/{number}.png" for number in range(5) for side in ("left", "right")]
+    capture.write_images(folder="../photographs")
+    capture.write_transforms({**LENS, "frames": capture.frames("../photographs/")})
+    found = load_transforms(capture.root)
+    assert found is not None and sorted(shot.name for shot in found.shots) == sorted(capture.names)

@@ -131,6 +131,7 @@ def test_small_photographs_of_a_capture_are_sound(tmp_path: Path, capsys: pytest
 def test_a_folder_of_few_photographs_is_said_to_be_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "few").mkdir()
     shutil.copy(SCENE / "images" / "0000.jpg", tmp_path / "few")
+    (tmp_path / "few" / "._0000.jpg").write_bytes(b"what a Mac leaves on foreign disks")
     assert told(tmp_path / "few", capsys)["problems"] == ["only 1 photograph; 30 and more do better"]
 
 
@@ -139,6 +140,10 @@ def test_what_was_interrupted_goes_on(tmp_path: Path, capsys: pytest.CaptureFixt
     (tmp_path / "my capture.partial" / "settings.json").write_text('{"input": "photographs"}')
     found = told(tmp_path / "my capture.partial", capsys)
     assert not found["healthy"] and found["next"][0].endswith("--resume")
+    begun = {"input": "photographs", "max-size": 500, "frames": 150, "lens": "opencv", "mapper": "incremental"}
+    (tmp_path / "my capture.partial" / "settings.json").write_text(json.dumps(begun))
+    found = told(tmp_path / "my capture.partial", capsys)
+    assert found["next"][0].endswith("my capture' --max-size 500 --lens opencv --resume")
     for damaged in ("{bad", "[]", "{}"):
         (tmp_path / "my capture.partial" / "settings.json").write_text(damaged)
         assert main(["info", str(tmp_path / "my capture.partial")]) == 2

@@ -60,6 +60,8 @@ def test_an_interrupted_film_leaves_nothing(
     [
         ("--output film.avi", "no name of a film"),
         ("--output there.webp", "pass --force"),
+        ("--output folder.webp --force", "folder.webp is a folder"),
+        ("--output there.webp/film.webp", "there.webp is a file"),
         ("--output film.webp --layout wipe", "two --layers"),
         ("--output film.webp --path keyframes", "belong together"),
         ("--output film.webp --layers base", "renders no layer base"),
@@ -74,6 +76,7 @@ def test_what_makes_no_sense_is_refused_before_anything_is_rendered(
     run = write_run(tmp_path / "run")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there.webp").write_text("mine")
+    (tmp_path / "folder.webp").mkdir()
     assert main(["video", str(run), *options.split()]) == 2
     assert words in " ".join(capsys.readouterr().err.split())
     assert not list(tmp_path.glob("film.*")) and (tmp_path / "there.webp").read_text() == "mine"

@@ -32,6 +32,7 @@ from glassplat.model import training
 from glassplat.model.run_directory import CHECKPOINT_SECONDS, RunDirectory, RunSettings
 from glassplat.model.training import Record, Run, TrainingSession
 from glassplat.panes import PlaneFitError
+from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
 from glassplat.training.checkpoint import load_checkpoint, recorded, save_checkpoint
 from glassplat.training.messages import CheckpointWritten, Message, RunBegun, StepDone, Working
@@ -514,3 +515,20 @@ def test_a_second_signal_interrupts_unless_torchrun_may_have_passed_it_on(
         with nullcontext() if launched else pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
         assert request.requested
+
+
+def test_a_capture_whose_poses_were_found_again_is_not_gone_on_with(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, interrupt_at=5)
+    before = RunDirectory(tmp_path).checkpoint.read_bytes()
+    capture = tiny_capture()
+
+    def turned(camera: Camera) -> Camera:
+        pose = camera.cam_from_world.clone()
+        pose[:3, 3] *= 2
+        return replace(camera, cam_from_world=pose)
+
+    other = replace(capture, train=tuple(view.with_camera(turned(view.camera)) for view in capture.train))
+    with pytest.raises(InputError, match=r"cameras of tiny are elsewhere than when .*: 1\.png.*prepared again\?"):
+        Run(RECIPE, SETTINGS, RunDirectory(tmp_path), other, resume=True).to_the_end(print)
+    assert RunDirectory(tmp_path).checkpoint.read_bytes() == before

@@ -98,6 +98,19 @@ def test_who_leaves_the_loop_where_a_stage_begins_can_go_on_there(recipe: Any, t
     assert all(torch.equal(tensor, whole[name]) for name, tensor in found.items())
 
 
+def test_a_pane_that_was_marked_after_the_planes_were_fitted_is_told_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    dataset = load_dataset(write_tiny_capture(tmp_path / "capture"))
+    options: Any = {"iterations": 10, "device": "cpu", "output": tmp_path / "run"}
+    for message in Training(dataset, PANES, **options):
+        if isinstance(message, StageEntered) and message.step == 4:
+            break
+    assert "was marked" not in caplog.text
+    next(iter(Training(replace(dataset, pane_labels=(1, 2)), PANES, resume=True, **options)))
+    assert "fitted before pane 2 was marked" in caplog.text
+
+
 def test_masks_that_make_no_pane_cost_nothing_that_was_learned_before(tmp_path: Path) -> None:
     dataset = replace(load_dataset(write_tiny_capture(tmp_path / "capture")), measured_points=False)
 

@@ -132,3 +132,19 @@ def test_an_output_may_be_a_link_or_the_current_folder(
     assert (folder.parent / "link").is_symlink()
     assert sorted(path.name for path in folder.iterdir()) == ["images", PAGE, RECORD]
     assert sorted(path.name for path in folder.parent.iterdir()) == ["link", "shop"]
+
+
+@pytest.mark.parametrize("option", ["--force", "--resume"])
+def test_a_capture_that_another_preparation_makes_is_left_to_it(
+    option: str, photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    workplace = Workplace(tmp_path / "capture")
+    with workplace.alone():
+        workplace.begin({}, resume=False, force=False)
+        assert main(["prepare", str(photographs), "--output", str(tmp_path / "capture"), option]) == 2
+        assert "another preparation is making" in " ".join(capsys.readouterr().err.split())
+        assert (workplace.folder / "settings.json").is_file()
+        with Workplace(tmp_path / "other").alone():
+            pass
+    with workplace.alone():
+        pass
