@@ -27,6 +27,7 @@ from glassplat.panes.material import (
     unseen_places,
     virtual_points,
 )
+from glassplat.render.panes import nearest_hits, panes_in_camera
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene import logit
@@ -68,6 +69,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("glassplat.training")
 
+LEAST_WITHIN = 0.25
+"""Share of a pane's marked pixels that lie in the rectangle that the capture gives, at the least."""
 LEAST_COVERAGE = 0.5
 """Where the panes mirror less than this share of what they could, the photographs do not show the room directly."""
 
@@ -160,9 +163,11 @@ def fitted_planes(dataset: Dataset, centers: Tensor | None, fit: PlaneFit) -> Pl
     """
     given = Planes.empty() if dataset.planes is None else _as_given(dataset.planes, fit)
     labels = [label for label in dataset.pane_labels if label not in given.labels]
+    shown = [(view.name, view.camera, view.pane_labels) for view in dataset.train if view.pane_labels is not None]
+    if dataset.planes is not None:
+        _check_given(dataset.planes, [(camera, seen) for _, camera, seen in shown])
     if not labels and len(given):
         return given if centers is None else given.to(centers.device)
-    shown = [(view.name, view.camera, view.pane_labels) for view in dataset.train if view.pane_labels is not None]
     _check_marked(labels, [seen for _, _, seen in shown], dataset)
     points = dataset.points.positions
     fitted = fit_planes(
@@ -176,6 +181,23 @@ def fitted_planes(dataset: Dataset, centers: Tensor | None, fit: PlaneFit) -> Pl
         unmarked=[(view.name, view.camera) for view in dataset.train if view.pane_labels is None],
     )
     return fitted if not len(given) else given.to(fitted.centers.device).concat(fitted)
+
+
+def _check_given(planes: Planes, shown: Sequence[tuple[Camera, Tensor]]) -> None:
+    """Raises PlaneFitError where a plane that the capture gives is not where its masks show it."""
+    for row, label in enumerate(planes.labels):
+        marked = within = 0
+        for camera, labels in shown:
+            pixels = labels == label
+            if (count := int(pixels.sum())) > 0:
+                hits = nearest_hits(panes_in_camera(planes.select([row]), camera), camera)
+                marked, within = marked + count, within + int((pixels & (hits.pane == 0)).sum())
+        if within < LEAST_WITHIN * marked:
+            raise PlaneFitError(
+                f"planes.json and the masks put pane {label} into different places: {within / marked:.0%} of the "
+                "pixels that show it lie in the rectangle of the file. Were the poses found again? Mark it again, or "
+                "remove it from the file"
+            )
 
 
 def _check_marked(labels: Sequence[int], masks: Sequence[Tensor], dataset: Dataset) -> None:

@@ -92,6 +92,15 @@ def test_a_rectangle_of_another_frame_is_refused(capture: Path) -> None:
         load_dataset(capture)
 
 
+def test_a_rectangle_that_is_not_where_the_masks_show_the_pane_is_refused() -> None:
+    dataset, aside = tiny_capture(), PANE.centers + 2 * PANE.half_sizes.max() * PANE.axes()[0]
+    assert len(fitted_planes(replace(dataset, planes=PANE), None, PlaneFit())) == 1
+    with pytest.raises(PlaneFitError, match=r"put pane 1 into different places: \d+% of .* Mark it again"):
+        fitted_planes(replace(dataset, planes=replace(PANE, centers=aside)), None, PlaneFit())
+    elsewhere = replace(PANE, centers=aside, labels=(2,))
+    assert fitted_planes(replace(dataset, planes=elsewhere, pane_labels=()), None, PlaneFit()).labels == (2,)
+
+
 def test_a_damaged_file_is_named(capture: Path) -> None:
     (capture / "planes.json").write_text('[{"label": 1}]')
     with pytest.raises(InputError, match=r"planes\.json"):
