@@ -217,21 +217,22 @@ def fill_polygon(outline: Array, size: tuple[int, int]) -> Mask:
     y = np.arange(height) + 0.5
     x = np.arange(width) + 0.5
     turns = np.zeros((height, width), dtype=np.int16)
+    within = slice(*np.searchsorted(x, (outline[:, 0].min(), outline[:, 0].max())))  # Left and right of it, none.
     for one, other in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         low, high = sorted((one[1], other[1]))
         rows = np.flatnonzero((y >= low) & (y < high))
         if not len(rows):
             continue
         crossing = one[0] + (y[rows] - one[1]) / (other[1] - one[1]) * (other[0] - one[0])
-        turns[rows] += np.int16(1 if other[1] > one[1] else -1) * (x[None, :] >= crossing[:, None])
+        turns[rows, within] += np.int16(1 if other[1] > one[1] else -1) * (x[None, within] >= crossing[:, None])
     return turns != 0
 
 
-def depths(camera: NumpyCamera, corners: Array) -> Array:
-    """[H, W] camera z at which each pixel's ray meets the plane of a polygon; infinite where it does not."""
+def depths(camera: NumpyCamera, corners: Array, rows: slice, columns: slice) -> Array:
+    """Camera z at which the ray of each pixel in a window meets the plane of a polygon; infinite where it does not."""
     center = corners.mean(axis=0)
     normal = np.linalg.svd(corners - center)[2][2]
-    x, y = np.meshgrid(np.arange(int(camera.size[0])) + 0.5, np.arange(int(camera.size[1])) + 0.5)
+    x, y = np.meshgrid(np.arange(columns.start, columns.stop) + 0.5, np.arange(rows.start, rows.stop) + 0.5)
     rays = camera.rays(np.stack([x, y], axis=-1))
     slopes = rays @ normal
     away = float((center - camera.center) @ normal) / np.where(np.abs(slopes) < 1e-9, 1e-9, slopes)

@@ -243,11 +243,16 @@ def pane_labels(name: str, camera: NumpyCamera, panes: Solved) -> Labels:
     for pane, fit in panes:
         corners = fit.shape.corners()
         outline = fill_polygon(seen_outline(camera, corners), (width, height))
-        depth = np.where(outline, depths(camera, corners), np.inf)
-        first = depth < nearest
-        shown = with_strokes(outline, pane.strokes.get(name, ()))
-        labels[first] = np.where(shown, pane.label, labels)[first]
-        nearest = np.minimum(nearest, np.where(shown, depth, np.inf))
+        down, across = np.flatnonzero(outline.any(axis=1)), np.flatnonzero(outline.any(axis=0))
+        if not len(down):
+            continue
+        window = slice(down[0], down[-1] + 1), slice(across[0], across[-1] + 1)
+        depth = np.where(outline[window], depths(camera, corners, *window), np.inf)
+        first = depth < nearest[window]
+        strokes = pane.strokes.get(name, ())
+        shown = (with_strokes(outline, strokes) if strokes else outline)[window]
+        labels[window][first] = np.where(shown, pane.label, labels[window])[first]
+        nearest[window] = np.minimum(nearest[window], np.where(shown, depth, np.inf))
     return labels
 
 

@@ -30,7 +30,7 @@ from glassplat.files.writing import SPLAT_WRITERS, atomic_write, real_path, scen
 from glassplat.model.model import CAMERAS, ENVIRONMENT, GLASS, PANORAMA, PLANES, Model, save_page, write_beside
 from glassplat.publish.camera_paths import fit_to_width, interpolate_cameras, keyframes_of
 from glassplat.publish.film import check_size, side_by_side, wipe_pictures, write_film
-from glassplat.publish.web_page import MOST_GAUSSIANS, PREVIEW, Sharing, fits, write_preview
+from glassplat.publish.web_page import MOST_GAUSSIANS, PREVIEW, Sharing, check_panes, fits, write_preview
 from glassplat.render.frame import check_layers
 from glassplat.render.layers import layer_image
 from glassplat.render.planar import Planar, dereflected_photo
@@ -215,6 +215,9 @@ def write_files(command: Export, console: Console) -> None:
     """Writes the files, and removes what an earlier run of the command wrote and this one does not."""
     model = command.file.open(command.scene, command.device)
     model = model.with_scene(_chosen(command, command.edits.apply(model.scene)))
+    if "html" in command.formats:
+        with input_checked():
+            check_panes(model.scene)
     splats = {kind: command.output / f"scene.{kind}" for kind in SPLAT_WRITERS}
     beside = [command.output / name for name in BESIDE_SPLATS]
     check_targets(command.output, [*beside, *splats.values()], [])

@@ -170,8 +170,8 @@ SHADERS = ("texels.glsl", "screen.vert", "project.frag", "splat.vert", "splat.fr
 CUBE_SIZE = 128
 """Texels along a side of what glossy things mirror."""
 MOST_VIEWS = 400
-MOST_PANES = 16
-"""The page orders the panes of every pixel by hand."""
+MOST_PANES = 24
+"""Each takes eight of the 224 vectors that WebGL 2 grants a shader."""
 MOST_GAUSSIANS = 1_000_000
 """76 MB to load. Textures of 4096 rows, which every device has, hold 1.4 million of SH degree 3."""
 RANKING_VIEWS, RANKING_WIDTH = 64, 480
@@ -255,17 +255,24 @@ def write_page(
         temporary.write_text(page, encoding="utf-8")
 
 
+def check_panes(scene: Scene) -> None:
+    """Raises ValueError where a page cannot show all panes of a scene."""
+    if len(scene.planes) > MOST_PANES:
+        raise ValueError(
+            f"the scene has {len(scene.planes)} panes, and a page shows at most {MOST_PANES}; export it without panes "
+            "by --layer transmission, or without a page by --formats ply spz"
+        )
+
+
 @torch.no_grad()
 def page_text(
     scene: Scene, renderer: Renderer, cameras: Sequence[tuple[str, Camera]], title: str, *, sharing: Sharing = PRIVATE
 ) -> str:
     """Text of the page."""
     settings = renderer.page_settings()
-    if not cameras or len(scene.planes) > MOST_PANES:
-        raise ValueError(
-            f"there are {len(cameras)} cameras and {len(scene.planes)} panes; expected at least one camera and at most "
-            f"{MOST_PANES} panes"
-        )
+    if not cameras:
+        raise ValueError("there are no cameras; expected at least one")
+    check_panes(scene)
     poster_view = best_view(scene.planes, [camera for _, camera in cameras])
     poster = jpeg(renderer(scene, poster_camera(cameras[poster_view][1])).rgb)
     scene = replace(scene, primary=visible_gaussians(scene.primary), glass=visible_gaussians(scene.glass))

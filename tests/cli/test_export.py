@@ -16,6 +16,9 @@ from glassplat.files.ply import read_gaussians
 from glassplat.files.sidecars import read_planes
 from glassplat.files.spz import read_spz
 from glassplat.model.model import load
+from glassplat.publish.web_page import MOST_PANES
+from glassplat.scene.panes import Planes
+from glassplat.scene.scene import with_pane
 from tests.cli.tiny_run import write_run
 from tests.training.tiny_capture import true_scene
 
@@ -128,3 +131,18 @@ def test_a_folder_is_exported_onto_itself(tmp_path: Path) -> None:
     left = ["cameras.json", "glassplat.json", "scene.ply", "scene.spz"]
     assert sorted(path.name for path in output.iterdir()) == left
     assert torch.equal(load(output).scene.primary.means, true_scene().primary.means)
+
+
+def test_more_panes_than_a_page_shows_are_told_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = load(write_run(tmp_path / "run"), device="cpu")
+    scene = model.scene
+    for label in range(2, MOST_PANES + 2):
+        scene = with_pane(scene, Planes.rectangle((0.2 * label, 0, 2), (0, 0, -1), (0.09, 0.3), label=label))
+    many, output = str(model.with_scene(scene).save(tmp_path / "many")), tmp_path / "an export"
+    assert main(["export", many, "--output", str(output)]) == 2
+    assert f"{MOST_PANES + 1} panes, and a page shows at most {MOST_PANES}" in " ".join(capsys.readouterr().err.split())
+    assert not output.exists()
+    for way_out in (("--layer", "transmission"), ("--formats", "ply", "spz")):
+        assert main(["export", many, "--output", str(output), *way_out]) == 0

@@ -93,33 +93,40 @@ export class Drawing {
     }
   }
 
-  // The pane without what is cut out of it, drawn on a layer of its own so that cuts do not cut the photograph.
   #region(pane, outline, color, isActive) {
     if (!outline.length) return;
+    const shape = this.#path(outline, true);
+    const strokes = pane.strokes[this.view.name] || [];
+    this.context.save();
+    this.context.globalAlpha = isActive ? 0.35 : 0.2;
+    this.context.fillStyle = color;
+    if (strokes.length) this.#withStrokes(shape, strokes, color);
+    else this.context.fill(shape);
+    this.context.restore();
+    this.context.strokeStyle = color;
+    this.context.lineWidth = isActive ? 2 : 1;
+    this.context.setLineDash([]);
+    this.context.stroke(shape);
+  }
+
+  // The pane without what is cut out of it, drawn on a layer of its own so that cuts do not cut the photograph.
+  #withStrokes(shape, strokes, color) {
     const layer = this.layer;
     layer.width = this.canvas.width;
     layer.height = this.canvas.height;
     const pencil = layer.getContext("2d");
     pencil.setTransform(this.context.getTransform());
-    const shape = this.#path(outline, true);
     pencil.fillStyle = color;
     pencil.fill(shape);
-    for (const stroke of pane.strokes[this.view.name] || []) {
+    for (const stroke of strokes) {
       pencil.globalCompositeOperation = stroke.effect === "cut" ? "destination-out" : "source-over";
       if (stroke.effect === "keep") { pencil.save(); pencil.clip(shape); }
       this.#stroke(pencil, stroke);
       if (stroke.effect === "keep") pencil.restore();
       pencil.globalCompositeOperation = "source-over";
     }
-    this.context.save();
-    this.context.globalAlpha = isActive ? 0.35 : 0.2;
     this.context.setTransform(1, 0, 0, 1, 0, 0);
     this.context.drawImage(layer, 0, 0);
-    this.context.restore();
-    this.context.strokeStyle = color;
-    this.context.lineWidth = isActive ? 2 : 1;
-    this.context.setLineDash([]);
-    this.context.stroke(shape);
   }
 
   #stroke(pencil, stroke) {

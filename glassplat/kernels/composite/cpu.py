@@ -415,11 +415,13 @@ def composite(
     cameras, count, num_channels = channels.shape
     shape = (bins.num_cameras, bins.height, bins.width)
     dtype, tiles = channels.dtype, len(bins.active)
-    image, alpha, mask = (torch.zeros(s, dtype=dtype) for s in ((*shape, num_channels), shape, shape))
+    # Of NumPy, whose zeros of many panes take no memory where nothing is drawn.
+    sizes = (*shape, num_channels), shape, shape
+    image, alpha, mask = (torch.from_numpy(np.zeros(size, REAL_OF[dtype])) for size in sizes)
     deviated = torch.zeros(shape if deviation else (0, 0, 0), dtype=dtype)
     # Of PyTorch, because its arrays begin with a cache line, and a packed splat is one.
-    sizes = cameras * count * tile.packed_width(num_channels), tiles * tile.STATE
-    packed, state = (torch.empty(size, dtype=dtype).numpy() for size in sizes)
+    lengths = cameras * count * tile.packed_width(num_channels), tiles * tile.STATE
+    packed, state = (torch.empty(length, dtype=dtype).numpy() for length in lengths)
     spread = torch.zeros(tiles * 2 * tile.PIXELS if deviation else 0, dtype=dtype).numpy()
     saved = Saved(packed, np.empty(len(bins.pair_splats), np.int32), state, spread)
     where = tile.flat(deviation.where.detach()) if deviation else spread
