@@ -331,10 +331,12 @@ def _close_gaps(mask: Mask) -> Mask:
     from scipy import ndimage
 
     reach = round(WIDEST_GAP / 2 * float(np.hypot(*mask.shape))) + 1
-    padded = np.pad(mask, 2 * reach, mode="edge")
+    window = _window(mask, 2 * reach + 1)
+    padded = np.pad(mask[window], 2 * reach, mode="edge")
     widened = ndimage.distance_transform_edt(~padded) < reach
-    closed = ndimage.distance_transform_edt(widened) >= reach
-    return np.asarray(closed[2 * reach : -2 * reach, 2 * reach : -2 * reach])
+    closed = np.zeros_like(mask)
+    closed[window] = (ndimage.distance_transform_edt(widened) >= reach)[2 * reach : -2 * reach, 2 * reach : -2 * reach]
+    return closed
 
 
 def _array(tensor: Tensor) -> Array:
@@ -348,13 +350,15 @@ def _without_slivers(mask: Mask) -> Mask:
     """
     from scipy import ndimage
 
-    parts, count = ndimage.label(mask)
+    window, kept = _window(mask, 1), np.zeros_like(mask)
+    parts, count = ndimage.label(mask[window])
     if count == 0:
         return mask
-    half_widths = ndimage.maximum(_signed_distance(mask), parts, index=np.arange(count + 1))
+    half_widths = ndimage.maximum(_signed_distance(mask[window]), parts, index=np.arange(count + 1))
     wide = half_widths > THINNEST_PART * np.hypot(*mask.shape)
     wide[0] = False
-    return np.asarray(wide[parts])
+    kept[window] = wide[parts]
+    return kept
 
 
 def _signed_distance(mask: Mask) -> Array:
@@ -364,9 +368,23 @@ def _signed_distance(mask: Mask) -> Array:
     # The edge runs half a pixel before the nearest centre on the other side.
     from scipy import ndimage
 
-    inside: Array = ndimage.distance_transform_edt(mask)
-    outside: Array = ndimage.distance_transform_edt(~mask)
-    return np.where(mask, inside - 0.5, 0.5 - outside)
+    distance: Array = 0.5 - ndimage.distance_transform_edt(~mask)
+    window = _window(mask, 1)  # A pixel's nearest one outside is no farther than those around the mask.
+    inside = ndimage.distance_transform_edt(mask[window])
+    distance[window] = np.where(mask[window], inside - 0.5, distance[window])
+    return distance
+
+
+def _window(mask: Mask, margin: int) -> tuple[slice, slice]:
+    """Rows and columns of all pixels of a mask, and so many more on every side; all where it has none."""
+    if not mask.any():
+        return slice(None), slice(None)
+    found = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    first, second = (
+        slice(max(int(at[0]) - margin, 0), min(int(at[-1]) + 1 + margin, size))
+        for at, size in zip(found, mask.shape, strict=True)
+    )
+    return first, second
 
 
 def _edge_points(mask: Mask) -> Array:
@@ -377,14 +395,19 @@ def _edge_points(mask: Mask) -> Array:
     return np.concatenate([upright, level])
 
 
+FARTHEST_SMOOTHED = 4.0
+"""Standard deviations at which the Gaussian that smooths a mask is cut off."""
+
+
 def _outward(mask: Mask, edge: Array) -> Array:
     """[E, 2] unit vectors down the slope of the smoothed mask at its edge points."""
     from scipy import ndimage
 
-    smooth = ndimage.gaussian_filter(mask.astype(np.float64), EDGE_SMOOTHING * np.hypot(*mask.shape), mode="nearest")
-    slopes = [
-        ndimage.map_coordinates(-np.gradient(smooth, axis=axis), edge[:, ::-1].T - 0.5, order=1) for axis in (1, 0)
-    ]
+    sigma = EDGE_SMOOTHING * np.hypot(*mask.shape)
+    window = _window(mask, 2 * int(FARTHEST_SMOOTHED * sigma + 2))
+    smooth = ndimage.gaussian_filter(mask[window].astype(np.float64), sigma, mode="nearest", truncate=FARTHEST_SMOOTHED)
+    places = edge[:, ::-1].T - 0.5 - np.array([[at.start or 0] for at in window])
+    slopes = [ndimage.map_coordinates(-np.gradient(smooth, axis=axis), places, order=1) for axis in (1, 0)]
     outward = np.stack(slopes, axis=1)
     return outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), np.finfo(np.float64).tiny)
 
