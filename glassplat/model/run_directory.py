@@ -42,7 +42,8 @@ WITHOUT_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
 
 
 def _is_near(recorded: Camera, camera: Camera, extent: float) -> bool:
-    return float((recorded.center - camera.center).norm()) <= MOST_MOVED * extent
+    rounding = ROUNDING * float(camera.center.norm())
+    return float((recorded.center - camera.center).norm()) <= MOST_MOVED * extent + rounding
 
 
 @contextmanager
@@ -119,6 +120,8 @@ FILES = (
 """What a run writes next to its checkpoint, scene and metrics."""
 MOST_MOVED = 0.02
 """Share of the scene's extent by which two cameras may differ that are taken for one."""
+ROUNDING = 1e-5
+"""Share of a camera's distance from the origin by which single precision may displace it as well."""
 NUMBERED = re.compile(r"iteration_([0-9]{1,18})")
 """The folder of a scene; people keep copies under other names next to it."""
 
