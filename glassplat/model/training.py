@@ -13,6 +13,7 @@ import zlib
 from collections.abc import Callable, Container, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple, NoReturn
@@ -125,6 +126,30 @@ def _put_handlers_back() -> None:
             signal.signal(number, handler)
 
 
+def with_gradients(messages: Generator[Message, None, None]) -> Generator[Message, None, None]:
+    """Passes messages on, made where gradients are switched on; between them that is as the caller has it.
+
+    PyTorch's own decorators of generators throw in a way that Python is about to give up.
+    """
+    following = partial(next, messages)
+    while True:
+        try:
+            with torch.inference_mode(False):
+                message = following()
+        except StopIteration:
+            return
+        try:
+            yield message
+        except GeneratorExit:
+            with torch.inference_mode(False):
+                messages.close()
+            raise
+        except BaseException as error:  # noqa: BLE001 - It is the messages' to answer.
+            following = partial(messages.throw, error)
+        else:
+            following = partial(next, messages)
+
+
 class Run:
     """A training run in its directory, followed message by message.
 
@@ -180,7 +205,6 @@ class Run:
         assert self.state is not None
         return self.state
 
-    @torch.inference_mode(False)  # It needs gradients, also where the caller has switched them off.
     def messages(self) -> Generator[Message, None, None]:
         """Trains from one message to the next; begun again after it ended, from the checkpoint on.
 
@@ -192,6 +216,9 @@ class Run:
             OSError: the disk is full or fails; the last checkpoint stays.
             RankLostError: another rank has ended; the checkpoint is written.
         """
+        return with_gradients(self._messages())
+
+    def _messages(self) -> Generator[Message, None, None]:
         self._ranks.check_alike(traits(self.recipe, self._settings, self._dataset) | {"resume": self._resume})
         yield from self._leading() if self._ranks.leads else self._following()
         self._ranks.exchange()  # The others stay until the leader has written the scene.
@@ -540,7 +567,7 @@ class Training:
             OSError: the disk is full or fails.
             RankLostError: another process that `torchrun` started has ended.
         """
-        return self._in_memory() if self._run is None else self._run.messages()
+        return with_gradients(self._in_memory()) if self._run is None else self._run.messages()
 
     def run(self, listen: Listener | None = None) -> Model:
         """Trains to the end; returns the trained model.
@@ -551,7 +578,7 @@ class Training:
         if self._run is not None:
             self._run.to_the_end(listen or _nobody)
         else:
-            for message in self._in_memory():
+            for message in self:
                 (listen or _nobody)(message)
         return self.model
 
@@ -608,7 +635,6 @@ class Training:
             raise RuntimeError("this training has no output to save to; use `training.model.save(path)`")
         self._run.save()
 
-    @torch.inference_mode(False)
     def _in_memory(self) -> Generator[Message, None, None]:
         self._ranks.check_alike(traits(self.recipe, self._settings, self._dataset))
         if self._state is None:
