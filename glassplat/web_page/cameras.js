@@ -25,13 +25,28 @@ function boundsOf(pane, pose, [fx, fy, cx, cy], [width, height], near) {
   return bounds[0] < bounds[2] && bounds[1] < bounds[3] ? bounds : null;
 }
 
+// The smallest bounds around those that are not null.
+function around(bounds) {
+  const given = bounds.filter(Boolean), edges = [Math.min, Math.min, Math.max, Math.max];
+  return edges.map((outermost, k) => outermost(...given.map((edge) => edge[k])));
+}
+
+// Which panes may be seen through one another, or share a pixel.
+function overlapping(bounds) {
+  const meet = (a, b) => a && b && a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3];
+  return bounds.map((one, k) => bounds.some((other, l) => k !== l && meet(one, other)));
+}
+
+// The panes that may need a mask of their own besides that of all.
+const ownMasks = ({ panes, nearest }) => (panes.length > 1 && !nearest ? panes : []);
+
 // While something moves, what a pane reflects weakly is drawn at half the scale, and with it the pane's mask.
 function scaleOfMirrors({ moving, scale, reflectances }) {
   return moving && Math.max(...reflectances, 0) < 0.3 ? Math.min(scale, Math.max(0.5 * scale, 0.15)) : scale;
 }
 
-// What the sorter has to know of a view: for the picture the camera itself; then for each pane's mask the same camera,
-// and for what it mirrors the one behind it, both with a window on what the pane covers.
+// What the sorter has to know of a view: for the picture the camera itself; for the mask of all panes and that of each
+// the same camera, null where it needs none; and for what each mirrors the one behind it, with a window on the pane.
 // A view has moved on before its order is there, so that windows, in tangents, are wider than the picture.
 // scales: of a picture that need not have all splats, and of its mirrors.
 const SPARE = 0.3, LOW_PASS = 0.3;
@@ -45,10 +60,12 @@ function camerasToSort(pose, { intrinsics, size }, scene, scales = {}) {
     rows: rotation, offset, near: scene.near, clip, glassOf, window: window(bounds || [0, 0, ...size]),
     thinned: scale ? { share: scale ** 2, pixels: (scale ** 2 * intrinsics[0] * intrinsics[1]) / LOW_PASS } : null,
   });
-  const bounds = scene.panes.map((pane) => boundsOf(pane, pose, intrinsics, size, scene.near));
+  const bounds = scene.panes.map((pane) => boundsOf(pane, pose, intrinsics, size, scene.near)), overlap = overlapping(bounds);
+  const mask = (glassOf, window) => camera(pose, window, scales.mirrors, { glassOf });
   return [
     camera(pose, null, scales.direct),
-    ...scene.panes.map((_, k) => camera(pose, bounds[k], scales.mirrors, { glassOf: k })),
+    scene.panes.length ? mask('all', bounds.some(Boolean) ? around(bounds) : null) : null,
+    ...ownMasks(scene).map((_, k) => (overlap[k] ? mask(k, bounds[k]) : null)),
     ...scene.panes.map((pane, k) => camera(mirroredPose(pose, pane), bounds[k], scales.mirrors, { clip: sideOf(pane, pose) })),
   ];
 }

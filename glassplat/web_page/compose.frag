@@ -1,16 +1,16 @@
 // Lays the panes before the image, from the farthest on each ray to the nearest: Eq. 1 of TR-Gaussians for each, or for
-// the nearest alone, with the mask of them all.
+// the nearest alone.
 precision highp float;
 precision highp sampler2DArray;
 
 uniform sampler2D image;
 #if PANES > 0
-uniform sampler2DArray masks, reflections, gains;
+uniform sampler2DArray masks, reflections, gains;  // masks: of all panes together, then of each
 uniform vec3 centers[PANES], normals[PANES], tangents[PANES], bitangents[PANES];  // in the camera
 uniform vec2 halfSizes[PANES];
 uniform float reflectances[PANES];
 uniform vec3 transmittances[PANES];
-uniform bool present[PANES];
+uniform int present[PANES];  // 0: not; 1: as part of the mask of all; 2: with a mask of its own, too
 #endif
 #ifdef SHINY
 uniform sampler2D strengths, normals;
@@ -57,10 +57,13 @@ float depthOf(int k, vec3 ray) {
   float depth = dot(centers[k], normals[k]) / dot(ray, normals[k]);
   vec3 offset = depth * ray - centers[k];
   bool inside = depth > 0.0 && abs(dot(offset, tangents[k])) <= halfSizes[k].x && abs(dot(offset, bitangents[k])) <= halfSizes[k].y;
-  return inside && present[k] ? depth : FAR;
+  return inside && present[k] > 0 ? depth : FAR;
 }
 
-float maskOf(int k) { return texture(masks, vec3(within(usedByMirrors), float(k))).r; }
+// Where a ray meets one pane, or only the nearest counts, that of all panes: it does not fade where glass of two adjoins.
+float maskOf(int k, bool isAlone) {
+  return texture(masks, vec3(within(usedByMirrors), isAlone || present[k] < 2 ? 0.0 : float(k + 1))).r;
+}
 
 void layPane(int k, float mask, vec3 ray, inout vec3 seen, inout vec4 mirror) {
   if (mask <= 0.0) return;
@@ -93,7 +96,11 @@ void main() {
 #if PANES > 0
   vec3 ray = vec3((pixel - intrinsics.zw) / intrinsics.xy, 1.0);
   float depths[PANES];
-  for (int k = 0; k < PANES; k++) depths[k] = depthOf(k, ray);
+  int met = 0;
+  for (int k = 0; k < PANES; k++) {
+    depths[k] = depthOf(k, ray);
+    if (depths[k] < FAR) met++;
+  }
   for (int n = 0; n < PANES; n++) {
     int farthest = -1;
     float depth = 0.0;
@@ -101,8 +108,7 @@ void main() {
       if (depths[k] < FAR && depths[k] > depth) { farthest = k; depth = depths[k]; }
     }
     if (farthest < 0) break;
-    float own = maskOf(farthest);
-    mask = nearestOnly ? own + (1.0 - own) * mask : own;
+    mask = maskOf(farthest, nearestOnly || met == 1);
     if (nearestOnly) { seen = behind; mirror = vec4(0.0); }
     layPane(farthest, mask, ray, seen, mirror);
     for (int k = 0; k < PANES; k++) if (k == farthest) depths[k] = FAR;

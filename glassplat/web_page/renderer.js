@@ -1,4 +1,4 @@
-// Draws a view: transmission, each visible pane's mask and what it mirrors, then the sum of all.
+// Draws a view: transmission, the panes' masks and what each mirrors, then the sum of all.
 
 const LAWS = ['pane', 'schlick', 'none'];
 const LAYERS = { rgb: 0, without_panes: 1, reflection: 2, strength: 3 };
@@ -24,8 +24,8 @@ function makeRenderer(canvas, scene) {
   const projection = graphics.framebuffer(projected.map((texture) => [texture]));
   const newOrder = () => ({ texture: graphics.dataTexture(gl.R32UI, gl.RED_INTEGER, null, 1, rows), count: 0 });
   // As camerasToSort() has them.
-  const orders = { direct: newOrder(), masks: panes.map(newOrder), mirrored: panes.map(newOrder) };
-  const ordered = [orders.direct, ...orders.masks, ...orders.mirrored];
+  const orders = { direct: newOrder(), joint: newOrder(), masks: ownMasks(scene).map(newOrder), mirrored: panes.map(newOrder) };
+  const ordered = [orders.direct, orders.joint, ...orders.masks, ...orders.mirrored];
   const cube = shiny && graphics.cube(scene.cube);
   const rectangles = graphics.rectangles(scene.total), empty = gl.createVertexArray();
   let targets = null;
@@ -38,13 +38,13 @@ function makeRenderer(canvas, scene) {
     }
     canvas.width = width;
     canvas.height = height;
-    const textures = [[formats[4]], [formats[1], panes.length], [formats[4], panes.length], [formats[1], panes.length], [gl.RGBA8], ...(shiny ? [[formats[1]], [formats[4]]] : [])]
+    const textures = [[formats[4]], [formats[1], 1 + orders.masks.length], [formats[4], panes.length], [formats[1], panes.length], [gl.RGBA8], ...(shiny ? [[formats[1]], [formats[4]]] : [])]
       .map(([format, layers]) => graphics.image(width, height, format, layers));
     const [image, masks, reflections, gains, small, ...surface] = textures;
     targets = {
       width, height, textures, image, masks, reflections, gains, small, surface,
       direct: graphics.framebuffer([[image], ...surface.map((texture) => [texture])]),
-      covered: panes.map((_, k) => graphics.framebuffer([[masks, k]])),
+      covered: [0, ...orders.masks.keys()].map((_, k) => graphics.framebuffer([[masks, k]])),
       mirrored: panes.map((_, k) => graphics.framebuffer([[reflections, k], ...(scene.intensity ? [[gains, k]] : [])])),
       coarse: graphics.framebuffer([[small]]),
     };
@@ -97,7 +97,7 @@ function makeRenderer(canvas, scene) {
     gl.disable(gl.SCISSOR_TEST);
   }
 
-  function compose(view, seen, { size, used, intrinsics }, usedByMirrors, target) {
+  function compose(view, present, { size, used, intrinsics }, usedByMirrors, target) {
     const at = use(programs.compose, [
       ['image', gl.TEXTURE_2D, targets.image],
       ...(panes.length ? ['masks', 'reflections', 'gains'].map((name) => [name, gl.TEXTURE_2D_ARRAY, targets[name]]) : []),
@@ -115,7 +115,7 @@ function makeRenderer(canvas, scene) {
       gl.uniform2fv(at('halfSizes'), panes.flatMap((pane) => pane.half));
       gl.uniform1fv(at('reflectances'), view.reflectances);
       gl.uniform3fv(at('transmittances'), panes.flatMap((pane) => pane.transmittance));
-      gl.uniform1iv(at('present'), panes.map((_, k) => (seen.includes(k) ? 1 : 0)));
+      gl.uniform1iv(at('present'), present);
     }
     gl.uniform4fv(at('intrinsics'), intrinsics);
     gl.uniform2fv(at('size'), size);
@@ -157,27 +157,30 @@ function makeRenderer(canvas, scene) {
   function* drawing(view, most = () => Infinity) {
     const faintest = view.moving ? 1 / 40 : 1 / 255;
     const placed = (scale) => ({ ...sized(view, scale), pose: view.pose, faintest });
-    const direct = placed(view.scale), mirrors = placed(scaleOfMirrors(view)), seen = [];
+    const direct = placed(view.scale), mirrors = placed(scaleOfMirrors(view));
     yield* splats('direct', orders.direct, targets.direct, direct, most);
+    const bounds = panes.map((pane) => (view.glass ? boundsOf(pane, view.pose, mirrors.intrinsics, mirrors.size, scene.near) : null));
+    const mask = (order, k, around) => splats('mask', order, targets.covered[k], { ...mirrors, bounds: around, degree: 0 }, most);
+    const overlap = overlapping(bounds), present = panes.map(() => 0);
+    if (bounds.some(Boolean)) yield* mask(orders.joint, 0, around(bounds));
     for (const [k, pane] of panes.entries()) {
-      const bounds = view.glass && boundsOf(pane, view.pose, mirrors.intrinsics, mirrors.size, scene.near);
-      if (!bounds) continue;
-      const side = sideOf(pane, view.pose), pose = mirroredPose(view.pose, pane);
-      yield* splats('mask', orders.masks[k], targets.covered[k], { ...mirrors, bounds, degree: 0 }, most);
-      yield* splats('mirrored', orders.mirrored[k], targets.mirrored[k], { ...mirrors, bounds, pose, side }, most);
-      seen.push(k);
+      if (!bounds[k]) continue;
+      const side = sideOf(pane, view.pose), pose = mirroredPose(view.pose, pane), own = overlap[k] && orders.masks[k];
+      present[k] = own?.count ? 2 : 1;
+      if (own?.count) yield* mask(own, k + 1, bounds[k]);
+      yield* splats('mirrored', orders.mirrored[k], targets.mirrored[k], { ...mirrors, bounds: bounds[k], pose, side }, most);
     }
-    show(view, seen, direct, mirrors);
+    show(view, present, direct, mirrors);
   }
 
   // In software what is drawn small is composed small, too.
-  function show(view, seen, direct, mirrors) {
+  function show(view, present, direct, mirrors) {
     const { width, height } = targets;
     if (!isSoftware || view.scale === 1) {
-      compose(view, seen, { size: [width, height], used: direct.used, intrinsics: view.intrinsics }, mirrors.used, null);
+      compose(view, present, { size: [width, height], used: direct.used, intrinsics: view.intrinsics }, mirrors.used, null);
       return;
     }
-    compose(view, seen, direct, mirrors.used, targets.coarse);
+    compose(view, present, direct, mirrors.used, targets.coarse);
     // Not by blitFramebuffer(), after which Chromium's canvas stays black.
     const at = use(programs.copy, [['image', gl.TEXTURE_2D, targets.small]]);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);

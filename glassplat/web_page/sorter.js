@@ -20,7 +20,7 @@ function sorterOf({ positions, reaches, areas, owners }) {
       const x = positions[3 * i], y = positions[3 * i + 1], z = positions[3 * i + 2];
       const far = rows[6] * x + rows[7] * y + rows[8] * z + offset[2];
       if (!(far > near && far < beyond) || (clip && clip[0] * x + clip[1] * y + clip[2] * z + clip[3] <= 0)) continue;
-      if (i >= firstGlass && owners[i - firstGlass] !== glassOf) continue;
+      if (i >= firstGlass && glassOf !== 'all' && owners[i - firstGlass] !== glassOf) continue;
       const u = rows[0] * x + rows[1] * y + rows[2] * z + offset[0], wide = across * reaches[i];
       if (u < left * far - wide || u > right * far + wide) continue;
       const v = rows[3] * x + rows[4] * y + rows[5] * z + offset[1], high = down * reaches[i];
@@ -48,9 +48,10 @@ function sorterOf({ positions, reaches, areas, owners }) {
     return order;
   }
 
-  // Of a pane's mask: its glass, and what is before the farthest of it.
+  // Of a mask: the glass of its pane, or of all, and what is before the farthest of it. No camera: nothing.
   return function order(camera) {
     [found, lowest, highest] = [0, 0x7fffffff, 0];
+    if (!camera) return new Uint32Array(0);
     const farthest = camera.glassOf === null ? Infinity : choose(camera, firstGlass, count, Infinity);
     choose(camera, 0, firstGlass, farthest);
     return sorted();

@@ -42,8 +42,7 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Environment, Scene, as_mirrors, without_glass
 from tests.browser_needed import needs_browser
 from tests.render.test_deferred import glossy as glossy_scene
-from tests.render.test_seen_panes import vitrine
-from tests.render.tiny_scene import camera_at, concatenated, in_single_precision, joined, pane, showcase
+from tests.render.tiny_scene import camera_at, concatenated, in_single_precision
 from tests.training.tiny_capture import tiny_capture, true_scene
 from tools.browser import Browser
 from tools.page_likeness import picture, pixels_of
@@ -439,31 +438,6 @@ def test_nothing_is_asked_for_and_nothing_complained_of(opened: Browser) -> None
     assert {address.split(":")[0] for address in opened.requests()} <= {"file", "data", "blob"}
     assert opened.complaints() == []
     assert opened.evaluate("document.title") == "A <tiny> scene & more"
-
-
-@needs_browser
-def test_panes_behind_panes_and_scenes_without_any(tmp_path: Path) -> None:
-    panes = joined(pane(2.0, half=0.8), pane(3.0, half=0.9, label=2))
-    tint = torch.tensor([[-0.6, -0.1, -0.4], [0.0, -0.5, 0.0]], dtype=torch.float64)
-    two = in_single_precision(showcase(replace(panes, log_transmittances=tint)))
-    for name, scene, renderer in (("two", two, Planar()), ("none", Scene(two.primary, two.extent), Splat())):
-        write_page(tmp_path / f"{name}.html", scene, renderer, CAMERAS, name)
-        with Browser(tmp_path / f"{name}.html", 320, 240) as browser:
-            for _, camera in CAMERAS[:2]:
-                assert likeness(browser, scene, renderer, camera) > 36
-            assert browser.complaints() == []
-
-
-@needs_browser
-def test_only_the_nearest_pane_is_laid_if_asked(tmp_path: Path) -> None:
-    scene, renderer = in_single_precision(vitrine(1, 2)), Planar(nearest_only=True)
-    write_page(tmp_path / "index.html", scene, renderer, CAMERAS, "nearest")
-    with Browser(tmp_path / "index.html", 320, 240) as browser:
-        for _, camera in CAMERAS[:2]:
-            assert likeness(browser, scene, renderer, camera) > 45
-            for layer in ("strength", "reflection"):
-                assert likeness(browser, scene, renderer, camera, layer) > 45
-        assert browser.complaints() == []
 
 
 def shining(mirrored: str) -> tuple[Scene, Renderer]:

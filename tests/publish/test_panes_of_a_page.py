@@ -1,0 +1,80 @@
+"""Several panes in a page: behind one another, side by side, and the nearest alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from glassplat.publish.web_page import write_page
+from glassplat.render.planar import Planar
+from glassplat.render.splat import Splat
+from glassplat.scene.panes import Planes
+from glassplat.scene.scene import Scene
+from tests.browser_needed import needs_browser
+from tests.publish.test_web_page import CAMERAS, likeness
+from tests.render.test_seen_panes import vitrine
+from tests.render.tiny_scene import in_single_precision, joined, pane, showcase
+from tools.browser import Browser
+
+SPLATS_OF_MASKS = """glassplat.then(async ({ navigation, lensOf, ordersOf }) => {
+  let orders = null;  // As it is where the page itself asks for another order meanwhile.
+  while (!orders) orders = await ordersOf(navigation.pose(), lensOf());
+  return orders.slice(1, -2).map((order) => order.length);
+})"""
+
+
+@needs_browser
+def test_panes_behind_panes_and_scenes_without_any(tmp_path: Path) -> None:
+    panes = joined(pane(2.0, half=0.8), pane(3.0, half=0.9, label=2))
+    tint = torch.tensor([[-0.6, -0.1, -0.4], [0.0, -0.5, 0.0]], dtype=torch.float64)
+    two = in_single_precision(showcase(replace(panes, log_transmittances=tint)))
+    for name, scene, renderer in (("two", two, Planar()), ("none", Scene(two.primary, two.extent), Splat())):
+        write_page(tmp_path / f"{name}.html", scene, renderer, CAMERAS, name)
+        with Browser(tmp_path / f"{name}.html", 320, 240) as browser:
+            for _, camera in CAMERAS[:2]:
+                assert likeness(browser, scene, renderer, camera) > 36
+            assert browser.complaints() == []
+
+
+@needs_browser
+def test_only_the_nearest_pane_is_laid_if_asked(tmp_path: Path) -> None:
+    scene, renderer = in_single_precision(vitrine(1, 2)), Planar(nearest_only=True)
+    write_page(tmp_path / "index.html", scene, renderer, CAMERAS, "nearest")
+    with Browser(tmp_path / "index.html", 320, 240) as browser:
+        for _, camera in CAMERAS[:2]:
+            assert likeness(browser, scene, renderer, camera) > 45
+            for layer in ("strength", "reflection"):
+                assert likeness(browser, scene, renderer, camera, layer) > 45
+        assert browser.complaints() == []
+
+
+def pane_of_three(x: float, label: int) -> Planes:
+    """One of three panes side by side, whose glass reaches into that of its neighbours."""
+    upright = pane(2.0, half=0.4, label=label)
+    center, facing = torch.tensor([[x, 0.0, 2.0]]).double(), torch.tensor([[0.0, 0.0, -1.0]]).double()
+    return upright.with_tensors({"centers": center, "raw_normals": facing})
+
+
+@needs_browser
+def test_panes_side_by_side_do_not_fade_where_they_adjoin(tmp_path: Path) -> None:
+    panes = joined(*(pane_of_three(x, label) for label, x in enumerate((-0.8, 0.0, 0.8), start=1)))
+    scene, renderer = in_single_precision(showcase(panes)), Planar()
+    write_page(tmp_path / "index.html", scene, renderer, CAMERAS, "three")
+    with Browser(tmp_path / "index.html", 320, 240) as browser:
+        for _, camera in CAMERAS[:2]:
+            for layer in ("strength", "reflection"):
+                assert likeness(browser, scene, renderer, camera, layer) > 55
+        assert browser.complaints() == []
+
+
+@needs_browser
+def test_a_pane_has_a_mask_of_its_own_only_where_another_may_be_seen_through_it(tmp_path: Path) -> None:
+    apart = joined(pane_of_three(-1.2, 1), pane_of_three(1.2, 2))
+    for name, panes, own in (("apart", apart, False), ("behind", joined(pane(2.0), pane(3.0, label=2)), True)):
+        write_page(tmp_path / f"{name}.html", in_single_precision(showcase(panes)), Planar(), CAMERAS, name)
+        with Browser(tmp_path / f"{name}.html", 320, 240) as browser:
+            joint, *each = browser.evaluate(SPLATS_OF_MASKS)
+            assert joint > 0 and len(each) == 2
+            assert all(each) if own else not any(each)
