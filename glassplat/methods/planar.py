@@ -14,19 +14,8 @@ from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import PointCloud
 from glassplat.methods.splat import image_term, population_of
 from glassplat.options import BLACK, CLEAR_GLASS
-from glassplat.panes import PlaneFit, PlaneFitError
+from glassplat.panes import PlaneFit, PlaneFitError, material
 from glassplat.panes.fit import fit_planes, with_mirrors
-from glassplat.panes.material import (
-    SURE_SLOPE,
-    JudgedPane,
-    judged_pane,
-    mirrored_coverage,
-    mirrored_lamps,
-    photographs_of,
-    reflections_behind,
-    unseen_places,
-    virtual_points,
-)
 from glassplat.render.panes import nearest_hits, panes_in_camera
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
@@ -35,6 +24,7 @@ from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import mirrored_gaussians
 from glassplat.scene.panes import Planes, coplanar_groups, name_labels
 from glassplat.scene.scene import Scene, glass_gaussians
+from glassplat.training import losses
 from glassplat.training.actions import (
     MOST_ADDED,
     Densify,
@@ -49,17 +39,6 @@ from glassplat.training.actions import (
 )
 from glassplat.training.corrections import corrections_begun, corrections_learnt, photographer_learnt
 from glassplat.training.densify import NEIGHBOURS
-from glassplat.training.losses import (
-    LossTerm,
-    ReflectanceDeparture,
-    depth_deviation_loss,
-    gradient_conflict,
-    intensity_departure,
-    mask_loss,
-    reflection_left,
-    tint_departure,
-    weighted_terms,
-)
 from glassplat.training.messages import Working
 from glassplat.training.options import PUBLISHED_ITERATIONS, Rate
 from glassplat.training.stage import Clock, Every, PostStep, Stage, TrainState, Work
@@ -226,24 +205,24 @@ def _as_given(planes: Planes, fit: PlaneFit) -> Planes:
 
 def judged_panes(
     scene: Scene, dataset: Dataset, labels: Sequence[int]
-) -> Generator[Working, None, dict[int, JudgedPane]]:
+) -> Generator[Working, None, dict[int, material.JudgedPane]]:
     """Likeness of each pane to a mirror, by label."""
-    photographs = photographs_of(scene, dataset.train) if labels else []
+    photographs = material.photographs_of(scene, dataset.train) if labels else []
     judged = {}
     for done, label in enumerate(labels):
         yield Working("telling mirrors from glass", done, len(labels))
-        judged[label] = judged_pane(scene, label, photographs)
+        judged[label] = material.judged_pane(scene, label, photographs)
     return judged
 
 
-def mirrors_among(planes: Planes, judged: Mapping[int, JudgedPane]) -> list[int]:
+def mirrors_among(planes: Planes, judged: Mapping[int, material.JudgedPane]) -> list[int]:
     """Labels of the panes that are mirrors, those in a front of glass only if they are so beyond doubt."""
     alike = {label for label, found in judged.items() if found.is_mirror}
     rows = [row for row, label in enumerate(planes.labels) if label in judged]
     for group in coplanar_groups(planes, rows):
         labels = {planes.labels[row] for row in group}
         if any(judged[label].is_known for label in labels - alike):
-            alike -= {label for label in labels if judged[label].like.slope < SURE_SLOPE}
+            alike -= {label for label in labels if judged[label].like.slope < material.SURE_SLOPE}
     return [label for label in judged if label in alike]
 
 
@@ -266,14 +245,14 @@ def reflects_little(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> W
     covered, whole = 0.0, 0
     for done, camera in enumerate(cameras):
         yield Working(f"looking for what {name_panes(panes, 'pane')} can mirror", done, len(cameras))
-        of_view, pixels = mirrored_coverage(scene, panes, camera)
+        of_view, pixels = material.mirrored_coverage(scene, panes, camera)
         covered, whole = covered + of_view, whole + pixels
     return covered < LEAST_COVERAGE * whole
 
 
 def turn_virtual_scene_round(state: TrainState, dataset: Dataset, mirrors: Planes) -> None:
     """Moves what the first stage built behind a mirror, or several in one plane, to where it really is, in front."""
-    virtual = virtual_points(state.scene.primary.means, mirrors, [view.camera for view in dataset.train])
+    virtual = material.virtual_points(state.scene.primary.means, mirrors, [view.camera for view in dataset.train])
     if moved := turn_round(state, virtual, mirrors):
         log.info("%d Gaussians behind %s moved to the front", moved, name_panes(mirrors, "mirror"))
 
@@ -304,7 +283,7 @@ class TurnReflections:
         of_glass, moved = surfaces(state.scene.planes, mirrors=False), 0
         for done, panes in enumerate(of_glass):
             yield Working(f"looking behind {name_panes(panes, 'pane')} for what it mirrors", done, len(of_glass))
-            moved += turn_round(state, reflections_behind(state.scene, panes, cameras), panes)
+            moved += turn_round(state, material.reflections_behind(state.scene, panes, cameras), panes)
         if moved:
             log.info("%d Gaussians behind glass moved to the front", moved)
         return moved > 0
@@ -334,7 +313,10 @@ class LightLamps:
         yield Working("looking for lamps that panes mirror", 0, 1)
         scene = state.scene
         rows = [row for row, label in enumerate(scene.planes.labels) if label not in scene.planes.mirrors]
-        lamps = mirrored_lamps(scene, scene.planes.select(rows), photographs_of(scene, dataset.train)) if rows else None
+        if not rows:
+            return False
+        photographs = material.photographs_of(scene, dataset.train)
+        lamps = material.mirrored_lamps(scene, scene.planes.select(rows), photographs)
         if lamps is None:
             return False
         log_gains = scene.primary.channels["log_intensity"] + lamps.gains.log()
@@ -366,7 +348,7 @@ class FillUnseen:
         of_glass = surfaces(state.scene.planes, mirrors=False)
         for done, panes in enumerate(of_glass):
             yield Working(f"looking for what {name_panes(panes, 'pane')} can mirror", done, len(of_glass))
-            places, color, cell = unseen_places(state.scene, panes, cameras)
+            places, color, cell = material.unseen_places(state.scene, panes, cameras)
             if 0 < len(places) < MOST_ADDED * len(state.scene.primary):
                 colors = (255 * color).round().to(torch.uint8).expand(len(places), 3)
                 cloud = PointCloud(places.cpu(), colors.cpu())
@@ -400,7 +382,7 @@ def seed_reflection(state: TrainState, dataset: Dataset, panes: Planes) -> Work:
         return False
     points = dataset.points
     device = panes.centers.device
-    virtual = virtual_points(points.positions.to(device), panes, cameras).cpu()
+    virtual = material.virtual_points(points.positions.to(device), panes, cameras).cpu()
     if int(virtual.sum()) <= NEIGHBOURS:  # Too few to tell how large they are.
         return False
     behind = replace(points, positions=points.positions[virtual], colors=points.colors[virtual])
@@ -565,8 +547,10 @@ def _glass_post_steps(recipe: PlanarRecipe) -> tuple[PostStep, ...]:
     return (glass_only_darkens,) if recipe.tint else ()
 
 
-def _joint_terms(recipe: PlanarRecipe, population: Population) -> tuple[LossTerm, ...]:
-    glass = weighted_terms(LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, tint_departure))
+def _joint_terms(recipe: PlanarRecipe, population: Population) -> tuple[losses.LossTerm, ...]:
+    glass = losses.weighted_terms(
+        losses.LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, losses.tint_departure)
+    )
     return (image_term(recipe.ssim_weight), *reflection_terms(recipe), *glass, *population.terms)
 
 
@@ -619,14 +603,15 @@ def _training_renderer(recipe: PlanarRecipe, gradient: str) -> Planar:
     )
 
 
-def reflection_terms(recipe: PlanarRecipe) -> tuple[LossTerm, ...]:
+def reflection_terms(recipe: PlanarRecipe) -> tuple[losses.LossTerm, ...]:
     """The terms whose weight is not zero."""
     weights = recipe.weights
-    conflict = reflection_left if recipe.conflict == "cells" else gradient_conflict
-    return weighted_terms(
-        LossTerm("depth", weights.depth, depth_deviation_loss),
-        LossTerm("conflict", weights.conflict, conflict),
-        LossTerm("mask", weights.mask, mask_loss),
-        LossTerm("intensity", weights.intensity, intensity_departure),
-        LossTerm("reflectance", weights.reflectance, ReflectanceDeparture(recipe.plane_fit.glass_reflectance)),
+    conflict = losses.reflection_left if recipe.conflict == "cells" else losses.gradient_conflict
+    reflectance = losses.ReflectanceDeparture(recipe.plane_fit.glass_reflectance)
+    return losses.weighted_terms(
+        losses.LossTerm("depth", weights.depth, losses.depth_deviation_loss),
+        losses.LossTerm("conflict", weights.conflict, conflict),
+        losses.LossTerm("mask", weights.mask, losses.mask_loss),
+        losses.LossTerm("intensity", weights.intensity, losses.intensity_departure),
+        losses.LossTerm("reflectance", weights.reflectance, reflectance),
     )

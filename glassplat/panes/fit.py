@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.panes import PlaneFit, PlaneFitError
+from glassplat.panes import PlaneFit, PlaneFitError, search
 from glassplat.panes.masks import (
     FramedPlanes,
     PaneView,
@@ -26,17 +26,6 @@ from glassplat.panes.masks import (
 )
 from glassplat.panes.material import virtual_points
 from glassplat.panes.objective import MIDDLE, JointObjective, Objective, edge_matches, pane_rectangle
-from glassplat.panes.search import (
-    Fit,
-    angle,
-    best_joint_plane,
-    best_plane,
-    best_supported,
-    contradiction,
-    in_one_surface,
-    plane_of_images,
-    tilt_uncertainty,
-)
 from glassplat.scene import logit
 from glassplat.scene.camera import Camera, NumpyCamera
 from glassplat.scene.panes import Planes, linked_groups, name_labels
@@ -269,7 +258,7 @@ def _found_pane(
         return found
     log.info(
         "pane %d: without the gaps of its masks, where things may stand before it, its plane is another one, %.2f "
-        "degrees away; it takes that plane", label, np.degrees(angle(found.plane, whole.plane)),
+        "degrees away; it takes that plane", label, np.degrees(search.angle(found.plane, whole.plane)),
     )  # fmt: skip
     return whole
 
@@ -286,11 +275,11 @@ def _fitted_pane(
     sound, faulty = [], []
     for source, objective in objectives.items():
         rng = np.random.default_rng((options.seed, label))
-        plane = best_plane(objective, hypotheses=options.hypotheses, refine=options.refined, rng=rng)
+        plane = search.best_plane(objective, hypotheses=options.hypotheses, refine=options.refined, rng=rng)
         fault = _fault(plane, objective, options)
-        sound += [Fit(source, plane)] if fault is None else []
+        sound += [search.Fit(source, plane)] if fault is None else []
         faulty += [] if fault is None else [_Found(label, evidence, plane, fault)]
-    return _Found(label, evidence, best_supported(label, sound, evidence)) if sound else faulty[0]
+    return _Found(label, evidence, search.best_supported(label, sound, evidence)) if sound else faulty[0]
 
 
 def _fault(plane: FramedPlanes, objective: Objective, options: PlaneFit) -> ValueError | None:
@@ -343,7 +332,7 @@ def _placed_by_images(pane: _Found, cloud: Array, cameras: Sequence[Camera], opt
     some = [replace(camera, cam_from_world=camera.cam_from_world.float()) for camera in some]
     panes = _planes([outlined], [pane.label], options)
     seen = virtual_points(torch.from_numpy(cloud).float(), panes, some).numpy()
-    images = plane_of_images(pane.plane.planes, outlined.center, cloud[seen], cloud[~seen], pane.evidence.extent)
+    images = search.plane_of_images(pane.plane.planes, outlined.center, cloud[seen], cloud[~seen], pane.evidence.extent)
     if images is None or not images.is_clear:
         return pane
     plane = FramedPlanes(images.plane, pane.plane.frames)
@@ -352,14 +341,14 @@ def _placed_by_images(pane: _Found, cloud: Array, cameras: Sequence[Camera], opt
     log.info(
         "pane %d: %.0f points seen through it are mirror images of others on a plane %.2f degrees from that of its "
         "masks, which has %.0f; it takes that plane",
-        pane.label, images.pairs, np.degrees(angle(pane.plane, plane)), images.before,
+        pane.label, images.pairs, np.degrees(search.angle(pane.plane, plane)), images.before,
     )  # fmt: skip
     return replace(pane, plane=plane, fault=None, is_settled=True)
 
 
 def _loss(pane: _Found, plane: FramedPlanes) -> float:
     """The excess of the contradiction of a plane over that of the pane's own."""
-    return float((contradiction(plane, pane.evidence) - contradiction(pane.plane, pane.evidence))[0])
+    return float((search.contradiction(plane, pane.evidence) - search.contradiction(pane.plane, pane.evidence))[0])
 
 
 def _neighbours(found: Sequence[_Found]) -> list[list[int]]:
@@ -368,7 +357,7 @@ def _neighbours(found: Sequence[_Found]) -> list[list[int]]:
 
     def may_share(one: int, other: int) -> bool:
         first, second = panes[one], panes[other]
-        return in_one_surface(first.plane, second.plane, (first.evidence, second.evidence))
+        return search.in_one_surface(first.plane, second.plane, (first.evidence, second.evidence))
 
     return [group for group in linked_groups(list(panes), may_share) if len(group) > 1]
 
@@ -379,10 +368,10 @@ def _joint(panes: Sequence[_Found], seed: int) -> list[_Found]:
     while len(panes) > 1:
         objective = JointObjective([pane.evidence for pane in panes])
         rng = np.random.default_rng((seed, *(pane.label for pane in panes)))
-        plane = best_joint_plane(objective, join_planes([pane.plane for pane in panes]), rng)
+        plane = search.best_joint_plane(objective, join_planes([pane.plane for pane in panes]), rng)
         losses = [_loss(pane, plane) for pane in panes]
         if max(losses) <= MOST_LOSS:
-            labels, turned = name_labels(pane.label for pane in panes), max(angle(p.plane, plane) for p in panes)
+            labels, turned = name_labels(pane.label for pane in panes), max(search.angle(p.plane, plane) for p in panes)
             log.info("panes %s lie in one plane, within %.2f degrees", labels, np.degrees(turned))
             return [replace(pane, plane=plane, is_settled=True) for pane in panes]
         del panes[int(np.argmax(losses))]
@@ -489,7 +478,7 @@ def _check_outline(label: int, views: Sequence[PaneView]) -> None:
 
 
 def _check_outlines(found: FramedPlanes, objective: Objective) -> None:
-    against = float(contradiction(found, objective)[0])
+    against = float(search.contradiction(found, objective)[0])
     if against > MOST_CONTRADICTION:
         raise ValueError(
             f"on no plane do the outlines of its masks meet; on the best one {against:.2f} of what is known tells "
@@ -505,7 +494,7 @@ def _check_certainty(found: FramedPlanes, objective: Objective) -> None:
 
 def _tilt_degrees(found: FramedPlanes, objective: Objective) -> float:
     """Degrees by which a plane may be turned before its masks tell."""
-    return float(np.degrees(tilt_uncertainty(found, objective, MIDDLE)[0]))
+    return float(np.degrees(search.tilt_uncertainty(found, objective, MIDDLE)[0]))
 
 
 def _left_open(degrees: float, objective: Objective) -> str:

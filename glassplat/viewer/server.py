@@ -27,18 +27,7 @@ from glassplat.publish.web_page import best_view, survey_capture
 from glassplat.render.frame import Renderer
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
-from glassplat.viewer import controls
-from glassplat.viewer.drawing import (
-    ERROR,
-    ViewerState,
-    Viewpoints,
-    ViewRequest,
-    draw_picture,
-    edit_scene,
-    error_drawn,
-    matrix_of,
-    point_along,
-)
+from glassplat.viewer import controls, drawing
 from glassplat.viewer.render_loop import RenderLoop, RenderThread, check_port
 
 LARGEST_HEIGHT, MOST_PIXELS = 1080, 4_000_000
@@ -102,7 +91,7 @@ class Client:
         rows = max(1, min(int(self._handle.camera.image_height), most))
         self._viewer.loop.ask(self._handle.client_id, request, (max(1, round(request.aspect * rows)), rows))
 
-    def request(self) -> ViewRequest | None:
+    def request(self) -> drawing.ViewRequest | None:
         """Request of the controls and the camera; None before the browser has reported its camera."""
         camera = self._handle.camera
         try:
@@ -110,9 +99,10 @@ class Client:
             fov_rad, aspect = float(camera.fov), float(camera.aspect)
         except AssertionError:  # viser has not heard of this camera yet; it will say so.
             return None
-        self._nearest = self._viewer.viewpoints.nearest(position, matrix_of(wxyz)[:, 2])
-        against = self._nearest if self._layer.value == ERROR else None
-        request = ViewRequest(cam_from_world(wxyz, position), fov_rad, aspect, self._layer.value, against=against)
+        self._nearest = self._viewer.viewpoints.nearest(position, drawing.matrix_of(wxyz)[:, 2])
+        against = self._nearest if self._layer.value == drawing.ERROR else None
+        pose = cam_from_world(wxyz, position)
+        request = drawing.ViewRequest(pose, fov_rad, aspect, self._layer.value, against=against)
         request = request if self._clean is None else self._clean.apply(request)
         return request if self._panes is None else self._panes.apply(request)
 
@@ -181,7 +171,7 @@ class Client:
         def work() -> None:
             try:
                 self._measure.take(
-                    point_along(self._viewer.state.scene, self._viewer.state.renderer, request, direction)
+                    drawing.point_along(self._viewer.state.scene, self._viewer.state.renderer, request, direction)
                 )
             except ValueError as error:
                 self._notify("No point", str(error), "red")
@@ -192,7 +182,7 @@ class Client:
         """Saves the scene as it is edited here, under a new name; says how that went."""
         writer, request = self._viewer.state.writer, self.request()
         if writer is not None and request is not None:
-            self._save(lambda: writer.write_scene(edit_scene(self._viewer.state.scene, request), name))
+            self._save(lambda: writer.write_scene(drawing.edit_scene(self._viewer.state.scene, request), name))
 
     def save_keyframes(self, name: str) -> None:
         """Saves the keyframes under a new name; says how that went."""
@@ -233,7 +223,7 @@ def plain(text: str) -> str:
 
 def cam_from_world(wxyz: NDArray[np.float64], position: NDArray[np.float64]) -> Tensor:
     """[4, 4] float32 from viser's camera, which has the axes of OpenCV."""
-    rotation = matrix_of(wxyz).T
+    rotation = drawing.matrix_of(wxyz).T
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
     return torch.from_numpy(pose).float()
@@ -243,7 +233,7 @@ class Viewer:
     """Serves a scene to any number of browsers until it is stopped; who made it draws, or `start` does."""
 
     def __init__(
-        self, state: ViewerState, host: str, port: int, buttons: Mapping[str, Callable[[], None]] | None = None
+        self, state: drawing.ViewerState, host: str, port: int, buttons: Mapping[str, Callable[[], None]] | None = None
     ) -> None:
         """Begins to serve.
 
@@ -265,7 +255,7 @@ class Viewer:
                 "the page of `glassplat export`, which needs nothing"
             ) from error
         self.state, self.host, self.buttons = state, host, buttons or {}
-        self.loop: RenderLoop[ViewRequest] = RenderLoop(self._draw, self._show, self._fail)
+        self.loop: RenderLoop[drawing.ViewRequest] = RenderLoop(self._draw, self._show, self._fail)
         self._thread: RenderThread | None = None
         self._clients: dict[int, Client] = {}
         logging.getLogger("websockets").setLevel(logging.CRITICAL)
@@ -278,7 +268,7 @@ class Viewer:
         self._server.scene.set_up_direction(tuple(survey.up.tolist()))
         self.focus = survey.focus.numpy()
         self.first = best_view(state.scene.planes, cameras)
-        self.viewpoints = Viewpoints(cameras, state.scene.extent)
+        self.viewpoints = drawing.Viewpoints(cameras, state.scene.extent)
         # The error layer asks for the same one with every edit.
         self._photograph = lru_cache(maxsize=2)(self._read_photograph)
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
@@ -343,12 +333,12 @@ class Viewer:
         if gone is not None:
             gone.leave()
 
-    def _draw(self, request: ViewRequest, height: int) -> NDArray[np.uint8]:
+    def _draw(self, request: drawing.ViewRequest, height: int) -> NDArray[np.uint8]:
         scene, renderer = self.state.scene, self.state.renderer
         if request.against is None:
-            return draw_picture(scene, renderer, request, height)
+            return drawing.draw_picture(scene, renderer, request, height)
         camera = self.state.cameras[request.against][1]
-        return error_drawn(scene, renderer, request, height, camera, self._photograph(request.against))
+        return drawing.error_drawn(scene, renderer, request, height, camera, self._photograph(request.against))
 
     def _read_photograph(self, index: int) -> Tensor:
         """[H, W, 3] uint8.
