@@ -121,7 +121,7 @@ function makePanel(scene, navigation, changed) {
   window.addEventListener('keyup', (event) => walking.delete(event.key.toLowerCase()));
   window.addEventListener('keydown', (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || (event.repeat && !event.key.startsWith('Arrow'))) return;
-    const own = event.target.matches('textarea') || (event.target.matches('[type=range], [role=slider]') && event.key.length > 1);
+    const own = event.target.matches('textarea, select') || (event.target.matches('[type=range], [role=slider]') && event.key.length > 1);
     if (own && event.key !== 'Escape') return;  // A slider has use for arrows, not for letters.
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
     if (!reflects && ('cgm'.includes(key) || LAYER_KEYS[Number(key) - 1])) return;
@@ -167,8 +167,9 @@ function makePanel(scene, navigation, changed) {
   body.classList.toggle('shiny', Boolean(scene.mirrored));
   if (scene.mirrored) document.querySelector('[data-set="layer=without_panes"]').textContent = 'Without reflections';
   if (scene.panes.length > 1) {
-    const chip = (value, label) => `<button data-set="pane=${value}">${label}</button>`;
-    element('panes').innerHTML = chip('all', 'All') + scene.panes.map((pane, k) => chip(k, pane.label)).join('');
+    const choice = (value, label) => `<option value="${value}">${label}</option>`;
+    element('panes').innerHTML = choice('all', 'All') + scene.panes.map((pane, k) => choice(k, pane.label)).join('');
+    element('panes').addEventListener('change', ({ target }) => set('pane', target.value));
     element('panes').parentElement.hidden = false;
   }
   show();

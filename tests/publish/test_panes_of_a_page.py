@@ -11,7 +11,7 @@ from glassplat.publish.web_page import write_page
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.panes import Planes
-from glassplat.scene.scene import Scene
+from glassplat.scene.scene import Scene, as_mirrors
 from tests.browser_needed import needs_browser
 from tests.publish.test_web_page import CAMERAS, likeness
 from tests.render.test_seen_panes import vitrine
@@ -50,16 +50,16 @@ def test_only_the_nearest_pane_is_laid_if_asked(tmp_path: Path) -> None:
         assert browser.complaints() == []
 
 
-def pane_of_three(x: float, label: int) -> Planes:
-    """One of three panes side by side, whose glass reaches into that of its neighbours."""
-    upright = pane(2.0, half=0.4, label=label)
+def upright_pane(x: float, label: int, half: float = 0.4) -> Planes:
+    """A pane across the z axis, of those side by side, whose glass reaches into that of its neighbours."""
+    upright = pane(2.0, half=half, label=label)
     center, facing = torch.tensor([[x, 0.0, 2.0]]).double(), torch.tensor([[0.0, 0.0, -1.0]]).double()
     return upright.with_tensors({"centers": center, "raw_normals": facing})
 
 
 @needs_browser
 def test_panes_side_by_side_do_not_fade_where_they_adjoin(tmp_path: Path) -> None:
-    panes = joined(*(pane_of_three(x, label) for label, x in enumerate((-0.8, 0.0, 0.8), start=1)))
+    panes = joined(*(upright_pane(x, label) for label, x in enumerate((-0.8, 0.0, 0.8), start=1)))
     scene, renderer = in_single_precision(showcase(panes)), Planar()
     write_page(tmp_path / "index.html", scene, renderer, CAMERAS, "three")
     with Browser(tmp_path / "index.html", 320, 240) as browser:
@@ -71,10 +71,27 @@ def test_panes_side_by_side_do_not_fade_where_they_adjoin(tmp_path: Path) -> Non
 
 @needs_browser
 def test_a_pane_has_a_mask_of_its_own_only_where_another_may_be_seen_through_it(tmp_path: Path) -> None:
-    apart = joined(pane_of_three(-1.2, 1), pane_of_three(1.2, 2))
+    apart = joined(upright_pane(-1.2, 1), upright_pane(1.2, 2))
     for name, panes, own in (("apart", apart, False), ("behind", joined(pane(2.0), pane(3.0, label=2)), True)):
         write_page(tmp_path / f"{name}.html", in_single_precision(showcase(panes)), Planar(), CAMERAS, name)
         with Browser(tmp_path / f"{name}.html", 320, 240) as browser:
             joint, *each = browser.evaluate(SPLATS_OF_MASKS)
             assert joint > 0 and len(each) == 2
             assert all(each) if own else not any(each)
+
+
+@needs_browser
+def test_one_of_many_panes_is_chosen_from_a_list(tmp_path: Path) -> None:
+    panes = joined(*(upright_pane(0.2 * label - 1.0, label, half=0.1) for label in range(1, 9)))
+    scene = in_single_precision(showcase(panes))
+    write_page(tmp_path / "index.html", scene, Planar(), CAMERAS, "eight")
+    with Browser(tmp_path / "index.html", 1280, 720) as browser:
+        dock = browser.evaluate(
+            "(({ left, right }) => [left, right])(document.querySelector('#dock').getBoundingClientRect())"
+        )
+        assert 0 <= dock[0] < dock[1] <= 1280
+        browser.run(
+            "const list = document.querySelector('#panes'); list.value = '4'; list.dispatchEvent(new Event('change'));"
+        )
+        browser.keys("m")
+        assert likeness(browser, as_mirrors(scene, [5]), Planar(), CAMERAS[1][1]) > 36
