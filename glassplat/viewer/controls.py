@@ -40,6 +40,8 @@ NO_PANE = "none"
 HANDLE_SHARE = 0.7
 """Length of a gizmo's arrows, of the mean half side of its pane."""
 OUTLINE_PIXELS = 2.0
+MOST_OPEN = 4
+"""Panes whose sliders are shown at once; those of more are folded away."""
 
 
 class PaneGizmo:
@@ -117,10 +119,11 @@ class PaneControls:
         self._gizmos = [PaneGizmo(handle.scene, planes, row) for row in range(len(planes))]
         with gui.add_folder("Glass"):
             self._glass = gui.add_dropdown("Panes", ("as it is", "mirror", "none"))
-            self._reflectances = {
-                label: gui.add_slider(f"Reflectance R0, pane {label}", 0.0, 1.0, 0.005, round(value, 3))
-                for label, value in self._own.items()
-            }
+            with gui.add_folder("Reflectance R0", expand_by_default=len(planes) <= MOST_OPEN):
+                self._reflectances = {
+                    label: gui.add_slider(f"Pane {label}", 0.0, 1.0, 0.005, round(value, 3))
+                    for label, value in self._own.items()
+                }
             self._gain = gui.add_slider("Gain", LEAST_GAIN, MOST_GAIN, 0.05, 1.0)
             self._chosen = gui.add_dropdown("Move pane", (NO_PANE, *map(str, planes.labels)))
             self._back = gui.add_button("Put panes back")
