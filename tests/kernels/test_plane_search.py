@@ -76,13 +76,17 @@ def test_followed_edges_are_those_of_the_definition(views: list[PaneView], plane
             size, hidden = pixel_and_frame(planes, target, points, outward)
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
                 doubt = target.diagonal * np.sqrt((1 + (own_size / size) ** 2) / 2)
-                shifts = (own_hidden - hidden) / (size * doubt)
+                shifts, most = (own_hidden - hidden) / (size * doubt), STEEPEST / (size * doubt)
             distances = target.edge_distance(np.where(compared[..., None], landed, 0).reshape(-1, 2))
             distances = distances.reshape(compared.shape) / doubt
             for name, expected in (("distances", distances), ("shifts", shifts)):
                 found = getattr(matches, name)[:, other, chosen]
                 assert (found[~compared] == 0).all()
-                np.testing.assert_allclose(found[compared], expected[compared], rtol=1e-9, atol=1e-12)
+                # How steeply a camera looks along a plane that it lies in is a matter of rounding, between two bounds.
+                aside = np.abs(planes.normals @ view.center - planes.offsets)[:, None] > 1e-9
+                sure = compared if name == "distances" else compared & aside
+                np.testing.assert_allclose(found[sure], expected[sure], rtol=1e-9, atol=1e-12)
+                assert name == "distances" or (np.abs(found[compared]) <= most[compared] * (1 + 1e-9)).all()
             seen.append(compared.sum())
     assert sum(np.array(seen) > 100) > 40
 
