@@ -9,10 +9,10 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from glassplat.captures import colmap_library as library
 from glassplat.errors import InputError
+from glassplat.files.images import resize_by_area
 from glassplat.files.records import LARGEST_COORDINATE
 
 ORTHOGONALITY_TOLERANCE = 1e-2
@@ -164,6 +164,10 @@ class Lens:
         )
 
 
+LEAST_SHARE = 1e-4
+"""Share of a pixel below which an area that covers it is rounding."""
+
+
 @dataclass(frozen=True)
 class PixelMap:
     """Turns a photograph, or its mask, into the pixel grid of its pinhole camera: undistorts, then reduces.
@@ -189,16 +193,20 @@ class PixelMap:
             labels = _undistort(labels, self.lens.as_colmap(), "NEAREST_NEIGHBOR")
         return nearest_resize(labels, self.width, self.height)
 
+    def ignored(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """[H, W] of the photograph's size to [height, width]; 1 where any pixel that is averaged has a label."""
+        if self.lens is not None:
+            labels = _undistort(labels, self.lens.as_colmap(), "NEAREST_NEIGHBOR")
+        if labels.shape == (self.height, self.width):
+            return labels
+        return (resize_by_area(labels > 0, self.width, self.height) > LEAST_SHARE).astype(np.uint8)
+
 
 def area_resize(pixels: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
     """[H, W, 3] averaged over the area of each new pixel; rounded once, so that no bias builds up."""
     if pixels.shape[:2] == (height, width):
         return pixels
-    reduced = np.empty((height, width, 3), dtype=np.uint8)
-    for index in range(3):  # One after the other: as floats a channel takes more memory than the photograph.
-        channel = Image.fromarray(pixels[:, :, index].astype(np.float32)).resize((width, height), Image.Resampling.BOX)
-        reduced[:, :, index] = np.clip(np.round(np.asarray(channel)), 0, 255)
-    return reduced
+    return np.clip(np.round(resize_by_area(pixels, width, height)), 0, 255).astype(np.uint8)
 
 
 def nearest_resize(labels: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:

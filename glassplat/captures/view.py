@@ -424,16 +424,20 @@ class MaskFile:
         """[H, W] uint8 in the pixel grid of the view's camera."""
         return torch.from_numpy(self.pixel_map.labels(nearest_resize(self.mask.labels(), *self.size)))
 
+    def ignored(self) -> Tensor:
+        """[H, W] uint8, above zero where a pixel of the view shows anything that has a label."""
+        return torch.from_numpy(self.pixel_map.ignored(nearest_resize(self.mask.labels(), *self.size)))
+
 
 @dataclass(frozen=True)
-class MaskFiles:
-    """Recipe for reading what any of several masks of one view marks."""
+class IgnoredFiles:
+    """Recipe for reading what any of several masks of one view leaves out."""
 
     masks: tuple[MaskFile, ...]
 
     def __call__(self) -> Tensor:
         """[H, W] uint8, above zero where any mask is."""
-        return torch.stack([mask() for mask in self.masks]).amax(dim=0)
+        return torch.stack([mask.ignored() for mask in self.masks]).amax(dim=0)
 
 
 @dataclass(frozen=True)
@@ -491,7 +495,7 @@ def prepare_view(
         image_path=shot.image_path,
         read_photo=PhotoFile(shot.image_path, pixel_map, options.background),
         read_pane_labels=None if mask is None else _mask_file(mask, (width, height), pixel_map),
-        read_ignored=MaskFiles(tuple(_mask_file(one, (width, height), pixel_map) for one in ignored))
+        read_ignored=IgnoredFiles(tuple(_mask_file(one, (width, height), pixel_map) for one in ignored))
         if ignored
         else None,
         read_normals=normals_reader(normals, camera),

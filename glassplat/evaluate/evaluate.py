@@ -379,7 +379,7 @@ def _transmission_psnr(frame: Frame, truth: GroundTruth | None, true_view: TrueV
 def _reflection_pixels(
     frame: Frame, truth: GroundTruth | None, true_view: TrueView | None
 ) -> tuple[Tensor, Tensor] | str:
-    """Rendered and true reflection [P, 3] at the pane's pixels, in [0, 1]."""
+    """Rendered and true reflection [P, 3] at the pane's pixels; the true one in [0, 1], where lamps are white."""
     if "reflection" not in frame.layers:
         return "the method renders no reflection"
     if true_view is None:
@@ -400,7 +400,7 @@ def _add_reflection(measurements: Iterable[_Measurement]) -> float | None:
             measurement.metrics["reflection_psnr"] = measurement.reflection
         else:
             image, target = measurement.reflection
-            measurement.metrics["reflection_psnr"] = metrics.psnr(gain * image, target)
+            measurement.metrics["reflection_psnr"] = metrics.psnr((gain * image).clamp(0, 1), target)
     return gain if pairs else None
 
 

@@ -223,17 +223,33 @@ def ssim(image: Tensor, target: Tensor) -> float:
     return float(photometric(quantize(image).to(torch.float32) / 255, quantize(target)).ssim)
 
 
+MOST_ROUNDS = 20
+"""Of the search for what a factor clips; two or three decide it."""
+
+
 def reflection_gain(images: list[Tensor], targets: list[Tensor]) -> float:
-    """The one factor on `images` that brings them closest to `targets` in least squares.
+    """The one factor on `images` that, clipped at white, brings them closest to `targets` in least squares.
 
     The reflection layer's scale trades off against the strength and the intensity a(u), so it is
-    compared up to a factor shared by the whole scene. 1 where the images are black.
+    compared up to a factor shared by the whole scene. 1 where the images are black. A photograph of a lamp
+    is white however bright the lamp is, so that what is clipped has no part in the factor.
 
     Args:
         images: pixels [P, 3], floating point; one entry per view, of any number of pixels.
         targets: the same shapes.
     """
     pairs = [(a.to(torch.float64), b.to(torch.float64)) for a, b in zip(images, targets, strict=True)]
+    gain = _least_squares([(image[target < 1], target[target < 1]) for image, target in pairs])
+    for _ in range(MOST_ROUNDS):
+        before, seen = gain, [gain * image < 1 for image, _ in pairs]
+        gain = _least_squares([(image[kept], target[kept]) for (image, target), kept in zip(pairs, seen, strict=True)])
+        if gain == before:
+            break
+    return gain
+
+
+def _least_squares(pairs: list[tuple[Tensor, Tensor]]) -> float:
+    """The factor on the first of each pair; 1 where it does not matter."""
     power = sum((image.square().sum().item() for image, _ in pairs), 0.0)
     product = sum(((image * target).sum().item() for image, target in pairs), 0.0)
     return product / power if power > 0 else 1.0

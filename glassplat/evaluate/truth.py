@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor
 
+from glassplat.captures.cameras import LEAST_SHARE, area_resize
 from glassplat.captures.view import View
 from glassplat.errors import InputError, input_checked
-from glassplat.files.images import image_size, read_colors, read_image, read_image_float
+from glassplat.files.images import image_size, read_colors, read_image, read_image_float, resize_by_area
 from glassplat.files.records import COORDINATE, Field, Flag, Items, Number, Whole, check_fields, read_json
 from glassplat.options import short_repr
 
@@ -37,7 +37,8 @@ class TrueView:
     """The true layers of one test view.
 
     Attributes:
-        transmission: [H, W, 3] uint8 sRGB, what the view shows without the panes.
+        transmission: [H, W, 3] uint8 sRGB, what passes the first pane on each ray: tinted by it, and with what panes
+            behind it reflect.
         reflection: [H, W, 3] uint8 sRGB, what the panes reflect, at full strength.
         strength: [H, W] float32, true Fresnel strength in [0, 1].
         labels: [H, W] uint8, pane label of pixels that a pane covers fully, else 0.
@@ -82,7 +83,7 @@ class GroundTruth:
         """The true layers for a photograph, averaged down to the given size.
 
         Args:
-            image_name: the photograph's name; its stem names the files.
+            image_name: the photograph's name, which the files bear, in its folder or in none.
             width: of the rendered view, pixels.
             height: of the rendered view, pixels.
 
@@ -92,13 +93,8 @@ class GroundTruth:
         Raises:
             InputError: only some of the view's files are there, or a file is broken.
         """
-        stem = Path(image_name).stem
-        paths = {
-            "transmission": _png_or_jpeg(self.folder / "trans" / stem),
-            "reflection": _png_or_jpeg(self.folder / "refl" / stem),
-            "strength": self.folder / "strength" / f"{stem}.png",
-            "labels": self.folder / "strength" / f"{stem}_pane.png",
-        }
+        in_folder, in_none = self._paths(Path(image_name).with_suffix("")), self._paths(Path(Path(image_name).stem))
+        paths = in_folder if any(path.is_file() for path in in_folder.values()) else in_none
         missing = [str(path) for path in paths.values() if not path.is_file()]
         if len(missing) == len(paths):
             return None
@@ -111,9 +107,18 @@ class GroundTruth:
             return TrueView(
                 transmission=torch.from_numpy(_resized_color(read_colors(paths["transmission"]), size)),
                 reflection=torch.from_numpy(_resized_color(read_colors(paths["reflection"]), size)),
-                strength=torch.from_numpy(resized_float(read_image_float(paths["strength"])[..., 0], size)),
+                strength=torch.from_numpy(resize_by_area(read_image_float(paths["strength"])[..., 0], *size)),
                 labels=torch.from_numpy(_resized_labels(read_image(paths["labels"])[..., 0], size)),
             )
+
+    def _paths(self, name: Path) -> dict[str, Path]:
+        """The files of a photograph of this name, without its suffix."""
+        return {
+            "transmission": _png_or_jpeg(self.folder / "trans" / name),
+            "reflection": _png_or_jpeg(self.folder / "refl" / name),
+            "strength": self.folder / "strength" / f"{name}.png",
+            "labels": self.folder / "strength" / f"{name}_pane.png",
+        }
 
 
 def _png_or_jpeg(stem: Path) -> Path:
@@ -150,20 +155,14 @@ def _true_plane(entry: Any, where: str) -> TruePlane:
 
 def _resized_color(pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
     colors = np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else np.ascontiguousarray(pixels[..., :3])
-    return np.array(Image.fromarray(colors).resize(size, Image.Resampling.BOX))
-
-
-def resized_float(pixels: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
-    """[H, W] averaged down to a size, which is width and height."""
-    return np.array(Image.fromarray(pixels).resize(size, Image.Resampling.BOX))
+    return area_resize(colors, *size)
 
 
 def _resized_labels(labels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
     """A label survives only where it covers the whole of the larger pixel."""
     result = np.zeros(size[::-1], dtype=np.uint8)
     for label in np.unique(labels[labels > 0]):
-        share = resized_float((labels == label).astype(np.float32), size)
-        result[share > 1 - 1e-4] = label
+        result[resize_by_area(labels == label, *size) > 1 - LEAST_SHARE] = label
     return result
 
 
@@ -205,11 +204,11 @@ def true_surface(view: View) -> TrueSurface | None:
     if vectors is None and strength is None:
         return None
     coverage = _coverage(view, vectors)
-    covered = torch.from_numpy(resized_float(coverage, size) > COVERED)
+    covered = torch.from_numpy(resize_by_area(coverage, *size) > COVERED)
     return TrueSurface(
         covered=covered,
         normals=None if vectors is None else _normals(vectors, coverage, size) * covered[..., None],
-        strength=None if strength is None else torch.from_numpy(resized_float(strength[..., 0], size)),
+        strength=None if strength is None else torch.from_numpy(resize_by_area(strength[..., 0], *size)),
     )
 
 
@@ -249,8 +248,7 @@ def _coverage(view: View, vectors: NDArray[np.float32] | None) -> NDArray[np.flo
 def _normals(vectors: NDArray[np.float32], coverage: NDArray[np.float32], size: tuple[int, int]) -> Tensor:
     """[H, W, 3] unit vectors: means over the covered parts of the smaller pixels."""
     weighted = _decode_normals(vectors) * coverage[..., None]
-    means = np.stack([resized_float(weighted[..., axis], size) for axis in range(3)], axis=-1)
-    return torch.nn.functional.normalize(torch.from_numpy(means), dim=-1)
+    return torch.nn.functional.normalize(torch.from_numpy(resize_by_area(weighted, *size)), dim=-1)
 
 
 def _decode_normals(vectors: NDArray[np.float32]) -> NDArray[np.float32]:

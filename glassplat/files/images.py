@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from functools import cache, lru_cache
 from itertools import count, takewhile
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -295,6 +295,30 @@ def _shades(image: Image.Image) -> NDArray[np.float32]:
     """Sixteen-bit grey as [H, W] in [0, 1]."""
     _check_shades(image)
     return np.asarray(image).astype(np.float32) / np.float32(_FULL_SCALE_16)
+
+
+def resize_by_area(pixels: NDArray[np.generic], width: int, height: int) -> NDArray[np.float32]:
+    """[H, W] or [H, W, C] as [height, width(, C)]: exact means over the area of each new pixel, whatever the factor."""
+    rows, columns = _shares_of_area(pixels.shape[0], height), _shares_of_area(pixels.shape[1], width)
+    planes = pixels.reshape(*pixels.shape[:2], -1)
+    means = np.empty((height, width, planes.shape[2]), dtype=np.float32)
+    for index in range(planes.shape[2]):  # One after the other: all as floats take more memory than the photograph.
+        means[..., index] = (columns @ (rows @ planes[..., index].astype(np.float32)).T).T
+    return means.reshape(height, width, *pixels.shape[2:])
+
+
+@lru_cache(maxsize=16)
+def _shares_of_area(old: int, new: int) -> Any:
+    """[new, old] sparse: what share of each new pixel along a side each of the old ones covers."""
+    from scipy import sparse
+
+    edges = np.arange(new + 1) * old / new
+    first, last = np.floor(edges[:-1]).astype(np.int64), np.ceil(edges[1:]).astype(np.int64)
+    counts = last - first
+    rows = np.repeat(np.arange(new), counts)
+    columns = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts - first, counts)
+    covered = np.minimum(columns + 1, edges[rows + 1]) - np.maximum(columns, edges[rows])
+    return sparse.csr_array(((covered * new / old).astype(np.float32), (rows, columns)), shape=(new, old))
 
 
 def _to_uint8(pixels: NDArray[np.generic]) -> NDArray[np.uint8]:

@@ -15,8 +15,10 @@ from PIL import Image
 
 import glassplat.evaluate.evaluate
 import glassplat.evaluate.metrics
+from glassplat.captures.cameras import PixelMap
 from glassplat.captures.dataset import load_dataset
-from glassplat.captures.view import View
+from glassplat.captures.masks import CutOut
+from glassplat.captures.view import IgnoredFiles, MaskFile, PhotoFile, View
 from glassplat.errors import InputError
 from glassplat.evaluate.evaluate import evaluate
 from glassplat.evaluate.truth import TrueSurface, TrueView
@@ -54,6 +56,18 @@ def test_masks_of_what_is_ignored_are_read_beside_those_of_panes(tmp_path: Path)
     assert first is not None and second is not None
     assert bool(first[:10, :20].all()) and int(first.sum()) == 200
     assert bool(second[:, 30:].all()) and int(second.sum()) == 280
+
+
+@pytest.mark.parametrize("size", [(40, 28), (25, 18), (20, 14), (13, 9)])
+def test_nothing_of_what_is_cut_out_is_seen_in_a_reduced_photograph(size: tuple[int, int], tmp_path: Path) -> None:
+    rows, columns = np.mgrid[:28, :40]
+    inside = (rows - 13.3) ** 2 + (columns - 19.1) ** 2 < 11.0**2
+    path, pixel_map = tmp_path / "0.png", PixelMap(None, *size)
+    Image.fromarray(np.where(inside[..., None], np.uint8([200, 180, 160, 255]), np.uint8([0, 0, 0, 0]))).save(path)
+    ignored = IgnoredFiles((MaskFile(CutOut(path), (40, 28), pixel_map),))()
+    kept = PhotoFile(path, pixel_map, None)()[ignored == 0]
+    assert len(kept) > 0.4 * inside.sum() * size[0] * size[1] / inside.size
+    assert kept.unique(dim=0).tolist() == [[200, 180, 160]]
 
 
 def ignored_of(root: Path) -> dict[str, torch.Tensor]:

@@ -58,6 +58,12 @@ def test_gain_is_the_least_squares_one() -> None:
     assert errors[1] < min(errors[0], errors[2])
 
 
+def test_a_lamp_that_is_brighter_than_white_does_not_darken_what_it_stands_in() -> None:
+    light = 0.5 * IMAGE.reshape(-1, 3)
+    light[:7] = 20.0
+    assert reflection_gain([light], [light.clamp(0, 1)]) == pytest.approx(1.0)
+
+
 def test_gain_of_nothing_is_one() -> None:
     assert reflection_gain([], []) == 1.0
     assert reflection_gain([torch.zeros(5, 3)], [torch.ones(5, 3)]) == 1.0

@@ -40,6 +40,20 @@ def test_layers_are_read_with_their_full_depth(tmp_path: Path) -> None:
     assert view.labels.tolist() == LABELS.tolist()
 
 
+def test_photographs_of_one_name_in_two_folders_have_each_its_own_layers(tmp_path: Path) -> None:
+    for folder, labels in (("left", LABELS), ("right", LABELS[:, ::-1])):
+        for kind in ("trans", "refl", "strength"):
+            (tmp_path / kind / folder).mkdir(parents=True)
+        write_view(tmp_path, f"{folder}/0008", np.ascontiguousarray(labels))
+    write_view(tmp_path, "0009", LABELS)
+    truth = load_truth(tmp_path)
+    assert truth is not None
+    found = [truth.view(name, 6, 2) for name in ("left/0008.jpg", "right/0008.jpg", "right/0009.jpg")]
+    assert [view.labels.tolist() for view in found if view] == [
+        rows.tolist() for rows in (LABELS, LABELS[:, ::-1], LABELS)
+    ]
+
+
 def test_a_smaller_pixel_is_pane_only_where_the_pane_covers_it(tmp_path: Path) -> None:
     write_view(tmp_path, "0008", LABELS)
     truth = load_truth(tmp_path)

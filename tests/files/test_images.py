@@ -19,6 +19,7 @@ from glassplat.files.images import (
     read_colors,
     read_image,
     read_image_float,
+    resize_by_area,
     write_image,
 )
 from tests.files.profiles import IN_P3, IN_SRGB, p3_profile, srgb_profile
@@ -232,3 +233,13 @@ def test_what_the_system_says_of_a_file_is_quoted_alone(tmp_path: Path) -> None:
     (tmp_path / "a.png").mkdir()
     with pytest.raises(ValueError, match=r"^cannot read .*a\.png as an image \(Is a directory\); replace"):
         read_image(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("new", [(4, 6), (5, 3), (7, 9), (15, 12), (1, 1)])
+def test_an_image_is_averaged_over_the_exact_area_of_each_new_pixel(new: tuple[int, int]) -> None:
+    """Held against a grid so fine that every edge of an old and of a new pixel lies on it."""
+    pixels = np.random.default_rng(0).integers(0, 256, (10, 9, 3), dtype=np.uint8)
+    fine = np.kron(pixels.astype(np.float64), np.ones((new[0], new[1], 1)))
+    expected = fine.reshape(new[0], 10, new[1], 9, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(resize_by_area(pixels, new[1], new[0]), expected, rtol=1e-5)
+    np.testing.assert_array_equal(resize_by_area(pixels[..., 0], 9, 10), pixels[..., 0])
