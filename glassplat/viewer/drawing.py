@@ -169,9 +169,9 @@ def draw_picture(scene: Scene, renderer: Renderer, request: ViewRequest, height:
 
 @torch.no_grad()
 def error_drawn(
-    scene: Scene, renderer: Renderer, request: ViewRequest, height: int, camera: Camera, photo: Tensor
+    scene: Scene, renderer: Renderer, request: ViewRequest, height: int, camera: Camera, photo: Tensor, *, name: str
 ) -> NDArray[np.uint8]:
-    """Error of the edited scene against a photograph, from its camera: [H, W, 3], W by the request's aspect.
+    """Error of the edited scene against a photograph, in its colours and from its camera: [H, W, 3], W by the aspect.
 
     The photograph fills the height, is black beyond its edges and cut off where the picture is narrower. Both are
     compared pixel by pixel, so that the picture has no more rows than the photograph.
@@ -183,6 +183,7 @@ def error_drawn(
         height: rows of the picture, at most.
         camera: of the photograph.
         photo: [H, W, 3] uint8.
+        name: of the photograph.
     """
     rows = min(height, photo.shape[0])
     columns = max(1, round(rows * camera.width / camera.height))
@@ -190,7 +191,8 @@ def error_drawn(
     small = torch.nn.functional.interpolate(
         photo.to(frame.rgb).movedim(-1, 0)[None], (rows, columns), mode="bilinear", antialias=True
     )[0].movedim(0, -1)
-    colors = error_colors(frame.photographed, small)
+    image = scene.exposures.interpolate(name).apply(frame.photographed, name)
+    colors = error_colors(image, small)
     missing = max(1, round(request.aspect * rows)) - columns
     left = missing // 2
     return _picture(torch.nn.functional.pad(colors, (0, 0, left, missing - left)))

@@ -337,8 +337,9 @@ class Viewer:
         scene, renderer = self.state.scene, self.state.renderer
         if request.against is None:
             return drawing.draw_picture(scene, renderer, request, height)
-        camera = self.state.cameras[request.against][1]
-        return drawing.error_drawn(scene, renderer, request, height, camera, self._photograph(request.against))
+        name, camera = self.state.cameras[request.against]
+        photo = self._photograph(request.against)
+        return drawing.error_drawn(scene, renderer, request, height, camera, photo, name=name)
 
     def _read_photograph(self, index: int) -> Tensor:
         """[H, W, 3] uint8.

@@ -133,6 +133,10 @@ def test_what_the_exposure_made_of_the_photograph_is_left_as_it_is() -> None:
     expected = exposures.apply(truth, "dark.png")
     torch.testing.assert_close(result.float() / 255, expected, rtol=0, atol=4 / 255)
     assert torch.equal(result[:, 16:], dark[:, 16:])
+    # A photograph that was held out has the exposure of its neighbours.
+    neighbours = Exposures(affine.expand(2, 3, 4), ("a.png", "c.png"))
+    held_out = dereflected_photo(frame, dark, "linear", exposures=neighbours, name="b.png")
+    assert torch.equal(held_out, result)
     unaware = dereflected_photo(frame, dark, "linear").float() / 255
     assert float((unaware - expected)[:, :16].abs().mean()) > 0.005
 

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from glassplat.render.deferred import Deferred
 from glassplat.render.planar import Planar
+from glassplat.scene.corrections import Exposures
 from glassplat.scene.scene import Environment, Scene, as_mirrors, move_pane, with_reflectance, without_glass
 from glassplat.viewer.drawing import PaneMove, Viewpoints, ViewRequest, draw_picture, edit_scene, error_drawn
 from glassplat.viewer.server import cam_from_world
@@ -65,16 +66,28 @@ def test_a_layer_that_is_drawn_on_request_is_drawn() -> None:
 def test_the_error_is_none_where_the_photograph_is_the_render_and_follows_edits() -> None:
     view = tiny_capture().train[1]
     wide = replace(REQUEST, aspect=3.0)
-    same = error_drawn(true_scene(), Planar(), wide, 4000, view.camera, view.photo)
+    same = error_drawn(true_scene(), Planar(), wide, 4000, view.camera, view.photo, name=view.name)
     assert same.shape == (28, 84, 3)
     assert same[..., 0].max() <= 5 and not same[:, :22].any() and not same[:, 62:].any()
-    elsewhere = error_drawn(true_scene(), Planar(), replace(wide, glass="mirror"), 28, view.camera, view.photo)
+    elsewhere = error_drawn(
+        true_scene(), Planar(), replace(wide, glass="mirror"), 28, view.camera, view.photo, name=view.name
+    )
     assert elsewhere[:, 22:62, 0].max() > 100
-    assert error_drawn(true_scene(), Planar(), replace(REQUEST, aspect=0.5), 20, view.camera, view.photo).shape == (
+    narrow = replace(REQUEST, aspect=0.5)
+    assert error_drawn(true_scene(), Planar(), narrow, 20, view.camera, view.photo, name=view.name).shape == (
         20,
         10,
         3,
     )
+
+
+def test_the_error_is_in_the_colours_of_the_photograph() -> None:
+    first, view, last = tiny_capture().train[:3]
+    affine = torch.cat([-0.3 * torch.eye(3), torch.zeros(3, 1)], dim=1).expand(2, 3, 4)
+    scene = replace(true_scene(), exposures=Exposures(affine, (first.name, last.name)))
+    dark = (0.7 * view.photo.float()).round().to(torch.uint8)
+    same = error_drawn(scene, Planar(), REQUEST, 28, view.camera, dark, name=view.name)
+    assert same[..., 0].max() <= 5
 
 
 def test_the_nearest_photograph_is_near_in_place_and_direction() -> None:
