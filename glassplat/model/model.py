@@ -44,7 +44,7 @@ from glassplat.scene.camera import LEAST_SINE, Camera
 from glassplat.scene.corrections import DEFAULT_UP, upward
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
-from glassplat.scene.scene import OPAQUE_SHEET, Scene, glass_gaussians, with_intensity, with_pane
+from glassplat.scene.scene import Scene, closed_glass, with_intensity, with_pane
 from glassplat.viewer.drawing import ERROR, ViewerState, Writer
 from glassplat.viewer.render_loop import LOCAL, vacant_port
 from glassplat.viewer.server import Viewer
@@ -591,7 +591,7 @@ def _glass(file: Path, planes: Planes, *, own: bool) -> Gaussians:
     """The glass that lies next to the file, or else an even sheet on each pane."""
     beside = file.with_name("glass.ply")
     if not len(planes) or not own or not beside.is_file():
-        return glass_gaussians(planes, opacity=OPAQUE_SHEET)
+        return closed_glass(planes)
     glass, _ = drawable(read_gaussians(beside), beside)
     if "logit_mark" not in glass.channels:
         raise InputError(f"{beside} has no property logit_mark; expected glass as `glassplat export` writes it")

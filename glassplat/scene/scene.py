@@ -371,8 +371,8 @@ OVERLAP = 0.7
 """Standard deviation of a disc, in distances between neighbours; the discs blend into an even sheet."""
 THICKNESS = 0.05
 """Standard deviation across the pane, as a share of that along it."""
-OPAQUE_SHEET = 0.9
-"""Opacity of discs that cover a pane which nobody trains."""
+CLOSED_OPACITY, CLOSED_MARK, CLOSED_OVERLAP = 0.99, 0.9999, 1.2
+"""Of discs on a pane which nobody trains; they leave no gap through which a mirror would show what is behind it."""
 
 MARK = 0.99
 """m of glass that nobody has trained; the paper's 1 has no finite logit."""
@@ -407,6 +407,14 @@ def glass_gaussians(planes: Planes, *, count: int = 1000, seed: int = 0, opacity
     return glass.with_tensors({name: tensor.to(planes.centers) for name, tensor in glass.tensors().items()})
 
 
+def closed_glass(planes: Planes) -> Gaussians:
+    """Glass Gaussians for panes that nobody trains: they cover every rectangle wholly, with a mask of almost 1."""
+    glass = glass_gaussians(planes, opacity=CLOSED_OPACITY)
+    wider = glass.log_scales + math.log(CLOSED_OVERLAP / OVERLAP)
+    marks = torch.full_like(glass.channels["logit_mark"], logit(CLOSED_MARK))
+    return glass.with_tensors({"log_scales": wider, "logit_mark": marks})
+
+
 def with_pane(scene: Scene, pane: Planes) -> Scene:
     """The scene with one more pane, its rectangle evenly covered with glass; on its device, in its precision.
 
@@ -420,7 +428,7 @@ def with_pane(scene: Scene, pane: Planes) -> Scene:
     if set(pane.labels) & set(scene.planes.labels):
         raise ValueError(f"the scene has a pane {pane.labels[0]} already; its panes are {list(scene.planes.labels)}")
     pane = pane.with_tensors({name: tensor.to(scene.primary.means) for name, tensor in pane.tensors().items()})
-    glass = glass_gaussians(pane, opacity=OPAQUE_SHEET)
+    glass = closed_glass(pane)
     return replace(
         scene,
         primary=with_intensity(scene.primary),

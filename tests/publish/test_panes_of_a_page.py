@@ -86,9 +86,8 @@ def test_one_of_many_panes_is_chosen_from_a_list(tmp_path: Path) -> None:
     scene = in_single_precision(showcase(panes))
     write_page(tmp_path / "index.html", scene, Planar(), CAMERAS, "eight")
     with Browser(tmp_path / "index.html", 1280, 720) as browser:
-        dock = browser.evaluate(
-            "(({ left, right }) => [left, right])(document.querySelector('#dock').getBoundingClientRect())"
-        )
+        sides = "(({ left, right }) => [left, right])(document.querySelector('#dock').getBoundingClientRect())"
+        dock = browser.evaluate(f"glassplat.then(() => {sides})")
         assert 0 <= dock[0] < dock[1] <= 1280
         browser.run(
             "const list = document.querySelector('#panes'); list.value = '4'; list.dispatchEvent(new Event('change'));"
