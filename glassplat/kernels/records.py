@@ -98,6 +98,9 @@ MOST_CHANNELS = 32
 
 TILE = 16
 """Edge of a tile in pixels."""
+BEHIND = 1 + 1e-5
+"""By what factor farther along a ray a pane has to be to be another surface: panes of one front share their plane up to
+rounding, and their rectangles may overlap."""
 DAZZLING = 1.5
 """Intensity of a reflection beyond which it is that of a lamp."""
 

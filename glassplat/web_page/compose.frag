@@ -26,7 +26,7 @@ uniform int law;
 uniform bool linearLight, gained, nearestOnly;
 out vec4 shown;
 
-const float FAR = 1e30;
+const float FAR = 1e30, BEHIND = 1.00001;
 
 vec2 within(vec2 part) { return min(gl_FragCoord.xy / size * part, part - 0.5 / vec2(textureSize(image, 0))); }
 
@@ -108,10 +108,14 @@ void main() {
       if (depths[k] < FAR && depths[k] > depth) { farthest = k; depth = depths[k]; }
     }
     if (farthest < 0) break;
+    for (int k = 0; k < PANES; k++) if (k == farthest) depths[k] = FAR;
+    // Panes in one plane are one surface, as in kernels/panes.
+    bool isShared = false;
+    for (int k = 0; k < PANES; k++) isShared = isShared || (depths[k] < FAR && depths[k] * BEHIND >= depth);
+    if (isShared) { met--; continue; }
     mask = maskOf(farthest, nearestOnly || met == 1);
     if (nearestOnly) { seen = behind; mirror = vec4(0.0); }
     layPane(farthest, mask, ray, seen, mirror);
-    for (int k = 0; k < PANES; k++) if (k == farthest) depths[k] = FAR;
   }
 #endif
 #ifdef SHINY

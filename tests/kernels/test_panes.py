@@ -80,6 +80,18 @@ def test_of_coincident_panes_one_is_met() -> None:
     assert not bool((pane_hits(twice, intrinsics, WIDTH, HEIGHT, beyond=first).pane >= 0).any())
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_panes_of_one_plane_that_overlap_are_one_surface(seed: int) -> None:
+    """Neighbours of a front, whose rectangles are larger than their glass; rounding would tell them apart."""
+    panes, intrinsics = random_panes(1, torch.float32, seed=seed)
+    aside = 0.5 * panes.half_sizes[:, :1] * panes.axes[:, 0]
+    beside = panes._replace(centers=panes.centers + aside)
+    both = Panes(*(torch.cat(pair) for pair in zip(panes, beside, strict=True)))
+    first = pane_hits(both, intrinsics, WIDTH, HEIGHT)
+    assert first.pane.unique().tolist() == [-1, 0, 1]
+    assert not bool((pane_hits(both, intrinsics, WIDTH, HEIGHT, beyond=first).pane >= 0).any())
+
+
 def test_a_plane_through_the_camera_is_not_hit() -> None:
     panes, intrinsics = random_panes(1, torch.float64)
     edge_on = Panes(

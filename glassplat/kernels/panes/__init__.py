@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 from glassplat.kernels import Fresnel
 from glassplat.kernels.backend.devices import kernels_for
 from glassplat.kernels.maths.pane import LAWS
-from glassplat.kernels.records import BlendedPanes, PaneHits, Panes, check_device, check_tensors
+from glassplat.kernels.records import BEHIND, BlendedPanes, PaneHits, Panes, check_device, check_tensors
 
 
 class MirroredViews(NamedTuple):
@@ -110,7 +110,8 @@ def pane_hits(
         height: of the image, pixels.
         mask: [H, W] visibility of the panes; where it is 0, `tiles` and `windows` leave the pixel out.
         beyond: hits with the same panes and camera; the nearest pane after them is sought, and none where they have
-            none. Called with its own results, this finds all panes along a ray, one after another.
+            none. Called with its own results, this finds all surfaces along a ray, one after another; panes in one plane
+            are one.
 
     Raises:
         ValueError: shapes disagree.
@@ -131,6 +132,7 @@ def pane_hits(
     check_tensors(expected)
     inputs = [tensor.detach().contiguous() for tensor in (*panes, intrinsics)]
     visible = None if mask is None else mask.detach().contiguous()
+    beyond = None if beyond is None else beyond._replace(depth=beyond.depth * BEHIND)
     hits: PaneHits = kernels_for("panes", intrinsics.device).pane_hits(inputs, width, height, visible, beyond)
     return hits
 

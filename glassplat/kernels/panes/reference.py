@@ -10,7 +10,7 @@ from torch import Tensor
 from glassplat.kernels import Fresnel
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 from glassplat.kernels.maths.pane import DARKEST, MOST_HELD
-from glassplat.kernels.records import DAZZLING, TILE, BlendedPanes, PaneHits, Panes
+from glassplat.kernels.records import BEHIND, DAZZLING, TILE, BlendedPanes, PaneHits, Panes
 
 
 def pane_hits(
@@ -33,9 +33,9 @@ def pane_hits(
         offset = along - (panes.centers * panes.axes[:, axis]).sum(-1)[:, None, None]
         inside &= offset.abs() <= panes.half_sizes[:, axis, None, None]
     if beyond is not None:
-        # A pane is not behind itself, however its depth is rounded.
+        # A pane is not behind itself, nor behind another of the same plane, however depths are rounded.
         own = beyond.pane == torch.arange(count, device=beyond.pane.device)[:, None, None]
-        inside &= (depth > beyond.depth) & ~own
+        inside &= (depth > beyond.depth * BEHIND) & ~own
     far = torch.full((1, height, width), torch.inf, dtype=rays.dtype)
     nearest, index = torch.cat([far, torch.where(inside, depth, torch.inf)]).min(dim=0)
     index = torch.where(nearest < torch.inf, index, 0) - 1
