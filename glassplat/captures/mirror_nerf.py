@@ -75,7 +75,7 @@ def _is_mirror_nerf(root: Path) -> bool:
     masks = root / MASK_FOLDER
     if not (root / TRAIN).is_file() or not masks.is_dir():
         return False
-    if (root / VAL).is_file() or next(masks.glob(f"{SYNTHETIC_MASK}*"), None) is not None:
+    if next(masks.glob(f"{SYNTHETIC_MASK}*"), None) is not None:
         return True
     settings = read_settings(root / TRAIN)
     return "fx" in settings or "intrinsics" in settings["frames"][0]

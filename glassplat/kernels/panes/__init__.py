@@ -110,8 +110,8 @@ def pane_hits(
         height: of the image, pixels.
         mask: [H, W] visibility of the panes; where it is 0, `tiles` and `windows` leave the pixel out.
         beyond: hits with the same panes and camera; the nearest pane after them is sought, and none where they have
-            none. Called with its own results, this finds all surfaces along a ray, one after another; panes in one plane
-            are one.
+            none. Called with its own results, this finds all surfaces along a ray, one after another; panes in one
+            plane are one.
 
     Raises:
         ValueError: shapes disagree.
