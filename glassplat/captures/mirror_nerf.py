@@ -25,8 +25,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from glassplat.captures.capture import Capture, RawPoints, Shot
-from glassplat.captures.masks import MASK_FOLDER, PaneMask, read_mask_at_threshold
-from glassplat.captures.transforms import OPENCV_FROM_OPENGL, Settings, image_path, read_points, read_settings, shots_of
+from glassplat.captures.masks import MASK_FOLDER, PANE_FOLDER, PaneMask, read_mask_at_threshold
+from glassplat.captures.transforms import (
+    OPENCV_FROM_OPENGL,
+    TEST,
+    TRAIN,
+    VAL,
+    Settings,
+    image_path,
+    read_points,
+    read_settings,
+    shots_of,
+)
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.images import IMAGE_SUFFIXES, image_size
 
@@ -34,7 +44,6 @@ if TYPE_CHECKING:
     from glassplat.captures.axes import AxesEvidence
     from glassplat.captures.view import View
 
-TRAIN, VAL, TEST = (f"transforms_{part}.json" for part in ("train", "val", "test"))
 LOOKED_FOR = f"a Mirror-NeRF scene ({TRAIN} and {MASK_FOLDER}/)"
 SYNTHETIC_MASK = "MirrorMask_"
 SAME_SIZE = 0.1
@@ -44,8 +53,8 @@ SAME_SIZE = 0.1
 def load_mirror_nerf(root: Path) -> Capture | None:
     """Read a Mirror-NeRF scene; None when the folder is none.
 
-    What tells it from other `transforms_train.json` captures, besides the folder of masks: intrinsics spelled `fx`
-    or as a matrix, a validation file, or masks called `MirrorMask_*`. Test views are those of the test file, or
+    What tells it from other `transforms_train.json` captures, besides the folder of masks and no folder of panes:
+    intrinsics spelled `fx` or as a matrix, or masks called `MirrorMask_*`. Test views are those of the test file, or
     else of the validation file; photographs that are in it and in the training file too are only tested on.
 
     Raises:
@@ -73,7 +82,7 @@ def load_mirror_nerf(root: Path) -> Capture | None:
 
 def _is_mirror_nerf(root: Path) -> bool:
     masks = root / MASK_FOLDER
-    if not (root / TRAIN).is_file() or not masks.is_dir():
+    if not (root / TRAIN).is_file() or not masks.is_dir() or (root / PANE_FOLDER).is_dir():
         return False
     if next(masks.glob(f"{SYNTHETIC_MASK}*"), None) is not None:
         return True

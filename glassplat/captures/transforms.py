@@ -97,6 +97,10 @@ LENS: dict[str, Field] = {
 }
 
 
+MOST_AS_SHARE = 2.0
+"""Of a focal length: a smaller one is a share of the image and no pixels."""
+
+
 def lens_from_settings(settings: Mapping[str, Any], image_path: Path, name: str) -> Lens:
     """The lens of one frame.
 
@@ -114,6 +118,12 @@ def lens_from_settings(settings: Mapping[str, Any], image_path: Path, name: str)
     found |= zip(LISTED, found["distortion_params"] or (), strict=False)
     model = found["camera_model"] or (FISHEYE if found["is_fisheye"] else "OPENCV")
     middle = [half if at is None else at for at, half in ((found["cx"], width / 2), (found["cy"], height / 2))]
+    if max(fx, fy) <= MOST_AS_SHARE or all(0 <= at <= 1 for at in middle):
+        raise InputError(
+            f"the lens of {name} has the focal length {fx:g}, {fy:g} and the principal point {middle[0]:g}, "
+            f"{middle[1]:g}; expected pixels of an image of {width}x{height}, and these look like shares of its sides: "
+            "multiply fl_x and cx by the width, fl_y and cy by the height"
+        )
     try:
         return _lens(str(model), [fx, fy, *middle], [found[key] for key in COEFFICIENTS], (width, height))
     except InputError as error:
@@ -204,11 +214,18 @@ def shots_of(root: Path, settings: Settings, file_name: str) -> dict[str, Shot]:
         )
     shots = {}
     for frame, path, name in zip(settings["frames"], paths, _names(root, paths), strict=True):
-        lens = lens_from_settings({**settings, **frame}, path, name)
+        lens = lens_from_settings(_of_frame(settings, frame), path, name)
         if frame["file_path"] in shots:
             raise InputError(f"{root / file_name} has two frames for {frame['file_path']}; keep one")
         shots[frame["file_path"]] = Shot(name, path, lens, _cam_from_world(frame, name))
     return shots
+
+
+def _of_frame(settings: Settings, frame: Settings) -> Settings:
+    """What holds for a frame: its own settings before the file's, and its opening angle before the file's length."""
+    lengths, angles = {"fl_x", "fl_y"}, {"camera_angle_x", "camera_angle_y"}
+    beaten = lengths | angles if angles & frame.keys() and not lengths & frame.keys() else set()
+    return {**{key: value for key, value in settings.items() if key not in beaten}, **frame}
 
 
 def image_path(root: Path, frame: Settings) -> Path:
@@ -276,7 +293,8 @@ def read_points(root: Path, settings: Settings) -> RawPoints | None:
         return RawPoints.from_arrays(positions, colors) if len(positions) else None
 
 
-WHOLE, TRAIN, TEST = "transforms.json", "transforms_train.json", "transforms_test.json"
+WHOLE = "transforms.json"
+TRAIN, VAL, TEST = (f"transforms_{part}.json" for part in ("train", "val", "test"))
 LOOKED_FOR = f"{WHOLE}, or {TRAIN} with or without {TEST}"
 
 
@@ -309,19 +327,23 @@ def _load_whole(root: Path) -> Capture:
 
 
 def _load_split(root: Path) -> Capture:
-    """Separate files for training and testing, as synthetic scenes have them."""
-    files = {name: read_settings(root / name) for name in (TRAIN, TEST) if (root / name).is_file()}
+    """Separate files for training and testing, or else validation, as synthetic scenes have them."""
+    tested = next((name for name in (TEST, VAL) if (root / name).is_file()), None)
+    files = {name: read_settings(root / name) for name in (TRAIN, tested) if name is not None}
     shots = {name: shots_of(root, settings, name) for name, settings in files.items()}
     kept: dict[str, Path] = {}
     for name, settings in files.items():
         kept |= _mask_paths(root, name, settings, shots[name])
     return Capture(
         shots=tuple(shots[TRAIN].values()),
-        test_shots=tuple(shots[TEST].values()) if TEST in shots else None,
+        test_shots=tuple(shots[tested].values()) if tested else None,
         points=read_points(root, files[TRAIN]),
         format_name=TRAIN,
         random_points=points_in_box if _is_blender(files[TRAIN]) else None,
-        warnings=tuple(_unused_priors(files[TRAIN])),
+        warnings=(
+            *_unused_priors(files[TRAIN]),
+            *([f"There is no {TEST}; the test views are those of {VAL}."] if tested == VAL else ()),
+        ),
         kept=kept,
     )
 

@@ -95,13 +95,16 @@ def read_table(path: Path, name: str = "vertex") -> PlyTable:
         return PlyTable(header, _read_binary(stream, element, earlier, BYTE_ORDERS[header.format], path))
 
 
+COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+
+
 def point_colors(columns: Mapping[str, NDArray]) -> NDArray | None:
-    """[N, 3] the columns red, green and blue, from 0 to 255; None where one is missing.
+    """[N, 3] the columns red, green and blue, or as some programs call them, from 0 to 255; None where one is missing.
 
     Fractions that are nowhere above one are shares of 255, as some programs write them.
     """
-    names = ("red", "green", "blue")
-    if not columns.keys() >= set(names):
+    names = next((names for names in COLORS if columns.keys() >= set(names)), None)
+    if names is None:
         return None
     colors = np.stack([columns[name] for name in names], axis=1)
     shares = np.issubdtype(colors.dtype, np.floating) and colors.max(initial=0) <= 1

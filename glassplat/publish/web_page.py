@@ -477,6 +477,8 @@ def described_view(name: str, camera: Camera) -> dict[str, Any]:
         "position": in_page(camera.center),
         "fx": camera.fx,
         "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
         "width": camera.width,
         "height": camera.height,
     }

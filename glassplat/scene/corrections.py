@@ -140,8 +140,9 @@ class Exposures(ByPhotograph):
 class PoseCorrections(ByPhotograph):
     """For each photograph a small motion of its camera about its own centre, in axes parallel to the world's.
 
-    cam_from_world = [R | t] becomes exp(twist turned by R) cam_from_world. In these axes a motion that all cameras have
-    in common is the mean of their twists, and that of a camera between two others the mean of theirs.
+    cam_from_world = [R | t] becomes exp(twist turned by R) cam_from_world. In these axes a shift that all cameras have
+    in common is the mean of their twists, and the motion of a camera between two others is about the mean of theirs. A
+    turn of all cameras about one place is no common twist: it shifts each of them differently.
     """
 
     TENSOR = "twists"

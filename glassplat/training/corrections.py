@@ -70,7 +70,8 @@ class Center:
 
     What all photographs have in common belongs to the scene: were it twice as bright and all photographs half as much,
     training would see no difference, and views that nobody photographed would have the wrong colours. Were all cameras
-    and the scene moved together, training would see none either, and test cameras stay behind.
+    and the scene shifted together, training would see none either, and test cameras stay behind. Of a turn of all
+    this takes off what turns each camera about its own centre, so that the mean orientation stays.
 
     Attributes:
         part: exposures or poses.

@@ -25,19 +25,19 @@ function boundsOf(pane, pose, [fx, fy, cx, cy], [width, height], near) {
   return bounds[0] < bounds[2] && bounds[1] < bounds[3] ? bounds : null;
 }
 
-// The smallest bounds around those that are not null.
+// The smallest bounds around all there are.
 function around(bounds) {
-  const given = bounds.filter(Boolean), edges = [Math.min, Math.min, Math.max, Math.max];
-  return edges.map((outermost, k) => outermost(...given.map((edge) => edge[k])));
+  const given = bounds.filter(Boolean);
+  return [0, 1, 2, 3].map((k) => (k < 2 ? Math.min : Math.max)(...given.map((edges) => edges[k])));
 }
 
-// Which panes may be seen through one another, or share a pixel.
+// Which panes may share a pixel.
 function overlapping(bounds) {
   const meet = (a, b) => a && b && a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3];
   return bounds.map((one, k) => bounds.some((other, l) => k !== l && meet(one, other)));
 }
 
-// The panes that may need a mask of their own besides that of all.
+// The panes that may need a mask besides that of all.
 const ownMasks = ({ panes, nearest }) => (panes.length > 1 && !nearest ? panes : []);
 
 // While something moves, what a pane reflects weakly is drawn at half the scale, and with it the pane's mask.
@@ -45,9 +45,9 @@ function scaleOfMirrors({ moving, scale, reflectances }) {
   return moving && Math.max(...reflectances, 0) < 0.3 ? Math.min(scale, Math.max(0.5 * scale, 0.15)) : scale;
 }
 
-// What the sorter has to know of a view: for the picture the camera itself; for the mask of all panes and that of each
-// the same camera, null where it needs none; and for what each mirrors the one behind it, with a window on the pane.
-// A view has moved on before its order is there, so that windows, in tangents, are wider than the picture.
+// What the sorter has to know of a view: for the picture the camera itself; the same for the mask of all panes and
+// that of each, null where it needs none; and for what each mirrors the one behind it.
+// A view moves on before its order is there: windows, in tangents, are wider than the picture.
 // scales: of a picture that need not have all splats, and of its mirrors.
 const SPARE = 0.3, LOW_PASS = 0.3;
 

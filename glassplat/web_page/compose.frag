@@ -5,12 +5,12 @@ precision highp sampler2DArray;
 
 uniform sampler2D image;
 #if PANES > 0
-uniform sampler2DArray masks, reflections, gains;  // masks: of all panes together, then of each
+uniform sampler2DArray masks, reflections, gains;  // masks: of all, then of each
 uniform vec3 centers[PANES], normals[PANES], tangents[PANES], bitangents[PANES];  // in the camera
 uniform vec2 halfSizes[PANES];
 uniform float reflectances[PANES];
 uniform vec3 transmittances[PANES];
-uniform int present[PANES];  // 0: not; 1: as part of the mask of all; 2: with a mask of its own, too
+uniform int present[PANES];  // 0: not; 1: in the mask of all; 2: and in its own
 #endif
 #ifdef SHINY
 uniform sampler2D strengths, normals;
@@ -60,7 +60,7 @@ float depthOf(int k, vec3 ray) {
   return inside && present[k] > 0 ? depth : FAR;
 }
 
-// Where a ray meets one pane, or only the nearest counts, that of all panes: it does not fade where glass of two adjoins.
+// That of all panes does not fade where two adjoin.
 float maskOf(int k, bool isAlone) {
   return texture(masks, vec3(within(usedByMirrors), isAlone || present[k] < 2 ? 0.0 : float(k + 1))).r;
 }
@@ -110,9 +110,9 @@ void main() {
     if (farthest < 0) break;
     for (int k = 0; k < PANES; k++) if (k == farthest) depths[k] = FAR;
     // Panes in one plane are one surface, as in kernels/panes.
-    bool isShared = false;
-    for (int k = 0; k < PANES; k++) isShared = isShared || (depths[k] < FAR && depths[k] * BEHIND >= depth);
-    if (isShared) { met--; continue; }
+    bool same = false;
+    for (int k = 0; k < PANES; k++) same = same || (depths[k] < FAR && depths[k] * BEHIND >= depth);
+    if (same) { met--; continue; }
     mask = maskOf(farthest, nearestOnly || met == 1);
     if (nearestOnly) { seen = behind; mirror = vec4(0.0); }
     layPane(farthest, mask, ray, seen, mirror);

@@ -14,7 +14,8 @@ function makeDisplay(canvas, scene, renderer, navigation, panel) {
   function intrinsics(width, height) {
     const view = scene.views[scene.first];
     const focal = Math.max((view.fy * height) / view.height, (view.fx * width) / view.width);
-    return [focal, focal, width / 2, height / 2];
+    const shift = (at, side, own) => (at - side / 2) * (focal / own);
+    return [focal, focal, width / 2 + shift(view.cx, view.width, view.fx), height / 2 + shift(view.cy, view.height, view.fy)];
   }
 
   const lensOf = () => ({ intrinsics: intrinsics(canvas.width, canvas.height), size: [canvas.width, canvas.height] });
@@ -73,7 +74,7 @@ function makeDisplay(canvas, scene, renderer, navigation, panel) {
 
   function whenDone(took) { waiting.push({ isDone: renderer.fence(), since: performance.now(), took }); }
 
-  // What has been waited for: how long each took since it was begun, or since the one before it was done.
+  // How long each of the finished took since it was begun, or since the one before it was done.
   function collect() {
     const now = performance.now();
     while (waiting.length && waiting[0].isDone()) {
@@ -122,7 +123,7 @@ function makeDisplay(canvas, scene, renderer, navigation, panel) {
     if (isSoftware) drawInParts(); else drawAtOnce(active && seconds);
   }
 
-  // For tests and for other scripts: the picture of one camera, as bytes [height][width][rgba] in base64.
+  // For tests and scripts: the picture of one camera, bytes [height][width][rgba] in base64.
   async function picture({ rotation, position, fx, fy, cx, cy, width, height, ...wanted }) {
     const pose = poseAt(rotation, position), lens = { intrinsics: [fx, fy, cx, cy], size: [width, height] };
     while (sorting) await new Promise((resolve) => setTimeout(resolve, 5));

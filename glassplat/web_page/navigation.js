@@ -88,8 +88,8 @@ function makeNavigation(scene, changed) {
   // The photographs that show a pane, each beside one that was taken near it; all where none shows any.
   function route() {
     const shown = views.filter((view) => scene.panes.some((pane) => {
-      const { fx, fy, width, height } = view;
-      const bounds = boundsOf(pane, poseOf(view), [fx, fy, width / 2, height / 2], [width, height], scene.near);
+      const { fx, fy, cx, cy, width, height } = view;
+      const bounds = boundsOf(pane, poseOf(view), [fx, fy, cx, cy], [width, height], scene.near);
       return bounds && (bounds[2] - bounds[0]) * (bounds[3] - bounds[1]) > LEAST_SHOWN * width * height;
     }));
     const left = new Set(shown.length ? shown : views), ordered = [];

@@ -44,7 +44,7 @@ function makeRenderer(canvas, scene) {
     targets = {
       width, height, textures, image, masks, reflections, gains, small, surface,
       direct: graphics.framebuffer([[image], ...surface.map((texture) => [texture])]),
-      covered: [0, ...orders.masks.keys()].map((_, k) => graphics.framebuffer([[masks, k]])),
+      covered: [orders.joint, ...orders.masks].map((_, k) => graphics.framebuffer([[masks, k]])),
       mirrored: panes.map((_, k) => graphics.framebuffer([[reflections, k], ...(scene.intensity ? [[gains, k]] : [])])),
       coarse: graphics.framebuffer([[small]]),
     };
@@ -159,8 +159,8 @@ function makeRenderer(canvas, scene) {
     const placed = (scale) => ({ ...sized(view, scale), pose: view.pose, faintest });
     const direct = placed(view.scale), mirrors = placed(scaleOfMirrors(view));
     yield* splats('direct', orders.direct, targets.direct, direct, most);
-    const bounds = panes.map((pane) => (view.glass ? boundsOf(pane, view.pose, mirrors.intrinsics, mirrors.size, scene.near) : null));
-    const mask = (order, k, around) => splats('mask', order, targets.covered[k], { ...mirrors, bounds: around, degree: 0 }, most);
+    const bounds = panes.map((pane) => view.glass && boundsOf(pane, view.pose, mirrors.intrinsics, mirrors.size, scene.near));
+    const mask = (order, k, area) => splats('mask', order, targets.covered[k], { ...mirrors, bounds: area, degree: 0 }, most);
     const overlap = overlapping(bounds), present = panes.map(() => 0);
     if (bounds.some(Boolean)) yield* mask(orders.joint, 0, around(bounds));
     for (const [k, pane] of panes.entries()) {

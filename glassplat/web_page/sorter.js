@@ -48,7 +48,7 @@ function sorterOf({ positions, reaches, areas, owners }) {
     return order;
   }
 
-  // Of a mask: the glass of its pane, or of all, and what is before the farthest of it. No camera: nothing.
+  // Of a mask: its glass, and what is before the farthest of it.
   return function order(camera) {
     [found, lowest, highest] = [0, 0x7fffffff, 0];
     if (!camera) return new Uint32Array(0);

@@ -174,6 +174,17 @@ def test_what_is_no_mirror_nerf_scene(capture) -> None:
     assert load_mirror_nerf(capture.root) is None
 
 
+def test_masks_of_what_to_keep_make_no_mirror_nerf_scene(capture) -> None:
+    """Blender's captures have a validation part, too; and where there are panes, these are in their own folder."""
+    write_real(capture)
+    assert load_mirror_nerf(capture.root) is not None
+    (capture.root / "panes").mkdir()
+    assert load_mirror_nerf(capture.root) is None
+    (capture.root / "panes").rmdir()
+    capture.write_transforms({"camera_angle_x": 0.7, "frames": capture.frames()[:7]}, file_name="transforms_train.json")
+    assert load_mirror_nerf(capture.root) is None
+
+
 @pytest.mark.parametrize(
     ("matrix", "message"),
     [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -176,10 +177,11 @@ def test_points_beside_the_file(capture, name: str, binary: bool) -> None:
     np.testing.assert_array_equal(points.colors[order], capture.colors[expected])
 
 
-def test_points_may_have_colours_as_shares(capture) -> None:
+@pytest.mark.parametrize("names", [("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), "rgb"])
+def test_points_may_have_colours_as_shares(names: Sequence[str], capture) -> None:
     capture.root.mkdir()
     header = ["ply", "format ascii 1.0", "element vertex 2", *(f"property float {n}" for n in "xyz")]
-    header += [*(f"property float {n}" for n in ("red", "green", "blue")), "end_header"]
+    header += [*(f"property float {n}" for n in names), "end_header"]
     (capture.root / "cloud.ply").write_text("\n".join([*header, "0 0 0 1 0.4 0", "1 1 1 0 0.2 1", ""]))
     points = load(capture, ply_file_path="cloud.ply").points
     assert points is not None
@@ -338,3 +340,26 @@ def test_photographs_elsewhere_with_one_name_in_two_folders_have_their_folders_n
     capture.write_transforms({**LENS, "frames": capture.frames("../photographs/")})
     found = load_transforms(capture.root)
     assert found is not None and sorted(shot.name for shot in found.shots) == sorted(capture.names)
+
+
+@pytest.mark.parametrize("shares", [{"fl_x": 0.9, "fl_y": 1.3, "cx": 0.47, "cy": 0.54}, {"cx": 0.5, "cy": 0.5}])
+def test_shares_of_the_image_are_not_taken_for_pixels(capture, shares: dict[str, float]) -> None:
+    with pytest.raises(InputError, match="look like shares of its sides: multiply fl_x and cx by the width"):
+        load(capture, **shares)
+
+
+def test_an_opening_angle_of_a_frame_goes_before_the_length_of_the_file(capture) -> None:
+    angled = [{**frame, "camera_angle_x": 2 * math.atan(16 / 40.0)} for frame in capture.frames()[:1]]
+    found = load(capture, frames=[*angled, *capture.frames()[1:]])
+    lengths = [shot.lens.focal_lengths() for shot in found.shots]
+    assert lengths[0] == pytest.approx((40.0, 40.0)) and lengths[1] == (30.0, 31.0)
+
+
+def test_the_validation_part_is_tested_on_where_there_is_no_test_part(capture) -> None:
+    capture.write_images()
+    capture.write_transforms({**LENS, "frames": capture.frames()[:-1]}, file_name="transforms_train.json")
+    capture.write_transforms({**LENS, "frames": capture.frames()[-1:]}, file_name="transforms_val.json")
+    found = load_transforms(capture.root)
+    assert found is not None and found.test_shots is not None
+    assert [shot.name for shot in found.test_shots] == capture.names[-1:]
+    assert any("the test views are those of transforms_val.json" in warning for warning in found.warnings)

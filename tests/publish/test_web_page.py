@@ -97,6 +97,18 @@ def test_what_is_beside_the_picture_is_left_out_unseen(opened: Browser) -> None:
 
 
 @needs_browser
+def test_the_first_view_looks_past_the_middle_as_its_photograph_does(tmp_path: Path) -> None:
+    name, camera = CAMERAS[0]
+    aside = replace(camera, fy=camera.fx, cx=0.8 * camera.width, cy=0.3 * camera.height)
+    write_page(tmp_path / "index.html", true_scene(), Planar(), [(name, aside)], "aside")
+    with Browser(tmp_path / "index.html", 10 * camera.width, 10 * camera.height) as browser:
+        found = browser.evaluate("glassplat.then(({ lensOf }) => lensOf())")
+        size = found["size"]
+        expected = [aside.fx / aside.width * size[0], aside.fy / aside.height * size[1], 0.8 * size[0], 0.3 * size[1]]
+        assert found["intrinsics"] == pytest.approx(expected, rel=1e-3)
+
+
+@needs_browser
 def test_the_buttons_do_what_they_say(opened: Browser) -> None:
     camera = CAMERAS[1][1]
     plain = picture(opened, camera)
