@@ -222,7 +222,7 @@ def shots_of(root: Path, settings: Settings, file_name: str) -> dict[str, Shot]:
 
 
 def _of_frame(settings: Settings, frame: Settings) -> Settings:
-    """What holds for a frame: its own settings before the file's, and its opening angle before the file's length."""
+    """The settings of a frame: its own go before those of the file, and its opening angle before the file's length."""
     lengths, angles = {"fl_x", "fl_y"}, {"camera_angle_x", "camera_angle_y"}
     beaten = lengths | angles if angles & frame.keys() and not lengths & frame.keys() else set()
     return {**{key: value for key, value in settings.items() if key not in beaten}, **frame}

@@ -25,7 +25,7 @@ function boundsOf(pane, pose, [fx, fy, cx, cy], [width, height], near) {
   return bounds[0] < bounds[2] && bounds[1] < bounds[3] ? bounds : null;
 }
 
-// The smallest bounds around all there are.
+// The smallest bounds around all.
 function around(bounds) {
   const given = bounds.filter(Boolean);
   return [0, 1, 2, 3].map((k) => (k < 2 ? Math.min : Math.max)(...given.map((edges) => edges[k])));
