@@ -32,16 +32,16 @@ FARTHEST = 1e6
 PLACE = Items(Number(-FARTHEST, FARTHEST), 2)
 
 
-@dataclass(frozen=True)
-class Record:
+class Record(Field):
     """A JSON object with known keys, as a field of another one."""
 
-    fields: Mapping[str, Field]
-    expected: str = "an object"
+    expected = "an object"
 
-    def read(self, value: Any, where: str) -> dict[str, Any]:
-        """The object's fields."""
-        return check_fields(value, self.fields, where)
+    def __init__(self, fields: Mapping[str, Field]) -> None:
+        self._fields = fields
+
+    def _converted(self, value: Any, where: str) -> dict[str, Any]:
+        return check_fields(value, self._fields, where)
 
 
 STROKE = Record(

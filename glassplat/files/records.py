@@ -17,9 +17,8 @@ import os
 import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from glassplat.options import is_finite, short_repr
 
@@ -149,13 +148,10 @@ LARGEST_COORDINATE = 1e12
 """World units. The square of a greater one, and what is summed up of them, does not fit float32."""
 
 
-class Field(Protocol):
-    """Requirements of one value."""
+class Field:
+    """Requirement of one value; `expected` is for messages, as in "expected a number"."""
 
-    @property
-    def expected(self) -> str:
-        """For messages, as in "expected a number"."""
-        ...
+    expected = "any value"
 
     def read(self, value: Any, where: str) -> Any:
         """The value, in the type that the program uses.
@@ -163,162 +159,117 @@ class Field(Protocol):
         Raises:
             ValueError: it is something else; names `where` it was found.
         """
-        ...
+        if not self._fits(value):
+            raise ValueError(f"{where} is {short_repr(value)}; expected {self.expected}")
+        return self._converted(value, where)
+
+    def _fits(self, value: Any) -> bool:
+        return True
+
+    def _converted(self, value: Any, where: str) -> Any:
+        return value
 
 
-@dataclass(frozen=True)
-class Number:
-    """A finite number, from `least` to `most`, or above `above`; read as float."""
+class Number(Field):
+    """A finite number, from `least` to `most`, or above `above`; no text nor truth value; read as float."""
 
-    least: float = -math.inf
-    most: float = math.inf
-    above: float = -math.inf
+    def __init__(self, least: float = -math.inf, most: float = math.inf, above: float = -math.inf) -> None:
+        self._least, self._most, self._above = least, most, above
+        self.expected = "a finite number" + _range_text(least, most, above)
 
-    @property
-    def expected(self) -> str:
-        """For messages."""
-        return "a finite number" + _range_text(self.least, self.most, self.above)
+    def _fits(self, value: Any) -> bool:
+        is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and is_finite(value)
+        return is_number and self._least <= value <= self._most and value > self._above
 
-    def read(self, value: Any, where: str) -> float:
-        """Refuses text and truth values too."""
-        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not is_number or not (is_finite(value) and self.least <= value <= self.most and value > self.above):
-            raise mismatch(value, where, self)
+    def _converted(self, value: Any, where: str) -> float:
         return float(value)
 
 
-@dataclass(frozen=True)
-class Whole:
-    """A whole number from `least` to `most`; read as int."""
+class Whole(Field):
+    """A whole number from `least` to `most`, not 2.0 nor true."""
 
-    least: int = LEAST_WHOLE
-    most: int = MOST_WHOLE
+    def __init__(self, least: int = LEAST_WHOLE, most: int = MOST_WHOLE) -> None:
+        self._least, self._most = least, most
+        self.expected = "a whole number" + _range_text(least, most)
 
-    @property
-    def expected(self) -> str:
-        """For messages."""
-        return "a whole number" + _range_text(self.least, self.most)
-
-    def read(self, value: Any, where: str) -> int:
-        """Refuses 2.0 and true too."""
-        if not isinstance(value, int) or isinstance(value, bool) or not self.least <= value <= self.most:
-            raise mismatch(value, where, self)
-        return value
+    def _fits(self, value: Any) -> bool:
+        return isinstance(value, int) and not isinstance(value, bool) and self._least <= value <= self._most
 
 
-@dataclass(frozen=True)
-class Flag:
-    """True or false."""
+class Flag(Field):
+    """True or false, not 0 nor 1."""
 
-    expected: str = "true or false"
+    expected = "true or false"
 
-    def read(self, value: Any, where: str) -> bool:
-        """Refuses 0 and 1 too."""
-        if not isinstance(value, bool):
-            raise mismatch(value, where, self)
-        return value
+    def _fits(self, value: Any) -> bool:
+        return isinstance(value, bool)
 
 
-@dataclass(frozen=True)
-class Text:
+class Text(Field):
     """A text that is not empty."""
 
-    expected: str = "a text that is not empty"
+    expected = "a text that is not empty"
 
-    def read(self, value: Any, where: str) -> str:
-        """The text as it is."""
-        if not isinstance(value, str) or not value:
-            raise mismatch(value, where, self)
-        return value
+    def _fits(self, value: Any) -> bool:
+        return isinstance(value, str) and bool(value)
 
 
-@dataclass(frozen=True)
-class Choice:
-    """One of a few values."""
+class Choice(Field):
+    """One of a few values; 1 is not true here."""
 
-    choices: tuple[Any, ...]
+    def __init__(self, choices: tuple[Any, ...]) -> None:
+        self._choices = choices
+        self.expected = f"one of {', '.join(map(repr, choices))}"
 
-    @property
-    def expected(self) -> str:
-        """For messages."""
-        return f"one of {', '.join(map(repr, self.choices))}"
-
-    def read(self, value: Any, where: str) -> Any:
-        """1 is not true here."""
-        if not any(value == choice and type(value) is type(choice) for choice in self.choices):
-            raise mismatch(value, where, self)
-        return value
+    def _fits(self, value: Any) -> bool:
+        return any(value == choice and type(value) is type(choice) for choice in self._choices)
 
 
-@dataclass(frozen=True)
-class Items:
+class Items(Field):
     """A list of values of one kind, of `count` of them if that is given; read as a tuple."""
 
-    item: Field
-    count: int | None = None
+    def __init__(self, item: Field, count: int | None = None) -> None:
+        self._item, self._count = item, count
+        self.expected = f"a list of {'' if count is None else f'{count} '}values, each {item.expected}"
 
-    @property
-    def expected(self) -> str:
-        """For messages."""
-        count = "" if self.count is None else f"{self.count} "
-        return f"a list of {count}values, each {self.item.expected}"
+    def _fits(self, value: Any) -> bool:
+        return isinstance(value, (list, tuple)) and self._count in (None, len(value))
 
-    def read(self, value: Any, where: str) -> tuple[Any, ...]:
-        """Names the entry that is wrong, counted from 1."""
-        if not isinstance(value, (list, tuple)) or self.count not in (None, len(value)):
-            raise mismatch(value, where, self)
-        return tuple(self.item.read(one, f"entry {index} of {where}") for index, one in enumerate(value, start=1))
+    def _converted(self, value: Any, where: str) -> tuple[Any, ...]:
+        return tuple(self._item.read(one, f"entry {index} of {where}") for index, one in enumerate(value, start=1))
 
 
-@dataclass(frozen=True)
-class ByName:
+class ByName(Field):
     """An object that maps any names to values of one kind; read as a dictionary."""
 
-    item: Field
+    def __init__(self, item: Field) -> None:
+        self._item, self.expected = item, f"an object whose values are each {item.expected}"
 
-    @property
-    def expected(self) -> str:
-        """For messages."""
-        return f"an object whose values are each {self.item.expected}"
+    def _fits(self, value: Any) -> bool:
+        return isinstance(value, dict)
 
-    def read(self, value: Any, where: str) -> dict[str, Any]:
-        """Names the value that is wrong."""
-        if not isinstance(value, dict):
-            raise mismatch(value, where, self)
-        return {name: self.item.read(one, f"{name!r} of {where}") for name, one in value.items()}
+    def _converted(self, value: Any, where: str) -> dict[str, Any]:
+        return {name: self._item.read(one, f"{name!r} of {where}") for name, one in value.items()}
 
 
-@dataclass(frozen=True)
-class Nullable:
-    """A value of some kind, or null."""
+class Nullable(Field):
+    """A value of some kind, or null, which is read as None."""
 
-    field: Field
+    def __init__(self, field: Field) -> None:
+        self._field, self.expected = field, f"{field.expected}, or null"
 
-    @property
-    def expected(self) -> str:
-        """For messages."""
-        return f"{self.field.expected}, or null"
-
-    def read(self, value: Any, where: str) -> Any:
-        """None for null."""
-        return None if value is None else self.field.read(value, where)
+    def _converted(self, value: Any, where: str) -> Any:
+        return None if value is None else self._field.read(value, where)
 
 
-@dataclass(frozen=True)
-class Optional:
+class Optional(Field):
     """A value of some kind under a key that may be missing, which means `default`."""
 
-    field: Field
-    default: Any = None
+    def __init__(self, field: Field, default: Any = None) -> None:
+        self._field, self.default, self.expected = field, default, field.expected
 
-    @property
-    def expected(self) -> str:
-        """For messages."""
-        return self.field.expected
-
-    def read(self, value: Any, where: str) -> Any:
-        """The value where there is one."""
-        return self.field.read(value, where)
+    def _converted(self, value: Any, where: str) -> Any:
+        return self._field.read(value, where)
 
 
 def check_fields(value: Any, fields: Mapping[str, Field], where: str) -> dict[str, Any]:
@@ -343,11 +294,6 @@ def check_fields(value: Any, fields: Mapping[str, Field], where: str) -> dict[st
         else:
             raise ValueError(f"{where} has no {key}; expected {field.expected}")
     return found
-
-
-def mismatch(value: Any, where: str, field: Field) -> ValueError:
-    """The error of a value that is not what was expected."""
-    return ValueError(f"{where} is {short_repr(value)}; expected {field.expected}")
 
 
 def _range_text(least: float, most: float, above: float = -math.inf) -> str:

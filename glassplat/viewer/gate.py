@@ -47,25 +47,21 @@ _SERVE = threading.Lock()
 logger = logging.getLogger(__name__)
 
 
-class ShortText:
-    """A text of a name or of what somebody typed."""
+class ShortText(Field):
+    """A text of a name or of what somebody typed; may be empty."""
 
     expected = f"a text of at most {LONGEST_TEXT} characters"
 
-    def read(self, value: Any, where: str) -> str:
-        """The text as it is; may be empty."""
-        if not isinstance(value, str) or len(value) > LONGEST_TEXT:
-            raise ValueError(f"{where} is no text of at most {LONGEST_TEXT} characters")
-        return value
+    def _fits(self, value: Any) -> bool:
+        return isinstance(value, str) and len(value) <= LONGEST_TEXT
 
 
-class ControlValue:
+class ControlValue(Field):
     """Possible value of a control."""
 
     expected = "a number, true, false or a short text"
 
-    def read(self, value: Any, where: str) -> Any:
-        """The value as it is."""
+    def _converted(self, value: Any, where: str) -> Any:
         if isinstance(value, bool):
             return value
         return (ShortText() if isinstance(value, str) else COORDINATE).read(value, where)
