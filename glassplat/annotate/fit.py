@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,40 +18,14 @@ RECTANGLE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 """Corners in half sides, one after the other round it."""
 
 
-class PaneShape(Protocol):
-    """Corners in one plane, moved by steps of a few numbers, which are fitted to marks."""
-
-    @property
-    def frame(self) -> Array:
-        """[3, 3] rows: two axes in the plane, and its normal."""
-        ...
-
-    @property
-    def freedom(self) -> int:
-        """Number of parameters; the first two tilt the plane, in radians."""
-        ...
-
-    def corners(self) -> Array:
-        """[K, 3] in the world, in order round the outline."""
-        ...
-
-    def apply_step(self, step: Array) -> PaneShape:
-        """The shape after a step."""
-        ...
-
-
 @dataclass(frozen=True)
 class RectanglePane:
     """A rectangle: tilt, turn, centre and two half sides."""
 
     axes: Array
+    """[3, 3] rows: along the first side, along the second, and the normal."""
     center: Array
     half_sizes: Array
-
-    @property
-    def frame(self) -> Array:
-        """[3, 3] along the first side, along the second, normal."""
-        return self.axes
 
     @property
     def freedom(self) -> int:
@@ -76,14 +50,10 @@ class PolygonPane:
     """Corners anywhere in a plane."""
 
     axes: Array
+    """[3, 3] rows: two in the plane, and its normal."""
     center: Array
     places: Array
     """[K, 2] corners along the first two axes, from the centre."""
-
-    @property
-    def frame(self) -> Array:
-        """[3, 3] two axes in the plane, normal."""
-        return self.axes
 
     @property
     def freedom(self) -> int:
@@ -103,6 +73,10 @@ class PolygonPane:
             center=self.center + reach * step[2] * self.axes[2],
             places=self.places + reach * step[3:].reshape(-1, 2),
         )
+
+
+PaneShape = RectanglePane | PolygonPane
+"""Corners in one plane; the first two parameters of a step tilt it, in radians."""
 
 
 def polygon_pane(corners: Array) -> PolygonPane:
@@ -323,7 +297,7 @@ def _stretched_to_corners(marks: Marks, cameras: Sequence[NumpyCamera], pane: Pa
     """
     corners = pane.corners()
     for number in loose:
-        place = _on_plane(marks, number, cameras, corners.mean(axis=0), pane.frame[2])
+        place = _on_plane(marks, number, cameras, corners.mean(axis=0), pane.axes[2])
         if place is None:
             continue
         if len(corners) == 4:
@@ -358,7 +332,7 @@ def _line_on_plane(
 ) -> tuple[Array, Array] | None:
     """Intersections of an edge's two sight lines, seen in one view, with a pane's plane; None if they diverge."""
     ((view, ends),) = places.items()
-    rays, normal, center = cameras[view].rays(np.asarray(ends)), pane.frame[2], cameras[view].center
+    rays, normal, center = cameras[view].rays(np.asarray(ends)), pane.axes[2], cameras[view].center
     heights, slopes = (pane.corners().mean(axis=0) - center) @ normal, rays @ normal
     if (slopes * heights <= 1e-3 * abs(heights)).any():
         return None
@@ -383,7 +357,7 @@ def _first_corners(marks: Marks, cameras: Sequence[NumpyCamera]) -> Array:
         raise TooFewMarksError(_missing(marks, len(points)))
     plane = polygon_pane(np.stack(spanning))
     completed = [
-        point if point is not None else _on_plane(marks, number, cameras, plane.center, plane.frame[2])
+        point if point is not None else _on_plane(marks, number, cameras, plane.center, plane.axes[2])
         for number, point in enumerate(known)
     ]
     return np.stack(_with_line_ends(completed, lines))

@@ -299,7 +299,7 @@ def planes_of(panes: Solved, cameras: Sequence[NumpyCamera]) -> Planes:
 
 def _rectangle(fit: PaneFit, cameras: Sequence[NumpyCamera]) -> tuple[NDArray[np.float64], ...]:
     """Centre, normal, tangent and half sizes."""
-    corners, axes = fit.shape.corners(), fit.shape.frame
+    corners, axes = fit.shape.corners(), fit.shape.axes
     middle = corners.mean(axis=0)
     flat = min_area_rectangle((corners - middle) @ axes[:2].T)
     facing = np.sign([(camera.center - middle) @ axes[2] for camera in cameras]).sum()

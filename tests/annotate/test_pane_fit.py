@@ -50,15 +50,15 @@ def test_exact_marks_give_the_pane(pane: Pane, shape: str) -> None:
     cameras = cameras_on(pane)
     fit = fit_pane(corner_marks(pane, cameras), cameras, shape)  # type: ignore[arg-type]
     np.testing.assert_allclose(fit.shape.corners(), pane.at(U, V), atol=1e-4)
-    assert fit.error < 1e-2 and normal_off(fit.shape.frame, pane) < 1e-2
-    np.testing.assert_allclose(fit.shape.frame @ fit.shape.frame.T, np.eye(3), atol=1e-9)
+    assert fit.error < 1e-2 and normal_off(fit.shape.axes, pane) < 1e-2
+    np.testing.assert_allclose(fit.shape.axes @ fit.shape.axes.T, np.eye(3), atol=1e-9)
 
 
 @pytest.mark.parametrize("count", [2, 3])
 def test_the_error_of_the_plane_is_as_large_as_the_doubt_says(count: int) -> None:
     cameras = cameras_on(FRONT, EYES[:count])
     fits = [fit_pane(corner_marks(FRONT, cameras, noise=0.37, seed=seed), cameras, "rectangle") for seed in range(30)]
-    errors = np.array([normal_off(fit.shape.frame, FRONT) for fit in fits])
+    errors = np.array([normal_off(fit.shape.axes, FRONT) for fit in fits])
     uncertainty = np.median([fit.uncertainty for fit in fits])
     assert 0.3 * uncertainty < np.sqrt((errors**2).mean()) < 2 * uncertainty
 
@@ -86,7 +86,7 @@ def test_one_wrong_mark_moves_the_plane_little(shape: str) -> None:
     marks = corner_marks(FRONT, cameras)
     marks.corners[1][2] = marks.corners[1][2] + 30.0
     fit = fit_pane(marks, cameras, shape)  # type: ignore[arg-type]
-    assert normal_off(fit.shape.frame, FRONT) < 0.5
+    assert normal_off(fit.shape.axes, FRONT) < 0.5
     assert max(fit.errors, key=fit.errors.__getitem__) == 2
 
 
@@ -120,7 +120,7 @@ def test_all_edges_without_a_corner_give_the_pane() -> None:
 def test_two_edges_give_the_plane_and_as_much_of_the_pane_as_was_marked() -> None:
     cameras = cameras_on(FRONT)
     fit = fit_pane(edge_marks(FRONT, cameras, (1, 3)), cameras, "rectangle")
-    assert normal_off(fit.shape.frame, FRONT) < 0.1
+    assert normal_off(fit.shape.axes, FRONT) < 0.1
     assert fit.uncertainty < 5
     sizes = np.linalg.norm(np.diff(fit.shape.corners()[:3], axis=0), axis=1)
     assert sizes[0] == pytest.approx(1.6, rel=0.02)
@@ -149,7 +149,7 @@ def test_where_a_long_front_ends_may_be_marked_in_one_photograph_only() -> None:
     ]
     places: list[dict[int, np.ndarray]] = [{}, {}, {}, {view: cameras[view].project(corners[3]) for view in (0, 1, 2)}]
     fit = fit_pane(Marks(places, edges), cameras, "rectangle")
-    assert normal_off(fit.shape.frame, front) < 2 * fit.uncertainty < 4
+    assert normal_off(fit.shape.axes, front) < 2 * fit.uncertainty < 4
     np.testing.assert_allclose(fit.shape.corners(), corners, atol=0.5)
 
 
@@ -220,7 +220,7 @@ def test_the_rectangle_of_a_polygon_keeps_its_order_and_hand() -> None:
     for corners in (FRONT.at(U, V), FRONT.at(U, V)[::-1]):
         rectangle = rectangle_pane(polygon_pane(corners))
         np.testing.assert_allclose(rectangle.corners(), corners, atol=1e-9)
-        assert np.linalg.det(rectangle.frame) == pytest.approx(1)
+        assert np.linalg.det(rectangle.axes) == pytest.approx(1)
 
 
 def test_corners_on_a_line_are_no_outline() -> None:
