@@ -35,7 +35,7 @@ from typing import Any, NamedTuple
 from filelock import FileLock, Timeout
 
 from glassplat.errors import InputError
-from glassplat.files.writing import atomic_write
+from glassplat.files.writing import write_text
 from glassplat.model.run_directory import check_unlocked
 
 BASELINE = "splat"
@@ -151,8 +151,8 @@ class Run:
     def start(self) -> subprocess.Popen[bytes]:
         """Begins the training, or goes on with it."""
         self.directory.mkdir(parents=True, exist_ok=True)
-        with atomic_write(self.directory / COMMAND) as temporary:  # Other processes look at it meanwhile.
-            temporary.write_text(json.dumps(self.train, indent=2) + "\n", encoding="utf-8")
+        # Atomically: other processes look at it meanwhile.
+        write_text(self.directory / COMMAND, json.dumps(self.train, indent=2) + "\n")
         begun = ["--resume"] if (self.directory / "checkpoint.safetensors").is_file() else []
         return self._glassplat("train", *self.train, "--output", str(self.directory), *begun)
 
@@ -433,8 +433,7 @@ def write_tables(output: Path, runs: Sequence[Run]) -> str:
     text = tables({(run.scene, run.name, run.seed): values_of(results) for run, results in finished})
     kept = [{"scene": r.scene, "name": r.name, "train": r.train} | results for r, results in finished]
     for name, content in ((RESULTS, json.dumps(kept, indent=2) + "\n"), ("tables.md", text)):
-        with atomic_write(output / name) as temporary:
-            temporary.write_text(content, encoding="utf-8")
+        write_text(output / name, content)
     return text
 
 

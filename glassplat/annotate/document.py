@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw
 
 from glassplat.annotate.fit import Marks, Shape
 from glassplat.files.records import ByName, Choice, Field, Items, Number, Optional, Whole, check_fields, read_json
-from glassplat.files.writing import atomic_write
+from glassplat.files.writing import write_text
 from glassplat.scene.camera import NumpyCamera
 
 Material = Literal["glass", "mirror", "screen"]
@@ -176,8 +176,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
 
 def write_document(folder: Path, value: Any) -> None:
     """Writes a document that was checked."""
-    with atomic_write(folder / ANNOTATIONS) as temporary:
-        temporary.write_text(json.dumps(value, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
+    write_text(folder / ANNOTATIONS, json.dumps(value, ensure_ascii=False, indent=1) + "\n")
 
 
 Array = NDArray[np.float64]

@@ -23,7 +23,7 @@ from glassplat.errors import InputError, first_names
 from glassplat.files.images import files_below, image_size, is_hidden, leads_out, write_image
 from glassplat.files.records import read_json
 from glassplat.files.sidecars import planes_json, write_planes
-from glassplat.files.writing import atomic_write, remove_empty, remove_unfinished
+from glassplat.files.writing import remove_empty, remove_unfinished, write_text
 from glassplat.options import CLEAR_GLASS
 from glassplat.panes.masks import min_area_rectangle
 from glassplat.scene import logit
@@ -173,10 +173,7 @@ def remove_results(root: Path) -> list[str]:
 
 def _write_record(folder: Path, masks: Set[str], digests: Sequence[str]) -> None:
     """Notes which masks of a folder were made here, and the digests of the planes that were, or are about to be."""
-    with atomic_write(folder / RECORD) as temporary:
-        temporary.write_text(
-            json.dumps({"masks": sorted(masks), "planes": " ".join(digests)}, indent=1), encoding="utf-8"
-        )
+    write_text(folder / RECORD, json.dumps({"masks": sorted(masks), "planes": " ".join(digests)}, indent=1))
 
 
 def _made_here(folder: Path) -> tuple[set[str], list[str]]:

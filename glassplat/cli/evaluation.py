@@ -27,8 +27,8 @@ from glassplat.evaluate.evaluate import (
 )
 from glassplat.evaluate.metrics import PLANE_COLUMNS, format_value, missing_reasons, shown_metrics
 from glassplat.evaluate.report import Report
+from glassplat.files.writing import write_text
 from glassplat.methods.planar import fitted_planes
-from glassplat.model.run_directory import write_text
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.render.planar import Planar, with_photographer
 from glassplat.training.checkpoint import recorded
@@ -127,8 +127,8 @@ def evaluate_run(
         "test_cameras": cameras_of_test_views(stored, aligned),
         **evaluation.results,
     }
-    write_text(path / "results.json", json.dumps(results, indent=2))
-    write_text(path / "per_view.json", json.dumps(evaluation.per_view, indent=2))
+    write_text(path / "results.json", json.dumps(results, indent=2) + "\n")
+    write_text(path / "per_view.json", json.dumps(evaluation.per_view, indent=2) + "\n")
     report.finish(results, evaluation.per_view)
     return results
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Literal
 from glassplat.cli.console import message_console, say
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.records import read_json, readable_name, reading
-from glassplat.files.writing import LOADED, check_folder, make_folder, real_path, scene_source
+from glassplat.files.writing import LOADED, check_folder, make_folder, real_path, scene_source, write_text
 from glassplat.kernels.backend.devices import DeviceName
-from glassplat.model.run_directory import RunDirectory, write_text
+from glassplat.model.run_directory import RunDirectory
 from glassplat.options import Finite, PaneLabel, Share, Up
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def claim_folder(folder: Path, command: str, run: Path) -> bool:
     """
     found = check_claim(folder, command)
     make_folder(folder)
-    write_text(folder / RECORD, json.dumps({"command": command, "run": readable_name(run)}))
+    write_text(folder / RECORD, json.dumps({"command": command, "run": readable_name(run)}) + "\n")
     return found
 
 

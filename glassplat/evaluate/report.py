@@ -19,7 +19,7 @@ from glassplat.evaluate import metrics
 from glassplat.evaluate.evaluate import EvaluatedView
 from glassplat.evaluate.truth import NOTHING_KNOWN, TrueSurface, TrueView
 from glassplat.files.images import flat_picture_names, write_image
-from glassplat.files.writing import atomic_write
+from glassplat.files.writing import write_text
 from glassplat.options import Blend
 from glassplat.render.frame import Frame
 from glassplat.render.layers import ERROR_SCALE, depth_colors, error_colors, label_colors, layer_image, normal_colors
@@ -315,8 +315,7 @@ class Report:
         if uses is not None:
             write_image(self._folder / USES_FILE, uses)
         page = overview_page(results, per_view, self._sheets, uses=None if uses is None else USES_FILE)
-        with atomic_write(self._folder / "index.html") as temporary:
-            temporary.write_text(page, encoding="utf-8")
+        write_text(self._folder / "index.html", page)
 
 
 def sheet_names(names: list[str]) -> dict[str, str]:

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from glassplat.files import records
 from glassplat.files.ply import CHANNEL_PREFIXES, as_numpy, as_tensor, is_channel
-from glassplat.files.writing import atomic_write
+from glassplat.files.writing import write_bytes
 from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.kernels.project.reference import sh_basis
 from glassplat.options import short_repr
@@ -369,8 +369,7 @@ def write_glb(path: Path | str, gaussians: Gaussians) -> None:
     broken = [name for name, tensor in gaussians.tensors().items() if not bool(tensor.isfinite().all())]
     if broken:
         raise ValueError(f"Gaussians whose {', '.join(broken)} are not all finite cannot be written as GLB")
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(_glb_bytes(gaussians))
+    write_bytes(path, _glb_bytes(gaussians))
 
 
 def read_glb(path: Path | str) -> Gaussians:

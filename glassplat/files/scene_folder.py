@@ -19,7 +19,7 @@ from glassplat.files.glb import MAGIC, read_glb
 from glassplat.files.ply import is_compressed, read_compressed, read_gaussians, write_gaussians
 from glassplat.files.ply_table import read_table
 from glassplat.files.spz import GZIP, read_spz, three_log_scales
-from glassplat.files.writing import FORGED_SUFFIXES, SCENE, SPLAT_SUFFIXES, atomic_write
+from glassplat.files.writing import FORGED_SUFFIXES, SCENE, SPLAT_SUFFIXES, write_bytes, write_text
 from glassplat.scene import SH_ZERO
 from glassplat.scene.corrections import Direction, Exposures, PoseCorrections
 from glassplat.scene.gaussians import Gaussians
@@ -81,8 +81,7 @@ def write_scene(folder: Path, scene: Scene) -> None:
         if len(corrections):
             sidecars.write_corrections(folder / name, corrections)
             files += [name]
-    with atomic_write(folder / SCENE) as temporary:
-        temporary.write_text(json.dumps(header, indent=2) + "\n", encoding="utf-8")
+    write_text(folder / SCENE, json.dumps(header, indent=2) + "\n")
 
 
 def read_scene(folder: Path) -> Scene:
@@ -292,8 +291,7 @@ def write_forged(path: Path, gaussians: Gaussians) -> None:
         plain = Path(folder) / "scene.ply"
         write_gaussians(plain, gaussians)
         data = _convert(forge, plain.read_bytes(), "ply", path.suffix.lower()[1:], path)
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(data)
+    write_bytes(path, data)
 
 
 def _forge(path: Path) -> Any:

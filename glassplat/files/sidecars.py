@@ -23,7 +23,7 @@ from torch import Tensor
 
 from glassplat.files import records
 from glassplat.files.images import read_image_float, write_image
-from glassplat.files.writing import atomic_write, make_folder
+from glassplat.files.writing import atomic_write, make_folder, write_text
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 from glassplat.options import CLEAR_GLASS, short_repr
 from glassplat.scene.camera import Camera, quat_from_rotation
@@ -163,9 +163,7 @@ def write_planes(path: Path | str, planes: Planes) -> None:
     Raises:
         ValueError: a plane holds a value that is not finite.
     """
-    text = planes_json(planes)
-    with atomic_write(path) as temporary_path:
-        temporary_path.write_text(text, encoding="utf-8", newline="\n")
+    write_text(path, planes_json(planes))
 
 
 def planes_json(planes: Planes) -> str:
@@ -334,8 +332,7 @@ def write_cameras(path: Path | str, cameras: Iterable[tuple[str, Camera]]) -> No
         cameras: image name and camera, in the order in which ids are given.
     """
     entries = [_camera_entry(index, name, camera) for index, (name, camera) in enumerate(cameras)]
-    with atomic_write(path) as temporary_path:
-        temporary_path.write_text(json.dumps(entries, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(entries, indent=1, allow_nan=False) + "\n")
 
 
 def read_cameras(path: Path | str) -> list[tuple[str, Camera]]:
@@ -393,8 +390,7 @@ ENTRIES: dict[type[ByPhotograph], records.Field] = {Exposures: TRANSFORM, PoseCo
 def write_corrections(path: Path, corrections: ByPhotograph) -> None:
     """Writes the values by photograph; `read_corrections` returns them exactly."""
     entries = dict(zip(corrections.names, corrections.values.detach().cpu().tolist(), strict=True))
-    with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(entries, indent=1) + "\n")
 
 
 def read_corrections(path: Path, kind: type[Correction]) -> Correction:
@@ -431,14 +427,9 @@ def write_colmap(
         for number, ((x, y, z), (r, g, b)) in enumerate(zip(positions.tolist(), colors.tolist(), strict=True), start=1)
     ]
     make_folder(folder)
-    _write(folder / "cameras.txt", [f"{number} {lens}\n" for lens, number in lenses.items()])
-    _write(folder / "images.txt", images)
-    _write(folder / "points3D.txt", points)
-
-
-def _write(path: Path, lines: list[str]) -> None:
-    with atomic_write(path) as temporary:
-        temporary.write_text("".join(lines), encoding="utf-8")
+    write_text(folder / "cameras.txt", "".join(f"{number} {lens}\n" for lens, number in lenses.items()))
+    write_text(folder / "images.txt", "".join(images))
+    write_text(folder / "points3D.txt", "".join(points))
 
 
 FORMAT = "glassplat-environment-1"

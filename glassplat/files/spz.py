@@ -24,7 +24,7 @@ from torch import Tensor
 
 from glassplat.files.ply import as_numpy, as_tensor
 from glassplat.files.records import reading
-from glassplat.files.writing import atomic_write
+from glassplat.files.writing import write_bytes
 from glassplat.scene.gaussians import Gaussians, half_turned
 
 log = logging.getLogger(__name__)
@@ -194,9 +194,7 @@ def write_spz(path: Path | str, gaussians: Gaussians, version: int = 3) -> None:
     Raises:
         ValueError: another version, no colours, a value that is not finite, or a position that is too far away.
     """
-    data = spz_bytes(gaussians, version)
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(data)
+    write_bytes(path, spz_bytes(gaussians, version))
 
 
 def spz_bytes(gaussians: Gaussians, version: int = 3) -> bytes:

@@ -75,6 +75,17 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
             temporary.unlink()
 
 
+def write_bytes(path: Path | str, data: bytes) -> None:
+    """Writes a file atomically."""
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_text(path: Path | str, text: str) -> None:
+    """Writes a text file in UTF-8 atomically; lines end as in the text, on every system."""
+    write_bytes(path, text.encode("utf-8"))
+
+
 def remove_unfinished(folder: Path, suffixes: Sequence[str]) -> None:
     """Removes what was left in a folder by writers that were killed; nobody may be writing such files there now."""
     for path in folder.glob(".*"):

@@ -30,7 +30,7 @@ from glassplat.kernels.backend.devices import DeviceName, chosen_device
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.recipe import recipe_to_json, with_background
 from glassplat.methods.splat_recipe import SplatRecipe
-from glassplat.model.run_directory import RunDirectory, write_text
+from glassplat.model.run_directory import RunDirectory
 from glassplat.options import BLACK, Cleaning, Up
 from glassplat.publish.camera_paths import orbit
 from glassplat.publish.cleaning import Floaters, clean_scene
@@ -477,8 +477,7 @@ def write_environment_files(folder: Path, scene: Scene) -> None:
         "forward": "+x in the middle column, +y left of it",
         "region": environment.region,
     }
-    with writing.atomic_write(folder / ENVIRONMENT) as temporary:
-        temporary.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
+    writing.write_text(folder / ENVIRONMENT, json.dumps(description, indent=2) + "\n")
 
 
 def write_as_run(folder: Path, model: Model, source: Path | None) -> None:
@@ -496,10 +495,11 @@ def write_as_run(folder: Path, model: Model, source: Path | None) -> None:
     directory.export(model.scene, step=0)
     write_cameras(folder / CAMERAS, model.cameras.items())
     if source is not None and (source / SETTINGS).is_file():
-        write_text(folder / SETTINGS, read_text(source / SETTINGS).rstrip("\n"))
+        writing.write_text(folder / SETTINGS, read_text(source / SETTINGS))
     else:
-        write_text(directory.imported, json.dumps({"file": None if source is None else str(source.resolve())}))
-    write_text(folder / "recipe.json", recipe_to_json(model.recipe))
+        file = None if source is None else str(source.resolve())
+        writing.write_text(directory.imported, json.dumps({"file": file}) + "\n")
+    writing.write_text(folder / "recipe.json", recipe_to_json(model.recipe) + "\n")
 
 
 def save_folder(model: Model, folder: Path, *, overwrite: bool = False) -> Path:

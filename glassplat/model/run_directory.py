@@ -23,7 +23,7 @@ from filelock import FileLock, Timeout
 from glassplat.captures.masks import Polarity
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.records import parse_json, read_json, read_text
-from glassplat.files.writing import atomic_write, check_folder, make_folder, remove_unfinished
+from glassplat.files.writing import check_folder, make_folder, remove_unfinished, write_text
 from glassplat.options import Downscale, Seed, Several, options_from_json
 from glassplat.training.messages import Message, StepDone, Working
 from glassplat.training.ranks import leads
@@ -230,13 +230,13 @@ class RunDirectory:
         from glassplat.methods.recipe import recipe_to_json
 
         make_folder(self.path)
-        write_text(self.path / "recipe.json", recipe_to_json(recipe))
+        write_text(self.path / "recipe.json", recipe_to_json(recipe) + "\n")
         self.write_settings(settings)
         write_cameras(self.path / "cameras.json", [(v.name, v.camera) for v in (*dataset.train, *dataset.test)])
 
     def write_settings(self, settings: RunSettings) -> None:
         """Replaces the recorded settings."""
-        write_text(self.path / "settings.json", json.dumps(dataclasses.asdict(settings), indent=2))
+        write_text(self.path / "settings.json", json.dumps(dataclasses.asdict(settings), indent=2) + "\n")
 
     def clear(self) -> None:
         """Removes what a training left half-written that was killed; for who holds the lock.
@@ -411,12 +411,6 @@ def check_output(directory: RunDirectory, *, resume: bool) -> None:
         directory.check_vacant()
 
 
-def write_text(path: Path, text: str) -> None:
-    """Writes a text file atomically."""
-    with atomic_write(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
-
-
 LOG_EVERY = 10
 
 
@@ -452,8 +446,7 @@ def open_log(path: Path, step: int) -> Iterator[RunLog]:
     A run that was killed may leave half a line, or the zeros of a power cut; such lines are left out.
     """
     kept = lines_until(path, step) if step and path.is_file() else []
-    with atomic_write(path) as temporary:
-        temporary.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+    write_text(path, "".join(line + "\n" for line in kept))
     file = path.open("a", encoding="utf-8")
     try:
         yield RunLog(file, path, step)

@@ -21,7 +21,7 @@ from glassplat import __version__
 from glassplat.captures.colmap_library import quiet_pycolmap
 from glassplat.errors import InputError, first_names
 from glassplat.files.records import read_json, readable_name
-from glassplat.files.writing import atomic_write, check_folder, make_folder, missing_folders, real_path, remove_empty
+from glassplat.files.writing import check_folder, make_folder, missing_folders, real_path, remove_empty, write_text
 from glassplat.prepare.photographs import (
     FEWEST,
     PICTURE_SUFFIX,
@@ -118,14 +118,12 @@ class Workplace:
             self._check_unchanged(known, json.loads(json.dumps(settings)))
         if known is None:
             make_folder(self.folder)
-            with atomic_write(self.folder / "settings.json") as temporary:
-                temporary.write_text(json.dumps(settings, indent=1), encoding="utf-8")
+            write_text(self.folder / "settings.json", json.dumps(settings, indent=1))
         return known is None
 
     def finish(self, record: Mapping[str, Any]) -> None:
         """Writes the record into the finished capture and moves it to the output."""
-        with atomic_write(self.capture / RECORD) as temporary:
-            temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        write_text(self.capture / RECORD, json.dumps(record, indent=1) + "\n")
         if self.output.exists():
             before = self.folder / "before"
             shutil.rmtree(before, ignore_errors=True)

@@ -20,7 +20,7 @@ from glassplat.captures.view import PointCloud, View
 from glassplat.errors import InputError
 from glassplat.evaluate.report import STYLE
 from glassplat.files.records import Field, Items, Number, Text, Whole, check_fields, read_json
-from glassplat.files.writing import atomic_write
+from glassplat.files.writing import write_text
 from glassplat.panes.material import virtual_points
 from glassplat.prepare.preparation import RECORD
 from glassplat.scene.camera import NumpyCamera
@@ -198,9 +198,7 @@ def write_page(capture: Path, target: Path, planes: Planes | None = None) -> Non
     from glassplat.captures.colmap_library import pycolmap  # `info` names this page, and need not wait for it.
 
     model = pycolmap.Reconstruction(capture / "sparse" / "0")
-    page = _page(report, dataset, model, planes, capture.resolve().name)
-    with atomic_write(target) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    write_text(target, _page(report, dataset, model, planes, capture.resolve().name))
 
 
 def _read_report(path: Path) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from glassplat.errors import InputError
 from glassplat.files.spz import FLIP, spz_bytes
-from glassplat.files.writing import atomic_write
+from glassplat.files.writing import write_bytes, write_text
 from glassplat.kernels.environment import cube_lookup
 from glassplat.render.frame import NEAR_PER_EXTENT, Renderer
 from glassplat.render.layers import contributions
@@ -224,8 +224,7 @@ def write_preview(path: Path | str, scene: Scene, renderer: Renderer, cameras: S
         bare = renderer(without_glass(scene), camera).rgb
         image = torch.cat([image[:, :middle], bare[:, middle:]], dim=1)
         image[:, middle - DIVIDER : middle + DIVIDER] = 1
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(jpeg(image))
+    write_bytes(path, jpeg(image))
 
 
 def write_page(
@@ -250,9 +249,7 @@ def write_page(
     Raises:
         ValueError: no camera, more panes than a page can show, or values that are not finite.
     """
-    page = page_text(scene, renderer, cameras, title, sharing=sharing)
-    with atomic_write(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    write_text(path, page_text(scene, renderer, cameras, title, sharing=sharing))
 
 
 def check_panes(scene: Scene) -> None:
