@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes, rectangle_offsets
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import Densify
-from glassplat.training.options import DefaultDensify, PhotoExposure, Photographer, PoseRefinement, Rate
+from glassplat.training.options import DefaultDensify, Photographer, Rate
 from glassplat.training.stage import Clock, Setup, Stage, TrainState, Work, carried_out
 
 END_SHARE = 0.1
@@ -28,34 +28,20 @@ CORRECTIONS: dict[str, type[ByPhotograph]] = {"exposures": Exposures, "poses": P
 """Of photographs, by part of the scene."""
 
 
-class Corrects(Protocol):
-    """A recipe, as far as photographs are corrected."""
-
-    @property
-    def exposure(self) -> PhotoExposure:
-        """Options of the exposure of each photograph."""
-        ...
-
-    @property
-    def poses(self) -> PoseRefinement:
-        """Options of the camera of each photograph."""
-        ...
-
-
-def _rates(recipe: Corrects) -> dict[str, float]:
+def _rates(recipe: Any) -> dict[str, float]:
     """Learning rates at the start, by part of the scene, of those that learn at all."""
     rates = {"exposures": recipe.exposure.rate, "poses": recipe.poses.rate}
     return {part: rate for part, rate in rates.items() if rate}
 
 
-def corrections_begun(recipe: Corrects, scene: Scene, dataset: Dataset) -> Scene:
+def corrections_begun(recipe: Any, scene: Scene, dataset: Dataset) -> Scene:
     """The first scene, with corrections that change nothing yet."""
     names = tuple(view.name for view in dataset.train)
     begun: dict[str, Any] = {part: CORRECTIONS[part].neutral(names) for part in _rates(recipe)}
     return replace(scene, **begun)
 
 
-def corrections_learnt(recipe: Corrects, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+def corrections_learnt(recipe: Any, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
     """The stages, in which the corrections learn as well."""
     for part, start in _rates(recipe).items():
         rate = {f"{part}.{CORRECTIONS[part].TENSOR}": Rate(start, start * END_SHARE)}
