@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -537,40 +537,6 @@ AXES: dict[str, tuple[int, int, int]] = {
 log = logging.getLogger(__name__)
 
 
-class ImportedScene(NamedTuple):
-    """A scene without photographs, the cameras to look at it from, and how many Gaussians could not be drawn."""
-
-    scene: Scene
-    cameras: NamedCameras
-    lost: int
-
-
-def imported_scene(file: Path, planes_file: Path | None = None, up: Up = "-y") -> ImportedScene:
-    """Reads a splat file, and next to it planes.json, glass.ply and cameras.json, as `export` writes them.
-
-    Args:
-        file: the splats.
-        planes_file: the panes, in place of those next to the file; glass is then spread evenly over each. The one
-            next to the file is no other.
-        up: which way is up, for cameras that nobody gives.
-
-    Raises:
-        FileNotFoundError, ValueError: a file is missing, damaged or foreign, or holds nothing to draw.
-    """
-    gaussians, lost = drawable(read_splats(file), file)
-    if not len(gaussians):
-        raise InputError(f"{file} holds no Gaussians; expected a trained splat")
-    planes = _planes(file, planes_file)
-    glass = _glass(
-        file,
-        planes,
-        own=planes_file is None or writing.real_path(planes_file) == writing.real_path(file.with_name("planes.json")),
-    )
-    cameras = _cameras(file, gaussians, up)
-    scene = Scene(with_intensity(gaussians), extent_of(gaussians, cameras), glass=glass, planes=planes)
-    return ImportedScene(scene, cameras, lost)
-
-
 def extent_of(gaussians: Gaussians, cameras: NamedCameras) -> float:
     """Extent of the scene as training defines it; of a single camera that of the scene."""
     centers = torch.stack([camera.center for _, camera in cameras])
@@ -654,10 +620,17 @@ def _from_run(path: Path, device: DeviceName) -> Model:
     return Model(scene.to(chosen_device(device)), recipe, by_name(cameras), path.resolve().name, path)
 
 
-def _from_file(path: Path, device: DeviceName, planes: Path | None, up: Up) -> Model:
-    """A scene that was not trained here, over black."""
+def _from_file(path: Path, device: DeviceName, planes_file: Path | None, up: Up) -> Model:
+    """A scene that was not trained here, over black, with the files that `export` writes next to its splats."""
     with input_checked():
-        scene, cameras, lost = imported_scene(path, planes, up)
+        gaussians, lost = drawable(read_splats(path), path)
+        if not len(gaussians):
+            raise InputError(f"{path} holds no Gaussians; expected a trained splat")
+        planes = _planes(path, planes_file)
+        own = planes_file is None or writing.real_path(planes_file) == writing.real_path(path.with_name("planes.json"))
+        glass = _glass(path, planes, own=own)
+        cameras = _cameras(path, gaussians, up)
+        scene = Scene(with_intensity(gaussians), extent_of(gaussians, cameras), glass=glass, planes=planes)
     if lost:
         log.warning("%d Gaussians of %s are left out: values that are no numbers or too large to draw", lost, path)
     recipe = recipe_of_splats(scene.primary)
