@@ -33,7 +33,7 @@ from glassplat.training.actions import Densify, GrowSh, ResetOpacity
 from glassplat.training.densify import Moments, forget
 from glassplat.training.losses import counted_pixels, residual
 from glassplat.training.options import MirrorSearch, NormalPropagation, PropagationSchedule, Rate
-from glassplat.training.stage import Clock, Every, TrainState
+from glassplat.training.stage import AtMoments, Clock, Every, TrainState
 
 LEAST_SHOWN = 0.1
 """Pixels, of all views together, below which a Gaussian is not seen."""
@@ -480,24 +480,18 @@ class DensifyWhilePropagating(Densify):
 
 
 @dataclass(frozen=True)
-class RefineEnvironment:
+class RefineEnvironment(AtMoments):
     """Doubles the environment's texels at certain moments, twice where two fall on one step.
 
     A normal has a gradient only as far as the texels that its reflection meets reach. Large texels at first let normals
     find their way from farther off; small ones make the reflection sharp in the end.
 
     Attributes:
-        moments: shares of the run.
         largest: texels along a face that are enough.
     """
 
-    moments: tuple[float, ...]
     largest: int
     name: str = "refine environment"
-
-    def due(self, clock: Clock) -> bool:
-        """Return whether to act after this step."""
-        return clock.is_at(self.moments)
 
     @torch.no_grad()
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:

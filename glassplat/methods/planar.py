@@ -41,7 +41,7 @@ from glassplat.training.corrections import corrections_begun, corrections_learnt
 from glassplat.training.densify import NEIGHBOURS
 from glassplat.training.messages import Working
 from glassplat.training.options import PUBLISHED_ITERATIONS, Rate
-from glassplat.training.stage import Clock, Every, PostStep, Stage, TrainState, Work
+from glassplat.training.stage import AtMoments, Clock, Every, PostStep, Stage, TrainState, Work
 
 if TYPE_CHECKING:
     from glassplat.methods.planar_recipe import PlanarRecipe
@@ -263,19 +263,10 @@ the first reset of opacities. A second and a third time take things that are rea
 
 
 @dataclass(frozen=True)
-class TurnReflections:
-    """Moves what was built behind panes of glass, for what they mirror, to where that is, in front; see lab/layers.md.
+class TurnReflections(AtMoments):
+    """Moves what was built behind panes of glass, for what they mirror, to where that is, in front (lab/layers.md)."""
 
-    Attributes:
-        moment: share of the run at which to do it.
-    """
-
-    moment: float
     name: str = "turn reflections"
-
-    def due(self, clock: Clock) -> bool:
-        """Return whether to act after this step."""
-        return clock.is_at((self.moment,))
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
         """Edits `state`, if there is anything to edit, and tells how far it is."""
@@ -289,24 +280,16 @@ class TurnReflections:
         return moved > 0
 
 
-LIT_AT, FILLED_AT = (0.4, 0.6), 0.5
+LIT_AT, FILLED_AT = (0.4, 0.6), (0.5,)
 """Shares of a run at which lamps are looked for, and at which what no view shows is filled."""
 
 
 @dataclass(frozen=True)
-class LightLamps:
-    """Takes the images of lamps from behind panes of glass, and makes the lamps as bright as their reflections are.
-
-    Attributes:
-        moments: shares of the run at which to do it.
-    """
+class LightLamps(AtMoments):
+    """Takes the images of lamps from behind panes of glass, and makes the lamps as bright as their reflections are."""
 
     moments: tuple[float, ...] = LIT_AT
     name: str = "light lamps"
-
-    def due(self, clock: Clock) -> bool:
-        """Return whether to act after this step."""
-        return clock.is_at(self.moments)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
         """Edits `state`, if there is anything to edit, and tells how far it is."""
@@ -328,19 +311,11 @@ class LightLamps:
 
 
 @dataclass(frozen=True)
-class FillUnseen:
-    """Adds Gaussians where panes of glass mirror something that no photograph shows, and nothing stands.
+class FillUnseen(AtMoments):
+    """Adds Gaussians where panes of glass mirror something that no photograph shows, and nothing stands."""
 
-    Attributes:
-        moment: share of the run at which to do it.
-    """
-
-    moment: float = FILLED_AT
+    moments: tuple[float, ...] = FILLED_AT
     name: str = "fill unseen"
-
-    def due(self, clock: Clock) -> bool:
-        """Return whether to act after this step."""
-        return clock.is_at((self.moment,))
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
         """Edits `state`, if there is anything to edit, and tells how far it is."""
@@ -561,7 +536,7 @@ def _early_resets(recipe: PlanarRecipe, population: Population) -> tuple[ResetOp
 
 def _turns(recipe: PlanarRecipe) -> tuple[TurnReflections | LightLamps, ...]:
     """The turning round of reflections behind glass, and the lighting of lamps, if there are to be any."""
-    return (TurnReflections(_joint_start(recipe) + TURN_AFTER), LightLamps()) if recipe.turn_reflections else ()
+    return (TurnReflections((_joint_start(recipe) + TURN_AFTER,)), LightLamps()) if recipe.turn_reflections else ()
 
 
 ADJUSTED_AFTER, JOINED_AFTER = 0.005, 0.003
@@ -571,7 +546,7 @@ looked for: as soon as it is known where panes are, behind which nothing is to b
 
 def _missing(recipe: PlanarRecipe, moment: float) -> tuple[SeedUnexplained, ...]:
     """The search for what is missing, if there is to be any."""
-    return (SeedUnexplained(moment, finished_renderer(recipe)),) if recipe.seed_unexplained else ()
+    return (SeedUnexplained((moment,), finished_renderer(recipe)),) if recipe.seed_unexplained else ()
 
 
 CLEARED_AFTER = 0.02

@@ -72,7 +72,7 @@ SEED_AT = (0.105, 0.203)
 def _missing(recipe: SplatRecipe) -> tuple[SeedUnexplained, ...]:
     """The search for what is missing, if there is to be any."""
     wanted = recipe.seed_unexplained and recipe.primitive == "ellipsoid" and recipe.strategy == "default"
-    return tuple(SeedUnexplained(moment, _bare(recipe)) for moment in SEED_AT if wanted)
+    return tuple(SeedUnexplained((moment,), _bare(recipe)) for moment in SEED_AT if wanted)
 
 
 def population_of(recipe: SplatRecipe | PlanarRecipe | DeferredRecipe) -> Population:

@@ -45,7 +45,7 @@ from glassplat.training.losses import (
 )
 from glassplat.training.messages import Working
 from glassplat.training.options import DefaultDensify, Intervals, McmcDensify, Rate
-from glassplat.training.stage import Action, Clock, Every, PostStep, TrainState, Work
+from glassplat.training.stage import Action, AtMoments, Clock, Every, PostStep, TrainState, Work
 
 log = logging.getLogger("glassplat.training")
 
@@ -413,7 +413,7 @@ MOST_ADDED = 0.05
 
 
 @dataclass(frozen=True)
-class SeedUnexplained:
+class SeedUnexplained(AtMoments):
     """Adds Gaussians where several photographs agree that something is, and the scene does not.
 
     Densification moves and copies what is there. A plain thing in an open space, such as a lamp, has no points, and
@@ -421,17 +421,11 @@ class SeedUnexplained:
     what they show differently.
 
     Attributes:
-        moment: share of the run at which to do it.
         renderer: shows the scene as the photographs do.
     """
 
-    moment: float
     renderer: Renderer
     name: str = "seed unexplained"
-
-    def due(self, clock: Clock) -> bool:
-        """Return whether to act after this step."""
-        return clock.is_at((self.moment,))
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
         """Edits `state`, if there is anything to edit, and tells how far it is."""

@@ -265,6 +265,21 @@ class Action(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class AtMoments:
+    """Base of actions that are due a few times in a run.
+
+    Attributes:
+        moments: shares of the run at which to act.
+    """
+
+    moments: tuple[float, ...]
+
+    def due(self, clock: Clock) -> bool:
+        """Return whether to act after this step."""
+        return clock.is_at(self.moments)
+
+
 class PostStep(Protocol):
     """A change of values that belongs to every step, like the noise of Langevin dynamics; no message reports it."""
 

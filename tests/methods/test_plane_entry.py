@@ -186,7 +186,7 @@ def test_what_shows_through_a_wall_behind_glass_is_a_reflection_unless_its_place
 
     state = state_of(scene)
     dataset: Any = SimpleNamespace(train=[SimpleNamespace(camera=camera) for camera in cameras])
-    action = TurnReflections(0.25)
+    action = TurnReflections((0.25,))
     assert action.due(Clock(25, 100, 1)) and not action.due(Clock(26, 100, 1))
     assert finished(action.apply(state, dataset, Clock(25, 100, 1)))
     torch.testing.assert_close(state.scene.primary.means[-1], torch.tensor([0.05, 0.0, -2.0]))

@@ -168,7 +168,7 @@ def test_lamps_that_are_lit_when_gaussians_grow_do_not_keep_them_from_it() -> No
 
 def test_what_a_pane_mirrors_unseen_is_filled_once() -> None:
     scene = scene_of(wall(4.0), wall(-3.0, 120).select(wall(-3.0).means[:, 0] < 1))
-    state, action = state_of(scene), FillUnseen(0.5)
+    state, action = state_of(scene), FillUnseen((0.5,))
     state.statistics["primary"] = ScreenStatistics(*torch.ones(3, 2, len(scene.primary)))
     assert finished(action.apply(state, capture_of(scene), Clock(50, 100, 5)))
     added = len(state.scene.primary) - len(scene.primary)

@@ -193,7 +193,7 @@ def test_a_thing_without_points_is_found_where_the_photographs_of_it_meet() -> N
     state, capture = TrainState(Scene(ground, 2.0), seed=0), views_of(whole)
     means = torch.ones_like(ground.means)
     state.optimizer.moments["primary.means"] = (means, means.clone())
-    action = SeedUnexplained(0.2, Splat())
+    action = SeedUnexplained((0.2,), Splat())
     assert action.due(Clock(20, 100, 10)) and not action.due(Clock(21, 100, 10))
     assert finished(action.apply(state, capture, Clock(20, 100, 10)))
     added = state.scene.primary.means[len(ground) :]
@@ -253,7 +253,7 @@ def test_nothing_is_added_where_the_scene_explains_the_photographs() -> None:
     whole = Scene(balls([(0.0, 0.0, 0.0), (0.5, 0.2, 0.3)], [200, 90], -1.8), 2.0)
     state = TrainState(whole, seed=0)
     assert len(missing_in(whole, views_of(whole).train, Splat())) == 0
-    assert not finished(SeedUnexplained(0.2, Splat()).apply(state, views_of(whole), Clock(20, 100, 10)))
+    assert not finished(SeedUnexplained((0.2,), Splat()).apply(state, views_of(whole), Clock(20, 100, 10)))
     assert state.scene is whole
 
 
@@ -261,7 +261,7 @@ def test_where_most_is_missing_nothing_is_added() -> None:
     whole = Scene(balls([(0.3, -0.2, 0.1), (0.0, 0.4, 0.0)], [250, 200], -1.8), 2.0)
     state = TrainState(Scene(whole.primary.select(torch.tensor([False, True])), 2.0), seed=0)
     assert len(missing_in(state.scene, views_of(whole).train, Splat())) > 5
-    assert not finished(SeedUnexplained(0.2, Splat()).apply(state, views_of(whole), Clock(20, 100, 10)))
+    assert not finished(SeedUnexplained((0.2,), Splat()).apply(state, views_of(whole), Clock(20, 100, 10)))
 
 
 def test_what_a_pane_mirrors_is_not_found_behind_it() -> None:
