@@ -110,15 +110,12 @@ class Exposures(ByPhotograph):
 
     Cameras change exposure and white balance from one photograph to the next. In sRGB, a power of the radiance, both
     are nearly factors on the channels.
+
+    `values` are [V, 3, 4] A and b; zero for a photograph in the scene's own colours.
     """
 
     TENSOR = "affine"
     SHAPE = (3, 4)
-
-    @property
-    def affine(self) -> Tensor:
-        """[V, 3, 4] A and b; zero for a photograph in the scene's own colours."""
-        return self.values
 
     def apply(self, image: Tensor, name: str) -> Tensor:
         """An image [..., 3] of the scene in the colours of a photograph; differentiable in both."""
@@ -143,18 +140,13 @@ class PoseCorrections(ByPhotograph):
     cam_from_world = [R | t] becomes exp(twist turned by R) cam_from_world. In these axes a shift that all cameras have
     in common is the mean of their twists, and the motion of a camera between two others is about the mean of theirs. A
     turn of all cameras about one place is no common twist: it shifts each of them differently.
+
+    `values` are [V, 6] twists: rotation vectors in radians, and translations in scene extents; zero for a camera that
+    stays. So both are small numbers whatever the capture's units.
     """
 
     TENSOR = "twists"
     SHAPE = (6,)
-
-    @property
-    def twists(self) -> Tensor:
-        """[V, 6] rotation vectors in radians, and translations in scene extents; zero for a camera that stays.
-
-        So both are small numbers whatever the capture's units.
-        """
-        return self.values
 
     def correct(self, camera: Camera, name: str, extent: float) -> Camera:
         """The camera of a photograph where it really is; differentiable in the twists.

@@ -57,8 +57,8 @@ def test_the_loss_compares_in_the_colours_of_the_photograph() -> None:
 def test_a_view_without_a_transform_gets_the_mean_of_its_neighbours() -> None:
     exposures = Exposures(drawn(4, 3, 4), ("x/8.png", "x/10.png", "y/9.png", "x/12.png"))
     found = exposures.interpolate("x/9.png")
-    torch.testing.assert_close(found.of("x/9.png"), exposures.affine[:2].mean(dim=0))
-    torch.testing.assert_close(exposures.interpolate("x/20.png").of("x/20.png"), exposures.affine[3])
+    torch.testing.assert_close(found.of("x/9.png"), exposures.values[:2].mean(dim=0))
+    torch.testing.assert_close(exposures.interpolate("x/20.png").of("x/20.png"), exposures.values[3])
     assert exposures.interpolate("x/10.png") is exposures
     assert exposures.interpolate("z/9.png") is exposures
     assert len(Exposures.neutral().interpolate("a")) == 0

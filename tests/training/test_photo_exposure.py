@@ -53,13 +53,13 @@ def trained(recipe: SplatRecipe, steps: int = 240) -> TrainState:
 
 
 def test_dark_photographs_are_told_from_bright_ones() -> None:
-    affine = trained(SplatRecipe(exposure=LEARNED)).scene.exposures.affine
+    affine = trained(SplatRecipe(exposure=LEARNED)).scene.exposures.values
     brightness = affine[:, :, :3].sum(dim=(1, 2)) / 3
     assert bool((brightness[1::2] < brightness[::2] - 0.2).all())
 
 
 def test_what_all_photographs_have_in_common_is_left_to_the_scene() -> None:
-    affine = trained(SplatRecipe(exposure=LEARNED)).scene.exposures.affine
+    affine = trained(SplatRecipe(exposure=LEARNED)).scene.exposures.values
     assert float(affine.abs().max()) > 0.05
     assert float(affine.mean(dim=0).abs().max()) < 1e-6
 
@@ -85,8 +85,8 @@ def test_switched_off_nothing_knows_of_them(method: str, iterations: int) -> Non
 def test_they_are_stored_with_the_scene_and_in_checkpoints(tmp_path: Path) -> None:
     state = trained(SplatRecipe(exposure=LEARNED), steps=12)
     write_scene(tmp_path / "scene", state.scene)
-    assert torch.equal(read_scene(tmp_path / "scene").exposures.affine, state.scene.exposures.affine)
+    assert torch.equal(read_scene(tmp_path / "scene").exposures.values, state.scene.exposures.values)
     save_checkpoint(tmp_path / "checkpoint.safetensors", state)
     restored = load_checkpoint(tmp_path / "checkpoint.safetensors").scene.exposures
     assert restored.names == state.scene.exposures.names
-    assert torch.equal(restored.affine, state.scene.exposures.affine)
+    assert torch.equal(restored.values, state.scene.exposures.values)

@@ -202,7 +202,7 @@ def test_corrections_are_stored_with_the_scene_and_in_checkpoints(tmp_path: Path
     save_checkpoint(tmp_path / "checkpoint.safetensors", state)
     for scene in (read_scene(tmp_path / "scene"), load_checkpoint(tmp_path / "checkpoint.safetensors").scene):
         assert scene.poses.names == state.scene.poses.names
-        assert torch.equal(scene.poses.twists, state.scene.poses.twists)
+        assert torch.equal(scene.poses.values, state.scene.poses.values)
 
 
 def test_a_run_leaves_the_refined_cameras(tmp_path: Path) -> None:
@@ -216,7 +216,7 @@ def test_a_run_leaves_the_refined_cameras(tmp_path: Path) -> None:
     for before, after in zip(dataset.train, refined.train, strict=True):
         assert misplacement(recorded[after.name], after.camera) < 1e-5
         assert misplacement(before.camera, after.camera) > 1e-4
-    assert float(state.scene.poses.twists.mean(dim=0).abs().max()) < 1e-6
+    assert float(state.scene.poses.values.mean(dim=0).abs().max()) < 1e-6
 
 
 def test_the_model_of_a_training_has_the_cameras_that_its_run_records(tmp_path: Path) -> None:
