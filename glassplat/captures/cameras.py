@@ -190,7 +190,7 @@ class PixelMap:
     def labels(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """[H, W] of the photograph's size to [height, width]; the nearest pixel's label, no label in between."""
         if self.lens is not None:
-            labels = _undistort(labels, self.lens.as_colmap(), "NEAREST_NEIGHBOR")
+            labels = undistort(labels, self.lens.as_colmap(), "NEAREST_NEIGHBOR")
         return nearest_resize(labels, self.width, self.height)
 
     def ignored(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -322,17 +322,14 @@ def _is_pinhole(model: str, parameters: tuple[float, ...]) -> bool:
     return model in PERSPECTIVE and not any(parameters[counts.focal + counts.middle :])
 
 
-def undistort(pixels: NDArray[np.uint8], lens: Any) -> NDArray[np.uint8]:
-    """[H, W, 3] as the pinhole camera of `pycolmap.undistort_camera` shows it, which may have another size.
+def undistort(pixels: NDArray[np.uint8], lens: Any, interpolation: Interpolation = "BILINEAR") -> NDArray[np.uint8]:
+    """A photograph as the pinhole camera of `pycolmap.undistort_camera` shows it, which may have another size.
 
     Args:
-        pixels: the photograph.
+        pixels: [H, W, 3] of the photograph, or [H, W].
         lens: its `pycolmap.Camera`.
+        interpolation: between pixels; the nearest one for labels.
     """
-    return _undistort(pixels, lens, "BILINEAR")
-
-
-def _undistort(pixels: NDArray[np.uint8], lens: Any, interpolation: Interpolation) -> NDArray[np.uint8]:
     options = library.pycolmap.UndistortCameraOptions()
     kinds = type(options.warp_options.interpolation)  # pycolmap gives this enumeration no public name.
     options.warp_options.interpolation = getattr(kinds, interpolation)
