@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import html
-import io
 import json
 import logging
 import os
@@ -16,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 from glassplat.captures.dataset import EXTENT_MARGIN, Dataset, with_corrected_cameras
@@ -32,9 +29,9 @@ from glassplat.methods.recipe import recipe_to_json, with_background
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import RunDirectory
 from glassplat.options import BLACK, Cleaning, Up
+from glassplat.publish import web_page
 from glassplat.publish.camera_paths import orbit
 from glassplat.publish.cleaning import Floaters, clean_scene
-from glassplat.publish.web_page import PRIVATE, Sharing, best_view, bounding_ball, cameras_around, write_page
 from glassplat.render.deferred import equirect_from_environment
 from glassplat.render.frame import Frame, Renderer, check_layers
 from glassplat.render.layers import layer_image
@@ -87,13 +84,11 @@ class Model:
         if not self.cameras:
             return f"<p>{text}</p>"
         names = tuple(self.cameras)
-        name = names[best_view(self.scene.planes, tuple(self.cameras.values()))]
+        name = names[web_page.best_view(self.scene.planes, tuple(self.cameras.values()))]
         camera = self.cameras[name]
         width = min(NOTEBOOK_WIDTH, camera.width)
         small = camera.resize(width, max(1, round(width * camera.height / camera.width)))
-        file = io.BytesIO()
-        Image.fromarray((255 * self.image(small)).round().byte().numpy()).save(file, "JPEG", quality=90)
-        picture = base64.b64encode(file.getvalue()).decode()
+        picture = web_page.in_base64(web_page.jpeg(self.image(small), quality=90))
         return f'<p>{text}</p><img src="data:image/jpeg;base64,{picture}" alt="{html.escape(name)}">'
 
     def show(self) -> Viewer:
@@ -129,7 +124,8 @@ class Model:
         Raises:
             InputError: it has neither cameras nor Gaussians.
         """
-        return self.cameras or dict(cameras_around(self.scene.primary, torch.tensor(AXES["-y"], dtype=torch.float64)))
+        up = torch.tensor(AXES["-y"], dtype=torch.float64)
+        return self.cameras or dict(web_page.cameras_around(self.scene.primary, up))
 
     def render(self, camera: Camera | str, *, layers: Sequence[str] = ("rgb",)) -> Frame:
         """Renders the image and its layers; differentiable in every tensor of the scene and in the camera's pose.
@@ -446,10 +442,10 @@ def left_out(model: Model, kind: str) -> list[str]:
     return [*lost, "the photographer"] if len(scene.photographer) else lost
 
 
-def save_page(model: Model, path: Path, title: str, *, sharing: Sharing = PRIVATE) -> None:
+def save_page(model: Model, path: Path, title: str, *, sharing: web_page.Sharing = web_page.PRIVATE) -> None:
     """Writes the page that shows a model with live panes in any browser."""
     with input_checked():
-        write_page(path, model.scene, model.renderer, tuple(model.viewpoints.items()), title, sharing=sharing)
+        web_page.write_page(path, model.scene, model.renderer, tuple(model.viewpoints.items()), title, sharing=sharing)
 
 
 def write_beside(folder: Path, scene: Scene) -> list[Path]:
@@ -541,7 +537,7 @@ def extent_of(gaussians: Gaussians, cameras: NamedCameras) -> float:
     """Extent of the scene as training defines it; of a single camera that of the scene."""
     centers = torch.stack([camera.center for _, camera in cameras])
     radius = float((centers - centers.mean(0)).norm(dim=1).max())
-    return EXTENT_MARGIN * (radius or bounding_ball(gaussians)[1])
+    return EXTENT_MARGIN * (radius or web_page.bounding_ball(gaussians)[1])
 
 
 def _planes(file: Path, planes_file: Path | None) -> Planes:
@@ -569,7 +565,7 @@ def _cameras(file: Path, gaussians: Gaussians, up: Up) -> NamedCameras:
         raise InputError(f"up is {up!r}; expected one of {', '.join(AXES)}")
     beside = file.with_name("cameras.json")
     cameras = read_cameras(beside) if beside.is_file() else []
-    return tuple(cameras or cameras_around(gaussians, torch.tensor(AXES[up], dtype=torch.float64)))
+    return tuple(cameras or web_page.cameras_around(gaussians, torch.tensor(AXES[up], dtype=torch.float64)))
 
 
 def load(

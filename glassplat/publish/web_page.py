@@ -374,11 +374,11 @@ def poster_camera(camera: Camera) -> Camera:
     return camera.resize(max(1, round(share * camera.width)), max(1, round(share * camera.height)))
 
 
-def jpeg(image: Tensor) -> bytes:
+def jpeg(image: Tensor, quality: int = POSTER_QUALITY) -> bytes:
     """An image [H, W, 3] in [0, 1] as JPEG."""
     stream = io.BytesIO()
     pixels = torch.round(image.clamp(0, 1) * 255).to("cpu", torch.uint8).numpy()
-    Image.fromarray(pixels).save(stream, "JPEG", quality=POSTER_QUALITY, optimize=True)
+    Image.fromarray(pixels).save(stream, "JPEG", quality=quality, optimize=True)
     return stream.getvalue()
 
 
