@@ -144,9 +144,9 @@ class FeatureDatabase:
                 pixels = read_photograph(self.photographs[index])
                 Image.fromarray(pixels).convert("L").save(temporary, compress_level=1)
 
-    def extract(self, features: Features, listen: Listener, threads: int) -> None:
+    def extract(self, features: Features, listen: Listener) -> None:
         """Finds the features of the photographs that have none yet."""
-        options = library.pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False)
+        options = library.pycolmap.FeatureExtractionOptions(use_gpu=False)
         options.sift.max_num_features = features.most
         options.sift.peak_threshold = features.least_contrast
         options.sift.first_octave = -1  # Twice the size, in which the smallest are found.
@@ -165,12 +165,12 @@ class FeatureDatabase:
             watched = _Watched("looking for features", _image_ids(database), database.exists_keypoints, listen)
             interruptible(work, watched.look)
 
-    def match(self, pairs: Sequence[tuple[int, int]], features: Features, listen: Listener, threads: int) -> None:
+    def match(self, pairs: Sequence[tuple[int, int]], features: Features, listen: Listener) -> None:
         """Matches pairs of photographs, by number, that are not matched yet."""
         listed = self.path.with_suffix(".pairs.txt")
         names = [(self.picture_name(one), self.picture_name(other)) for one, other in pairs]
         listed.write_text("".join(f"{one} {other}\n" for one, other in names), encoding="utf-8")
-        matching = library.pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
+        matching = library.pycolmap.FeatureMatchingOptions(use_gpu=False)
         matching.guided_matching = features.guided
         verification = library.pycolmap.TwoViewGeometryOptions()
         verification.ransac.random_seed = SEED
@@ -384,9 +384,7 @@ class Mapping:
 PLACING = "placing the photographs"
 
 
-def place_photographs(
-    database: Path, mapper: Mapper, options: Mapping, *, count: int, listen: Listener, threads: int
-) -> list[Any]:
+def place_photographs(database: Path, mapper: Mapper, options: Mapping, *, count: int, listen: Listener) -> list[Any]:
     """The connected groups of photographs that were placed, each a `pycolmap.Reconstruction`, the largest first.
 
     Args:
@@ -395,7 +393,6 @@ def place_photographs(
         options: how.
         count: of the photographs, for the progress.
         listen: is told how far it is.
-        threads: to use.
 
     Raises:
         InputError: the database is damaged.
@@ -404,9 +401,9 @@ def place_photographs(
     output.mkdir(exist_ok=True)
     listen(Working(PLACING, 0, count))
     if mapper == "incremental":
-        work = _incremental(database, output, _incremental_options(options, threads), count, listen)
+        work = _incremental(database, output, _incremental_options(options), count, listen)
     else:
-        work = _global(database, output, threads)
+        work = _global(database, output)
     with check_database(database):
         found = interruptible(work)
     return sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
@@ -444,8 +441,8 @@ def _incremental(database: Path, output: Path, options: Any, count: int, listen:
     return work
 
 
-def _global(database: Path, output: Path, threads: int) -> Callable[[Any], dict]:
-    options = library.pycolmap.GlobalPipelineOptions(num_threads=threads, random_seed=SEED)
+def _global(database: Path, output: Path) -> Callable[[Any], dict]:
+    options = library.pycolmap.GlobalPipelineOptions(random_seed=SEED)
 
     def work(token: Any) -> dict:
         return library.pycolmap.global_mapping(database, output, output, options=options)
@@ -453,10 +450,8 @@ def _global(database: Path, output: Path, threads: int) -> Callable[[Any], dict]
     return work
 
 
-def _incremental_options(options: Mapping, threads: int) -> Any:
-    chosen = library.pycolmap.IncrementalPipelineOptions(
-        num_threads=threads, random_seed=SEED, min_model_size=3, extract_colors=False
-    )
+def _incremental_options(options: Mapping) -> Any:
+    chosen = library.pycolmap.IncrementalPipelineOptions(random_seed=SEED, min_model_size=3, extract_colors=False)
     chosen.mapper.init_min_tri_angle = options.first_angle
     chosen.mapper.abs_pose_min_num_inliers = options.least_matches
     return chosen

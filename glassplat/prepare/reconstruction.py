@@ -84,12 +84,10 @@ class Settings:
     Attributes:
         lens: COLMAP's camera model.
         mapper: one photograph after the other, or all at once.
-        threads: to use.
     """
 
     lens: LensName = "simple_radial"
     mapper: Mapper = "incremental"
-    threads: int = -1
 
 
 def image_numbers(model: Any) -> dict[int, Any]:
@@ -118,12 +116,7 @@ def best_solution(
             listen(Note(note))
         database = _match_features(photographs, work, attempt.features, settings, listen)
         models = place_photographs(
-            database.path,
-            settings.mapper,
-            attempt.mapping,
-            count=len(photographs),
-            listen=listen,
-            threads=settings.threads,
+            database.path, settings.mapper, attempt.mapping, count=len(photographs), listen=listen
         )
         tried += 1
         found = Solution(database, models, attempt.name, tried)
@@ -140,9 +133,9 @@ def _match_features(
     database = FeatureDatabase(work / f"features-{features.most}.db", work / "grey", photographs)
     database.write_pictures(listen)
     database.create(settings.lens)
-    database.extract(features, listen, settings.threads)
+    database.extract(features, listen)
     _check_texture(database)
-    database.match(chosen_pairs(database.descriptors()), features, listen, settings.threads)
+    database.match(chosen_pairs(database.descriptors()), features, listen)
     return database
 
 

@@ -63,7 +63,7 @@ def test_half_a_picture_of_a_killed_command_is_no_photograph(tmp_path: Path) -> 
     for name, data in ((".000002.0a.tmp.png", whole), (".000003.0b.tmp.png", whole[: len(whole) // 2])):
         (tmp_path / "grey" / name).write_bytes(data)
     database.create("simple_radial")
-    database.extract(Features(500, 0.0067), lambda message: None, threads=1)
+    database.extract(Features(500, 0.0067), lambda message: None)
     counts = database.feature_counts()
     assert len(counts) == 2 and (counts > 0).all()
 
