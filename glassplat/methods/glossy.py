@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
 
 
-def first_scene(recipe: DeferredRecipe, dataset: Dataset) -> Scene:
+def deferred_scene(recipe: DeferredRecipe, dataset: Dataset) -> Scene:
     """The first scene: one Gaussian per point that hardly reflects, and no environment yet."""
     primary = population_of(recipe).initial(dataset.points, recipe.sh_degree)
     strengths = torch.full((len(primary),), logit(recipe.first_strength), dtype=torch.float32)
@@ -55,12 +55,12 @@ def first_scene(recipe: DeferredRecipe, dataset: Dataset) -> Scene:
     return corrections_begun(recipe, Scene(primary, dataset.extent), dataset)
 
 
-def finished_renderer(recipe: DeferredRecipe) -> Deferred:
+def deferred_renderer(recipe: DeferredRecipe) -> Deferred:
     """The renderer of the finished scene, with all its layers."""
     return Deferred(recipe.background or BLACK, least_strength=INVISIBLE)
 
 
-def stages_of(recipe: DeferredRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
+def deferred_stages(recipe: DeferredRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
     """Bootstrap, then everything; what changes in between is up to `Propagate`. A short run has no reflections."""
     short = iterations < recipe.least_iterations
     stages = _matte_stages(recipe, "ellipsoid", seed, iterations) if short else _reflecting_stages(recipe)
@@ -227,20 +227,20 @@ def doublings(first_texels: int, texels: int, bootstrap: float) -> tuple[float, 
 NORMAL_TERMS = ("consistency", "monocular normals")
 
 
-def traced_first_scene(recipe: TracedRecipe, dataset: Dataset) -> Scene:
+def traced_scene(recipe: TracedRecipe, dataset: Dataset) -> Scene:
     """The first scene: one Gaussian per point that hardly reflects, and nothing to mirror yet."""
     scene = recipe.distant().initialise(dataset)
     return replace(scene, primary=as_discs(scene.primary)) if recipe.primitive == "disc" else scene
 
 
-def traced_finished_renderer(recipe: TracedRecipe) -> Traced | Deferred:
+def traced_renderer(recipe: TracedRecipe) -> Traced | Deferred:
     """The renderer of the finished scene, with all its layers."""
     if recipe.mirrors == "environment" and recipe.primitive == "ellipsoid":
-        return recipe.distant().renderer()
+        return deferred_renderer(recipe.distant())
     return Traced(recipe.background or BLACK, recipe.least_strength)
 
 
-def traced_stages_of(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
+def traced_stages(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
     """Bootstrap, reflections, everything without propagation; a short run learns as `splat` does."""
     if iterations < recipe.least_iterations:
         return corrections_learnt(recipe, _matte_stages(recipe.distant(), recipe.primitive, seed, iterations))

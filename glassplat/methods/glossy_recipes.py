@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from glassplat.methods.splat_recipe import Primitive
 from glassplat.options import (
@@ -21,11 +21,11 @@ from glassplat.options import (
 )
 from glassplat.scene import SH_ZERO
 from glassplat.training.options import (
-    PUBLISHED_ITERATIONS,
     DefaultDensify,
     GaussianRates,
     Intervals,
     McmcDensify,
+    MethodRecipe,
     MirrorSearch,
     NormalPropagation,
     PhotoExposure,
@@ -38,16 +38,9 @@ from glassplat.training.options import (
     Texels,
 )
 
-if TYPE_CHECKING:
-    from glassplat.captures.dataset import Dataset
-    from glassplat.render.deferred import Deferred
-    from glassplat.render.traced import Traced
-    from glassplat.scene.scene import Scene
-    from glassplat.training.stage import Stage
-
 
 @dataclass(frozen=True)
-class GlossyOptions:
+class GlossyOptions(MethodRecipe):
     """Options of `deferred` and `traced`: a strength and a normal for every Gaussian, and how both are learnt.
 
     Attributes:
@@ -141,7 +134,8 @@ DEFERRED_CODE_ITERATIONS = 61_000
 class DeferredRecipe(GlossyOptions):
     """3DGS-DR: a strength and a normal for every Gaussian, one environment, and shading per pixel."""
 
-    method: ClassVar[str] = "deferred"
+    method = "deferred"
+    functions = "glassplat.methods.glossy:deferred"
 
     @classmethod
     def paper(cls) -> DeferredRecipe:
@@ -182,24 +176,6 @@ class DeferredRecipe(GlossyOptions):
             mcmc=McmcDensify.published(),
         )
 
-    def initialise(self, dataset: Dataset) -> Scene:
-        """The first scene: one Gaussian per point that hardly reflects, and no environment yet."""
-        from glassplat.methods.glossy import first_scene
-
-        return first_scene(self, dataset)
-
-    def renderer(self) -> Deferred:
-        """The renderer of the finished scene, with all its layers."""
-        from glassplat.methods.glossy import finished_renderer
-
-        return finished_renderer(self)
-
-    def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
-        """Bootstrap, then everything; what changes in between is up to `Propagate`. A short run has no reflections."""
-        from glassplat.methods.glossy import stages_of
-
-        return stages_of(self, seed, iterations)
-
 
 TRACED_CODE_ITERATIONS = 40_000
 """Length of a run of the public code, but for two captures, whose runs are longer."""
@@ -224,7 +200,8 @@ class TracedRecipe(GlossyOptions):
             have it and that of `monocular_weight` from the first step on (paper).
     """
 
-    method: ClassVar[str] = "traced"
+    method = "traced"
+    functions = "glassplat.methods.glossy:traced"
 
     primitive: Annotated[Primitive, ESSENTIAL] = "ellipsoid"
     harmonics_from_start: bool = False
@@ -300,21 +277,3 @@ class TracedRecipe(GlossyOptions):
     def distant(self) -> DeferredRecipe:
         """The recipe of `deferred` with the same options."""
         return DeferredRecipe(**{shared.name: getattr(self, shared.name) for shared in fields(GlossyOptions)})
-
-    def initialise(self, dataset: Dataset) -> Scene:
-        """The first scene: one Gaussian per point that hardly reflects, and nothing to mirror yet."""
-        from glassplat.methods.glossy import traced_first_scene
-
-        return traced_first_scene(self, dataset)
-
-    def renderer(self) -> Traced | Deferred:
-        """The renderer of the finished scene, with all its layers."""
-        from glassplat.methods.glossy import traced_finished_renderer
-
-        return traced_finished_renderer(self)
-
-    def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
-        """Bootstrap, reflections, everything without propagation; a short run has no reflections."""
-        from glassplat.methods.glossy import traced_stages_of
-
-        return traced_stages_of(self, seed, iterations)

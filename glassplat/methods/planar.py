@@ -371,7 +371,7 @@ def seed_reflection(state: TrainState, dataset: Dataset, panes: Planes) -> Work:
     return True
 
 
-def first_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
+def planar_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
     """The first scene: one Gaussian per point, no planes yet.
 
     Raises:
@@ -403,7 +403,7 @@ def _lack_of_masks(dataset: Dataset) -> str:
     )
 
 
-def finished_renderer(recipe: PlanarRecipe) -> Planar:
+def planar_renderer(recipe: PlanarRecipe) -> Planar:
     """The renderer of the finished scene, with all its layers."""
     return Planar(
         recipe.background or BLACK,
@@ -414,7 +414,7 @@ def finished_renderer(recipe: PlanarRecipe) -> Planar:
     )
 
 
-def stages_of(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
+def planar_stages(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
     """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
     first, second, third = recipe.stage_shares
     population = population_of(recipe)
@@ -546,7 +546,7 @@ looked for: as soon as it is known where panes are, behind which nothing is to b
 
 def _missing(recipe: PlanarRecipe, moment: float) -> tuple[SeedUnexplained, ...]:
     """The search for what is missing, if there is to be any."""
-    return (SeedUnexplained((moment,), finished_renderer(recipe)),) if recipe.seed_unexplained else ()
+    return (SeedUnexplained((moment,), planar_renderer(recipe)),) if recipe.seed_unexplained else ()
 
 
 CLEARED_AFTER = 0.02
@@ -570,7 +570,7 @@ def _joint_start(recipe: PlanarRecipe) -> float:
 
 def _training_renderer(recipe: PlanarRecipe, gradient: str) -> Planar:
     return replace(
-        finished_renderer(recipe),
+        planar_renderer(recipe),
         reflection_gradient="all" if gradient == "all" else "planes",
         deviation=recipe.weights.depth != 0,
         deviation_depth_gradient=recipe.moving_mean,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from glassplat.kernels import Fresnel
 from glassplat.options import (
@@ -21,22 +21,16 @@ from glassplat.options import (
 )
 from glassplat.panes import PlaneFit
 from glassplat.training.options import (
-    PUBLISHED_ITERATIONS,
     DefaultDensify,
     GaussianRates,
     Intervals,
     McmcDensify,
+    MethodRecipe,
     PhotoExposure,
     Photographer,
     PoseRefinement,
     Strategy,
 )
-
-if TYPE_CHECKING:
-    from glassplat.captures.dataset import Dataset
-    from glassplat.render.planar import Planar
-    from glassplat.scene.scene import Scene
-    from glassplat.training.stage import Stage
 
 
 @dataclass(frozen=True)
@@ -78,7 +72,7 @@ class Perturbation:
 
 
 @dataclass(frozen=True)
-class PlanarRecipe:
+class PlanarRecipe(MethodRecipe):
     """TR-Gaussians: transmission, reflection and planes, trained in three stages.
 
     Attributes:
@@ -126,7 +120,8 @@ class PlanarRecipe:
         photographer: whether panes show who took the photographs.
     """
 
-    method: ClassVar[str] = "planar"
+    method = "planar"
+    functions = "glassplat.methods.planar:planar"
     sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
     ssim_weight: Share = 0.2
     view_dependence_weight: NotNegative = 0.02
@@ -185,25 +180,3 @@ class PlanarRecipe:
             densify=DefaultDensify.published(),
             mcmc=McmcDensify.published(),
         )
-
-    def initialise(self, dataset: Dataset) -> Scene:
-        """The first scene: one Gaussian per point, no planes yet.
-
-        Raises:
-            PlaneFitError: the masks do not do.
-        """
-        from glassplat.methods.planar import first_scene
-
-        return first_scene(self, dataset)
-
-    def renderer(self) -> Planar:
-        """The renderer of the finished scene, with all its layers."""
-        from glassplat.methods.planar import finished_renderer
-
-        return finished_renderer(self)
-
-    def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
-        """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
-        from glassplat.methods.planar import stages_of
-
-        return stages_of(self, seed, iterations)

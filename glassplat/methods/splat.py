@@ -22,19 +22,19 @@ if TYPE_CHECKING:
     from glassplat.methods.splat_recipe import DiscTerms, SplatRecipe
 
 
-def first_scene(recipe: SplatRecipe, dataset: Dataset) -> Scene:
+def splat_scene(recipe: SplatRecipe, dataset: Dataset) -> Scene:
     """The first scene: one Gaussian per point."""
     first = population_of(recipe).initial(dataset.points, recipe.sh_degree)
     scene = Scene(as_discs(first) if recipe.primitive == "disc" else first, dataset.extent)
     return corrections_begun(recipe, scene, dataset)
 
 
-def finished_renderer(recipe: SplatRecipe) -> Splat:
+def splat_renderer(recipe: SplatRecipe) -> Splat:
     """The renderer of the finished scene, with all its layers."""
     return Splat(recipe.background or BLACK)
 
 
-def stages_of(recipe: SplatRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
+def splat_stages(recipe: SplatRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
     """One stage; of discs a new one whenever one of their terms begins to count."""
     population = population_of(recipe)
     first = Stage(

@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from glassplat.options import ESSENTIAL, Color, Internal, NotNegative, Share, ShDegree
 from glassplat.training.options import (
-    PUBLISHED_ITERATIONS,
     DefaultDensify,
     GaussianRates,
     Intervals,
     McmcDensify,
+    MethodRecipe,
     PhotoExposure,
     PoseRefinement,
     Strategy,
 )
-
-if TYPE_CHECKING:
-    from glassplat.captures.dataset import Dataset
-    from glassplat.render.splat import Splat
-    from glassplat.scene.scene import Scene
-    from glassplat.training.stage import Stage
 
 Primitive = Literal["ellipsoid", "disc"]
 
@@ -44,7 +38,7 @@ class DiscTerms:
 
 
 @dataclass(frozen=True)
-class SplatRecipe:
+class SplatRecipe(MethodRecipe):
     """Plain Gaussian Splatting, the baseline: of ellipsoids (3DGS) or discs (2DGS).
 
     Attributes:
@@ -65,7 +59,8 @@ class SplatRecipe:
         poses: whether the camera of each photograph is corrected.
     """
 
-    method: ClassVar[str] = "splat"
+    method = "splat"
+    functions = "glassplat.methods.splat:splat"
 
     primitive: Annotated[Primitive, ESSENTIAL] = "ellipsoid"
     sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
@@ -92,21 +87,3 @@ class SplatRecipe:
             densify=DefaultDensify.published(),
             mcmc=McmcDensify.published(),
         )
-
-    def initialise(self, dataset: Dataset) -> Scene:
-        """The first scene: one Gaussian per point."""
-        from glassplat.methods.splat import first_scene
-
-        return first_scene(self, dataset)
-
-    def renderer(self) -> Splat:
-        """The renderer of the finished scene, with all its layers."""
-        from glassplat.methods.splat import finished_renderer
-
-        return finished_renderer(self)
-
-    def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
-        """One stage; of discs a new one whenever one of their terms begins to count."""
-        from glassplat.methods.splat import stages_of
-
-        return stages_of(self, seed, iterations)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
@@ -23,6 +24,12 @@ from glassplat.options import (
     Share,
     ShDegree,
 )
+
+if TYPE_CHECKING:
+    from glassplat.captures.dataset import Dataset
+    from glassplat.render.frame import Renderer
+    from glassplat.scene.scene import Scene
+    from glassplat.training.stage import Stage
 
 PUBLISHED_ITERATIONS = 30_000
 """Length of the runs for which 3DGS, and TR-Gaussians after it, chose their learning rates."""
@@ -422,3 +429,34 @@ class SurroundingsOptions:
         )
     )
     reset: Internal[Share] = 0.0
+
+
+class MethodRecipe:
+    """Base of the methods' recipes, which import PyTorch only where they are used.
+
+    Attributes:
+        method: its name on the command line.
+        functions: module, and beginning of the names, of its functions `*_scene`, `*_renderer` and `*_stages`.
+    """
+
+    method: ClassVar[str]
+    functions: ClassVar[str]
+
+    def initialise(self, dataset: Dataset) -> Scene:
+        """The first scene; raises PlaneFitError where a method needs masks of panes and these do not do."""
+        scene: Scene = self._function("scene")(self, dataset)
+        return scene
+
+    def renderer(self) -> Renderer:
+        """The renderer of the finished scene, with all its layers."""
+        renderer: Renderer = self._function("renderer")(self)
+        return renderer
+
+    def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
+        """The training stages of a run of this length."""
+        stages: tuple[Stage, ...] = self._function("stages")(self, seed, iterations)
+        return stages
+
+    def _function(self, name: str) -> Any:
+        module, _, beginning = self.functions.partition(":")
+        return getattr(importlib.import_module(module), f"{beginning}_{name}")
