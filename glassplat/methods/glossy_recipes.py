@@ -9,7 +9,6 @@ from typing import Annotated, Literal
 from glassplat.methods.splat_recipe import Primitive
 from glassplat.options import (
     ESSENTIAL,
-    Color,
     Finite,
     InnerShare,
     Internal,
@@ -17,7 +16,6 @@ from glassplat.options import (
     Positive,
     Several,
     Share,
-    ShDegree,
 )
 from glassplat.scene import SH_ZERO
 from glassplat.training.options import (
@@ -28,11 +26,8 @@ from glassplat.training.options import (
     MethodRecipe,
     MirrorSearch,
     NormalPropagation,
-    PhotoExposure,
-    PoseRefinement,
     PropagationSchedule,
     ReflectionRates,
-    Strategy,
     SurroundingsOptions,
     SurroundingsStart,
     Texels,
@@ -46,9 +41,6 @@ class GlossyOptions(MethodRecipe):
     Attributes:
         sh_degree: highest degree of the view-dependent colour, which grows once propagation has ended unless a
             method says otherwise.
-        ssim_weight: lambda, share of D-SSIM in the photometric loss.
-        view_dependence_weight: of the squares of the spherical harmonics beyond the constant one.
-        background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
         bootstrap: share of the run without reflection (paper: a few thousand iterations); where mirrors are searched
             for afterwards it is a run of `splat`, else harmonics wait.
         texels: edge length of the environment's cube faces in the end.
@@ -78,18 +70,8 @@ class GlossyOptions(MethodRecipe):
             (`raise_rates_matte`, `raise_rates_found`), not meanwhile: that costs a mirror ball its normals
             (lab/training.md).
         reflection_rates: learning rates of strength and environment.
-        intervals: when opacities are reset and the SH degree grows.
-        strategy: what decides how many Gaussians there are and where; `densify` or `mcmc` holds its options.
-        densify: when and how Gaussians are added and pruned under `default`.
-        mcmc: when and how Gaussians are relocated and added under `mcmc`.
-        exposure: whether the exposure of each photograph is learned.
-        poses: whether the camera of each photograph is corrected.
     """
 
-    sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
-    ssim_weight: Share = 0.2
-    view_dependence_weight: NotNegative = 0.0
-    background: Annotated[Color | None, ESSENTIAL] = None
     bootstrap: Share = 0.06
     texels: Annotated[Texels, ESSENTIAL] = 64
     first_texels: Texels = 16
@@ -110,11 +92,6 @@ class GlossyOptions(MethodRecipe):
     rates: GaussianRates = field(default_factory=partial(GaussianRates, short_run_power=0.0))
     reflection_rates: Internal[ReflectionRates] = field(default_factory=ReflectionRates)
     intervals: Intervals = field(default_factory=lambda: Intervals(opacity=0.005, least=150))
-    strategy: Annotated[Strategy, ESSENTIAL] = "default"
-    densify: DefaultDensify = field(default_factory=DefaultDensify)
-    mcmc: McmcDensify = field(default_factory=McmcDensify)
-    exposure: PhotoExposure = field(default_factory=PhotoExposure)
-    poses: PoseRefinement = field(default_factory=PoseRefinement)
 
     def contradiction(self) -> str | None:
         """Contradiction between the options, if any."""

@@ -10,14 +10,12 @@ from glassplat.options import (
     ESSENTIAL,
     Ascending,
     Blend,
-    Color,
     InnerShare,
     Internal,
     NotNegative,
     Positive,
     Range,
     Share,
-    ShDegree,
 )
 from glassplat.panes import PlaneFit
 from glassplat.training.options import (
@@ -26,10 +24,7 @@ from glassplat.training.options import (
     Intervals,
     McmcDensify,
     MethodRecipe,
-    PhotoExposure,
     Photographer,
-    PoseRefinement,
-    Strategy,
 )
 
 
@@ -76,11 +71,8 @@ class PlanarRecipe(MethodRecipe):
     """TR-Gaussians: transmission, reflection and planes, trained in three stages.
 
     Attributes:
-        sh_degree: highest degree of the view-dependent colour.
-        ssim_weight: lambda, share of D-SSIM in the photometric loss.
         view_dependence_weight: of the squares of the spherical harmonics beyond the constant one. Mirrored views see
             Gaussians from where no photograph does, so that harmonics extrapolate; the paper has no such term.
-        background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
         stage_shares: lengths of the three stages in relation to each other (paper: 3000, 3000 and 24,000 iterations).
         fresnel: how the strength rises with the angle: as that of a pane with two surfaces, by Schlick's curve of one
             surface as in the paper, or not at all (ablation).
@@ -104,28 +96,19 @@ class PlanarRecipe(MethodRecipe):
         perturbation: of opacities; amplitude zero switches it off (ablation).
         moving_mean: let the gradient of the depth deviation pass through the mean depth too, as Eq. 14 is written; if
             not, Gaussians are drawn to the mean, and the mean not to them.
-        rates: learning rates of the Gaussians.
         plane_fit: how planes are found from masks.
-        intervals: when opacities are reset and the SH degree grows.
         strategy: what decides how many primary Gaussians there are and where: densification, or MCMC (Eq. 20), under
             which opacities are reset once, after reflections were turned round.
         early_resets: reset opacities in the first two stages too, at the intervals of the third, as in the paper.
         densify_by: the views by which primary Gaussians are densified: those that show them directly, or their mirror
             images if these need more detail, each counting by what panes leave of it; or all views and mirror images
             alike.
-        densify: when and how Gaussians are added and pruned under `default`.
-        mcmc: when and how Gaussians are relocated and added under `mcmc`.
-        exposure: whether the exposure of each photograph is learned.
-        poses: whether the camera of each photograph is corrected.
         photographer: whether panes show who took the photographs.
     """
 
     method = "planar"
     functions = "glassplat.methods.planar:planar"
-    sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
-    ssim_weight: Share = 0.2
     view_dependence_weight: NotNegative = 0.02
-    background: Annotated[Color | None, ESSENTIAL] = None
     stage_shares: Internal[tuple[Positive, Positive, Positive]] = (0.1, 0.1, 0.8)
     fresnel: Internal[Fresnel] = "pane"
     intensity: Internal[bool] = True
@@ -143,16 +126,9 @@ class PlanarRecipe(MethodRecipe):
     conflict: Internal[Literal["cells", "pixels"]] = "cells"
     moving_mean: Internal[bool] = False
     perturbation: Perturbation = field(default_factory=Perturbation)
-    rates: GaussianRates = field(default_factory=GaussianRates)
     plane_fit: PlaneFit = field(default_factory=PlaneFit)
-    intervals: Intervals = field(default_factory=Intervals)
-    strategy: Annotated[Strategy, ESSENTIAL] = "default"
     early_resets: Internal[bool] = False
     densify_by: Internal[Literal["direct", "all"]] = "direct"
-    densify: DefaultDensify = field(default_factory=DefaultDensify)
-    mcmc: McmcDensify = field(default_factory=McmcDensify)
-    exposure: PhotoExposure = field(default_factory=PhotoExposure)
-    poses: PoseRefinement = field(default_factory=PoseRefinement)
     photographer: Photographer = field(default_factory=Photographer)
 
     @classmethod

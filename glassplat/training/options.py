@@ -12,6 +12,7 @@ import tyro
 from glassplat.options import (
     ESSENTIAL,
     Ascending,
+    Color,
     Count,
     InnerShare,
     Internal,
@@ -431,16 +432,40 @@ class SurroundingsOptions:
     reset: Internal[Share] = 0.0
 
 
+@dataclass(frozen=True)
 class MethodRecipe:
-    """Base of the methods' recipes, which import PyTorch only where they are used.
+    """Options of all methods, whose recipes import PyTorch only where they are used.
 
     Attributes:
         method: its name on the command line.
         functions: module, and beginning of the names, of its functions `*_scene`, `*_renderer` and `*_stages`.
+        sh_degree: highest degree of the view-dependent colour.
+        ssim_weight: lambda, share of D-SSIM in the photometric loss.
+        view_dependence_weight: of the squares of the spherical harmonics beyond the constant one.
+        background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
+        rates: learning rates of the Gaussians.
+        intervals: when opacities are reset and the SH degree grows.
+        strategy: what decides how many Gaussians there are and where; `densify` or `mcmc` holds its options.
+        densify: when and how Gaussians are added and pruned under `default`.
+        mcmc: when and how Gaussians are relocated and added under `mcmc`.
+        exposure: whether the exposure of each photograph is learned.
+        poses: whether the camera of each photograph is corrected.
     """
 
     method: ClassVar[str]
     functions: ClassVar[str]
+
+    sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
+    ssim_weight: Share = 0.2
+    view_dependence_weight: NotNegative = 0.0
+    background: Annotated[Color | None, ESSENTIAL] = None
+    rates: GaussianRates = field(default_factory=GaussianRates)
+    intervals: Intervals = field(default_factory=Intervals)
+    strategy: Annotated[Strategy, ESSENTIAL] = "default"
+    densify: DefaultDensify = field(default_factory=DefaultDensify)
+    mcmc: McmcDensify = field(default_factory=McmcDensify)
+    exposure: PhotoExposure = field(default_factory=PhotoExposure)
+    poses: PoseRefinement = field(default_factory=PoseRefinement)
 
     def initialise(self, dataset: Dataset) -> Scene:
         """The first scene; raises PlaneFitError where a method needs masks of panes and these do not do."""
