@@ -13,12 +13,10 @@ from glassplat.training.actions import GrowSh, Population, SeedUnexplained, defa
 from glassplat.training.corrections import corrections_begun, corrections_learnt
 from glassplat.training.densify import as_discs
 from glassplat.training.losses import LossTerm, PhotometricLoss, disc_normals, distortion
-from glassplat.training.options import PUBLISHED_ITERATIONS
+from glassplat.training.options import PUBLISHED_ITERATIONS, MethodRecipe
 from glassplat.training.stage import AverageLast, Every, Stage
 
 if TYPE_CHECKING:
-    from glassplat.methods.glossy_recipes import DeferredRecipe
-    from glassplat.methods.planar_recipe import PlanarRecipe
     from glassplat.methods.splat_recipe import DiscTerms, SplatRecipe
 
 
@@ -75,7 +73,7 @@ def _missing(recipe: SplatRecipe) -> tuple[SeedUnexplained, ...]:
     return tuple(SeedUnexplained((moment,), _bare(recipe)) for moment in SEED_AT if wanted)
 
 
-def population_of(recipe: SplatRecipe | PlanarRecipe | DeferredRecipe) -> Population:
+def population_of(recipe: MethodRecipe) -> Population:
     """Contribution of the recipe's strategy."""
     if recipe.strategy == "mcmc":
         population = mcmc_population(recipe.mcmc, recipe.rates.of("primary")["primary.means"])

@@ -19,7 +19,7 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes, rectangle_offsets
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import Densify
-from glassplat.training.options import DefaultDensify, Photographer, Rate
+from glassplat.training.options import DefaultDensify, MethodRecipe, Photographer, Rate
 from glassplat.training.stage import Clock, Setup, Stage, TrainState, Work, carried_out
 
 END_SHARE = 0.1
@@ -28,20 +28,20 @@ CORRECTIONS: dict[str, type[ByPhotograph]] = {"exposures": Exposures, "poses": P
 """Of photographs, by part of the scene."""
 
 
-def _rates(recipe: Any) -> dict[str, float]:
+def _rates(recipe: MethodRecipe) -> dict[str, float]:
     """Learning rates at the start, by part of the scene, of those that learn at all."""
     rates = {"exposures": recipe.exposure.rate, "poses": recipe.poses.rate}
     return {part: rate for part, rate in rates.items() if rate}
 
 
-def corrections_begun(recipe: Any, scene: Scene, dataset: Dataset) -> Scene:
+def corrections_begun(recipe: MethodRecipe, scene: Scene, dataset: Dataset) -> Scene:
     """The first scene, with corrections that change nothing yet."""
     names = tuple(view.name for view in dataset.train)
     begun: dict[str, Any] = {part: CORRECTIONS[part].neutral(names) for part in _rates(recipe)}
     return replace(scene, **begun)
 
 
-def corrections_learnt(recipe: Any, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+def corrections_learnt(recipe: MethodRecipe, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
     """The stages, in which the corrections learn as well."""
     for part, start in _rates(recipe).items():
         rate = {f"{part}.{CORRECTIONS[part].TENSOR}": Rate(start, start * END_SHARE)}
