@@ -196,7 +196,7 @@ class PixelMap:
     def ignored(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """[H, W] of the photograph's size to [height, width]; 1 where any pixel that is averaged has a label."""
         if self.lens is not None:
-            labels = _undistort(labels, self.lens.as_colmap(), "NEAREST_NEIGHBOR")
+            labels = undistort(labels, self.lens.as_colmap(), "NEAREST_NEIGHBOR")
         if labels.shape == (self.height, self.width):
             return labels
         return (resize_by_area(labels > 0, self.width, self.height) > LEAST_SHARE).astype(np.uint8)
