@@ -53,9 +53,10 @@ SAME_SIZE = 0.1
 def load_mirror_nerf(root: Path) -> Capture | None:
     """Read a Mirror-NeRF scene; None when the folder is none.
 
-    What tells it from other `transforms_train.json` captures, besides the folder of masks and no folder of panes:
-    intrinsics spelled `fx` or as a matrix, or masks called `MirrorMask_*`. Test views are those of the test file, or
-    else of the validation file; photographs that are in it and in the training file too are only tested on.
+    What tells it from other `transforms_train.json` captures, besides the folder of masks: these are called
+    `MirrorMask_*`; or intrinsics are spelled `fx` or as a matrix, and there is no folder of panes. Test views are
+    those of the test file, or else of the validation file; photographs that are in it and in the training file too
+    are only tested on.
 
     Raises:
         InputError: a broken file, no mask that belongs to a photograph, or poses with which the mirror lies behind
@@ -82,10 +83,12 @@ def load_mirror_nerf(root: Path) -> Capture | None:
 
 def _is_mirror_nerf(root: Path) -> bool:
     masks = root / MASK_FOLDER
-    if not (root / TRAIN).is_file() or not masks.is_dir() or (root / PANE_FOLDER).is_dir():
+    if not (root / TRAIN).is_file() or not masks.is_dir():
         return False
     if next(masks.glob(f"{SYNTHETIC_MASK}*"), None) is not None:
         return True
+    if (root / PANE_FOLDER).is_dir():
+        return False
     settings = read_settings(root / TRAIN)
     return "fx" in settings or "intrinsics" in settings["frames"][0]
 
