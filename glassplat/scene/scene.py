@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -272,7 +272,8 @@ def tilt_pane(scene: Scene, label: int, about_tangent: float, about_bitangent: f
         return scene
     tangent, bitangent = (axes[row] for axes in scene.planes.axes())
     axis = torch.nn.functional.normalize(about_tangent * tangent + about_bitangent * bitangent, dim=0)
-    return _turn_pane(scene, row, torch.cat([axis.new_tensor([math.cos(angle / 2)]), math.sin(angle / 2) * axis]))
+    turn = torch.cat([axis.new_tensor([math.cos(angle / 2)]), math.sin(angle / 2) * axis])
+    return _turn_pane(scene, row, turn, glass_of_pane(scene, row))
 
 
 def shift_pane(scene: Scene, label: int, distance: float) -> Scene:
@@ -290,29 +291,44 @@ def shift_pane(scene: Scene, label: int, distance: float) -> Scene:
     _check_finite(label, distance)
     if distance == 0:
         return scene
-    return _translate_pane(scene, row, distance * scene.planes.normals[row])
+    return _translate_pane(scene, row, distance * scene.planes.normals[row], glass_of_pane(scene, row))
 
 
-def move_pane(scene: Scene, label: int, turn: Sequence[float], step: Sequence[float]) -> Scene:
-    """The pane and its glass, turned about the rectangle's middle and then taken elsewhere; not to move changes no bit.
+class PaneMove(NamedTuple):
+    """Movement of a pane: a rotation about its middle, then a step, in world axes and units.
+
+    label: which pane. turn: quaternion `wxyz`, of any length. step: from where the middle was to where it is.
+    """
+
+    label: int
+    turn: tuple[float, ...]
+    step: tuple[float, ...]
+
+
+def move_panes(scene: Scene, moves: Sequence[PaneMove]) -> Scene:
+    """Panes and their glass, turned and then taken elsewhere; not to move changes no bit.
+
+    The glass of a pane is what lies nearest to it before any of them moves.
 
     Args:
         scene: what to edit; it is left as it is.
-        label: which pane.
-        turn: [4] quaternion, `wxyz`, of any length, in world axes.
-        step: [3] from where the middle was to where it is, world units.
+        moves: one after the other.
 
     Raises:
-        ValueError: no pane has the label, a number is not finite, or the quaternion has no length.
+        ValueError: no pane has a label, a number is not finite, or a quaternion has no length.
     """
-    row = row_of(scene.planes, label)
-    _check_finite(label, *turn, *step)
-    if not any(turn):
-        raise ValueError(f"pane {label} cannot be turned by a quaternion of no length; expected w, x, y, z")
-    if any(turn[1:]):
-        quat = torch.nn.functional.normalize(scene.planes.centers.new_tensor(turn), dim=0)
-        scene = _turn_pane(scene, row, quat)
-    return _translate_pane(scene, row, scene.planes.centers.new_tensor(step)) if any(step) else scene
+    rows = [row_of(scene.planes, label) for label, _, _ in moves]
+    owned = {row: glass_of_pane(scene, row) for row in rows}
+    for row, (label, turn, step) in zip(rows, moves, strict=True):
+        _check_finite(label, *turn, *step)
+        if not any(turn):
+            raise ValueError(f"pane {label} cannot be turned by a quaternion of no length; expected w, x, y, z")
+        if any(turn[1:]):
+            quat = torch.nn.functional.normalize(scene.planes.centers.new_tensor(turn), dim=0)
+            scene = _turn_pane(scene, row, quat, owned[row])
+        if any(step):
+            scene = _translate_pane(scene, row, scene.planes.centers.new_tensor(step), owned[row])
+    return scene
 
 
 def glass_of_pane(scene: Scene, row: int) -> Tensor:
@@ -332,12 +348,12 @@ def row_of(planes: Planes, label: int) -> int:
     return planes.labels.index(label)
 
 
-def _turn_pane(scene: Scene, row: int, turn: Tensor) -> Scene:
-    """A pane and its glass, turned about its middle by a unit quaternion [4]."""
+def _turn_pane(scene: Scene, row: int, turn: Tensor, owned: Tensor) -> Scene:
+    """A pane and the glass [N] bool that it owns, turned about its middle by a unit quaternion [4]."""
     rotation = rotation_from_quat(turn)
     planes = scene.planes
     turned = {name: _with_row(getattr(planes, name), row, rotation) for name in ("raw_normals", "tangents")}
-    glass, of_pane = scene.glass, glass_of_pane(scene, row)[:, None]
+    glass, of_pane = scene.glass, owned[:, None]
     center = planes.centers[row].to(glass.means)
     means = (glass.means - center) @ rotation.to(glass.means).T + center
     quats = quat_product(turn.to(glass.quats).expand_as(glass.quats), glass.quats)
@@ -345,12 +361,12 @@ def _turn_pane(scene: Scene, row: int, turn: Tensor) -> Scene:
     return replace(scene, glass=glass.with_tensors(placed), planes=planes.with_tensors(turned))
 
 
-def _translate_pane(scene: Scene, row: int, step: Tensor) -> Scene:
-    """A pane and its glass, taken elsewhere by a step [3]."""
+def _translate_pane(scene: Scene, row: int, step: Tensor, owned: Tensor) -> Scene:
+    """A pane and the glass [N] bool that it owns, taken elsewhere by a step [3]."""
     centers = scene.planes.centers.clone()
     centers[row] += step
     means = scene.glass.means
-    placed = torch.where(glass_of_pane(scene, row)[:, None], means + step.to(means), means)
+    placed = torch.where(owned[:, None], means + step.to(means), means)
     planes = scene.planes.with_tensors({"centers": centers})
     return replace(scene, glass=scene.glass.with_tensors({"means": placed}), planes=planes)
 

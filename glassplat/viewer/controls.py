@@ -18,7 +18,8 @@ from glassplat.publish.cleaning import Floaters
 from glassplat.render.layers import LABEL_COLORS
 from glassplat.scene.camera import Camera
 from glassplat.scene.panes import Planes
-from glassplat.viewer.drawing import LEAST_GAIN, MOST_GAIN, PaneMove, ViewerState, ViewRequest, matrix_of, wxyz_of
+from glassplat.scene.scene import PaneMove
+from glassplat.viewer.drawing import LEAST_GAIN, MOST_GAIN, ViewerState, ViewRequest, matrix_of, wxyz_of
 
 logger = logging.getLogger(__name__)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from glassplat.render.frame import Renderer
 from glassplat.render.layers import error_colors, layer_image
 from glassplat.render.planar import PHOTOGRAPHED
 from glassplat.scene.camera import Camera, quat_from_rotation, rotation_from_quat
-from glassplat.scene.scene import Scene, as_mirrors, move_pane, with_reflectance, without_glass
+from glassplat.scene.scene import PaneMove, Scene, as_mirrors, move_panes, with_reflectance, without_glass
 
 
 def matrix_of(wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -98,14 +98,6 @@ MEASURED_ROWS, SURFACE_COVERAGE = 480, 0.5
 """Of the picture in which points are measured, and below which it shows no surface."""
 
 
-class PaneMove(NamedTuple):
-    """New place of a pane: turned by a quaternion [4], `wxyz`, about its middle, then shifted by [3] world units."""
-
-    label: int
-    turn: tuple[float, ...]
-    step: tuple[float, ...]
-
-
 @dataclass(frozen=True)
 class ViewRequest:
     """A view that a client asks for.
@@ -147,8 +139,7 @@ def edit_scene(scene: Scene, request: ViewRequest) -> Scene:
         scene = replace(scene, primary=scene.primary.select(request.kept.to(scene.primary.means.device)))
     if not len(scene.planes) or request.glass == "none":
         return without_glass(scene) if len(scene.planes) else scene
-    for move in request.moves:
-        scene = move_pane(scene, *move)
+    scene = move_panes(scene, request.moves)
     for label, reflectance in request.reflectances:
         scene = with_reflectance(scene, label, reflectance)
     if request.glass == "mirror":

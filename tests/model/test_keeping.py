@@ -17,7 +17,7 @@ from glassplat.cli.serving import writer_for
 from glassplat.errors import InputError
 from glassplat.files.sidecars import read_cameras
 from glassplat.model.watching import FolderWriter
-from glassplat.scene.scene import move_pane
+from glassplat.scene.scene import PaneMove, move_panes
 from tests.cli.tiny_run import write_run
 from tests.model.test_model import model
 from tests.training.tiny_capture import tiny_capture, true_scene
@@ -29,7 +29,7 @@ def test_an_edited_scene_is_a_run_of_its_own_that_knows_the_photographs(tmp_path
     run = write_run(tmp_path / "run")
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     loaded = glassplat.load(run, device="cpu")
-    edited = move_pane(loaded.scene, 1, (1.0, 0.0, 0.05, 0.0), (0.0, 0.0, 0.1))
+    edited = move_panes(loaded.scene, [PaneMove(1, (1.0, 0.0, 0.05, 0.0), (0.0, 0.0, 0.1))])
     said = FolderWriter(loaded, tmp_path).write_scene(edited, " place, seen twice ".replace(",", " +").strip())
     place = tmp_path / "place + seen twice"
     assert f"glassplat view '{place}'" in said

@@ -12,10 +12,11 @@ import torch
 from glassplat.render.planar import Planar
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import (
+    PaneMove,
     Scene,
     as_mirrors,
     glass_of_pane,
-    move_pane,
+    move_panes,
     shift_pane,
     tilt_pane,
     with_pane,
@@ -99,7 +100,7 @@ def test_no_motion_changes_no_bit() -> None:
     scene = showcase()
     assert_same(tilt_pane(scene, 1, 0.0, 0.0), scene)
     assert_same(shift_pane(scene, 1, 0.0), scene)
-    assert_same(move_pane(scene, 1, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), scene)
+    assert_same(move_panes(scene, [PaneMove(1, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))]), scene)
     assert torch.equal(Planar()(tilt_pane(scene, 1, 0, 0), CAMERA).rgb, Planar()(scene, CAMERA).rgb)
 
 
@@ -121,7 +122,7 @@ def test_a_turn_and_a_step_are_a_tilt_and_a_shift() -> None:
     tangent, normal = scene.planes.axes()[0][1], scene.planes.normals[1]
     turn = (2 * math.cos(half), *(2 * math.sin(half) * tangent).tolist())
     expected = tilt_pane(shift_pane(scene, 7, 0.5), 7, 30.0, 0.0)
-    edited = move_pane(scene, 7, turn, (0.5 * normal).tolist())
+    edited = move_panes(scene, [PaneMove(7, turn, (0.5 * normal).tolist())])
     for name, tensor in edited.parameters().items():
         torch.testing.assert_close(tensor, expected.parameters()[name])
     assert torch.equal(edited.glass.means[:12], scene.glass.means[:12])
@@ -158,6 +159,19 @@ def test_a_pane_moves_with_its_own_glass_and_no_other(move: Callable[[Scene], Sc
     torch.testing.assert_close(height(edited), height(scene))
 
 
+def test_panes_that_change_places_take_their_own_glass_along() -> None:
+    """Also where the one passes through the other, whose glass is nearer to it then."""
+    scene = two_panes()
+    own = glass_of_pane(scene, 1)
+    (first, second), turn = scene.planes.centers, (1.0, 0.0, 0.0, 0.0)
+    step = (second - first).tolist()
+    moves = [PaneMove(scene.planes.labels[0], turn, step), PaneMove(7, turn, [-along for along in step])]
+    edited = move_panes(scene, moves)
+    torch.testing.assert_close(edited.planes.centers, scene.planes.centers.flip(0))
+    moved = torch.where(own[:, None], first - second, second - first)
+    torch.testing.assert_close(edited.glass.means, scene.glass.means + moved)
+
+
 def test_the_scene_that_is_edited_stays_as_it_is() -> None:
     scene, untouched = showcase(), showcase()
     for edit in (lambda: as_mirrors(scene, [1]), lambda: tilt_pane(scene, 1, 5, 5), lambda: shift_pane(scene, 1, 1.0)):
@@ -172,7 +186,7 @@ def test_the_scene_that_is_edited_stays_as_it_is() -> None:
         lambda s: with_reflectance(s, 3, 0.5),
         lambda s: tilt_pane(s, 3, 1.0, 0.0),
         lambda s: shift_pane(s, 3, 1.0),
-        lambda s: move_pane(s, 3, (1, 0, 0, 0), (0, 0, 1)),
+        lambda s: move_panes(s, [PaneMove(3, (1, 0, 0, 0), (0, 0, 1))]),
     ],
 )
 def test_an_unknown_label_lists_those_there_are(edit: Callable[[Scene], Scene]) -> None:
@@ -194,9 +208,9 @@ def test_an_infinite_motion_is_refused() -> None:
     with pytest.raises(ValueError, match="expected finite numbers"):
         tilt_pane(showcase(), 1, float("nan"), 0.0)
     with pytest.raises(ValueError, match="expected finite numbers"):
-        move_pane(showcase(), 1, (1, 0, 0, 0), (0, float("nan"), 0))
+        move_panes(showcase(), [PaneMove(1, (1, 0, 0, 0), (0, float("nan"), 0))])
     with pytest.raises(ValueError, match="quaternion of no length"):
-        move_pane(showcase(), 1, (0, 0, 0, 0), (0, 0, 0))
+        move_panes(showcase(), [PaneMove(1, (0, 0, 0, 0), (0, 0, 0))])
 
 
 def test_a_label_names_one_pane() -> None:

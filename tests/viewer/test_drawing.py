@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from glassplat.render.deferred import Deferred
 from glassplat.render.planar import Planar
 from glassplat.scene.corrections import Exposures
-from glassplat.scene.scene import Environment, Scene, as_mirrors, move_pane, with_reflectance, without_glass
-from glassplat.viewer.drawing import PaneMove, Viewpoints, ViewRequest, draw_picture, edit_scene, error_drawn
+from glassplat.scene.scene import Environment, PaneMove, Scene, as_mirrors, move_panes, with_reflectance, without_glass
+from glassplat.viewer.drawing import Viewpoints, ViewRequest, draw_picture, edit_scene, error_drawn
 from glassplat.viewer.server import cam_from_world
 from tests.training.tiny_capture import tiny_capture, true_scene
 
@@ -25,7 +25,7 @@ EDITS = {
     "none": (replace(REQUEST, glass="none"), without_glass(true_scene())),
     "moved": (
         replace(REQUEST, moves=(PaneMove(1, (1.0, 0.0, 0.1, 0.0), (0.0, 0.2, 0.0)),)),
-        move_pane(true_scene(), 1, (1.0, 0.0, 0.1, 0.0), (0.0, 0.2, 0.0)),
+        move_panes(true_scene(), [PaneMove(1, (1.0, 0.0, 0.1, 0.0), (0.0, 0.2, 0.0))]),
     ),
     "reflectance": (replace(REQUEST, reflectances=((1, 0.9),)), with_reflectance(true_scene(), 1, 0.9)),
 }
