@@ -377,8 +377,11 @@ def test_a_rank_that_does_not_lead_saves_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", [InputError, FileNotFoundError])
-def test_a_photograph_that_cannot_be_read_any_more_costs_nothing(tmp_path: Path, kind: type[Exception]) -> None:
+def test_a_photograph_that_cannot_be_read_any_more_costs_nothing(
+    tmp_path: Path, kind: type[Exception], monkeypatch: pytest.MonkeyPatch
+) -> None:
     gone, memory = threading.Event(), Memory(0.0)
+    monkeypatch.setattr("glassplat.captures.view.DISK_RATE", 1e-9)  # Nothing is worth a copy on disk, however busy.
 
     def guarded(view: View) -> View:
         def read() -> torch.Tensor:
