@@ -175,7 +175,8 @@ class SceneEdits:
         tilt: pane label and two angles in degrees, about the pane's first and second side; `--tilt 1 10 0`.
         shift: pane label and a distance along the pane's normal in world units, those of the capture's poses;
             the normal is in results.json, and a negative distance goes the other way; `--shift 1 0.05`.
-        surroundings: panorama (.exr or .png, equirectangular, z up) that glossy things mirror instead of their own.
+        surroundings: panorama (.exr or .png, equirectangular, z up) that glossy things mirror instead of their own,
+            near and far.
     """
 
     remove_glass: bool = False
@@ -220,22 +221,30 @@ class SceneEdits:
 
 
 def in_surroundings(scene: Scene, panorama: Path) -> Scene:
-    """The scene with another environment, as finely divided as its own.
+    """The scene with another environment, as finely divided as its own, and without near surroundings before it.
 
     Raises:
-        InputError: the scene mirrors no environment, or the panorama cannot be read.
+        InputError: nothing in the scene mirrors its surroundings, or the panorama cannot be read.
     """
     from glassplat.files.sidecars import read_equirect
     from glassplat.render.deferred import environment_from_equirect
 
-    if scene.environment.is_empty:
+    near = scene.surroundings
+    if scene.environment.is_empty and not len(near):
         raise InputError("nothing in the run mirrors its surroundings; train it with `glassplat train deferred`")
     try:
-        environment = environment_from_equirect(read_equirect(panorama), scene.environment.size)
+        image = read_equirect(panorama)
+        size = scene.environment.size or min(LARGEST_FACE, max(1, image.shape[0] // 2))
+        environment = environment_from_equirect(image, size)
     except (FileNotFoundError, ValueError) as error:
         raise InputError(str(error)) from error
-    raw = environment.raw.to(scene.environment.raw)
-    return replace(scene, environment=replace(scene.environment, raw=raw))
+    raw = environment.raw.to(scene.primary.means)
+    far = replace(scene.environment, raw=raw)
+    return replace(scene, environment=far, surroundings=near.select(near.means.new_zeros(len(near)).bool()))
+
+
+LARGEST_FACE = 512
+"""Texels along a face of an environment where the scene had none of its own."""
 
 
 Split = Literal["train", "test", "all"]

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from glassplat.cli.main import main
+from glassplat.cli.places import SceneEdits
 from glassplat.cli.runs import open_run
+from glassplat.files.sidecars import write_equirect
+from glassplat.scene.scene import Environment
 from glassplat.training.checkpoint import load_checkpoint
 from tests.training.object_capture import few_steps, write_object_capture
 
@@ -62,6 +66,19 @@ def test_a_run_that_lost_its_surroundings_says_so(run: Path, capsys: pytest.Capt
     (folder / "surroundings.ply").unlink()
     assert main(["eval", str(run)]) == 2
     assert "no surroundings.ply in" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("mirrors", ["both", "surroundings"])
+def test_a_panorama_takes_the_place_of_near_surroundings_too(run: Path, mirrors: str) -> None:
+    panorama = run.parent / "red.png"
+    write_equirect(panorama, torch.tensor([1.0, 0.0, 0.0]).expand(8, 16, 3))
+    stored = open_run(run, "cpu")
+    assert len(stored.scene.surroundings)
+    own = Environment.empty() if mirrors == "surroundings" else stored.scene.environment
+    scene = SceneEdits(surroundings=panorama).apply(replace(stored.scene, environment=own))
+    camera = stored.dataset.test[0].camera
+    seen = stored.renderer.with_layers(("surroundings",))(scene, camera).layers["surroundings"]
+    assert seen[..., 0].min() > 0.95 and seen[..., 1:].max() < 0.05
 
 
 def test_broken_normals_beside_the_photographs_are_named(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
