@@ -10,6 +10,7 @@ turn it.
 from __future__ import annotations
 
 import logging
+import math
 import struct
 import zlib
 from dataclasses import replace
@@ -222,12 +223,35 @@ def spz_bytes(gaussians: Gaussians, version: int = 3) -> bytes:
             step,
             farthest,
         )
+    _warn_of_sizes(gaussians.log_scales)
     sections = [section.tobytes() for section in packed_sections(gaussians, layout)]
     head = (MAGIC, version, layout.number, layout.degree, layout.fractional_bits, 0)
     if version == 4:
         return _streamed(head, sections)
     packer = zlib.compressobj(9, zlib.DEFLATED, GZIP_WINDOW)
     return packer.compress(HEADER.pack(*head, 0) + b"".join(sections)) + packer.flush()
+
+
+MOST_CLIPPED = 0.001
+"""Share of the Gaussians whose sizes may be clipped without a warning."""
+THIN = 3.0
+"""A Gaussian whose length is e to this times its thickness, or more, looks as if it had none."""
+
+
+def _warn_of_sizes(log_scales: Tensor) -> None:
+    """Warns where many Gaussians are larger than SPZ can say, or so small that being thicker changes their look."""
+    lowest, highest, within = LOWEST_LOG_SCALE, LOWEST_LOG_SCALE + 255 / STEPS_PER_LOG, 0.5 / STEPS_PER_LOG
+    largest, smallest = log_scales.amax(dim=1), log_scales.amin(dim=1)
+    small = (smallest < lowest - within) & (largest < lowest + THIN)
+    share = float((small | (largest > highest + within)).double().mean())
+    if share > MOST_CLIPPED:
+        log.warning(
+            "SPZ and the web page hold sizes of %.2g to %.3g units; those of %.3g %% of the Gaussians are clipped, and "
+            "they look different. Bring the scene to other units with `glassplat clean --scale`, or write a PLY",
+            math.exp(lowest),
+            math.exp(highest),
+            100 * share,
+        )
 
 
 def read_spz(path: Path | str) -> Gaussians:

@@ -144,6 +144,21 @@ def test_what_cannot_be_written_is_refused(change: dict, words: str, tmp_path: P
     assert not (tmp_path / "a.spz").exists()
 
 
+@pytest.mark.parametrize("log_scale", [-12.0, 8.0])
+def test_sizes_that_are_clipped_are_told_of(log_scale: float, caplog: pytest.LogCaptureFixture) -> None:
+    before = typical(count=2000)
+    spz_bytes(before)
+    flat = before.log_scales.clone()
+    flat[:, 2] = -14  # How thin a flat Gaussian is cannot be seen.
+    spz_bytes(before.with_tensors({"log_scales": flat}))
+    flat[:2] = log_scale
+    spz_bytes(before.with_tensors({"log_scales": flat}))
+    assert not caplog.messages
+    flat[:10] = log_scale
+    spz_bytes(before.with_tensors({"log_scales": flat}))
+    assert "4.5e-05 to 379 units; those of 0.5 % of" in caplog.text and "`glassplat clean --scale`" in caplog.text
+
+
 def test_positions_that_are_rounded_by_more_than_a_gaussian_are_told_of(caplog: pytest.LogCaptureFixture) -> None:
     far = typical().means.clone()
     spz_bytes(typical())
