@@ -25,7 +25,7 @@ from glassplat.files.scene_folder import drawable, read_splats
 from glassplat.files.sidecars import read_cameras, read_planes, write_cameras, write_equirect, write_planes
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
 from glassplat.methods.planar_recipe import PlanarRecipe
-from glassplat.methods.recipe import recipe_to_json, with_background
+from glassplat.methods.recipe import recipe_to_json, resolve_background, with_background
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import RunDirectory
 from glassplat.options import BLACK, Cleaning, Up
@@ -184,9 +184,13 @@ class Model:
         Where one is None, `<name>_reason` says why. Unlike `glassplat eval`, it takes panes from the ground truth or
         else from the rendered mask, never from masks of the capture, and where cameras were corrected, it moves those
         of the test views as their neighbours' instead of aligning them with their photographs. It writes nothing.
+
+        Raises:
+            InputError: the photographs are laid over another background than the model's.
         """
         from glassplat.evaluate.evaluate import evaluate  # Training imports this file, and may never need it.
 
+        resolve_background(with_background(self.recipe, BLACK), dataset)
         renderer = with_photographer(self.renderer, "beside")
         return evaluate(self.scene, renderer, with_corrected_cameras(dataset, self.scene)).results
 

@@ -303,6 +303,15 @@ def test_metrics_are_those_of_the_test_views() -> None:
     assert model().evaluate(tiny_capture())["psnr"] > 40
 
 
+def test_photographs_over_another_background_are_not_measured() -> None:
+    white, black = (dataclasses.replace(tiny_capture(), background=(value,) * 3) for value in (1.0, 0.0))
+    expected = r"laid over \(1.0, 1.0, 1.0\), but .* over \(0.0, 0.0, 0.0\); .* background=\(0.0, 0.0, 0.0\)"
+    for one in (model(), bare()):
+        with pytest.raises(InputError, match=expected):
+            one.evaluate(white)
+    assert model().evaluate(black)["psnr"] > 40
+
+
 def test_metrics_are_of_what_photographs_show_somebody_in_the_glass_too() -> None:
     plain = model()
     drawn = random_gaussians(40, (0.0, 0.0, 0.0), seed=5)
