@@ -349,6 +349,7 @@ class Population:
         post_steps: what follows the optimiser in every step.
         terms: regularisers of the objective.
         densify_until: share of the run until which `edits` read screen gradients.
+        cap: largest number of first Gaussians; None or 0 for no limit.
     """
 
     opacity: float = 0.1
@@ -358,9 +359,15 @@ class Population:
     post_steps: tuple[PostStep, ...] = ()
     terms: tuple[LossTerm, ...] = ()
     densify_until: float = 0.0
+    cap: int | None = None
 
     def initial(self, points: PointCloud, sh_degree: int) -> Gaussians:
-        """The first primary Gaussians, one per point."""
+        """The first primary Gaussians, one per point; under a cap, of points drawn evenly, in every run the same."""
+        if self.cap and len(points) > self.cap:
+            log.info("The first Gaussians are %d of the %d points, as many as the cap allows", self.cap, len(points))
+            generator = torch.Generator().manual_seed(0)
+            kept = torch.randperm(len(points), generator=generator)[: self.cap].to(points.colors.device)
+            points = PointCloud(points.positions[kept], points.colors[kept])
         return gaussians_from_points(points, sh_degree=sh_degree, opacity=self.opacity, spread=self.spread)
 
 
@@ -368,7 +375,7 @@ def default_population(densifier: DefaultDensify, intervals: Intervals) -> Popul
     """3DGS: clone, split, prune, and reset the opacities; and what adds to no view is removed in the end."""
     reset = ResetOpacity(Every(intervals.opacity, 0.0, intervals.reset_stop, intervals.least, only_multiples_of=3))
     edits = (Densify(densifier), PruneIdle(densifier))
-    return Population(edits=edits, resets=(reset,), densify_until=densifier.stop)
+    return Population(edits=edits, resets=(reset,), densify_until=densifier.stop, cap=densifier.cap)
 
 
 MCMC_OPACITY = 0.5
@@ -394,6 +401,7 @@ def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:
         edits=(Relocate(densifier),),
         post_steps=(AddNoise(densifier, means_rate),) if densifier.noise_rate != 0 else (),
         terms=terms,
+        cap=densifier.cap,
     )
 
 

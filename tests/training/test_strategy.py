@@ -21,7 +21,7 @@ from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import differentiate, train
 from glassplat.training.losses import PhotometricLoss
 from glassplat.training.messages import ActionDone, Message, StepDone
-from glassplat.training.options import Intervals, McmcDensify
+from glassplat.training.options import DefaultDensify, Intervals, McmcDensify
 from glassplat.training.stage import AverageLast, Clock, Stage, TrainState
 from tests.training.tiny_capture import tiny_capture, true_scene
 
@@ -226,3 +226,20 @@ def test_screen_gradients_are_collected_for_who_densifies_by_them() -> None:
     assert first.densify_until == 0
     # The glass is densified under either strategy.
     assert {stage.densify_until for stage in later} == {PlanarRecipe().densify.stop}
+
+
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_a_cap_bounds_the_first_gaussians(strategy: Any, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    capture, usual = tiny_capture(), SplatRecipe(strategy=strategy).initialise(tiny_capture()).primary
+    many, few = 10**6, 7
+    capped = [
+        SplatRecipe(strategy=strategy, densify=DefaultDensify(cap=cap), mcmc=McmcDensify(cap=cap)) for cap in (many, 0)
+    ]
+    assert all(torch.equal(recipe.initialise(capture).primary.means, usual.means) for recipe in capped)
+    assert not caplog.messages
+    recipe = SplatRecipe(strategy=strategy, densify=DefaultDensify(cap=few), mcmc=McmcDensify(cap=few))
+    first, again = (recipe.initialise(capture).primary for _ in range(2))
+    assert len(first) == few and torch.equal(first.means, again.means)
+    assert all((usual.means == mean).all(dim=1).any() for mean in first.means)
+    assert f"The first Gaussians are {few} of the {len(usual)} points" in caplog.text
