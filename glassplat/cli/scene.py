@@ -287,7 +287,7 @@ class Export:
         formats: which files; glb is glTF with KHR_gaussian_splatting, html a page that shows the scene in any browser,
             by itself and without a server.
         layer: all is the scene with its panes next to it, as planes.json and glass.ply; transmission is the place
-            without its panes and what they reflect.
+            without its panes and what they and glossy things reflect.
         title: of the page; the run's name if not given.
         credit: shown on the page: who made the scene, and its licence.
         url: where the page will lie on the web. Previews of links to it show preview.jpg, which then lies next to it.

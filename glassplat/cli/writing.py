@@ -27,6 +27,7 @@ from glassplat.files.images import write_image
 from glassplat.files.records import readable_name
 from glassplat.files.sidecars import read_cameras, write_cameras
 from glassplat.files.writing import SPLAT_WRITERS, atomic_write, real_path, scene_source, write_splats
+from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.model import CAMERAS, ENVIRONMENT, GLASS, PANORAMA, PLANES, Model, save_page, write_beside
 from glassplat.publish.camera_paths import fit_to_width, interpolate_cameras, keyframes_of
 from glassplat.publish.film import check_size, side_by_side, wipe_pictures, write_film
@@ -36,7 +37,7 @@ from glassplat.render.layers import layer_image
 from glassplat.render.planar import Planar, dereflected_photo
 from glassplat.scene.camera import Camera
 from glassplat.scene.corrections import in_order
-from glassplat.scene.scene import Scene, without_glass
+from glassplat.scene.scene import Scene
 from glassplat.training.messages import Working
 
 if TYPE_CHECKING:
@@ -214,7 +215,7 @@ def write_clean(command: Clean, console: Console) -> None:
 def write_files(command: Export, console: Console) -> None:
     """Writes the files, and removes what an earlier run of the command wrote and this one does not."""
     model = command.file.open(command.scene, command.device)
-    model = model.with_scene(_chosen(command, command.edits.apply(model.scene)))
+    model = _chosen(command, model.with_scene(command.edits.apply(model.scene)))
     if "html" in command.formats:
         with input_checked():
             check_panes(model.scene)
@@ -258,11 +259,13 @@ def _remove_earlier(command: Export, targets: Sequence[Path], written: Sequence[
         say(console, f"removed {first_names([path.name for path in earlier], len(earlier))} of the earlier run")
 
 
-def _chosen(command: Export, scene: Scene) -> Scene:
+def _chosen(command: Export, model: Model) -> Model:
+    """The model; or the place in its own colours, without anything that reflects, as plain Gaussians."""
     if command.layer == "all":
-        return scene
-    bare = without_glass(scene)
-    return replace(bare, primary=replace(bare.primary, channels={}))
+        return model
+    primary = replace(model.scene.primary, channels={})
+    recipe = SplatRecipe(background=model.recipe.background, primitive="disc" if primary.are_discs else "ellipsoid")
+    return replace(model, scene=Scene(primary, model.scene.extent), recipe=recipe)
 
 
 def _write_page(command: Export, model: Model, console: Console) -> list[Path]:

@@ -15,6 +15,7 @@ from glassplat.cli.runs import open_run
 from glassplat.errors import InputError
 from glassplat.files.images import read_image
 from glassplat.files.sidecars import read_equirect, write_equirect
+from glassplat.model.model import load
 from glassplat.render.deferred import equirect_from_environment
 from glassplat.scene.scene import Environment
 from glassplat.training.checkpoint import load_checkpoint
@@ -93,3 +94,15 @@ def test_what_mirrors_nothing_has_no_surroundings_to_exchange(run: Path) -> None
     scene = replace(open_run(run, "cpu").scene, environment=Environment.empty())
     with pytest.raises(InputError, match="nothing in the run mirrors its surroundings"):
         SceneEdits(surroundings=run.parent / "red.png").apply(scene)
+
+
+def test_its_own_colours_are_exported_as_plain_gaussians(run: Path) -> None:
+    output, stored = run.parent / "bare", open_run(run, "cpu")
+    formats = ["--formats", "ply", "spz", "glb", "html"]
+    assert main(["export", str(run), "--output", str(output), "--layer", "transmission", *formats]) == 0
+    names = ["cameras.json", "glassplat.json", "index.html", "scene.glb", "scene.ply", "scene.spz"]
+    assert sorted(path.name for path in output.iterdir()) == names
+    bare, camera = load(output / "scene.ply", device="cpu"), stored.dataset.test[0].camera
+    assert "logit_strength" not in bare.scene.primary.channels
+    base = replace(stored.renderer, background=(0.0, 0.0, 0.0))(stored.scene, camera).layers["base"]
+    torch.testing.assert_close(bare.render(camera).rgb, base, atol=1e-5, rtol=0)
