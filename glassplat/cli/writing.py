@@ -28,7 +28,17 @@ from glassplat.files.records import readable_name
 from glassplat.files.sidecars import read_cameras, write_cameras
 from glassplat.files.writing import SPLAT_WRITERS, atomic_write, real_path, scene_source, write_splats
 from glassplat.methods.splat_recipe import SplatRecipe
-from glassplat.model.model import CAMERAS, ENVIRONMENT, GLASS, PANORAMA, PLANES, Model, save_page, write_beside
+from glassplat.model.model import (
+    CAMERAS,
+    ENVIRONMENT,
+    GLASS,
+    PANORAMA,
+    PLANES,
+    Model,
+    left_out,
+    save_page,
+    write_beside,
+)
 from glassplat.publish.camera_paths import fit_to_width, interpolate_cameras, keyframes_of
 from glassplat.publish.film import check_size, side_by_side, wipe_pictures, write_film
 from glassplat.publish.web_page import MOST_GAUSSIANS, PREVIEW, Sharing, check_panes, fits, write_preview
@@ -233,6 +243,8 @@ def write_files(command: Export, console: Console) -> None:
             write_splats(kind, splats[kind], model.scene.primary, **options)
         written.append(splats[kind])
         say(console, f"{splats[kind].stat().st_size / 1e6:.2f} MB -> {splats[kind]}")
+        if lost := left_out(model, kind):
+            warn(console, f"{splats[kind].name} leaves out {', '.join(lost)}; {command.scene} holds everything")
     if "html" in command.formats:
         written += _write_page(command, model, console)
     if is_again:
@@ -291,5 +303,5 @@ def _write_beside(command: Export, scene: Scene, console: Console) -> list[Path]
     if len(scene.planes):
         say(console, f"{count_noun(len(scene.planes), 'pane')} -> {command.output / PLANES}, their shape -> {GLASS}")
     if not scene.environment.is_empty:
-        warn(console, f"other viewers show this scene without what it mirrors; that is in {ENVIRONMENT}")
+        say(console, f"what it mirrors from afar -> {command.output / ENVIRONMENT}, {PANORAMA}")
     return written

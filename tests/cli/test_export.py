@@ -39,6 +39,14 @@ def test_all_that_the_scene_has_is_written(tmp_path: Path) -> None:
     torch.testing.assert_close(read_spz(output / "scene.spz").means, scene.primary.means, rtol=0, atol=1e-4)
 
 
+def test_what_a_file_leaves_out_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, output = write_run(tmp_path / "run"), tmp_path / "an export"
+    assert main(["export", str(run), "--output", str(output), "--formats", "ply", "spz"]) == 0
+    told = capsys.readouterr().out
+    assert f"warning: scene.spz leaves out how bright Gaussians are in panes; {run} holds everything\n" in told
+    assert "scene.ply leaves out" not in told
+
+
 def test_names_that_are_no_text_are_titles(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run").rename(tmp_path / os.fsdecode(b"caf\xe9"))
     for title in ([], ["--title", os.fsdecode(b"Caf\xe9"), "--credit", os.fsdecode(b"\xe9")]):
