@@ -308,6 +308,10 @@ MATTE = (
     "no more than %.0f %% of what is seen looks different from different sides. If something reflects anyway, "
     "--region X Y Z RADIUS names its place"
 )
+EMPTY = (
+    "no Gaussian lies in the sphere in which anything may reflect, of radius %.3g around (%.3g, %.3g, %.3g). "
+    "--region X Y Z RADIUS names another, in the units of the capture's poses"
+)
 OVERLOOKED = (
     "but %.0f %% of what is seen looks different from different sides. More --iterations give normals more time to "
     "spread, and --region X Y Z RADIUS names the place where something reflects"
@@ -413,7 +417,12 @@ class Propagate:
         turns = state.records.get(TURNS)
         if turns is None:
             turns = self.search.turning(state.scene, dataset.train, self.renderer)
-        log.warning(NOTHING_FOUND, clock.step, (MATTE if turns < LOOKS_REFLECTIVE else OVERLOOKED) % (100 * turns))
+        advice = (MATTE if turns < LOOKS_REFLECTIVE else OVERLOOKED) % (100 * turns)
+        region = state.scene.environment.region
+        if region is not None and not bool(in_region(state.scene).any()):
+            *center, radius = region
+            advice = EMPTY % (radius, *center)
+        log.warning(NOTHING_FOUND, clock.step, advice)
 
 
 @dataclass(frozen=True)

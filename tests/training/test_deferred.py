@@ -20,7 +20,7 @@ from glassplat.model.run_directory import RunDirectory, RunSettings
 from glassplat.model.training import Run
 from glassplat.render.deferred import Deferred
 from glassplat.scene import logit
-from glassplat.scene.scene import Scene
+from glassplat.scene.scene import Environment, Scene
 from glassplat.training.actions import ResetOpacity
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import train
@@ -190,10 +190,15 @@ class Told(Search):
 
 
 def propagated(
-    search: Search, schedule: PropagationSchedule, intervals: int = 10, *, raises_rates_found: bool = False
+    search: Search,
+    schedule: PropagationSchedule,
+    intervals: int = 10,
+    *,
+    raises_rates_found: bool = False,
+    state: TrainState | None = None,
 ) -> tuple[TrainState, list[int]]:
     """A state after so many intervals of ten steps, of a run of a hundred, and when normals were propagated."""
-    state, done = fresh_state(), []
+    state, done = state or fresh_state(), []
     when = Every(0.1, stop=schedule.stop, skip_multiples_of=3)
     action = Propagate(
         when, NormalPropagation(), schedule, Deferred(), {"primary.sh": Rate(3.0)}, search, raises_rates_found
@@ -265,6 +270,15 @@ def test_where_nothing_reflects_the_rates_rise_and_the_log_says_so(
         assert re.search(rf"nothing reflective was found.*{said}", warnings[0])
     else:
         assert "40 % of what is seen is reflection" in caplog.messages[-1]
+
+
+def test_a_region_without_gaussians_is_named(caplog: pytest.LogCaptureFixture) -> None:
+    state = fresh_state()
+    environment = Environment(torch.zeros(6, 1, 1, 3), region=(50.0, 0.0, 0.5, 2.0))
+    state.scene = replace(state.scene, environment=environment)
+    propagated(Search(), PropagationSchedule(patience=2), state=state)
+    (warning,) = [record.getMessage() for record in caplog.records]
+    assert "no Gaussian lies in the sphere in which anything may reflect, of radius 2 around (50, 0, 0.5)" in warning
 
 
 @pytest.mark.parametrize("recipe", [DeferredRecipe(), TracedRecipe(), TracedRecipe(raise_rates_found=False)])
