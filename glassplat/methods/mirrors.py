@@ -300,10 +300,8 @@ FOUND = 0.03
 LOOKS_REFLECTIVE = 0.16
 """Share that turns with the view, below which propagation would cost more than it finds: two metal eggs with 0.07 lost
 1.3 dB by it at 7000 iterations, a mirror ball with 0.30 gained (lab/glossy.md)."""
-NOTHING_FOUND = (
-    "step %d: little or nothing reflective was found, so that normals are not propagated and the rest of the run "
-    "learns as fast as splat; %s"
-)
+NOTHING_FOUND = "step %d: little or nothing reflective was found, so that normals are not propagated any further%s; %s"
+AS_SPLAT = " and the rest of the run learns as fast as splat"
 MATTE = (
     "no more than %.0f %% of what is seen looks different from different sides. If something reflects anyway, "
     "--region X Y Z RADIUS names its place"
@@ -422,7 +420,7 @@ class Propagate:
         if region is not None and not bool(in_region(state.scene).any()):
             *center, radius = region
             advice = EMPTY % (radius, *center)
-        log.warning(NOTHING_FOUND, clock.step, advice)
+        log.warning(NOTHING_FOUND, clock.step, AS_SPLAT if self.matte_rates else "", advice)
 
 
 @dataclass(frozen=True)

@@ -274,10 +274,11 @@ class BeginReflections:
     def __call__(self, state: TrainState, dataset: Dataset) -> Generator[Working, None, bool]:
         """Edits `state`."""
         self.environment(state, dataset)
-        if self.surroundings is None and not self.mirrors.begin_found:
-            return True
-        yield Working("looking for mirrors", 0, 1)
-        seen, mirrors = mirror_lookalikes(self.mirrors, state.scene, dataset.train, self.renderer)
+        copies = self.surroundings is not None and self.surroundings.start.source != "box"
+        seen = mirrors = torch.zeros(len(state.scene.primary), dtype=torch.bool)
+        if self.mirrors.begin_found or copies:
+            yield Working("looking for mirrors", 0, 1)
+            seen, mirrors = mirror_lookalikes(self.mirrors, state.scene, dataset.train, self.renderer)
         if self.surroundings is not None:
             self.surroundings(state, dataset, seen & ~mirrors)
         if self.mirrors.begin_found:

@@ -278,7 +278,15 @@ def test_a_region_without_gaussians_is_named(caplog: pytest.LogCaptureFixture) -
     state.scene = replace(state.scene, environment=environment)
     propagated(Search(), PropagationSchedule(patience=2), state=state)
     (warning,) = [record.getMessage() for record in caplog.records]
+    assert "learns as fast as splat" in warning
     assert "no Gaussian lies in the sphere in which anything may reflect, of radius 2 around (50, 0, 0.5)" in warning
+
+
+def test_rates_that_stay_are_not_said_to_rise(caplog: pytest.LogCaptureFixture) -> None:
+    schedule, told = PropagationSchedule(end="fixed", stop=0.5), Told(reflects=(0.0,))
+    action = Propagate(Every(0.1, stop=0.5), NormalPropagation(), schedule, Deferred(), search=told)
+    action.apply(fresh_state(), tiny_capture(), Clock(50, 100, 5))
+    assert "little or nothing reflective" in caplog.text and "as fast as splat" not in caplog.text
 
 
 @pytest.mark.parametrize("recipe", [DeferredRecipe(), TracedRecipe(), TracedRecipe(raise_rates_found=False)])

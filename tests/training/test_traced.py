@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import pytest
 import torch
@@ -165,6 +166,16 @@ def test_surroundings_are_copied_spread_or_both() -> None:
     )
     assert len(spread) == 40 and len(copied) > 10 and len(both) == 40 + len(copied)
     assert set(copied.means[:, 0].tolist()) <= set(fresh_state().scene.primary.means[:, 0].tolist())
+
+
+@pytest.mark.parametrize("source", ["box", "both"])
+def test_mirrors_are_looked_for_only_where_something_depends_on_them(source: Literal["box", "both"]) -> None:
+    start = replace(RECIPE.surroundings.start, source=source)
+    recipe = replace(RECIPE, surroundings=replace(RECIPE.surroundings, start=start))
+    state, setup = fresh_state(), recipe.stages(seed=0)[1].setup
+    assert setup is not None
+    assert len(list(setup(state, tiny_capture()))) == (source == "both")  # type: ignore[call-overload]
+    assert len(state.scene.surroundings)
 
 
 def test_copies_keep_their_harmonics_beside_the_box() -> None:
