@@ -191,8 +191,11 @@ class Model:
         from glassplat.evaluate.evaluate import evaluate  # Training imports this file, and may never need it.
 
         resolve_background(with_background(self.recipe, BLACK), dataset)
-        renderer = with_photographer(self.renderer, "beside")
-        return evaluate(self.scene, renderer, with_corrected_cameras(dataset, self.scene)).results
+        scene, renderer = self.scene, with_photographer(self.renderer, "beside")
+        if dataset.test:
+            kind = dataset.test[0].camera.cam_from_world.dtype
+            scene = scene.with_parameters({name: tensor.to(kind) for name, tensor in scene.tensors().items()})
+        return evaluate(scene, renderer, with_corrected_cameras(dataset, scene)).results
 
     def to(self, device: torch.device | str) -> Model:
         """The same on another device."""

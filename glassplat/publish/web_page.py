@@ -270,6 +270,8 @@ def page_text(
     if not cameras:
         raise ValueError("there are no cameras; expected at least one")
     check_panes(scene)
+    kind = scene.primary.means.dtype
+    cameras = [(name, replace(camera, cam_from_world=camera.cam_from_world.to(kind))) for name, camera in cameras]
     poster_view = best_view(scene.planes, [camera for _, camera in cameras])
     poster = jpeg(renderer(scene, poster_camera(cameras[poster_view][1])).rgb)
     scene = replace(scene, primary=visible_gaussians(scene.primary), glass=visible_gaussians(scene.glass))
@@ -412,6 +414,7 @@ def cube_bytes(scene: Scene, settings: Mapping[str, Any]) -> bytes:
     near, environment = settings["mirrored"] == "near", scene.environment
     size = CUBE_SIZE if near else min(environment.size, CUBE_SIZE)
     directions = cube_directions(size).reshape(-1, 3) * torch.tensor(FLIP, dtype=torch.float32)
+    directions = directions.to(scene.primary.means)
     if near and len(scene.surroundings):
         weights = torch.sigmoid(scene.primary.logit_opacities) * torch.sigmoid(scene.primary.channels["logit_strength"])
         middle = (weights[:, None] * scene.primary.means).sum(0) / weights.sum()

@@ -303,6 +303,13 @@ def test_metrics_are_those_of_the_test_views() -> None:
     assert model().evaluate(tiny_capture())["psnr"] > 40
 
 
+def test_a_scene_in_double_precision_is_measured_and_published(tmp_path: Path) -> None:
+    whole = model()
+    double = whole.with_parameters({name: tensor.double() for name, tensor in whole.scene.parameters().items()})
+    assert double.save(tmp_path / "page.html").is_file()
+    assert double.evaluate(tiny_capture())["psnr"] == pytest.approx(whole.evaluate(tiny_capture())["psnr"], abs=1e-3)
+
+
 def test_photographs_over_another_background_are_not_measured() -> None:
     white, black = (dataclasses.replace(tiny_capture(), background=(value,) * 3) for value in (1.0, 0.0))
     expected = r"laid over \(1.0, 1.0, 1.0\), but .* over \(0.0, 0.0, 0.0\); .* background=\(0.0, 0.0, 0.0\)"

@@ -23,6 +23,7 @@ from glassplat.publish.web_page import (
     SHADERS,
     Sharing,
     asset,
+    cube_bytes,
     fill_template,
     fits,
     fitting,
@@ -471,6 +472,15 @@ def shining(mirrored: str) -> tuple[Scene, Renderer]:
         channels={},
     )
     return replace(scene, primary=primary, surroundings=around), Traced()
+
+
+@pytest.mark.parametrize("mirrored", ["distant", "near"])
+def test_what_is_mirrored_is_the_same_in_double_precision(mirrored: str) -> None:
+    scene, renderer = shining(mirrored)
+    double = scene.with_parameters({name: tensor.double() for name, tensor in scene.parameters().items()})
+    faces = [bytearray(cube_bytes(each, renderer.page_settings())) for each in (scene, double)]
+    single, other = (torch.frombuffer(each, dtype=torch.uint8).int() for each in faces)
+    assert int((single - other).abs().max()) <= 1
 
 
 @needs_browser
