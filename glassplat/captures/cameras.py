@@ -111,6 +111,10 @@ LARGEST_COEFFICIENT = 1e6
 """Of distortion; those of a calibration are below 100."""
 LEAST_SIDE = 8
 """Of a photograph, in pixels; smaller ones are what a failed download or export leaves."""
+LEAST_BLANK = 1e-3
+"""Share of an undistorted image outside the photograph; below, it is rounding along the border."""
+BLANK_SIDE = 256
+"""Of the image on which that is measured, in pixels; a whole photograph takes a second."""
 MOST_SKEW = 0.05
 """Relative deviation of a photograph's side from a scaled copy's, however few pixels that is."""
 
@@ -197,6 +201,13 @@ class PixelMap:
         """[H, W] of the photograph's size to [height, width]; 1 where any pixel that is averaged has a label."""
         if self.lens is not None:
             labels = undistort(labels, self.lens.as_colmap(), "NEAREST_NEIGHBOR")
+        return self._any(labels)
+
+    def blank(self) -> NDArray[np.uint8]:
+        """[height, width]; 1 where any pixel that is averaged lies outside the photograph of the lens."""
+        return self._any(_blank(self.lens) if self.lens else np.zeros((self.height, self.width), np.uint8))
+
+    def _any(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         if labels.shape == (self.height, self.width):
             return labels
         return (resize_by_area(labels > 0, self.width, self.height) > LEAST_SHARE).astype(np.uint8)
@@ -313,6 +324,28 @@ def pinhole_of(lens: Lens) -> tuple[Pinhole, bool]:
         ) from error
     fx, fy, cx, cy = (float(value) for value in found.params)
     return Pinhole(fx, fy, cx, cy, found.width, found.height), True
+
+
+@lru_cache(maxsize=1024)
+def blank_share(lens: Lens) -> float:
+    """Share of the undistorted image that shows nothing of the photograph; 0 where that is rounding along its border.
+
+    Strong barrel lenses have such parts, since COLMAP enlarges no image to more than twice its size.
+
+    Raises:
+        InputError: as `pinhole_of`.
+    """
+    if not pinhole_of(lens)[1]:
+        return 0.0
+    scale = min(1.0, BLANK_SIDE / max(lens.width, lens.height))
+    small = lens.rescale(max(1, round(scale * lens.width)), max(1, round(scale * lens.height)))
+    share = float(_blank(small).mean())
+    return share if share > LEAST_BLANK else 0.0
+
+
+def _blank(lens: Lens) -> NDArray[np.uint8]:
+    """[H, W] of the undistorted image, 1 where it shows nothing of the photograph."""
+    return (undistort(np.full((lens.height, lens.width), 255, np.uint8), lens.as_colmap()) < 255).astype(np.uint8)
 
 
 def _is_pinhole(model: str, parameters: tuple[float, ...]) -> bool:

@@ -15,6 +15,7 @@ from threading import Event
 import torch
 
 from glassplat.captures.axes import axes_evidence
+from glassplat.captures.cameras import blank_share
 from glassplat.captures.capture import Capture, Shot
 from glassplat.captures.files import CaptureFiles, read_capture
 from glassplat.captures.masks import PLANES, CutOut, Polarity
@@ -89,6 +90,8 @@ EXTENT_MARGIN = 1.1
 FARTHEST_ORIGIN = 1e4
 SAME_PLACE = 1e-6
 """Cameras closer together than this share of their distance from the origin differ by rounding only."""
+MUCH_BLANK = 0.01
+"""Share of an undistorted photograph outside what its lens saw, above which that is said."""
 LEAST_RADIUS = 1e-9
 """World units. The square of a smaller one is lost in float32."""
 
@@ -221,6 +224,7 @@ def dataset_of(
         *capture.warnings,
         *masks.warnings,
         *_view_warnings(prepared, shown),
+        *_blank_warnings(shots),
         *(["Transparent pixels of the photographs are left out."] if cut_out else ()),
         *point_warnings,
         *_far_off(train, extent),
@@ -336,6 +340,17 @@ def _view_warnings(prepared: list[PreparedView], background: Rgb | None) -> list
     if background is not None:
         warnings.append(f"The photographs have transparent pixels; they are laid over sRGB {background}.")
     return warnings
+
+
+def _blank_warnings(shots: Sequence[Shot]) -> list[str]:
+    """A warning when undistorted photographs have large parts outside what the lens saw."""
+    share = max(blank_share(shot.lens) for shot in shots)
+    if share <= MUCH_BLANK:
+        return []
+    return [
+        f"The lens is so wide that up to {share:.1%} of an undistorted photograph lie outside what it saw; these "
+        "pixels are left out."
+    ]
 
 
 @torch.no_grad()

@@ -36,6 +36,7 @@ from glassplat.captures.cameras import (
     MOST_SKEW,
     Pinhole,
     PixelMap,
+    blank_share,
     lens_for_image,
     nearest_resize,
     pinhole_of,
@@ -431,13 +432,15 @@ class MaskFile:
 
 @dataclass(frozen=True)
 class IgnoredFiles:
-    """Recipe for reading what any of several masks of one view leaves out."""
+    """Recipe for reading what any of several masks of one view leaves out, and what lies outside its photograph."""
 
     masks: tuple[MaskFile, ...]
+    blank: PixelMap | None = None
 
     def __call__(self) -> Tensor:
         """[H, W] uint8, above zero where any mask is."""
-        return torch.stack([mask.ignored() for mask in self.masks]).amax(dim=0)
+        blank = [] if self.blank is None else [torch.from_numpy(self.blank.blank())]
+        return torch.stack([*blank, *(mask.ignored() for mask in self.masks)]).amax(dim=0)
 
 
 @dataclass(frozen=True)
@@ -487,6 +490,7 @@ def prepare_view(
     pinhole, distorted = pinhole_of(lens)
     small = _reduced_size(pinhole, options.downscale, shot.name)
     pixel_map = PixelMap(lens if distorted else None, *small)
+    blank = pixel_map if blank_share(lens) else None
     pose = torch.from_numpy(rigid_pose(shot.cam_from_world, shot.name)).float()
     camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, pinhole.width, pinhole.height).resize(*small)
     view = View(
@@ -495,8 +499,8 @@ def prepare_view(
         image_path=shot.image_path,
         read_photo=PhotoFile(shot.image_path, pixel_map, options.background),
         read_pane_labels=None if mask is None else _mask_file(mask, (width, height), pixel_map),
-        read_ignored=IgnoredFiles(tuple(_mask_file(one, (width, height), pixel_map) for one in ignored))
-        if ignored
+        read_ignored=IgnoredFiles(tuple(_mask_file(one, (width, height), pixel_map) for one in ignored), blank)
+        if ignored or blank
         else None,
         read_normals=normals_reader(normals, camera),
     )

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import sys
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from glassplat.captures import colmap_library
-from glassplat.captures.cameras import MODEL_OF_ID, PARAMETER_COUNTS, PERSPECTIVE, Lens, pinhole_of
+from glassplat.captures.cameras import MODEL_OF_ID, PARAMETER_COUNTS, PERSPECTIVE, Lens, blank_share, pinhole_of
 from glassplat.captures.colmap import ModelImage, pose_matrix
 from glassplat.captures.dataset import load_dataset
 from glassplat.errors import InputError
@@ -74,3 +76,32 @@ def test_a_lens_that_bends_names_the_extra_that_straightens_it(model: str) -> No
     assert model not in PERSPECTIVE or example(model).parameters[-1]
     with pytest.raises(InputError, match=r"pip install 'glassplat\[prepare\]'"):
         pinhole_of(example(model))
+
+
+@pytest.mark.parametrize("downscale", [1, 2])
+def test_what_a_strong_barrel_lens_did_not_see_is_left_out(capture, downscale: int) -> None:
+    capture.size = (160, 120)
+    capture.lenses = [("SIMPLE_RADIAL", [75.0, 80.0, 60.0, -0.3]), ("SIMPLE_RADIAL", [160.0, 80.0, 60.0, -0.1])]
+    capture.write_colmap()
+    for name in capture.names:
+        Image.new("RGB", capture.size, "white").save(capture.root / "images" / name)
+    capture.write_mask("ignore/0002.png", np.pad(np.full((40, 60), 255, np.uint8), ((40, 40), (50, 50))))
+    data = load_dataset(capture.root, downscale=downscale)
+    masked, wide, ordinary = (view for view in data.train if view.name in ("0002.png", "0004.png", "0005.png"))
+    assert ordinary.ignored is None and wide.ignored is not None and masked.ignored is not None
+    for view in (wide, masked):
+        assert view.ignored is not None and bool((view.photo[~view.ignored] == 255).all())
+        black = (view.photo == 0).all(dim=-1)
+        assert black.double().mean() > 0.04 and bool(view.ignored[black].all())
+    assert 0.04 < wide.ignored.double().mean() < 0.07
+    assert masked.ignored.double().mean() > wide.ignored.double().mean() + 0.01
+    assert any(re.search(r"up to 5\.\d% of an undistorted photograph", text) for text in data.warnings)
+
+
+def test_ordinary_lenses_see_all_of_their_undistorted_photographs() -> None:
+    pytest.importorskip("pycolmap")
+    for model, count in (("SIMPLE_RADIAL", 1), ("OPENCV", 4), ("OPENCV_FISHEYE", 4), ("FOV", 1)):
+        for focal in (400.0, 640.0):
+            kinds = PARAMETER_COUNTS[model].focal
+            lens = Lens(model, (*[focal] * kinds, 320.0, 240.0, -0.05, *[0.0] * (count - 1)), 640, 480)
+            assert blank_share(lens) == 0
