@@ -18,7 +18,7 @@ from glassplat.captures.axes import axes_evidence
 from glassplat.captures.cameras import blank_share
 from glassplat.captures.capture import Capture, Shot
 from glassplat.captures.files import CaptureFiles, read_capture
-from glassplat.captures.masks import PLANES, CutOut, Polarity
+from glassplat.captures.masks import IGNORE_FOLDER, MASK_FOLDER, PLANES, CutOut, Polarity, left_out_share
 from glassplat.captures.transforms import points_in_view
 from glassplat.captures.view import (
     GIGABYTE,
@@ -27,6 +27,7 @@ from glassplat.captures.view import (
     PreparedView,
     View,
     ViewOptions,
+    evenly,
     normals_paths,
     prepare_view,
 )
@@ -92,6 +93,10 @@ SAME_PLACE = 1e-6
 """Cameras closer together than this share of their distance from the origin differ by rounding only."""
 MUCH_BLANK = 0.01
 """Share of an undistorted photograph outside what its lens saw, above which that is said."""
+FEW_MASKS = 4
+"""Photographs whose masks are looked at while a capture is loaded."""
+MUCH_LEFT_OUT = 0.7
+"""Share of photographs that masks leave out, above which that is said."""
 LEAST_RADIUS = 1e-9
 """World units. The square of a smaller one is lost in float32."""
 
@@ -225,6 +230,7 @@ def dataset_of(
         *masks.warnings,
         *_view_warnings(prepared, shown),
         *_blank_warnings(shots),
+        *_mask_warnings(files),
         *(["Transparent pixels of the photographs are left out."] if cut_out else ()),
         *point_warnings,
         *_far_off(train, extent),
@@ -351,6 +357,23 @@ def _blank_warnings(shots: Sequence[Shot]) -> list[str]:
         f"The lens is so wide that up to {share:.1%} of an undistorted photograph lie outside what it saw; these "
         "pixels are left out."
     ]
+
+
+def _mask_warnings(files: CaptureFiles) -> list[str]:
+    """A warning when masks leave out most of the photographs; decodes only a few of them.
+
+    Raises:
+        InputError: masks leave out every photograph.
+    """
+    names = evenly(sorted(files.ignored), FEW_MASKS)
+    shares = [left_out_share(files.ignored[name]) for name in names]
+    share = sum(shares) / max(len(shares), 1) * len(files.ignored) / len(files.shots)
+    if share <= MUCH_LEFT_OUT:
+        return []
+    meaning = f"black in {MASK_FOLDER}/ is left out, and white in {IGNORE_FOLDER}/; are the masks inverted?"
+    if all(shot.name in files.ignored and left_out_share(files.ignored[shot.name]) == 1 for shot in files.shots):
+        raise InputError(f"masks leave out all pixels of all photographs of {files.root}: {meaning}")
+    return [f"Masks leave out about {share:.0%} of the photographs: {meaning}"]
 
 
 @torch.no_grad()

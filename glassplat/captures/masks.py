@@ -10,7 +10,7 @@ Masks in `masks/`, or `x_mask.png` next to a photograph `x.png`, mean what they 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Set
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from os.path import lexists, normpath
 from pathlib import Path, PurePosixPath
@@ -244,6 +244,11 @@ class CutOut:
 
 IgnoredMask = CutOut | KeepMask | PaneMask
 """A mask whose `labels()` are above zero on what is not to be learned."""
+
+
+def left_out_share(masks: Sequence[IgnoredMask]) -> float:
+    """Share of a photograph that the one of its masks leaves out that leaves out most."""
+    return max(float((mask.labels() > 0).mean()) for mask in masks)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import torch
 from glassplat.captures.cameras import LEAST_SIDE
 from glassplat.captures.dataset import Dataset, dataset_of, load_dataset
 from glassplat.captures.files import CaptureFiles
+from glassplat.captures.view import evenly
 from glassplat.cli.console import count_noun, shell_word
 from glassplat.cli.info import FEW_VIEWS, Finding, describe_broken
 from glassplat.errors import InputError, input_checked
@@ -28,6 +29,8 @@ from glassplat.scene.scene import Scene
 from glassplat.training.checkpoint import recorded
 
 FEW_POINTS, FEW_MASKS = 500, 3
+MASKS_LOOKED_AT = 16
+"""Photographs whose share of ignored pixels is measured."""
 
 
 def remaining_parts(files: CaptureFiles) -> Iterator[Finding]:
@@ -67,8 +70,13 @@ def write_capture_page(path: Path, target: Path) -> None:
 def _describe_panes(path: Path, dataset: Dataset) -> Finding:
     """Marked panes, and the quality of the marks."""
     finding = Finding()
-    if ignoring := sum(view.read_ignored is not None for view in (*dataset.train, *dataset.test)):
-        finding.facts["ignored"] = f"parts of {ignoring} photographs, by masks or transparency"
+    if ignoring := [view for view in (*dataset.train, *dataset.test) if view.read_ignored is not None]:
+        looked_at = [view.ignored for view in evenly(ignoring, MASKS_LOOKED_AT)]
+        shares = [float(ignored.double().mean()) for ignored in looked_at if ignored is not None]
+        finding.facts["ignored"] = (
+            f"about {sum(shares) / len(shares):.0%} of {count_noun(len(ignoring), 'photograph')}, by masks, "
+            "transparency, or the lens"
+        )
     if estimated := sum(view.read_normals is not None for view in dataset.train):
         finding.facts["normals"] = f"estimated for {estimated} training photographs; deferred and traced use them"
     annotated = sum(view.is_annotated for view in dataset.train)

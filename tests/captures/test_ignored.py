@@ -110,6 +110,22 @@ def test_masks_of_one_bit_of_sixteen_of_transparency_and_of_a_palette_leave_out_
     assert all(torch.equal(ignored, DROPPED) for ignored in found.values())
 
 
+def test_masks_that_leave_out_most_are_questioned_and_those_that_leave_nothing_refused(tmp_path: Path) -> None:
+    root = write_tiny_capture(tmp_path / "capture")
+    names = [path.name for path in (root / "images").iterdir()]
+    write_shades(root / "masks/1.png", KEPT)
+    assert not any("inverted" in text for text in load_dataset(root).warnings)
+    for name in names:
+        write_shades(root / "masks" / name, 255 - KEPT)
+    assert any("leave out about 87% of the photographs: black" in text for text in load_dataset(root).warnings)
+    for name in names:
+        write_shades(root / "masks" / name, np.zeros_like(KEPT))
+    with pytest.raises(InputError, match=r"all pixels of all photographs .* black in masks/ is left out.* inverted\?"):
+        load_dataset(root)
+    write_shades(root / "masks" / names[-1], KEPT)
+    assert any("inverted" in text for text in load_dataset(root).warnings)
+
+
 def test_both_kinds_of_masks_of_a_photograph_leave_out(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path / "capture")
     write_shades(root / "masks/1.png", KEPT)

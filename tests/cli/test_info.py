@@ -68,6 +68,14 @@ def test_estimated_normals_are_counted(tmp_path: Path, capsys: pytest.CaptureFix
     assert told(capture, capsys)["facts"]["normals"].startswith("estimated for 3 training photographs")
 
 
+def test_the_share_that_masks_leave_out_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capture = write_tiny_capture(tmp_path / "capture")
+    (capture / "ignore").mkdir()
+    for name in ("1.png", "2.png"):
+        Image.fromarray(np.repeat(np.uint8([[0] * 30 + [255] * 10]), 28, axis=0)).save(capture / "ignore" / name)
+    assert told(capture, capsys)["facts"]["ignored"].startswith("about 25% of 2 photographs, by masks")
+
+
 def test_photographs_are_to_be_prepared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(SCENE / "images", tmp_path / "my photographs")
     found = told(tmp_path / "my photographs", capsys)
