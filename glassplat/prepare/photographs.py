@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
 
-from glassplat.captures.masks import MASK_MARK
+from glassplat.captures.masks import IGNORE_FOLDER, MASK_FOLDER, MASK_MARK, PANE_FOLDER
 from glassplat.errors import InputError, first_names
 from glassplat.files import images
 from glassplat.files.records import readable_name, reading
@@ -55,6 +55,7 @@ class Photograph:
         width, height: upright and reduced, as it is used.
         device: what took it; photographs of one device and size share a lens.
         focal: in pixels of the reduced photograph; None where the file does not tell.
+        transparent: whether parts of it are, which are read as black.
     """
 
     path: Path
@@ -63,11 +64,17 @@ class Photograph:
     height: int
     device: str
     focal: float | None
+    transparent: bool = False
 
 
 PICTURE_SUFFIX = ".jpg"
 """Of photographs as they are written into a capture."""
 CAPTURE_FOLDERS = ("sparse", "panes", "gt", "ignore")
+MASK_FOLDERS = (PANE_FOLDER, MASK_FOLDER, IGNORE_FOLDER)
+NOT_CARRIED = (
+    "They are not carried into the capture: make masks for its own photographs, which have no distortion and may be "
+    "smaller, and put them into its masks/, ignore/ or panes/."
+)
 
 
 def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photograph]:
@@ -80,10 +87,13 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
     if (folder / "images").is_dir() and any((folder / name).is_dir() for name in CAPTURE_FOLDERS):
         raise InputError(f"{folder} is a capture; expected a folder of photographs, such as {folder / 'images'}")
     paths = _photograph_paths(folder)
-    masks = masks_among(paths)
+    masks = {*masks_among(paths), *_in_mask_folders(paths, folder)}
     if masks:
         listen(
-            Note(f"{len(masks)} files are masks by their names and left out: {first_names([p.name for p in masks])}.")
+            Note(
+                f"Masks by their names or folders, which are no photographs: {_names_below(folder, sorted(masks))}. "
+                f"{NOT_CARRIED}"
+            )
         )
         paths = [path for path in paths if path not in masks]
     names = capture_names(paths, folder)
@@ -108,6 +118,14 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
         raise InputError(
             f"{folder} holds {len(found)} photographs{same}; expected at least {FEWEST}, and better 30 or more, taken "
             "from places a step apart"
+        )
+    cut_out = [one.path for one in found.values() if one.transparent]
+    if cut_out:
+        listen(
+            Note(
+                f"Transparent parts of {len(cut_out)} of {len(found)} photographs become black "
+                f"({_names_below(folder, cut_out)}); leave them out by masks in the capture's ignore/."
+            )
         )
     return list(found.values())
 
@@ -170,6 +188,15 @@ def masks_among(paths: Sequence[Path]) -> list[Path]:
     plain = {path.with_suffix("") for path in paths}
     named = [path for path in paths if path.stem.endswith(MASK_MARK)]
     return [path for path in named if path.with_name(path.stem.removesuffix(MASK_MARK)) in plain]
+
+
+def _in_mask_folders(paths: Sequence[Path], folder: Path) -> list[Path]:
+    """Files below a folder for masks, which is itself below a folder."""
+    return [path for path in paths if not {*MASK_FOLDERS}.isdisjoint(path.relative_to(folder).parts[:-1])]
+
+
+def _names_below(folder: Path, paths: Sequence[Path]) -> str:
+    return first_names([readable_name(path.relative_to(folder)) for path in paths])
 
 
 def read_photograph(photograph: Photograph) -> NDArray[np.uint8]:
@@ -257,6 +284,7 @@ def _examine(path: Path, name: str, max_size: int, least_side: int = LEAST_SIDE)
             tags = dict(exif) | dict(exif.get_ifd(ExifTags.IFD.Exif))
             image.draft("RGB", (LEAST_SIDE, LEAST_SIDE))
             image.load()
+            transparent = images.opacity(image) is not None
         with reading(path):
             contents = hashlib.blake2b(path.read_bytes(), digest_size=16).digest()
     except (ValueError, FileNotFoundError) as error:
@@ -269,7 +297,8 @@ def _examine(path: Path, name: str, max_size: int, least_side: int = LEAST_SIDE)
     width, height = size[::-1] if sideways else size
     scale = min(1.0, max_size / max(size))
     width, height = round(width * scale), round(height * scale)
-    return Photograph(path, name, width, height, _device(tags), _focal(tags, width, height)), contents
+    device, focal = _device(tags), _focal(tags, width, height)
+    return Photograph(path, name, width, height, device, focal, transparent), contents
 
 
 def _device(tags: dict) -> str:

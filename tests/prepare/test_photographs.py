@@ -38,6 +38,10 @@ def found(folder: Path, heard: Heard, max_size: int = 1600) -> dict[str, Photogr
     return {one.path.name: one for one in photographs_in(folder, max_size, heard)}
 
 
+def notes_of(heard: Heard) -> list[str]:
+    return [message.text for message in heard if isinstance(message, Note)]
+
+
 def corner(photograph: Photograph) -> tuple[int, ...]:
     """The colour near the upper left."""
     return tuple(int(value) for value in read_photograph(photograph)[10, 10])
@@ -96,6 +100,8 @@ def test_what_was_cut_out_is_black(mode: str, tmp_path: Path, heard: Heard) -> N
         shades = shades.quantize(4) if mode == "P" else shades
         shades.save(folder / "cut.png", transparency=shades.getpixel((0, 0)))
     row = read_photograph(found(folder, heard)["cut.png"])[45]
+    (note,) = notes_of(heard)
+    assert note.startswith("Transparent parts of 1 of 4 photographs become black (cut.png)")
     assert not row[:36].any() and (row[84:] == 200).all()
     if mode in ("RGBA", "LA"):
         assert (row[46:74] == 100).all()
@@ -165,9 +171,18 @@ def test_masks_next_to_photographs_are_no_photographs(tmp_path: Path, heard: Hea
     folder = three(tmp_path / "in")
     for seed, name in enumerate(("1_mask.jpg", "2_mask.png", "wall_mask.png"), start=5):
         picture(seed).save(folder / name)
+    for name in ("masks/0.png", "left/ignore/0.png", "panes/1.png"):
+        (folder / name).parent.mkdir(parents=True)
+        picture(9).save(folder / name)
     assert sorted(found(folder, heard)) == ["0.png", "1.png", "2.png", "wall_mask.png"]
-    notes = [message.text for message in heard if isinstance(message, Note)]
-    assert notes == ["2 files are masks by their names and left out: 1_mask.jpg, 2_mask.png."]
+    (note,) = notes_of(heard)
+    names = "1_mask.jpg, 2_mask.png, left/ignore/0.png, masks/0.png, panes/1.png"
+    assert note.startswith(f"Masks by their names or folders, which are no photographs: {names}. They are not carried")
+
+
+def test_folders_of_the_input_itself_are_not_asked(tmp_path: Path, heard: Heard) -> None:
+    assert len(found(three(tmp_path / "masks" / "panes"), heard)) == 3
+    assert not notes_of(heard)
 
 
 def test_folders_may_be_links(tmp_path: Path, heard: Heard) -> None:
