@@ -98,7 +98,7 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
         paths = [path for path in paths if path not in masks]
     names = capture_names(paths, folder)
     found: dict[bytes, Photograph] = {}
-    twins: list[str] = []
+    same: list[tuple[Path, bytes]] = []
     broken: dict[str, InputError] = {}
     for done, path in enumerate(paths):
         listen(Working("looking at the photographs", done, len(paths)))
@@ -107,18 +107,23 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
         except InputError as error:
             broken[path.name] = error
             continue
-        if contents in found:
-            twins.append(f"{path.name} (as {found[contents].path.name})")
-        else:
-            found[contents] = photograph
+        kept, twin = found.get(contents, photograph), photograph
+        if len(kept.name) > len(photograph.name):
+            kept, twin = photograph, kept  # `IMG 9 copy.jpg` goes before `IMG 9.jpg`.
+        found[contents] = kept
+        if twin is not kept:
+            same.append((twin.path, contents))
     if broken:
         raise _refusal(broken, len(paths))
+    twins = [f"{path.name} (as {found[contents].path.name})" for path, contents in same]
     if len(found) < FEWEST:
-        same = f", and {first_names(twins)} the same again" if twins else ""
+        again = f", and {first_names(twins)} the same again" if twins else ""
         raise InputError(
-            f"{folder} holds {len(found)} photographs{same}; expected at least {FEWEST}, and better 30 or more, taken "
+            f"{folder} holds {len(found)} photographs{again}; expected at least {FEWEST}, and better 30 or more, taken "
             "from places a step apart"
         )
+    if twins:
+        listen(Note(f"Left out, as the same photographs again: {first_names(twins)}."))
     cut_out = [one.path for one in found.values() if one.transparent]
     if cut_out:
         listen(

@@ -212,6 +212,17 @@ def test_the_same_photograph_counts_once(tmp_path: Path, heard: Heard) -> None:
     folder = three(tmp_path / "in")
     (folder / "copy.png").write_bytes((folder / "1.png").read_bytes())
     assert sorted(found(folder, heard)) == ["0.png", "1.png", "2.png"]
+    assert notes_of(heard) == ["Left out, as the same photographs again: copy.png (as 1.png)."]
+
+
+def test_of_the_same_photographs_the_one_with_the_shorter_name_stays(tmp_path: Path, heard: Heard) -> None:
+    folder = three(tmp_path / "in")
+    for name in ("IMG 9 copy 2.png", "IMG 9 copy.png", "IMG 9.png", "IMG 8.png"):
+        picture(9 - (name == "IMG 8.png")).save(folder / name)
+    names = list(found(folder, heard))
+    assert names == ["0.png", "1.png", "2.png", "IMG 8.png", "IMG 9.png"]
+    twins = "IMG 9 copy 2.png (as IMG 9.png), IMG 9 copy.png (as IMG 9.png)"
+    assert notes_of(heard) == [f"Left out, as the same photographs again: {twins}."]
 
 
 def broken(folder: Path) -> None:
