@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from os.path import isfile, lexists
 from pathlib import Path
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 from glassplat.captures.cameras import MODEL_OF_ID, PARAMETER_COUNTS, Lens, make_lens
 from glassplat.captures.capture import Capture, RawPoints, Shot
 from glassplat.errors import InputError, first_names, input_checked
+from glassplat.files.images import files_below
 from glassplat.files.records import reading
 from glassplat.options import short_repr
 
@@ -273,7 +275,8 @@ def _shots(root: Path, model: Model) -> tuple[Shot, ...]:
         raise InputError(
             f"no folder {images} next to the COLMAP model; expected the {len(model.images)} photographs there"
         )
-    missing = sorted(image.name for image in model.images if not isfile(images / image.name))
+    names = _names_on_disk(images, [image.name for image in model.images])
+    missing = sorted(name for name in names if not isfile(images / name))
     if missing:
         raise InputError(
             f"{len(missing)} of the {len(model.images)} photographs of the COLMAP model are missing in {images}: "
@@ -285,9 +288,17 @@ def _shots(root: Path, model: Model) -> tuple[Shot, ...]:
             f"photographs whose camera is not in the COLMAP model: {first_names(orphans)}; export it again"
         )
     return tuple(
-        Shot(image.name, images / image.name, model.lenses[image.camera_id], pose_matrix(image))
-        for image in model.images
+        Shot(name, images / name, model.lenses[image.camera_id], pose_matrix(image))
+        for name, image in zip(names, model.images, strict=True)
     )
+
+
+def _names_on_disk(images: Path, names: list[str]) -> list[str]:
+    """The names as the folder spells them, where masks follow it: some programs of Macs take accents for letters."""
+    if all(isfile(images / name) for name in names):
+        return names
+    spelled = {normalize("NFC", name): name for name in (p.relative_to(images).as_posix() for p in files_below(images))}
+    return [name if isfile(images / name) else spelled.get(normalize("NFC", name), name) for name in names]
 
 
 def _other_models(root: Path, used: Path) -> tuple[str, ...]:

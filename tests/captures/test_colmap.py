@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
+from typing import Literal
+from unicodedata import normalize
 
 import numpy as np
 import pytest
@@ -129,6 +132,20 @@ def test_missing_photographs_are_counted_and_named(capture) -> None:
         (capture.root / "images" / name).unlink()
     with pytest.raises(InputError, match=r"7 of the 10 photographs .* 0002.png, .* 0006.png and 2 more"):
         load_dataset(capture.root)
+
+
+@pytest.mark.parametrize("on_disk", ["NFC", "NFD"])
+def test_accents_are_the_same_however_they_are_written(capture, on_disk: Literal["NFC", "NFD"]) -> None:
+    in_model: Literal["NFC", "NFD"] = "NFD" if on_disk == "NFC" else "NFC"
+    capture.names = [normalize(in_model, f"f\u00fcr/\u00e9 {index}.png") for index in range(10)]
+    capture.write_colmap()
+    shutil.rmtree(capture.root / "images")
+    capture.names = [normalize(on_disk, name) for name in capture.names]
+    capture.write_images()
+    capture.write_mask(f"panes/{capture.names[1]}", np.ones((24, 32), dtype=np.uint8))
+    data = load_dataset(capture.root)
+    assert sorted(view.name for view in (*data.train, *data.test)) == capture.names
+    assert [view.name for view in data.train if view.is_annotated] == [capture.names[1]]
 
 
 def test_missing_folder_of_images(capture) -> None:
