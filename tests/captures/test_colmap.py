@@ -76,6 +76,14 @@ def test_binary_wins_and_other_models_are_mentioned(capture) -> None:
     assert "(1)" in found.warnings[0]
 
 
+def test_frames_next_to_a_model_are_not_passed_over_in_silence(capture) -> None:
+    capture.write_colmap()
+    assert load_dataset(capture.root).warnings == ()
+    capture.write_transforms({"frames": capture.frames()})
+    (warning,) = load_dataset(capture.root).warnings
+    assert "COLMAP model" in warning and "is read, and not transforms.json" in warning
+
+
 def test_no_model_is_not_mine(tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     assert load_colmap(tmp_path) is None
