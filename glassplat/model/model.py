@@ -390,6 +390,8 @@ def by_name(cameras: Iterable[tuple[str, Camera]]) -> dict[str, Camera]:
 
 
 PLANES, GLASS, CAMERAS = "planes.json", "glass.ply", "cameras.json"
+EXPORTED = "scene"
+"""Name without suffix of the splats that `export` writes, next to their panes."""
 SETTINGS = "settings.json"
 PANORAMA, ENVIRONMENT = "environment.png", "environment.json"
 
@@ -553,6 +555,8 @@ def _planes(file: Path, planes_file: Path | None) -> Planes:
         if file.with_name(GLASS).is_file():
             log.warning("%s has panes no more: next to it is %s, but no %s", file, GLASS, PLANES)
         return Planes.empty()
+    if planes_file is None and file.stem != EXPORTED:
+        log.info("%s gets the panes of %s; move it into a folder of its own if they are not its panes", file, beside)
     return read_planes(planes_file or beside)
 
 

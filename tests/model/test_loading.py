@@ -44,6 +44,21 @@ def test_glass_without_its_panes_is_warned_of(tmp_path: Path, caplog: pytest.Log
     assert "no planes.json" in caplog.text
 
 
+def test_panes_that_may_be_of_another_file_are_mentioned(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["export", str(write_run(tmp_path / "run")), "--output", str(tmp_path / "out"), "--formats", "ply"]
+    assert main(command) == 0
+    write_gaussians(tmp_path / "out" / "other.ply", typical())
+    with caplog.at_level(logging.INFO, "glassplat"):
+        assert load(tmp_path / "out", device="cpu").panes and "gets the panes" not in caplog.text
+        assert load(tmp_path / "out" / "other.ply", device="cpu").panes
+    assert f"other.ply gets the panes of {tmp_path / 'out' / 'planes.json'}" in caplog.text
+    capsys.readouterr()
+    assert main(["info", str(tmp_path / "out" / "other.ply")]) == 0
+    assert f", of {tmp_path / 'out' / 'planes.json'}" in capsys.readouterr().out
+
+
 def test_a_file_of_discs_is_drawn_as_discs(tmp_path: Path) -> None:
     solid = true_scene().primary
     discs = replace(solid, log_scales=solid.log_scales[:, :2].contiguous())
