@@ -338,7 +338,7 @@ class Model:
             The path.
 
         Raises:
-            FileExistsError: something is there, also next to it; nothing was written.
+            FileExistsError: it is there, or something else next to it; nothing was written.
             InputError: the format is not known, or cannot hold this model.
         """
         return save_model(self, Path(path), overwrite=overwrite)
@@ -411,8 +411,8 @@ def save_model(model: Model, path: Path, *, overwrite: bool) -> Path:
         raise InputError(f"{path}: expected a name that ends in {endings}, or a folder's")
     names = (PLANES, GLASS, CAMERAS, *(() if model.scene.environment.is_empty else (ENVIRONMENT, PANORAMA)))
     beside = [path.with_name(name) for name in names] if kind in writing.SPLAT_WRITERS else []
-    found = [str(target) for target in (path, *beside) if target.exists()]
-    if found and not overwrite:
+    found = [] if overwrite else [str(target) for target in (path, *_foreign(model, beside)) if target.exists()]
+    if found:
         raise FileExistsError(
             f"{first_names(found)} is already there; nothing was written. Choose another folder, or overwrite=True"
         )
@@ -429,6 +429,18 @@ def save_model(model: Model, path: Path, *, overwrite: bool) -> Path:
         write_planes(path.parent / PLANES, model.scene.planes)  # Panes of what was there must not be taken for its own.
     write_cameras(path.parent / CAMERAS, model.cameras.items())
     return path
+
+
+def _foreign(model: Model, beside: Sequence[Path]) -> list[Path]:
+    """The files next to a splat file that are there already and not what the model writes, as in another format."""
+    there = [target for target in beside if target.exists()]
+    if not there:
+        return []
+    with tempfile.TemporaryDirectory() as folder:
+        own = [*write_beside(Path(folder), model.scene), Path(folder) / CAMERAS]
+        write_cameras(own[-1], model.cameras.items())
+        contents = {file.name: file.read_bytes() for file in own}
+    return [target for target in there if not target.is_file() or target.read_bytes() != contents.get(target.name)]
 
 
 CHANNELED = ("ply", "glb")

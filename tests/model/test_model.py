@@ -180,6 +180,17 @@ def test_what_is_saved_is_loaded_again(name: str, tolerance: float, tmp_path: Pa
     assert not [left for left in path.parent.iterdir() if left.name.startswith(".")]
 
 
+def test_a_model_is_saved_in_several_formats_next_to_each_other(tmp_path: Path) -> None:
+    environment = Environment(torch.zeros(6, 4, 4, 3))
+    whole = model().with_scene(dataclasses.replace(model().scene, environment=environment))
+    for name in ("a.ply", "a.spz", "a.glb"):
+        whole.save(tmp_path / name)
+    darker = whole.with_reflectance(LABEL, 0.01)
+    with pytest.raises(FileExistsError, match=r"planes\.json is already there; nothing was written"):
+        darker.save(tmp_path / "b.ply")
+    assert not (tmp_path / "b.ply").exists()
+
+
 DISCS = {"primary": as_discs(true_scene().primary)}
 NO_PANES, PLAIN = {"planes": Planes.empty()}, PlanarRecipe(background=(0.0, 0.0, 0.0))
 
