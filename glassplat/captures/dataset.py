@@ -91,6 +91,8 @@ EXTENT_MARGIN = 1.1
 FARTHEST_ORIGIN = 1e4
 SAME_PLACE = 1e-6
 """Cameras closer together than this share of their distance from the origin differ by rounding only."""
+NERFSTUDIO_POINTS = "colmap/sparse/0/points3D.bin"
+"""Where nerfstudio keeps the model that its poses are from."""
 MUCH_BLANK = 0.01
 """Share of an undistorted photograph outside what its lens saw, above which that is said."""
 FEW_MASKS = 4
@@ -221,7 +223,7 @@ def dataset_of(
         for shot in shots
     ]
     train, test, split = _split_views(_in_one_memory([p.view for p in prepared], memory), capture)
-    points, point_warnings = _points(capture, train)
+    points, point_warnings = _points(root, capture, train)
     extent = _extent(train)
     measured = capture.points is not None
     _check_axes(train, points if measured else None, capture.format_name)
@@ -315,13 +317,14 @@ def _far_off(train: tuple[View, ...], extent: float) -> tuple[str, ...]:
     return (f"The cameras are {ratio:.0f} scene extents away from the origin; shift the capture to keep precision.",)
 
 
-def _points(capture: Capture, train: tuple[View, ...]) -> tuple[PointCloud, list[str]]:
+def _points(root: Path, capture: Capture, train: tuple[View, ...]) -> tuple[PointCloud, list[str]]:
     """The capture's points, or random ones with a warning."""
     if capture.points is None:
         make = capture.random_points or (lambda: points_in_view([view.camera for view in train]))
         points = PointCloud.of(make())
+        unread = _unread_points(root / NERFSTUDIO_POINTS)
         return points, [
-            f"The {capture.format_name} capture has no points; {len(points)} random points are used instead."
+            f"The {capture.format_name} capture has no points; {len(points)} random points are used instead.{unread}"
         ]
     found = PointCloud.of(capture.points)
     # Where a coordinate is NaN, the comparison is false.
@@ -332,6 +335,17 @@ def _points(capture: Capture, train: tuple[View, ...]) -> tuple[PointCloud, list
     if not len(kept):
         raise InputError(f"no point of the capture is finite and within {LARGEST_COORDINATE:g}; export the model again")
     return kept, [f"{int((~usable).sum())} points that are not finite or beyond {LARGEST_COORDINATE:g} are left out."]
+
+
+def _unread_points(path: Path) -> str:
+    """Sentence on the points of a COLMAP model that lies in a capture of nerfstudio, if it does."""
+    if not path.is_file():
+        return ""
+    folder = path.parents[2]
+    return (
+        f" Those of {path} are not read: make a sparse_pc.ply of them, named by ply_file_path, with a newer "
+        f"ns-process-data; or read the COLMAP model, {folder}, with the photographs linked as {folder / 'images'}."
+    )
 
 
 def _view_warnings(prepared: list[PreparedView], background: Rgb | None) -> list[str]:

@@ -289,6 +289,19 @@ def test_file_that_is_no_transforms(capture, content: str) -> None:
         load_dataset(capture.root)
 
 
+def test_points_of_the_model_next_to_frames_of_nerfstudio_are_mentioned(capture) -> None:
+    load(capture)
+    folder = capture.root / "colmap"
+    (warning,) = load_dataset(capture.root).warnings
+    assert warning.endswith("random points are used instead.")
+    (folder / "sparse" / "0").mkdir(parents=True)
+    capture.reconstruction().write_binary(folder / "sparse" / "0")
+    (warning,) = load_dataset(capture.root).warnings
+    assert f"Those of {folder / 'sparse' / '0' / 'points3D.bin'} are not read" in warning and "ply_file_path" in warning
+    (folder / "images").symlink_to(capture.root / "images")
+    assert len(load_dataset(folder).points) == len(capture.points), "the folder can be read as it is said"
+
+
 def test_ply_that_is_no_point_cloud(capture) -> None:
     capture.root.mkdir()
     (capture.root / "points3d.ply").write_text("not a ply\n")
