@@ -1,7 +1,7 @@
-// Keeps the picture up to date. A graphics card draws each all at once. A processor draws a small one of fewer splats while
-// something moves or has just changed, and at rest refines it by parts, between which it looks whether anything moves.
+// Keeps the picture up to date. A graphics card draws each all at once. A processor draws a small one of fewer splats
+// while something moves, and at rest refines it by parts.
 
-const REST = 0.18, MIDDLE = 0.5, MOST_WAITING = 2, MOST_NOTED = 500, NONE = { pose: null, thinned: false };
+const REST = 0.18, MIDDLE = 0.5, MOST_WAITING = 2, MOST_NOTED = 500, MOST_BYTES = 6e8, NONE = { pose: null, thinned: false };
 
 function makeDisplay(canvas, scene, renderer, navigation, panel) {
   const { isSoftware } = renderer, sort = makeSorter(scene), pace = makePace(isSoftware), noted = [];
@@ -23,7 +23,8 @@ function makeDisplay(canvas, scene, renderer, navigation, panel) {
   // Whether the window has changed its size.
   function fit() {
     const sides = [canvas.clientWidth, canvas.clientHeight];
-    const ratio = Math.min(window.devicePixelRatio || 1, 2, renderer.largest / Math.max(...sides));
+    const bytes = (16 + 12 * scene.panes.length) * sides[0] * sides[1];
+    const ratio = Math.min(window.devicePixelRatio || 1, 2, renderer.largest / Math.max(...sides), Math.sqrt(MOST_BYTES / bytes));
     return renderer.resize(...sides.map((side) => Math.max(1, Math.round(side * ratio))));
   }
 
@@ -58,7 +59,7 @@ function makeDisplay(canvas, scene, renderer, navigation, panel) {
     if (noted.length > MOST_NOTED) noted.shift();
   }
 
-  // Draws a picture, all of it; how many splats it took.
+  // Draws all of a picture; how many splats it took.
   function whole(view) {
     let splats = 0;
     for (const step of renderer.drawing(view)) splats += step.splats;

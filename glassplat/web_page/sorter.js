@@ -67,14 +67,14 @@ function sortingWorker() {
   };
 }
 
-// Asks the worker, or sorts here where a browser allows none; only the newest request waits while one is under way.
+// Asks the worker, or sorts here where there is none; only the newest request waits.
 function makeSorter({ positions, reaches, areas, owners }) {
   const splats = { positions, reaches, areas, owners };
   let worker = null, here = null, asked = null, waiting = null;
   try {
     const source = `${sorterOf}\n(${sortingWorker})()`;
     worker = new Worker(URL.createObjectURL(new Blob([source], { type: 'text/javascript' })));
-    worker.onerror = () => {  // What it was asked is sorted here, unless something newer was asked since.
+    worker.onerror = () => {  // What it was asked is sorted here, or what is newer.
       worker = null;
       here = sorterOf(splats);
       if (waiting) asked?.resolve(null);

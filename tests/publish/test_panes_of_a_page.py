@@ -94,3 +94,14 @@ def test_one_of_many_panes_is_chosen_from_a_list(tmp_path: Path) -> None:
         )
         browser.keys("m")
         assert likeness(browser, as_mirrors(scene, [5]), Planar(), CAMERAS[1][1]) > 36
+
+
+@needs_browser
+def test_a_large_window_with_many_panes_is_drawn_more_coarsely(tmp_path: Path) -> None:
+    """Every pane has its own images of the window; 24 of them would take a gigabyte here."""
+    panes = joined(*(upright_pane(0.1 * label - 1.2, label, half=0.05) for label in range(1, 25)))
+    write_page(tmp_path / "index.html", in_single_precision(showcase(panes)), Planar(), CAMERAS, "many")
+    with Browser(tmp_path / "index.html", 2000, 1500) as browser:
+        width, height = browser.evaluate("glassplat.then(({ lensOf }) => lensOf().size)")
+        assert 1200 < width < 1700 and abs(width / height - 4 / 3) < 0.01
+        assert browser.complaints() == []
