@@ -74,6 +74,9 @@ def seen_panes(
 ) -> SeenPanes | None:
     """The panes on the ray of each pixel, None where no tile shows any; the planes keep their gradient.
 
+    Of a scene's panes A, B and C the view may show A and C, through A: then `planes` are A and C, `rows` [0, 2], and in
+    a pixel that shows C through A `order` has 0 first and 1 next; where there is A alone it has 0 first and -1 next.
+
     Args:
         planes: the scene's.
         camera: of the view.

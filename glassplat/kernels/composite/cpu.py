@@ -1,4 +1,28 @@
-"""Blending of sorted splats: the operation on the CPU."""
+"""Blending of sorted splats: the operation on the CPU.
+
+For each pixel this is a short loop over the splats of its tile, from front to back:
+
+    for splat in tile:
+        alpha = min(0.99, 2^exponent(offset))              # 0 below 1/255
+        if splat is glass:
+            if t_glass (1 - alpha) < 1e-4: take no more glass
+            mask    += mark alpha t t_glass
+            t_glass *= 1 - alpha
+        else:
+            if t (1 - alpha) < 1e-4: stop
+            image   += channels alpha t
+            t       *= 1 - alpha
+
+It is run for sixteen pixels at a time:
+
+    image   tiles of 16 x 16 pixels, a few for each task                               composite_forward
+    tile    16 blocks, and its splats in chunks of 128, packed side by side (`fetch`)
+    block   4 x 4 pixels, the lanes of one vector, and the splats that reach it        blend_block
+            (`list_block`; glass as ~k)
+
+Four channels are blended along with alpha; `blend_more` adds the others from the weights that were kept. A pixel that
+has stopped keeps its transmittance with the sign turned, so that one comparison tells which lanes still run.
+"""
 
 from __future__ import annotations
 
