@@ -323,7 +323,8 @@ def _found_masks(
         return masks, ()
     if not (masks or named):
         raise InputError(_no_photograph(root / MASK_FOLDER, unmatched, photographs))
-    return masks, (f"{len(unmatched)} masks belong to no photograph ({first_names(sorted(unmatched))}).",)
+    belong = "1 mask belongs" if len(unmatched) == 1 else f"{len(unmatched)} masks belong"
+    return masks, (f"{belong} to no photograph ({first_names(sorted(unmatched))}).",)
 
 
 def _why_panes(root: Path, masks: Mapping[str, Path], *, marked: bool) -> str | None:

@@ -146,7 +146,8 @@ def check_layers(renderer: Renderer, scene: Scene, layers: Sequence[str], method
     foreign = [layer for layer in layers if layer not in known]
     if foreign or not layers:
         asked = f"renders no layer {', '.join(foreign)}" if foreign else "renders nothing without layers"
-        raise InputError(f"{method} {asked}; expected layers out of {', '.join(known)}")
+        trained = "; only a run trained with --photographer.learn has photographed" if "photographed" in foreign else ""
+        raise InputError(f"{method} {asked}; expected layers out of {', '.join(known)}{trained}")
 
 
 NEAR_PER_EXTENT = 0.01

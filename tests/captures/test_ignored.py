@@ -171,7 +171,7 @@ def test_masks_that_frames_name_may_have_any_name(tmp_path: Path, mask: str) -> 
     name_mask(root, "transforms.json", mask)
     assert list(ignored_of(root)) == ["1.png"] and load_dataset(root).warnings == ()
     write_shades(root / "masks/elsewhere.png", KEPT)
-    assert any("1 masks belong to no photograph (elsewhere.png)" in text for text in load_dataset(root).warnings)
+    assert any("1 mask belongs to no photograph (elsewhere.png)" in text for text in load_dataset(root).warnings)
 
 
 def test_frames_of_a_file_for_training_name_their_masks_too(tmp_path: Path) -> None:
@@ -190,7 +190,7 @@ def test_masks_of_photographs_without_a_pose_are_mentioned(tmp_path: Path) -> No
     root = write_tiny_capture(tmp_path / "capture")
     write_shades(root / "masks/1.png", KEPT)
     write_shades(root / "masks/elsewhere.png", KEPT)
-    assert any("1 masks belong to no photograph (elsewhere.png)" in text for text in load_dataset(root).warnings)
+    assert any("1 mask belongs to no photograph (elsewhere.png)" in text for text in load_dataset(root).warnings)
     (root / "masks/1.png").unlink()
     with pytest.raises(InputError, match=r"match no photograph: elsewhere\.png"):
         load_dataset(root)
@@ -206,7 +206,7 @@ def test_a_capture_of_earlier_versions_keeps_its_panes_and_says_so_once(tmp_path
         assert old.ignored is None and torch.equal(old.pane_labels, new.pane_labels)
     assert [text for text in before.warnings if "rename it to panes/" in text] == list(before.warnings)
     shutil.copy(next((root / "masks").iterdir()), root / "masks" / "elsewhere.png")
-    assert any("belong to no photograph (elsewhere.png)" in text for text in load_dataset(root).warnings)
+    assert any("1 mask belongs to no photograph (elsewhere.png)" in text for text in load_dataset(root).warnings)
 
 
 def test_black_and_white_panes_of_earlier_versions_are_known_by_their_planes(tmp_path: Path) -> None:

@@ -65,6 +65,7 @@ def test_every_layer_that_is_listed_can_be_rendered(method: str, tmp_path: Path)
     ("method", "layers", "words"),
     [
         ("splat", ["base"], "splat renders no layer base; expected layers out of rgb, normal, depth, alpha"),
+        ("planar", ["photographed"], "only a run trained with --photographer.learn has photographed"),
         ("splat", ["rgb", "mask", "depth", "base"], "splat renders no layer mask, base; expected"),
         ("planar", ["rgb", "environment"], "planar renders no layer environment; expected layers out of rgb, "),
         ("planar", [], "planar renders nothing without layers; expected layers out of rgb, "),
