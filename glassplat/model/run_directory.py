@@ -251,6 +251,7 @@ class RunDirectory:
         """Writes the recorded cameras again, as training found them if it looked for them.
 
         Then `sparse/0` is the same as a COLMAP model, of the photographs as training saw them: undistorted and reduced.
+        Random points are not in it.
         """
         from glassplat.captures.dataset import with_corrected_cameras
         from glassplat.files.sidecars import write_cameras, write_colmap
@@ -260,7 +261,8 @@ class RunDirectory:
         write_cameras(self.path / "cameras.json", cameras)
         if not len(scene.poses):
             return
-        positions, colors = dataset.points.positions.numpy(), dataset.points.colors.numpy()
+        measured = slice(None if dataset.measured_points else 0)
+        positions, colors = (part[measured].numpy() for part in (dataset.points.positions, dataset.points.colors))
         write_colmap(self.path / "sparse" / "0", sorted(cameras, key=itemgetter(0)), positions, colors)
 
     def recipe(self) -> Any:

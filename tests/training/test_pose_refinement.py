@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from glassplat.captures.colmap import read_model
 from glassplat.captures.dataset import Dataset, load_dataset, with_corrected_cameras
 from glassplat.captures.view import View
 from glassplat.cli.runs import open_run
@@ -236,6 +237,15 @@ def test_the_model_of_a_training_has_the_cameras_that_its_run_records(tmp_path: 
 def test_a_camera_in_memory_is_moved_by_what_is_on_another_device() -> None:
     elsewhere = moved_camera(CAMERA, torch.zeros(6, device="meta"), 1.0)  # A device that every machine has.
     assert elsewhere.cam_from_world.device.type == "meta"
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_random_points_are_not_written_as_measured_ones(measured: bool, tmp_path: Path) -> None:
+    dataset = replace(tiny_capture(), measured_points=measured)
+    RunDirectory(tmp_path).write_trained_cameras(dataset, corrected_scene())
+    model = read_model(tmp_path / "sparse/0")
+    assert len(model.images) == len(dataset.train) + len(dataset.test)
+    assert len(model.points) == (len(dataset.points) if measured else 0)
 
 
 def test_a_refined_model_is_read_as_colmap(tmp_path: Path) -> None:
