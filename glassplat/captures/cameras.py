@@ -113,7 +113,7 @@ LEAST_SIDE = 8
 """Of a photograph, in pixels; smaller ones are what a failed download or export leaves."""
 LEAST_BLANK = 1e-3
 """Share of an undistorted image outside the photograph; below, it is rounding along the border."""
-BLANK_SIDE = 256
+BLANK_SIDE = 128
 """Of the image on which that is measured, in pixels; a whole photograph takes a second."""
 MOST_SKEW = 0.05
 """Relative deviation of a photograph's side from a scaled copy's, however few pixels that is."""
