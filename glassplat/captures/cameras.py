@@ -205,7 +205,7 @@ class PixelMap:
 
     def blank(self) -> NDArray[np.uint8]:
         """[height, width]; 1 where any pixel that is averaged lies outside the photograph of the lens."""
-        return self._any(_blank(self.lens) if self.lens else np.zeros((self.height, self.width), np.uint8))
+        return self._any(blank_pixels(self.lens) if self.lens else np.zeros((self.height, self.width), np.uint8))
 
     def _any(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         if labels.shape == (self.height, self.width):
@@ -339,11 +339,11 @@ def blank_share(lens: Lens) -> float:
         return 0.0
     scale = min(1.0, BLANK_SIDE / max(lens.width, lens.height))
     small = lens.rescale(max(1, round(scale * lens.width)), max(1, round(scale * lens.height)))
-    share = float(_blank(small).mean())
+    share = float(blank_pixels(small).mean())
     return share if share > LEAST_BLANK else 0.0
 
 
-def _blank(lens: Lens) -> NDArray[np.uint8]:
+def blank_pixels(lens: Lens) -> NDArray[np.uint8]:
     """[H, W] of the undistorted image, 1 where it shows nothing of the photograph."""
     return (undistort(np.full((lens.height, lens.width), 255, np.uint8), lens.as_colmap()) < 255).astype(np.uint8)
 
