@@ -21,6 +21,7 @@ from glassplat.kernels.records import NORMAL_MIN, Shaded
 from glassplat.render.frame import (
     NEAR_PER_EXTENT,
     Frame,
+    OverBackground,
     ScreenPass,
     check_colored,
     check_ellipsoids,
@@ -325,7 +326,7 @@ INVISIBLE = 1 / 512
 
 
 @dataclass(frozen=True)
-class Deferred:
+class Deferred(OverBackground):
     """Blends colour, normal and reflection strength, then shades every pixel once (3DGS-DR, Section 3.1).
 
         C, N, R = sum_i (c_i, n_i, r_i) alpha_i T_i                   (Eqs. 1 and 2)
@@ -345,7 +346,6 @@ class Deferred:
             strength learns from what it would reflect.
     """
 
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     depth: bool = True
     environment: bool = False
     least_strength: float = 0.0

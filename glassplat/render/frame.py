@@ -132,6 +132,21 @@ class Renderer(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class OverBackground:
+    """The colour behind everything, which all renderers draw over.
+
+    Attributes:
+        background: colour behind everything, sRGB.
+    """
+
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if len(self.background) != 3:
+            raise ValueError(f"background is {self.background}; expected three numbers, sRGB from 0 to 1")
+
+
 MEDIAN_DEPTH = "median_depth"
 """A layer that any renderer has of discs."""
 

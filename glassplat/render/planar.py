@@ -20,6 +20,7 @@ from glassplat.render.frame import (
     NEAR_PER_EXTENT,
     Drawing,
     Frame,
+    OverBackground,
     Renderer,
     ScreenPass,
     check_colored,
@@ -86,7 +87,7 @@ class SecondPass(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Planar:
+class Planar(OverBackground):
     """Renders transmission, reflection and their blend (TR-Gaussians, Section III-A).
 
         C = (1 - R) C_t + R C_r                      (Eq. 1)
@@ -128,7 +129,6 @@ class Planar:
             much is left of either; if not, all of them count alike.
     """
 
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     fresnel: Fresnel = "pane"
     intensity: bool = True
     reflection_gradient: Literal["all", "planes"] = "all"
@@ -140,6 +140,7 @@ class Planar:
     tells_mirrored: bool = True
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.blend not in get_args(Blend):
             raise ValueError(f"blend is {self.blend!r}; expected one of {get_args(Blend)}")
 

@@ -19,6 +19,7 @@ from glassplat.render.frame import (
     NEAR_PER_EXTENT,
     Drawing,
     Frame,
+    OverBackground,
     Renderer,
     ScreenPass,
     camera_batch,
@@ -146,7 +147,7 @@ def ellipsoid_normals(scene: Scene, camera: Camera) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Splat:
+class Splat(OverBackground):
     """Renders the primary Gaussians by EWA splatting, or as discs where they are flat, and front-to-back blending.
 
         C(u) = sum_i c_i alpha_i T_i,   T_i = prod_{j<i} (1 - alpha_j)
@@ -164,7 +165,6 @@ class Splat:
         normal: also render the normals of discs; costs three more channels.
     """
 
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     depth: bool = True
     normal: bool = True
 

@@ -23,7 +23,15 @@ from glassplat.render.deferred import (
     shaded_pixels,
     view_directions,
 )
-from glassplat.render.frame import MEDIAN_DEPTH, NEAR_PER_EXTENT, Frame, SpacePass, check_colored, over_background
+from glassplat.render.frame import (
+    MEDIAN_DEPTH,
+    NEAR_PER_EXTENT,
+    Frame,
+    OverBackground,
+    SpacePass,
+    check_colored,
+    over_background,
+)
 from glassplat.scene import SH_ZERO
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
@@ -35,7 +43,7 @@ hold the surface too."""
 
 
 @dataclass(frozen=True)
-class Traced:
+class Traced(OverBackground):
     """Blends colour, normal, strength and depth of surfaces, then traces what each pixel mirrors (EnvGS, Section 4.1).
 
         v = sum_i v_i alpha_i T_i,  v in {c_base, x, n, beta}                   (Eq. 3)
@@ -61,7 +69,6 @@ class Traced:
         surroundings: also render the layer `surroundings`.
     """
 
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     least_strength: float = 0.0
     faintest: float = INVISIBLE
     joint: bool = True

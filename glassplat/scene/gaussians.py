@@ -12,6 +12,8 @@ from glassplat.scene import among_known
 
 DISC_SCALES = 2
 """Scales of a disc; an ellipsoid has one more."""
+SH_COEFFICIENTS = (0, 1, 4, 9, 16)
+"""Harmonics per colour: none, or those up to a degree from 0 to 3."""
 PER_GAUSSIAN = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
 
@@ -51,6 +53,11 @@ class Gaussians:
                 raise ValueError(
                     f"{name} has {tensor.shape[0]} rows where means has {count}; expected one row per Gaussian"
                 )
+        if self.sh.dim() != 3 or self.sh.shape[1] not in SH_COEFFICIENTS or self.sh.shape[2] != 3:
+            raise ValueError(
+                f"sh has shape {tuple(self.sh.shape)}; expected (N, K, 3) with K one of {SH_COEFFICIENTS}, as degrees "
+                "up to 3 have them"
+            )
         if not 0 <= self.active_sh_degree <= max(self.max_sh_degree, 0):
             raise ValueError(
                 f"active_sh_degree is {self.active_sh_degree}, but sh holds degrees up to {self.max_sh_degree}"

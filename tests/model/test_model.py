@@ -18,6 +18,9 @@ from PIL import Image
 import glassplat
 from glassplat import Camera, Gaussians, InputError, Model, Planar, PlanarRecipe, Scene, SplatRecipe, View
 from glassplat.model.model import by_name
+from glassplat.render.deferred import Deferred
+from glassplat.render.splat import Splat
+from glassplat.render.traced import Traced
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Environment
 from glassplat.training.densify import as_discs
@@ -343,6 +346,20 @@ def test_metrics_are_of_what_photographs_show_somebody_in_the_glass_too() -> Non
 def test_gaussians_of_a_model_are_plain_data() -> None:
     primary = model().scene.primary
     assert isinstance(primary, Gaussians) and len(primary.concat(primary)) == 2 * len(primary)
+
+
+@pytest.mark.parametrize("shape", [(30, 5, 3), (30, 25, 3), (30, 4), (30, 4, 4)])
+def test_colours_that_are_no_harmonics_are_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(
+        ValueError, match=r"sh has shape \(30, .*; expected \(N, K, 3\) with K one of \(0, 1, 4, 9, 16\)"
+    ):
+        dataclasses.replace(true_scene().primary, sh=torch.zeros(shape))
+
+
+@pytest.mark.parametrize("renderer", [Splat, Planar, Deferred, Traced])
+def test_a_background_is_a_colour(renderer: type) -> None:
+    with pytest.raises(ValueError, match=r"background is \(0.1, 0.2, 0.3, 0.4\); expected three numbers, sRGB"):
+        renderer((0.1, 0.2, 0.3, 0.4))
 
 
 def test_a_view_in_memory_is_kept_and_what_is_no_tensor_and_no_angle_is_refused() -> None:
