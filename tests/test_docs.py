@@ -12,6 +12,7 @@ import torch
 
 import glassplat
 from glassplat.cli import main
+from tests.training.tiny_capture import tiny_capture
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
@@ -91,6 +92,17 @@ def test_the_term_of_a_recipe_of_ones_own_leaves_out_stages_without_depths() -> 
     image, depth = torch.zeros(2, 3, 3), torch.tensor([[0.0, 1.0, 3.0], [0.0, 0.0, 0.0]])
     assert terms[0].function(glassplat.Frame(image, {}), None, None) is None
     assert terms[0].function(glassplat.Frame(image, {"depth": depth}), None, None) == 0.75
+
+
+@pytest.mark.parametrize("recipe", ["SplatRecipe", "DeferredRecipe"])
+def test_the_term_of_a_recipe_of_ones_own_counts_in_every_step(recipe: str) -> None:
+    blocks = PYTHON_BLOCK.findall((ROOT / "docs" / "python.md").read_text(encoding="utf-8"))
+    (block,) = [block for block in blocks if "LossTerm" in block]
+    names = {"glassplat": glassplat, "dataclasses": dataclasses}
+    exec(block.replace("PlanarRecipe", recipe), names)
+    messages = glassplat.Training(tiny_capture(), names["Calm"](), iterations=4)
+    steps = [message for message in messages if isinstance(message, glassplat.StepDone)]
+    assert len(steps) == 4 and all("calm" in step.losses for step in steps)
 
 
 MODULE = re.compile(r"python -m ((?:tools|benchmarks)(?:\.\w+)?)([^`\n|;]*)")
