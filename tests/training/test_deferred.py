@@ -478,3 +478,16 @@ def test_estimated_normals_count_from_when_things_reflect(recipe: DeferredRecipe
 
     assert weights(recipe) == [[], [0.5], [0.5]]
     assert weights(replace(recipe, monocular_weight=0.0)) == [[], [], []]
+
+
+def test_mirrors_are_looked_for_after_enough_steps_however_short_the_run() -> None:
+    def steps(recipe: DeferredRecipe | TracedRecipe, iterations: int) -> int:
+        stages = recipe.stages(0, iterations)
+        assert sum(stage.share for stage in stages) == pytest.approx(1)
+        return round(stages[0].share * iterations)
+
+    short = replace(DeferredRecipe(), least_iterations=1)
+    assert [steps(short, iterations) for iterations in (700, 1000, 4999, 7000)] == [262, 300, 300, 420]
+    assert [steps(TracedRecipe(least_iterations=1), iterations) for iterations in (1000, 2000)] == [300, 500]
+    assert steps(DeferredRecipe.paper(), 1000) == round(1000 * DeferredRecipe.paper().bootstrap)
+    assert short.stages(0, 5000)[0].share == short.bootstrap
