@@ -46,7 +46,7 @@ def splat_stages(recipe: SplatRecipe, seed: int, iterations: int = PUBLISHED_ITE
         densify_until=population.densify_until,
     )
     stages, began = [first], 0.0
-    for start, term in terms_by_start(recipe.discs) if recipe.primitive == "disc" else ():
+    for start, term in terms_by_start(recipe.discs, iterations) if recipe.primitive == "disc" else ():
         last = stages.pop()
         stages += [replace(last, share=start - began)] if start > began else []
         losses = (*last.losses, term)
@@ -84,10 +84,18 @@ def population_of(recipe: MethodRecipe) -> Population:
     return replace(population, post_steps=(*population.post_steps, AverageLast(recipe.intervals.averaged_passes)))
 
 
-def terms_by_start(options: DiscTerms) -> tuple[tuple[float, LossTerm], ...]:
-    """The terms that count at all, with the shares of the run after which they do, in order."""
+LEAST_DISTORTION_START = 400
+"""Steps before which discs are not on surfaces yet; to draw them together then makes them fog."""
+
+
+def terms_by_start(options: DiscTerms, iterations: int) -> tuple[tuple[float, LossTerm], ...]:
+    """The terms that count at all, with the shares of the run after which they do, in order.
+
+    Of a mirror ball at 800 iterations, a distortion term from step 80 on left 11.0 dB, from step 400 on 21.2.
+    """
+    distortion_start = max(options.distortion_start, LEAST_DISTORTION_START / iterations)
     terms = (
-        (options.distortion_start, LossTerm("distortion", options.distortion_weight, distortion)),
+        (distortion_start, LossTerm("distortion", options.distortion_weight, distortion)),
         (options.normal_start, LossTerm("normals", options.normal_weight, disc_normals)),
     )
     wanted = [(start, term) for start, term in terms if term.weight > 0 and start < 1]

@@ -23,7 +23,7 @@ class DiscTerms:
 
     Attributes:
         distortion_weight: of how far apart along a ray lies what a pixel shows; 2DGS takes 1000 for bounded scenes.
-        distortion_start: share of the run after which it counts.
+        distortion_start: share of the run after which it counts, if that is 400 steps or more; else after 400.
         normal_weight: of how far the discs' normals are from those of their depths.
         normal_start: share of the run after which it counts.
     """

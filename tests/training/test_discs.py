@@ -11,6 +11,7 @@ import torch
 
 from glassplat.cli.main import main
 from glassplat.files.scene_folder import read_scene
+from glassplat.methods.glossy_recipes import TracedRecipe
 from glassplat.methods.splat_recipe import DiscTerms, SplatRecipe
 from glassplat.model.run_directory import RunDirectory
 from glassplat.render.splat import Splat
@@ -45,6 +46,20 @@ def test_terms_count_from_their_share_of_the_run_on() -> None:
     assert first[0].losses[-1].function is disc_normals
     assert len(replace(DISCS, discs=DiscTerms(0.0, 0.1, 0.0, 0.2)).stages(0)) == 1
     assert len(replace(DISCS, primitive="ellipsoid").stages(0)) == 1
+
+
+def test_discs_are_on_surfaces_before_distortion_counts() -> None:
+    def starts(iterations: int) -> list[float]:
+        stages = DISCS.stages(0, iterations)
+        assert sum(stage.share for stage in stages) == pytest.approx(1)
+        counts = [any(term.name == "distortion" for term in stage.losses) for stage in stages]
+        return [sum(s.share for s in stages[:i]) * iterations for i, has in enumerate(counts) if has][:1]
+
+    assert starts(300) == starts(400) == []
+    assert [starts(n)[0] for n in (800, 2500, 3999)] == pytest.approx([400, 400, 400])
+    assert DISCS.stages(0, 4000)[0].share == DISCS.stages(0)[0].share
+    matte = TracedRecipe(primitive="disc").stages(0, 800)
+    assert [stage.share for stage in matte] == pytest.approx([7 / 30, 0.5 - 7 / 30, 0.5])
 
 
 def short(recipe: SplatRecipe) -> SplatRecipe:

@@ -278,7 +278,7 @@ def test_the_preset_is_that_of_the_public_configuration() -> None:
 
 
 def test_a_short_run_of_discs_learns_as_splat_does_with_discs() -> None:
-    stages, plain = TracedRecipe(primitive="disc").stages(0, 1000), SplatRecipe(primitive="disc").stages(0)
+    stages, plain = TracedRecipe(primitive="disc").stages(0, 1000), SplatRecipe(primitive="disc").stages(0, 1000)
     assert [stage.name for stage in stages] == [f"as {stage.name}" for stage in plain]
     assert [[term.name for term in stage.losses] for stage in stages] == [
         [term.name for term in stage.losses] for stage in plain
