@@ -114,7 +114,7 @@ LEAST_SIDE = 8
 LEAST_BLANK = 1e-3
 """Share of an undistorted image outside the photograph; below, it is rounding along the border."""
 BLANK_SIDE = 128
-"""Of the image on which that is measured, in pixels; a whole photograph takes a second."""
+"""Of the image on which that is measured, in pixels; a whole photograph takes seconds."""
 MOST_SKEW = 0.05
 """Relative deviation of a photograph's side from a scaled copy's, however few pixels that is."""
 
@@ -201,13 +201,14 @@ class PixelMap:
         """[H, W] of the photograph's size to [height, width]; 1 where any pixel that is averaged has a label."""
         if self.lens is not None:
             labels = undistort(labels, self.lens.as_colmap(), "NEAREST_NEIGHBOR")
-        return self._any(labels)
+        return self.reduce_labels(labels)
 
     def blank(self) -> NDArray[np.uint8]:
         """[height, width]; 1 where any pixel that is averaged lies outside the photograph of the lens."""
-        return self._any(blank_pixels(self.lens) if self.lens else np.zeros((self.height, self.width), np.uint8))
+        return _blank_in(self)
 
-    def _any(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def reduce_labels(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """[H, W] of the undistorted size to [height, width]; 1 where any pixel that is averaged has a label."""
         if labels.shape == (self.height, self.width):
             return labels
         return (resize_by_area(labels > 0, self.width, self.height) > LEAST_SHARE).astype(np.uint8)
@@ -341,6 +342,13 @@ def blank_share(lens: Lens) -> float:
     small = lens.rescale(max(1, round(scale * lens.width)), max(1, round(scale * lens.height)))
     share = float(blank_pixels(small).mean())
     return share if share > LEAST_BLANK else 0.0
+
+
+@lru_cache(maxsize=8)
+def _blank_in(pixel_map: PixelMap) -> NDArray[np.uint8]:
+    """`PixelMap.blank`, which takes as long as undistorting a photograph and is the same for all of a lens."""
+    shape = (pixel_map.height, pixel_map.width)
+    return pixel_map.reduce_labels(blank_pixels(pixel_map.lens)) if pixel_map.lens else np.zeros(shape, np.uint8)
 
 
 def blank_pixels(lens: Lens) -> NDArray[np.uint8]:

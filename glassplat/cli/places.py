@@ -193,7 +193,15 @@ class SceneEdits:
             InputError: there are no panes, no pane has a label, a value is out of range, edits contradict, or the
                 panorama cannot be read or nothing mirrors it.
         """
-        from glassplat.scene.scene import as_mirrors, shift_pane, tilt_pane, with_reflectance, without_glass
+        from glassplat.scene.scene import (
+            as_mirrors,
+            glass_of_pane,
+            row_of,
+            shift_pane,
+            tilt_pane,
+            with_reflectance,
+            without_glass,
+        )
 
         if self.surroundings is not None:
             scene = in_surroundings(scene, self.surroundings)
@@ -203,10 +211,12 @@ class SceneEdits:
         with input_checked():
             for label, reflectance in self.reflectance.items():
                 scene = with_reflectance(scene, label, reflectance)
+            moved = {*self.tilt, *self.shift}
+            owned = {label: glass_of_pane(scene, row_of(scene.planes, label)) for label in moved}
             for label, angles in self.tilt.items():
-                scene = tilt_pane(scene, label, *angles)
+                scene = tilt_pane(scene, label, *angles, owned=owned[label])
             for label, distance in self.shift.items():
-                scene = shift_pane(scene, label, distance)
+                scene = shift_pane(scene, label, distance, owned=owned[label])
             scene = as_mirrors(scene, self.as_mirror)
         return without_glass(scene) if self.remove_glass else scene
 

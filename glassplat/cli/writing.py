@@ -244,7 +244,8 @@ def write_files(command: Export, console: Console) -> None:
         written.append(splats[kind])
         say(console, f"{splats[kind].stat().st_size / 1e6:.2f} MB -> {splats[kind]}")
         if lost := left_out(model, kind):
-            warn(console, f"{splats[kind].name} leaves out {', '.join(lost)}; {command.scene} holds everything")
+            held = f"; {command.scene} holds everything" if command.edits == SceneEdits() else ""
+            warn(console, f"{splats[kind].name} leaves out {', '.join(lost)}{held}")
     if "html" in command.formats:
         written += _write_page(command, model, console)
     if is_again:

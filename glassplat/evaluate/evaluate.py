@@ -246,10 +246,10 @@ def evaluate(
     truth = load_truth(dataset.truth)
     lpips = metrics.load_lpips()
     regions = regions or (RENDERED_REGIONS if truth is None else TRUE_REGIONS)
-    # The first frame may wait for the compiler; it must not count.
-    timed_render(renderer, scene, dataset.test[0])
     # With a photographer frames hold two images, what photographs show and what nobody disturbs; the latter is timed.
     timed = with_photographer(renderer, "absent") if len(scene.photographer) else renderer
+    # The first frame may wait for the compiler; it must not count.
+    timed_render(timed, scene, dataset.test[0])
     measurements, learned = {}, scene.exposures.to("cpu")
     for view in dataset.test:
         frame, seconds = timed_render(renderer, scene, view)

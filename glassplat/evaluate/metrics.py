@@ -239,10 +239,13 @@ def reflection_gain(images: list[Tensor], targets: list[Tensor]) -> float:
         targets: the same shapes.
     """
     pairs = [(a.to(torch.float64), b.to(torch.float64)) for a, b in zip(images, targets, strict=True)]
-    gain = _least_squares([(image[target < 1], target[target < 1]) for image, target in pairs])
+    below = [(image[target < 1], target[target < 1]) for image, target in pairs]
+    gain = _least_squares(below if any(len(target) for _, target in below) else pairs)
     for _ in range(MOST_ROUNDS):
-        before, seen = gain, [gain * image < 1 for image, _ in pairs]
-        gain = _least_squares([(image[kept], target[kept]) for (image, target), kept in zip(pairs, seen, strict=True)])
+        before, seen = gain, [(image[gain * image < 1], target[gain * image < 1]) for image, target in pairs]
+        if not any(len(target) for _, target in seen):
+            break
+        gain = _least_squares(seen)
         if gain == before:
             break
     return gain

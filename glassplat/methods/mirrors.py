@@ -412,14 +412,15 @@ class Propagate:
                 "step %d: normal propagation has ended, %.0f %% of what is seen is reflection", clock.step, 100 * share
             )
             return
-        turns = state.records.get(TURNS)
-        if turns is None:
-            turns = self.search.turning(state.scene, dataset.train, self.renderer)
-        advice = (MATTE if turns < LOOKS_REFLECTIVE else OVERLOOKED) % (100 * turns)
         region = state.scene.environment.region
         if region is not None and not bool(in_region(state.scene).any()):
             *center, radius = region
             advice = EMPTY % (radius, *center)
+        else:
+            turns = state.records.get(TURNS)
+            if turns is None:
+                turns = self.search.turning(state.scene, dataset.train, self.renderer)
+            advice = (MATTE if turns < LOOKS_REFLECTIVE else OVERLOOKED) % (100 * turns)
         log.warning(NOTHING_FOUND, clock.step, AS_SPLAT if self.matte_rates else "", advice)
 
 

@@ -22,7 +22,7 @@ from glassplat.files import writing
 from glassplat.files.ply import read_gaussians, write_gaussians
 from glassplat.files.records import read_text
 from glassplat.files.scene_folder import drawable, read_splats
-from glassplat.files.sidecars import read_cameras, read_planes, write_cameras, write_equirect, write_planes
+from glassplat.files.sidecars import planes_json, read_cameras, read_planes, write_cameras, write_equirect, write_planes
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.recipe import recipe_to_json, resolve_background, with_background
@@ -440,6 +440,9 @@ def _foreign(model: Model, beside: Sequence[Path]) -> list[Path]:
         own = [*write_beside(Path(folder), model.scene), Path(folder) / CAMERAS]
         write_cameras(own[-1], model.cameras.items())
         contents = {file.name: file.read_bytes() for file in own}
+    if not len(model.scene.planes):  # An earlier model's panes are taken away; its glass stays, and nobody reads it.
+        contents[PLANES] = planes_json(model.scene.planes).encode()
+        there = [target for target in there if target.name != GLASS or not (target.parent / PLANES).exists()]
     return [target for target in there if not target.is_file() or target.read_bytes() != contents.get(target.name)]
 
 

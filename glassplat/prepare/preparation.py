@@ -19,6 +19,7 @@ from filelock import FileLock, Timeout
 
 from glassplat import __version__
 from glassplat.captures.colmap_library import quiet_pycolmap
+from glassplat.captures.masks import IGNORE_FOLDER
 from glassplat.errors import InputError, first_names
 from glassplat.files.records import read_json, readable_name
 from glassplat.files.writing import check_folder, make_folder, missing_folders, real_path, remove_empty, write_text
@@ -43,6 +44,8 @@ PAGE = "prepare.html"
 """In the capture: the same for people."""
 PHOTOGRAPHS = "photographs"
 """In the settings of an interrupted preparation: the states of the files that it was begun with."""
+MASKS = "masks"
+"""In the record: digests of the masks of what a wide lens did not see."""
 MADE = ("images", "sparse", RECORD, PAGE)
 """In a capture: all that comes from here; whatever else is there, somebody spent time on."""
 
@@ -176,7 +179,13 @@ class Workplace:
                 f"{self.output} holds a capture that was prepared before; choose a new folder for --output, or replace "
                 "it with --force"
             )
-        others = [name for name in found if name not in MADE and not name.startswith(".")]
+        others = [name for name in found if name not in (*MADE, IGNORE_FOLDER) and not name.startswith(".")]
+        own = read_json(self.output / RECORD).get(MASKS, ())
+        others += [
+            path.relative_to(self.output).as_posix()
+            for path in sorted((self.output / IGNORE_FOLDER).rglob("*"))
+            if path.is_file() and _digest(path) not in own
+        ]
         pictures = [path for path in (self.output / "images").rglob("[!.]*") if path.is_file()]
         added = {path for path in pictures if path.suffix != PICTURE_SUFFIX} | set(masks_among(pictures))
         others += sorted(path.relative_to(self.output).as_posix() for path in added)
@@ -400,9 +409,14 @@ def _prepare(task: Preparation, workplace: Workplace, listen: Listener, *, resum
     report = report_of(solution)
     _check_enough(report, task)
     write_capture(solution, workplace.capture, listen)
+    masks = sorted({_digest(path) for path in (workplace.capture / IGNORE_FOLDER).rglob("*.png")})
     made = {"command": "prepare", "version": __version__, **task.record()}
-    workplace.finish({**made, "report": asdict(report)})
+    workplace.finish({**made, "report": asdict(report), **({MASKS: masks} if masks else {})})
     return report
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def is_video(source: Path) -> bool:

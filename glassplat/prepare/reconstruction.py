@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from glassplat.captures import colmap_library as library
-from glassplat.captures.cameras import blank_pixels, blank_share, make_lens, undistort
+from glassplat.captures.cameras import Lens, blank_pixels, blank_share, make_lens, undistort
 from glassplat.captures.masks import IGNORE_FOLDER
 from glassplat.errors import InputError, first_names
 from glassplat.files.images import write_image
@@ -166,7 +166,7 @@ def write_capture(solution: Solution, folder: Path, listen: Listener) -> None:
     """
     model = solution.models[0]
     lenses = {key: library.pycolmap.Camera(camera.todict()) for key, camera in model.cameras.items()}
-    blank = _blank_parts(lenses)
+    wide, blank = _wide_lenses(lenses), lru_cache(maxsize=1)(blank_pixels)
     _straighten(model)
     images = image_numbers(model)
     for done, (number, image) in enumerate(sorted(images.items())):
@@ -176,8 +176,9 @@ def write_capture(solution: Solution, folder: Path, listen: Listener) -> None:
         target = folder / "images" / photograph.name
         target.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(pixels).save(target, quality=JPEG_QUALITY, subsampling=0)
-        if image.camera_id in blank:
-            write_image((folder / IGNORE_FOLDER / photograph.name).with_suffix(".png"), blank[image.camera_id])
+        if image.camera_id in wide:
+            mask = (folder / IGNORE_FOLDER / photograph.name).with_suffix(".png")
+            write_image(mask, 255 * blank(wide[image.camera_id]))
         image.name = photograph.name
     listen(Working("taking the colours of points from the photographs", 0, len(images)))
     model.extract_colors_for_all_images(folder / "images")
@@ -186,13 +187,13 @@ def write_capture(solution: Solution, folder: Path, listen: Listener) -> None:
     model.write_binary(sparse)
 
 
-def _blank_parts(cameras: dict[int, Any]) -> dict[int, NDArray[np.uint8]]:
-    """White on what a wide lens did not see of its undistorted photographs, [H, W]; none of other lenses."""
+def _wide_lenses(cameras: dict[int, Any]) -> dict[int, Lens]:
+    """The lenses that did not see all of their undistorted photographs."""
     lenses = {
         key: make_lens(camera.model_name, list(camera.params), (camera.width, camera.height))
         for key, camera in cameras.items()
     }
-    return {key: 255 * blank_pixels(lens) for key, lens in lenses.items() if blank_share(lens)}
+    return {key: lens for key, lens in lenses.items() if blank_share(lens)}
 
 
 def _straighten(model: Any) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 from numpy.typing import NDArray
@@ -280,10 +281,11 @@ def _bin(low: float, high: float) -> str:
 
 
 def _shown(views: Sequence[View], model: Any) -> list[Shown]:
-    images = {image.name: image for image in model.images.values()}
+    # A file may spell an accent in another way than the model does.
+    images = {normalize("NFC", image.name): image for image in model.images.values()}
     found = []
     for view in views:
-        keys = [point.point3D_id for point in images[view.name].points2D if point.has_point3D()]
+        keys = [point.point3D_id for point in images[normalize("NFC", view.name)].points2D if point.has_point3D()]
         error = float(np.mean([model.points3D[key].error for key in keys])) if keys else 0.0
         found.append(Shown(view, len(keys), error))
     return found

@@ -252,7 +252,9 @@ def with_reflectance(scene: Scene, label: int, base_reflectance: float) -> Scene
     return replace(scene, planes=replace(scene.planes, logit_reflectances=logits, mirrors=mirrors))
 
 
-def tilt_pane(scene: Scene, label: int, about_tangent: float, about_bitangent: float) -> Scene:
+def tilt_pane(
+    scene: Scene, label: int, about_tangent: float, about_bitangent: float, *, owned: Tensor | None = None
+) -> Scene:
     """The pane and its glass, turned about the rectangle's middle; zero angles change no bit.
 
     Args:
@@ -260,6 +262,7 @@ def tilt_pane(scene: Scene, label: int, about_tangent: float, about_bitangent: f
         label: which pane.
         about_tangent: degrees about the rectangle's first side, right-handed.
         about_bitangent: degrees about its second side. Two angles together are one rotation vector.
+        owned: [N] bool, the pane's glass; if None, what is nearest to it.
 
     Raises:
         ValueError: no pane has the label, or an angle is not finite.
@@ -273,16 +276,17 @@ def tilt_pane(scene: Scene, label: int, about_tangent: float, about_bitangent: f
     tangent, bitangent = (axes[row] for axes in scene.planes.axes())
     axis = torch.nn.functional.normalize(about_tangent * tangent + about_bitangent * bitangent, dim=0)
     turn = torch.cat([axis.new_tensor([math.cos(angle / 2)]), math.sin(angle / 2) * axis])
-    return _turn_pane(scene, row, turn, glass_of_pane(scene, row))
+    return _turn_pane(scene, row, turn, glass_of_pane(scene, row) if owned is None else owned)
 
 
-def shift_pane(scene: Scene, label: int, distance: float) -> Scene:
+def shift_pane(scene: Scene, label: int, distance: float, *, owned: Tensor | None = None) -> Scene:
     """The pane and its glass, moved along the pane's normal; zero changes no bit.
 
     Args:
         scene: what to edit; it is left as it is.
         label: which pane.
         distance: world units, positive to where the normal points.
+        owned: [N] bool, the pane's glass; if None, what is nearest to it.
 
     Raises:
         ValueError: no pane has the label, or the distance is not finite.
@@ -291,7 +295,8 @@ def shift_pane(scene: Scene, label: int, distance: float) -> Scene:
     _check_finite(label, distance)
     if distance == 0:
         return scene
-    return _translate_pane(scene, row, distance * scene.planes.normals[row], glass_of_pane(scene, row))
+    owned = glass_of_pane(scene, row) if owned is None else owned
+    return _translate_pane(scene, row, distance * scene.planes.normals[row], owned)
 
 
 class PaneMove(NamedTuple):

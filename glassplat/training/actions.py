@@ -362,7 +362,7 @@ class Population:
     cap: int | None = None
 
     def initial(self, points: PointCloud, sh_degree: int) -> Gaussians:
-        """The first primary Gaussians, one per point; under a cap, of points drawn evenly, in every run the same."""
+        """The first primary Gaussians, one per point; under a cap, of points drawn at random, in every run the same."""
         if self.cap and len(points) > self.cap:
             log.info("The first Gaussians are %d of the %d points, as many as the cap allows", self.cap, len(points))
             generator = torch.Generator().manual_seed(0)

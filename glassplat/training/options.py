@@ -194,7 +194,8 @@ class DefaultDensify:
         prune_scale_fraction: from `prune_large_start` on, Gaussians with an axis above this share of the
             scene extent are removed. 3DGS also states a limit of 20 pixels on screen, but clears the radii before it
             looks at them, so that its published results have none.
-        cap: largest number of Gaussians to begin with and to grow to; None takes `--densify.per-pixel` for the latter.
+        cap: largest number of Gaussians to begin with and to grow to; None takes `--densify.per-pixel` for the latter,
+            and 0 keeps all first ones and adds none.
         per_pixel: largest number of Gaussians to grow to for each pixel of all training photographs, which is reached
             where these contradict each other, by cars and leaves, and never stop asking for more; 0 for no limit.
         least_contribution: Gaussians that add less than so many pixels to every training view, directly and mirrored,

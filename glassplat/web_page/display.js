@@ -23,7 +23,7 @@ function makeDisplay(canvas, scene, renderer, navigation, panel) {
   // Whether the window has changed its size.
   function fit() {
     const sides = [canvas.clientWidth, canvas.clientHeight];
-    const bytes = (16 + 12 * scene.panes.length) * sides[0] * sides[1];
+    const bytes = (isSoftware ? 2 : 1) * (16 + 12 * scene.panes.length) * sides[0] * sides[1];
     const ratio = Math.min(window.devicePixelRatio || 1, 2, renderer.largest / Math.max(...sides), Math.sqrt(MOST_BYTES / bytes));
     return renderer.resize(...sides.map((side) => Math.max(1, Math.round(side * ratio))));
   }

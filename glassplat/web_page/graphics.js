@@ -87,7 +87,7 @@ function makeGraphics(canvas) {
     return made;
   }
 
-  // Two triangles for each four vertices. Not instances, which some drivers, and all in software, draw one by one.
+  // Two triangles for each four vertices; some drivers draw instances one by one.
   function rectangles(count) {
     const indices = new Uint32Array(6 * count), array = gl.createVertexArray();
     for (let i = 0; i < count; i++) indices.set([4 * i, 4 * i + 1, 4 * i + 2, 4 * i + 2, 4 * i + 1, 4 * i + 3], 6 * i);

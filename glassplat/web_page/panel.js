@@ -1,4 +1,4 @@
-// The controls around the picture. They change a state and say that it changed; drawing is not their business.
+// The controls around the picture. They change a state and say that it changed.
 
 const element = (id) => document.getElementById(id);
 const STATE = { layer: 'rgb', compare: false, divider: 0.5, glass: 'real', pane: 'all' };
@@ -34,6 +34,7 @@ function makePanel(scene, navigation, changed) {
       element('share').textContent = percent(state.reflectances[first]);
     }
     element('dock').dataset.glass = state.glass;
+    element('panes').value = state.pane;
     changed();
   }
 
@@ -121,7 +122,7 @@ function makePanel(scene, navigation, changed) {
   window.addEventListener('keyup', (event) => walking.delete(event.key.toLowerCase()));
   window.addEventListener('keydown', (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || (event.repeat && !event.key.startsWith('Arrow'))) return;
-    const own = event.target.matches('textarea, select') || (event.target.matches('[type=range], [role=slider]') && event.key.length > 1);
+    const own = event.target.matches('textarea') || (event.target.matches('[type=range], [role=slider], select') && event.key.length > 1);
     if (own && event.key !== 'Escape') return;  // A slider has use for arrows, not for letters.
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
     if (!reflects && ('cgm'.includes(key) || LAYER_KEYS[Number(key) - 1])) return;
@@ -132,7 +133,7 @@ function makePanel(scene, navigation, changed) {
     event.preventDefault();
   });
 
-  // Glass turns into a mirror within a second. Whether any pane still does.
+  // Glass turns into a mirror in a second. Whether any pane still does.
   function turn(seconds) {
     const mirrors = state.glass === 'mirror' ? chosen() : [];
     let turning = false;

@@ -77,7 +77,7 @@ function makeRenderer(canvas, scene) {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // Projected splats from one place of their order to another, over what is there, or with the first one instead of it.
+  // Projected splats from one place of their order to another, over what is there, or instead of it.
   function splat(which, [from, to], target, { size, bounds: [left, top, right, bottom] }) {
     const at = use(programs[which], [['projected', gl.TEXTURE_2D, projected[0]], ['looks', gl.TEXTURE_2D, projected[1]]]);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
@@ -132,7 +132,7 @@ function makeRenderer(canvas, scene) {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // The part of the targets that is drawn at a scale, and the intrinsics of a picture of that size.
+  // The part of the targets that is drawn at a scale, and its intrinsics.
   function sized(view, scale) {
     const size = [targets.width, targets.height].map((side) => Math.max(1, Math.round(side * scale)));
     const used = [size[0] / targets.width, size[1] / targets.height];
@@ -150,7 +150,7 @@ function makeRenderer(canvas, scene) {
     } while (from < order.count);
   }
 
-  // Draws a view in steps of at most so many splats, and shows it with the last one.
+  // Draws a view in steps of at most so many splats, and shows it.
   // view: pose, intrinsics of the whole canvas, scale of what is drawn, layers left and right of the divider (a share
   // of the width), reflectances; glass says whether the panes are drawn at all. A moving picture leaves out what is
   // faint, and what a pane reflects weakly is drawn at half its scale.
@@ -166,8 +166,8 @@ function makeRenderer(canvas, scene) {
     for (const [k, pane] of panes.entries()) {
       if (!bounds[k]) continue;
       const side = sideOf(pane, view.pose), pose = mirroredPose(view.pose, pane), own = overlap[k] && orders.masks[k];
-      present[k] = own?.count ? 2 : 1;
-      if (own?.count) yield* mask(own, k + 1, bounds[k]);
+      present[k] = own?.isKnown ? 2 : 1;
+      if (own?.isKnown) yield* mask(own, k + 1, bounds[k]);
       yield* splats('mirrored', orders.mirrored[k], targets.mirrored[k], { ...mirrors, bounds: bounds[k], pose, side }, most);
     }
     show(view, present, direct, mirrors);
@@ -191,6 +191,8 @@ function makeRenderer(canvas, scene) {
   }
 
   function setOrder(k, sorted) {
+    ordered[k].isKnown = Boolean(sorted);
+    if (!sorted) return;
     const whole = Math.floor(sorted.length / ROW), rest = sorted.length % ROW;
     gl.bindTexture(gl.TEXTURE_2D, ordered[k].texture);
     const write = (row, width, height, data) =>

@@ -51,7 +51,7 @@ function sorterOf({ positions, reaches, areas, owners }) {
   // Of a mask: its glass, and what is before the farthest of it.
   return function order(camera) {
     [found, lowest, highest] = [0, 0x7fffffff, 0];
-    if (!camera) return new Uint32Array(0);
+    if (!camera) return null;
     const farthest = camera.glassOf === null ? Infinity : choose(camera, firstGlass, count, Infinity);
     choose(camera, 0, firstGlass, farthest);
     return sorted();
@@ -63,7 +63,7 @@ function sortingWorker() {
   self.onmessage = ({ data }) => {
     if (data.positions) { order = sorterOf(data); return; }
     const orders = data.cameras.map(order);
-    self.postMessage({ orders }, orders.map((sorted) => sorted.buffer));
+    self.postMessage({ orders }, orders.filter(Boolean).map((sorted) => sorted.buffer));
   };
 }
 

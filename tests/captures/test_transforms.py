@@ -376,3 +376,21 @@ def test_the_validation_part_is_tested_on_where_there_is_no_test_part(capture) -
     assert found is not None and found.test_shots is not None
     assert [shot.name for shot in found.test_shots] == capture.names[-1:]
     assert any("the test views are those of transforms_val.json" in warning for warning in found.warnings)
+
+
+def test_photographs_of_the_validation_part_are_not_trained_on(capture) -> None:
+    capture.write_images()
+    capture.write_transforms({**LENS, "frames": capture.frames()}, file_name="transforms_train.json")
+    capture.write_transforms({**LENS, "frames": capture.frames()[-2:]}, file_name="transforms_val.json")
+    data = load_dataset(capture.root)
+    assert [view.name for view in data.test] == capture.names[-2:]
+    assert [view.name for view in data.train] == capture.names[:-2]
+
+
+def test_a_validation_part_whose_photographs_are_away_is_left_alone(capture) -> None:
+    capture.write_images()
+    gone = [{**frame, "file_path": f"gone/{index}.png"} for index, frame in enumerate(capture.frames())]
+    capture.write_transforms({**LENS, "frames": capture.frames()}, file_name="transforms_train.json")
+    capture.write_transforms({**LENS, "frames": gone}, file_name="transforms_val.json")
+    found = load_transforms(capture.root)
+    assert found is not None and found.test_shots is None and len(found.shots) == len(capture.names)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from glassplat.cli import progress
 from glassplat.cli.main import main
@@ -13,8 +14,17 @@ from glassplat.cli.places import SceneEdits
 from glassplat.errors import InputError
 from glassplat.files.images import read_image
 from glassplat.model.model import load
-from glassplat.scene.scene import Scene, as_mirrors, shift_pane, tilt_pane, with_reflectance, without_glass
+from glassplat.scene.scene import (
+    Scene,
+    as_mirrors,
+    glass_of_pane,
+    shift_pane,
+    tilt_pane,
+    with_reflectance,
+    without_glass,
+)
 from tests.cli.tiny_run import rendered, write_run
+from tests.scene.test_plane_edits import two_panes
 from tests.training.tiny_capture import true_scene
 
 EDITS = {
@@ -102,6 +112,14 @@ def test_a_log_is_told_how_far_it_is(
     assert main([name, str(run), "--output", str(tmp_path / "out"), *options]) == 0
     said = capsys.readouterr().out
     assert f"{work} (1)\n{work}: 1 of 1, 0 s left\n{end}" in said
+
+
+def test_panes_that_pass_each_other_keep_their_glass() -> None:
+    scene = two_panes()
+    own, other = glass_of_pane(scene, 1), scene.planes.labels[0]
+    shifted = SceneEdits(shift={other: 25.0, 7: -25.0}, tilt={7: (10.0, 0.0)}).apply(scene)
+    expected = shift_pane(tilt_pane(scene, 7, 10.0, 0.0), 7, -25.0)
+    torch.testing.assert_close(shifted.glass.means[own], expected.glass.means[own])
 
 
 def test_a_scene_without_panes_cannot_be_edited() -> None:

@@ -64,6 +64,12 @@ def test_a_lamp_that_is_brighter_than_white_does_not_darken_what_it_stands_in() 
     assert reflection_gain([light], [light.clamp(0, 1)]) == pytest.approx(1.0)
 
 
+def test_gain_of_what_is_all_white_is_large_enough() -> None:
+    images = torch.tensor([0.5, 0.4, 0.3, 0.6, 0.9])[:, None].expand(5, 3)
+    gain = reflection_gain([images], [torch.ones(5, 3)])
+    assert float((gain * images).clamp(max=1).min()) > 0.9
+
+
 def test_gain_of_nothing_is_one() -> None:
     assert reflection_gain([], []) == 1.0
     assert reflection_gain([torch.zeros(5, 3)], [torch.ones(5, 3)]) == 1.0

@@ -275,6 +275,8 @@ def test_panes_of_what_was_there_are_not_taken_over(tmp_path: Path) -> None:
         bare().save(tmp_path / "b.ply")
     bare().save(tmp_path / "b.ply", overwrite=True)
     assert glassplat.load(tmp_path / "b.ply", device="cpu").panes == ()
+    bare().save(tmp_path / "b.spz")
+    assert glassplat.load(tmp_path / "b.spz", device="cpu").panes == ()
 
 
 @pytest.mark.parametrize("name", ["environment.png", "environment.json"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from pathlib import Path
 
 import pytest
@@ -82,6 +84,17 @@ def test_a_link_to_itself_is_no_place_for_a_capture(
 ) -> None:
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     assert "expected a folder" in refused(photographs, tmp_path / "loop", capsys)
+
+
+def test_force_replaces_masks_that_were_prepared_and_no_others(tmp_path: Path) -> None:
+    output, mask = tmp_path / "capture", tmp_path / "capture" / "ignore" / "left" / "1.png"
+    mask.parent.mkdir(parents=True)
+    mask.write_bytes(b"what a wide lens did not see")
+    (output / RECORD).write_text(json.dumps({"masks": [hashlib.sha256(mask.read_bytes()).hexdigest()]}))
+    Workplace(output).begin({}, resume=False, force=True)
+    mask.write_bytes(b"a passer-by, too")
+    with pytest.raises(InputError, match=r"capture holds ignore/left/1.png, which somebody made"):
+        Workplace(output).begin({}, resume=False, force=True)
 
 
 @pytest.mark.parametrize("name", ["normals/a.png", "notes.txt", "panes/a.png", "images/a_mask.jpg", "images/b/c.png"])
