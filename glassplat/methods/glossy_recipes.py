@@ -41,9 +41,8 @@ class GlossyOptions(MethodRecipe):
     Attributes:
         sh_degree: highest degree of the view-dependent colour, which grows once propagation has ended unless a
             method says otherwise.
-        bootstrap: share of the run without reflection (paper: a few thousand iterations); where mirrors are searched
-            for afterwards it is a run of `splat`, of 300 steps or more if the run has time for them, else harmonics
-            wait.
+        bootstrap: share of the run without reflection, 300 steps at least (paper: a few thousand). Where mirrors are
+            searched for afterwards it is a run of `splat`, else harmonics wait.
         texels: edge length of the environment's cube faces in the end.
         first_texels: edge length at the start.
         first_strength: reflection strength of every Gaussian at the start.

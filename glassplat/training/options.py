@@ -194,8 +194,7 @@ class DefaultDensify:
         prune_scale_fraction: from `prune_large_start` on, Gaussians with an axis above this share of the
             scene extent are removed. 3DGS also states a limit of 20 pixels on screen, but clears the radii before it
             looks at them, so that its published results have none.
-        cap: largest number of Gaussians to begin with and to grow to; None takes `--densify.per-pixel` for the latter,
-            and 0 keeps all first ones and adds none.
+        cap: largest number of Gaussians, from the start; None leaves it to `--densify.per-pixel`, 0 adds none.
         per_pixel: largest number of Gaussians to grow to for each pixel of all training photographs, which is reached
             where these contradict each other, by cars and leaves, and never stop asking for more; 0 for no limit.
         least_contribution: Gaussians that add less than so many pixels to every training view, directly and mirrored,
@@ -239,8 +238,8 @@ class McmcDensify:
     """Options for relocating, adding and moving Gaussians (Kheradmand et al. 2024).
 
     Attributes:
-        cap: largest number of Gaussians to begin with and to grow to; None grows to half as many as a photograph has
-            pixels, for what detail can be told apart follows the pixels.
+        cap: largest number of Gaussians, from the start; None grows to half as many as a photograph has pixels, for
+            what detail can be told apart follows the pixels.
         interval: steps between relocations.
         start: share of the run after which relocation begins.
         stop: share of the run after which relocation and growth end; the noise goes on.
