@@ -238,8 +238,7 @@ class McmcDensify:
     """Options for relocating, adding and moving Gaussians (Kheradmand et al. 2024).
 
     Attributes:
-        cap: largest number of Gaussians, from the start; None grows to half as many as a photograph has pixels, for
-            what detail can be told apart follows the pixels.
+        cap: largest number of Gaussians, from the start; None grows to half as many as a photograph has pixels.
         interval: steps between relocations.
         start: share of the run after which relocation begins.
         stop: share of the run after which relocation and growth end; the noise goes on.
