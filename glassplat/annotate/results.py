@@ -23,7 +23,7 @@ from glassplat.errors import InputError, first_names
 from glassplat.files.images import files_below, image_size, is_hidden, leads_out, write_image
 from glassplat.files.records import read_json
 from glassplat.files.sidecars import planes_json, write_planes
-from glassplat.files.writing import remove_empty, remove_unfinished, write_text
+from glassplat.files.writing import file_digest, remove_empty, remove_unfinished, write_text
 from glassplat.options import CLEAR_GLASS
 from glassplat.panes.masks import min_area_rectangle
 from glassplat.scene import logit
@@ -136,14 +136,14 @@ def write_results(root: Path, views: Sequence[View], cameras: Sequence[NumpyCame
     for name in earlier - new:
         (folder / name).unlink(missing_ok=True)
     write_planes(root / PLANES, planes)
-    _write_record(folder, new, [_digest(root / PLANES)])
+    _write_record(folder, new, [file_digest(root / PLANES)])
     return sorted(new)
 
 
 def _check_planes(root: Path) -> None:
     """Refuse to replace planes that somebody else wrote; earlier versions did not record which were theirs."""
     masks, digests = _made_here(root / PANE_FOLDER)
-    written = _digest(root / PLANES)
+    written = file_digest(root / PLANES)
     if written and written not in digests and (digests or not masks):
         raise InputError(
             f"{root / PLANES} was not made by `glassplat annotate`, or somebody has changed it since; nothing was "
@@ -160,7 +160,7 @@ def remove_results(root: Path) -> list[str]:
     """
     folder = root / PANE_FOLDER
     masks, digests = [folder / name for name in sorted(earlier_masks(root))], _made_here(folder)[1]
-    ours = [*([root / PLANES] if _digest(root / PLANES) in digests else ()), *masks]
+    ours = [*([root / PLANES] if file_digest(root / PLANES) in digests else ()), *masks]
     removed = [path for path in ours if path.is_file()]
     for path in (*removed, folder / RECORD):  # The record last: after an interrupt, the rest is known to be ours.
         path.unlink(missing_ok=True)
@@ -184,11 +184,6 @@ def _made_here(folder: Path) -> tuple[set[str], list[str]]:
         return {str(name) for name in masks}, str(planes).split()
     except (OSError, ValueError, TypeError, KeyError):
         return set(), []
-
-
-def _digest(path: Path) -> str:
-    """Digest of a file's contents; empty where there is none."""
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
 
 def capture_to_mark(root: Path) -> Dataset:

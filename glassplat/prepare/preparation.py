@@ -22,7 +22,15 @@ from glassplat.captures.colmap_library import quiet_pycolmap
 from glassplat.captures.masks import IGNORE_FOLDER
 from glassplat.errors import InputError, first_names
 from glassplat.files.records import read_json, readable_name
-from glassplat.files.writing import check_folder, make_folder, missing_folders, real_path, remove_empty, write_text
+from glassplat.files.writing import (
+    check_folder,
+    file_digest,
+    make_folder,
+    missing_folders,
+    real_path,
+    remove_empty,
+    write_text,
+)
 from glassplat.prepare.photographs import (
     FEWEST,
     PICTURE_SUFFIX,
@@ -184,7 +192,7 @@ class Workplace:
         others += [
             path.relative_to(self.output).as_posix()
             for path in sorted((self.output / IGNORE_FOLDER).rglob("*"))
-            if path.is_file() and _digest(path) not in own
+            if path.is_file() and file_digest(path) not in own
         ]
         pictures = [path for path in (self.output / "images").rglob("[!.]*") if path.is_file()]
         added = {path for path in pictures if path.suffix != PICTURE_SUFFIX} | set(masks_among(pictures))
@@ -409,14 +417,10 @@ def _prepare(task: Preparation, workplace: Workplace, listen: Listener, *, resum
     report = report_of(solution)
     _check_enough(report, task)
     write_capture(solution, workplace.capture, listen)
-    masks = sorted({_digest(path) for path in (workplace.capture / IGNORE_FOLDER).rglob("*.png")})
+    masks = sorted({file_digest(path) for path in (workplace.capture / IGNORE_FOLDER).rglob("*.png")})
     made = {"command": "prepare", "version": __version__, **task.record()}
     workplace.finish({**made, "report": asdict(report), **({MASKS: masks} if masks else {})})
     return report
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def is_video(source: Path) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from glassplat.captures import colmap_library as library
-from glassplat.captures.cameras import Lens, blank_pixels, blank_share, make_lens, undistort
+from glassplat.captures.cameras import Lens, PixelMap, blank_share, make_lens, undistort
 from glassplat.captures.masks import IGNORE_FOLDER
 from glassplat.errors import InputError, first_names
 from glassplat.files.images import write_image
@@ -166,7 +165,7 @@ def write_capture(solution: Solution, folder: Path, listen: Listener) -> None:
     """
     model = solution.models[0]
     lenses = {key: library.pycolmap.Camera(camera.todict()) for key, camera in model.cameras.items()}
-    wide, blank = _wide_lenses(lenses), lru_cache(maxsize=1)(blank_pixels)
+    wide = _wide_lenses(lenses)
     _straighten(model)
     images = image_numbers(model)
     for done, (number, image) in enumerate(sorted(images.items())):
@@ -178,7 +177,8 @@ def write_capture(solution: Solution, folder: Path, listen: Listener) -> None:
         Image.fromarray(pixels).save(target, quality=JPEG_QUALITY, subsampling=0)
         if image.camera_id in wide:
             mask = (folder / IGNORE_FOLDER / photograph.name).with_suffix(".png")
-            write_image(mask, 255 * blank(wide[image.camera_id]))
+            height, width = pixels.shape[:2]
+            write_image(mask, 255 * PixelMap(wide[image.camera_id], width, height).blank())
         image.name = photograph.name
     listen(Working("taking the colours of points from the photographs", 0, len(images)))
     model.extract_colors_for_all_images(folder / "images")
