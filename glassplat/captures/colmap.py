@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from glassplat.captures.cameras import MODEL_OF_ID, PARAMETER_COUNTS, Lens, make_lens
 from glassplat.captures.capture import Capture, RawPoints, Shot
+from glassplat.captures.transforms import TRAIN, WHOLE
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.images import files_below
 from glassplat.files.records import reading
@@ -263,7 +264,7 @@ def load_colmap(root: Path) -> Capture | None:
         test_shots=None,
         points=model.points if len(model.points) else None,
         format_name="COLMAP",
-        warnings=_other_models(root, folder),
+        warnings=(*_other_models(root, folder), *_unread_frames(root)),
         cut_out=True,
     )
 
@@ -312,3 +313,14 @@ def _other_models(root: Path, used: Path) -> tuple[str, ...]:
     if not others:
         return ()
     return (f"{used} is used; there are more models in {sparse} ({first_names(others)}), which are left out.",)
+
+
+def _unread_frames(root: Path) -> tuple[str, ...]:
+    """A warning where there is a `transforms.json` as well, which may name another split."""
+    unread = [name for name in (WHOLE, TRAIN) if (root / name).is_file()]
+    if not unread:
+        return ()
+    return (
+        f"The COLMAP model of {root} is read, and not {first_names(unread)}: neither its poses, nor its split, nor its "
+        "masks. Move one of them away.",
+    )

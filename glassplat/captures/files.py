@@ -102,7 +102,7 @@ def _load_capture(root: Path) -> Capture:
     for load, _ in LOADERS:
         capture = load(root)
         if capture is not None:
-            return capture if load is not colmap.load_colmap else _with_unread_frames(root, capture)
+            return capture
     looked_for = "; ".join(text for _, text in LOADERS)
     names = sorted(path.name for path in root.iterdir())
     found = first_names(names, limit=8) or "nothing"
@@ -110,18 +110,6 @@ def _load_capture(root: Path) -> Capture:
     if any(Path(name).suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) for name in names):
         message += f" Photographs become a capture by: glassplat prepare {shlex.quote(str(root))} --output CAPTURE"
     raise UnknownFormatError(message)
-
-
-def _with_unread_frames(root: Path, capture: Capture) -> Capture:
-    """The capture of a COLMAP model, with a warning where there is a `transforms.json`, too."""
-    unread = [name for name in (transforms.WHOLE, transforms.TRAIN) if (root / name).is_file()]
-    if not unread:
-        return capture
-    warning = (
-        f"The COLMAP model of {root} is read, and not {first_names(unread)}: neither its poses, nor its split, nor its "
-        "masks. Move one of them away."
-    )
-    return replace(capture, warnings=(*capture.warnings, warning))
 
 
 def _check_names(shots: tuple[Shot, ...]) -> None:

@@ -328,23 +328,22 @@ def _load_whole(root: Path) -> Capture:
 
 def _load_split(root: Path) -> Capture:
     """Separate files for training and testing, or else validation, as synthetic scenes have them."""
-    tested = _test_part(root)
-    files = {name: read_settings(root / name) for name in (TRAIN, tested) if name is not None}
+    tested = TEST if (root / TEST).is_file() else VAL
+    files = {name: read_settings(root / name) for name in (TRAIN, tested) if (root / name).is_file()}
+    if VAL in files and not all(image_path(root, frame).is_file() for frame in files[VAL]["frames"]):
+        del files[VAL]  # Its photographs are not there, as where nobody needs them.
     shots = {name: shots_of(root, settings, name) for name, settings in files.items()}
     kept: dict[str, Path] = {}
     for name, settings in files.items():
         kept |= _mask_paths(root, name, settings, shots[name])
-    also = {shot.image_path for shot in shots[VAL].values()} if tested == VAL else set()
+    also = {shot.image_path for shot in shots.get(VAL, {}).values()}
     return Capture(
         shots=tuple(shot for shot in shots[TRAIN].values() if shot.image_path not in also),
-        test_shots=tuple(shots[tested].values()) if tested else None,
+        test_shots=tuple(shots[tested].values()) if tested in shots else None,
         points=read_points(root, files[TRAIN]),
         format_name=TRAIN,
         random_points=points_in_box if _is_blender(files[TRAIN]) else None,
-        warnings=(
-            *_unused_priors(files[TRAIN]),
-            *([UNTESTED] if tested == VAL else ()),
-        ),
+        warnings=(*_unused_priors(files[TRAIN]), *([UNTESTED] if VAL in shots else ())),
         kept=kept,
     )
 
@@ -353,16 +352,6 @@ UNTESTED = (
     f"There is no {TEST}; the test views are those of {VAL}, and are not trained on. Move it away to go on with a run "
     "that was begun without it."
 )
-
-
-def _test_part(root: Path) -> str | None:
-    """The file of the test views: the validation file if there is no other, and all its photographs are there."""
-    if (root / TEST).is_file():
-        return TEST
-    is_whole = (root / VAL).is_file() and all(
-        image_path(root, frame).is_file() for frame in read_settings(root / VAL)["frames"]
-    )
-    return VAL if is_whole else None
 
 
 def _mask_paths(root: Path, file: str, settings: Settings, shots: Mapping[str, Shot]) -> dict[str, Path]:
