@@ -238,9 +238,9 @@ def in_surroundings(scene: Scene, panorama: Path) -> Scene:
     """
     from glassplat.files.sidecars import read_equirect
     from glassplat.render.deferred import environment_from_equirect
+    from glassplat.scene.gaussians import Gaussians
 
-    near = scene.surroundings
-    if scene.environment.is_empty and not len(near):
+    if scene.environment.is_empty and not len(scene.surroundings):
         raise InputError("nothing in the run mirrors its surroundings; train it with `glassplat train deferred`")
     try:
         image = read_equirect(panorama)
@@ -249,8 +249,7 @@ def in_surroundings(scene: Scene, panorama: Path) -> Scene:
     except (FileNotFoundError, ValueError) as error:
         raise InputError(str(error)) from error
     raw = environment.raw.to(scene.primary.means)
-    far = replace(scene.environment, raw=raw)
-    return replace(scene, environment=far, surroundings=near.select(near.means.new_zeros(len(near)).bool()))
+    return replace(scene, environment=replace(scene.environment, raw=raw), surroundings=Gaussians.empty())
 
 
 LARGEST_FACE = 512

@@ -31,6 +31,7 @@ from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.model import (
     CAMERAS,
     ENVIRONMENT,
+    EXPORTED,
     GLASS,
     PANORAMA,
     PLANES,
@@ -229,7 +230,7 @@ def write_files(command: Export, console: Console) -> None:
     if "html" in command.formats:
         with input_checked():
             check_panes(model.scene)
-    splats = {kind: command.output / f"scene.{kind}" for kind in SPLAT_WRITERS}
+    splats = {kind: command.output / f"{EXPORTED}.{kind}" for kind in SPLAT_WRITERS}
     beside = [command.output / name for name in BESIDE_SPLATS]
     check_targets(command.output, [*beside, *splats.values()], [])
     is_again = claim_folder(command.output, "export", command.scene)
