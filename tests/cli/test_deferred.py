@@ -96,7 +96,8 @@ def test_what_mirrors_nothing_has_no_surroundings_to_exchange(run: Path) -> None
         SceneEdits(surroundings=run.parent / "red.png").apply(scene)
 
 
-def test_its_own_colours_are_exported_as_plain_gaussians(run: Path) -> None:
+def assert_own_colours_are_exported(run: Path) -> None:
+    """What `--layer transmission` writes of a glossy run is its layer `base`, as plain Gaussians, in every format."""
     output, stored = run.parent / "bare", open_run(run, "cpu")
     formats = ["--formats", "ply", "spz", "glb", "html"]
     assert main(["export", str(run), "--output", str(output), "--layer", "transmission", *formats]) == 0
@@ -106,3 +107,7 @@ def test_its_own_colours_are_exported_as_plain_gaussians(run: Path) -> None:
     assert "logit_strength" not in bare.scene.primary.channels
     base = replace(stored.renderer, background=(0.0, 0.0, 0.0))(stored.scene, camera).layers["base"]
     torch.testing.assert_close(bare.render(camera).rgb, base, atol=1e-5, rtol=0)
+
+
+def test_its_own_colours_are_exported_as_plain_gaussians(run: Path) -> None:
+    assert_own_colours_are_exported(run)

@@ -14,9 +14,9 @@ from glassplat.cli.main import main
 from glassplat.cli.places import SceneEdits
 from glassplat.cli.runs import open_run
 from glassplat.files.sidecars import write_equirect
-from glassplat.model.model import load
 from glassplat.scene.scene import Environment
 from glassplat.training.checkpoint import load_checkpoint
+from tests.cli.test_deferred import assert_own_colours_are_exported
 from tests.training.object_capture import few_steps, write_object_capture
 
 LAYERS = ("rgb", "base", "reflection", "strength", "normal", "surroundings", "depth", "alpha")
@@ -101,12 +101,4 @@ def test_broken_normals_beside_the_photographs_are_named(run: Path, capsys: pyte
 
 
 def test_its_own_colours_are_exported_as_plain_gaussians(run: Path) -> None:
-    output, stored = run.parent / "bare", open_run(run, "cpu")
-    formats = ["--formats", "ply", "spz", "glb", "html"]
-    assert main(["export", str(run), "--output", str(output), "--layer", "transmission", *formats]) == 0
-    names = ["cameras.json", "glassplat.json", "index.html", "scene.glb", "scene.ply", "scene.spz"]
-    assert sorted(path.name for path in output.iterdir()) == names
-    bare, camera = load(output / "scene.ply", device="cpu"), stored.dataset.test[0].camera
-    assert "logit_strength" not in bare.scene.primary.channels
-    base = replace(stored.renderer, background=(0.0, 0.0, 0.0))(stored.scene, camera).layers["base"]
-    torch.testing.assert_close(bare.render(camera).rgb, base, atol=1e-5, rtol=0)
+    assert_own_colours_are_exported(run)
