@@ -1,5 +1,4 @@
 // Shows what was drawn small in the whole window.
-precision highp float;
 uniform sampler2D image;
 uniform vec2 size, used;
 out vec4 shown;

@@ -23,11 +23,11 @@ function makeGraphics(canvas) {
     return shader;
   }
 
-  function program(vertex, shared, fragment, constants = {}) {
-    const defines = HEAD + Object.entries(constants).map(([name, value]) => `#define ${name} ${value}\n`).join('');
-    const made = gl.createProgram(), texels = SHADERS['texels.glsl'];
-    gl.attachShader(made, compiled(gl.VERTEX_SHADER, defines + texels + SHADERS[vertex]));
-    gl.attachShader(made, compiled(gl.FRAGMENT_SHADER, defines + (shared ? SHADERS[shared] : '') + SHADERS[fragment]));
+  function program(vertex, fragment, constants = {}) {
+    const defines = Object.entries(constants).map(([name, value]) => `#define ${name} ${value}\n`).join('');
+    const made = gl.createProgram(), head = HEAD + defines + SHADERS['texels.glsl'];
+    gl.attachShader(made, compiled(gl.VERTEX_SHADER, head + SHADERS[vertex]));
+    gl.attachShader(made, compiled(gl.FRAGMENT_SHADER, head + SHADERS[fragment]));
     gl.linkProgram(made);
     if (!gl.getProgramParameter(made, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(made) || 'program lost');
     const places = new Map();
@@ -39,10 +39,8 @@ function makeGraphics(canvas) {
   }
 
   function filtered(target, filter) {
-    gl.texParameteri(target, gl.TEXTURE_MIN_FILTER, filter);
-    gl.texParameteri(target, gl.TEXTURE_MAG_FILTER, filter);
-    gl.texParameteri(target, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
-    gl.texParameteri(target, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+    for (const name of ['MIN_FILTER', 'MAG_FILTER']) gl.texParameteri(target, gl[`TEXTURE_${name}`], filter);
+    for (const name of ['WRAP_S', 'WRAP_T']) gl.texParameteri(target, gl[`TEXTURE_${name}`], gl.CLAMP_TO_EDGE);
   }
 
   function dataTexture(internal, format, data, channels, height = data.length / (channels * ROW)) {
@@ -97,6 +95,7 @@ function makeGraphics(canvas) {
     return array;
   }
 
+  // Returns what sets uniforms of one kind by their names; of matrices, true says that they come by rows.
   function use({ made, at }, textures) {
     gl.useProgram(made);
     textures.forEach(([name, target, texture], unit) => {
@@ -104,7 +103,9 @@ function makeGraphics(canvas) {
       gl.bindTexture(target, texture);
       gl.uniform1i(at(name), unit);
     });
-    return at;
+    return (kind, values, ...byRows) => {
+      for (const [name, value] of Object.entries(values)) gl[`uniform${kind}`](at(name), ...byRows, value);
+    };
   }
 
   // Whether everything that was asked for until now is drawn, whenever one asks.

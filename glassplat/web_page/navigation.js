@@ -52,15 +52,15 @@ function makeNavigation(scene, changed) {
     const held = clamped(angle + pitch, Math.min(angle, steepest), Math.max(angle, Math.PI - steepest)) - angle;
     const turn = product(rotationAbout(up, yaw), rotationAbout(row(pose.rotation, 0), -held));
     const arm = turned(turn, minus(centerOf(pose), pivot));
-    const inverse = [turn[0], turn[3], turn[6], turn[1], turn[4], turn[7], turn[2], turn[5], turn[8]];
-    moveTo(plus(pivot, arm), product(pose.rotation, inverse), pivot);
+    moveTo(plus(pivot, arm), product(pose.rotation, transposed(turn)), pivot);
   }
 
-  function pan(right, down) {
-    const step = plus(scaled(row(pose.rotation, 0), right), row(pose.rotation, 1), down);
-    const moved = allowed(plus(centerOf(pose), step)), taken = minus(moved, centerOf(pose));
-    set(poseAt(pose.rotation, moved), plus(pivot, taken));
+  function shift(step) {
+    const from = centerOf(pose), moved = allowed(plus(from, step));
+    set(poseAt(pose.rotation, moved), plus(pivot, minus(moved, from)));
   }
+
+  function pan(right, down) { shift(plus(scaled(row(pose.rotation, 0), right), row(pose.rotation, 1), down)); }
 
   // As far along the line of sight as it may go; from a place beside that, the camera would look past its pivot.
   function dolly(factor) {
@@ -74,9 +74,7 @@ function makeNavigation(scene, changed) {
   }
 
   function walk(ahead, right, rise) {
-    const step = plus(plus(scaled(forward(), ahead), row(pose.rotation, 0), right), up, rise);
-    const moved = allowed(plus(centerOf(pose), step));
-    set(poseAt(pose.rotation, moved), plus(pivot, minus(moved, centerOf(pose))));
+    shift(plus(plus(scaled(forward(), ahead), row(pose.rotation, 0), right), up, rise));
   }
 
   function flyTo(view, seconds = 0.9) {

@@ -87,20 +87,17 @@ void main() {
 
   uvec2 shape = texelFetch(shapes, texel(index), 0).xy;
   vec4 scaleBytes = bytesOf(shape.y);
-  mat3 rotation = rotationOf(shape.x), axes = rotation;
+  mat3 rotation = rotationOf(shape.x);
   vec3 scales = exp(scaleBytes.xyz / 16.0 - 10.0);
-  axes = mat3(axes[0] * scales.x, axes[1] * scales.y, axes[2] * scales.z);
+  mat3 axes = transpose(camFromWorld * mat3(rotation[0] * scales.x, rotation[1] * scales.y, rotation[2] * scales.z));
   // The shortest axis of a shiny splat, turned to the camera.
-  vec3 facing = transpose(camFromWorld) * inCamera, normal = rotation[shortest(scaleBytes.xyz)];
-  normal *= dot(normal, facing) > 0.0 ? -1.0 : 1.0;
+  vec3 normal = rotation[shortest(scaleBytes.xyz)];
+  normal *= dot(normal, mean - eye) > 0.0 ? -1.0 : 1.0;
   vec2 tangents = inCamera.xy / inCamera.z;
   vec2 margin = MARGIN * size;
   vec2 held = clamp(tangents, -(intrinsics.zw + margin) / intrinsics.xy, (size - intrinsics.zw + margin) / intrinsics.xy);
-  vec3 rowX = vec3(camFromWorld[0].x, camFromWorld[1].x, camFromWorld[2].x);
-  vec3 rowY = vec3(camFromWorld[0].y, camFromWorld[1].y, camFromWorld[2].y);
-  vec3 rowZ = vec3(camFromWorld[0].z, camFromWorld[1].z, camFromWorld[2].z);
-  vec3 vx = (intrinsics.x / inCamera.z * (rowX - held.x * rowZ)) * axes;
-  vec3 vy = (intrinsics.y / inCamera.z * (rowY - held.y * rowZ)) * axes;
+  vec3 vx = intrinsics.x / inCamera.z * (axes[0] - held.x * axes[2]);
+  vec3 vy = intrinsics.y / inCamera.z * (axes[1] - held.y * axes[2]);
   float xx = dot(vx, vx), xy = dot(vx, vy), yy = dot(vy, vy);
   vec3 spread = cross(vx, vy);
   float determinant = dot(spread, spread) + LOW_PASS * (xx + yy) + LOW_PASS * LOW_PASS;

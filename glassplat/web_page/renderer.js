@@ -6,14 +6,14 @@ const LAYERS = { rgb: 0, without_panes: 1, reflection: 2, strength: 3 };
 function makeRenderer(canvas, scene) {
   const graphics = makeGraphics(canvas), { gl, formats, use, isSoftware } = graphics;
   const shiny = Boolean(scene.mirrored), panes = scene.panes, rows = texelRows(scene.total);
-  const splatProgram = (constants) => graphics.program('splat.vert', null, 'splat.frag', constants);
+  const splatProgram = (constants) => graphics.program('splat.vert', 'splat.frag', constants);
   const programs = {
-    project: graphics.program('screen.vert', 'texels.glsl', 'project.frag'),
+    project: graphics.program('screen.vert', 'project.frag'),
     direct: splatProgram(shiny ? { COLORED: 1, CHANNELED: 1, SHINY: 1 } : { COLORED: 1, CHANNELED: 0 }),
     mask: splatProgram({ COLORED: 0, CHANNELED: 1 }),
     mirrored: splatProgram({ COLORED: 1, CHANNELED: scene.intensity ? 1 : 0 }),
-    copy: graphics.program('screen.vert', null, 'copy.frag'),
-    compose: graphics.program('screen.vert', null, 'compose.frag', { PANES: panes.length, ...(shiny && { SHINY: 1 }) }),
+    copy: graphics.program('screen.vert', 'copy.frag'),
+    compose: graphics.program('screen.vert', 'compose.frag', { PANES: panes.length, ...(shiny && { SHINY: 1 }) }),
   };
   const inputs = {
     places: graphics.dataTexture(gl.RGBA32UI, gl.RGBA_INTEGER, scene.places, 4),
@@ -51,35 +51,31 @@ function makeRenderer(canvas, scene) {
     return true;
   }
 
-  // side: of the pane that the pose is mirrored in, if it is; degree: of the harmonics that matter.
-  function project(order, { pose, size, bounds, intrinsics, faintest, degree = scene.degree, side = null }) {
-    const textures = { ...inputs, order: order.texture };
-    const at = use(programs.project, Object.entries(textures).map(([name, texture]) => [name, gl.TEXTURE_2D, texture]));
-    gl.bindFramebuffer(gl.FRAMEBUFFER, projection);
-    gl.viewport(0, 0, ROW, texelRows(order.count));
-    gl.uniform1i(at('count'), order.count);
-    gl.uniform1i(at('firstGlass'), scene.firstGlass);
-    gl.uniform1i(at('degree'), degree);
-    gl.uniform1i(at('harmonicTexels'), scene.perSplat);
-    gl.uniformMatrix3fv(at('camFromWorld'), true, pose.rotation);
-    gl.uniform3fv(at('offset'), pose.offset);
-    gl.uniform3fv(at('eye'), centerOf(pose));
-    gl.uniform4fv(at('intrinsics'), intrinsics);
-    gl.uniform2fv(at('size'), size);
-    gl.uniform4fv(at('bounds'), bounds);
-    gl.uniform4fv(at('clipPlane'), side || [0, 0, 0, 1]);
-    gl.uniform1f(at('near'), scene.near);
-    gl.uniform2fv(at('channelRange'), scene.channelRange);
-    gl.uniform1f(at('faintest'), faintest);
-    gl.uniform1i(at('mirrored'), side ? 1 : 0);
-    gl.uniform1i(at('shiny'), shiny ? 1 : 0);
+  // One triangle over all of a target.
+  function cover(target, width, height) {
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
+    gl.viewport(0, 0, width, height);
     gl.bindVertexArray(empty);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
+  // side: of the pane that the pose is mirrored in, if it is; degree: of the harmonics that matter.
+  function project(order, { pose, size, bounds, intrinsics, faintest, degree = scene.degree, side = null }) {
+    const textures = { ...inputs, order: order.texture };
+    const set = use(programs.project, Object.entries(textures).map(([name, texture]) => [name, gl.TEXTURE_2D, texture]));
+    const { firstGlass, perSplat, near, channelRange } = scene;
+    set('1i', { count: order.count, firstGlass, degree, harmonicTexels: perSplat, mirrored: side !== null, shiny });
+    set('1f', { near, faintest });
+    set('2fv', { size, channelRange });
+    set('3fv', { offset: pose.offset, eye: centerOf(pose) });
+    set('4fv', { intrinsics, bounds, clipPlane: side || [0, 0, 0, 1] });
+    set('Matrix3fv', { camFromWorld: pose.rotation }, true);
+    cover(projection, ROW, texelRows(order.count));
+  }
+
   // Projected splats from one place of their order to another, over what is there, or instead of it.
   function splat(which, [from, to], target, { size, bounds: [left, top, right, bottom] }) {
-    const at = use(programs[which], [['projected', gl.TEXTURE_2D, projected[0]], ['looks', gl.TEXTURE_2D, projected[1]]]);
+    const set = use(programs[which], [['projected', gl.TEXTURE_2D, projected[0]], ['looks', gl.TEXTURE_2D, projected[1]]]);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
     gl.viewport(0, 0, ...size);
     gl.enable(gl.SCISSOR_TEST);
@@ -90,7 +86,7 @@ function makeRenderer(canvas, scene) {
     }
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    gl.uniform2fv(at('size'), size);
+    set('2fv', { size });
     gl.bindVertexArray(rectangles);
     gl.drawElements(gl.TRIANGLES, 6 * (to - from), gl.UNSIGNED_INT, 24 * from);
     gl.disable(gl.BLEND);
@@ -98,38 +94,30 @@ function makeRenderer(canvas, scene) {
   }
 
   function compose(view, present, { size, used, intrinsics }, usedByMirrors, target) {
-    const at = use(programs.compose, [
+    const set = use(programs.compose, [
       ['image', gl.TEXTURE_2D, targets.image],
       ...(panes.length ? ['masks', 'reflections', 'gains'].map((name) => [name, gl.TEXTURE_2D_ARRAY, targets[name]]) : []),
       ...(shiny ? [['strengths', gl.TEXTURE_2D, targets.surface[0]], ['normals', gl.TEXTURE_2D, targets.surface[1]], ['surroundings', gl.TEXTURE_CUBE_MAP, cube]] : []),
     ]);
-    if (shiny) gl.uniformMatrix3fv(at('camFromWorld'), true, view.pose.rotation);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
-    gl.viewport(0, 0, ...size);
+    const { rotation } = view.pose, { background, fresnel, blend, intensity, nearest } = scene;
     if (panes.length) {
-      const { rotation } = view.pose;
-      gl.uniform3fv(at('centers'), panes.flatMap((pane) => inCamera(view.pose, pane.center)));
-      for (const [name, key] of [['normals', 'normal'], ['tangents', 'tangent'], ['bitangents', 'bitangent']]) {
-        gl.uniform3fv(at(name), panes.flatMap((pane) => turned(rotation, pane[key])));
-      }
-      gl.uniform2fv(at('halfSizes'), panes.flatMap((pane) => pane.half));
-      gl.uniform1fv(at('reflectances'), view.reflectances);
-      gl.uniform3fv(at('transmittances'), panes.flatMap((pane) => pane.transmittance));
-      gl.uniform1iv(at('present'), present);
+      const ofEach = (value) => panes.flatMap(value), turnedEach = (key) => ofEach((pane) => turned(rotation, pane[key]));
+      set('1iv', { present });
+      set('1fv', { reflectances: view.reflectances });
+      set('2fv', { halfSizes: ofEach((pane) => pane.half) });
+      set('3fv', {
+        centers: ofEach((pane) => inCamera(view.pose, pane.center)), transmittances: ofEach((pane) => pane.transmittance),
+        normals: turnedEach('normal'), tangents: turnedEach('tangent'), bitangents: turnedEach('bitangent'),
+      });
     }
-    gl.uniform4fv(at('intrinsics'), intrinsics);
-    gl.uniform2fv(at('size'), size);
-    gl.uniform2fv(at('used'), used);
-    gl.uniform2fv(at('usedByMirrors'), usedByMirrors);
-    gl.uniform3fv(at('background'), scene.background);
-    gl.uniform2i(at('layers'), LAYERS[view.layers[0]], LAYERS[view.layers[1]]);
-    gl.uniform1f(at('divider'), view.divider * size[0]);
-    gl.uniform1i(at('law'), LAWS.indexOf(scene.fresnel));
-    gl.uniform1i(at('linearLight'), scene.blend === 'linear' ? 1 : 0);
-    gl.uniform1i(at('gained'), scene.intensity ? 1 : 0);
-    gl.uniform1i(at('nearestOnly'), scene.nearest ? 1 : 0);
-    gl.bindVertexArray(empty);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    if (shiny) set('Matrix3fv', { camFromWorld: rotation }, true);
+    set('1i', { law: LAWS.indexOf(fresnel), linearLight: blend === 'linear', gained: intensity, nearestOnly: nearest });
+    set('1f', { divider: view.divider * size[0] });
+    set('2iv', { layers: view.layers.map((name) => LAYERS[name]) });
+    set('2fv', { size, used, usedByMirrors });
+    set('3fv', { background });
+    set('4fv', { intrinsics });
+    cover(target, ...size);
   }
 
   // The part of the targets that is drawn at a scale, and its intrinsics.
@@ -182,12 +170,8 @@ function makeRenderer(canvas, scene) {
     }
     compose(view, present, direct, mirrors.used, targets.coarse);
     // Not by blitFramebuffer(), after which Chromium's canvas stays black.
-    const at = use(programs.copy, [['image', gl.TEXTURE_2D, targets.small]]);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.viewport(0, 0, width, height);
-    gl.uniform2f(at('size'), width, height);
-    gl.uniform2fv(at('used'), direct.used);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    use(programs.copy, [['image', gl.TEXTURE_2D, targets.small]])('2fv', { size: [width, height], used: direct.used });
+    cover(null, width, height);
   }
 
   function setOrder(k, sorted) {

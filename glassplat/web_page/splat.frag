@@ -1,5 +1,4 @@
 // Blended back to front. The channel is of glass how much it is part of a pane, and mirrored how much of it reflects.
-precision highp float;
 in vec2 along;
 flat in vec4 shade;
 flat in float channel;

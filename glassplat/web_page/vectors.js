@@ -13,13 +13,9 @@ const clamped = (x, low, high) => Math.min(Math.max(x, low), high);
 
 const row = (m, k) => [m[3 * k], m[3 * k + 1], m[3 * k + 2]];
 const turned = (m, v) => [dot(row(m, 0), v), dot(row(m, 1), v), dot(row(m, 2), v)];
-const turnedBack = (m, v) => [0, 1, 2].map((k) => m[k] * v[0] + m[3 + k] * v[1] + m[6 + k] * v[2]);
-
-function product(a, b) {
-  const result = [];
-  for (let i = 0; i < 3; i++) for (let j = 0; j < 3; j++) result.push(dot(row(a, i), [b[j], b[3 + j], b[6 + j]]));
-  return result;
-}
+const transposed = (m) => [0, 3, 6, 1, 4, 7, 2, 5, 8].map((k) => m[k]);
+const turnedBack = (m, v) => turned(transposed(m), v);
+const product = (a, b) => [0, 1, 2].flatMap((i) => turnedBack(b, row(a, i)));
 
 function rotationAbout(axis, angle) {
   const [x, y, z] = unit(axis), c = Math.cos(angle), s = Math.sin(angle), k = 1 - c;
@@ -32,7 +28,7 @@ function rotationAbout(axis, angle) {
 
 // Turned the short way about one axis, from rotation a at t = 0 to b at t = 1.
 function between(a, b, t) {
-  const m = product(b, [0, 3, 6, 1, 4, 7, 2, 5, 8].map((k) => a[k]));
+  const m = product(b, transposed(a));
   const skew = [m[7] - m[5], m[2] - m[6], m[3] - m[1]], cosine = (m[0] + m[4] + m[8] - 1) / 2;
   let axis = skew;
   if (cosine < 0) {
@@ -50,10 +46,9 @@ const inCamera = (pose, point) => plus(turned(pose.rotation, point), pose.offset
 
 // The camera behind the mirror, which is left-handed: Eq. 8 of TR-Gaussians.
 function mirroredPose(pose, pane) {
-  const n = pane.normal, flip = [];
-  for (let i = 0; i < 3; i++) for (let j = 0; j < 3; j++) flip.push((i === j ? 1 : 0) - 2 * n[i] * n[j]);
-  const moved = scaled(n, 2 * dot(pane.center, n));
-  return { rotation: product(pose.rotation, flip), offset: plus(turned(pose.rotation, moved), pose.offset) };
+  const n = pane.normal, seen = turned(pose.rotation, n);
+  const rotation = pose.rotation.map((x, k) => x - 2 * seen[Math.floor(k / 3)] * n[k % 3]);
+  return { rotation, offset: plus(pose.offset, seen, 2 * dot(pane.center, n)) };
 }
 
 function lookingAt(position, target, up) {
