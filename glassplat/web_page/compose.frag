@@ -1,6 +1,5 @@
 // Lays the panes before the image, from the farthest on each ray to the nearest: Eq. 1 of TR-Gaussians for each, or for
 // the nearest alone.
-precision highp float;
 precision highp sampler2DArray;
 
 uniform sampler2D image;
@@ -26,7 +25,7 @@ uniform int law;
 uniform bool linearLight, gained, nearestOnly;
 out vec4 shown;
 
-const float FAR = 1e30, BEHIND = 1.00001;
+const float FAR = 1e30, BEHIND = 1.00001, FAINT = 0.5;
 
 vec2 within(vec2 part) { return min(gl_FragCoord.xy / size * part, part - 0.5 / vec2(textureSize(image, 0))); }
 
@@ -60,11 +59,9 @@ float depthOf(int k, vec3 ray) {
   return inside && present[k] > 0 ? depth : FAR;
 }
 
-// That of all panes does not fade where two adjoin.
-float maskOf(int k, bool isAlone) {
-  return texture(masks, vec3(within(usedByMirrors), isAlone || present[k] < 2 ? 0.0 : float(k + 1))).r;
-}
+float maskOf(int layer) { return texture(masks, vec3(within(usedByMirrors), float(layer))).r; }
 
+// A faint pane adds to what those behind it mirror, as in kernels/panes; another one takes their place.
 void layPane(int k, float mask, vec3 ray, inout vec3 seen, inout vec4 mirror) {
   if (mask <= 0.0) return;
   vec2 there = within(usedByMirrors);
@@ -75,13 +72,14 @@ void layPane(int k, float mask, vec3 ray, inout vec3 seen, inout vec4 mirror) {
   float strength = strengthOf(reflectances[k], abs(dot(normalize(ray), normals[k]))) * mask;
   vec3 through = decoded(seen) * (1.0 - mask * (1.0 - transmittances[k]));
   seen = encoded(mix(through, light, strength));
-  mirror = vec4(light, strength);
+  mirror = vec4(light, 1.0) * strength + (mask < FAINT ? 1.0 - strength : 0.0) * mirror;
 }
 #endif
 
+// mirror: light that is added, and the share of light that it replaces.
 vec3 layerOf(int layer, vec3 seen, vec3 behind, vec4 mirror, float mask) {
   if (layer == 1) return behind;
-  if (layer == 2) return encoded(mirror.rgb) * mask;
+  if (layer == 2) return encoded(mirror.rgb / max(mirror.a, 1e-9)) * mask;
   if (layer == 3) return vec3(mirror.a);
   return seen;
 }
@@ -92,9 +90,10 @@ void main() {
   vec4 base = texture(image, at);
   vec3 behind = base.rgb + (1.0 - base.a) * background, seen = behind;
   vec4 mirror = vec4(0.0);
-  float mask = 0.0;
+  float mask = 1.0;
 #if PANES > 0
   vec3 ray = vec3((pixel - intrinsics.zw) / intrinsics.xy, 1.0);
+  mask = maskOf(0);
   float depths[PANES];
   int met = 0;
   for (int k = 0; k < PANES; k++) {
@@ -113,17 +112,18 @@ void main() {
     bool same = false;
     for (int k = 0; k < PANES; k++) same = same || (depths[k] < FAR && depths[k] * BEHIND >= depth);
     if (same) { met--; continue; }
-    mask = maskOf(farthest, nearestOnly || met == 1);
     if (nearestOnly) { seen = behind; mirror = vec4(0.0); }
-    layPane(farthest, mask, ray, seen, mirror);
+    // The mask of all panes does not fade where two adjoin.
+    bool isAlone = nearestOnly || met == 1 || present[farthest] < 2;
+    layPane(farthest, isAlone ? mask : maskOf(farthest + 1), ray, seen, mirror);
   }
 #endif
 #ifdef SHINY
   // 3DGS-DR, Eq. 3.
   vec3 ray = normalize(vec3((pixel - intrinsics.zw) / intrinsics.xy, 1.0)) * camFromWorld, normal = texture(normals, at).xyz;
   vec3 light = texture(surroundings, reflect(ray, normal / max(length(normal), 1e-6))).rgb;
-  mirror = vec4(light, texture(strengths, at).r);
-  if (mirror.a < 1.0 / 512.0) mirror = vec4(0.0);
+  float strength = texture(strengths, at).r;
+  if (strength >= 1.0 / 512.0) mirror = vec4(light, 1.0) * strength;
   seen = mix(behind, light, mirror.a);
 #endif
   int layer = pixel.x < divider ? layers.x : layers.y;

@@ -116,4 +116,5 @@ def test_a_pane_without_glass_does_not_reflect_by_that_of_another(label: int, tm
     write_page(tmp_path / "index.html", scene, Planar(), CAMERAS, "one has glass")
     with Browser(tmp_path / "index.html", 320, 240) as browser:
         for _, camera in CAMERAS[:2]:
-            assert likeness(browser, scene, Planar(), camera) > 42
+            for layer in ("rgb", "reflection", "strength"):
+                assert likeness(browser, scene, Planar(), camera, layer) > 42

@@ -493,12 +493,14 @@ def test_what_shines_mirrors_what_surrounds_it(mirrored: str, tmp_path: Path) ->
     with Browser(tmp_path / "index.html", 320, 240) as browser:
         for _, camera in cameras:
             large = camera.resize(8 * camera.width, 8 * camera.height)
-            for layer, truth in (("rgb", "rgb"), ("without_panes", "base"), ("strength", "strength")):
-                frame = renderer(scene, large)
-                image = frame.rgb if truth == "rgb" else frame.layers[truth]
+            frame = renderer(scene, large)
+            layers = {"rgb": frame.rgb, "without_panes": frame.layers["base"]}
+            layers |= {name: frame.layers[name] for name in ("reflection", "strength")}
+            for layer, image in layers.items():
                 image = image if image.dim() == 3 else image[..., None].expand(-1, -1, 3)
                 found = psnr(picture(browser, large, layer), image.float().clamp(0, 1))
-                assert found > 34, (layer, found)
+                # A reflection has sharp edges where what is mirrored turns quickly.
+                assert found > (20 if layer == "reflection" else 34), (layer, found)
         shown = browser.evaluate("[...document.querySelectorAll('#dock button')].filter((b) => b.offsetParent).length")
         assert shown == 5, "four layers and the comparison"
         assert browser.complaints() == []
