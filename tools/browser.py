@@ -98,6 +98,11 @@ class Browser:
         if address.startswith("http") and "?" in address:
             self._tab.wait_for_url(lambda at: "?" not in at)  # A link with a key in it leads on to the page.
 
+    def prefer(self, **media: Any) -> None:
+        """Loads the page again for a person with preferences, such as `reduced_motion="reduce"`."""
+        self._tab.emulate_media(**media)
+        self._tab.reload()
+
     def evaluate(self, expression: str) -> Any:
         """The value of an expression, awaited; raises RuntimeError with what the page threw."""
         from playwright.sync_api import Error

@@ -1,6 +1,7 @@
 // The scene as it lies in the page: two SPZ files (the scene, the glass), a byte per splat
 // (and for glass one that says which pane it is part of), and a description.
 
+const CURRENT = 'try a current Firefox, Chrome, Edge or Safari';
 const ROW = 1024;  // texels of a data texture's row
 const HARMONIC_BYTES = [0, 9, 24, 45];
 const REACH = 4;   // standard deviations that may show: to 1/255 of full opacity, and more where they are seen aslant
@@ -13,6 +14,7 @@ function packedBytes(id) {
 }
 
 async function inflated(bytes) {
+  if (!window.DecompressionStream) throw new Error(`this browser is too old; ${CURRENT}`);
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream('gzip'));
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }

@@ -7,7 +7,6 @@ function makeDisplay(canvas, scene, renderer, navigation, panel) {
   const { isSoftware } = renderer, sort = makeSorter(scene), pace = makePace(isSoftware), noted = [];
   let stale = true, sorting = false, order = NONE;
   let quiet = REST, drawn = 0, job = null, waiting = [], last = 0;
-  const isStill = matchMedia('(prefers-reduced-motion: reduce)').matches;
   const isResting = () => quiet >= REST;
 
   // The photograph's field of view fills the shorter side of the window.
@@ -116,7 +115,7 @@ function makeDisplay(canvas, scene, renderer, navigation, panel) {
     const seconds = Math.min((time - last) / 1000, 0.25), pose = navigation.pose;
     last = time;
     if (document.hidden || renderer.isLost()) return;
-    const active = [navigation.advance(seconds), panel.walk(seconds), panel.turn(isStill ? 1 : seconds)].some(Boolean) || pose() !== tick.seen;
+    const active = [navigation.advance(seconds), panel.walk(seconds), panel.turn(IS_STILL ? 1 : seconds)].some(Boolean) || pose() !== tick.seen;
     tick.seen = pose();
     quiet = active ? 0 : quiet + seconds;
     if (fit()) [stale, order] = [true, NONE];

@@ -5,7 +5,7 @@ const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i;
 
 function makeGraphics(canvas) {
   const gl = canvas.getContext('webgl2', { antialias: false, alpha: false, depth: false, powerPreference: 'high-performance' });
-  if (!gl) throw new Error('this browser has no WebGL 2; try a current Firefox, Chrome, Edge or Safari');
+  if (!gl) throw new Error(`this browser has no WebGL 2; ${CURRENT}`);
   const named = gl.getExtension('WEBGL_debug_renderer_info');
   const isSoftware = named ? SOFTWARE.test(gl.getParameter(named.UNMASKED_RENDERER_WEBGL)) : false;
   const single = ['EXT_color_buffer_float', 'EXT_float_blend', 'OES_texture_float_linear'].map((name) => gl.getExtension(name)).every(Boolean);

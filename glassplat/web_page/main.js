@@ -12,11 +12,11 @@ async function start() {
   const navigation = makeNavigation(scene, changed), panel = makePanel(scene, navigation, changed);
   listenToPointers(canvas, navigation, () => document.body.classList.add('touched'));
   display = makeDisplay(canvas, scene, renderer, navigation, panel);
-  await display.begin();
   canvas.addEventListener('webglcontextlost', () => fail('The browser has taken the picture away; load the page again.'));
+  await display.begin();
   document.body.classList.toggle('plain', renderer.isSoftware);
   document.body.classList.add('ready');
-  if (!renderer.isSoftware && !matchMedia('(prefers-reduced-motion: reduce)').matches && !location.hash.includes('still')) navigation.sway();
+  if (!renderer.isSoftware && !IS_STILL && !location.hash.includes('still')) navigation.sway();
   return { ...display, panel, navigation, scene };
 }
 

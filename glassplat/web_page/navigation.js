@@ -1,6 +1,7 @@
 // Where the camera is: turns about a point that it looks at, moves, snaps to photographs, and stays near them.
 
 const EASE = (t) => t * t * (3 - 2 * t);
+const IS_STILL = matchMedia('(prefers-reduced-motion: reduce)').matches, FLIGHT_SECONDS = IS_STILL ? 1e-3 : 0.9;
 const LEAST_SHOWN = 0.05;  // Share of a photograph that a pane fills where it is worth a stop.
 
 function makeNavigation(scene, changed) {
@@ -77,10 +78,10 @@ function makeNavigation(scene, changed) {
     shift(plus(plus(scaled(forward(), ahead), row(pose.rotation, 0), right), up, rise));
   }
 
-  function flyTo(view, seconds = 0.9) {
+  function flyTo(view) {
     still();
     stop = view;
-    flight = { view, from: pose, to: poseOf(view), pivots: [pivot, pivotOf(view)], seconds, passed: 0 };
+    flight = { view, from: pose, to: poseOf(view), pivots: [pivot, pivotOf(view)], passed: 0 };
   }
 
   // The photographs that show a pane, each beside one that was taken near it; all where none shows any.
@@ -127,7 +128,7 @@ function makeNavigation(scene, changed) {
   }
 
   function flown() {
-    const t = EASE(Math.min(1, flight.passed / flight.seconds));
+    const t = EASE(Math.min(1, flight.passed / FLIGHT_SECONDS));
     const place = mixed(centerOf(flight.from), centerOf(flight.to), t);
     set(poseAt(between(flight.from.rotation, flight.to.rotation, t), place), mixed(...flight.pivots, t));
     if (t >= 1) flight = null;
@@ -197,7 +198,7 @@ function listenToPointers(canvas, navigation, touched) {
   });
   const released = (event) => {
     if (!held.delete(event.pointerId)) return;
-    if (event.timeStamp - time > 80 || held.size) navigation.velocity.yaw = navigation.velocity.pitch = 0;
+    if (event.timeStamp - time > 80 || held.size || IS_STILL) navigation.velocity.yaw = navigation.velocity.pitch = 0;
     last = held.size ? middle() : null;
   };
   canvas.addEventListener('pointerup', released);

@@ -13,6 +13,7 @@ function viewOfAddress(views) {
 function makePanel(scene, navigation, changed) {
   const state = { ...STATE, reflectances: scene.panes.map((pane) => pane.reflectance) };
   const silver = scene.panes.map(() => 0);  // How far each pane is on its way from glass to a mirror.
+  const divider = element('divider'), slider = element('reflectance');
   const body = document.body, reflects = scene.panes.length > 0 || Boolean(scene.mirrored);
   const chosen = () => scene.panes.map((_, k) => k).filter((k) => state.pane === 'all' || Number(state.pane) === k);
   const percent = (share) => `${(100 * share).toFixed(share < 0.1 ? 1 : 0)} %`;
@@ -25,12 +26,12 @@ function makePanel(scene, navigation, changed) {
       button.setAttribute('aria-pressed', String(state[key] === value));
     }
     element('compare').setAttribute('aria-pressed', String(state.compare));
-    element('divider').hidden = !state.compare;
-    element('divider').ariaValueNow = Math.round(100 * state.divider);
-    element('divider').style.left = `${100 * state.divider}%`;
+    divider.hidden = !state.compare;
+    divider.ariaValueNow = Math.round(100 * state.divider);
+    divider.style.left = `${100 * state.divider}%`;
     const first = chosen()[0];
     if (first !== undefined) {
-      element('reflectance').value = valueOf(state.reflectances[first]);
+      slider.value = valueOf(state.reflectances[first]);
       element('share').textContent = percent(state.reflectances[first]);
     }
     element('dock').dataset.glass = state.glass;
@@ -48,7 +49,8 @@ function makePanel(scene, navigation, changed) {
   function standAt(view) {
     navigation.flyTo(view);
     element('photo').textContent = view.name;
-    location.replace(`#view=${encodeURIComponent(view.name)}`);
+    // By the whole address: in a frame of srcdoc, a fragment alone would lead to the page around it.
+    location.replace(`${location.href.split('#')[0]}#view=${encodeURIComponent(view.name)}`);
     changed();
   }
 
@@ -100,20 +102,20 @@ function makePanel(scene, navigation, changed) {
     if (button.dataset.set) set(...button.dataset.set.split('='));
     if (button.dataset.do) actions[button.dataset.do]();
   });
-  element('reflectance').addEventListener('input', ({ target }) => {
+  slider.addEventListener('input', () => {
     state.glass = 'real';
-    for (const k of chosen()) state.reflectances[k] = clamped(shareOf(Number(target.value)), 1e-4, 1 - 1e-4);
+    for (const k of chosen()) state.reflectances[k] = clamped(shareOf(Number(slider.value)), 1e-4, 1 - 1e-4);
     show();
   });
-  element('reflectance').addEventListener('dblclick', () => {
+  slider.addEventListener('dblclick', () => {
     for (const k of chosen()) state.reflectances[k] = scene.panes[k].reflectance;
     show();
   });
-  element('divider').addEventListener('pointerdown', (event) => element('divider').setPointerCapture(event.pointerId));
-  element('divider').addEventListener('pointermove', (event) => {
+  divider.addEventListener('pointerdown', (event) => divider.setPointerCapture(event.pointerId));
+  divider.addEventListener('pointermove', (event) => {
     if (event.buttons) divide(event.clientX / window.innerWidth);
   });
-  element('divider').addEventListener('keydown', ({ key }) => {
+  divider.addEventListener('keydown', ({ key }) => {
     if (key.startsWith('Arrow')) divide(state.divider + (key === 'ArrowLeft' || key === 'ArrowDown' ? -0.02 : 0.02));
   });
 
@@ -164,6 +166,7 @@ function makePanel(scene, navigation, changed) {
     };
   }
 
+  document.querySelector('[data-do=full]').hidden = !document.fullscreenEnabled;
   body.classList.toggle('panes', scene.panes.length > 0);
   body.classList.toggle('shiny', Boolean(scene.mirrored));
   if (scene.mirrored) document.querySelector('[data-set="layer=without_panes"]').textContent = 'Without reflections';

@@ -283,26 +283,6 @@ def test_the_address_may_name_a_photograph_as_it_is_typed(tmp_path: Path) -> Non
 
 
 @needs_browser
-def test_every_control_can_be_reached_on_a_narrow_screen(opened: Browser) -> None:
-    left = """(() => {
-      const controls = [...document.querySelectorAll('#dock button, #dock input')].filter((one) => one.offsetParent);
-      document.getElementById('dock').scrollLeft = -1e4;
-      return Math.min(...controls.map((one) => one.getBoundingClientRect().left));
-    })()"""
-    assert opened.evaluate(left) >= 0
-
-
-@needs_browser
-def test_a_window_wider_than_textures_shows_a_coarser_picture(tmp_path: Path) -> None:
-    write_page(tmp_path / "index.html", true_scene(), Planar(), CAMERAS, "Wide")
-    with Browser(tmp_path / "index.html", 8400, 100) as browser:
-        browser.wait("document.body.classList.contains('ready')", "the page")
-        canvas = "document.getElementById('view')"
-        limit = browser.evaluate(f"{canvas}.getContext('webgl2').getParameter(0x0d33)")  # MAX_TEXTURE_SIZE
-        assert browser.evaluate(f"{canvas}.width") == limit and browser.complaints() == []
-
-
-@needs_browser
 def test_a_camera_that_looks_straight_down_is_not_turned_up_by_a_touch(opened: Browser) -> None:
     up = torch.tensor(opened.evaluate("glassplat.then(({ scene }) => scene.up)"), dtype=torch.float32)
     right = torch.nn.functional.normalize(torch.tensor([0.0, -up[2], up[1]]), dim=0)
@@ -318,17 +298,6 @@ def test_a_camera_that_looks_straight_down_is_not_turned_up_by_a_touch(opened: B
     })"""
     forward = torch.tensor(opened.evaluate(turned.replace("ROWS", str(rows))), dtype=torch.float32)
     torch.testing.assert_close(forward, -up, atol=1e-5, rtol=0)
-
-
-@needs_browser
-def test_a_picture_that_the_browser_takes_away_is_not_lost_in_silence(tmp_path: Path) -> None:
-    write_page(tmp_path / "index.html", true_scene(), Planar(), CAMERAS, "Lost")
-    with Browser(tmp_path / "index.html", 320, 240) as browser:
-        browser.wait("document.body.classList.contains('ready')", "the page")
-        graphics = "document.getElementById('view').getContext('webgl2')"
-        browser.run(f"{graphics}.getExtension('WEBGL_lose_context').loseContext()")
-        browser.wait("document.body.classList.contains('failed')", "a word about it")
-        assert "load the page again" in browser.evaluate("document.getElementById('message').textContent")
 
 
 UNTIL = "const until = async (holds) => { while (!holds()) await new Promise((next) => setTimeout(next, 5)); };"

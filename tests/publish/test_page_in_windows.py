@@ -1,0 +1,88 @@
+"""The page in windows, frames and browsers of all kinds, and for readers who prefer something."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from glassplat.publish.web_page import in_script, page_text, write_page
+from glassplat.render.planar import Planar
+from tests.browser_needed import needs_browser
+from tests.publish.test_web_page import CAMERAS
+from tests.training.tiny_capture import true_scene
+from tools.browser import Browser
+
+
+@needs_browser
+def test_every_control_can_be_reached_on_a_narrow_screen(tmp_path: Path) -> None:
+    write_page(tmp_path / "index.html", true_scene(), Planar(), CAMERAS, "Narrow")
+    with Browser(tmp_path / "index.html", 320, 240) as browser:
+        browser.wait("document.body.classList.contains('ready')", "the page")
+        browser.evaluate("document.querySelector('[data-do=help]').click()")
+        outside = """[...document.querySelectorAll('#dock button, #dock input, #help')].filter((one) => {
+          const { left, top, right, bottom } = one.getBoundingClientRect();
+          return Math.min(left, top) < 0 || right > innerWidth || bottom > innerHeight;
+        }).map((one) => one.id || one.textContent)"""
+        assert browser.evaluate(outside) == []
+
+
+@needs_browser
+def test_a_window_wider_than_textures_shows_a_coarser_picture(tmp_path: Path) -> None:
+    write_page(tmp_path / "index.html", true_scene(), Planar(), CAMERAS, "Wide")
+    with Browser(tmp_path / "index.html", 8400, 100) as browser:
+        browser.wait("document.body.classList.contains('ready')", "the page")
+        canvas = "document.getElementById('view')"
+        limit = browser.evaluate(f"{canvas}.getContext('webgl2').getParameter(0x0d33)")  # MAX_TEXTURE_SIZE
+        assert browser.evaluate(f"{canvas}.width") == limit and browser.complaints() == []
+
+
+LOSE = "document.getElementById('view').getContext('webgl2').getExtension('WEBGL_lose_context').loseContext();"
+BEGIN = "await display.begin();"
+
+
+@needs_browser
+@pytest.mark.parametrize(
+    ("broken", "by", "message"),
+    [
+        ("body.classList.add('ready');", f"body.classList.add('ready'); {LOSE}", "load the page again"),
+        (BEGIN, f"{LOSE} await new Promise((next) => setTimeout(next, 50)); {BEGIN}", "load the page again"),
+        ("getContext('webgl2'", "getContext('none'", "no WebGL 2; try a current"),
+        ("window.DecompressionStream", "window.nothing", "too old; try a current"),
+    ],
+)
+def test_a_picture_that_the_browser_cannot_show_is_not_lost_in_silence(
+    broken: str, by: str, message: str, tmp_path: Path
+) -> None:
+    page = page_text(true_scene(), Planar(), CAMERAS, "Lost")
+    assert page.count(broken) == 1
+    (tmp_path / "index.html").write_text(page.replace(broken, by))
+    with Browser(tmp_path / "index.html", 320, 240) as browser:
+        browser.wait("document.body.classList.contains('failed')", "a word about it")
+        assert message in browser.evaluate("document.getElementById('message').textContent")
+
+
+@needs_browser
+def test_preferences_of_the_reader_count(tmp_path: Path) -> None:
+    write_page(tmp_path / "index.html", true_scene(), Planar(), CAMERAS, "Preferences")
+    with Browser(tmp_path / "index.html", 320, 240) as browser:
+        browser.prefer(reduced_motion="reduce", forced_colors="active")
+        color = "getComputedStyle(document.querySelector('[aria-pressed=PRESSED]')).backgroundColor"
+        browser.wait("document.body.classList.contains('ready')", "the page")
+        assert len({browser.evaluate(color.replace("PRESSED", pressed)) for pressed in ("true", "false")}) == 2
+        flown = "navigation.flyTo(scene.views[1]); return [navigation.advance(0.02), navigation.advance(0.02)];"
+        assert browser.evaluate(f"glassplat.then(({{ navigation, scene }}) => {{ {flown} }})") == [True, False]
+
+
+@needs_browser
+def test_a_frame_that_holds_the_page_as_text_keeps_it(tmp_path: Path) -> None:
+    page = in_script(page_text(true_scene(), Planar(), CAMERAS, "Framed"))
+    frame = "<iframe allow=\"fullscreen 'none'\"></iframe>"
+    (tmp_path / "outer.html").write_text(f"{frame}<script>document.querySelector('iframe').srcdoc = {page}</script>")
+    with Browser(tmp_path / "outer.html", 640, 480) as browser:
+        framed = "document.querySelector('iframe').contentDocument"
+        browser.wait(f"{framed}.body.classList.contains('ready')", "the page")
+        assert browser.evaluate(f"{framed}.querySelector('[data-do=full]').hidden"), "the frame does not allow it"
+        browser.run(f"{framed}.querySelector('[data-do=after]').click()")
+        browser.wait(f"{framed}.location.href.startsWith('about:srcdoc#view=')", "the address")
+        assert browser.evaluate(f"{framed}.body.classList.contains('ready')")
