@@ -159,7 +159,7 @@ function makePanel(scene, navigation, changed) {
   function wanted() {
     const layers = state.compare ? [state.layer === 'without_panes' ? 'rgb' : state.layer, 'without_panes'] : [state.layer, state.layer];
     return {
-      glass: state.glass !== 'none' && scene.panes.length > 0,
+      glass: scene.panes.map((_, k) => state.glass !== 'none' || !chosen().includes(k)),
       reflectances: state.reflectances.map((share, k) => share + EASE(silver[k]) * (1 - 1e-6 - share)),
       layers,
       divider: state.compare ? state.divider : 2,

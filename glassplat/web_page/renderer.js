@@ -140,14 +140,14 @@ function makeRenderer(canvas, scene) {
 
   // Draws a view in steps of at most so many splats, and shows it.
   // view: pose, intrinsics of the whole canvas, scale of what is drawn, layers left and right of the divider (a share
-  // of the width), reflectances; glass says whether the panes are drawn at all. A moving picture leaves out what is
+  // of the width), reflectances; glass says of each pane whether it is there. A moving picture leaves out what is
   // faint, and what a pane reflects weakly is drawn at half its scale.
   function* drawing(view, most = () => Infinity) {
     const faintest = view.moving ? 1 / 40 : 1 / 255;
     const placed = (scale) => ({ ...sized(view, scale), pose: view.pose, faintest });
     const direct = placed(view.scale), mirrors = placed(scaleOfMirrors(view));
     yield* splats('direct', orders.direct, targets.direct, direct, most);
-    const bounds = panes.map((pane) => view.glass && boundsOf(pane, view.pose, mirrors.intrinsics, mirrors.size, scene.near));
+    const bounds = panes.map((pane, k) => view.glass[k] && boundsOf(pane, view.pose, mirrors.intrinsics, mirrors.size, scene.near));
     const mask = (order, k, area) => splats('mask', order, targets.covered[k], { ...mirrors, bounds: area, degree: 0 }, most);
     const overlap = overlapping(bounds), present = panes.map(() => 0);
     if (bounds.some(Boolean)) yield* mask(orders.joint, 0, around(bounds));

@@ -94,6 +94,9 @@ def test_one_of_many_panes_is_chosen_from_a_list(tmp_path: Path) -> None:
         browser.run(f"const list = document.querySelector('#panes'); list.focus(); {choose}")
         browser.keys("m")
         assert likeness(browser, as_mirrors(scene, [5]), Planar(), CAMERAS[1][1]) > 36
+        browser.keys("g")
+        without = replace(scene, planes=scene.planes.select([0, 1, 2, 3, 5, 6, 7]))
+        assert likeness(browser, without, Planar(), CAMERAS[1][1], "strength") > 60
 
 
 @needs_browser
