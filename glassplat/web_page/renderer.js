@@ -80,10 +80,7 @@ function makeRenderer(canvas, scene) {
     gl.viewport(0, 0, ...size);
     gl.enable(gl.SCISSOR_TEST);
     gl.scissor(left, size[1] - bottom, right - left, bottom - top);
-    if (!from) {
-      gl.clearColor(0, 0, 0, 0);
-      gl.clear(gl.COLOR_BUFFER_BIT);
-    }
+    if (!from) gl.clear(gl.COLOR_BUFFER_BIT);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     set('2fv', { size });
