@@ -94,12 +94,14 @@ def test_the_term_of_a_recipe_of_ones_own_leaves_out_stages_without_depths() -> 
     assert terms[0].function(glassplat.Frame(image, {"depth": depth}), None, None) == 0.75
 
 
-@pytest.mark.parametrize("recipe", ["SplatRecipe", "DeferredRecipe"])
-def test_the_term_of_a_recipe_of_ones_own_counts_in_every_step(recipe: str) -> None:
+@pytest.mark.parametrize(
+    ("recipe", "layer"), [("SplatRecipe", "depth"), ("DeferredRecipe", "depth"), ("SplatRecipe", "normal")]
+)
+def test_the_term_of_a_recipe_of_ones_own_counts_in_every_step(recipe: str, layer: str) -> None:
     blocks = PYTHON_BLOCK.findall((ROOT / "docs" / "python.md").read_text(encoding="utf-8"))
     (block,) = [block for block in blocks if "LossTerm" in block]
     names = {"glassplat": glassplat, "dataclasses": dataclasses}
-    exec(block.replace("PlanarRecipe", recipe), names)
+    exec(block.replace("PlanarRecipe", recipe).replace("depth", layer), names)
     messages = glassplat.Training(tiny_capture(), names["Calm"](), iterations=4)
     steps = [message for message in messages if isinstance(message, glassplat.StepDone)]
     assert len(steps) == 4 and all("calm" in step.losses for step in steps)

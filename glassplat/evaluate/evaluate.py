@@ -19,7 +19,7 @@ from glassplat.errors import InputError
 from glassplat.evaluate import metrics
 from glassplat.evaluate.truth import GroundTruth, TrueSurface, TrueView, load_truth, true_surface
 from glassplat.kernels.photometric import photometric
-from glassplat.render.frame import Drawing, Frame, Renderer
+from glassplat.render.frame import Frame, Renderer
 from glassplat.render.panes import nearest_hits, panes_in_camera
 from glassplat.render.planar import with_photographer
 from glassplat.scene.camera import Camera
@@ -280,7 +280,7 @@ def evaluate(
     return Evaluation(results, per_view)
 
 
-def timed_render(renderer: Drawing, scene: Scene, view: View) -> tuple[Frame, float]:
+def timed_render(renderer: Renderer, scene: Scene, view: View) -> tuple[Frame, float]:
     """A frame without gradients, on the CPU, and the seconds it took.
 
     Raises:

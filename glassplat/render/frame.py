@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -93,10 +93,6 @@ class Frame:
         return self.direct if self.direct is None or self.mirrored is None else self.direct | self.mirrored
 
 
-Drawing = Callable[[Scene, Camera], Frame]
-"""What only renders, as any renderer does."""
-
-
 class Renderer(Protocol):
     """Anything that turns a scene and a camera into a frame."""
 
@@ -123,8 +119,8 @@ class Renderer(Protocol):
         """Names of the layers of a scene that are worth looking at, `rgb` the first; frames hold more for losses."""
         ...
 
-    def with_layers(self, layers: Sequence[str]) -> Drawing:
-        """The drawing of frames that also have those of these layers which are rendered only when asked."""
+    def with_layers(self, layers: Sequence[str]) -> Renderer:
+        """The renderer of frames that also have those of these layers which are rendered only when asked."""
         ...
 
     def page_settings(self) -> Mapping[str, Any]:

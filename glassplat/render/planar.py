@@ -18,7 +18,6 @@ from glassplat.kernels.tiles import bin_tiles
 from glassplat.options import BLACK, Blend, Rgb
 from glassplat.render.frame import (
     NEAR_PER_EXTENT,
-    Drawing,
     Frame,
     OverBackground,
     Renderer,
@@ -47,7 +46,7 @@ from glassplat.render.panes import (
     tint_of_panes,
     visibilities,
 )
-from glassplat.render.splat import with_normals
+from glassplat.render.splat import WithNormals
 from glassplat.scene.camera import Camera
 from glassplat.scene.corrections import Exposures
 from glassplat.scene.gaussians import Gaussians
@@ -209,10 +208,10 @@ class Planar(OverBackground):
         panes = ("transmission", "without_panes", "reflection", "strength", "mask")
         return ("rgb", *panes, "normal", "depth", "alpha", *known)
 
-    def with_layers(self, layers: Sequence[str]) -> Drawing:
-        """The drawing of frames, also of `photographed` and `normal` where they are among the layers."""
+    def with_layers(self, layers: Sequence[str]) -> Renderer:
+        """The renderer of frames that also have `photographed` and `normal` where they are among the layers."""
         renderer = replace(self, photographer="beside") if PHOTOGRAPHED in layers else self
-        return with_normals(renderer) if "normal" in layers else renderer
+        return WithNormals(renderer) if "normal" in layers else renderer
 
     def page_settings(self) -> Mapping[str, Any]:
         """Settings with which the web page lays panes before the image."""

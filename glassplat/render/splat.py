@@ -17,7 +17,6 @@ from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.frame import (
     MEDIAN_DEPTH,
     NEAR_PER_EXTENT,
-    Drawing,
     Frame,
     OverBackground,
     Renderer,
@@ -119,23 +118,44 @@ def blended_ellipsoids(
     return composite(splats, channels, bins, absgrad=joined_absgrad(screen))
 
 
-def with_normals(renderer: Renderer) -> Drawing:
+@dataclass(frozen=True)
+class WithNormals:
     """A renderer's frames, with a layer `normal` [H, W, 3] where they have none; discs get theirs from the renderer.
 
         n(u) = sum_i n_i alpha_i T_i
 
     n_i is the shortest axis of ellipsoid i, turned to the camera (3DGS-DR, Section 3.1). Of what panes stand before it
     is the things behind them, as the layer `depth` is. Costs a pass of its own.
+
+    Attributes:
+        renderer: renders everything else.
     """
 
-    def drawing(scene: Scene, camera: Camera) -> Frame:
-        frame = renderer(scene, camera)
+    renderer: Renderer
+
+    def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
+        """Renders `scene` from `camera`, where the scene's tensors are."""
+        frame = self.renderer(scene, camera, with_absgrad=with_absgrad)
         if "normal" in frame.layers:
             return frame
         normals = ellipsoid_normals(scene, camera.to(scene.primary.means.device))
         return replace(frame, layers={**frame.layers, "normal": normals})
 
-    return drawing
+    def check(self, scene: Scene) -> None:
+        """Raises ValueError where the renderer does."""
+        self.renderer.check(scene)
+
+    def layers(self, scene: Scene) -> tuple[str, ...]:
+        """Names of the renderer's layers."""
+        return self.renderer.layers(scene)
+
+    def with_layers(self, layers: Sequence[str]) -> WithNormals:
+        """The renderer of frames that also have these layers."""
+        return WithNormals(self.renderer.with_layers(layers))
+
+    def page_settings(self) -> Mapping[str, Any]:
+        """Settings of the renderer for the web page."""
+        return self.renderer.page_settings()
 
 
 def ellipsoid_normals(scene: Scene, camera: Camera) -> Tensor:
@@ -210,10 +230,10 @@ class Splat(OverBackground):
         """Names of the layers that are worth looking at."""
         return ("rgb", "normal", "depth", "alpha", *((MEDIAN_DEPTH,) if scene.primary.are_discs else ()))
 
-    def with_layers(self, layers: Sequence[str]) -> Drawing:
-        """The drawing of frames, also of `depth` and `normal` where they are among the layers."""
+    def with_layers(self, layers: Sequence[str]) -> Renderer:
+        """The renderer of frames that also have `depth` and `normal` where they are among the layers."""
         renderer = replace(self, depth=self.depth or "depth" in layers, normal=self.normal or "normal" in layers)
-        return with_normals(renderer) if "normal" in layers else renderer
+        return WithNormals(renderer) if "normal" in layers else renderer
 
     def page_settings(self) -> Mapping[str, Any]:
         """Settings for the web page: there are no panes."""
