@@ -187,6 +187,12 @@ def load_dataset(
     return dataset_of(files, downscale=downscale, background=background, memory=memory)
 
 
+def check_dataset(dataset: Dataset) -> None:
+    """Refuse what is no data set, such as the path of one, with an InputError."""
+    if not isinstance(dataset, Dataset):
+        raise InputError(f"dataset is {dataset!r}; expected what `glassplat.load_dataset` returns for a capture")
+
+
 def check_downscale(downscale: float) -> None:
     """Refuse a factor that reduces nothing.
 

@@ -382,11 +382,16 @@ class View:
         """A view of pixels at hand, such as a rendered one: a `photo` [H, W, 3] and `pane_labels` [H, W], of uint8.
 
         Raises:
-            ValueError: they are no tensors.
+            ValueError: they are no tensors of uint8, or of another size than the camera's.
         """
-        for given in (photo, pane_labels):
+        for given, channels in ((photo, (3,)), (pane_labels, ())):
             if given is not None and not isinstance(given, Tensor):
                 raise ValueError(f"the pixels of {name} are a {type(given).__name__}; expected a tensor of uint8")
+            shape = (camera.height, camera.width, *channels)
+            if given is not None and (given.shape != shape or given.dtype != torch.uint8):
+                raise ValueError(
+                    f"the pixels of {name} are {given.dtype} of shape {tuple(given.shape)}; expected uint8 of {shape}"
+                )
         labels = None if pane_labels is None else partial(_at_hand, pane_labels)
         return View(name, camera, Path(name), partial(_at_hand, photo), labels)
 

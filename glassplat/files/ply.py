@@ -58,7 +58,6 @@ def read_compressed(path: Path, table: PlyTable) -> Gaussians:
         log_scales=torch.from_numpy(scales),
         logit_opacities=torch.logit(opacities),
         sh=torch.from_numpy(np.concatenate([constant, rest], axis=1).astype(np.float32)),
-        active_sh_degree=round((1 + rest.shape[1]) ** 0.5) - 1,
     )
 
 
@@ -192,7 +191,6 @@ def read_gaussians(path: Path | str) -> Gaussians:
         logit_opacities=columns["opacity"],
         sh=sh,
         channels={name: column for name, column in columns.items() if is_channel(name)},
-        active_sh_degree=max(round(sh.shape[1] ** 0.5) - 1, 0),
     )
 
 

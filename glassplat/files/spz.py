@@ -110,7 +110,6 @@ def unpack_gaussians(sections: list[Bytes], layout: Layout) -> Gaussians:
         log_scales=as_tensor(scales.reshape(count, 3).astype(np.float32) / STEPS_PER_LOG + LOWEST_LOG_SCALE),
         logit_opacities=torch.logit(as_tensor(shares)),
         sh=as_tensor(np.concatenate([constant, rest], axis=1)),
-        active_sh_degree=min(layout.degree, 3),
     )
     return half_turned(stored, FLIP)
 

@@ -131,6 +131,7 @@ def surroundings_in_box(
         log_scales=means.new_full((count, 3), math.log(spread)),
         logit_opacities=means.new_full((count,), logit(opacity)),
         sh=means.new_zeros(count, (sh_degree + 1) ** 2, 3),
+        active_sh_degree=0,
     )
 
 

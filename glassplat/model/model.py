@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from glassplat.captures.dataset import EXTENT_MARGIN, Dataset, with_corrected_cameras
+from glassplat.captures.dataset import EXTENT_MARGIN, Dataset, check_dataset, with_corrected_cameras
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files import writing
 from glassplat.files.ply import read_gaussians, write_gaussians
@@ -28,7 +28,7 @@ from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.recipe import recipe_to_json, resolve_background, with_background
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import RunDirectory
-from glassplat.options import BLACK, Cleaning, Up
+from glassplat.options import BLACK, CLEAR_GLASS, Cleaning, Up
 from glassplat.publish import web_page
 from glassplat.publish.camera_paths import orbit
 from glassplat.publish.cleaning import Floaters, clean_scene
@@ -51,7 +51,7 @@ NOTEBOOK_WIDTH = 480
 """Pixels."""
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Model:
     """A scene, the method that renders it, and the cameras it was photographed from.
 
@@ -130,7 +130,7 @@ class Model:
     def render(self, camera: Camera | str, *, layers: Sequence[str] = ("rgb",)) -> Frame:
         """Renders the image and its layers; differentiable in every tensor of the scene and in the camera's pose.
 
-        Kernels have first derivatives only: a gradient of a gradient, as with `create_graph=True`, would be wrong.
+        Kernels have first derivatives only: a gradient of a gradient, as with `create_graph=True`, is refused.
 
         `frame.rgb` is [H, W, 3] in sRGB, not clamped; `frame.layers` are further images by name, [H, W] or [H, W, 3].
         Under `torch.no_grad()` it is faster.
@@ -186,20 +186,26 @@ class Model:
         of the test views as their neighbours' instead of aligning them with their photographs. It writes nothing.
 
         Raises:
-            InputError: the photographs are laid over another background than the model's.
+            InputError: `dataset` is something else, or its photographs lie over another background than the model's.
         """
+        check_dataset(dataset)
         from glassplat.evaluate.evaluate import evaluate  # Training imports this file, and may never need it.
 
         resolve_background(with_background(self.recipe, BLACK), dataset)
         scene, renderer = self.scene, with_photographer(self.renderer, "beside")
         if dataset.test:
-            kind = dataset.test[0].camera.cam_from_world.dtype
-            scene = scene.with_parameters({name: tensor.to(kind) for name, tensor in scene.tensors().items()})
+            scene = scene.to(dataset.test[0].camera.cam_from_world.dtype)
         return evaluate(scene, renderer, with_corrected_cameras(dataset, scene)).results
 
-    def to(self, device: torch.device | str) -> Model:
-        """The same on another device."""
-        return replace(self, scene=self.scene.to(device))
+    def to(self, device: torch.device | torch.dtype | str) -> Model:
+        """The same on another device, or in another precision, as float64 for `torch.autograd.gradcheck`.
+
+        Cameras are wherever they are: rendering takes them to the scene's device.
+        """
+        cameras = self.cameras
+        if isinstance(device, torch.dtype):
+            cameras = {name: camera.to(device) for name, camera in cameras.items()}
+        return replace(self, scene=self.scene.to(device), cameras=cameras)
 
     def with_scene(self, scene: Scene) -> Model:
         """Another scene, rendered in the same way from the same cameras."""
@@ -288,7 +294,7 @@ class Model:
         half_sizes: tuple[float, float],
         *,
         tangent: Sequence[float] | None = None,
-        base_reflectance: float = 0.077,
+        base_reflectance: float = CLEAR_GLASS,
         label: int | None = None,
     ) -> Model:
         """One more pane, also in a scene that was trained without any.
@@ -298,7 +304,7 @@ class Model:
             normal: [3] of any length.
             half_sizes: half its sides along tangent and bitangent, world units.
             tangent: [3] direction of its first side; if None a horizontal one, as the cameras are held upright.
-            base_reflectance: R0; that of window glass if not given, 1 makes a mirror.
+            base_reflectance: R0; that of clear glass if not given, 1 makes a mirror.
             label: what to call it, 1 to 255; the first number that is free if None.
 
         Raises:

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, NoReturn
 import torch
 
 from glassplat import __version__
-from glassplat.captures.dataset import Dataset, photographs_read, with_corrected_cameras
+from glassplat.captures.dataset import Dataset, check_dataset, photographs_read, with_corrected_cameras
 from glassplat.errors import InputError, RankLostError, first_names
 from glassplat.files.writing import make_folder
 from glassplat.kernels.backend.devices import DeviceName, chosen_device, compile_seconds
@@ -523,8 +523,7 @@ class Training:
                 value that it cannot have; `output` holds something else, or nothing to go on from; the run is too short
                 for its stages; or the photographs lie over another background than the recipe's.
         """
-        if not isinstance(dataset, Dataset):
-            raise InputError(f"dataset is {dataset!r}; expected what `glassplat.load_dataset` returns for a capture")
+        check_dataset(dataset)
         if not dataset.train:
             raise InputError(f"{dataset.root} has no training views; expected one or more in `dataset.train`")
         chosen = chosen_recipe(recipe)

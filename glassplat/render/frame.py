@@ -58,7 +58,7 @@ class SpacePass:
     contributions: Tensor
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
     """A rendered view and its layers.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import index
 from typing import Any, Literal
 
 import torch
@@ -100,6 +101,7 @@ def rasterization(
         name: value is not None and value is not False for name, value in others.items()
     }
     _check_options(render_mode, rasterize_mode, camera_model, [name for name, is_on in on.items() if is_on])
+    width, height = index(width), index(height)
     cameras = CameraBatch(viewmats, _intrinsics(viewmats, Ks), width, height)
     if eps2d > LOW_PASS:
         edges = viewmats.new_tensor([-ANYWHERE, -ANYWHERE, ANYWHERE, ANYWHERE])

@@ -21,9 +21,9 @@ def waits(device: torch.device) -> bool:
     return device.type == "cuda"
 
 
-def to_device(tensor: Tensor, device: torch.device | str) -> Tensor:
-    """The tensor on a device; on its way there, if it comes from memory: what is computed from it comes after it."""
-    if tensor.device.type != "cpu" or torch.device(device).type != "cuda":
+def to_device(tensor: Tensor, device: torch.device | torch.dtype | str) -> Tensor:
+    """The tensor on a device, perhaps on its way there, or of another type; what is computed from it comes later."""
+    if isinstance(device, torch.dtype) or tensor.device.type != "cpu" or torch.device(device).type != "cuda":
         return tensor.to(device)
     # Only from memory that stays in its place can a GPU fetch by itself.
     return tensor.pin_memory().to(device, non_blocking=True)
@@ -112,7 +112,7 @@ def mirror_matrices(centers: Tensor, normals: Tensor) -> Tensor:
     return torch.cat([top, bottom.expand(normals.shape[0], 1, 4)], dim=1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Camera:
     """One pinhole view of the world.
 
@@ -134,9 +134,8 @@ class Camera:
     def __post_init__(self) -> None:
         pose = self.cam_from_world
         if not isinstance(pose, Tensor) or pose.shape != (4, 4):
-            raise ValueError(
-                f"cam_from_world is a {type(pose).__name__}; expected a tensor [4, 4], such as torch.eye(4)"
-            )
+            given = f"has shape {tuple(pose.shape)}" if isinstance(pose, Tensor) else f"is a {type(pose).__name__}"
+            raise ValueError(f"cam_from_world {given}; expected a tensor [4, 4], such as torch.eye(4)")
         lengths = self.fx, self.fy, self.width, self.height
         if not all(0 < length < math.inf for length in lengths) or not math.isfinite(self.cx + self.cy):
             raise ValueError(
@@ -173,7 +172,10 @@ class Camera:
         """
         if not 0 < fov_rad < math.pi:
             raise ValueError(f"fov_rad is {fov_rad}; expected radians between 0 and pi")
-        pose = look_at(*(torch.as_tensor(vector, dtype=torch.float64) for vector in (eye, target, up)))
+        vectors = [torch.as_tensor(vector, dtype=torch.float64) for vector in (eye, target, up)]
+        if shapes := [tuple(vector.shape) for vector in vectors if vector.shape != (3,)]:
+            raise ValueError(f"eye, target or up has shape {shapes[0]}; expected three numbers each")
+        pose = look_at(*vectors)
         focal = height / 2 / math.tan(fov_rad / 2)
         return Camera(pose, focal, focal, width / 2, height / 2, width, height)
 
@@ -197,8 +199,8 @@ class Camera:
         """[3] camera centre in the world."""
         return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
 
-    def to(self, device: torch.device | str) -> Camera:
-        """The same camera on another device."""
+    def to(self, device: torch.device | torch.dtype | str) -> Camera:
+        """The same camera on another device, or in another precision."""
         pose = to_device(self.cam_from_world, device)
         return self if pose is self.cam_from_world else replace(self, cam_from_world=pose)
 

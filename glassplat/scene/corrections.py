@@ -94,8 +94,8 @@ class ByPhotograph:
         known = among_known(tensors, self.tensors(), "these corrections")
         return replace(self, values=known.get(self.TENSOR, self.values))
 
-    def to(self, device: torch.device | str) -> Self:
-        """The same on another device."""
+    def to(self, device: torch.device | torch.dtype | str) -> Self:
+        """The same on another device, or in another precision."""
         return replace(self, values=self.values.to(device))
 
     @classmethod

@@ -14,10 +14,27 @@ DISC_SCALES = 2
 """Scales of a disc; an ellipsoid has one more."""
 SH_COEFFICIENTS = (0, 1, 4, 9, 16)
 """Harmonics per colour: none, or those up to a degree from 0 to 3."""
+ALL_DEGREES = -1
 PER_GAUSSIAN = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
 
-@dataclass(frozen=True)
+def check_rows(tensors: Mapping[str, Tensor], count: int, rows: Mapping[str, tuple[tuple[int, ...], ...]]) -> None:
+    """Refuse tensors, other than `sh`, without `count` rows of one of their shapes; of a single number if not given.
+
+    Raises:
+        TypeError: something is no tensor.
+        ValueError: a tensor has another shape.
+    """
+    for name, tensor in tensors.items():
+        if not isinstance(tensor, Tensor):
+            raise TypeError(f"{name} is a {type(tensor).__name__}; expected a tensor (`torch.from_numpy` makes one)")
+        allowed = [(count, *row) for row in rows.get(name, ((),))]
+        if name != "sh" and tensor.shape not in allowed:
+            expected = " or ".join(map(str, allowed))
+            raise ValueError(f"{name} has shape {tuple(tensor.shape)}; expected {expected}, all of as many rows")
+
+
+@dataclass(frozen=True, eq=False)
 class Gaussians:
     """N anisotropic Gaussians in world space; every tensor is a raw, trainable value.
 
@@ -30,7 +47,7 @@ class Gaussians:
         sh: [N, K, 3] spherical-harmonic colour coefficients, K in {0, 1, 4, 9, 16}; K = 0 for
             Gaussians without a colour of their own (glass).
         channels: named raw per-Gaussian values, each [N] (`log_intensity`, `logit_mark`, ...).
-        active_sh_degree: highest degree in use; grows during training.
+        active_sh_degree: highest degree in use; grows during training. All that `sh` holds if not given.
     """
 
     means: Tensor
@@ -39,25 +56,19 @@ class Gaussians:
     logit_opacities: Tensor
     sh: Tensor
     channels: Mapping[str, Tensor] = field(default_factory=dict)
-    active_sh_degree: int = 0
+    active_sh_degree: int = ALL_DEGREES
 
     def __post_init__(self) -> None:
-        for name, tensor in self.tensors().items():
-            if not isinstance(tensor, Tensor):
-                raise TypeError(
-                    f"{name} is a {type(tensor).__name__}; expected a tensor (`torch.from_numpy` makes one)"
-                )
-        count = self.means.shape[0]
-        for name, tensor in self.tensors().items():
-            if tensor.shape[0] != count:
-                raise ValueError(
-                    f"{name} has {tensor.shape[0]} rows where means has {count}; expected one row per Gaussian"
-                )
-        if self.sh.dim() != 3 or self.sh.shape[1] not in SH_COEFFICIENTS or self.sh.shape[2] != 3:
+        count = len(self.means) if isinstance(self.means, Tensor) and self.means.dim() else 0
+        check_rows(self.tensors(), count, {"means": ((3,),), "quats": ((4,),), "log_scales": ((2,), (3,))})
+        sizes = tuple(self.sh.shape)
+        if len(sizes) != 3 or sizes[0] != count or sizes[1] not in SH_COEFFICIENTS or sizes[2] != 3:
             raise ValueError(
-                f"sh has shape {tuple(self.sh.shape)}; expected (N, K, 3) with K one of {SH_COEFFICIENTS}, as degrees "
-                "up to 3 have them"
+                f"sh has shape {sizes}; expected (N, K, 3) with K one of {SH_COEFFICIENTS}, as degrees "
+                f"up to 3 have them, and N = {count} as of the means"
             )
+        if self.active_sh_degree == ALL_DEGREES:
+            object.__setattr__(self, "active_sh_degree", max(self.max_sh_degree, 0))
         if not 0 <= self.active_sh_degree <= max(self.max_sh_degree, 0):
             raise ValueError(
                 f"active_sh_degree is {self.active_sh_degree}, but sh holds degrees up to {self.max_sh_degree}"
@@ -102,12 +113,19 @@ class Gaussians:
         return self.with_tensors({name: tensor[index] for name, tensor in self.tensors().items()})
 
     def concat(self, other: Gaussians) -> Gaussians:
-        """These Gaussians, then others with the same tensors."""
-        theirs = other.tensors()
-        return self.with_tensors({name: torch.cat([tensor, theirs[name]]) for name, tensor in self.tensors().items()})
+        """These Gaussians, then others with the same tensors.
 
-    def to(self, device: torch.device | str) -> Gaussians:
-        """The same set on another device."""
+        Raises:
+            ValueError: the others have other tensors, or some of other sizes.
+        """
+        mine, theirs = ({name: (*t.shape[1:],) for name, t in part.tensors().items()} for part in (self, other))
+        if mine != theirs:
+            raise ValueError(f"one set has columns {mine}, the other {theirs}; expected the same of both")
+        tensors = other.tensors()
+        return self.with_tensors({name: torch.cat([tensor, tensors[name]]) for name, tensor in self.tensors().items()})
+
+    def to(self, device: torch.device | torch.dtype | str) -> Gaussians:
+        """The same set on another device, or in another precision."""
         return self.with_tensors({name: tensor.to(device) for name, tensor in self.tensors().items()})
 
     @staticmethod
@@ -119,6 +137,7 @@ class Gaussians:
             log_scales=torch.zeros(0, 3, dtype=torch.float32),
             logit_opacities=torch.zeros(0, dtype=torch.float32),
             sh=torch.zeros(0, sh_coefficients, 3, dtype=torch.float32),
+            active_sh_degree=0,
             channels={name: torch.zeros(0, dtype=torch.float32) for name in channels},
         )
 

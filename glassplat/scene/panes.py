@@ -11,6 +11,7 @@ from torch import Tensor
 
 from glassplat.scene import among_known
 from glassplat.scene.camera import Camera, constant
+from glassplat.scene.gaussians import check_rows
 
 LEAST_SINE = 1e-6
 """Of the angle between a pane's normal and its tangent."""
@@ -31,7 +32,7 @@ def name_labels(labels: Iterable[int]) -> str:
     return ", ".join(f"{run[0]} to {run[-1]}" if len(run) > LONGEST_LIST else ", ".join(map(str, run)) for run in runs)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Planes:
     """K rectangles that reflect, one per pane.
 
@@ -61,11 +62,8 @@ class Planes:
     log_transmittances: Tensor | None = None
 
     def __post_init__(self) -> None:
-        for name, tensor in self.tensors().items():
-            if tensor.shape[0] != len(self.labels):
-                raise ValueError(
-                    f"{name} has {tensor.shape[0]} rows for {len(self.labels)} plane labels; expected one row per plane"
-                )
+        rows = dict.fromkeys(self.tensors(), ((3,),)) | {"logit_reflectances": ((),), "half_sizes": ((2,),)}
+        check_rows(self.tensors(), len(self.labels), rows)
         if wrong := [label for label in self.labels if not 1 <= label <= HIGHEST_LABEL]:
             raise ValueError(f"there are planes with the labels {wrong}; expected 1 to {HIGHEST_LABEL}, as in masks")
         if len(set(self.labels)) < len(self.labels):
@@ -146,8 +144,8 @@ class Planes:
         )
         return together.select(sorted(range(len(together)), key=together.labels.__getitem__))
 
-    def to(self, device: torch.device | str) -> Planes:
-        """The same planes on another device."""
+    def to(self, device: torch.device | torch.dtype | str) -> Planes:
+        """The same planes on another device, or in another precision."""
         return self.with_tensors({name: tensor.to(device) for name, tensor in self.tensors().items()})
 
     @staticmethod

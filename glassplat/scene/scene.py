@@ -23,7 +23,7 @@ NOISE = 5.0
 """Of the logits of an environment before training."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Environment:
     """Light from infinitely far away, one colour for each direction.
 
@@ -66,8 +66,8 @@ class Environment:
         """The same environment with its tensors replaced by name."""
         return replace(self, **among_known(tensors, ENVIRONMENT_TENSORS, "environments"))
 
-    def to(self, device: torch.device | str) -> Environment:
-        """The same environment on another device."""
+    def to(self, device: torch.device | torch.dtype | str) -> Environment:
+        """The same environment on another device, or in another precision."""
         return self.with_tensors({name: tensor.to(device) for name, tensor in self.tensors().items()})
 
     @staticmethod
@@ -95,7 +95,7 @@ PARTS = (*GAUSSIAN_SETS, "planes", "environment", "exposures", "poses")
 """Fields of `Scene` that hold tensors."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """Primary Gaussians, glass Gaussians, reflection planes, and what shiny surfaces mirror.
 
@@ -172,8 +172,8 @@ class Scene:
         changed: dict[str, Any] = {part: gaussians}
         return replace(self, **changed)
 
-    def to(self, device: torch.device | str) -> Scene:
-        """The same scene on another device."""
+    def to(self, device: torch.device | torch.dtype | str) -> Scene:
+        """The same scene on another device, or in another precision."""
         moved: dict[str, Any] = {name: getattr(self, name).to(device) for name in PARTS}
         return replace(self, **moved)
 
@@ -349,7 +349,7 @@ def row_of(planes: Planes, label: int) -> int:
     """
     if label not in planes.labels:
         there_are = f"the panes are {name_labels(planes.labels)}" if len(planes) else "it has no panes"
-        raise ValueError(f"the scene has no pane {label}; {there_are}")
+        raise ValueError(f"the scene has no pane {label!r}; {there_are}")
     return planes.labels.index(label)
 
 

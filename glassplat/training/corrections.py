@@ -108,6 +108,7 @@ def first_photographer(
         log_scales=torch.log(SPREAD * radii)[:, None].repeat(1, 3),
         logit_opacities=torch.full((count,), logit(OPACITY), dtype=torch.float32),
         sh=torch.zeros(count, (sh_degree + 1) ** 2, 3, dtype=torch.float32),
+        active_sh_degree=0,
     )
     return found.to(device)
 

@@ -73,6 +73,7 @@ def gaussians_from_points(
         logit_opacities=torch.full((count,), logit(opacity), device=device, dtype=torch.float32),
         sh=sh,
         channels={"log_intensity": torch.zeros(count, device=device, dtype=torch.float32)},
+        active_sh_degree=0,
     )
 
 

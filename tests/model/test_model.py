@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import copy
 import dataclasses
 import io
 import pickle
@@ -348,6 +349,48 @@ def test_metrics_are_of_what_photographs_show_somebody_in_the_glass_too() -> Non
 def test_gaussians_of_a_model_are_plain_data() -> None:
     primary = model().scene.primary
     assert isinstance(primary, Gaussians) and len(primary.concat(primary)) == 2 * len(primary)
+    own = Gaussians(primary.means, primary.quats, primary.log_scales, primary.logit_opacities, primary.sh)
+    assert own.active_sh_degree == own.max_sh_degree == 2, "colours that are given are used"
+    for one, other in (
+        (primary, own),
+        (own, primary),
+        (own, dataclasses.replace(own, sh=own.sh[:, :1], active_sh_degree=0)),
+    ):
+        with pytest.raises(ValueError, match=r"one set has columns .*; expected the same of both"):
+            one.concat(other)
+
+
+def test_what_holds_tensors_is_told_from_its_copies() -> None:
+    whole = model()
+    for thing in (whole, whole.scene, whole.scene.primary, whole.scene.planes, whole.cameras["2.png"]):
+        assert thing in {thing} and thing not in [copy.deepcopy(thing)]
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "expected"),
+    [
+        ("primary.means", (30, 2), r"means has shape \(30, 2\); expected \(30, 3\)"),
+        ("primary.quats", (30, 3), r"quats has shape \(30, 3\); expected \(30, 4\)"),
+        ("primary.log_scales", (30, 1), r"log_scales has .*; expected \(30, 2\) or \(30, 3\)"),
+        ("primary.logit_opacities", (30, 1), r"logit_opacities has .*; expected \(30,\)"),
+        ("primary.log_intensity", (29,), r"log_intensity has .*; expected \(30,\)"),
+        ("planes.centers", (1, 2), r"centers has shape \(1, 2\); expected \(1, 3\)"),
+        ("planes.logit_reflectances", (1, 1), r"logit_reflectances has .*; expected \(1,\)"),
+        ("planes.half_sizes", (1, 3), r"half_sizes has .*; expected \(1, 2\)"),
+    ],
+)
+def test_tensors_of_another_shape_are_refused(name: str, shape: tuple[int, ...], expected: str) -> None:
+    with pytest.raises(ValueError, match=expected):
+        model().with_parameters({name: torch.zeros(shape)})
+    with pytest.raises(TypeError, match="is a list; expected a tensor"):
+        model().with_parameters({name: [0.0]})  # type: ignore[dict-item]
+
+
+def test_a_model_in_double_precision_is_rendered_from_its_cameras() -> None:
+    double = model().to(torch.float64)
+    assert double.render("2.png").rgb.dtype == torch.float64
+    torch.testing.assert_close(double.image("2.png").float(), model().image("2.png"))
+    assert double.to("cpu").cameras is double.cameras
 
 
 @pytest.mark.parametrize("shape", [(30, 5, 3), (30, 25, 3), (30, 4), (30, 4, 4)])
@@ -372,5 +415,16 @@ def test_a_view_in_memory_is_kept_and_what_is_no_tensor_and_no_angle_is_refused(
     assert torch.equal(kept.photo, tiny_capture().train[0].photo)
     with pytest.raises(ValueError, match="the pixels of a are a ndarray; expected a tensor"):
         View.in_memory("a", camera, photo=np.zeros((28, 40, 3), np.uint8))  # type: ignore[arg-type]
+    for photo in (torch.zeros(28, 40, 3), torch.zeros(40, 28, 3, dtype=torch.uint8)):
+        with pytest.raises(ValueError, match=r"pixels of a are .*; expected uint8 of \(28, 40, 3\)"):
+            View.in_memory("a", camera, photo=photo)
+    with pytest.raises(ValueError, match=r"cam_from_world has shape \(3, 4\); expected a tensor \[4, 4\]"):
+        dataclasses.replace(camera, cam_from_world=camera.cam_from_world[:3])
+    with pytest.raises(ValueError, match=r"eye, target or up has shape \(2,\); expected three numbers"):
+        Camera.look_at((0, 0), (0, 0, 1), up=(0, -1, 0))
+    with pytest.raises(InputError, match="dataset is 'captures/shop'; expected what"):
+        model().evaluate("captures/shop")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="the scene has no pane '1'; the panes are 1"):
+        model().with_mirrors("1")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="fov_rad is 0; expected radians between 0 and pi"):
         Camera.look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0), fov_rad=0)

@@ -104,7 +104,7 @@ HEADERS: list[tuple[dict[str, Any], str]] = [
     ({"extent": float("nan")}, "extent of the header of .* is nan; expected a finite number"),
     ({"labels": 5}, "labels of the header of .* is 5; expected a list"),
     ({"labels": ["left"]}, "entry 1 of labels of the header of .* is 'left'; expected a whole number"),
-    ({"labels": [1, 2, 3]}, "holds no training state: centers has 1 rows for 3 plane labels"),
+    ({"labels": [1, 2, 3]}, r"holds no training state: centers has shape \(1, 3\); expected \(3, 3\)"),
     ({"mirrors": [9]}, "holds no training state: mirrors .* are not all among the plane labels"),
     ({"region": [1]}, "region of the header of .* is .*; expected a list of 4 values"),
     ({"active_sh_degree": 1}, "active_sh_degree of the header of .* is 1; expected an object"),
@@ -140,7 +140,7 @@ def test_what_lacks_in_the_header_is_named(checkpoint: Path, key: str) -> None:
 
 TENSORS: list[tuple[str, Any, str]] = [
     ("scene/primary/means", None, r"primary has the tensors \[.*\]; expected \[.*'means'"),
-    ("scene/primary/means", torch.zeros(4, 3), "rows where means has 4"),
+    ("scene/primary/means", torch.zeros(4, 3), r"expected \(4, 4\), all of as many rows"),
     ("scene/primary/quats", torch.zeros(40, 3), r"quats of primary has shape \[40, 3\]; expected rows of \[4\]"),
     ("scene/primary/sh", torch.zeros(40, 2, 3), r"sh of primary has shape \[40, 2, 3\]"),
     ("scene/primary/means", torch.zeros(40, 3, dtype=torch.int64), "holds torch.int64; expected floating-point"),
