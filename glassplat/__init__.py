@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from glassplat.captures.dataset import Dataset, load_dataset
-    from glassplat.captures.view import View
+    from glassplat.captures.view import PointCloud, View
     from glassplat.errors import InputError
     from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
     from glassplat.methods.planar_recipe import PlanarRecipe
@@ -53,6 +53,7 @@ __all__ = [  # noqa: RUF022 - In the order in which the documentation tells of t
     "Training",
     "Dataset",
     "View",
+    "PointCloud",
     "Camera",
     "Scene",
     "Gaussians",
@@ -82,7 +83,7 @@ __all__ = [  # noqa: RUF022 - In the order in which the documentation tells of t
 
 HOMES = {
     "captures.dataset": ("Dataset", "load_dataset"),
-    "captures.view": ("View",),
+    "captures.view": ("PointCloud", "View"),
     "errors": ("InputError",),
     "methods.glossy_recipes": ("DeferredRecipe", "TracedRecipe"),
     "methods.planar_recipe": ("PlanarRecipe",),

@@ -107,6 +107,18 @@ def test_the_term_of_a_recipe_of_ones_own_counts_in_every_step(recipe: str, laye
     assert len(steps) == 4 and all("calm" in step.losses for step in steps)
 
 
+def test_data_in_memory_are_trained_on() -> None:
+    blocks = PYTHON_BLOCK.findall((ROOT / "docs" / "python.md").read_text(encoding="utf-8"))
+    (block,) = [block for block in blocks if "in_memory" in block]
+    tiny = tiny_capture()
+    shots = [(view.camera, view.photo) for view in tiny.train]
+    names = {"glassplat": glassplat, "Path": Path, "shots": shots, **vars(tiny.points)}
+    exec(block, names)
+    model = glassplat.Training(names["dataset"], "splat", iterations=2).run()
+    again = model.with_parameters(model.scene.parameters())
+    assert len(model.cameras) == 6 and torch.equal(again.image("0.png"), model.image("0.png"))
+
+
 MODULE = re.compile(r"python -m ((?:tools|benchmarks)(?:\.\w+)?)([^`\n|;]*)")
 
 
