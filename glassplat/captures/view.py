@@ -384,14 +384,11 @@ class View:
         Raises:
             ValueError: they are no tensors of uint8, or of another size than the camera's.
         """
-        for given, channels in ((photo, (3,)), (pane_labels, ())):
-            if given is not None and not isinstance(given, Tensor):
-                raise ValueError(f"the pixels of {name} are a {type(given).__name__}; expected a tensor of uint8")
-            shape = (camera.height, camera.width, *channels)
-            if given is not None and (given.shape != shape or given.dtype != torch.uint8):
-                raise ValueError(
-                    f"the pixels of {name} are {given.dtype} of shape {tuple(given.shape)}; expected uint8 of {shape}"
-                )
+        size = camera.height, camera.width
+        for given, shape in ((photo, (*size, 3)), (pane_labels, size)):
+            if given is not None and (getattr(given, "dtype", None) != torch.uint8 or given.shape != shape):
+                found = f"{given.dtype} {[*given.shape]}" if isinstance(given, Tensor) else f"a {type(given).__name__}"
+                raise ValueError(f"the pixels of {name} are {found}; expected a tensor of uint8 {[*shape]}")
         labels = None if pane_labels is None else partial(_at_hand, pane_labels)
         return View(name, camera, Path(name), partial(_at_hand, photo), labels)
 

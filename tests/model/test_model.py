@@ -19,6 +19,7 @@ from PIL import Image
 import glassplat
 from glassplat import Camera, Gaussians, InputError, Model, Planar, PlanarRecipe, Scene, SplatRecipe, View
 from glassplat.model.model import by_name
+from glassplat.options import CLEAR_GLASS
 from glassplat.render.deferred import Deferred
 from glassplat.render.splat import Splat
 from glassplat.render.traced import Traced
@@ -127,6 +128,7 @@ def test_edits_are_new_models() -> None:
 def test_one_pane_of_two_is_taken_out_with_its_glass() -> None:
     two = model().with_pane((3.0, 0.0, 2.0), (0.0, 0.0, 1.0), (0.5, 0.4))
     assert two.panes == (1, 2) and len(two.scene.glass) > len(model().scene.glass)
+    assert float(two.scene.planes.base_reflectances[1]) == pytest.approx(CLEAR_GLASS)
     back = two.without_pane(2)
     assert back.panes == (1,) and torch.equal(back.scene.glass.means, model().scene.glass.means)
 
@@ -416,7 +418,7 @@ def test_a_view_in_memory_is_kept_and_what_is_no_tensor_and_no_angle_is_refused(
     with pytest.raises(ValueError, match="the pixels of a are a ndarray; expected a tensor"):
         View.in_memory("a", camera, photo=np.zeros((28, 40, 3), np.uint8))  # type: ignore[arg-type]
     for photo in (torch.zeros(28, 40, 3), torch.zeros(40, 28, 3, dtype=torch.uint8)):
-        with pytest.raises(ValueError, match=r"pixels of a are .*; expected uint8 of \(28, 40, 3\)"):
+        with pytest.raises(ValueError, match=r"pixels of a are .*; expected a tensor of uint8 \[28, 40, 3\]"):
             View.in_memory("a", camera, photo=photo)
     with pytest.raises(ValueError, match=r"cam_from_world has shape \(3, 4\); expected a tensor \[4, 4\]"):
         dataclasses.replace(camera, cam_from_world=camera.cam_from_world[:3])

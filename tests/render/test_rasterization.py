@@ -206,3 +206,9 @@ def test_radii_are_of_what_is_drawn(eps2d: float) -> None:
 def test_what_is_not_supported_is_refused(changed: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         plain(**changed)
+
+
+def test_a_size_is_a_whole_number_of_any_kind() -> None:
+    assert torch.equal(plain(width=torch.tensor(WIDTH))[0], plain()[0])
+    with pytest.raises(TypeError, match="'float' object cannot be interpreted as an integer"):
+        plain(height=float(HEIGHT))
