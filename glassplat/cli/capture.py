@@ -31,8 +31,8 @@ class Prepare:
         max_size: reduce photographs to this many pixels along the longer side.
         frames: photographs to take from a video, at most.
         lens: COLMAP's model of the lens; opencv and opencv_fisheye for wide ones.
-        mapper: place one photograph after the other, or all at once.
-        least_registered: share of the photographs that have to be placed; with a larger one, more is tried.
+        mapper: register one photograph after the other, or all at once.
+        least_registered: share of the photographs that have to be registered; with a larger one, more is tried.
         resume: go on where the command was interrupted.
         force: replace a capture that was prepared before, or begin an interrupted one again.
     """

@@ -95,7 +95,7 @@ def _describe_preparation(path: Path, finding: Finding) -> None:
     try:
         report = read_json(path / RECORD)["report"]
         finding.facts["prepared"] = (
-            f"{report['registered']} of {report['photographs']} photographs placed, points "
+            f"{report['registered']} of {report['photographs']} photographs registered, points "
             f"{report['reprojection_error']:.2f} pixels off"
         )
         finding.problems += report["advice"]

@@ -370,22 +370,24 @@ Mapper = Literal["incremental", "global"]
 
 @dataclass(frozen=True)
 class Mapping:
-    """Options for placing photographs.
+    """Options for registering photographs.
 
     Attributes:
         first_angle: degrees between the sight lines of the first two photographs.
-        least_matches: on known points, with which a photograph is placed.
+        least_matches: on known points, with which a photograph is registered.
     """
 
     first_angle: float = 16.0
     least_matches: int = 30
 
 
-PLACING = "placing the photographs"
+REGISTERING = "registering the photographs"
 
 
-def place_photographs(database: Path, mapper: Mapper, options: Mapping, *, count: int, listen: Listener) -> list[Any]:
-    """The connected groups of photographs that were placed, each a `pycolmap.Reconstruction`, the largest first.
+def register_photographs(
+    database: Path, mapper: Mapper, options: Mapping, *, count: int, listen: Listener
+) -> list[Any]:
+    """The connected groups of photographs that were registered, each a `pycolmap.Reconstruction`, the largest first.
 
     Args:
         database: the matches.
@@ -399,7 +401,7 @@ def place_photographs(database: Path, mapper: Mapper, options: Mapping, *, count
     """
     output = database.with_suffix(".models")
     output.mkdir(exist_ok=True)
-    listen(Working(PLACING, 0, count))
+    listen(Working(REGISTERING, 0, count))
     if mapper == "incremental":
         work = _incremental(database, output, _incremental_options(options), count, listen)
     else:
@@ -410,21 +412,21 @@ def place_photographs(database: Path, mapper: Mapper, options: Mapping, *, count
 
 
 def _incremental(database: Path, output: Path, options: Any, count: int, listen: Listener) -> Callable[[Any], dict]:
-    group = placed_now = 0
+    group = registered_now = 0
 
     def tell() -> None:
         # Each group is work of its own: its time left is not that of the whole.
-        what = PLACING if group <= 1 else f"{PLACING}, group {group}"
-        listen(Working(what, placed_now, count))
+        what = REGISTERING if group <= 1 else f"{REGISTERING}, group {group}"
+        listen(Working(what, registered_now, count))
 
     def begun() -> None:
-        nonlocal group, placed_now
-        group, placed_now = group + 1, 2
+        nonlocal group, registered_now
+        group, registered_now = group + 1, 2
         tell()
 
     def next_one() -> None:
-        nonlocal placed_now
-        placed_now = min(placed_now + 1, count)
+        nonlocal registered_now
+        registered_now = min(registered_now + 1, count)
         tell()
 
     def work(token: Any) -> dict:

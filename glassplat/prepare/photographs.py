@@ -47,7 +47,7 @@ SIDEWAYS = (5, 6, 7, 8)
 
 @dataclass(frozen=True)
 class Photograph:
-    """One photograph to place.
+    """One photograph to register.
 
     Attributes:
         path: the file.

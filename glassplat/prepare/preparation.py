@@ -235,9 +235,9 @@ class Report:
 
     Attributes:
         photographs: how many there were.
-        registered: how many were placed, all connected with each other.
+        registered: how many have a pose, all connected with each other.
         missing: names of the files that were not.
-        groups: sizes of the groups of photographs that were placed, each by itself; each photograph counts once.
+        groups: sizes of the groups of photographs that were registered, each by itself; each photograph counts once.
         points: measured places in the scene.
         reprojection_error: mean distance of a point from where photographs show it, in pixels.
         track_length: mean number of photographs that a point was measured in.
@@ -263,14 +263,14 @@ class Report:
 
     @property
     def share(self) -> float:
-        """Of the photographs, those that were placed."""
+        """Of the photographs, those that were registered."""
         return self.registered / self.photographs
 
     def lines(self) -> list[str]:
         """The report for people."""
         missing = f" (not: {first_names(list(self.missing), 8)})" if self.missing else ""
         return [
-            f"{self.registered} of {self.photographs} photographs placed{missing}, with {self.attempt}",
+            f"{self.registered} of {self.photographs} photographs registered{missing}, with {self.attempt}",
             f"{self.points} points, each in {self.track_length:.1f} photographs on average, "
             f"{self.reprojection_error:.2f} pixels off",
             *(f"camera: {camera}" for camera in self.cameras),
@@ -302,7 +302,7 @@ def report_of(solution: Solution) -> Report:
 
 
 def _groups(solution: Solution) -> tuple[int, ...]:
-    """Number of photographs that each model adds to the larger ones; part of a group may be placed twice."""
+    """Number of photographs that each model adds to the larger ones; part of a group may be registered twice."""
     known: set[int] = set()
     sizes = []
     for model in solution.models:
@@ -314,7 +314,7 @@ def _groups(solution: Solution) -> tuple[int, ...]:
 
 
 def _describe_lenses(model: Any) -> list[str]:
-    """Each lens that took a placed photograph."""
+    """Each lens that took a registered photograph."""
     used = {image.camera_id for image in model.images.values() if image.has_pose}
     return [
         f"{camera.width}x{camera.height}, focal length {camera.mean_focal_length():.0f} pixels"
@@ -364,8 +364,8 @@ class Preparation:
         output: the capture.
         max_size: pixels of the longer side to which photographs are reduced.
         frames: photographs taken from a video, at most.
-        least_registered: share of the photographs that have to be placed.
-        settings: how they are placed.
+        least_registered: share of the photographs that have to be registered.
+        settings: how they are registered.
     """
 
     source: Path
@@ -377,9 +377,9 @@ class Preparation:
 
     def record(self) -> dict[str, Any]:
         """Inputs on which the work depends: an interrupted one goes on with the same only."""
-        placing = {"lens": self.settings.lens, "mapper": self.settings.mapper}
+        options = {"lens": self.settings.lens, "mapper": self.settings.mapper}
         source = readable_name(real_path(self.source))
-        return {"input": source, "max-size": self.max_size, "frames": self.frames, **placing}
+        return {"input": source, "max-size": self.max_size, "frames": self.frames, **options}
 
 
 def prepare(task: Preparation, listen: Listener, *, resume: bool = False, force: bool = False) -> Report:
@@ -392,7 +392,7 @@ def prepare(task: Preparation, listen: Listener, *, resume: bool = False, force:
         force: replace a capture that was prepared before, or begin an interrupted one again.
 
     Raises:
-        InputError: photographs that cannot be used, or too few of them could be placed; the message says what to do.
+        InputError: photographs that cannot be used, or too few of them are registered; the message says what to do.
         OSError: the capture cannot be written.
     """
     check_places(task)
@@ -462,7 +462,7 @@ def _photographs(task: Preparation, workplace: Workplace, listen: Listener) -> l
 
 
 def _check_enough(report: Report, task: Preparation) -> None:
-    """Refuse a capture of which too much is missing, or that no photograph was placed in."""
+    """Refuse a capture of which too much is missing, or in which no photograph was registered."""
     if report.registered >= 3 and report.share >= task.least_registered:
         return
     lines = "\n".join(report.lines())
@@ -472,6 +472,6 @@ def _check_enough(report: Report, task: Preparation) -> None:
         else "nothing was written"
     )
     raise InputError(
-        f"{report.registered} of {report.photographs} photographs could be placed, expected at least "
+        f"{report.registered} of {report.photographs} photographs could be registered, expected at least "
         f"{task.least_registered:.0%}\n{lines}\n{remedy}"
     )

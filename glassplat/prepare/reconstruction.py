@@ -22,7 +22,7 @@ from glassplat.prepare.colmap import (
     Mapper,
     Mapping,
     chosen_pairs,
-    place_photographs,
+    register_photographs,
 )
 from glassplat.prepare.photographs import Listener, Note, Photograph, read_photograph
 from glassplat.training.messages import Working
@@ -54,7 +54,7 @@ ATTEMPTS = (
 
 @dataclass(frozen=True)
 class Solution:
-    """The groups that one attempt placed.
+    """The groups that one attempt registered.
 
     Attributes:
         database: of the attempt.
@@ -81,7 +81,7 @@ class Solution:
 
 @dataclass(frozen=True)
 class Settings:
-    """Options for placing photographs.
+    """Options for registering photographs.
 
     Attributes:
         lens: COLMAP's camera model.
@@ -93,7 +93,7 @@ class Settings:
 
 
 def image_numbers(model: Any) -> dict[int, Any]:
-    """The placed images of a model by the number of their photograph."""
+    """The registered images of a model by the number of their photograph."""
     return {int(Path(image.name).stem): image for image in model.images.values() if image.has_pose}
 
 
@@ -102,7 +102,7 @@ def best_solution(
 ) -> Solution:
     """Places photographs, with as many attempts as it takes; what lies in `work` from before is used.
 
-    More features take many times as long, so they are tried only where less than the share `least` was placed.
+    More features take many times as long, so they are tried only where less than the share `least` was registered.
 
     Raises:
         InputError: the photographs show too little to be recognised.
@@ -114,10 +114,12 @@ def best_solution(
             enough = least if attempt.features == MANY else max(ENOUGH, least)
             if best.registered >= enough * len(photographs):
                 break
-            note = f"{best.registered} of {len(photographs)} photographs were placed; trying again with {attempt.name}"
+            note = (
+                f"{best.registered} of {len(photographs)} photographs are registered; trying again with {attempt.name}"
+            )
             listen(Note(note))
         database = _match_features(photographs, work, attempt.features, settings, listen)
-        models = place_photographs(
+        models = register_photographs(
             database.path, settings.mapper, attempt.mapping, count=len(photographs), listen=listen
         )
         tried += 1

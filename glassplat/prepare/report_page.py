@@ -244,7 +244,7 @@ def _behind(dataset: Dataset, planes: Planes | None) -> NDArray[np.bool_]:
 def _cards(report: Mapping[str, Any], behind: NDArray[np.bool_], planes: Planes | None) -> list[str]:
     share = behind.sum() / max(len(behind), 1)
     facts = {
-        "photographs placed": f"{report['registered']} of {report['photographs']}",
+        "photographs registered": f"{report['registered']} of {report['photographs']}",
         "points": f"{report['points']:,}",
         "pixels off, on average": f"{report['reprojection_error']:.2f}",
         "photographs per point": f"{report['track_length']:.1f}",
@@ -317,4 +317,4 @@ def _thumbnail(view: View) -> str:
 def _missing(names: Sequence[str]) -> list[str]:
     if not names:
         return []
-    return ["<h2>Not placed</h2>", f'<p class="advice">{html.escape(", ".join(map(str, names)))}</p>']
+    return ["<h2>Not registered</h2>", f'<p class="advice">{html.escape(", ".join(map(str, names)))}</p>']

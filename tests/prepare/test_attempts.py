@@ -63,7 +63,7 @@ def test_more_features_only_where_too_few_are_placed(
     def placed(*unused: object, **also: object) -> list[Group]:
         return [Group(size)] if (size := next(left)) else []
 
-    monkeypatch.setattr(reconstruction, "place_photographs", placed)
+    monkeypatch.setattr(reconstruction, "register_photographs", placed)
     solution = best_solution(photographs, Path("work"), Settings(), least, notes.append)
     assert tried == features
     assert (solution.registered, solution.tried) == (best, len(sizes))
@@ -81,5 +81,5 @@ def test_a_second_group_is_work_of_its_own(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(library.pycolmap, "incremental_mapping", mapping)
     heard: list[Any] = []
     colmap._incremental(Path("d"), Path("o"), Mapping(), 9, heard.append)(None)
-    first, second = "placing the photographs", "placing the photographs, group 2"
+    first, second = "registering the photographs", "registering the photographs, group 2"
     assert heard == [Working(first, done, 9) for done in (2, 3, 4, 5)] + [Working(second, done, 9) for done in (2, 3)]

@@ -99,7 +99,7 @@ def test_a_capture_is_replaced_only_by_force(prepared: Path, capsys: pytest.Capt
 
 
 @pytest.mark.parametrize(
-    "phase", ["looking for features", "matching photographs", "placing the photographs", "writing"]
+    "phase", ["looking for features", "matching photographs", "registering the photographs", "writing"]
 )
 def test_what_was_interrupted_goes_on(phase: str, photographs: Path, tmp_path: Path, heard: Heard) -> None:
     task = Preparation(photographs, tmp_path / "capture")
@@ -154,6 +154,6 @@ def test_photographs_of_two_places_are_refused_with_their_groups(
             ImageOps.invert(ImageOps.mirror(image)).save(path.with_name(f"other {path.name}"), quality=95)
     assert main(["prepare", str(photographs), "--output", str(tmp_path / "capture")]) == 2
     message = " ".join(capsys.readouterr().err.split())
-    assert "of 12 photographs could be placed, expected at least 80%" in message
+    assert "of 12 photographs could be registered, expected at least 80%" in message
     assert "groups that share nothing" in message and "--least-registered" in message
     assert not (tmp_path / "capture").exists()

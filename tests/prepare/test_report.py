@@ -89,7 +89,7 @@ def test_names_that_are_no_text_can_be_read_again(tmp_path: Path) -> None:
 def test_a_good_preparation_needs_no_advice() -> None:
     found = report([FakeModel(range(10))])
     assert found.share == 1 and found.groups == (10,) and found.advice == () and found.missing == ()
-    assert found.lines()[0].startswith("10 of 10 photographs placed, with")
+    assert found.lines()[0].startswith("10 of 10 photographs registered, with")
 
 
 def test_photographs_that_were_placed_twice_are_no_second_group() -> None:
