@@ -87,7 +87,7 @@ def polygon_pane(corners: Array) -> PolygonPane:
     """
     center = corners.mean(axis=0)
     _, sizes, axes = np.linalg.svd(corners - center)
-    if sizes[1] < 1e-6 * sizes[0]:
+    if sizes[1] <= 1e-6 * sizes[0]:
         raise ValueError("the corners lie on one line; expected an outline that spans an area")
     axes = axes * np.array([[1.0], [1.0], [np.linalg.det(axes)]])
     return PolygonPane(axes, center, (corners - center) @ axes[:2].T)

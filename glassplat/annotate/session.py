@@ -346,7 +346,7 @@ class Session:
             return {
                 "label": pane.label,
                 "solved": False,
-                "message": solved.problem,
+                "message": self._crossing(marks) or solved.problem,
                 "next": [{"view": number} for number in self._second_views(marks)],
                 "lines": self._sight_lines(marks),
             }
@@ -355,7 +355,7 @@ class Session:
         return {
             "label": pane.label,
             "solved": True,
-            "message": self._judgement(pane, fit, marks),
+            "message": self._crossing(marks) or self._judgement(pane, fit, marks),
             "error": fit.error,
             "uncertainty": fit.uncertainty,
             "errors": fit.errors,
@@ -363,6 +363,14 @@ class Session:
             "corners": [_places(camera, corners) for camera in self.cameras],
             "next": [{"view": number, "uncertainty": uncertainty} for number, uncertainty in advice],
         }
+
+    def _crossing(self, marks: Marks) -> str:
+        """A warning about the first photograph in which the sides of the outline cross, or nothing."""
+        for view in marks.views():
+            outline = [places[view] for places in marks.corners if view in places]
+            if len(outline) == len(marks.corners) and _crosses_itself(np.array(outline)):
+                return f"the sides cross in {self.views[view].name}: click the corners in order round the pane"
+        return ""
 
     def _judgement(self, pane: MarkedPane, fit: PaneFit, marks: Marks) -> str:
         """A warning about a fit, or nothing."""
@@ -372,10 +380,11 @@ class Session:
             if fit.error > POOR_RECTANGLE * max(free.error, 1.0):
                 return (
                     f"the corners do not form a rectangle ({fit.error:.1f} pixels off, {free.error:.1f} without that "
-                    "demand): check them, or choose polygon"
+                    "demand): check them and their order, or choose polygon"
                 )
         if fit.errors[worst] > 0.01 * self.cameras[worst].diagonal:
-            return f"the marks in {self.views[worst].name} are {fit.errors[worst]:.0f} pixels off: check them"
+            name = self.views[worst].name
+            return f"the marks in {name} are {fit.errors[worst]:.0f} pixels off: check them and their order"
         return ""
 
     def _second_views(self, marks: Marks) -> list[int]:
@@ -415,6 +424,14 @@ class Session:
         centers = np.stack([camera.center for camera in self.cameras])
         things = self._points if len(self._points) else centers
         return max(float(np.median(np.linalg.norm(things - centers.mean(axis=0), axis=1))), 1e-6)
+
+
+def _crosses_itself(outline: Array) -> bool:
+    """Return whether two sides of an outline [K, 2] cross."""
+    along, away = np.roll(outline, -1, axis=0) - outline, outline[None] - outline[:, None]
+    starts = along[:, None, 0] * away[..., 1] - along[:, None, 1] * away[..., 0]
+    is_apart = starts * np.roll(starts, -1, axis=1) < 0  # Ends of the other side lie on both sides of this one.
+    return bool((is_apart & is_apart.T).any())
 
 
 def _places(camera: NumpyCamera, corners: Array) -> list[list[float] | None]:

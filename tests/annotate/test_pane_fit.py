@@ -223,6 +223,7 @@ def test_the_rectangle_of_a_polygon_keeps_its_order_and_hand() -> None:
         assert np.linalg.det(rectangle.axes) == pytest.approx(1)
 
 
-def test_corners_on_a_line_are_no_outline() -> None:
+@pytest.mark.parametrize("step", [1.0, 0.0], ids=["line", "place"])
+def test_corners_on_a_line_are_no_outline(step: float) -> None:
     with pytest.raises(ValueError, match="lie on one line"):
-        polygon_pane(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]]))
+        polygon_pane(step * np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]]))

@@ -358,3 +358,18 @@ def test_only_panes_that_have_changed_are_fitted_again(room: Path, monkeypatch: 
     document["panes"][1]["shape"] = "polygon"
     saved(opened, document)
     assert len(fitted) == 4
+
+
+CROSSED = ((0, 0), (1, 2), (2, 1), (3, 3))
+
+
+@pytest.mark.parametrize("shape", ["rectangle", "polygon"])
+def test_sides_that_cross_are_told_of(shape: str, room: Path) -> None:
+    document = marked_document(shape=shape)
+    session, corners = opened_session(room), document["panes"][0]["corners"]
+    assert saved(session, document)["panes"][0]["message"] == ""
+    for crossing in ({NAMES[0]}, {NAMES[0], NAMES[1], NAMES[2]}):
+        swapped = [{**corners[one], **{view: corners[other][view] for view in crossing}} for one, other in CROSSED]
+        for marks in (swapped, [{NAMES[0]: places[NAMES[0]]} for places in swapped]):
+            answer = saved(session, marked_document(shape=shape, corners=marks))["panes"][0]
+            assert answer["message"] == "the sides cross in 0.png: click the corners in order round the pane"
