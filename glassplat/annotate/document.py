@@ -67,7 +67,7 @@ DOCUMENT: dict[str, Field] = {"version": Choice((1,)), "panes": Items(PANE)}
 
 @dataclass(frozen=True)
 class Stroke:
-    """A part of one photograph that is, or is not, covered by what stands before the pane.
+    """A part of one photograph that is, or is not, covered by what stands in front of the pane.
 
     Attributes:
         kind: a filled polygon, or a line as wide as a brush.

@@ -62,7 +62,7 @@ def grab_outlines(photo: NDArray[np.uint8], outline: Array) -> list[Array]:
     factor = np.array([small.shape[1], small.shape[0]]) / (high - low)
     inside = fill_polygon((outline - low) * factor, (small.shape[1], small.shape[0]))
     if not inside.any():
-        raise InputError("the outline holds nothing of the photograph; draw it round what stands before the pane")
+        raise InputError("the outline holds nothing of the photograph; draw it round what stands in front of the pane")
     if inside.all():
         return [outline]
     found = _foreground(cv2, np.ascontiguousarray(small[:, :, ::-1]), inside)
@@ -229,7 +229,7 @@ def earlier_masks(root: Path) -> set[str]:
 
 
 def pane_labels(name: str, camera: NumpyCamera, panes: Solved) -> Labels:
-    """[H, W] label of the nearest pane at each pixel of a view, without what stands before it."""
+    """[H, W] label of the nearest pane at each pixel of a view, without what stands in front of it."""
     width, height = int(camera.size[0]), int(camera.size[1])
     labels, nearest = np.zeros((height, width), dtype=np.uint8), np.full((height, width), np.inf)
     for pane, fit in panes:

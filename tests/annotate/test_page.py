@@ -70,7 +70,7 @@ def test_a_pane_is_marked_cut_and_written(page: Page) -> None:
     assert is_blue(page.color_at(middle))
     outside = true_corners(3)[0] - (12, 12)
     assert not is_blue(page.color_at(tuple(outside)))
-    assert "pixels; the plane is sure to" in page.window.run("return document.getElementById('panes').textContent")
+    assert "pixels; the plane is uncertain by" in page.window.run("return document.getElementById('panes').textContent")
 
     page.show(0)
     corners = true_corners(0)
@@ -157,6 +157,15 @@ def test_a_corner_that_only_the_fit_knows_can_be_dragged(page: Page) -> None:
     assert "2.png" in page.document()["corners"][1]
 
 
+def test_a_narrow_window_has_room_for_the_photograph(room: Path) -> None:
+    with marking_page(room, width=390, height=844) as opened:
+        page = Page(opened.window, opened.server)
+        page.mark_true(0)
+        marked = [places["0.png"] for places in page.document()["corners"]]
+        np.testing.assert_allclose(marked, true_corners(0), atol=0.02)
+        assert page.window.run("return document.documentElement.scrollWidth") == 390
+
+
 def test_keys_choose_photographs_panes_and_brushes(page: Page) -> None:
     page.mark_true(0)
     page.mark_true(1)
@@ -212,7 +221,7 @@ def test_a_corner_too_many_of_a_polygon_can_be_removed(page: Page) -> None:
     page.window.keys("Delete")
     page.mark_true(1)
     assert len(page.document()["corners"]) == len(page.document()["edges"]) == 4
-    assert "pixels; the plane is sure to" in page.said()
+    assert "pixels; the plane is uncertain by" in page.said()
 
 
 def test_undo_gives_up_a_line_before_it_takes_back_marks(page: Page) -> None:
@@ -324,14 +333,17 @@ def test_what_changes_while_it_is_saved_is_not_said_to_be_saved(page: Page) -> N
     assert [len(places) for places in page.document()["corners"]] == [1, 1, 0, 0]
 
 
-def test_what_the_server_refuses_is_not_said_to_be_saved(page: Page) -> None:
+REFUSED = 'new Response(\'{"error": "the disk is full"}\', { status: 400 })'
+ENDED = "Promise.reject(new TypeError('Failed to fetch'))"
+
+
+@pytest.mark.parametrize(("answer", "text"), [(REFUSED, "the disk is full"), (ENDED, "the command has ended")])
+def test_what_the_server_refuses_is_not_said_to_be_saved(answer: str, text: str, page: Page) -> None:
     page.mark_true(0)
-    page.window.run(
-        'window.asked = window.fetch; window.fetch = async () => new Response(\'{"error": "the disk is full"}\','
-        " { status: 400, headers: { 'Content-Type': 'application/json' } })"
-    )
+    page.window.run(f"window.asked = window.fetch; window.fetch = async () => {answer}")
     page.window.press("#undo")
     page.window.wait("document.body.dataset.state === 'failed'", "a refusal")
+    assert f"not saved: {text}" in page.window.run("return document.getElementById('status').textContent")
     for button in ("#close", "#write"):
         page.window.press(button)
         page.window.wait("document.getElementById('status').className === 'bad'", "a refusal once more")

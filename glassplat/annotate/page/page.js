@@ -4,15 +4,8 @@ import { Drawing, colorOf } from "/drawing.js";
 import { Marking, distance } from "/marking.js";
 
 const element = (id) => document.getElementById(id);
+const GONE = "the command has ended; start it again, open the address that it prints in a new tab, and go on here";
 const REACH = 11; // Pixels of the screen around a corner that belong to it.
-const HINTS = {
-  corner: "click the corners of the pane, one after the other round it; beside the photograph too",
-  edge: "drag along an edge, in the direction round the pane",
-  polygon: "click round what stands before the pane; Enter or a double click closes it",
-  grab: "click round what stands before the pane, roughly; Enter or a double click closes it, and its outline is found",
-  brush: "paint over what stands before the pane; [ and ] change the brush",
-  restore: "paint the pane back where too much was cut; [ and ] change the brush",
-};
 
 let capture, marking, drawing;
 let current = 0, tool = "corner", radius = 20, pending = null, drag = null, pointer = null, gestures = 0;
@@ -24,7 +17,7 @@ const images = new Map();
 
 async function ask(path, body) {
   const options = body === undefined ? {} : { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) };
-  const response = await fetch(path, options);
+  const response = await fetch(path, options).catch(() => { throw new Error(GONE); });
   const answer = await response.json();
   if (!response.ok) throw Object.assign(new Error(answer.error || response.statusText), { answer });
   return answer;
@@ -95,11 +88,12 @@ function refresh() {
 
 function hint() {
   if (!marking.pane) return "add a pane first";
-  if (tool !== "corner" && tool !== "edge") return HINTS[tool];
+  const how = document.querySelector(`[data-tool=${tool}]`).title.slice(3);
+  if (tool !== "corner" && tool !== "edge") return how;
   const number = upcoming();
   if (number === null) return `all ${tool}s are marked or skipped here; drag corners, or go to another photograph`;
   const which = tool === "corner" ? `corner ${number + 1}` : `edge from corner ${number + 1} to ${(number + 1) % marking.pane.corners.length + 1}`;
-  return `${which}: ${HINTS[tool]}; N skips it`;
+  return `${which}: ${how}; N skips it`;
 }
 
 // The corner or edge that comes next in this photograph.
@@ -176,7 +170,7 @@ const counted = (number, noun) => `${number} ${noun}${number === 1 ? "" : "s"}`;
 function judgement(answer) {
   if (!answer) return [];
   if (!answer.solved) return [[answer.message, "poor"]];
-  const lines = [[`marks fit to ${answer.error.toFixed(1)} pixels; the plane is sure to ${degrees(answer.uncertainty)}`, answer.uncertainty < SURE ? "good" : "poor"]];
+  const lines = [[`marks fit to ${answer.error.toFixed(1)} pixels; the plane is uncertain by ${degrees(answer.uncertainty)}`, answer.uncertainty < SURE ? "good" : "poor"]];
   if (answer.message) lines.push([answer.message, "poor"]);
   const best = answer.next[0];
   if (best && answer.uncertainty > 0.3) lines.push([`marking ${capture.views[best.view].name} would make it ${degrees(best.uncertainty)}`, ""]);
@@ -357,9 +351,9 @@ async function write() {
   try {
     await settled();
     const { masks, planes, told } = await ask("/results", {});
-    const unsure = planes.filter((plane) => plane.uncertainty >= SURE).map((plane) => `pane ${plane.label} (${degrees(plane.uncertainty)})`);
-    const warning = unsure.length ? `; still unsure, mark more: ${unsure.join(", ")}` : "";
-    tell(told ?? `written: ${counted(masks.length, "mask")}, ${counted(planes.length, "plane")}${warning}`, unsure.length > 0);
+    const uncertain = planes.filter((plane) => plane.uncertainty >= SURE).map((plane) => `pane ${plane.label} (${degrees(plane.uncertainty)})`);
+    const warning = uncertain.length ? `; still uncertain, mark more: ${uncertain.join(", ")}` : "";
+    tell(told ?? `written: ${counted(masks.length, "mask")}, ${counted(planes.length, "plane")}${warning}`, uncertain.length > 0);
     document.body.dataset.written = `${masks.length} ${planes.length}`;
   } catch (error) {
     tell(error.message, true);
