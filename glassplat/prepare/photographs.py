@@ -119,8 +119,8 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
     if len(found) < FEWEST:
         again = f", and {first_names(twins)} the same again" if twins else ""
         raise InputError(
-            f"{folder} holds {len(found)} photographs{again}; expected at least {FEWEST}, and better 30 or more, taken "
-            "from places a step apart"
+            f"{folder} holds too few photographs: {len(found)}{again}; expected at least {FEWEST}, and better 30 or "
+            "more, taken from places a step apart"
         )
     if twins:
         listen(Note(f"Left out, as the same photographs again: {first_names(twins)}."))

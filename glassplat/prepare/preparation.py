@@ -42,7 +42,14 @@ from glassplat.prepare.photographs import (
     masks_among,
     photographs_in,
 )
-from glassplat.prepare.reconstruction import Settings, Solution, best_solution, image_numbers, write_capture
+from glassplat.prepare.reconstruction import (
+    Settings,
+    Solution,
+    TooLittleShownError,
+    best_solution,
+    image_numbers,
+    write_capture,
+)
 
 log = logging.getLogger(__name__)
 
@@ -408,14 +415,16 @@ def _prepare(task: Preparation, workplace: Workplace, listen: Listener, *, resum
     begun = workplace.begin(settings, resume=resume, force=force)
     try:
         photographs = _photographs(task, workplace, listen)
-    except InputError:
-        if begun:  # What an earlier call left is worth more than these photographs, which may be away for a moment.
+        begun = False
+        solution = best_solution(photographs, workplace.folder, task.settings, task.least_registered, listen)
+        report = report_of(solution)
+        _check_enough(report, task)
+    except InputError as error:
+        # What an earlier call left is worth more than these photographs, which may be away for a moment.
+        if begun or isinstance(error, TooLittleShownError):
             workplace.discard()
             remove_empty(missing)
         raise
-    solution = best_solution(photographs, workplace.folder, task.settings, task.least_registered, listen)
-    report = report_of(solution)
-    _check_enough(report, task)
     write_capture(solution, workplace.capture, listen)
     masks = sorted({file_digest(path) for path in (workplace.capture / IGNORE_FOLDER).rglob("*.png")})
     made = {"command": "prepare", "version": __version__, **task.record()}
@@ -463,15 +472,16 @@ def _photographs(task: Preparation, workplace: Workplace, listen: Listener) -> l
 
 def _check_enough(report: Report, task: Preparation) -> None:
     """Refuse a capture of which too much is missing, or in which no photograph was registered."""
-    if report.registered >= 3 and report.share >= task.least_registered:
+    if report.registered >= FEWEST and report.share >= task.least_registered:
         return
     lines = "\n".join(report.lines())
+    kind = InputError if report.registered >= FEWEST else TooLittleShownError
     remedy = (
-        f"if that is enough, repeat with --resume --least-registered {int(100 * report.share) / 100:g}"
-        if report.registered >= 3
-        else "nothing was written"
+        "nothing was written"
+        if kind is TooLittleShownError
+        else f"if that is enough, repeat with --resume --least-registered {int(100 * report.share) / 100:g}"
     )
-    raise InputError(
+    raise kind(
         f"{report.registered} of {report.photographs} photographs could be registered, expected at least "
         f"{task.least_registered:.0%}\n{lines}\n{remedy}"
     )

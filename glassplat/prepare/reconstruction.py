@@ -143,11 +143,15 @@ def _match_features(
     return database
 
 
+class TooLittleShownError(InputError):
+    """No option gives these photographs poses, so nothing that was done so far is of use."""
+
+
 def _check_texture(database: FeatureDatabase) -> None:
     counts = database.feature_counts()
     poor = [one.path.name for one, count in zip(database.photographs, counts, strict=True) if count < FEWEST_FEATURES]
     if 2 * len(poor) > len(counts):
-        raise InputError(
+        raise TooLittleShownError(
             f"{len(poor)} of {len(counts)} photographs show fewer than {FEWEST_FEATURES} places that could be "
             f"recognised ({first_names(poor)}): they are blurred, dark or without texture. Photograph with more light, "
             "hold still, and let things with texture be in the picture, such as the pane's surroundings"

@@ -282,8 +282,8 @@ def a_capture(folder: Path) -> None:
         (tiny, r"thumbnail\.png is 30x20 pixels large; expected a photograph, 64"),
         (heic, r"1 photographs in .* are HEIC files.*IMG_1\.HEIC.*save them as JPEG.*pip install 'glassplat\[heic\]'"),
         (heic_by_another_name, r"1 photographs in .* are HEIC files.*IMG_2\.jpg.*save them as JPEG"),
-        (too_few, r"holds 2 photographs; expected at least 3"),
-        (only_twins, r"holds 1 photographs, and 1\.png \(as 0\.png\), 2\.png \(as 0\.png\) the same again"),
+        (too_few, r"holds too few photographs: 2; expected at least 3"),
+        (only_twins, r"holds too few photographs: 1, and 1\.png \(as 0\.png\), 2\.png \(as 0\.png\) the same again"),
         (nothing, r"no photograph in .*found notes\.txt"),
     ],
 )
