@@ -48,6 +48,9 @@ def page(room: Path) -> Iterator[Page]:
         yield Page(opened.window, opened.server)
 
 
+FULL = "there can be 64 panes at most"
+
+
 def is_blue(color: np.ndarray) -> bool:
     """Whether the first pane's colour lies over the grey photograph."""
     return bool(color[2] > color[0] + 15)
@@ -155,6 +158,27 @@ def test_a_corner_that_only_the_fit_knows_can_be_dragged(page: Page) -> None:
     page.window.drag([start, (start[0] + 6, start[1])])
     page.saved()
     assert "2.png" in page.document()["corners"][1]
+
+
+def test_there_are_at_most_64_panes_and_each_has_its_colour_and_is_shown(page: Page) -> None:
+    for _ in range(62):
+        page.window.keys("a")
+    page.saved()
+    page.window.keys("a")
+    top = page.window.run("return document.querySelector('.pane.active').getBoundingClientRect().top")
+    assert 0 < top < 900
+    page.saved()
+    page.window.keys("a")
+    assert page.window.run("return document.getElementById('status').textContent") == FULL
+    assert len(json.loads((page.root / "annotations.json").read_text())["panes"]) == 64
+    colors = "[...document.querySelectorAll('.pane i')].map((swatch) => swatch.style.background)"
+    assert page.window.run(f"return new Set({colors}).size") == 64
+
+
+def test_shift_and_tab_lead_to_the_buttons(page: Page) -> None:
+    page.window.run("document.getElementById('canvas').focus()")
+    page.window.keys("Shift", "Tab")
+    assert page.window.run("return document.activeElement.tagName") == "BUTTON"
 
 
 def test_a_narrow_window_has_room_for_the_photograph(room: Path) -> None:

@@ -3,7 +3,7 @@
 import { distance, fromSegment } from "/marking.js";
 
 export const COLORS = ["#53a6ff", "#ff8a5c", "#58d68d", "#d58cff", "#ffd84d", "#5ce1e6", "#ff6fa3", "#b5e853"];
-export const colorOf = (label) => COLORS[(label - 1) % COLORS.length];
+export const colorOf = (label) => COLORS[label - 1] || `hsl(${label * 137.5} 85% 68%)`;
 const ROOM = 0.25; // Beside the photograph, in its sizes: corners may lie there.
 
 export class Drawing {

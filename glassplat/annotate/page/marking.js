@@ -50,14 +50,17 @@ export class Marking {
     this.changed();
   }
 
+  // Returns whether there is room for one more.
   addPane() {
+    const used = this.document.panes.map((pane) => pane.label);
+    let label = 1;
+    while (used.includes(label)) label += 1;
+    if (label > 64) return false;
     this.change((document) => {
-      const used = document.panes.map((pane) => pane.label);
-      let label = 1;
-      while (used.includes(label)) label += 1;
       document.panes.push({ label, material: "glass", shape: "rectangle", corners: [{}, {}, {}, {}], edges: [{}, {}, {}, {}], strokes: {} });
       this.active = label;
     });
+    return true;
   }
 
   removePane(label) {

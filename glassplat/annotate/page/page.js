@@ -76,9 +76,11 @@ function takeOver(answer, message) {
 }
 
 function refresh() {
-  if (shownPane !== marking.active) { shownPane = marking.active; pending = drag = null; unskip(); }
+  const isOther = shownPane !== marking.active;
+  if (isOther) { shownPane = marking.active; pending = drag = null; unskip(); }
   drawViews();
   drawPanes();
+  if (isOther) element("panes").querySelector(".active")?.scrollIntoView({ block: "nearest" });
   element("undo").disabled = !marking.done.length;
   element("redo").disabled = !marking.undone.length;
   document.querySelectorAll("[data-tool]").forEach((button) => button.setAttribute("aria-pressed", button.dataset.tool === tool));
@@ -312,7 +314,7 @@ const KEYS = {
   ArrowLeft: () => show(current - 1),
   ArrowRight: () => show(current + 1),
   s: () => { const next = suggested()[0]; if (next) show(next.view); },
-  a: () => marking.addPane(),
+  a: () => marking.addPane() || tell("there can be 64 panes at most", true),
   n: skip,
   0: () => { drawing.fit(); draw(); },
   1: () => choose("corner"),
@@ -338,7 +340,7 @@ function keyed(event) {
     event.shiftKey ? marking.redo() : undo();
     return;
   }
-  if (event.ctrlKey || event.metaKey || event.altKey) return;
+  if (event.ctrlKey || event.metaKey || event.altKey || (event.shiftKey && event.key === "Tab")) return;
   const act = KEYS[event.key] || KEYS[event.key.toLowerCase()];
   if (!act || (event.target.closest("button") && ["Enter", "Tab", " "].includes(event.key))) return;
   event.preventDefault();
