@@ -19,7 +19,14 @@ from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES, files_below, i
 from glassplat.files.records import Text, check_fields, read_json
 from glassplat.files.writing import SCENE, SPLAT_SUFFIXES, check_folder, scene_source
 from glassplat.model.run_directory import RunDirectory
-from glassplat.prepare.photographs import LEAST_SIDE, VIDEO_SUFFIXES, NoOpenCVError, broken_photographs, video_facts
+from glassplat.prepare.photographs import (
+    LEAST_SIDE,
+    VIDEO_SUFFIXES,
+    NoOpenCVError,
+    broken_photographs,
+    masks_below,
+    video_facts,
+)
 from glassplat.prepare.preparation import PAGE, RECORD, Preparation
 
 KINDS = f"a capture, photographs, a video, a run, an exported scene, or a splat file ({', '.join(SPLAT_SUFFIXES)})"
@@ -119,7 +126,9 @@ def photographs_finding(path: Path) -> Iterator[Finding]:
     if not found:
         names = first_names(sorted(one.name for one in path.iterdir()), 8) or "nothing"
         raise InputError(f"{path} is nothing that is known; expected {KINDS}; it holds {names}")
-    yield Finding("photographs without poses", {"photographs": len(found)})
+    masks = masks_below(path, found)
+    found = [one for one in found if one not in masks]
+    yield Finding("photographs without poses", {"photographs": len(found), **({"masks": len(masks)} if masks else {})})
     finding = Finding()
     sound = len(found) - describe_broken(found, finding, LEAST_SIDE)
     if sound < FEW_VIEWS:

@@ -87,7 +87,7 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
     if (folder / "images").is_dir() and any((folder / name).is_dir() for name in CAPTURE_FOLDERS):
         raise InputError(f"{folder} is a capture; expected a folder of photographs, such as {folder / 'images'}")
     paths = _photograph_paths(folder)
-    masks = {*masks_among(paths), *_in_mask_folders(paths, folder)}
+    masks = masks_below(folder, paths)
     if masks:
         listen(
             Note(
@@ -195,9 +195,10 @@ def masks_among(paths: Sequence[Path]) -> list[Path]:
     return [path for path in named if path.with_name(path.stem.removesuffix(MASK_MARK)) in plain]
 
 
-def _in_mask_folders(paths: Sequence[Path], folder: Path) -> list[Path]:
-    """Files below a folder for masks, which is itself below a folder."""
-    return [path for path in paths if not {*MASK_FOLDERS}.isdisjoint(path.relative_to(folder).parts[:-1])]
+def masks_below(folder: Path, paths: Sequence[Path]) -> set[Path]:
+    """Files below a folder that are masks by their names, or by the folders that they lie in."""
+    inside = [path for path in paths if not {*MASK_FOLDERS}.isdisjoint(path.relative_to(folder).parts[:-1])]
+    return {*masks_among(paths), *inside}
 
 
 def _names_below(folder: Path, paths: Sequence[Path]) -> str:

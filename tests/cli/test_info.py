@@ -78,8 +78,12 @@ def test_the_share_that_masks_leave_out_is_told(tmp_path: Path, capsys: pytest.C
 
 def test_photographs_are_to_be_prepared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(SCENE / "images", tmp_path / "my photographs")
+    (tmp_path / "my photographs" / "masks").mkdir()
+    for mask in ("0001_mask.png", "masks/0002.png"):
+        Image.new("L", (640, 480)).save(tmp_path / "my photographs" / mask)
     found = told(tmp_path / "my photographs", capsys)
-    assert found["kind"] == "photographs without poses" and found["facts"]["photographs"] == 64
+    assert found["kind"] == "photographs without poses"
+    assert found["facts"] == {"photographs": 64, "masks": 2}
     assert any("glassplat prepare" in line for line in found["next"])
 
 
