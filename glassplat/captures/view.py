@@ -68,9 +68,10 @@ DISK_RATE = 2e8
 """Bytes that a slow disk reads in a second."""
 DISK_RESERVE = 5 * GIGABYTE
 """Bytes of the disk that photographs leave free: the training writes there, too."""
-LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
-"""Files that say how much a container may take."""
-
+MEMBERSHIP, GROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
+"""Where Linux says which groups this process belongs to, and where the limits of each are."""
+LIMITS = {"": "memory.max", "memory": "memory.limit_in_bytes"}
+"""Files of limits, by the controllers of a group: those of the second version have no name."""
 
 Item = TypeVar("Item")
 
@@ -206,13 +207,10 @@ class Memory:
             InputError: they cannot be read.
         """
         with self._lock:
-            found = self._look_up(source)
-            if found is not None:
+            if (found := self._look_up(source)) is not None:
                 return found
-            future = self._pending.get(source)
-            is_mine = future is None
-            if future is None:
-                future = self._pending[source] = Future()
+            is_mine = source not in self._pending
+            future = self._pending.setdefault(source, Future())
         if is_mine:
             self._read(source, future)
         return future.result()
@@ -236,12 +234,9 @@ class Memory:
             spool.close()
 
     def _look_up(self, source: Source) -> Tensor | None:
-        if source in self._resident:
-            return self._resident[source]
         if source in self._passing:
             self._passing.move_to_end(source)
-            return self._passing[source]
-        return None
+        return self._resident.get(source, self._passing.get(source))
 
     @torch.inference_mode(False)  # Who looks first may not need gradients; a later one may.
     def _read(self, source: Source, future: Future[Tensor]) -> None:
@@ -290,17 +285,24 @@ def default_budget() -> float:
 
 
 def machine_memory() -> float:
-    """Bytes of memory that the machine has, or that a container may take of it."""
+    """Bytes of memory that the machine has, or that a container, a service or a scheduler's job may take of it."""
     try:
         whole = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     except (AttributeError, ValueError, OSError):  # Windows has no such question.
         whole = UNKNOWN
-    for path in LIMITS:
-        try:
+    for path in memory_limits():
+        with suppress(OSError, ValueError):  # No such file, or it says `max`.
             whole = min(whole, float(path.read_text()))
-        except (OSError, ValueError):  # No such file, or it says `max`.
-            continue
     return whole
+
+
+def memory_limits() -> Iterator[Path]:
+    """Files that may limit this process: of its group, and of those around it, which in a container end at the root."""
+    lines = MEMBERSHIP.read_text(encoding="utf-8", errors="replace").splitlines() if MEMBERSHIP.is_file() else []
+    for _, controllers, name in (line.split(":", 2) for line in lines):
+        if controllers in LIMITS:
+            group = GROUPS / controllers / name.lstrip("/")
+            yield from (folder / LIMITS[controllers] for folder in (group, *group.parents))
 
 
 @dataclass(frozen=True)

@@ -216,11 +216,21 @@ def test_the_machine_has_memory_and_processes_share_it(monkeypatch: pytest.Monke
     assert default_budget() == whole / 4
 
 
-def test_a_container_may_take_less_than_the_machine_has(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    (tmp_path / "limit").write_text("1000000\n")
-    (tmp_path / "none").write_text("max\n")
-    monkeypatch.setattr("glassplat.captures.view.LIMITS", (tmp_path / "none", tmp_path / "limit", tmp_path / "gone"))
-    assert machine_memory() == 1e6
+@pytest.mark.parametrize("file", ["memory.max", "memory/memory.limit_in_bytes"])
+@pytest.mark.parametrize("group", ["", "slurm/job_7"])
+@pytest.mark.parametrize("limited", ["", "slurm"])
+def test_a_container_or_a_job_may_take_less_than_the_machine_has(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, file: str, group: str, limited: str
+) -> None:
+    folder, _, name = file.rpartition("/")
+    for number, inner in enumerate(["", "slurm", "slurm/job_7"]):
+        (tmp_path / folder / inner).mkdir(parents=True, exist_ok=True)
+        limit = "1000000\n" if inner == limited else "max\n" if number else "9223372036854771712\n"
+        (tmp_path / folder / inner / name).write_text(limit)
+    (tmp_path / "membership").write_text(f"3:cpuset:/other\n4:{folder}:/{group}\n")
+    monkeypatch.setattr("glassplat.captures.view.GROUPS", tmp_path)
+    monkeypatch.setattr("glassplat.captures.view.MEMBERSHIP", tmp_path / "membership")
+    assert (machine_memory() == 1e6) == group.startswith(limited)
 
 
 def trained_scene(root: Path, memory: float | None, folder: Path) -> Scene:
