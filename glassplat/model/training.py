@@ -249,7 +249,8 @@ class Run:
                 directory.begin(self.recipe, settings, self._dataset)
             self.state = self._ranks.broadcast(state, settings.device)
             with run_directory.open_log(directory.log, self.state.step) as log:
-                self._session = TrainingSession(self.state, self._ranks, Record(directory.checkpoint, log, self._every))
+                record = Record(directory.checkpoint, log, self._every, self._restore)
+                self._session = TrainingSession(self.state, self._ranks, record)
                 yield from self._session.deliver(RunBegun(self.state.step, settings.iterations, anew))
                 with self._dataset.memory.spool_to(directory.path):
                     yield from self._session.run_stages(self._stages, self._dataset, settings.iterations)
@@ -275,8 +276,14 @@ class Run:
         if self._ranks.leads:
             self._export()
 
+    def _restore(self) -> None:
+        """Records again what is run where the directory was removed or renamed meanwhile, so that it is a run's."""
+        if not (self._directory.path / "recipe.json").is_file():
+            self._directory.begin(self.recipe, self._settings, self._dataset)
+
     def _export(self) -> None:
         assert self.state is not None
+        self._restore()
         self._directory.export(self.state.scene, self.state.step)
         self._directory.write_trained_cameras(self._dataset, self.state.scene)
 
@@ -369,11 +376,15 @@ UNKNOWN = "unknown"
 
 
 class Record(NamedTuple):
-    """Files that the leader writes while it trains: a checkpoint every so many seconds, and the log."""
+    """Files that the leader writes while it trains: a checkpoint every so many seconds, and the log.
+
+    Before a checkpoint, `restore` sees to it that its directory is that of a run.
+    """
 
     checkpoint: Path
     log: run_directory.RunLog
     every: float
+    restore: Callable[[], None] = lambda: None
 
 
 class TrainingSession:
@@ -469,6 +480,7 @@ class TrainingSession:
         compiling = compile_seconds() - self._compiled_before
         self._state.seconds = self._seconds_before + self._saved - self._started - compiling
         if self._record is not None:
+            self._record.restore()
             save_checkpoint(self._record.checkpoint, self._state)
         self._writing = time.perf_counter() - self._saved
 

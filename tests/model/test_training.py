@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import threading
@@ -165,6 +166,19 @@ def test_a_scene_is_saved_in_the_middle_of_a_run(tmp_path: Path) -> None:
             saved = glassplat.load(tmp_path / "run", device="cpu")
             assert torch.equal(saved.scene.primary.means, training.model.scene.primary.means)
     assert (tmp_path / "run" / "point_cloud" / "iteration_4").is_dir()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows moves no folder in which a file is open")
+@pytest.mark.parametrize("checkpoint_every", [1e-3, math.inf])
+def test_a_directory_that_was_moved_away_meanwhile_is_a_run_again(checkpoint_every: float, tmp_path: Path) -> None:
+    output = tmp_path / "run"
+    options: Any = {"iterations": 4, "device": "cpu", "output": output}
+    training = Training(tiny_capture(), RECIPE, **options, checkpoint_every=checkpoint_every)
+    for message in training:
+        if isinstance(message, StepDone) and message.step == 2:
+            output.rename(tmp_path / "elsewhere")
+    assert glassplat.load(output, device="cpu").recipe == training.recipe
+    assert steps(Training(tiny_capture(), RECIPE, **options, resume=True)) == []
 
 
 @dataclass(frozen=True)
