@@ -42,8 +42,8 @@ class TensorsFile(NamedTuple):
     file: Any
 
     def tensors(self) -> dict[str, Tensor]:
-        """All tensors by name."""
-        return {name: self.file.get_tensor(name) for name in self.file.keys()}  # noqa: SIM118
+        """All tensors by name, in memory: those of the library stay in the file, which Windows then never replaces."""
+        return {name: self.file.get_tensor(name).clone() for name in self.file.keys()}  # noqa: SIM118
 
 
 def write_tensors(path: Path | str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:

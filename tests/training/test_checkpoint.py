@@ -68,6 +68,13 @@ def test_a_state_survives(checkpoint: Path) -> None:
         assert torch.equal(read.optimizer.moments[name][1], torch.ones_like(tensor)), name
 
 
+def test_what_becomes_of_the_file_changes_no_state_that_was_read(checkpoint: Path) -> None:
+    written, read = trained_state().scene.parameters(), load_checkpoint(checkpoint).scene.parameters()
+    with checkpoint.open("r+b") as file:
+        file.write(bytes(checkpoint.stat().st_size))
+    assert all(torch.equal(read[name], tensor) for name, tensor in written.items())
+
+
 def test_tinted_panes_survive(tmp_path: Path) -> None:
     state, tint = trained_state(), -torch.rand(1, 3)
     state.scene = replace(state.scene, planes=replace(state.scene.planes, log_transmittances=tint))
