@@ -467,7 +467,7 @@ def import_held(module: str) -> Any:
 @contextmanager
 def _announce(console: Console, module: str) -> Iterator[None]:
     """Shows the line meanwhile, where somebody may be watching and the module is not there yet."""
-    if module in sys.modules or not console.is_terminal:
+    if module in sys.modules or not console.is_interactive:
         yield
         return
     console.print(LINE, end="", highlight=False)

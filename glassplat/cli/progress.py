@@ -157,7 +157,7 @@ class TrainingProgress:
     def __init__(self, console: Console, plan: Plan, clock: Callable[[], float] = time.monotonic) -> None:
         self._console, self._standing = console, Standing(plan.iterations)
         self._pace = Pace(plan, clock)
-        self._display: StepBar | StepLines = StepBar(console) if console.is_terminal else StepLines(console, clock)
+        self._display: StepBar | StepLines = StepBar(console) if console.is_interactive else StepLines(console, clock)
 
     def __enter__(self) -> TrainingProgress:
         return self
@@ -316,7 +316,7 @@ class WorkProgress:
         self._task: progress.TaskID | None = None
 
     def __enter__(self) -> WorkProgress:
-        if self._console.is_terminal:
+        if self._console.is_interactive:
             columns = (
                 progress.TextColumn("{task.description}", markup=False),
                 progress.BarColumn(),

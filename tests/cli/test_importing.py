@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import io
 import sys
+from collections.abc import Callable
 
 import pytest
 from rich.console import Console
@@ -14,8 +15,8 @@ from glassplat.cli.console import LINE, import_now
 MODULE = "glassplat.cli.progress"
 
 
-def terminal() -> Console:
-    return Console(file=io.StringIO(), force_terminal=True, legacy_windows=False, _environ={"TERM": "xterm"})
+def terminal(kind: str = "xterm") -> Console:
+    return Console(file=io.StringIO(), force_terminal=True, legacy_windows=False, _environ={"TERM": kind})
 
 
 def standard_error(monkeypatch: pytest.MonkeyPatch, console: Console) -> Console:
@@ -42,9 +43,12 @@ def test_what_is_there_is_not_announced(monkeypatch: pytest.MonkeyPatch) -> None
     assert shown(console) == ""
 
 
-def test_a_file_gets_no_such_line(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("make", [lambda: Console(file=io.StringIO()), lambda: terminal("dumb")])
+def test_a_file_or_a_terminal_that_erases_nothing_gets_no_such_line(
+    make: Callable[[], Console], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delitem(sys.modules, MODULE, raising=False)
-    console = standard_error(monkeypatch, Console(file=io.StringIO()))
+    console = standard_error(monkeypatch, make())
     import_now(MODULE)
     assert shown(console) == ""
 

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -46,10 +47,10 @@ class FakeClock:
         return self.now
 
 
-def lines_of(messages: Iterable[Message], seconds: float, plan: Plan = PLAN) -> list[str]:
+def lines_of(messages: Iterable[Message], seconds: float, plan: Plan = PLAN, **terminal: Any) -> list[str]:
     """What is written to a file while messages come at a distance in time."""
     clock, file = FakeClock(), io.StringIO()
-    with TrainingProgress(Console(file=file, width=40), plan, clock) as progress:
+    with TrainingProgress(Console(file=file, width=40, **terminal), plan, clock) as progress:
         for message in messages:
             progress.show(message)
             clock.now += seconds
@@ -64,6 +65,12 @@ def test_lines_come_soon_at_first_and_then_every_few_seconds() -> None:
     assert pauses == [2.0, 4.0, 8.0, *[LONGEST_PAUSE] * 3]
     left = in_words((1000 - shown[-1]) / 2)
     assert lines[-1] == f"step {shown[-1]} of 1000: loss 0.2500, 1020 Gaussians, {left} left"
+
+
+def test_a_terminal_that_redraws_nothing_gets_the_lines_of_a_file() -> None:
+    messages = [step(number) for number in range(1, 101)]
+    dumb: dict[str, Any] = {"force_terminal": True, "_environ": {"TERM": "dumb"}}
+    assert lines_of(messages, 0.5, **dumb) == lines_of(messages, 0.5)
 
 
 def test_the_time_left_is_that_of_this_session_and_its_last_minute() -> None:
