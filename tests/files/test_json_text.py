@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from glassplat.files.records import DEEPEST, parse_json, read_json
+from glassplat.files.records import DEEPEST, _without_repeats, parse_json, read_json
 
 
 @pytest.mark.parametrize(
@@ -31,6 +31,23 @@ def test_damage_is_named_with_the_file(tmp_path: Path, content: bytes, message: 
     with pytest.raises(ValueError, match=message) as caught:
         read_json(tmp_path / "a.json")
     assert str(tmp_path / "a.json") in str(caught.value)
+
+
+def test_a_repeated_key_among_many_is_found_in_linear_time() -> None:
+    comparisons = 0
+
+    class Key(str):
+        __slots__ = ()
+        __hash__ = str.__hash__
+
+        def __eq__(self, other: object) -> bool:
+            nonlocal comparisons
+            comparisons += 1
+            return str.__eq__(self, other)
+
+    with pytest.raises(ValueError, match="the key '1999' occurs twice"):
+        _without_repeats([(Key(key), 0) for key in (*range(2000), 1999)])
+    assert comparisons < 10 * 2000
 
 
 def test_byte_order_marks_and_line_ends_of_other_systems_are_read(tmp_path: Path) -> None:
