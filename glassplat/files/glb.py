@@ -9,6 +9,7 @@ of our own, which other programs leave alone.
 from __future__ import annotations
 
 import functools
+import itertools
 import json
 import math
 import struct
@@ -343,6 +344,8 @@ TURN = (-1.0, -1.0, 1.0)
 LEAST_SHARE, LEAST_SCALE = 1e-7, 1e-12
 PLAIN_COUNT, BYTES_PER_GAUSSIAN = 2**20, 8
 """A file of B bytes may show B / 8 Gaussians, or a million: real ones take forty bytes, bombs show one often."""
+MOST_NODES, MOST_PARTS = 10_000, 2000
+"""Of a file, and of sets of splats that they show: to read so many takes seconds."""
 
 
 def write_glb(path: Path | str, gaussians: Gaussians) -> None:
@@ -383,11 +386,15 @@ def read_glb(path: Path | str) -> Gaussians:
             other files, sparse, compressed, or placed with a skewed or mirrored transform.
     """
     file = GltfReader(Path(path))
-    shown = [
+    splats_of = functools.cache(functools.partial(_splat_primitives, file))
+    every = (
         (primitive, f"primitive {index} of mesh {mesh} in {path}", placement)
         for mesh, placement in _placed_meshes(file)
-        for index, primitive in enumerate(_splat_primitives(file, mesh))
-    ]
+        for index, primitive in enumerate(splats_of(mesh))
+    )
+    shown = list(itertools.islice(every, MOST_PARTS + 1))
+    if len(shown) > MOST_PARTS:
+        raise ValueError(f"{path} shows more than {MOST_PARTS} sets of splats; expected fewer: join them")
     count = sum(file.count(primitive.get("POSITION", 0)) for primitive, _, _ in shown)
     if count > max(PLAIN_COUNT, file.size / BYTES_PER_GAUSSIAN):
         raise ValueError(f"{path} shows {count} Gaussians out of {file.size} bytes; no scene does: it is damaged")
@@ -446,6 +453,8 @@ def _placed_meshes(file: GltfReader) -> list[tuple[int, Placement | ValueError]]
 
     Meshes without splats may lie anywhere, so what cannot be placed comes with the reason, for who needs to.
     """
+    if len(file.list_of("nodes")) > MOST_NODES:
+        raise ValueError(f"{file.path} has more than {MOST_NODES} nodes; expected fewer: export its splats alone")
     scenes = file.list_of("scenes")
     chosen = file.document.get("scene", 0)
     if scenes:

@@ -95,6 +95,18 @@ def test_sets_of_which_one_has_no_channels_come_back_without(tmp_path: Path) -> 
     assert len(after) == 2 * len(before) and not after.channels
 
 
+@pytest.mark.parametrize(
+    ("nodes", "meshes", "message"), [(2001, 1, "more than 2000 sets"), (10_001, 0, "more than 10000 nodes")]
+)
+def test_a_small_file_does_not_show_one_set_for_minutes(nodes: int, meshes: int, message: str, tmp_path: Path) -> None:
+    def crowd(document: dict[str, Any]) -> None:
+        document["nodes"] = [{"mesh": 0} if meshes else {}] * nodes
+        document["scenes"] = [{"nodes": list(range(nodes))}]
+
+    with pytest.raises(ValueError, match=message):
+        read_glb(edited(written(tmp_path, typical()), crowd))
+
+
 def test_a_channel_of_another_length_is_refused(tmp_path: Path) -> None:
     def shorten(document: dict[str, Any]) -> None:
         attributes = document["meshes"][0]["primitives"][0]["attributes"]
