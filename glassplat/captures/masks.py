@@ -139,9 +139,9 @@ def _palette_shades(indices: NDArray[np.uint8], colors: NDArray[np.uint8], path:
 
 def _one_colour(pixels: NDArray[np.uint8], path: Path) -> NDArray[np.uint8]:
     """Grey values of an RGB mask: black against one colour."""
-    bright = pixels >= THRESHOLD
-    mixtures = np.bincount((bright[..., 0] * 4 + bright[..., 1] * 2 + bright[..., 2]).ravel(), minlength=8)
-    if np.count_nonzero(mixtures[1:]) > 1:
+    bright = (pixels >= THRESHOLD).view(np.uint8)
+    mixtures = bright[..., 0] << 2 | bright[..., 1] << 1 | bright[..., 2]  # As bytes: a large mask takes gigabytes.
+    if ((mixtures > 0) & (mixtures < mixtures.max())).any():
         raise InputError(
             f"{path} is painted in several colours; expected a label image (grey, 0 no pane, 1..K the pane)"
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 from PIL import Image, ImageOps
 
 from glassplat.captures.dataset import Dataset, load_dataset
-from glassplat.captures.masks import CaptureMasks, MaskSet, find_masks, mask_paths
+from glassplat.captures.masks import CaptureMasks, MaskSet, find_masks, mask_paths, read_mask_values
 from glassplat.captures.view import View
 from glassplat.errors import InputError
 
@@ -345,6 +346,16 @@ def test_several_colours_are_refused(capture) -> None:
     capture.write_mask("panes/0001.png", pixels)
     with pytest.raises(InputError, match="several colours"):
         load_dataset(capture.root)
+
+
+def test_a_mask_in_colour_takes_little_memory(tmp_path: Path) -> None:
+    Image.new("RGB", (2048, 1024), (255, 0, 0)).save(tmp_path / "a.png")
+    read_mask_values(tmp_path / "a.png")
+    tracemalloc.start()
+    read_mask_values(tmp_path / "a.png")
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 16 * 2048 * 1024, "bytes a pixel, of arrays of ours; Pillow's own are not counted"
 
 
 def test_labels_beside_black_and_white_are_refused(capture) -> None:
