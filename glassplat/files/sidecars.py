@@ -8,7 +8,7 @@ import math
 import os
 import re
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from os.path import isfile
 from pathlib import Path
@@ -22,7 +22,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from glassplat.files import records
-from glassplat.files.images import read_image_float, write_image
+from glassplat.files.images import image_size, read_image_float, write_image
 from glassplat.files.writing import atomic_write, make_folder, write_text
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 from glassplat.options import CLEAR_GLASS, short_repr
@@ -470,6 +470,8 @@ def read_environment(path: Path | str) -> Environment:
 
 
 EXR, PNG = ".exr", ".png"
+MOST_PIXELS = 2**25
+"""Of a panorama, 8192 x 4096: as floats it takes ten times the memory of a photograph, and no environment is finer."""
 
 
 def read_equirect(path: Path | str) -> Tensor:
@@ -489,12 +491,8 @@ def read_equirect(path: Path | str) -> Tensor:
     if path.suffix.lower() == EXR:
         image = srgb_from_linear(torch.from_numpy(_read_exr(path)))
     else:
+        _check_size(path, *image_size(path))
         image = torch.from_numpy(_color(read_image_float(path), path))
-    height, width = image.shape[:2]
-    if width != 2 * height:
-        raise ValueError(
-            f"{path} is {width} x {height} pixels; expected an equirectangular image, twice as wide as high"
-        )
     if not bool(torch.isfinite(image).all()):
         raise ValueError(f"{path} holds values that are not finite; expected radiance of at least 0")
     return image.clamp(0, 1)
@@ -532,18 +530,36 @@ def _check_suffix(path: Path) -> None:
         raise ValueError(f"cannot tell the format of the panorama {path}; use the suffix {EXR} or {PNG}")
 
 
+def _check_size(path: Path, width: int, height: int) -> None:
+    """Refuse the size in a header before room is made for pixels: that of an EXR file may be anything."""
+    if width != 2 * height or width * height > MOST_PIXELS:
+        raise ValueError(
+            f"{path} is {width} x {height} pixels; expected an equirectangular image, twice as wide as high, of at most "
+            f"{MOST_PIXELS / 1e6:.0f} megapixels"
+        )
+
+
 def _read_exr(path: Path) -> NDArray[np.float32]:
     """Linear radiance [H, W, 3]."""
-    import OpenEXR  # As above.
-
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {name: channel.pixels for name, channel in file.channels().items()}
-    except (RuntimeError, ValueError) as error:
-        raise ValueError(f"cannot read {path} as OpenEXR ({error}); replace the file or remove it") from error
+    (left, top), (right, bottom) = _in_exr(path, lambda file: file.header()["dataWindow"], header_only=True)
+    _check_size(path, int(right) - int(left) + 1, int(bottom) - int(top) + 1)
+    channels = _in_exr(
+        path, lambda file: {name: one.pixels for name, one in file.channels().items()}, separate_channels=True
+    )
     if not {"R", "G", "B"} <= channels.keys():
         raise ValueError(f"{path} has the channels {sorted(channels)}; expected R, G and B")
     return np.stack([channels[name] for name in "RGB"], axis=-1).astype(np.float32)
+
+
+def _in_exr(path: Path, look: Callable[[Any], Any], **options: bool) -> Any:
+    """Look into an EXR file; what the library raises becomes an error that names it."""
+    import OpenEXR  # As above.
+
+    try:
+        with OpenEXR.File(str(path), **options) as file:
+            return look(file)
+    except (RuntimeError, ValueError, KeyError) as error:
+        raise ValueError(f"cannot read {path} as OpenEXR ({error}); replace the file or remove it") from error
 
 
 def _color(pixels: NDArray[np.float32], path: Path) -> NDArray[np.float32]:

@@ -4,6 +4,7 @@ import numpy as np
 import OpenEXR
 import pytest
 import torch
+from PIL import Image
 
 from glassplat.files.sidecars import read_equirect, write_equirect
 from glassplat.kernels.maths.images import linear_from_srgb
@@ -58,6 +59,14 @@ def test_files_that_are_no_panorama_are_named(tmp_path: Path) -> None:
     write_channels(tmp_path / "square.exr", {"RGB": np.zeros((2, 3, 3), np.float32)})
     with pytest.raises(ValueError, match="3 x 2 pixels; expected an equirectangular image, twice as wide as high"):
         read_equirect(tmp_path / "square.exr")
+    whole = bytearray((tmp_path / "square.exr").read_bytes() + bytes(2**16))  # Room for a table of all lines.
+    window = whole.index(b"dataWindow") + len("dataWindow.box2i.") + 4
+    whole[window : window + 16] = np.array([0, 0, 2**16 - 1, 2**15 - 1], "<i4").tobytes()
+    (tmp_path / "vast.exr").write_bytes(whole)
+    Image.new("1", (2**14, 2**13)).save(tmp_path / "vast.png")
+    for name, size in (("vast.exr", "65536 x 32768"), ("vast.png", "16384 x 8192")):
+        with pytest.raises(ValueError, match=f"{size} pixels; .* of at most 34 megapixels"):
+            read_equirect(tmp_path / name)
     write_channels(tmp_path / "nan.exr", {"RGB": np.full((2, 4, 3), np.nan, np.float32)})
     with pytest.raises(ValueError, match="not finite"):
         read_equirect(tmp_path / "nan.exr")
