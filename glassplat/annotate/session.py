@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from glassplat.annotate.document import (
+    ANNOTATIONS,
     MOST_PANES,
     PLACE,
     MarkedPane,
@@ -29,11 +30,11 @@ from glassplat.annotate.document import (
 from glassplat.annotate.fit import Marks, PaneFit, TooFewMarksError, corner_information, fit_pane, tilt_deviation
 from glassplat.annotate.results import capture_to_mark, grab_outlines, remove_results, write_results
 from glassplat.captures.dataset import Dataset
-from glassplat.captures.masks import PLANES
+from glassplat.captures.masks import PANE_FOLDER, PLANES
 from glassplat.captures.view import View
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.records import Field, Items, Text, Whole, check_fields
-from glassplat.files.writing import check_folder
+from glassplat.files.writing import check_folder, check_links
 from glassplat.scene.camera import NumpyCamera
 
 Array = NDArray[np.float64]
@@ -447,8 +448,9 @@ def opened_session(root: Path) -> Session:
         root: folder of the capture.
 
     Raises:
-        InputError: it cannot be read, or nothing may be written in it.
+        InputError: it cannot be read, nothing may be written in it, or a link leads out of it.
     """
+    check_links(root, (ANNOTATIONS, PANE_FOLDER, PLANES))
     dataset = capture_to_mark(root)
     check_folder(root)
     return Session(dataset)

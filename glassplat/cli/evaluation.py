@@ -27,8 +27,9 @@ from glassplat.evaluate.evaluate import (
 )
 from glassplat.evaluate.metrics import PLANE_COLUMNS, format_value, missing_reasons, shown_metrics
 from glassplat.evaluate.report import Report
-from glassplat.files.writing import write_text
+from glassplat.files.writing import check_links, write_text
 from glassplat.methods.planar import fitted_planes
+from glassplat.model.run_directory import EVALUATED
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.render.planar import Planar, with_photographer
 from glassplat.training.checkpoint import recorded
@@ -94,8 +95,9 @@ def evaluate_run(
         show: is told how far it is.
 
     Raises:
-        InputError: the capture does not say where its panes are in this way.
+        InputError: the capture does not say where its panes are in this way, or a link leads out of the run.
     """
+    check_links(stored.directory.path, (*EVALUATED, stored.directory.results.name))
     seconds, regions = train_seconds(stored), pane_regions(stored.dataset, panes)
     aligned = align == "always" or (align == "auto" and len(stored.scene.poses) > 0)
     if aligned:

@@ -534,8 +534,8 @@ def _check_size(path: Path, width: int, height: int) -> None:
     """Refuse the size in a header before room is made for pixels: that of an EXR file may be anything."""
     if width != 2 * height or width * height > MOST_PIXELS:
         raise ValueError(
-            f"{path} is {width} x {height} pixels; expected an equirectangular image, twice as wide as high, of at most "
-            f"{MOST_PIXELS / 1e6:.0f} megapixels"
+            f"{path} is {width} x {height} pixels; expected an equirectangular image, twice as wide as high, of at "
+            f"most {MOST_PIXELS / 1e6:.0f} megapixels"
         )
 
 

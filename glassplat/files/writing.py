@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+from glassplat.errors import InputError
+
 FORGED_SUFFIXES = (".sog", ".ksplat")
 """Formats that an extra reads and writes."""
 SPLAT_SUFFIXES = (".ply", ".spz", ".glb", ".splat", *FORGED_SUFFIXES)
@@ -179,6 +181,23 @@ def remove_empty(folders: Sequence[Path]) -> None:
 def real_path(path: Path) -> Path:
     """Path after following links; one that goes round in circles stays as it is, unlike in `Path.resolve`."""
     return Path(os.path.realpath(path))
+
+
+def check_links(folder: Path, names: Sequence[str]) -> None:
+    """Refuses links that lead out of a folder where files and folders of these names are to be written.
+
+    Who has filled the folder, as with a run or a capture of somebody else, could have any file replaced by them.
+
+    Raises:
+        InputError: names the link; nothing has been written.
+    """
+    inside = real_path(folder)
+    for path in (path for name in names for path in (folder / name, *(folder / name).rglob("*"))):
+        if path.is_symlink() and not real_path(path).is_relative_to(inside):
+            raise InputError(
+                f"{path} is a link that leads out of {folder}, to {real_path(path)}; nothing was written. Put what it "
+                "leads to in its place, or remove it"
+            )
 
 
 def scene_source(path: Path) -> Path:

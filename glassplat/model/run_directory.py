@@ -23,7 +23,7 @@ from filelock import FileLock, Timeout
 from glassplat.captures.masks import Polarity
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.records import parse_json, read_json, read_text
-from glassplat.files.writing import check_folder, make_folder, remove_unfinished, write_text
+from glassplat.files.writing import check_folder, check_links, make_folder, remove_unfinished, write_text
 from glassplat.options import Downscale, Seed, Several, options_from_json
 from glassplat.training.messages import Message, StepDone, Working
 from glassplat.training.ranks import leads
@@ -107,16 +107,8 @@ class RunSettings:
     mask_polarity: Polarity = "auto"
 
 
-FILES = (
-    "recipe.json",
-    "settings.json",
-    "log.jsonl",
-    "cameras.json",
-    "per_view.json",
-    "sheets",
-    "uses.png",
-    "index.html",
-)
+EVALUATED = ("per_view.json", "sheets", "uses.png", "index.html")
+FILES = ("recipe.json", "settings.json", "log.jsonl", "cameras.json", *EVALUATED)
 """What a run writes next to its checkpoint, scene and metrics."""
 MOST_MOVED = 0.02
 """Share of the scene's extent by which two cameras may differ that are taken for one."""
@@ -398,14 +390,15 @@ def check_output(directory: RunDirectory, *, resume: bool) -> None:
     """Check a run's directory before the photographs are read; writes nothing.
 
     Raises:
-        InputError: a fresh run would overwrite something, there is nothing to go on from, or another training writes
-            there.
+        InputError: a fresh run would overwrite something, there is nothing to go on from, another training writes
+            there, or a link leads out of it.
         NotADirectoryError: it is a file, or goes through one.
         PermissionError: nothing may be written there.
     """
     if not leads():
         return  # Rank 0 writes, and may have begun already.
     check_folder(directory.path)
+    check_links(directory.path, (*FILES, directory.checkpoint.name, directory.results.name, "point_cloud", "sparse"))
     check_unlocked(directory.path)
     if resume:
         directory.check_saved()

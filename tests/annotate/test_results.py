@@ -89,6 +89,23 @@ def test_a_record_that_names_other_files_removes_none(room: Path) -> None:
     assert (room / "transforms.json").exists()
 
 
+@pytest.mark.parametrize("name", ["panes", "panes/sub", "panes/0.png", "annotations.json", "planes.json"])
+def test_a_link_out_of_a_capture_replaces_and_removes_nothing(name: str, room: Path, tmp_path: Path) -> None:
+    finish(room, marked_document())
+    is_folder, elsewhere = not Path(name).suffix, tmp_path / "elsewhere"
+    if (room / name).exists():
+        (room / name).rename(elsewhere)
+    else:
+        elsewhere.mkdir()
+        (elsewhere / "mine.png").write_bytes(b"mine")
+        (room / "panes" / "annotated.json").write_text(json.dumps([*NAMES[:3], "sub/mine.png"]))
+    before = sorted((path, path.read_bytes()) for path in (elsewhere.iterdir() if is_folder else [elsewhere]))
+    (room / name).symlink_to(elsewhere)
+    with pytest.raises(InputError, match="leads out of"):
+        finish(room, marked_document((1, 2)))
+    assert sorted((path, path.read_bytes()) for path in (elsewhere.iterdir() if is_folder else [elsewhere])) == before
+
+
 @pytest.mark.parametrize("folder", ["../photos/", "/photos/", "a/../../photos/"])
 def test_masks_stay_in_their_folder_wherever_the_photographs_lie(folder: str, tmp_path: Path) -> None:
     names = [f"{tmp_path if folder.startswith('/') else ''}{folder}{name}" for name in NAMES]

@@ -86,6 +86,22 @@ def test_a_link_in_the_output_leads_nowhere(
     assert contents(images) == before
 
 
+@pytest.mark.parametrize("name", ["results.json", "sheets", "sheets/0.png", "log.jsonl"])
+def test_a_link_in_the_run_of_somebody_else_leads_nowhere(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, mine = write_run(tmp_path / "run"), tmp_path / "mine" / "0.png"
+    for path in (mine, run / "checkpoint.safetensors"):
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(b"mine")
+    (run / name).parent.mkdir(exist_ok=True)
+    (run / name).symlink_to(mine.parent if name == "sheets" else mine)
+    again = ["train", "planar", "--data", str(tmp_path / "capture"), "--output", str(run), "--resume"]
+    assert main(again if name == "log.jsonl" else ["eval", str(run)]) == 2
+    assert "leads out of" in " ".join(capsys.readouterr().err.split())
+    assert contents(mine.parent) == {"0.png": b"mine"}
+
+
 def test_an_output_that_is_a_link_to_a_folder_is_that_folder(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
     (tmp_path / "real").mkdir()
