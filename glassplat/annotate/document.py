@@ -213,18 +213,17 @@ def fill_polygon(outline: Array, size: tuple[int, int]) -> Mask:
     width, height = size
     if len(outline) < 3:
         return np.zeros((height, width), dtype=bool)
-    y = np.arange(height) + 0.5
-    x = np.arange(width) + 0.5
-    turns = np.zeros((height, width), dtype=np.int16)
-    within = slice(*np.searchsorted(x, (outline[:, 0].min(), outline[:, 0].max())))  # Left and right of it, none.
+    y, x = np.arange(height) + 0.5, np.arange(width) + 0.5
+    turns = np.zeros((height, width + 1), dtype=np.int16)  # First where each row is crossed, then summed up.
     for one, other in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         low, high = sorted((one[1], other[1]))
         rows = np.flatnonzero((y >= low) & (y < high))
         if not len(rows):
             continue
         crossing = one[0] + (y[rows] - one[1]) / (other[1] - one[1]) * (other[0] - one[0])
-        turns[rows, within] += np.int16(1 if other[1] > one[1] else -1) * (x[None, within] >= crossing[:, None])
-    return turns != 0
+        turns[rows, np.searchsorted(x, crossing)] += 1 if other[1] > one[1] else -1
+    np.cumsum(turns, axis=1, out=turns)
+    return turns[:, :width] != 0
 
 
 def depths(camera: NumpyCamera, corners: Array, rows: slice, columns: slice) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -304,6 +305,15 @@ def test_a_cut_that_crosses_itself_is_cut_whole(way: int) -> None:
     found = fill_polygon(star, (100, 100))
     assert found[45:55, 45:55].all() and found[15, 50] and not found[80, 50] and not found[2, 2]
     np.testing.assert_array_equal(fill_polygon(np.concatenate([star, star]), (100, 100)), found)
+
+
+def test_an_edge_of_a_polygon_costs_its_rows_and_not_their_pixels() -> None:
+    square = np.array([[0.0, 0.0], [900.0, 0.0], [900.0, 600.0], [0.0, 600.0]])
+    tracemalloc.start()
+    assert fill_polygon(square, (900, 600)).all()
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 5 * 900 * 600, "two bytes a pixel for the turns and one for the mask"
 
 
 def test_masks_of_bent_photographs_are_bent_too(room: Path) -> None:
