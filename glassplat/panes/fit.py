@@ -138,11 +138,11 @@ def fit_planes(
     As in the paper, candidates are points that project near a mask's edge, RANSAC draws planes
     through them, and rotating calipers bound the rectangle. Beyond the paper, the masks themselves
     choose among the planes and place the best one exactly: on the pane's own plane, and on no other,
-    the masks of all views coincide (`consistency`), and their edges do (`edges`). RANSAC alone often prefers a
-    wall or the floor. No points are needed: further planes are drawn through the masks.
+    the masks of all views coincide (`mask_agreement`), and their edges do (`edge_matches`). RANSAC alone often prefers
+    a wall or the floor. No points are needed: further planes are drawn through the masks.
 
     Gaussians may mislead, so that each pane is fitted to the measured points as well, and of both planes the one is
-    kept that masks and measured points support better (`plane_evidence`). Panes of one front get one plane, which the
+    kept that masks and measured points support better (`best_supported`). Panes of one front get one plane, which the
     masks of all place together (`JointObjective`), unless that fits one of them worse than its own. A pane that mirrors
     many points, such as a mirror with ragged masks, is placed by these (`plane_of_images`).
 

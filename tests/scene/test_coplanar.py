@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -32,6 +33,19 @@ def test_turned_panes_and_those_before_one_another_are_apart() -> None:
     assert coplanar_groups(front(at(0.0), at(1.0, turn_deg=3)), range(2)) == [[0], [1]]
     assert coplanar_groups(front(at(0.0), at(0.0, offset=0.05)), range(2)) == [[0], [1]]
     assert coplanar_groups(front(at(0.0), at(1.0, turn_deg=0.5)), range(2)) == [[0, 1]]
+    # From the plane of the one, the middle of the other is not off; the other way round it is.
+    assert coplanar_groups(front(at(0.0), at(4.0, turn_deg=0.9)), range(2)) == [[0], [1]]
+
+
+@pytest.mark.parametrize("unit", [0.1, 20.0])
+def test_the_unit_of_length_does_not_matter(unit: float) -> None:
+    for panes, expected in (
+        ((at(0.0), at(0.0, offset=0.015)), [[0, 1]]),
+        ((at(0.0), at(0.0, offset=0.025)), [[0], [1]]),
+    ):
+        planes = front(*panes)
+        scaled = replace(planes, centers=unit * planes.centers, half_sizes=unit * planes.half_sizes)
+        assert coplanar_groups(scaled, range(2)) == expected
 
 
 def test_the_side_from_which_a_pane_was_marked_does_not_matter() -> None:

@@ -22,6 +22,7 @@ def test_means_and_covariances_are_mirrored() -> None:
     torch.testing.assert_close(after.means, before.means @ matrix[:3, :3].T + matrix[:3, 3])
     torch.testing.assert_close(covariances(after), matrix[:3, :3] @ covariances(before) @ matrix[:3, :3].T)
     assert torch.equal(after.sh[:, 0], before.sh[:, 0]) and not bool(after.sh[:, 1:].any())
+    assert bool(before.sh[:, 1:].all()), "the Gaussians that are mirrored stay as they are"
 
 
 def test_mirroring_twice_gives_the_gaussians_back() -> None:

@@ -41,6 +41,13 @@ def test_cameras_that_are_tilted_down_tell_where_up_is() -> None:
     assert angle_deg(upward(wobbly), UP) < 1.5
 
 
+def test_cameras_that_are_tilted_down_on_one_side_of_a_thing_tell_where_up_is() -> None:
+    """Their images stand upright along a direction that is as far from up as they are tilted."""
+    cameras = [turned(yaw, -30) for yaw in range(-40, 41, 20)]
+    assert angle_deg(upward(cameras), UP) < 3
+    assert upward(100 * cameras) == pytest.approx(upward(cameras))
+
+
 def test_cameras_that_look_one_way_are_taken_to_stand_upright() -> None:
     assert angle_deg(upward([turned(10, 0), turned(10, 0)]), UP) < 1e-3
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from glassplat.render.planar import Planar
+from glassplat.scene.camera import rotation_from_quat
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import (
     PaneMove,
@@ -153,10 +154,15 @@ def test_a_pane_moves_with_its_own_glass_and_no_other(move: Callable[[Scene], Sc
     assert torch.equal(edited.planes.raw_normals[0], scene.planes.raw_normals[0])
     assert not torch.equal(edited.glass.means[own], scene.glass.means[own])
 
-    def height(planes_of: Scene) -> torch.Tensor:
-        return (planes_of.glass.means[own] - planes_of.planes.centers[1]) @ planes_of.planes.normals[1]
+    assert torch.equal(edited.glass.quats[~own], scene.glass.quats[~own])
 
-    torch.testing.assert_close(height(edited), height(scene))
+    def in_pane(glass_of: Scene) -> tuple[torch.Tensor, torch.Tensor]:
+        """Places and axes of the pane's glass in its own frame."""
+        frame = torch.stack([*(axis[1] for axis in glass_of.planes.axes()), glass_of.planes.normals[1]])
+        places = (glass_of.glass.means[own] - glass_of.planes.centers[1]) @ frame.T
+        return places, frame @ rotation_from_quat(glass_of.glass.quats[own])
+
+    torch.testing.assert_close(in_pane(edited), in_pane(scene))
 
 
 def test_panes_that_change_places_take_their_own_glass_along() -> None:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import pytest
 import torch
 from torch import Tensor
 
+from glassplat.render.deferred import view_directions
 from glassplat.render.frame import Frame
 from glassplat.render.splat import Splat
 from glassplat.scene.gaussians import Gaussians
@@ -48,6 +52,14 @@ def test_normals_of_a_depth_map_are_those_of_its_plane() -> None:
         torch.testing.assert_close(normals[10:16, 12:24].mean((0, 1)), expected, atol=0.02, rtol=0)
         blended = frame.layers["normal"][12:16, 15:20] / frame.layers["alpha"][12:16, 15:20, None]
         torch.testing.assert_close(blended, expected.expand_as(blended), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, -1.0), (0.5, 0.2, -1.0), (-0.3, 0.6, -1.0)])
+def test_normals_of_a_true_depth_map_are_exact(normal: tuple[float, float, float]) -> None:
+    expected = torch.nn.functional.normalize(torch.tensor(normal, dtype=torch.float64), dim=0)
+    depth = -3.0 / (view_directions(replace(CAMERA, cam_from_world=torch.eye(4).double())) @ expected)
+    normals = torch.stack(normals_of_depths(depth, CAMERA), dim=-1)
+    torch.testing.assert_close(normals, expected.expand_as(normals))
 
 
 def test_discs_that_lie_in_their_surface_agree_with_it() -> None:

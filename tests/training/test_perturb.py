@@ -1,11 +1,12 @@
 """Opacity perturbation of what is seen through a pane."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 
-from glassplat.scene.camera import Camera
+from glassplat.scene.camera import Camera, rotation_from_quat
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes, behind_panes
 from glassplat.training.densify import perturb_opacities
@@ -62,6 +63,26 @@ def test_points_outside_of_the_image_are_not_seen() -> None:
     assert behind_panes(point, PANE, [FRONT]).all()
     assert not behind_panes(point, PANE, [camera_at(-2.0, focal=500.0)]).any()
     assert behind_panes(point, PANE, [camera_at(-2.0, focal=500.0), FRONT]).all()
+
+
+def test_a_segment_crosses_the_rectangles_wherever_the_world_is_turned() -> None:
+    panes = PANE.concat(replace(PANE, centers=torch.tensor([[1.8, 0.6, 0.5]]), labels=(2,)))
+    points = torch.rand(500, 3) * torch.tensor([8.0, 4.0, 4.0]) - torch.tensor([2.0, 2.0, 1.0])
+    start = FRONT.center
+    shares = (panes.centers[:, 2] - start[2]) / (points[:, 2:] - start[2])
+    crossings = start + shares[..., None] * (points - start)[:, None]
+    inside = ((crossings - panes.centers)[..., :2].abs() <= panes.half_sizes).all(dim=-1)
+    expected = ((points[:, :2] - start[:2]).abs().amax(dim=1) <= points[:, 2] - start[2]) & (
+        inside & (shares > 0) & (shares < 1)
+    ).any(dim=1)
+    turn, shift = rotation_from_quat(torch.tensor([0.7, -0.2, 0.4, 0.5])), torch.tensor([3.0, -5.0, 2.0])
+    moved = {name: panes.tensors()[name] @ turn.T for name in ("centers", "raw_normals", "tangents")}
+    back = torch.eye(4)
+    back[:3, :3], back[:3, 3] = turn.T, -turn.T @ shift
+    camera = replace(FRONT, cam_from_world=FRONT.cam_from_world @ back)
+    there = panes.with_tensors({**moved, "centers": moved["centers"] + shift})
+    assert torch.equal(behind_panes(points, panes, [FRONT]), expected)
+    assert torch.equal(behind_panes(points @ turn.T + shift, there, [camera]), expected)
 
 
 def test_no_panes_select_nothing() -> None:
