@@ -154,8 +154,18 @@ def test_without_live_ones_nothing_happens(opacities: list[float]) -> None:
 
 
 def test_a_single_live_one_is_doubled() -> None:
-    after, _ = relocate_and_grow(OPTIONS, make_gaussians([0.75]), {}, cap=100, generator=rng())
+    before = make_gaussians([0.75])
+    after, _ = relocate_and_grow(OPTIONS, before, {}, cap=100, generator=rng())
     assert torch.sigmoid(after.logit_opacities).tolist() == pytest.approx([0.5, 0.5])
+    # Along a line G has the integral sigma and G^2 sigma / sqrt(2): 0.75 sigma = (2 * 0.5 - 0.25 / sqrt(2)) sigma'.
+    smaller = before.log_scales + math.log(0.75 / (1 - 0.25 / math.sqrt(2)))
+    torch.testing.assert_close(after.log_scales, smaller.repeat(2, 1))
+
+
+def test_growth_puts_no_more_into_one_place_than_the_sum_is_exact_for() -> None:
+    before = make_gaussians([0.95] + [0.0051] * 100)
+    after, _ = relocate_and_grow(McmcDensify(growth=2.0), before, {}, cap=1000, generator=rng())
+    assert (after.means == before.means[0]).all(dim=1).sum() == MOST_COPIES and len(after) > 120
 
 
 def test_the_same_seed_gives_the_same_set_and_another_seed_another() -> None:
