@@ -13,7 +13,7 @@ from glassplat.render.frame import Frame
 from glassplat.render.planar import Planar, as_mirror_image, dereflected_photo
 from glassplat.scene.corrections import Exposures
 from glassplat.scene.scene import as_mirrors
-from tests.render.tiny_scene import camera_at, in_single_precision, showcase
+from tests.render.tiny_scene import camera_at, in_single_precision, pane, showcase
 
 SIZE = (24, 32)
 BLENDS: tuple[Blend, ...] = ("srgb", "linear")
@@ -70,8 +70,9 @@ def test_without_a_pane_the_photograph_stays_bit_for_bit() -> None:
     assert not torch.equal(result[:, :16], photo[:, :16])
 
 
-def test_where_most_light_is_reflected_the_render_takes_over() -> None:
-    frame, photo, _ = case(0.95, "linear")
+@pytest.mark.parametrize("reflection", [0.0, 0.3], ids=["of a dark room", "of a bright one"])
+def test_where_most_light_is_reflected_the_render_takes_over(reflection: float) -> None:
+    frame, photo, _ = case(0.95, "linear", reflection)
     result = dereflected_photo(frame, photo, "linear")
     assert torch.equal(result[:, :12], uint8(frame.layers["without_panes"])[:, :12])
 
@@ -114,9 +115,10 @@ def test_a_photograph_of_another_size_is_refused() -> None:
         dereflected_photo(frame, photo[1:], "linear")
 
 
+@pytest.mark.parametrize("half", [50.0, 0.4])
 @pytest.mark.parametrize("blend", BLENDS)
-def test_the_mirror_made_of_layers_is_the_mirror_rendered(blend: Blend) -> None:
-    scene, camera = in_single_precision(showcase()), camera_at(0.0, 0.0, -0.2)
+def test_the_mirror_made_of_layers_is_the_mirror_rendered(blend: Blend, half: float) -> None:
+    scene, camera = in_single_precision(showcase(pane(2.0, half))), camera_at(0.0, 0.0, -0.2)
     camera = replace(camera, cam_from_world=camera.cam_from_world.float())
     renderer = Planar(blend=blend)
     rendered = renderer(as_mirrors(scene, [1]), camera).rgb

@@ -176,7 +176,7 @@ def test_what_reaches_no_farther_than_the_clip_is_left_out() -> None:
     assert not bool(plain(radius_clip=1e4)[1].any())
 
 
-@pytest.mark.parametrize("eps2d", [0.0, 0.3, 10.0])
+@pytest.mark.parametrize("eps2d", [0.0, 0.3, 5.0, 10.0])
 def test_radii_are_of_what_is_drawn(eps2d: float) -> None:
     """The second Gaussian lies 9 pixels to the left of the image."""
     only = {"quats": torch.tensor([[1.0, 0, 0, 0]] * 2), "scales": torch.full((2, 3), 0.05)}

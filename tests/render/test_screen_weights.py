@@ -37,8 +37,9 @@ def test_only_what_is_behind_the_pane_counts_by_what_comes_through() -> None:
     assert 0.65 < float(weight[behind].min()) < 0.9
 
 
-def test_a_mirror_counts_for_what_it_shows() -> None:
-    scene = replace(showcase(), planes=pane(2.0, base_reflectance=1 - 1e-9))
+@pytest.mark.parametrize("half", [50.0, 0.6])
+def test_a_mirror_counts_for_what_it_shows(half: float) -> None:
+    scene = replace(showcase(), planes=pane(2.0, half, base_reflectance=1 - 1e-9))
     layers = Planar(blend="srgb")(scene, CAMERA).layers
     direct, mirrored = primary_and_mirrored(scene, CAMERA)
     assert float(mirrored.weight) == pytest.approx(float(layers["mask"][layers["pane"] >= 0].mean()), rel=1e-6)
@@ -46,7 +47,7 @@ def test_a_mirror_counts_for_what_it_shows() -> None:
     inside = (columns >= 0) & (columns < CAMERA.width) & (rows >= 0) & (rows < CAMERA.height)
     hidden = inside & (direct.radii[0] > 0).all(dim=-1)
     assert int(hidden.sum()) > 3
-    covered = layers["mask"][rows[hidden], columns[hidden]]
+    covered = (layers["mask"] * (layers["pane"] >= 0))[rows[hidden], columns[hidden]]
     torch.testing.assert_close(torch.as_tensor(direct.weight)[0, hidden], 1 - covered)
 
 

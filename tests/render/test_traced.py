@@ -10,7 +10,7 @@ import torch
 
 from glassplat.render.deferred import INVISIBLE, Deferred, view_directions
 from glassplat.render.splat import Splat
-from glassplat.render.traced import Traced, mirrored_contributions, traced_surroundings
+from glassplat.render.traced import START_PER_EXTENT, Traced, mirrored_contributions, traced_surroundings
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Environment, Scene
@@ -58,6 +58,19 @@ def test_a_flat_mirror_shows_what_the_mirrored_camera_sees() -> None:
     expected = Traced(surroundings=True)(scene, mirrored(camera)).layers["surroundings"]
     torch.testing.assert_close(frame.layers["reflection"], expected)
     assert float(expected.max()) > 0.3
+
+
+@pytest.mark.parametrize("extent", [1.0, 4.0])
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_a_ray_meets_nothing_of_the_surface_that_it_leaves(extent: float, share: float) -> None:
+    """Of a white sheet before the mirror, which has the mirror's own place in the surroundings."""
+    distance = share * START_PER_EXTENT * extent
+    shift = torch.tensor([0.0, 0.0, -distance], dtype=torch.float64)
+    sheet = replace(mirror_wall(), means=mirror_wall().means + shift, sh=torch.ones(1, 1, 3).double(), channels={})
+    camera = camera_at(0.0, 0.0, 0.0)
+    shown = Traced()(Scene(mirror_wall(), extent, surroundings=sheet), camera).layers["reflection"]
+    # In the middle, to which the wall's depth belongs and where rays leave it at a right angle.
+    assert bool(shown[14, 20].any()) == (share > 1)
 
 
 def flattened(gaussians: Gaussians) -> Gaussians:
@@ -161,13 +174,16 @@ def test_gradients_match_finite_differences() -> None:
     assert torch.autograd.gradcheck(image, leaves, eps=1e-7, atol=2e-4, fast_mode=True)
 
 
-def test_reflections_can_be_kept_from_moving_surfaces() -> None:
+@pytest.mark.parametrize("part", ["surroundings", "environment"])
+def test_reflections_can_be_kept_from_moving_surfaces(part: str) -> None:
     scene, camera = glossy(), camera_at(0.0, 0.0, 0.0)
+    if part == "environment":
+        scene = lit(replace(scene, surroundings=Gaussians.empty()))
     leaves = leaves_of(scene)
     layer = Traced(joint=False)(scene.with_parameters(leaves), camera).layers["reflection"]
     gradients = torch.autograd.grad(layer.sum(), leaves.values(), allow_unused=True)
     reached = {name for name, g in zip(leaves, gradients, strict=True) if g is not None and float(g.abs().max()) > 0}
-    assert reached and all(name.startswith("surroundings.") for name in reached)
+    assert reached and all(name.startswith(f"{part}.") for name in reached)
 
 
 def test_moving_scene_and_camera_together_changes_nothing() -> None:
