@@ -326,7 +326,7 @@ def _drift(fitted: dict[str, Any], marked: Planes, row: int, extent: float) -> d
 def _difference(fitted: dict[str, Any], center: Sequence[float], normal: Sequence[float]) -> tuple[float, float]:
     """Angle between the normals in degrees, and the distance of the other plane's centre from the fitted plane."""
     own = torch.tensor(fitted["normal"], dtype=torch.float64)
-    other = torch.nn.functional.normalize(torch.tensor(normal, dtype=torch.float64), dim=0)
+    other = torch.tensor(normal, dtype=torch.float64)
     # The arc tangent keeps its precision for the small angles that matter here; the arc cosine does not.
     angle = torch.atan2(torch.linalg.cross(own, other).norm(), (own @ other).abs())
     apart = torch.tensor(center, dtype=torch.float64) - torch.tensor(fitted["center"], dtype=torch.float64)

@@ -84,15 +84,16 @@ def true_panes() -> list[dict[str, object]]:
 
 
 def perfect_frame(folder: Path, index: int, name: str) -> Frame:
-    """Layers as the ground truth has them, the reflection at half its brightness."""
+    """Layers as the ground truth has them on the panes, the reflection at half its brightness; noise elsewhere."""
     stem = Path(name).stem
     read = {kind: np.asarray(Image.open(folder / kind / f"{stem}.png")) for kind in ("trans", "refl")}
     images = {kind: torch.from_numpy(pixels.astype(np.float32) / 255) for kind, pixels in read.items()}
     pane = torch.from_numpy(pane_labels(index) > 0).float()
+    noise = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(index))
     layers = {
-        "transmission": images["trans"],
+        "transmission": torch.where(pane[..., None] > 0, images["trans"], noise),
         "without_panes": images["trans"],
-        "reflection": 0.5 * images["refl"],
+        "reflection": torch.where(pane[..., None] > 0, 0.5 * images["refl"], noise),
         "strength": 0.1 * pane,
         "share": 0.1 * pane,
         "mask": pane,

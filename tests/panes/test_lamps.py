@@ -13,9 +13,9 @@ from torch import Tensor
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import PointCloud, View
 from glassplat.methods.planar import FillUnseen, LightLamps
-from glassplat.panes.material import Photograph, mirrored_image, mirrored_lamps, unseen_places
+from glassplat.panes.material import Photograph, _ends_of_rays, mirrored_image, mirrored_lamps, unseen_places
 from glassplat.render.planar import Planar
-from glassplat.scene.camera import Camera
+from glassplat.scene.camera import Camera, mirror_matrices
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene, glass_gaussians
@@ -123,6 +123,20 @@ def test_places_are_found_where_a_pane_mirrors_nothing_and_nowhere_else() -> Non
     assert bool((found.places[:, 2] < 2).all()) and float((found.places[:, 0] > -0.5).float().mean()) == 1
     torch.testing.assert_close(found.color, torch.full((3,), 120 / 255), atol=0.02, rtol=0)
     assert len(unseen_places(closed, closed.planes, CAMERAS).places) == 0
+
+
+def test_places_lie_at_the_end_of_the_room_where_the_mirrored_camera_sees_the_hole() -> None:
+    pane = Planes.rectangle((0.1, 0.0, 2.0), (0.2, -0.1, -1.0), (0.8, 0.6))
+    view, hole, middle = camera(0.3), torch.zeros(120, 160, dtype=torch.bool), torch.tensor([0.1, 0.2, -0.3])
+    hole[30:70, 60:140] = True
+    places = _ends_of_rays(pane, view, hole, middle, torch.tensor(5.0))
+    torch.testing.assert_close((places - middle).norm(dim=1), torch.full((len(places),), 5.0))
+    mirrored = replace(view, cam_from_world=view.cam_from_world @ mirror_matrices(pane.centers, pane.normals)[0])
+    pixels, depths = mirrored.project(places)
+    row, column = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
+    expected = torch.stack([column, row], dim=-1)[::4, ::4][hole[::4, ::4]] + 0.5
+    torch.testing.assert_close(pixels, expected, atol=1e-3, rtol=0)
+    assert len(places) == 200 and bool((depths > 2).all())
 
 
 def state_of(scene: Scene) -> TrainState:

@@ -232,6 +232,18 @@ def test_the_environment_is_behind_the_surroundings() -> None:
     assert not torch.allclose(frame.layers["reflection"], distant.layers["reflection"], atol=0.05)
 
 
+def test_an_environment_of_one_colour_is_a_background() -> None:
+    scene, camera = glossy(), camera_at(0.1, -0.1, 0.0)
+    light = (0.2, 0.7, 0.4)
+    even = Environment(torch.logit(torch.tensor(light, dtype=torch.float64)).expand(6, 2, 2, 3).contiguous())
+    plain = Traced(light, surroundings=True)(scene, camera)
+    found = Traced(light, surroundings=True)(replace(scene, environment=even), camera)
+    seen = plain.layers["alpha"] > 0.01
+    torch.testing.assert_close(found.layers["surroundings"], plain.layers["surroundings"])
+    torch.testing.assert_close(found.layers["reflection"][seen], plain.layers["reflection"][seen])
+    torch.testing.assert_close(found.rgb, plain.rgb, atol=1e-3, rtol=0)
+
+
 def test_where_no_ray_is_traced_the_environment_alone_is_mirrored() -> None:
     scene, camera = lit(glossy()), camera_at(0.0, 0.0, 0.0)
     some, every = Traced(least_strength=0.2)(scene, camera), Traced()(scene, camera)
