@@ -40,7 +40,7 @@ def test_masks_tell_it_too(capture) -> None:
     right = evidence_of_masks(views)
     assert right is not None and (right.as_read, right.flipped) == (1.0, 0.0)
     wrong = evidence_of_masks([replace(view, camera=flip_axes(view.camera)) for view in views])
-    assert wrong is not None and wrong.contradicts
+    assert wrong is not None and (wrong.as_read, wrong.flipped) == (0.0, 1.0) and wrong.contradicts
 
 
 def test_two_masks_or_parallel_rays_tell_nothing(capture) -> None:

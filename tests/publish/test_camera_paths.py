@@ -79,7 +79,14 @@ def test_an_interpolated_path_begins_and_ends_at_its_cameras(frames: int) -> Non
     for camera in path:
         rotation = camera.cam_from_world[:3, :3]
         torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-5, rtol=0)
-    assert fit_to_width(path[0], 321 + 1).width % 2 == 0 and fit_to_width(path[0], 322).height % 2 == 0
+
+
+@pytest.mark.parametrize("width", [2, 322, 1000])
+def test_pictures_of_a_film_have_even_sides_and_the_shape_of_the_camera(width: int) -> None:
+    camera = Camera.look_at((0.0, 0.0, -1.0), (0.0, 0.0, 0.0), up=UP, width=800, height=600)
+    fitted = fit_to_width(camera, width)
+    assert fitted.width == width and fitted.height % 2 == 0 and abs(fitted.height - 0.75 * width) <= 1
+    assert math.isclose(fitted.fy / fitted.height, camera.fy / 600) and math.isclose(fitted.cx, width / 2)
 
 
 def test_no_picture_of_a_path_is_stretched_by_a_camera_on_its_side() -> None:
