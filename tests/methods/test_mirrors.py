@@ -13,7 +13,16 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from glassplat.captures.view import CAMERA_FROM_PICTURE, FOLDER, View, normals_reader
-from glassplat.methods.mirrors import FACING, facing, made_mirrors, mirror_lookalikes, neighbours, seen_normals
+from glassplat.methods.mirrors import (
+    FACING,
+    facing,
+    made_mirrors,
+    mirror_lookalikes,
+    neighbours,
+    residual_spreads,
+    seen_normals,
+)
+from glassplat.render.layers import contributions
 from glassplat.render.splat import Splat
 from glassplat.scene import SH_ZERO
 from glassplat.scene.camera import Camera, rotation_from_quat
@@ -85,6 +94,15 @@ def test_what_looks_different_from_different_sides_looks_like_a_mirror() -> None
     assert bool(seen.all()) and bool(found[x < -0.3].all()) and not bool(found[x > 0.3].any())
 
 
+def test_a_residual_spreads_by_its_standard_deviation() -> None:
+    scene = slope()
+    plain = replace(scene, primary=replace(scene.primary, active_sh_degree=0))
+    shown, spreads = residual_spreads(plain, views(0.15, -0.15, 0.15, -0.15), Splat())
+    left = inner(scene) & (scene.primary.means[:, 0] < -0.2)
+    torch.testing.assert_close(spreads[left], torch.full_like(spreads[left], 0.15), rtol=0.1, atol=0)
+    torch.testing.assert_close(shown, 4 * residual_spreads(plain, views(0.0), Splat())[0])
+
+
 def test_what_is_the_same_from_every_side_does_not_however_wrong_it_is() -> None:
     assert not bool(mirror_lookalikes(SEARCH, slope(), views(0.2, 0.2, 0.2), Splat())[1].any())
 
@@ -108,6 +126,16 @@ def test_depths_tell_which_way_a_surface_faces(discs: bool) -> None:
     normals = normalize(sums[told], dim=1)
     assert float(told.float().mean()) > 0.8
     assert float((normals @ true_normal()).mean()) > math.cos(math.radians(4))
+
+
+def test_a_surface_counts_by_the_cosine_at_which_it_is_seen() -> None:
+    scene = slope()
+    with torch.no_grad():
+        sums, pixels = seen_normals(scene, views(0.0)), contributions(scene, camera())
+    rays = normalize(scene.primary.means, dim=1)
+    chosen = inner(scene) & (pixels > 1)
+    expected = (pixels * -(rays @ true_normal()))[chosen]
+    torch.testing.assert_close(sums.norm(dim=1)[chosen], expected, rtol=0.05, atol=0)
 
 
 @pytest.mark.parametrize("estimated", [True, False])

@@ -15,6 +15,7 @@ from glassplat.methods.planar import (
     PaneSetup,
     TurnReflections,
     mirrors_among,
+    reflects_little,
     seed_reflection,
     surfaces,
     turn_virtual_scene_round,
@@ -69,6 +70,15 @@ def test_a_capture_that_shows_the_room_needs_no_seeds() -> None:
     state = state_of(replace(scene, primary=room))
     assert not finished(seed_reflection(state, tiny_capture(), PANE))
     assert len(state.scene.primary) == len(scene.primary)
+
+
+@pytest.mark.parametrize(("second", "expected"), [(60.0, True), (95.0, False)])
+def test_little_is_reflected_where_less_than_half_of_all_views_together_is_covered(
+    second: float, expected: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    covered = iter([10.0, second])
+    monkeypatch.setattr(material, "mirrored_coverage", lambda *_: (next(covered), 100))
+    assert finished(reflects_little(true_scene(), PANE, [view.camera for view in tiny_capture().train[:2]])) == expected
 
 
 def test_a_capture_from_the_front_gets_the_mirrored_points() -> None:

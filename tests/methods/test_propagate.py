@@ -59,6 +59,7 @@ def test_sabotage_disturbs_the_constant_colour_of_what_does_not_reflect() -> Non
     disturbed, kept = colors_disturbed(propagation, many, moments(), torch.Generator().manual_seed(0))
     change = disturbed.sh * SH_ZERO
     assert change[:3, 0].abs().min() > 0 and change[:, 0].abs().max() <= 0.1
+    assert change[:3, 0].min() < 0 < change[:3, 0].max()
     assert not change[3:].any() and not change[:, 1:].any()
     first, _ = kept["primary.sh"]
     assert not first[:3].any() and first[3:].all()

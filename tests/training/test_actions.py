@@ -166,6 +166,17 @@ def test_a_set_grows_to_its_limit_and_no_further() -> None:
     assert len(state.scene.primary) == count + 2
 
 
+@pytest.mark.parametrize("adapts", [True, False])
+def test_thresholds_rise_for_small_photographs(adapts: bool) -> None:
+    state, capture = TrainState(SplatRecipe(sh_degree=1).initialise(tiny_capture()), seed=0), tiny_capture()
+    count, options = len(state.scene.primary), DefaultDensify(adapt_to_size=adapts)
+    gradients, absgrads = torch.ones(2, 2, count) * 1.5
+    gradients, absgrads = options.gradient_threshold * gradients, options.absgrad_threshold * absgrads
+    state.statistics["primary"] = ScreenStatistics(gradients, absgrads, torch.ones(2, count))
+    Densify(options).apply(state, capture, Clock(10, 100, 5))
+    assert (len(state.scene.primary) > count) != adapts
+
+
 def views_of(scene: Scene) -> Dataset:
     """Ten views of a scene in a half circle, without test views."""
     views = []

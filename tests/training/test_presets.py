@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,21 @@ def parsed(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_the_table_of_a_page_is_that_of_the_preset(method: str) -> None:
     page = (DOCS / f"{method}.md").read_text(encoding="utf-8")
     assert with_table(page, method) == page, "python -m tools.make_differences writes the tables anew"
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+@pytest.mark.parametrize("method", RECIPES)
+def test_what_learns_once_learns_to_the_end(method: str, preset: Any) -> None:
+    stages = recipe_of(method, preset).stages(0)
+    for before, after in pairwise(stages):
+        assert before.rates.keys() <= after.rates.keys(), after.name
+
+
+def test_panes_move_at_a_tenth_of_their_rates_in_the_joint_stage() -> None:
+    _, adjustment, joint = PlanarRecipe.paper().stages(0)
+    ratio = {name: joint.rates[name].at(0, 1) / rate.at(0, 1) for name, rate in adjustment.rates.items()}
+    slower = {name for name, share in ratio.items() if share == pytest.approx(0.1)}
+    assert slower == {"planes.centers", "planes.raw_normals"}
 
 
 @pytest.mark.parametrize("method", RECIPES)
