@@ -9,7 +9,7 @@ import torch
 
 from glassplat.captures.dataset import load_dataset
 from glassplat.errors import InputError
-from glassplat.evaluate.evaluate import EvaluatedView, evaluate, peak_memory_mib
+from glassplat.evaluate.evaluate import RENDERED_REGIONS, EvaluatedView, evaluate, peak_memory_mib
 from glassplat.evaluate.metrics import json_values, plane_table, psnr
 from glassplat.evaluate.truth import load_truth
 from glassplat.render.deferred import view_directions
@@ -246,6 +246,24 @@ def test_right_halves_need_a_left_half_that_counts(case) -> None:
     results = evaluate(case.scene, case.renderer, replace(case.dataset, test=(halved,))).results
     assert results["right_half_psnr"] is None and "left half" in results["right_half_psnr_reason"]
     assert results["psnr"] is not None
+
+
+def test_another_exposure_costs_nothing_where_colours_are_corrected(case) -> None:
+    view = case.dataset.test[0]
+    rendered = case.renderer.frames[view.camera.fx].rgb
+    dark = replace(view, read_photo=lambda: (255 * (0.5 * rendered + 0.1)).round().to(torch.uint8))
+    results = evaluate(case.scene, case.renderer, replace(case.dataset, test=(dark,))).results
+    assert results["psnr"] < 25 and min(results["corrected_psnr"], results["right_half_psnr"]) > 48
+
+
+def test_a_pane_is_measured_where_it_is_not_ignored(case) -> None:
+    view = case.dataset.test[1]
+    columns = torch.arange(view.camera.width).expand_as(view.photo[..., 0])
+    ignored = columns % 3 == 0
+    frame = case.renderer.frames[view.camera.fx]
+    dataset = replace(case.dataset, test=(replace(view, read_ignored=lambda: ignored),))
+    results = evaluate(case.scene, case.renderer, dataset, regions=RENDERED_REGIONS).results
+    assert results["pane_psnr"] == psnr(frame.rgb, view.photo, (frame.layers["mask"] > 0.5) & ~ignored)
 
 
 def test_a_perfect_view_does_not_hide_the_mean_of_the_others(case) -> None:

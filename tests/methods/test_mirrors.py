@@ -97,7 +97,7 @@ def test_what_looks_different_from_different_sides_looks_like_a_mirror() -> None
 def test_a_residual_spreads_by_its_standard_deviation() -> None:
     scene = slope()
     plain = replace(scene, primary=replace(scene.primary, active_sh_degree=0))
-    shown, spreads = residual_spreads(plain, views(0.15, -0.15, 0.15, -0.15), Splat())
+    shown, spreads = residual_spreads(plain, views(0.2, -0.1, 0.2, -0.1), Splat())
     left = inner(scene) & (scene.primary.means[:, 0] < -0.2)
     torch.testing.assert_close(spreads[left], torch.full_like(spreads[left], 0.15), rtol=0.1, atol=0)
     torch.testing.assert_close(shown, 4 * residual_spreads(plain, views(0.0), Splat())[0])

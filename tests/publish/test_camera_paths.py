@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
+from typing import Any
 
 import pytest
 import torch
@@ -67,6 +69,20 @@ def test_an_orbit_stays_in_front_of_what_was_seen_from_one_side() -> None:
     for camera in path:
         assert float(forward(camera)[2]) > 0.8
         assert min(float((camera.center - other.center).norm()) for other in IN_FRONT) < 0.5
+    # In a loop that is both wide and tall, and closed.
+    centers = torch.stack([camera.center for camera in path])
+    wide, tall, _ = (centers.amax(dim=0) - centers.amin(dim=0)).tolist()
+    assert wide > tall > 0.05 and float((centers - centers.roll(1, dims=0)).norm(dim=1).max()) < 0.5 * wide
+    quarters = centers[::6, :2] - centers[:, :2].mean(dim=0)
+    assert abs(float(quarters[0] @ quarters[1])) < 0.05 * wide * tall
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 12, 40])
+def test_keyframes_are_few_and_spread_from_the_first_to_the_last(count: int) -> None:
+    found: list[Any] = keyframes_of(range(count))  # type: ignore[arg-type]
+    assert found[0] == 0 and found[-1] == count - 1 and len(found) == min(count, 12)
+    steps = [after - before for before, after in pairwise(found)]
+    assert not steps or max(steps) - min(steps) <= 1
 
 
 @pytest.mark.parametrize("frames", [2, 25])

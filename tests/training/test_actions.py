@@ -79,6 +79,8 @@ def one_gaussian(
         (one_gaussian((1.0, 0.1, 0.1), 0.1), False),
         (one_gaussian((0.5, 0.5, 0.5), 0.99), True),
         (one_gaussian((0.4, 0.4, 0.4), 0.99), False),
+        (one_gaussian((0.5, 1.0, 1.0), 0.9), True),
+        (one_gaussian((0.45, 1.0, 1.0), 0.9), False),
     ],
 )
 def test_fog_is_what_is_opaque_where_a_camera_stands(gaussian: Gaussians, expected: bool) -> None:

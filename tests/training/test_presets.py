@@ -26,7 +26,7 @@ from glassplat.training.actions import AddNoise, Densify, PerturbOpacity, Reloca
 from glassplat.training.loop import differentiate, train
 from glassplat.training.messages import ActionDone, StepDone
 from glassplat.training.options import DefaultDensify, McmcDensify, PropagationSchedule, Rate, SurroundingsStart
-from glassplat.training.stage import Clock, Stage, TrainState, stage_starts
+from glassplat.training.stage import AtMoments, Clock, Stage, TrainState, stage_starts
 from tests.render.test_seen_panes import CAMERA, vitrine
 from tests.training.progress_of import finished
 from tests.training.test_default import edited, make_gaussians, seen
@@ -56,6 +56,20 @@ def test_what_learns_once_learns_to_the_end(method: str, preset: Any) -> None:
     stages = recipe_of(method, preset).stages(0)
     for before, after in pairwise(stages):
         assert before.rates.keys() <= after.rates.keys(), after.name
+
+
+@pytest.mark.parametrize("iterations", [500, 7000])
+@pytest.mark.parametrize("method", RECIPES)
+def test_what_is_due_at_a_moment_is_an_action_of_the_stage_then(method: str, iterations: int) -> None:
+    stages = recipe_of(method).stages(0, iterations)
+    starts = stage_starts(stages, iterations)
+    planned, acting = set(), set()
+    for stage, start, end in zip(stages, starts, starts[1:], strict=False):
+        for action in (action for action in stage.actions if isinstance(action, AtMoments)):
+            steps = {round(moment * iterations) for moment in action.moments}
+            planned |= {(action.name, step) for step in steps}
+            acting |= {(action.name, step) for step in steps if start < step <= end}
+    assert acting == planned
 
 
 def test_panes_move_at_a_tenth_of_their_rates_in_the_joint_stage() -> None:
