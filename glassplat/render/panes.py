@@ -15,7 +15,7 @@ from glassplat.kernels.composite import composite
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 from glassplat.kernels.panes import MirroredViews, blend_panes, pane_hits
 from glassplat.kernels.project import GradientSum
-from glassplat.kernels.records import TILE, BlendedPanes, PaneHits, Panes, Projected, Splats
+from glassplat.kernels.records import TILE, PaneHits, Panes, Projected, Splats
 from glassplat.kernels.tiles import bin_tiles
 from glassplat.options import Blend
 from glassplat.render.frame import project_gaussians
@@ -249,9 +249,15 @@ def composite_panes(
     if not laid:
         return CompositedPanes(image, *layers, share)
     faint = masks[0] < FAINT
-    for mask, (behind, farther) in zip(masks[1:], reversed(laid), strict=True):
-        layers = _joined_layers(layers, behind, farther, faint & (farther.strength > 0), blend)
-        faint = faint & (mask < FAINT)
+    for number, (behind, farther) in enumerate(reversed(laid), 1):
+        reflection = farther.reflection
+        for mask, pane in zip(masks[:number], seen.order, strict=False):
+            if transmittances is not None:
+                behind = tint_by_panes(behind, mask, pane, transmittances, blend)
+                reflection = tint_by_panes(reflection, mask, pane, transmittances, blend)
+        where = faint & (farther.strength > 0)
+        layers = _joined_layers(layers, (behind, reflection, farther.strength), where, blend)
+        faint = faint & (masks[number] < FAINT)
     return CompositedPanes(image, *layers, share)
 
 
@@ -289,20 +295,22 @@ def _all_of_them(strengths: Sequence[Tensor]) -> Tensor:
     return share
 
 
-def _joined_layers(
-    layers: tuple[Tensor, Tensor, Tensor], behind: Tensor, farther: BlendedPanes, where: Tensor, blend: Blend
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Transmission, reflection and strength of a pane and the one behind it as if they were one, in some pixels.
+Layers = tuple[Tensor, Tensor, Tensor]
+"""Transmission, reflection and strength."""
+
+
+def _joined_layers(layers: Layers, farther: Layers, where: Tensor, blend: Blend) -> Layers:
+    """Those of a pane and of one seen through its glass as if they were one, in some pixels.
 
     They make the same image: R = R_1 + (1 - R_1) R_2 and R C_r = R_1 C_1 + (1 - R_1) R_2 C_2.
     """
     decode, encode = curves(blend)
-    transmission, reflection, strength = layers
+    (transmission, reflection, strength), (behind, mirrored, share) = layers, farther
     pixels = where.nonzero(as_tuple=True)
     first = strength[pixels]
-    second = (1 - first) * farther.strength[pixels]
+    second = (1 - first) * share[pixels]
     both = first + second
-    light = first[:, None] * decode(reflection[pixels]) + second[:, None] * decode(farther.reflection[pixels])
+    light = first[:, None] * decode(reflection[pixels]) + second[:, None] * decode(mirrored[pixels])
     return (
         transmission.index_put(pixels, behind[pixels]),
         reflection.index_put(pixels, encode(light / both[:, None])),

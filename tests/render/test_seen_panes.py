@@ -86,9 +86,11 @@ def test_where_the_nearest_pane_cannot_be_seen_the_layers_are_those_of_the_next(
         torch.testing.assert_close(both.layers[name][where], back.layers[name][where], rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.parametrize("tint", [None, ((0.5, 0.9, 0.6), (0.7, 0.6, 0.9))], ids=["clear", "tinted"])
 @pytest.mark.parametrize("blend", ["linear", "srgb"])
-def test_the_layers_recombine_to_the_image(blend: Blend) -> None:
-    frame = Planar(blend=blend)(vitrine(1, 2), CAMERA)
+def test_the_layers_recombine_to_the_image(blend: Blend, tint: tuple[tuple[float, ...], ...] | None) -> None:
+    scene, logarithms = vitrine(1, 2), None if tint is None else torch.tensor(tint, dtype=torch.float64).log()
+    frame = Planar(blend=blend)(replace(scene, planes=replace(scene.planes, log_transmittances=logarithms)), CAMERA)
     decode, _ = curves(blend)
     share = frame.layers["strength"][..., None]
     expected = (1 - share) * decode(frame.layers["transmission"]) + share * decode(frame.layers["reflection"])
