@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 
-from glassplat.render.layers import contributions
+from glassplat.render.layers import contributions, window_means, window_sums
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.panes import Planes
@@ -45,3 +46,15 @@ def test_they_leave_no_graph() -> None:
     means = scene.primary.means.requires_grad_()
     found = contributions(replace(scene, primary=scene.primary.with_tensors({"means": means})), CAMERA)
     assert not found.requires_grad and means.grad is None
+
+
+@pytest.mark.parametrize("reach", [0, 1, 2, 9])
+def test_sums_and_means_over_windows_are_those_of_every_pixel_by_itself(reach: int) -> None:
+    image, region = torch.rand(6, 8, 2, dtype=torch.float64), torch.rand(6, 8) < 0.6
+    for row in range(6):
+        for column in range(8):
+            window = slice(max(row - reach, 0), row + reach + 1), slice(max(column - reach, 0), column + reach + 1)
+            inside = image[window][region[window]]
+            torch.testing.assert_close(window_sums(image, reach)[row, column], image[window].sum(dim=(0, 1)))
+            expected = inside.sum(dim=0) / max(len(inside), 1)
+            torch.testing.assert_close(window_means(image, region, reach)[row, column], expected)
