@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from glassplat.captures.colmap_library import quiet_pycolmap
-from glassplat.cli.console import import_now, say, shell_word
+from glassplat.cli.console import Command, say, shell_word
 from glassplat.cli.progress import WorkProgress
 from glassplat.files.writing import check_capture_folder, real_path
 from glassplat.options import Range, Share
@@ -94,7 +94,7 @@ class Prepare:
 
 
 @dataclass(frozen=True)
-class Annotate:
+class Annotate(Command):
     """Mark the panes of a capture in the browser: corners in a few photographs, and what stands in front of them.
 
     Attributes:
@@ -103,21 +103,13 @@ class Annotate:
         open_browser: open the page at once; not over SSH.
     """
 
+    work = "serving:serve_marking"
+    left = "what was marked is saved in {capture}: repeat the command to go on"
+
     capture: tyro.conf.Positional[Path]
     port: Annotated[int, Range(0, 65535)] = 8765
     open_browser: bool = True
 
-    def ready(self) -> None:
-        """Refuses what is no folder, and imports what reads it."""
+    def check(self) -> None:
+        """Refuses what is no folder."""
         check_capture_folder(self.capture)
-        import_now("glassplat.cli.serving")
-
-    def run(self, console: Console) -> None:
-        """Serves the page until it is closed, or Ctrl-C."""
-        from glassplat.cli.serving import serve_marking
-
-        serve_marking(self, console)
-
-    def left_behind(self) -> str:
-        """Text after an interrupt: the state on disk, and how to go on."""
-        return f"what was marked is saved in {self.capture}: repeat the command to go on"

@@ -29,7 +29,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from shlex import quote
 from types import FrameType
-from typing import Any, Literal, NamedTuple, NoReturn
+from typing import Any, ClassVar, Literal, NamedTuple, NoReturn
 
 from rich.console import Console
 from rich.control import Control, ControlType
@@ -462,6 +462,36 @@ def import_held(module: str) -> Any:
     """The same while a command works: signals are answered after the import, which must not break off."""
     with held_signals():
         return import_now(module)
+
+
+class Command:
+    """Base of the commands whose work is a function `(command, console)` of a module that imports PyTorch.
+
+    Attributes:
+        work: the module in `glassplat.cli`, and the function.
+        left: what an interrupt leaves behind, and how to go on; fields of the command stand in braces.
+    """
+
+    work: ClassVar[str]
+    left: ClassVar[str]
+
+    def check(self) -> None:
+        """Refuses what can be refused before that takes long."""
+        raise NotImplementedError
+
+    def ready(self) -> None:
+        """Refuses what can be refused, and imports what works."""
+        self.check()
+        import_now(f"glassplat.cli.{self.work.partition(':')[0]}")
+
+    def run(self, console: Console) -> None:
+        """Does the work."""
+        module, _, function = self.work.partition(":")
+        getattr(importlib.import_module(f"glassplat.cli.{module}"), function)(self, console)
+
+    def left_behind(self) -> str:
+        """Text after an interrupt: the state on disk, and how to go on."""
+        return self.left.format(**vars(self))
 
 
 @contextmanager

@@ -12,7 +12,8 @@ from rich.table import Table
 
 from glassplat.captures.dataset import Dataset
 from glassplat.cli.console import say
-from glassplat.cli.runs import StoredRun
+from glassplat.cli.progress import WorkProgress
+from glassplat.cli.runs import StoredRun, open_run
 from glassplat.errors import InputError
 from glassplat.evaluate.evaluate import (
     RENDERED_REGIONS,
@@ -36,7 +37,7 @@ from glassplat.training.checkpoint import recorded
 from glassplat.training.messages import Working
 
 if TYPE_CHECKING:
-    from glassplat.cli.scene import Align, PaneSource
+    from glassplat.cli.scene import Align, Evaluate, PaneSource
 
 
 def pane_regions(dataset: Dataset, source: PaneSource) -> PaneRegions:
@@ -73,6 +74,15 @@ def _marked_regions(dataset: Dataset) -> PaneRegions:
         return marked_regions(fitted_planes(dataset, None, PlaneFit(margin=1.0)))
     except PlaneFitError as error:
         raise InputError(f"the masks of {dataset.root} lead to no plane: {error}. Use --panes rendered") from error
+
+
+def evaluate_and_report(command: Evaluate, console: Console) -> None:
+    """Evaluates a run and reports."""
+    stored = open_run(command.run_directory, command.device, command.data)
+    with WorkProgress(console) as progress:
+        results = evaluate_run(stored, command.panes, align=command.align, show=progress.show)
+    print_results(console, results)
+    say(console, f"pictures: {stored.directory.path / 'index.html'}")
 
 
 UNMOVED = "as the capture has them"

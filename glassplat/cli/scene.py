@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
-from rich.console import Console
 
-from glassplat.cli.console import import_now, say
+from glassplat.cli.console import Command
 from glassplat.cli.places import SceneEdits, SplatFile, Split, check_claim, check_file, check_scene, say_scene
 from glassplat.errors import InputError, input_checked
 from glassplat.files.writing import FORGED_SUFFIXES, WRITTEN, check_folder
@@ -27,7 +26,7 @@ Align = Literal["auto", "always", "never"]
 
 
 @dataclass(frozen=True)
-class Evaluate:
+class Evaluate(Command):
     """Measure a run on its test views and write comparison sheets.
 
     Attributes:
@@ -41,38 +40,24 @@ class Evaluate:
             scored; auto does so for runs that refined the cameras of training views.
     """
 
+    work = "evaluation:evaluate_and_report"
+    left = "{run_directory} itself is as it was: repeat the command to evaluate it"
+
     run_directory: tyro.conf.Positional[Path]
     device: DeviceName = "auto"
     data: Path | None = None
     panes: PaneSource = "auto"
     align: Align = "auto"
 
-    def ready(self) -> None:
-        """Refuses what is no run, and imports what renders."""
+    def check(self) -> None:
+        """Refuses what is no run."""
         RunDirectory(self.run_directory).check_begun()
         check_folder(self.run_directory)
         say_scene(self.run_directory)
-        import_now("glassplat.cli.evaluation")
-
-    def run(self, console: Console) -> None:
-        """Evaluates and reports."""
-        from glassplat.cli.evaluation import evaluate_run, print_results
-        from glassplat.cli.progress import WorkProgress
-        from glassplat.cli.runs import open_run
-
-        stored = open_run(self.run_directory, self.device, self.data)
-        with WorkProgress(console) as progress:
-            results = evaluate_run(stored, self.panes, align=self.align, show=progress.show)
-        print_results(console, results)
-        say(console, f"pictures: {stored.directory.path / 'index.html'}")
-
-    def left_behind(self) -> str:
-        """Text after an interrupt: the state on disk, and how to go on."""
-        return f"{self.run_directory} itself is as it was: repeat the command to evaluate it"
 
 
 @dataclass(frozen=True)
-class Render:
+class Render(Command):
     """Render the layers of a run from its cameras, with its panes as they are or edited.
 
     Attributes:
@@ -86,6 +71,9 @@ class Render:
         data: where the capture is now, if it has moved since training.
     """
 
+    work = "writing:write_layers"
+    left = "images already written to {output} are whole: repeat the command for all of them"
+
     run_directory: tyro.conf.Positional[Path]
     output: Path
     layers: tuple[str, ...] = ("rgb",)
@@ -94,26 +82,15 @@ class Render:
     device: DeviceName = "auto"
     data: Path | None = None
 
-    def ready(self) -> None:
-        """Refuses what is no run, and an output that holds something else; imports what renders."""
+    def check(self) -> None:
+        """Refuses what is no run, and an output that holds something else."""
         RunDirectory(self.run_directory).check_begun()
         check_claim(self.output, "render")
         say_scene(self.run_directory)
-        import_now("glassplat.cli.writing")
-
-    def run(self, console: Console) -> None:
-        """Renders."""
-        from glassplat.cli.writing import write_layers
-
-        write_layers(self, console)
-
-    def left_behind(self) -> str:
-        """Text after an interrupt: the state on disk, and how to go on."""
-        return f"images already written to {self.output} are whole: repeat the command for all of them"
 
 
 @dataclass(frozen=True)
-class View:
+class View(Command):
     """Look at a scene in the browser, layer by layer, with its panes as they are or edited.
 
     Attributes:
@@ -127,6 +104,9 @@ class View:
         device: where to render; auto takes an NVIDIA GPU where one can be used.
     """
 
+    work = "serving:serve_viewer"
+    left = "what was saved in the browser stays"
+
     scene: tyro.conf.Positional[Path]
     port: Annotated[int, Range(0, 65535)] = 8080
     host: str = LOCAL
@@ -135,29 +115,18 @@ class View:
     edits: Annotated[SceneEdits, tyro.conf.arg(name="")] = field(default_factory=SceneEdits)
     device: DeviceName = "auto"
 
-    def ready(self) -> None:
-        """Refuses what is no scene, an output that cannot be written, and a port that is taken; imports the viewer."""
+    def check(self) -> None:
+        """Refuses what is no scene, an output that cannot be written, and a port that is taken."""
         check_scene(self.scene)
         self.file.check()
         if self.output is not None:
             check_folder(self.output)
         check_port(self.host, self.port)
         say_scene(self.scene)
-        import_now("glassplat.cli.serving")
-
-    def run(self, console: Console) -> None:
-        """Serves until it is interrupted."""
-        from glassplat.cli.serving import serve_viewer
-
-        serve_viewer(self, console)
-
-    def left_behind(self) -> str:
-        """Text after an interrupt: the state on disk, and how to go on."""
-        return "what was saved in the browser stays"
 
 
 @dataclass(frozen=True)
-class Video:
+class Video(Command):
     """Film a scene along a path: one layer, several side by side, or one wiped over another.
 
     Attributes:
@@ -177,6 +146,9 @@ class Video:
         device: where to render; auto takes an NVIDIA GPU where one can be used.
     """
 
+    work = "writing:film"
+    left = "nothing was written: repeat the command"
+
     scene: tyro.conf.Positional[Path]
     output: Path
     path: Literal["orbit", "interpolate", "keyframes"] = "orbit"
@@ -191,8 +163,8 @@ class Video:
     edits: Annotated[SceneEdits, tyro.conf.arg(name="")] = field(default_factory=SceneEdits)
     device: DeviceName = "auto"
 
-    def ready(self) -> None:
-        """Refuses everything that can be known to be wrong before it takes long, and imports what renders."""
+    def check(self) -> None:
+        """Refuses everything that can be known to be wrong before it takes long."""
         try:
             with input_checked():
                 check_encoder(self.output, self.fps)
@@ -214,17 +186,6 @@ class Video:
         if self.keyframes is not None:
             check_file(self.keyframes)
         say_scene(self.scene)
-        import_now("glassplat.cli.writing")
-
-    def run(self, console: Console) -> None:
-        """Renders the pictures and encodes them."""
-        from glassplat.cli.writing import film
-
-        film(self, console)
-
-    def left_behind(self) -> str:
-        """Text after an interrupt: the state on disk, and how to go on."""
-        return "nothing was written: repeat the command"
 
 
 if TYPE_CHECKING:
@@ -234,7 +195,7 @@ else:
 
 
 @dataclass(frozen=True)
-class Clean:
+class Clean(Command):
     """Take floaters out of a scene, and give it metres; writes another scene.
 
     Attributes:
@@ -246,6 +207,9 @@ class Clean:
         device: where to work; auto takes an NVIDIA GPU where one can be used.
     """
 
+    work = "writing:write_clean"
+    left = "{scene} is as it was; remove {output} and repeat the command"
+
     scene: tyro.conf.Positional[Path]
     output: Path
     rules: Annotated[Cleaning, tyro.conf.arg(name="")] = field(default_factory=Cleaning)
@@ -253,7 +217,7 @@ class Clean:
     file: Annotated[SplatFile, tyro.conf.arg(name="")] = field(default_factory=SplatFile)
     device: DeviceName = "auto"
 
-    def ready(self) -> None:
+    def check(self) -> None:
         """Refuses what is no scene, points that do not differ, and an output that is there."""
         check_scene(self.scene)
         self.file.check()
@@ -263,21 +227,10 @@ class Clean:
         if os.path.lexists(self.output) and any(self.output.iterdir()):
             raise InputError(f"{self.output} is not empty; nothing was written. Choose a new folder for --output")
         say_scene(self.scene)
-        import_now("glassplat.cli.writing")
-
-    def run(self, console: Console) -> None:
-        """Writes the clean scene."""
-        from glassplat.cli.writing import write_clean
-
-        write_clean(self, console)
-
-    def left_behind(self) -> str:
-        """Text after an interrupt: the state on disk, and how to go on."""
-        return f"{self.scene} is as it was; remove {self.output} and repeat the command"
 
 
 @dataclass(frozen=True)
-class Export:
+class Export(Command):
     """Write a scene as others read it: PLY, SPZ, GLB, a web page with live panes, and the panes next to them.
 
     Attributes:
@@ -297,6 +250,9 @@ class Export:
         device: where to render what has to be rendered; auto takes an NVIDIA GPU where one can be used.
     """
 
+    work = "writing:write_files"
+    left = "files already written to {output} are whole: repeat the command for all of them"
+
     scene: tyro.conf.Positional[Path]
     output: Path
     formats: tuple[Format, ...] = ("ply", "spz", "html")
@@ -309,7 +265,7 @@ class Export:
     edits: Annotated[SceneEdits, tyro.conf.arg(name="")] = field(default_factory=SceneEdits)
     device: DeviceName = "auto"
 
-    def ready(self) -> None:
+    def check(self) -> None:
         """Refuses what contradicts itself, what is no scene, and an output that holds something else."""
         if not self.formats:
             raise InputError(f"nothing to write without --formats; expected some of {', '.join(WRITTEN)}")
@@ -321,21 +277,10 @@ class Export:
         self.file.check()
         check_claim(self.output, "export")
         say_scene(self.scene)
-        import_now("glassplat.cli.writing")
-
-    def run(self, console: Console) -> None:
-        """Writes the files."""
-        from glassplat.cli.writing import write_files
-
-        write_files(self, console)
-
-    def left_behind(self) -> str:
-        """Text after an interrupt: the state on disk, and how to go on."""
-        return f"files already written to {self.output} are whole: repeat the command for all of them"
 
 
 @dataclass(frozen=True)
-class Dereflect:
+class Dereflect(Command):
     """Take the reflections out of a planar run's photographs; one PNG per photograph, under its name.
 
     Attributes:
@@ -349,6 +294,9 @@ class Dereflect:
         data: where the capture is now, if it has moved since training.
     """
 
+    work = "writing:write_dereflected"
+    left = "images already written to {output} are whole: repeat the command for all of them"
+
     run_directory: tyro.conf.Positional[Path]
     output: Path
     split: Split = "all"
@@ -357,19 +305,8 @@ class Dereflect:
     device: DeviceName = "auto"
     data: Path | None = None
 
-    def ready(self) -> None:
-        """Refuses what is no run, and an output that holds something else; imports what renders."""
+    def check(self) -> None:
+        """Refuses what is no run, and an output that holds something else."""
         RunDirectory(self.run_directory).check_begun()
         check_claim(self.output, "dereflect")
         say_scene(self.run_directory)
-        import_now("glassplat.cli.writing")
-
-    def run(self, console: Console) -> None:
-        """Writes the images."""
-        from glassplat.cli.writing import write_dereflected
-
-        write_dereflected(self, console)
-
-    def left_behind(self) -> str:
-        """Text after an interrupt: the state on disk, and how to go on."""
-        return f"images already written to {self.output} are whole: repeat the command for all of them"
