@@ -386,11 +386,7 @@ def _gpu() -> str:
 
 
 def check_arguments(arguments: Sequence[str]) -> None:
-    """Refuses empty arguments after a command: as a path, an empty text is the folder that it was started in.
-
-    Raises:
-        InputError: an argument is empty; says which.
-    """
+    """Refuses empty arguments after a command: as a path, an empty text is the folder that it was started in."""
     for before, argument in itertools.pairwise(arguments):
         option, is_joined, value = argument.partition("=")
         if argument == "" or (option.startswith("--") and is_joined and not value):

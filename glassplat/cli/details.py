@@ -34,11 +34,7 @@ MASKS_LOOKED_AT = 16
 
 
 def remaining_parts(files: CaptureFiles) -> Iterator[Finding]:
-    """Parts about a capture that its files alone do not give.
-
-    Raises:
-        InputError: it cannot be used.
-    """
+    """Parts about a capture that its files alone do not give."""
     dataset = dataset_of(files)
     finding = Finding()
     sizes = sorted({f"{v.camera.width}x{v.camera.height}" for v in (*dataset.train, *dataset.test)})
@@ -120,11 +116,7 @@ FAINT = 0.01
 
 
 def splats_part(path: Path) -> Finding:
-    """Part about a file of Gaussians, with the panes next to it, which `load` takes, too.
-
-    Raises:
-        InputError: one of them cannot be read.
-    """
+    """Part about a file of Gaussians, with the panes next to it, which `load` takes, too."""
     beside = path.with_name(PLANES)
     with input_checked():
         gaussians = read_splats(path)
@@ -176,11 +168,7 @@ def trained_part(directory: RunDirectory) -> Finding:
 
 
 def imported_part(directory: RunDirectory) -> Finding:
-    """Part about a scene that lies in a run's directory, and that no photographs can be compared with.
-
-    Raises:
-        InputError: it cannot be read.
-    """
+    """Part about a scene that lies in a run's directory, and that no photographs can be compared with."""
     finding = Finding()
     _describe_scene(directory.latest_scene()[0], finding)
     _suggest_looking(directory.path, finding)
@@ -188,11 +176,7 @@ def imported_part(directory: RunDirectory) -> Finding:
 
 
 def scene_part(path: Path) -> Finding:
-    """Part about the scene in a folder.
-
-    Raises:
-        InputError: it cannot be read.
-    """
+    """Part about the scene in a folder."""
     try:
         scene = read_scene(path)
     except (ValueError, FileNotFoundError) as error:

@@ -41,11 +41,7 @@ if TYPE_CHECKING:
 
 
 def pane_regions(dataset: Dataset, source: PaneSource) -> PaneRegions:
-    """The pixels that show panes, from the source of this name.
-
-    Raises:
-        InputError: the capture has no such source.
-    """
+    """The pixels that show panes, from the source of this name."""
     if source == "auto":
         return _best_regions(dataset)
     if source == "masks":
@@ -103,9 +99,6 @@ def evaluate_run(
         panes: what says where panes are.
         align: whether test cameras are moved first.
         show: is told how far it is.
-
-    Raises:
-        InputError: the capture does not say where its panes are in this way, or a link leads out of the run.
     """
     check_links(stored.directory.path, (*EVALUATED, stored.directory.results.name))
     seconds, regions = train_seconds(stored), pane_regions(stored.dataset, panes)

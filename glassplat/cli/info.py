@@ -116,11 +116,7 @@ def is_photograph(path: Path) -> bool:
 
 
 def photographs_finding(path: Path) -> Iterator[Finding]:
-    """A folder of photographs without poses.
-
-    Raises:
-        InputError: there are none.
-    """
+    """A folder of photographs without poses."""
     below = [one for one in files_below(path) if not is_hidden(one.relative_to(path))]
     found = sorted(one for one in below if is_photograph(one) and one.is_file())
     if not found:
@@ -185,11 +181,7 @@ def preparation_finding(path: Path) -> Iterator[Finding]:
 
 
 def splat_finding(path: Path) -> Iterator[Finding]:
-    """A file of Gaussians.
-
-    Raises:
-        InputError: it cannot be read.
-    """
+    """A file of Gaussians."""
     first = Finding("a splat file", {"bytes": path.stat().st_size})
     if (path.parent / SCENE).is_file():
         first.facts["next to it"] = ", ".join(sorted(one.name for one in path.parent.iterdir() if one != path))
@@ -198,11 +190,7 @@ def splat_finding(path: Path) -> Iterator[Finding]:
 
 
 def run_finding(path: Path) -> Iterator[Finding]:
-    """The directory of a training, or of a scene that was written like one.
-
-    Raises:
-        InputError: its records are damaged.
-    """
+    """The directory of a training, or of a scene that was written like one."""
     directory = RunDirectory(path)
     if directory.imported.is_file():
         yield Finding("a scene without a capture")
@@ -230,21 +218,13 @@ def runs_finding(path: Path) -> Iterator[Finding]:
 
 
 def scene_finding(path: Path) -> Iterator[Finding]:
-    """A folder that a scene was exported to.
-
-    Raises:
-        InputError: it cannot be read.
-    """
+    """A folder that a scene was exported to."""
     yield Finding("an exported scene", {"files": ", ".join(sorted(one.name for one in path.iterdir()))})
     yield import_held(DETAILS).scene_part(path)
 
 
 def export_finding(path: Path) -> Iterator[Finding]:
-    """A folder that `glassplat export` wrote.
-
-    Raises:
-        InputError: its splats cannot be read.
-    """
+    """A folder that `glassplat export` wrote."""
     yield Finding("an exported scene", {"files": ", ".join(sorted(one.name for one in path.iterdir()))})
     yield import_held(DETAILS).splats_part(scene_source(path))
     opened = [f"glassplat view {shell_word(path)}    shows it in the browser"]
@@ -307,12 +287,7 @@ class Info:
 
 
 def finder_of(path: Path) -> Finder:
-    """Function that examines a path.
-
-    Raises:
-        FileNotFoundError: nothing is there.
-        InputError: nothing that is known.
-    """
+    """Function that examines a path."""
     if not os.path.lexists(path):
         raise FileNotFoundError(f"there is nothing at {path}; expected {KINDS}")
     return _finder_of_folder(path) if path.is_dir() else _finder_of_file(path)

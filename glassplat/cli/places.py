@@ -28,12 +28,7 @@ RECORD = "glassplat.json"
 
 
 def claim_folder(folder: Path, command: str, run: Path) -> bool:
-    """Makes a folder for a command's pictures and records whose it is; returns whether pictures in it are replaced.
-
-    Raises:
-        InputError: the folder holds something else, which must not be overwritten.
-        NotADirectoryError: it is a file, or goes through one.
-    """
+    """Makes a folder for a command's pictures and records whose it is; returns whether pictures in it are replaced."""
     found = check_claim(folder, command)
     make_folder(folder)
     write_text(folder / RECORD, json.dumps({"command": command, "run": readable_name(run)}) + "\n")
@@ -41,12 +36,7 @@ def claim_folder(folder: Path, command: str, run: Path) -> bool:
 
 
 def check_claim(folder: Path, command: str) -> bool:
-    """Look whether a command may write into a folder; returns whether it has done so before.
-
-    Raises:
-        InputError, NotADirectoryError: as `claim_folder` does; nothing is written.
-        PermissionError: nothing may be written there.
-    """
+    """Look whether a command may write into a folder; returns whether it has done so before."""
     check_folder(folder)
     found = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
     if found and _recorded_command(folder / RECORD) != command:
@@ -64,9 +54,6 @@ def check_targets(folder: Path, targets: Sequence[Path], photographs: Sequence[P
         folder: what the pictures are written into.
         targets: the files to write, in it, and folders that they go into.
         photographs: what must stay whatever happens.
-
-    Raises:
-        InputError: names the file and where it leads, or what is in its place; nothing has been written.
     """
     inside, kept = real_path(folder), {real_path(path) for path in photographs}
     for target in (folder / RECORD, *targets):
@@ -91,12 +78,7 @@ def _recorded_command(record: Path) -> str | None:
 
 
 def check_scene(path: Path) -> None:
-    """Refuses a folder that neither a run was begun in nor a scene exported to, and a file that cannot be read.
-
-    Raises:
-        FileNotFoundError: nothing is there.
-        InputError: the folder is no run, or the file cannot be read.
-    """
+    """Refuses a folder that neither a run was begun in nor a scene exported to, and a file that cannot be read."""
     path = scene_source(path)
     if path.is_file() or (path.suffix and not path.is_dir()):
         check_file(path)
@@ -109,11 +91,7 @@ def check_scene(path: Path) -> None:
 
 
 def say_scene(path: Path) -> None:
-    """Says what the records of a run tell, or how large a file is: the first that is known of a scene.
-
-    Raises:
-        InputError: the records are damaged.
-    """
+    """Says what the records of a run tell, or how large a file is: the first that is known of a scene."""
     say(message_console(), f"{path}: {_in_words(path)}")
 
 
@@ -129,12 +107,7 @@ def _in_words(path: Path) -> str:
 
 
 def check_file(path: Path) -> None:
-    """Refuses a file that cannot be read.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        InputError: it cannot be read.
-    """
+    """Refuses a file that cannot be read."""
     with input_checked(), reading(path), path.open("rb"):
         pass
 
@@ -187,12 +160,7 @@ class SceneEdits:
     surroundings: Path | None = None
 
     def apply(self, scene: Scene) -> Scene:
-        """The edited scene.
-
-        Raises:
-            InputError: there are no panes, no pane has a label, a value is out of range, edits contradict, or the
-                panorama cannot be read or nothing mirrors it.
-        """
+        """The edited scene."""
         from glassplat.scene.scene import (
             as_mirrors,
             glass_of_pane,
@@ -231,11 +199,7 @@ class SceneEdits:
 
 
 def in_surroundings(scene: Scene, panorama: Path) -> Scene:
-    """The scene with another environment, as finely divided as its own, and without near surroundings before it.
-
-    Raises:
-        InputError: nothing in the scene mirrors its surroundings, or the panorama cannot be read.
-    """
+    """The scene with another environment, as finely divided as its own, and without near surroundings before it."""
     from glassplat.files.sidecars import read_equirect
     from glassplat.render.deferred import environment_from_equirect
     from glassplat.scene.gaussians import Gaussians
@@ -260,11 +224,7 @@ Split = Literal["train", "test", "all"]
 
 
 def chosen_views(dataset: Dataset, split: Split) -> tuple[View, ...]:
-    """The views of a split, by name.
-
-    Raises:
-        InputError: there are none.
-    """
+    """The views of a split, by name."""
     parts = {"train": dataset.train, "test": dataset.test, "all": (*dataset.train, *dataset.test)}
     if not parts[split]:
         raise InputError(f"{dataset.root} has no {split} views; choose another --split")

@@ -86,12 +86,7 @@ def open_run(
 def capture_of(
     directory: RunDirectory, recipe: Any, moved: Path | None = None, downscale: float | None = None
 ) -> Dataset:
-    """The capture of a run, where it was or where it is said to be now; of a scene without one its cameras alone.
-
-    Raises:
-        InputError: it cannot be read.
-        FileNotFoundError: it is no longer where it was.
-    """
+    """The capture of a run, where it was or where it is said to be now; of a scene without one its cameras alone."""
     if directory.imported.is_file() and moved is None:
         return _without_photographs(directory)
     settings = directory.settings()

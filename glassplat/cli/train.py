@@ -70,11 +70,7 @@ class Train(Generic[RecipeKind]):
     view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
 
     def ready(self) -> None:
-        """Refuses what stands in the way, says what the capture's folder holds, and imports what trains.
-
-        Raises:
-            InputError: among others, the run is too short for its stages.
-        """
+        """Refuses what stands in the way, says what the capture's folder holds, and imports what trains."""
         if real_path(self.output) == real_path(self.data):
             raise InputError(f"{self.output} is the capture itself; choose another folder for --output")
         recipe: Any = self.recipe
@@ -133,9 +129,6 @@ def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:
     Returns:
         `Train`, with the recipes of the preset or of the file that the arguments name as defaults and, where they ask
         for help, with the options that help should show; and the arguments for it.
-
-    Raises:
-        InputError: there is no such method; the file is no recipe, or another method's.
     """
     first = arguments[0] if arguments else "-"
     if first not in RECIPES and not first.startswith("-"):
@@ -154,11 +147,7 @@ def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:
 
 
 def read_recipe(path: Path, arguments: Sequence[str]) -> Any:
-    """The recipe in a file, which is of the method that the arguments name.
-
-    Raises:
-        InputError: it is no recipe, or another method's.
-    """
+    """The recipe in a file, which is of the method that the arguments name."""
     with input_checked():
         recipe = recipe_from_json(read_text(path), str(path))
     asked = asked_method(arguments) or recipe.method

@@ -110,11 +110,7 @@ def dereflect_view(command: Dereflect, stored: StoredRun, renderer: Planar, view
 
 
 def planar_renderer(stored: StoredRun) -> Planar:
-    """The renderer of a run that has reflections to take off, that of the photographer among them.
-
-    Raises:
-        InputError: it has none.
-    """
+    """The renderer of a run that has reflections to take off, that of the photographer among them."""
     renderer = stored.renderer
     if isinstance(renderer, Planar) and len(stored.scene.planes):
         return replace(renderer, photographer="present")

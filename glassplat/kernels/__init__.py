@@ -1,4 +1,8 @@
-"""Operations on tensors: most are differentiable, and most have a plain-PyTorch twin of the same name."""
+"""Operations on tensors: most are differentiable, and most have a plain-PyTorch twin of the same name.
+
+All of them raise ValueError where shapes disagree or a value is out of range, and TypeError where tensors are of
+different or unsupported types, or not on one device that has kernels.
+"""
 
 from __future__ import annotations
 

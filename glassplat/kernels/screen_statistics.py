@@ -58,10 +58,6 @@ def add_views(sums: Sums, views: Views) -> None:
     Args:
         sums: the record so far; contiguous float32 or float64.
         views: of the same floating-point type.
-
-    Raises:
-        ValueError: shapes disagree.
-        TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
     cameras, count, _ = views.radii.shape
     expected: dict[str, tuple[Tensor, tuple[int, ...]]] = {

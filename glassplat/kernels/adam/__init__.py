@@ -56,11 +56,6 @@ def adam(updates: Sequence[Update], *, betas: tuple[float, float] = (0.9, 0.999)
         updates: the parameters, all of one floating-point type and on one device, no two of them in the same memory.
         betas: decay of the two running means.
         eps: added to the root of the second moment.
-
-    Raises:
-        ValueError: shapes differ, a rate or decay has not one entry per column, a step is below 1, or a tensor that
-            changes in place is not contiguous.
-        TypeError: floating-point types differ or are not supported, or tensors are on different devices.
     """
     for update in updates:
         _check(update, updates[0].parameter)

@@ -24,12 +24,7 @@ from glassplat.kernels.records import (
 
 
 def check_bins(channels: Tensor, bins: TileBins, cameras: int, count: int, these: str) -> None:
-    """Raises where channels or bins are not of these splats or discs, or where no kernel exists for them.
-
-    Raises:
-        ValueError: shapes disagree.
-        TypeError: channels and bins are on different devices.
-    """
+    """Raises where channels or bins are not of these splats or discs, or where no kernel exists for them."""
     check_device("channels", channels, "bins", bins.pair_splats)
     if channels.ndim != 3 or not 1 <= channels.shape[2] <= MOST_CHANNELS:
         raise ValueError(f"channels has shape {list(channels.shape)}, expected [C, G, D] with D in 1..{MOST_CHANNELS}")
@@ -98,10 +93,6 @@ def composite(
         absgrad: [C, G, 2], any values; they change nothing. Its gradient is the absolute gradient of the centres: |v_x|
             and |v_y|, summed over the pixels, of which the gradient of `means2d` is the sum with signs (AbsGS,
             arXiv 2404.10484, Eq. 8). Pixels that disagree cancel there and show here.
-
-    Raises:
-        TypeError: tensors are not all float32 or all float64, or on different devices.
-        ValueError: shapes disagree, or glass has no marks.
     """
     cameras, count = splats.opacities.shape
     check_bins(channels, bins, cameras, count, "these very splats")
@@ -205,10 +196,6 @@ def composite_discs(
         low_pass: standard deviation in pixels of the falloff around the centre; 0 leaves it out.
         absgrad: [C, G, 2], any values, as in `composite`; its gradient is that of `means2d` with the parts of single
             pixels added up without their signs.
-
-    Raises:
-        TypeError: tensors are not all float32 or all float64, or on different devices.
-        ValueError: shapes disagree, or a number is out of range.
     """
     _check(discs, channels, bins, absgrad)
     if not near >= 0 or not low_pass >= 0:

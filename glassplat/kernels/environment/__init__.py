@@ -44,10 +44,6 @@ def surface_channels(
 
     Returns:
         [N, 7 + E]: colour, unit normal in world axes and strength, as `shade_environment` reads them, then `extra`.
-
-    Raises:
-        ValueError: shapes disagree.
-        TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
     count = quats.shape[0]
     if extra is None:
@@ -114,10 +110,6 @@ def cube_lookup(texels: Tensor, directions: Tensor) -> Tensor:
 
     Returns:
         [..., D] blended texels.
-
-    Raises:
-        ValueError: shapes disagree, or the map has no texels.
-        TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
     check_cube(texels)
     check_tensors({"texels": (texels, tuple(texels.shape)), "directions": (directions, (*directions.shape[:-1], 3))})
@@ -181,10 +173,6 @@ def shade_environment(
         world_from_cam: [3, 3] rotation from camera to world axes; may be mirrored.
         background: what is seen behind the surfaces, sRGB.
         least_strength: pixels that reflect less are left as they are, which saves their lookup.
-
-    Raises:
-        ValueError: shapes disagree, channels are missing, or the environment has no texels.
-        TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
     check_cube(texels)
     height, width = alpha.shape

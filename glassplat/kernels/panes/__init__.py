@@ -35,10 +35,6 @@ def mirrored_views(centers: Tensor, raw_normals: Tensor, cam_from_world: Tensor)
         centers: [K, 3] a point on each plane, world units.
         raw_normals: [K, 3] normals of any length.
         cam_from_world: [4, 4].
-
-    Raises:
-        ValueError: shapes disagree.
-        TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
     expected = {"centers": (centers, (len(centers), 3)), "raw_normals": (raw_normals, (len(centers), 3))}
     check_tensors({**expected, "cam_from_world": (cam_from_world, (4, 4))})
@@ -76,10 +72,6 @@ def panes_in_camera(
         tangents: [K, 3] direction of the first side, made orthogonal to the normal.
         half_sizes: [K, 2] along tangent and bitangent.
         cam_from_world: [4, 4].
-
-    Raises:
-        ValueError: shapes disagree.
-        TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
     rows = {"centers": (centers, 3), "raw_normals": (raw_normals, 3), "tangents": (tangents, 3)}
     expected = {name: (tensor, (len(centers), width)) for name, (tensor, width) in rows.items()}
@@ -112,10 +104,6 @@ def pane_hits(
         beyond: hits with the same panes and camera; the nearest pane after them is sought, and none where they have
             none. Called with its own results, this finds all surfaces along a ray, one after another; panes in one
             plane are one.
-
-    Raises:
-        ValueError: shapes disagree.
-        TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
     count = panes.centers.shape[0]
     expected = {
@@ -180,11 +168,6 @@ def blend_panes(
             surface's; "none" is f = R0 for every angle.
         intensity: multiply by A; False sets C_r = C_raw.
         linear: blend and multiply linear radiance; False does so with sRGB values, as the paper does.
-
-    Raises:
-        ValueError: shapes disagree, or there is no such `fresnel`.
-        TypeError: tensors of different or unsupported floating-point types, a pane that is not int32, or on
-            different devices.
     """
     height, width, count = *mask.shape, normals.shape[0]
     check_tensors(
@@ -238,10 +221,6 @@ def inside_panes(pane: Tensor, strength: Tensor) -> Tensor:
 
     Returns:
         [H, W], of the type of the strength.
-
-    Raises:
-        ValueError: shapes disagree.
-        TypeError: a pane that is not int32, a strength of an unsupported type, or differing devices.
     """
     check_tensors({"strength": (strength, tuple(pane.shape))})
     check_device("pane", pane, "strength", strength)
@@ -269,10 +248,6 @@ def layer_slopes(
 
     Returns:
         Two images [H, W].
-
-    Raises:
-        ValueError: shapes disagree.
-        TypeError: tensors of different or unsupported floating-point types, `where` is not bool, or differing devices.
     """
     height, width = strength.shape
     shape = (height, width, 3)
@@ -300,10 +275,6 @@ def slopes_at(slopes: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> 
 
     Returns:
         [C, N].
-
-    Raises:
-        ValueError: shapes disagree.
-        TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
     size, leading = tuple(slopes.shape), tuple(depths.shape)
     expected = {"slopes": (slopes, size), "near": (near, size), "means2d": (means2d, (*leading, 2))}
@@ -335,10 +306,6 @@ def gradient_conflict(
         hit: [H, W] weight of each pixel, 1 where a pane is.
         strength: [H, W] R, the share of the light that is reflected; None counts all cells alike.
         cell: side of the cells, in pixels.
-
-    Raises:
-        ValueError: shapes disagree, an image is too small, or cells have no pixels.
-        TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
     height, width = hit.shape
     if height < 3 or width < 3:

@@ -33,10 +33,6 @@ def photometric(image: Tensor, target: Tensor) -> Photometric:
     Args:
         image: [H, W, 3] in [0, 1], float32 or float64.
         target: [H, W, 3] uint8, the photograph as it is stored; 255 is 1.
-
-    Raises:
-        TypeError: a type is not supported, or the images are on different devices or one without kernels.
-        ValueError: shapes disagree, or there is no pixel.
     """
     _check_images(image, target)
     return Photometric(*_Photometric.apply(image, target))

@@ -27,10 +27,6 @@ def projection_inputs(
         scales: how many a Gaussian has.
         sh_degree: highest degree of the spherical harmonics to evaluate.
         near: smallest depth.
-
-    Raises:
-        ValueError: a shape, the degree or `near` is out of range.
-        TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
     _check(gaussians, cameras, scales)
     check_sh_degree(sh_degree, gaussians.sh.shape[1])
@@ -116,10 +112,6 @@ def project(
             none at all, which makes all colours zero.
         near: smallest depth (camera z, world units), at least 0.
         total: the same for all projections of these very tensors whose gradients are to be added up.
-
-    Raises:
-        ValueError: a shape, the degree or `near` is out of range.
-        TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
     inputs = projection_inputs(gaussians, cameras, scales=SOLID, sh_degree=sh_degree, near=near)
     total = GradientSum() if total is None else total
@@ -213,10 +205,6 @@ def project_discs(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: i
         sh_degree: highest degree of the spherical harmonics to evaluate; `gaussians.sh` may hold more, or none at all,
             which makes all colours zero.
         near: smallest depth (camera z, world units), at least 0.
-
-    Raises:
-        ValueError: a shape, the degree or `near` is out of range.
-        TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
     inputs = projection_inputs(gaussians, cameras, scales=FLAT, sh_degree=sh_degree, near=near)
     return ProjectedDiscs(*_ProjectDiscs.apply(*inputs, cameras.width, cameras.height, sh_degree, near))

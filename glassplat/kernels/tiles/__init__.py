@@ -26,10 +26,6 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
         width: of the image, pixels.
         height: of the image, pixels.
         active_tiles: [C, rows, columns] bool, tiles to fill and traverse; all if None.
-
-    Raises:
-        ValueError: a shape or the image size is wrong, or there are more pairs than an int32 can count.
-        TypeError: tensors of different or unsupported types, or on different devices.
     """
     _check(splats, width, height, active_tiles)
     plain = Splats(*(tensor.detach().contiguous() for tensor in splats))

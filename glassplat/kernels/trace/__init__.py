@@ -107,10 +107,6 @@ def trace(
         near: smallest distance of a hit, in lengths of the ray's direction, at least 0.
         contributions: [N, 2], any values; they change nothing. Its gradient is what each Gaussian adds to the rays,
             whatever the objective: the sums of its blending weights, and of these times the distances in world units.
-
-    Raises:
-        ValueError: a shape, the degree or `near` is out of range, or the hierarchy is of other Gaussians.
-        TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
     _check(gaussians, rays, bvh, sh_degree, near, contributions)
     shapes, flat = shapes_of(gaussians), gaussians.log_scales.shape[1] == FLAT
