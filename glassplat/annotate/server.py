@@ -93,7 +93,8 @@ class PageHandler(BaseHTTPRequestHandler):
 
     def _answer(self, work: Callable[[], None]) -> None:
         try:
-            self._check_host()
+            self.__dict__.pop("_path", None)  # A connection is used for more than one request.
+            self.server.access.check_host(self._host)
             work()
         except RefusedError as refused:
             self.close_connection = True
@@ -142,10 +143,6 @@ class PageHandler(BaseHTTPRequestHandler):
     @cached_property
     def _path(self) -> Any:
         return urlsplit(self.path)
-
-    def _check_host(self) -> None:
-        self.__dict__.pop("_path", None)  # A connection is used for more than one request.
-        self.server.access.check_host(self._host)
 
     @property
     def _host(self) -> str:

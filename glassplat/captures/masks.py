@@ -547,7 +547,8 @@ def _decide_polarity(values: list[MaskValues], polarity: Polarity) -> tuple[bool
     binary = [v for v in values if v.kind == "binary"]
     if polarity != "auto" or not binary:
         return polarity == "dark" and bool(binary), []
-    frame = float(np.median([_border_share(v.pixels) for v in binary]))
+    borders = (np.concatenate([p[0], p[-1], p[1:-1, 0], p[1:-1, -1]]) for p in (v.pixels for v in binary))
+    frame = float(np.median([(border > 0).mean() for border in borders]))
     has_both = float(np.mean([v.pixels.min() == 0 for v in binary])) > MOSTLY_PANE
     if frame > FRAMED_BY_PANE and has_both:
         return True, [
@@ -559,9 +560,3 @@ def _decide_polarity(values: list[MaskValues], polarity: Polarity) -> tuple[bool
             f"The panes cover {frame:.0%} of the image border; state the polarity if the masks are inverted."
         ]
     return False, []
-
-
-def _border_share(pixels: NDArray[np.uint8]) -> float:
-    """Share of the outermost pixels that are set."""
-    border = np.concatenate([pixels[0], pixels[-1], pixels[1:-1, 0], pixels[1:-1, -1]])
-    return float((border > 0).mean())

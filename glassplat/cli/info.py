@@ -205,11 +205,6 @@ def run_finding(path: Path) -> Iterator[Finding]:
     yield import_held(DETAILS).trained_part(directory)
 
 
-def holds_runs(path: Path) -> bool:
-    """Return whether a folder has runs in it, and no photographs next to them."""
-    return any(path.glob("*/recipe.json")) and not any(is_photograph(one) for one in path.iterdir())
-
-
 def runs_finding(path: Path) -> Iterator[Finding]:
     """A folder with the directories of trainings in it, as `glassplat demo` writes it."""
     runs = sorted(recipe.parent for recipe in path.glob("*/recipe.json"))
@@ -322,4 +317,5 @@ def _capture_or_photographs(path: Path) -> Iterator[Finding]:
     try:
         yield from capture_finding(path)
     except UnknownFormatError:
-        yield from (runs_finding if holds_runs(path) else photographs_finding)(path)
+        holds_runs = any(path.glob("*/recipe.json")) and not any(is_photograph(one) for one in path.iterdir())
+        yield from (runs_finding if holds_runs else photographs_finding)(path)

@@ -114,11 +114,6 @@ class Pace:
         speed = seconds / (plan.work(number) - plan.work(number - steps))
         return speed * (plan.work(plan.iterations) - plan.work(number))
 
-    def time_left(self, number: int) -> str:
-        """The time left, in words."""
-        seconds = self.seconds_left(number)
-        return "time left is not known yet" if seconds is None else f"{in_words(seconds)} left"
-
     def forecast(self, number: int) -> str | None:
         """Sentence on the whole run's time and what would make it shorter: once, as soon as it is known."""
         seconds, steps = self._since_first(number)
@@ -188,7 +183,8 @@ class TrainingProgress:
             standing.loss = _smoothed(standing.loss, message.loss)
             standing.count = sum(count for part, count in message.counts.items() if part != "planes")
             self._pace.step(message.step)
-            standing.left = self._pace.time_left(message.step)
+            seconds = self._pace.seconds_left(message.step)
+            standing.left = "time left is not known yet" if seconds is None else f"{in_words(seconds)} left"
             if forecast := self._pace.forecast(message.step):
                 self._say(forecast)
             self._display.step(standing)

@@ -134,7 +134,9 @@ def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:
     if first not in RECIPES and not first.startswith("-"):
         raise InputError(no_such("method", first, RECIPES, "glassplat train --help"))
     full = FULL_HELP in arguments
-    recipes = [recipe_of(method, asked_preset(arguments)) for method in RECIPES]
+    # One that is none, parsing will refuse.
+    preset: Preset = "paper" if last_value(arguments, "--preset") == "paper" else "glassplat"
+    recipes = [recipe_of(method, preset) for method in RECIPES]
     if (config := last_value(arguments, "--config")) is not None:
         given = read_recipe(Path(config), arguments)
         recipes = [given if recipe.method == given.method else recipe for recipe in recipes]
@@ -160,11 +162,6 @@ def asked_method(arguments: Sequence[str]) -> str | None:
     """The first word that is a method's name, and not a folder's; None if there is none."""
     words = itertools.pairwise(["", *arguments])
     return next((word for before, word in words if word in RECIPES and before not in PATH_OPTIONS), None)
-
-
-def asked_preset(arguments: Sequence[str]) -> Preset:
-    """The preset that the arguments name last; the default one where that is none, which parsing will refuse."""
-    return "paper" if last_value(arguments, "--preset") == "paper" else "glassplat"
 
 
 def last_value(arguments: Sequence[str], option: str) -> str | None:

@@ -299,7 +299,9 @@ def plane_table(
         else:
             entry |= dict.fromkeys(ERRORS) | {f"{name}_reason": missing for name in ERRORS}
         if marked is not None and label in marked.labels:
-            entry |= _drift(entry, marked, marked.labels.index(label), extent)
+            row = marked.labels.index(label)
+            turn, offset = _difference(entry, marked.centers[row].tolist(), marked.normals[row].tolist())
+            entry |= {"normal_drift_deg": turn, "offset_drift": offset / extent}
         table.append(entry)
     return table
 
@@ -316,11 +318,6 @@ def _errors(fitted: dict[str, Any], true: TruePlane, extent: float) -> dict[str,
         "offset_error": offset / extent,
         "base_reflectance_error": abs(fitted["base_reflectance"] - true.base_reflectance),
     }
-
-
-def _drift(fitted: dict[str, Any], marked: Planes, row: int, extent: float) -> dict[str, float]:
-    turn, offset = _difference(fitted, marked.centers[row].tolist(), marked.normals[row].tolist())
-    return {"normal_drift_deg": turn, "offset_drift": offset / extent}
 
 
 def _difference(fitted: dict[str, Any], center: Sequence[float], normal: Sequence[float]) -> tuple[float, float]:

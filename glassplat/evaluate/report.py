@@ -332,9 +332,11 @@ def overview_page(
 ) -> str:
     """The overview as one HTML page; its only references are the pictures, by relative path."""
     title = f"glassplat: {results.get('method', 'evaluation')}"
+    known = {name.replace("_", " "): results[name] for name in SETTINGS if results.get(name) is not None}
+    settings = " · ".join(f"{_escape(name)} <b>{_escape(value)}</b>" for name, value in known.items())
     parts = [
         f"<h1>{_escape(title)}</h1>",
-        f'<p class="settings">{_settings_line(results)}</p>',
+        f'<p class="settings">{settings}</p>',
         _cards(results),
         _missing(results),
         _figure("uses", uses, "photographs without reflections, and panes as mirrors") if uses else "",
@@ -350,11 +352,6 @@ def overview_page(
         f'<!doctype html>\n<html lang="en">\n<head>{head}<style>{STYLE}</style></head>\n'
         f"<body>\n{body}\n<script>{SCRIPT}</script>\n</body>\n</html>\n"
     )
-
-
-def _settings_line(results: Mapping[str, Any]) -> str:
-    known = [(name.replace("_", " "), results[name]) for name in SETTINGS if results.get(name) is not None]
-    return " · ".join(f"{_escape(name)} <b>{_escape(value)}</b>" for name, value in known)
 
 
 def _cards(results: Mapping[str, Any]) -> str:

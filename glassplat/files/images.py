@@ -383,7 +383,7 @@ def _distinct(parts: Mapping[str, Parts]) -> dict[str, Path]:
     # The deepest first, so that no file can stand where one of them needs a folder.
     for name in sorted(parts, key=lambda name: (-len(parts[name]), times[plain[name]] > 1)):
         wanted = _candidates(parts[name], clash=times[plain[name]] > 1)
-        path = next(path for path in wanted if _is_free(path, taken))
+        path = next(path for path in wanted if not {_key(path), f"{_key(path)}/"} & taken)
         taken |= {_key(path), *(f"{_key(folder)}/" for folder in path.parents)}
         paths[name] = Path(path)
     return {name: paths[name] for name in parts}
@@ -426,11 +426,6 @@ def _candidates(parts: Parts, *, clash: bool) -> Iterator[PurePosixPath]:
     whole = PurePosixPath(*parts)
     yield whole.with_name(f"{whole.name}.png")
     yield from (whole.with_name(f"{whole.name}-{number}.png") for number in count(2))
-
-
-def _is_free(path: PurePosixPath, taken: set[str]) -> bool:
-    """Return whether the path is neither a file yet nor a folder of one."""
-    return not {_key(path), f"{_key(path)}/"} & taken
 
 
 def _key(path: PurePosixPath) -> str:

@@ -93,7 +93,11 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         renderer=Splat(recipe.background or BLACK, depth=False),
         losses=(image, *population.terms),
         rates=(_rates_of_splat(recipe) if recipe.search.begin_found else recipe.rates).of("primary", held),
-        actions=(*population.edits, *_regular(recipe, population)),
+        # A scene has to look right before mirrors can be recognised.
+        actions=(
+            *population.edits,
+            *((GrowSh(Every(recipe.intervals.sh)), *population.resets) if recipe.search.begin_found else ()),
+        ),
         post_steps=population.post_steps,
         densify_until=population.densify_until,
     )
@@ -165,11 +169,6 @@ def _rates_of_splat(recipe: DeferredRecipe) -> GaussianRates:
         if recipe.raise_rates_matte
         else recipe.rates
     )
-
-
-def _regular(recipe: DeferredRecipe, population: Population) -> tuple[Action, ...]:
-    """Actions of the bootstrap, as in `splat`: a scene has to look right before mirrors can be recognised."""
-    return (GrowSh(Every(recipe.intervals.sh)), *population.resets) if recipe.search.begin_found else ()
 
 
 def first_reflections(recipe: DeferredRecipe) -> BeginReflections:
@@ -262,7 +261,10 @@ def traced_stages(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHED_I
         return corrections_learnt(recipe, _matte_stages(recipe.distant(), recipe.primitive, seed, iterations))
     known = recipe.distant().stages(seed, iterations)
     if recipe.harmonics_from_start:
-        known = tuple(_with_harmonics(stage, Every(recipe.intervals.sh)) for stage in known)
+        grow = GrowSh(Every(recipe.intervals.sh))
+        known = tuple(
+            replace(stage, actions=(*(a for a in stage.actions if not isinstance(a, GrowSh)), grow)) for stage in known
+        )
     bootstrap, distant, refinement = known
     if recipe.primitive == "disc":
         distant, refinement = _with_renderer(recipe, distant), _with_renderer(recipe, refinement)
@@ -278,12 +280,6 @@ def traced_stages(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHED_I
         setup = replace(setup, environment=replace(setup.environment, texels=0))
     near = replace(_tracing(recipe, distant), setup=setup)
     return bootstrap, near, _tracing(recipe, refinement)
-
-
-def _with_harmonics(stage: Stage, when: Every) -> Stage:
-    """The stage, in which colours begin to turn with the view whether normals spread or not."""
-    kept = tuple(action for action in stage.actions if not isinstance(action, GrowSh))
-    return replace(stage, actions=(*kept, GrowSh(when)))
 
 
 def _with_normal_terms(recipe: TracedRecipe, bootstrap: Stage, reflecting: Stage) -> Stage:

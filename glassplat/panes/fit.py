@@ -287,7 +287,8 @@ def _fault(plane: FramedPlanes, objective: Objective, options: PlaneFit) -> Valu
     try:
         _check_agreement(plane.planes, objective.views, options.least_agreement)
         _check_outlines(plane, objective)
-        _check_certainty(plane, objective)
+        if (degrees := _tilt_degrees(plane, objective)) > VERY_UNSURE:
+            raise _UndecidedError(_left_open(degrees, objective))
     except ValueError as error:
         return error
     return None
@@ -484,12 +485,6 @@ def _check_outlines(found: FramedPlanes, objective: Objective) -> None:
             f"on no plane do the outlines of its masks meet; on the best one {against:.2f} of what is known tells "
             f"against it, expected at most {MOST_CONTRADICTION}"
         )
-
-
-def _check_certainty(found: FramedPlanes, objective: Objective) -> None:
-    degrees = _tilt_degrees(found, objective)
-    if degrees > VERY_UNSURE:
-        raise _UndecidedError(_left_open(degrees, objective))
 
 
 def _tilt_degrees(found: FramedPlanes, objective: Objective) -> float:

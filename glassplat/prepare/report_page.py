@@ -217,11 +217,13 @@ def _page(report: Mapping[str, Any], dataset: Dataset, model: Any, planes: Plane
     points = list(model.points3D.values())
     tracks = np.array([point.track.length() for point in points])
     errors = np.array([point.error for point in points])
+    legend = "cameras blue, in the order of their names joined by a line; points in their colours"
+    legend += "" if planes is None else ", those behind panes magenta; panes yellow"
     body = [
         f"<h1>{html.escape(title)}</h1>",
         f'<div class="cards">{"".join(_cards(report, behind, planes))}</div>',
         *(f'<p class="advice">{html.escape(str(line))}</p>' for line in report["advice"]),
-        f"<section><h2>From above</h2>{plan(views, dataset.points, behind, planes)}<p>{_legend(planes)}</p></section>",
+        f"<section><h2>From above</h2>{plan(views, dataset.points, behind, planes)}<p>{legend}</p></section>",
         f"<section>{_bars('Points by the photographs that show them', tracks, TRACKS)}"
         f"{_bars('Points by how far off they are, in pixels', errors, ERRORS)}</section>",
         "<h2>Photographs</h2>",
@@ -254,11 +256,6 @@ def _cards(report: Mapping[str, Any], behind: NDArray[np.bool_], planes: Planes 
     }
     facts |= {f"camera {number}": camera for number, camera in enumerate(report["cameras"], start=1)}
     return [f"<div><b>{html.escape(str(value))}</b><span>{name}</span></div>" for name, value in facts.items()]
-
-
-def _legend(planes: Planes | None) -> str:
-    seen = "cameras blue, in the order of their names joined by a line; points in their colours"
-    return seen if planes is None else f"{seen}, those behind panes magenta; panes yellow"
 
 
 def _bars(title: str, values: NDArray[Any], edges: Sequence[float]) -> str:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import PointCloud, View, evenly
-from glassplat.render.frame import Frame, Renderer
+from glassplat.render.frame import Renderer
 from glassplat.render.layers import contributions, window_means
 from glassplat.scene.camera import Camera, to_device
 from glassplat.scene.gaussians import Gaussians
@@ -506,7 +506,10 @@ def unexplained_places(
         here = places[rows]
         pixels = nearest_pixels(camera.project(here)[0], camera)
         frame = renderer(scene, camera)
-        looks = (_past_panes(frame) & counted_pixels(view, device))[pixels]
+        looks = counted_pixels(view, device)
+        if (strength := frame.layers.get("strength")) is not None:
+            looks = looks & (strength <= 0)
+        looks = looks[pixels]
         looks &= ~crosses_pane(here, scene.planes, camera.center)
         missing = _missing_pixels(residual(frame, view, scene))[pixels] & looks
         photographed = scene.exposures.undone(to_device(view.photo, device)[pixels].float() / 255, view.name)
@@ -546,9 +549,3 @@ def _missing_pixels(error: Tensor) -> Tensor:
     reach = max(round(WINDOW / 2 * error.shape[1]), 1)
     mean = window_means(error, torch.ones_like(error[..., 0]), reach)
     return mean.abs().mean(dim=-1) > UNEXPLAINED
-
-
-def _past_panes(frame: Frame) -> Tensor:
-    """[H, W] bool: pixels that show no pane."""
-    strength = frame.layers.get("strength")
-    return torch.ones_like(frame.rgb[..., 0], dtype=torch.bool) if strength is None else strength <= 0

@@ -235,15 +235,13 @@ def split(gaussians: Gaussians, index: Tensor, *, generator: torch.Generator) ->
     fresh = torch.arange(source.shape[0], device=index.device) >= count - index.shape[0]
 
     means, log_scales = gaussians.means[source], gaussians.log_scales[source]
-    means[fresh] += _drawn_offsets(gaussians.quats[parents], gaussians.deviations[parents], generator)
+    # Offsets from the centre that are distributed as the Gaussian.
+    deviations = gaussians.deviations[parents]
+    unit = torch.randn(deviations.shape, generator=generator, dtype=deviations.dtype, device=deviations.device)
+    turn = rotation_from_quat(gaussians.quats[parents])
+    means[fresh] += (turn @ (unit * deviations)[..., None]).squeeze(-1)
     log_scales[fresh] -= math.log(SHRINK)
     return Edit(source, fresh, {"means": means, "log_scales": log_scales})
-
-
-def _drawn_offsets(quats: Tensor, deviations: Tensor, generator: torch.Generator) -> Tensor:
-    """[N, 3] one random offset from the centre of each Gaussian, distributed as the Gaussian."""
-    unit = torch.randn(deviations.shape, generator=generator, dtype=deviations.dtype, device=deviations.device)
-    return (rotation_from_quat(quats) @ (unit * deviations)[..., None]).squeeze(-1)
 
 
 @torch.no_grad()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -118,22 +117,24 @@ def composite(
     if absgrad is not None:
         expected["absgrad"] = (absgrad, (cameras, count, 2))
     check_tensors(expected)
-    needing = [tensor for tensor in (*splats[:3], channels, marks, absgrad) if tensor is not None]
-    needs_gradients = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in needing)
-    return Composite(
-        *_Composite.apply(*splats, channels, marks, absgrad, bins, num_primary, deviation, needs_gradients)
-    )
+    needs = needs_gradients(*splats[:3], channels, marks, absgrad)
+    return Composite(*_Composite.apply(*splats, channels, marks, absgrad, bins, num_primary, deviation, needs))
+
+
+def needs_gradients(*tensors: Tensor | None) -> bool:
+    """Return whether a gradient of any of these will be asked for."""
+    return torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors)
 
 
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        *tensors, _, bins, num_primary, deviation, needs_gradients = arguments
+        *tensors, _, bins, num_primary, deviation, needs = arguments
         *fields, channels, marks = (tensor.detach().contiguous() for tensor in tensors)
         splats = Splats(*fields)
         *outputs, saved = kernels_for("composite", channels.device).composite(
             splats, channels, bins,
-            marks=marks, num_primary=num_primary, deviation=deviation, needs_gradients=needs_gradients,
+            marks=marks, num_primary=num_primary, deviation=deviation, needs_gradients=needs,
         )  # fmt: skip
         ctx.save_for_backward(*splats, channels, marks)
         ctx.bins, ctx.num_primary, ctx.deviation, ctx.saved = bins, num_primary, deviation, saved
@@ -200,10 +201,9 @@ def composite_discs(
     _check(discs, channels, bins, absgrad)
     if not near >= 0 or not low_pass >= 0:
         raise ValueError(f"near is {near} and low_pass {low_pass}; expected numbers of at least 0")
-    needing = [tensor for tensor in (*discs[:4], channels, absgrad) if tensor is not None]
-    needs_gradients = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in needing)
+    needs = needs_gradients(*discs[:4], channels, absgrad)
     return BlendedDiscs(
-        *_CompositeDiscs.apply(*discs[:4], channels, absgrad, discs.outlines, bins, near, low_pass, needs_gradients)
+        *_CompositeDiscs.apply(*discs[:4], channels, absgrad, discs.outlines, bins, near, low_pass, needs)
     )
 
 
@@ -224,34 +224,26 @@ def _check(discs: Discs, channels: Tensor, bins: TileBins, absgrad: Tensor | Non
     check_tensors(expected)
 
 
-def _discs(tensors: Sequence[Tensor], outlines: Splats) -> Discs:
-    means2d, maps, opacities, depths = tensors[:4]
-    return Discs(means2d, maps, opacities, depths, outlines)
-
-
 class _CompositeDiscs(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, means2d: Tensor, maps: Tensor, opacities: Tensor, depths: Tensor, channels: Tensor,
-        absgrad: Tensor | None, outlines: Splats, bins: TileBins, near: float, low_pass: float, needs_gradients: bool,
-    ) -> tuple[Tensor, ...]:  # fmt: skip
-        tensors = tuple(tensor.detach().contiguous() for tensor in (means2d, maps, opacities, depths, channels))
-        plain = _discs(tensors, Splats(*(tensor.detach().contiguous() for tensor in outlines)))
-        kernels = kernels_for("composite", channels.device)
-        *outputs, saved = kernels.composite_discs(
-            plain, tensors[4], bins, near=near, low_pass=low_pass, needs_gradients=needs_gradients
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+        *tensors, _, outlines, bins, near, low_pass, needs = arguments
+        *fields, channels = (tensor.detach().contiguous() for tensor in tensors)
+        discs = Discs(*fields, Splats(*(tensor.detach().contiguous() for tensor in outlines)))
+        *outputs, saved = kernels_for("composite", channels.device).composite_discs(
+            discs, channels, bins, near=near, low_pass=low_pass, needs_gradients=needs
         )
-        ctx.save_for_backward(*tensors)
-        ctx.rest = (plain.outlines, bins, saved, near, low_pass)
+        ctx.save_for_backward(*fields, channels)
+        ctx.rest = (discs.outlines, bins, saved, near, low_pass)
         return tuple(outputs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *v_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        channels = ctx.saved_tensors[4]
+        *fields, channels = ctx.saved_tensors
         outlines, bins, saved, near, low_pass = ctx.rest
         found = kernels_for("composite", channels.device).composite_discs_gradients(
-            _discs(ctx.saved_tensors, outlines), channels, bins, saved, [v.contiguous() for v in v_outputs],
+            Discs(*fields, outlines), channels, bins, saved, [v.contiguous() for v in v_outputs],
             near=near, low_pass=low_pass, with_absgrad=ctx.needs_input_grad[5],
         )  # fmt: skip
         return (*found, None, None, None, None, None)

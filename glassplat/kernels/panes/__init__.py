@@ -323,12 +323,11 @@ def gradient_conflict(
 
 class _GradientConflict(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, transmission: Tensor, reflection: Tensor, hit: Tensor, strength: Tensor | None, cell: int
-    ) -> Tensor:
-        images = [None if t is None else t.detach().contiguous() for t in (transmission, reflection, hit, strength)]
+    def forward(ctx: Any, *arguments: Any) -> Tensor:
+        *images, cell = arguments
+        plain = [None if image is None else image.detach().contiguous() for image in images]
         mean: Tensor
-        mean, slopes = kernels_for("panes", hit.device).gradient_conflict(*images, cell)
+        mean, slopes = kernels_for("panes", images[0].device).gradient_conflict(*plain, cell)
         ctx.save_for_backward(slopes)
         return mean
 

@@ -42,6 +42,11 @@ def projection_inputs(
     return (*gaussians, cameras.cam_from_world, cameras.intrinsics, clip_planes, windows)
 
 
+def _degree(gaussians: RawGaussians, sh_degree: int) -> int:
+    """The degree as kernels take it: -1 for no colour."""
+    return sh_degree if gaussians.sh.shape[1] else -1
+
+
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)
 def _whole_images(count: int, width: int, height: int, dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -116,7 +121,7 @@ def project(
     inputs = projection_inputs(gaussians, cameras, scales=SOLID, sh_degree=sh_degree, near=near)
     total = GradientSum() if total is None else total
     *fields, total.token = _Project.apply(
-        *inputs, total.token, total.found, cameras.width, cameras.height, sh_degree, near
+        *inputs, total.token, total.found, cameras.width, cameras.height, _degree(gaussians, sh_degree), near
     )  # fmt: skip
     return Projected(*fields)
 
@@ -125,23 +130,16 @@ class _Project(torch.autograd.Function):
     """The kernels as one node of the autograd graph."""
 
     @staticmethod
-    def forward(
-        ctx: Any, means: Tensor, quats: Tensor, log_scales: Tensor, logit_opacities: Tensor, sh: Tensor,
-        cam_from_world: Tensor, intrinsics: Tensor, clip_planes: Tensor, windows: Tensor,
-        token: Tensor | None, shared: list[Tensor], width: int, height: int, sh_degree: int, near: float,
-    ) -> tuple[Tensor, ...]:  # fmt: skip
-        inputs = (means, quats, log_scales, logit_opacities, sh, cam_from_world, intrinsics, clip_planes, windows)
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+        *inputs, _, ctx.shared, width, height, degree, near = arguments
         tensors = [tensor.detach().contiguous() for tensor in inputs]
-        degree = sh_degree if sh.shape[1] else -1
-        kernels = kernels_for("project", means.device)
-        outputs: tuple[Tensor, ...] = kernels.project(tensors, width, height, degree=degree, near=near)
-        radii = outputs[5]
+        kernels = kernels_for("project", tensors[0].device)
+        *outputs, radii = kernels.project(tensors, width, height, degree=degree, near=near)
         ctx.save_for_backward(*tensors[:7], radii)
         ctx.size_and_degree = (width, height, degree)
-        ctx.shared = shared
         ctx.mark_non_differentiable(radii)
         ctx.set_materialize_grads(False)
-        return *outputs, means.new_empty(0)
+        return *outputs, radii, radii.new_empty(0)
 
     @staticmethod
     @once_differentiable
@@ -207,22 +205,18 @@ def project_discs(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: i
         near: smallest depth (camera z, world units), at least 0.
     """
     inputs = projection_inputs(gaussians, cameras, scales=FLAT, sh_degree=sh_degree, near=near)
-    return ProjectedDiscs(*_ProjectDiscs.apply(*inputs, cameras.width, cameras.height, sh_degree, near))
+    degree = _degree(gaussians, sh_degree)
+    return ProjectedDiscs(*_ProjectDiscs.apply(*inputs, cameras.width, cameras.height, degree, near))
 
 
 class _ProjectDiscs(torch.autograd.Function):
     """The kernels as one node of the autograd graph."""
 
     @staticmethod
-    def forward(
-        ctx: Any, means: Tensor, quats: Tensor, log_scales: Tensor, logit_opacities: Tensor, sh: Tensor,
-        cam_from_world: Tensor, intrinsics: Tensor, clip_planes: Tensor, windows: Tensor,
-        width: int, height: int, sh_degree: int, near: float,
-    ) -> tuple[Tensor, ...]:  # fmt: skip
-        inputs = (means, quats, log_scales, logit_opacities, sh, cam_from_world, intrinsics, clip_planes, windows)
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+        *inputs, width, height, degree, near = arguments
         tensors = [tensor.detach().contiguous() for tensor in inputs]
-        degree = sh_degree if sh.shape[1] else -1
-        kernels = kernels_for("project", means.device)
+        kernels = kernels_for("project", tensors[0].device)
         outputs: tuple[Tensor, ...] = kernels.project_discs(tensors, width, height, degree=degree, near=near)
         ctx.save_for_backward(*tensors[:7], outputs[-1], outputs[1])
         ctx.size_and_degree = (width, height, degree)

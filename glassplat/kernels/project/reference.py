@@ -57,7 +57,8 @@ def _project_all(
     if visible is not None:
         ellipse = _Ellipses(*(_where(visible, entry, torch.ones_like(entry)) for entry in ellipse))
     conics = torch.stack([ellipse.yy, -ellipse.xy, ellipse.xx], dim=-1) / ellipse.determinant[..., None]
-    radii = _half_extents(ellipse, opacities).detach()
+    reach = 2 * torch.log(opacities / ALPHA_MIN).clamp(min=0)
+    radii = torch.sqrt(reach[..., None] * torch.stack([ellipse.xx, ellipse.yy], dim=-1)).detach()
     colors = _colors(gaussians, _outwards(gaussians, linear, offset), sh_degree)
     projected = Projected(means2d, conics, depths, opacities, colors.clamp(min=0), radii)
     if visible is None:
@@ -93,12 +94,6 @@ def rotations(quats: Tensor) -> Tensor:
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ], dim=-1).reshape(-1, 3, 3)  # fmt: skip
-
-
-def _half_extents(ellipse: _Ellipses, opacities: Tensor) -> Tensor:
-    """Half extents [C, N, 2] of the region with alpha >= 1/255; zero where there is none."""
-    reach = 2 * torch.log(opacities / ALPHA_MIN).clamp(min=0)
-    return torch.sqrt(reach[..., None] * torch.stack([ellipse.xx, ellipse.yy], dim=-1))
 
 
 def _outwards(gaussians: RawGaussians, linear: Tensor, offset: Tensor) -> Tensor:

@@ -149,17 +149,14 @@ class _Trace(torch.autograd.Function):
     """The kernels as one node of the autograd graph."""
 
     @staticmethod
-    def forward(
-        ctx: Any, means: Tensor, frames: Tensor, opacities: Tensor, sh: Tensor, origins: Tensor, directions: Tensor,
-        contributions: Tensor | None, bvh: Bvh, flat: bool, degree: int, near: float,
-    ) -> tuple[Tensor, ...]:  # fmt: skip
-        tensors = [tensor.detach().contiguous() for tensor in (means, frames, opacities, sh, origins, directions)]
-        kernels = kernels_for("trace", means.device)
-        outputs: tuple[Tensor, ...] = kernels.trace(
-            tensors[:4], tensors[4:], bvh, flat=flat, degree=degree, near=near, learning=any(ctx.needs_input_grad)
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+        *inputs, _, bvh, flat, degree, near = arguments
+        tensors = [tensor.detach().contiguous() for tensor in inputs]
+        ctx.options = {"flat": flat, "degree": degree, "near": near}
+        outputs: tuple[Tensor, ...] = kernels_for("trace", tensors[0].device).trace(
+            tensors[:4], tensors[4:], bvh, **ctx.options, learning=any(ctx.needs_input_grad)
         )
         ctx.save_for_backward(*tensors, *bvh, *outputs)
-        ctx.options = {"flat": flat, "degree": degree, "near": near}
         ctx.mark_non_differentiable(outputs[3])
         return outputs[:4]
 
