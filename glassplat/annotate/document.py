@@ -110,11 +110,7 @@ def _number_places(places: Mapping[str, Any], numbers: Mapping[str, int]) -> dic
 
 
 def parsed_document(value: Any, where: str) -> tuple[MarkedPane, ...]:
-    """The panes of a document, checked.
-
-    Raises:
-        ValueError: it is no such document, or larger than anybody marks; names `where` it came from.
-    """
+    """The panes of a document, checked."""
     panes = tuple(_pane(entry) for entry in check_fields(value, DOCUMENT, where)["panes"])
     labels = [pane.label for pane in panes]
     if len(set(labels)) != len(labels):
@@ -138,11 +134,7 @@ def _pane(entry: Mapping[str, Any]) -> MarkedPane:
 
 
 def read_document(folder: Path) -> Any:
-    """The document of a capture as JSON; an empty one where nothing was marked yet.
-
-    Raises:
-        ValueError: the file is damaged.
-    """
+    """The document of a capture as JSON; an empty one where nothing was marked yet."""
     path = folder / ANNOTATIONS
     if not path.exists():
         return {"version": 1, "panes": []}

@@ -80,11 +80,7 @@ PaneShape = RectanglePane | PolygonPane
 
 
 def polygon_pane(corners: Array) -> PolygonPane:
-    """The polygon in the plane that lies closest to points [K, 3].
-
-    Raises:
-        ValueError: they lie on a line.
-    """
+    """The polygon in the plane that lies closest to points [K, 3]."""
     center = corners.mean(axis=0)
     _, sizes, axes = np.linalg.svd(corners - center)
     if sizes[1] <= 1e-6 * sizes[0]:

@@ -50,9 +50,6 @@ def grab_outlines(photo: NDArray[np.uint8], outline: Array) -> list[Array]:
 
     Returns:
         [Q, 2] pixels of each piece; the rough outline itself where nothing in it differs from what is around it.
-
-    Raises:
-        InputError: OpenCV is missing, or the outline holds nothing of the photograph.
     """
     cv2 = _opencv()
     low, high = _window(outline, photo.shape[1], photo.shape[0])
@@ -114,10 +111,6 @@ def write_results(root: Path, views: Sequence[View], cameras: Sequence[NumpyCame
     """Writes a mask for every photograph with a mark, and all planes; returns the masks' names.
 
     A mask tells of every pane what of it a photograph shows, also of panes that were not marked in this one.
-
-    Raises:
-        InputError: the folder holds masks that were not made here, or the planes were not, or changed since.
-        OSError: something cannot be written.
     """
     folder = root / PANE_FOLDER
     earlier = earlier_masks(root)
@@ -152,12 +145,7 @@ def _check_planes(root: Path) -> None:
 
 
 def remove_results(root: Path) -> list[str]:
-    """Removes the masks and planes that were made here, and nothing else; returns their names in the capture.
-
-    Raises:
-        InputError: the folder of masks holds some that were not made here.
-        OSError: something cannot be removed.
-    """
+    """Removes the masks and planes that were made here, and nothing else; returns their names in the capture."""
     folder = root / PANE_FOLDER
     masks, digests = [folder / name for name in sorted(earlier_masks(root))], _made_here(folder)[1]
     ours = [*([root / PLANES] if file_digest(root / PLANES) in digests else ()), *masks]
@@ -190,10 +178,6 @@ def capture_to_mark(root: Path) -> Dataset:
     """A capture whose panes are marked here, or nowhere.
 
     Masks that were made here are not read: after an interrupt, or if they show no pane, they would be in the way.
-
-    Raises:
-        FileNotFoundError: no such folder.
-        InputError: it cannot be read, or holds masks of panes that were not made here.
     """
     earlier_masks(root)
     files = read_poses(root)
@@ -208,11 +192,7 @@ def capture_to_mark(root: Path) -> Dataset:
 
 
 def earlier_masks(root: Path) -> set[str]:
-    """Names in their folder of the masks of a capture's panes that were made here before.
-
-    Raises:
-        InputError: there are others.
-    """
+    """Names in their folder of the masks of a capture's panes that were made here before."""
     folder = root / PANE_FOLDER
     if not folder.is_dir():
         return set()

@@ -44,11 +44,7 @@ class AnnotationServer(ThreadingHTTPServer):
     daemon_threads = True
 
     def __init__(self, session: Session, port: int) -> None:
-        """Listens; `port` 0 takes any that is free.
-
-        Raises:
-            InputError: the port is taken, or may not be listened on.
-        """
+        """Listens; `port` 0 takes any that is free."""
         self.session = session
         self.access = Access()
         self.is_finished = False

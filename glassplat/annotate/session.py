@@ -116,9 +116,6 @@ def merge_documents(base: Any, theirs: Any, ours: Any) -> Merged:
         base: the document that both began with.
         theirs: what is saved.
         ours: what was to be saved.
-
-    Raises:
-        ValueError: there are too many panes for both to be kept.
     """
     before, there, here = ({pane["label"]: pane for pane in document["panes"]} for document in (base, theirs, ours))
     kept, renamed = dict(there), dict[int, int]()
@@ -283,12 +280,7 @@ class Session:
             self._versions.popitem(last=False)
 
     def grab(self, asked: Any) -> dict[str, Any]:
-        """The outlines of what stands within a rough outline in a photograph.
-
-        Raises:
-            ValueError: it is no such outline.
-            InputError: OpenCV is missing, or the outline holds nothing of the photograph.
-        """
+        """The outlines of what stands within a rough outline in a photograph."""
         fields = check_fields(asked, GRABBED, "the outline of the page")
         if fields["view"] >= len(self.views) or not 3 <= len(fields["points"]) <= MOST_GRABBED:
             raise ValueError(f"expected 3 to {MOST_GRABBED} points in one of {len(self.views)} views")
@@ -312,9 +304,6 @@ class Session:
         """Writes masks and planes of everything that is marked, here or by another program; says what was written.
 
         Where nothing is marked any more, what was written before is removed.
-
-        Raises:
-            InputError: no pane is known yet, or a folder of masks holds some that were not made here.
         """
         panes = parsed_document(self._current()["document"], "the document")
         solved = [(one.pane, one.fit) for one in map(self.solve, panes) if one.fit is not None]
@@ -446,9 +435,6 @@ def opened_session(root: Path) -> Session:
 
     Args:
         root: folder of the capture.
-
-    Raises:
-        InputError: it cannot be read, nothing may be written in it, or a link leads out of it.
     """
     check_links(root, (ANNOTATIONS, PANE_FOLDER, PLANES))
     dataset = capture_to_mark(root)

@@ -1,4 +1,5 @@
 """The command line.
 
-What the user can mend is an InputError or an OSError of a path, whose message says how; `console.ending` prints it.
+Here, and in `annotate`, `prepare` and `viewer`, what the user can mend is an InputError, a ValueError of a file or an
+OSError of a path, whose message says how; `console.ending` prints it.
 """

@@ -226,12 +226,7 @@ class FeatureDatabase:
 
 @contextmanager
 def check_database(path: Path) -> Iterator[None]:
-    """Says in words what is wrong with a database that COLMAP cannot work with.
-
-    Raises:
-        InputError: it is damaged.
-        OSError: the disk is full.
-    """
+    """Says in words what is wrong with a database that COLMAP cannot work with."""
     try:
         yield
     except InputError:
@@ -395,9 +390,6 @@ def register_photographs(
         options: how.
         count: of the photographs, for the progress.
         listen: is told how far it is.
-
-    Raises:
-        InputError: the database is damaged.
     """
     output = database.with_suffix(".models")
     output.mkdir(exist_ok=True)

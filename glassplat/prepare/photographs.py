@@ -78,12 +78,7 @@ NOT_CARRIED = (
 
 
 def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photograph]:
-    """The photographs below a folder in the order in which they were numbered; every one is decoded once, to check it.
-
-    Raises:
-        InputError: there are too few, some are broken or too small, or they are of a kind that cannot be read; or the
-            folder is a capture, whose masks would be taken for photographs.
-    """
+    """The photographs below a folder in the order in which they were numbered; each is decoded once, to check it."""
     if (folder / "images").is_dir() and any((folder / name).is_dir() for name in CAPTURE_FOLDERS):
         raise InputError(f"{folder} is a capture; expected a folder of photographs, such as {folder / 'images'}")
     paths = _photograph_paths(folder)
@@ -136,11 +131,7 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
 
 
 def file_states(source: Path) -> dict[str, list[int]]:
-    """Size and time of the last change of a video, or of every photograph below a folder, by name.
-
-    Raises:
-        InputError: there are no photographs, or some of a kind that cannot be read.
-    """
+    """Size and time of the last change of a video, or of every photograph below a folder, by name."""
     folder, paths = (source.parent, [source]) if source.is_file() else (source, _photograph_paths(source))
     found = {}
     for path in paths:
@@ -206,11 +197,7 @@ def _names_below(folder: Path, paths: Sequence[Path]) -> str:
 
 
 def read_photograph(photograph: Photograph) -> NDArray[np.uint8]:
-    """[H, W, 3] sRGB, upright, reduced; transparent parts black.
-
-    Raises:
-        InputError: the file has changed since it was looked at, or cannot be read.
-    """
+    """[H, W, 3] sRGB, upright, reduced; transparent parts black."""
     try:
         image = _upright(photograph.path).resize(
             (photograph.width, photograph.height), Image.Resampling.LANCZOS, reducing_gap=3
@@ -234,11 +221,7 @@ def _upright(path: Path) -> Image.Image:
 
 
 def _photograph_paths(folder: Path) -> list[Path]:
-    """Image files below a folder by their numbers: 2.jpg before 10.jpg.
-
-    Raises:
-        InputError: there are none, or some that cannot be read.
-    """
+    """Image files below a folder by their numbers: 2.jpg before 10.jpg."""
     if not folder.is_dir():
         raise InputError(f"no folder or video {folder}; expected a folder of photographs, or a video file")
     below = images.files_below(folder)
@@ -354,9 +337,6 @@ def frames_of(video: Path, folder: Path, most: int, listen: Listener) -> list[Pa
         folder: where to; frames that are there already are kept, so that an interrupted choice goes on.
         most: number of frames wanted; a video that moves little has fewer.
         listen: is told how far it is.
-
-    Raises:
-        InputError: OpenCV is missing, the file is no video, or one in which nothing moves.
     """
     cv2 = _opencv()
     footage = _measure_motion(cv2, video, listen)

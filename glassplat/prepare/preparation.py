@@ -90,11 +90,7 @@ class Workplace:
 
     @contextmanager
     def alone(self) -> Iterator[None]:
-        """Holds the output against other preparations on this machine, where it knows locks.
-
-        Raises:
-            InputError: another one is making this capture.
-        """
+        """Holds the output against other preparations on this machine, where it knows locks."""
         user = os.getuid() if hasattr(os, "getuid") else ""
         name = hashlib.sha256(os.fsencode(self.output)).hexdigest()[:16]
         lock = FileLock(Path(tempfile.gettempdir()) / f"glassplat-prepare-{user}-{name}.lock", blocking=False)
@@ -118,9 +114,6 @@ class Workplace:
             settings: what the work depends on; an interrupted one goes on with the same only.
             resume: go on with what was interrupted.
             force: begin again, and replace a capture that was prepared before.
-
-        Raises:
-            InputError: the output is something else, or what lies there does not fit.
         """
         self._check_output(force)
         known = self._known_settings()
@@ -154,11 +147,7 @@ class Workplace:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _check_unchanged(self, known: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
-        """Refuse to go on with other settings, or with other photographs: their poses and features are kept by number.
-
-        Raises:
-            InputError: names what differs.
-        """
+        """Refuse to go on with other settings or photographs: their poses and features are kept by number."""
         changed = sorted(key for key in {*known, *settings} if known.get(key) != settings.get(key))
         if set(changed) - {PHOTOGRAPHS}:
             raise InputError(
@@ -211,11 +200,7 @@ class Workplace:
             )
 
     def _known_settings(self) -> dict[str, Any] | None:
-        """Those of an interrupted preparation; None where there is none.
-
-        Raises:
-            InputError: the folder is something else.
-        """
+        """Those of an interrupted preparation; None where there is none."""
         if not self.folder.exists() or not any(self.folder.iterdir()):
             return None
         try:
@@ -397,10 +382,6 @@ def prepare(task: Preparation, listen: Listener, *, resume: bool = False, force:
         listen: is told how far it is.
         resume: go on where an earlier call was interrupted.
         force: replace a capture that was prepared before, or begin an interrupted one again.
-
-    Raises:
-        InputError: photographs that cannot be used, or too few of them are registered; the message says what to do.
-        OSError: the capture cannot be written.
     """
     check_places(task)
     quiet_pycolmap()
@@ -438,11 +419,7 @@ def is_video(source: Path) -> bool:
 
 
 def check_places(task: Preparation) -> None:
-    """Refuse an input that is no photographs, and an output among them.
-
-    Raises:
-        InputError: says what to choose instead.
-    """
+    """Refuse an input that is no photographs, and an output among them."""
     source, output = real_path(task.source), real_path(task.output)
     if source.is_file() and not is_video(source):
         known = ", ".join(VIDEO_SUFFIXES)
@@ -458,11 +435,7 @@ def check_places(task: Preparation) -> None:
 
 
 def _photographs(task: Preparation, workplace: Workplace, listen: Listener) -> list[Photograph]:
-    """Those of the folder or the video.
-
-    Raises:
-        InputError: they cannot be used.
-    """
+    """Those of the folder or the video."""
     if not is_video(task.source):
         return photographs_in(task.source, task.max_size, listen)
     frames = workplace.folder / "frames"

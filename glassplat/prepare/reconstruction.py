@@ -103,9 +103,6 @@ def best_solution(
     """Places photographs, with as many attempts as it takes; what lies in `work` from before is used.
 
     More features take many times as long, so they are tried only where less than the share `least` was registered.
-
-    Raises:
-        InputError: the photographs show too little to be recognised.
     """
     best: Solution | None = None
     tried = 0
@@ -165,9 +162,6 @@ def write_capture(solution: Solution, folder: Path, listen: Listener) -> None:
     """Writes `images/` and `sparse/0` of the largest group; the solution's model is changed on the way.
 
     What a wide lens did not see of its undistorted photographs is left out by masks in `ignore/`.
-
-    Raises:
-        InputError: a photograph can no longer be read.
     """
     model = solution.models[0]
     lenses = {key: library.pycolmap.Camera(camera.todict()) for key, camera in model.cameras.items()}

@@ -189,10 +189,6 @@ def write_page(capture: Path, target: Path, planes: Planes | None = None) -> Non
         capture: the folder.
         target: the file to write.
         planes: of panes that are marked in it; points behind them are counted and shown.
-
-    Raises:
-        InputError: the capture cannot be read, or has no report.
-        OSError: it was not prepared here, or the page cannot be written.
     """
     report = _read_report(capture / RECORD)
     dataset = load_dataset(capture)

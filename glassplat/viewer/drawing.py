@@ -193,11 +193,7 @@ def error_drawn(
 def point_along(
     scene: Scene, renderer: Renderer, request: ViewRequest, direction: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """[3] the point that a picture of a request shows in a direction [3], world axes.
-
-    Raises:
-        ValueError: there is nothing.
-    """
+    """[3] the point that a picture of a request shows in a direction [3], world axes."""
     camera = request.camera(MEASURED_ROWS)
     x, y, z = (camera.cam_from_world[:3, :3].double().numpy() @ direction).tolist()
     if z <= 0:

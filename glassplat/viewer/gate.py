@@ -192,11 +192,7 @@ def reply_with(status: HTTPStatus, headers: Mapping[str, str], text: str = "") -
 
 
 def guarded_server(access: Access, *, host: str, port: int, title: str) -> viser.ViserServer:
-    """A server of viser that serves only whom `access` lets in, and hears only what it understands.
-
-    Raises:
-        InputError: viser makes its server in another way than this package knows.
-    """
+    """A server of viser that serves only whom `access` lets in, and hears only what it understands."""
     made: list[str] = []
     with _SERVE, redirect_stdout(io.StringIO()):  # viser prints a table of addresses; the commands say them.
         usual: Any = websockets_server.serve

@@ -27,11 +27,7 @@ FIRST_PORT, MOST_PORTS = 8080, 100
 
 
 def vacant_port(host: str) -> int:
-    """The first port from 8080 on that can be used.
-
-    Raises:
-        InputError: none of a hundred can.
-    """
+    """The first port from 8080 on that can be used."""
     for port in range(FIRST_PORT, FIRST_PORT + MOST_PORTS):
         try:
             check_port(host, port)
@@ -46,9 +42,6 @@ def check_port(host: str, port: int) -> int:
 
     Returns:
         The port; one that is free in place of 0.
-
-    Raises:
-        InputError: nothing can listen there.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family) as probe:

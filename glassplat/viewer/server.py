@@ -242,9 +242,6 @@ class Viewer:
             host: who may look, with the key of the address; 127.0.0.1 is this machine alone.
             port: where the browser finds it; 0 takes any that is free.
             buttons: further ones by what is written on them, and what they do; called from other threads.
-
-        Raises:
-            InputError: viser is not installed or cannot be guarded, or the port cannot be used.
         """
         port = check_port(host, port)
         try:
