@@ -25,9 +25,6 @@ def rigid_pose(matrix: NDArray[np.float64], name: str) -> NDArray[np.float64]:
     Args:
         matrix: [4, 4] or [3, 4] rigid transform as read from a file.
         name: photograph, for the message.
-
-    Raises:
-        InputError: not finite or absurdly far away, not a rotation (scaled, sheared or mirrored), or of another shape.
     """
     if matrix.shape not in ((3, 4), (4, 4)):
         raise InputError(f"the pose of {name} has shape {list(matrix.shape)}; expected a 4x4 or 3x4 matrix")
@@ -158,11 +155,7 @@ class Lens:
         return Lens(self.model, tuple(scaled), width, height)
 
     def as_colmap(self) -> Any:
-        """The `pycolmap.Camera`.
-
-        Raises:
-            InputError: pycolmap is not installed.
-        """
+        """The `pycolmap.Camera`."""
         return library.pycolmap.Camera(
             model=self.model, width=self.width, height=self.height, params=list(self.parameters)
         )
@@ -235,9 +228,6 @@ def make_lens(model: str, parameters: list[float], size: tuple[int, int]) -> Len
         model: COLMAP's name of the camera model.
         parameters: in COLMAP's order.
         size: width and height in pixels.
-
-    Raises:
-        InputError: unknown model, wrong number of parameters, or a size or a parameter that no lens has.
     """
     if model not in PARAMETER_COUNTS:
         raise InputError(f"unknown camera model {model!r}; expected one of {', '.join(PARAMETER_COUNTS)}")
@@ -275,11 +265,7 @@ def _size_text(size: tuple[int, int]) -> str:
 
 
 def lens_for_image(lens: Lens, size: tuple[int, int], name: str) -> Lens:
-    """The lens at the size of the image file; images reduced after calibration rescale it.
-
-    Raises:
-        InputError: the two sizes differ in aspect by more than rounding.
-    """
+    """The lens at the size of the image file; images reduced after calibration rescale it."""
     width, height = size
     if min(size) < LEAST_SIDE:
         raise InputError(
@@ -306,11 +292,7 @@ def _skew(expected: float, side: int, rounding: float) -> float:
 
 @lru_cache(maxsize=1024)
 def pinhole_of(lens: Lens) -> tuple[Pinhole, bool]:
-    """The pinhole camera that replaces a lens, and whether photographs have to be undistorted for it.
-
-    Raises:
-        InputError: the lens cannot be undistorted, such as a panorama, or needs pycolmap for it, which is not there.
-    """
+    """The pinhole camera that replaces a lens, and whether photographs have to be undistorted for it."""
     if _is_pinhole(lens.model, lens.parameters):
         first = PARAMETER_COUNTS[lens.model].focal
         cx, cy = lens.parameters[first : first + 2]
@@ -332,9 +314,6 @@ def blank_share(lens: Lens) -> float:
     """Share of the undistorted image that shows nothing of the photograph; 0 where that is rounding along its border.
 
     Strong barrel lenses have such parts, since COLMAP enlarges no image to more than twice its size.
-
-    Raises:
-        InputError: as `pinhole_of`.
     """
     if not pinhole_of(lens)[1]:
         return 0.0

@@ -36,9 +36,6 @@ class RawPoints:
         """Points from arrays of any real type.
 
         Positions beyond float32 become infinite.
-
-        Raises:
-            InputError: a colour is not in 0..255.
         """
         colors = np.asarray(colors)
         outside = ~((colors >= 0) & (colors <= HIGHEST_COLOR))

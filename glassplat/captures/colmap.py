@@ -63,11 +63,7 @@ def model_suffix(folder: Path) -> str | None:
 
 
 def read_model(folder: Path) -> Model:
-    """Read cameras, images and points, which may be stored in the other way; a folder without points gives none.
-
-    Raises:
-        InputError: a file is cut off or holds what no model holds; names the file.
-    """
+    """Read cameras, images and points, which may be stored in the other way; a folder without points gives none."""
     suffix = model_suffix(folder)
     if suffix is None:
         raise InputError(f"no COLMAP model in {folder}; expected cameras and images as .bin or .txt")
@@ -84,11 +80,7 @@ def read_model(folder: Path) -> Model:
 
 
 def pose_matrix(image: ModelImage) -> NDArray[np.float64]:
-    """[4, 4] `cam_from_world`, OpenCV axes.
-
-    Raises:
-        InputError: the rotation is no unit quaternion.
-    """
+    """[4, 4] `cam_from_world`, OpenCV axes."""
     if not abs(math.hypot(*image.quat) - 1) < UNIT_TOLERANCE:
         quat = list(image.quat)
         raise InputError(f"the rotation of {image.name} is {quat}; expected a finite unit quaternion (w, x, y, z)")
@@ -194,11 +186,7 @@ def _records(stream: Iterator[str]) -> Iterator[str]:
 
 
 def _at_least(count: int, fields: list[str]) -> list[str]:
-    """The fields of a line, if they are so many.
-
-    Raises:
-        ValueError: there are fewer; repeats them.
-    """
+    """The fields of a line, if they are so many."""
     if len(fields) < count:
         line = " ".join(fields)
         raise ValueError(f"the line {short_repr(line)}; expected at least {count} values, separated by spaces")
@@ -249,11 +237,7 @@ LOOKED_FOR = "a COLMAP model (cameras and images as .bin or .txt in sparse/0, sp
 
 
 def load_colmap(root: Path) -> Capture | None:
-    """Read a COLMAP capture with photographs in `images/`; None when there is no model.
-
-    Raises:
-        InputError: the model is damaged, or photographs of it are missing.
-    """
+    """Read a COLMAP capture with photographs in `images/`; None when there is no model."""
     folder = next((root / name for name in MODEL_FOLDERS if model_suffix(root / name)), None)
     if folder is None:
         return None

@@ -22,11 +22,7 @@ MISSING = (
 
 
 def __getattr__(name: str) -> Any:
-    """`pycolmap`, which takes a tenth of a second to import.
-
-    Raises:
-        InputError: it is not installed.
-    """
+    """`pycolmap`, which takes a tenth of a second to import."""
     if name != "pycolmap":
         raise AttributeError(f"module {__name__} has no attribute {name}")
     before = signal.getsignal(signal.SIGTERM)
@@ -43,10 +39,6 @@ def __getattr__(name: str) -> Any:
 
 
 def quiet_pycolmap() -> None:
-    """Keeps pycolmap from printing; what matters of it is said in this package's own words.
-
-    Raises:
-        InputError: it is not installed.
-    """
+    """Keeps pycolmap from printing; what matters of it is said in this package's own words."""
     logging = __getattr__("pycolmap").logging
     logging.minloglevel = int(logging.FATAL)

@@ -50,9 +50,6 @@ def given_planes(root: Path, cameras: Sequence[Camera]) -> Planes | None:
     Args:
         root: the capture's folder.
         cameras: its training cameras, each pane in the sight of one at least.
-
-    Raises:
-        InputError: the file is damaged, or a pane lies where no camera looks, as in another capture's frame.
     """
     path = root / PLANES
     if not lexists(path):
@@ -194,11 +191,7 @@ def check_dataset(dataset: Dataset) -> None:
 
 
 def check_downscale(downscale: float) -> None:
-    """Refuse a factor that reduces nothing.
-
-    Raises:
-        InputError: it is below 1, or no number.
-    """
+    """Refuse a factor that reduces nothing."""
     if not math.isfinite(downscale) or downscale < 1:
         raise InputError(f"downscale is {downscale}; expected a number of at least 1")
 
@@ -206,11 +199,7 @@ def check_downscale(downscale: float) -> None:
 def dataset_of(
     files: CaptureFiles, *, downscale: float = 1.0, background: Rgb = WHITE, memory: float | None = None
 ) -> Dataset:
-    """Make a `Dataset`, as `load_dataset` does, of a capture whose folder was read.
-
-    Raises:
-        InputError: as `load_dataset`.
-    """
+    """Make a `Dataset`, as `load_dataset` does, of a capture whose folder was read."""
     check_downscale(downscale)
     root, capture, shots, masks = files.root, files.capture, files.shots, files.masks
     transparent = _any_transparent(shots)
@@ -380,11 +369,7 @@ def _blank_warnings(shots: Sequence[Shot]) -> list[str]:
 
 
 def _mask_warnings(files: CaptureFiles) -> list[str]:
-    """A warning when masks leave out most of the photographs; decodes only a few of them.
-
-    Raises:
-        InputError: masks leave out every photograph.
-    """
+    """A warning when masks leave out most of the photographs; decodes only a few of them."""
     names = evenly(sorted(files.ignored), FEW_MASKS)
     shares = [left_out_share(files.ignored[name]) for name in names]
     share = sum(shares) / max(len(shares), 1) * len(files.ignored) / len(files.shots)

@@ -60,21 +60,12 @@ def read_capture(root: Path | str, *, mask_polarity: Polarity = "auto") -> Captu
     Args:
         root: the capture's folder.
         mask_polarity: which value of black-and-white masks is the pane.
-
-    Raises:
-        FileNotFoundError: no such folder.
-        InputError: a format that is not known, or a capture that cannot be used; the message says why.
     """
     return with_masks(read_poses(root), mask_polarity)
 
 
 def read_poses(root: Path | str) -> CaptureFiles:
-    """Read a capture as `read_capture` does, but look for no masks.
-
-    Raises:
-        FileNotFoundError: no such folder.
-        InputError: a format that is not known, or a capture that cannot be used; the message says why.
-    """
+    """Read a capture as `read_capture` does, but look for no masks."""
     root = Path(root)
     if not is_encodable(whole := str(root.resolve())):  # Runs record it.
         raise InputError(f"the path {readable_name(whole)} is no UTF-8; rename the folders in it")
@@ -85,11 +76,7 @@ def read_poses(root: Path | str) -> CaptureFiles:
 
 
 def with_masks(files: CaptureFiles, mask_polarity: Polarity = "auto") -> CaptureFiles:
-    """A capture of which the poses were read, with its masks.
-
-    Raises:
-        InputError: they cannot be used; the message says why.
-    """
+    """A capture of which the poses were read, with its masks."""
     photographs = {shot.name: shot.image_path for shot in files.shots}
     capture = files.capture
     found = find_masks(files.root, photographs, mask_polarity, panes=capture.masks, kept=capture.kept)

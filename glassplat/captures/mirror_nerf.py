@@ -57,10 +57,6 @@ def load_mirror_nerf(root: Path) -> Capture | None:
     `MirrorMask_*`; or intrinsics are spelled `fx` or as a matrix, and there is no folder of panes. Test views are
     those of the test file, or else of the validation file; photographs that are in it and in the training file too
     are only tested on.
-
-    Raises:
-        InputError: a broken file, no mask that belongs to a photograph, or poses with which the mirror lies behind
-            the cameras whatever the axes.
     """
     if not _is_mirror_nerf(root):
         return None
@@ -113,11 +109,7 @@ def _plain_frame(root: Path, settings: Settings, frame: Settings) -> dict[str, A
 
 
 def _intrinsics(settings: Settings, name: str) -> tuple[float, float, float, float] | None:
-    """fx, fy, cx, cy as stored, of the frame's matrix or of the file; None where only opening angles are given.
-
-    Raises:
-        InputError: something else than numbers.
-    """
+    """fx, fy, cx, cy as stored, of the frame's matrix or of the file; None where only opening angles are given."""
     try:
         if "intrinsics" in settings:
             matrix = np.array(settings["intrinsics"], dtype=np.float64)
@@ -138,9 +130,6 @@ def _in_pixels_of(path: Path, intrinsics: tuple[float, float, float, float]) -> 
 
     Nothing says at what size it was calibrated. The principal point lies near the middle, so twice its position is
     that size; where this is about the photograph's own, the principal point is taken as measured.
-
-    Raises:
-        InputError: the photograph cannot be read, or is of another shape than what was calibrated.
     """
     with input_checked():
         width, height = image_size(path)

@@ -107,9 +107,6 @@ def lens_from_settings(settings: Mapping[str, Any], image_path: Path, name: str)
     Focal length: `fl_x`, `fl_y`, or the opening angles `camera_angle_x`, `camera_angle_y` in radians. Principal
     point: `cx`, `cy`, or the middle. Size: `w`, `h`, or that of the image. Distortion: `k1` ... `k6`, `p1`, `p2`, as
     in OpenCV; or `distortion_params`, a list of k1 to k4, p1 and p2, which goes before them.
-
-    Raises:
-        InputError: no focal length, a value that is no number, an unknown camera model; names the photograph.
     """
     with input_checked():
         found = check_fields(settings, LENS, f"the lens of {name}")
@@ -187,11 +184,7 @@ FILE: dict[str, Field] = {
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """The contents of one file, with at least one frame; every frame names a photograph and has a matrix.
-
-    Raises:
-        InputError: no valid JSON, no frames, or one that is not as `FRAME` says; names the file.
-    """
+    """The contents of one file, with at least one frame; every frame names a photograph and has a matrix."""
     with input_checked():
         settings = read_json(path)
         frames = settings.get("frames") if isinstance(settings, dict) else None
@@ -299,11 +292,7 @@ LOOKED_FOR = f"{WHOLE}, or {TRAIN} with or without {TEST} or {VAL}"
 
 
 def load_transforms(root: Path) -> Capture | None:
-    """Read `transforms.json`, or the train and test files of a synthetic scene; None when there is neither.
-
-    Raises:
-        InputError: no valid JSON, missing photographs, poses or intrinsics; names the file.
-    """
+    """Read `transforms.json`, or the train and test files of a synthetic scene; None when there is neither."""
     if (root / TRAIN).is_file():
         return _load_split(root)
     if (root / WHOLE).is_file():

@@ -123,11 +123,7 @@ class GltfWriter:
         return len(self._accessors) - 1
 
     def file(self, document: Mapping[str, Any]) -> bytes:
-        """The GLB of a document, to which the arrays are added.
-
-        Raises:
-            ValueError: more than 4 GiB, which the format cannot hold.
-        """
+        """The GLB of a document, to which the arrays are added."""
         whole = {**document, "accessors": self._accessors, "bufferViews": self._views}
         whole["buffers"] = [{"byteLength": self._size}]
         text = json.dumps(whole, separators=(",", ":"), allow_nan=False).encode()
@@ -143,12 +139,7 @@ class GltfReader:
     """A GLB file whose buffer is inside; what it says is checked where it is used."""
 
     def __init__(self, path: Path) -> None:
-        """Reads the file.
-
-        Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: another kind of file, another version, damaged or cut off, or without a document.
-        """
+        """Reads the file."""
         with records.reading(path):
             data = path.read_bytes()
         self.path, self.size = path, len(data)
@@ -185,11 +176,7 @@ class GltfReader:
         return int(self.entry("accessors", index, ACCESSOR)["count"])
 
     def array(self, index: int, width: int) -> NDArray[np.float32]:
-        """The rows [N, width] of an accessor as float32, dequantised where they are normalised.
-
-        Raises:
-            ValueError: another width, or bytes that are not there.
-        """
+        """The rows [N, width] of an accessor as float32, dequantised where they are normalised."""
         accessor = self.entry("accessors", index, ACCESSOR)
         view = self.entry("bufferViews", accessor["bufferView"], VIEW)
         if WIDTHS[accessor["type"]] != width or "sparse" in self.raw("accessors", index):
@@ -265,11 +252,7 @@ class Placement:
 
 
 def placement_of(node: Mapping[str, Any], outer: Placement, where: str) -> Placement:
-    """Placement of a node, within the placement of its parent.
-
-    Raises:
-        ValueError: its transform is skewed, mirrored, of different scales, or of a scale that is none.
-    """
+    """Placement of a node, within the placement of its parent."""
     if node["matrix"] is not None:
         own = _of_matrix(torch.tensor(node["matrix"], dtype=torch.float64).reshape(4, 4).T, where)
     else:
@@ -356,10 +339,6 @@ def write_glb(path: Path | str, gaussians: Gaussians) -> None:
     Args:
         path: the file.
         gaussians: at least one, with colours, in the capture's frame; discs get a third scale of zero.
-
-    Raises:
-        ValueError: no Gaussians, no colours, a channel whose name PLY could not hold or that has capital letters, or a
-            value that is not finite.
     """
     if not len(gaussians) or gaussians.max_sh_degree < 0:
         raise ValueError("no Gaussians, or none with colours, cannot be written as GLB; expected f_dc_0 to f_dc_2")
@@ -379,11 +358,6 @@ def read_glb(path: Path | str) -> Gaussians:
     """Reads the splats of a GLB, all of them as one set, in the frame of a PLY.
 
     Memory stays in proportion to the size of the file, whatever it says.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: another kind of file, no splats in it, damaged, cut off, or stored in a way that is not read: in
-            other files, sparse, compressed, or placed with a skewed or mirrored transform.
     """
     file = GltfReader(Path(path))
     splats_of = functools.cache(functools.partial(_splat_primitives, file))

@@ -54,12 +54,7 @@ def reads_heif() -> bool:
 
 
 def open_image(path: Path) -> Image.Image:
-    """Open and fully decode an image, in the mode it is stored in; orientation tags are not applied.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is no image, is cut off or too large, or its values are no colours; the message names it.
-    """
+    """Open and fully decode an image, in the mode it is stored in; orientation tags are not applied."""
     with checked_image(path) as image:
         image.load()
         _check_shades(image)
@@ -67,23 +62,13 @@ def open_image(path: Path) -> Image.Image:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height as stored; reads the header only, but of a TIFF with an orientation tag everything.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is no image, or too large.
-    """
+    """Width and height as stored; reads the header only, but of a TIFF with an orientation tag everything."""
     with checked_image(path) as image:
         return image.width, image.height
 
 
 def is_transparent(path: Path) -> bool:
-    """Return whether any pixel lets through what is behind it; decodes only images that store transparency.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is no image, is cut off or too large.
-    """
+    """Return whether any pixel lets through what is behind it; decodes only images that store transparency."""
     with checked_image(path) as image:
         return opacity(image) is not None
 
@@ -101,33 +86,19 @@ def read_image(path: Path | str) -> NDArray[np.uint8]:
     """Read an image as uint8 [H, W, C]: one channel for grey, three for colour, four with transparency.
 
     Sixteen-bit grey is scaled to eight bits. Values are as stored: `read_colors` is for photographs.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is no image, is cut off or too large, or its values are no colours.
     """
     with checked_image(Path(path)) as image:
         return _pixels(_in_eight_bits(image))
 
 
 def read_colors(path: Path | str) -> NDArray[np.uint8]:
-    """Read a photograph as `read_image` does, its colours converted to sRGB by the embedded profile.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is no image, is cut off or too large, or its values are no colours.
-    """
+    """Read a photograph as `read_image` does, its colours converted to sRGB by the embedded profile."""
     with checked_image(Path(path)) as image:
         return _pixels(in_srgb(image))
 
 
 def read_image_float(path: Path | str) -> NDArray[np.float32]:
-    """Read an image as float32 [H, W, C] in [0, 1], with the full precision of sixteen-bit grey.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is no image, is cut off or too large, or its values are no colours.
-    """
+    """Read an image as float32 [H, W, C] in [0, 1], with the full precision of sixteen-bit grey."""
     with checked_image(Path(path)) as image:
         if image.mode in SHADES_16:
             return _shades(image)[:, :, None]
@@ -155,12 +126,7 @@ def write_image(path: Path | str, image: Tensor | NDArray[np.generic]) -> None:
 
 @contextmanager
 def checked_image(path: Path) -> Iterator[Image.Image]:
-    """An image whose size is checked; all that Pillow raises about a bad file becomes one error that names it.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is no image, is cut off or too large.
-    """
+    """An image whose size is checked; all that Pillow raises about a bad file becomes one error that names it."""
     try:
         with Image.open(path, formats=(*FORMATS, "HEIF") if reads_heif() else FORMATS) as image:
             if image.width * image.height > MOST_PIXELS:

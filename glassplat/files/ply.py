@@ -34,11 +34,7 @@ def is_compressed(table: PlyTable) -> bool:
 
 @np.errstate(over="ignore", invalid="ignore")  # What is out of range is told by the caller; here it must not warn.
 def read_compressed(path: Path, table: PlyTable) -> Gaussians:
-    """The Gaussians of a compressed PLY, whose `vertex` table has been read.
-
-    Raises:
-        ValueError: it lacks its chunks, or their number or the harmonics do not fit.
-    """
+    """The Gaussians of a compressed PLY, whose `vertex` table has been read."""
     words = [table.columns[name] for name in PACKED]
     if any(word.dtype != np.uint32 for word in words):
         raise ValueError(f"{path} stores packed values in {[str(word.dtype) for word in words]}; expected uint")
@@ -146,9 +142,6 @@ def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
     The properties are x y z, nx ny nz (zero), f_dc_*, f_rest_* (channel-major), opacity (logit),
     scale_* (log; two of a disc), rot_* (`wxyz`), then one property per channel, which other readers skip.
     Gaussians without colour (K = 0) have neither f_dc nor f_rest.
-
-    Raises:
-        ValueError: a channel's name could not be told from a foreign property when read back.
     """
     unreadable = [name for name in gaussians.channels if not is_channel(name)]
     if unreadable:
@@ -171,10 +164,6 @@ def read_gaussians(path: Path | str) -> Gaussians:
     Properties may come in any order, in ascii or either byte order, with SH degree 0 to 3, with red, green and blue
     in place of harmonics, or no colour at all. Properties that begin with `log_`, `logit_` or `raw_` become channels;
     normals and other foreign properties are ignored. `active_sh_degree` is the highest degree stored.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: a damaged or truncated file, a point cloud, a mesh, or a compressed splat file.
     """
     path = Path(path)
     table = read_table(path)

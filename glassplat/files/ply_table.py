@@ -69,10 +69,6 @@ def read_table(path: Path, name: str = "vertex") -> PlyTable:
     Args:
         path: the file.
         name: which element to read; what comes after it in the file is not looked at.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: not a PLY file, a damaged header, no such element, or fewer bytes than announced.
     """
     if not os.path.isfile(path):
         raise FileNotFoundError(f"no PLY file at {path}; check the path")
@@ -127,11 +123,7 @@ def write_table(path: Path, names: list[str], rows: NDArray[np.float32]) -> None
 
 
 def read_header(stream: BinaryIO, path: Path) -> PlyHeader:
-    """Parses the header and leaves the stream at the first byte of the data.
-
-    Raises:
-        ValueError: not a PLY file, or a header that is cut off or malformed.
-    """
+    """Parses the header and leaves the stream at the first byte of the data."""
     if stream.readline(LONGEST_HEADER_LINE).rstrip() != b"ply":
         raise ValueError(
             f"{path} is not a PLY file: expected its first line to be 'ply'. Give a Gaussian-splatting .ply file"

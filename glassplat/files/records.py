@@ -29,13 +29,7 @@ LARGEST_TEXT = 2**28
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turns what opening or reading a file raises into errors that say what is wrong with which file.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: a folder, a pipe or a device, which may never end, a file without permission, a name that is too
-            long, a loop of links, a failing disk.
-    """
+    """Turns what opening or reading a file raises into errors that say what is wrong with which file."""
     try:
         if not stat.S_ISREG(os.stat(path).st_mode):
             raise ValueError(f"{path} cannot be read (it is a folder, a pipe or a device); expected a file")
@@ -48,12 +42,7 @@ def reading(path: Path) -> Iterator[None]:
 
 
 def read_text(path: Path) -> str:
-    """The text of a UTF-8 file, with or without a byte-order mark.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it cannot be read, is no text in UTF-8, or is larger than `LARGEST_TEXT`.
-    """
+    """The text of a UTF-8 file, with or without a byte-order mark."""
     with reading(path):
         size = os.stat(path).st_size
         if size > LARGEST_TEXT:
@@ -73,21 +62,12 @@ MOST_DIGITS = 20
 
 
 def read_json(path: Path) -> Any:
-    """The contents of a JSON file.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it cannot be read or is no valid JSON; the message names the file.
-    """
+    """The contents of a JSON file."""
     return parse_json(read_text(path), str(path))
 
 
 def parse_json(text: str, where: str) -> Any:
-    """The value that a text in JSON stands for; `where` names the text in messages.
-
-    Raises:
-        ValueError: no valid JSON, nested too deeply, or with a key twice in one object.
-    """
+    """The value that a text in JSON stands for; `where` names the text in messages."""
     try:
         value = json.loads(text, parse_int=_whole, object_pairs_hook=_without_repeats)
     except RecursionError as error:
@@ -154,11 +134,7 @@ class Field:
     expected = "any value"
 
     def read(self, value: Any, where: str) -> Any:
-        """The value, in the type that the program uses.
-
-        Raises:
-            ValueError: it is something else; names `where` it was found.
-        """
+        """The value, in the type that the program uses."""
         if not self._fits(value):
             raise ValueError(f"{where} is {short_repr(value)}; expected {self.expected}")
         return self._converted(value, where)
@@ -279,9 +255,6 @@ def check_fields(value: Any, fields: Mapping[str, Field], where: str) -> dict[st
         value: what was read.
         fields: what has to be under each key; one that is `Optional` may be missing.
         where: names the object in messages.
-
-    Raises:
-        ValueError: no object, a key that is missing, or a value of another type or out of range.
     """
     if not isinstance(value, dict):
         raise ValueError(f"{where} is {short_repr(value)}; expected an object with {', '.join(fields)}")

@@ -85,11 +85,7 @@ def write_scene(folder: Path, scene: Scene) -> None:
 
 
 def read_scene(folder: Path) -> Scene:
-    """Reads what `write_scene` wrote.
-
-    Raises:
-        FileNotFoundError, ValueError: a file is missing, truncated or foreign.
-    """
+    """Reads what `write_scene` wrote."""
     header = records.check_fields(records.read_json(folder / SCENE), HEADER, str(folder / SCENE))
     for name in header["files"] or ():
         if not os.path.isfile(folder / name):
@@ -116,11 +112,7 @@ def read_scene(folder: Path) -> Scene:
 
 
 def direction(up: Sequence[float] | None, where: str) -> Direction | None:
-    """The direction that a header holds, if any.
-
-    Raises:
-        ValueError: its length is not one.
-    """
+    """The direction that a header holds, if any."""
     if up is None:
         return None
     x, y, z = up
@@ -156,11 +148,7 @@ def _ellipsoids(gaussians: Gaussians, path: Path) -> Gaussians:
 
 
 def _drawable(path: Path) -> Gaussians:
-    """Gaussians whose colours and channels leave images finite; where one cannot be, it is left out by the renderers.
-
-    Raises:
-        ValueError: a value that training does not come to.
-    """
+    """Gaussians whose colours and channels leave images finite; what cannot be drawn, the renderers leave out."""
     gaussians = read_gaussians(path)
     bounds = {"sh": LARGEST_COLOR} | {
         name: LARGEST_LOG if name.startswith("log_") else LARGEST_COLOR for name in gaussians.channels
@@ -181,10 +169,6 @@ def read_splats(path: Path | str) -> Gaussians:
     """Reads the Gaussians of a file in the frame of a PLY (y down, z forward), as they are stored.
 
     What kind of file it is, its first bytes say; a .splat, .sog or .ksplat its name.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: another kind of file, or one that is damaged or cut off.
     """
     path = Path(path)
     with records.reading(path), path.open("rb") as stream:
@@ -204,11 +188,7 @@ def read_splats(path: Path | str) -> Gaussians:
 
 
 def drawable(gaussians: Gaussians, path: Path | str) -> tuple[Gaussians, int]:
-    """Those that can be drawn, and how many cannot: values that are not finite or absurd, rotations without direction.
-
-    Raises:
-        ValueError: none of them can.
-    """
+    """Those that can be drawn, and how many cannot: values not finite or absurd, rotations without direction."""
     bounds = {
         "means": records.LARGEST_COORDINATE,
         "log_scales": LARGEST_LOG,
@@ -256,12 +236,7 @@ def _read_rows(path: Path) -> Gaussians:
 
 
 def read_forged(path: Path) -> Gaussians:
-    """Reads a .sog (PlayCanvas) or .ksplat (GaussianSplats3D), which are lossy, in the frame of a PLY.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: gaussforge is not installed, or cannot read it.
-    """
+    """Reads a .sog (PlayCanvas) or .ksplat (GaussianSplats3D), which are lossy, in the frame of a PLY."""
     forge, kind = _forge(path), path.suffix.lower()[1:]
     with records.reading(path):
         data = path.read_bytes()

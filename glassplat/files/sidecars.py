@@ -81,10 +81,6 @@ def opened_tensors(path: Path, file_format: str, what: str) -> Iterator[TensorsF
         path: the file.
         file_format: what the header says under `format`.
         what: what the file is, for messages, such as "an environment".
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file cannot be read, is truncated or foreign; also if that shows while it is open.
     """
     try:
         with records.reading(path), _unicode_name(path) as name, _open_table(name) as file:
@@ -173,9 +169,6 @@ def planes_json(planes: Planes) -> str:
     and other programs (world units, the capture's frame), and the raw values raw_normal and
     logit_reflectance that training continues from; where glass may be tinted also transmittance, of red, green and
     blue, and its raw log_transmittance (see `Planes`).
-
-    Raises:
-        ValueError: a plane holds a value that is not finite.
     """
     entries = [_pane_entry(planes, index) for index in range(len(planes))]
     for entry in entries:
@@ -336,12 +329,7 @@ def write_cameras(path: Path | str, cameras: Iterable[tuple[str, Camera]]) -> No
 
 
 def read_cameras(path: Path | str) -> list[tuple[str, Camera]]:
-    """Reads what `write_cameras`, or another program in that layout, wrote: names and float32 cameras, in file order.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: not a list of cameras, a missing or malformed value, or a matrix that is no rotation.
-    """
+    """Reads what `write_cameras`, or another program in that layout, wrote: names and float32 cameras in order."""
     path = Path(path)
     entries = records.read_json(path)
     if not isinstance(entries, list):
@@ -394,11 +382,7 @@ def write_corrections(path: Path, corrections: ByPhotograph) -> None:
 
 
 def read_corrections(path: Path, kind: type[Correction]) -> Correction:
-    """Reads the exposures or poses that `write_corrections` wrote, as float32.
-
-    Raises:
-        FileNotFoundError, ValueError: the file is missing or foreign; says what is wrong.
-    """
+    """Reads the exposures or poses that `write_corrections` wrote, as float32."""
     entries = records.ByName(ENTRIES[kind]).read(records.read_json(path), str(path))
     values = torch.tensor(list(entries.values()), dtype=torch.float32).reshape(len(entries), *kind.SHAPE)
     return kind(values, tuple(entries))
@@ -447,12 +431,7 @@ def write_environment(path: Path | str, environment: Environment) -> None:
 
 
 def read_environment(path: Path | str) -> Environment:
-    """Reads what `write_environment` wrote.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is truncated or foreign, or holds values that are not finite.
-    """
+    """Reads what `write_environment` wrote."""
     path = Path(path)
     if not os.path.isfile(path):
         raise FileNotFoundError(f"no environment at {path}; expected the environment.safetensors of a run")
@@ -479,10 +458,6 @@ def read_equirect(path: Path | str) -> Tensor:
 
     An EXR file holds linear radiance with Rec. 709 primaries, of which what is brighter than white is clipped; a PNG
     file holds sRGB. Where directions lie is said in docs/conventions.md.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: another format, cut off, without colour, not twice as wide as high, or a value that is not finite.
     """
     path = Path(path)
     _check_suffix(path)

@@ -190,9 +190,6 @@ def write_spz(path: Path | str, gaussians: Gaussians, version: int = 3) -> None:
         path: the file.
         gaussians: with colours, in the capture's frame.
         version: 3 or 4.
-
-    Raises:
-        ValueError: another version, no colours, a value that is not finite, or a position that is too far away.
     """
     write_bytes(path, spz_bytes(gaussians, version))
 
@@ -257,10 +254,6 @@ def read_spz(path: Path | str) -> Gaussians:
     """Reads an SPZ file of versions 1 to 4 into the frame of a PLY; harmonics of the fourth degree are left out.
 
     Memory stays in proportion to what the header may claim for a file of this size, whatever is compressed in it.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: another kind of file, a version of the future, damaged, cut off, or a size that cannot be true.
     """
     path = Path(path)
     with reading(path):

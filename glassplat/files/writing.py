@@ -136,11 +136,7 @@ def check_folder(path: Path) -> None:
 
 
 def check_capture_folder(path: Path) -> None:
-    """Look whether a folder is there that may be a capture.
-
-    Raises:
-        FileNotFoundError: there is none.
-    """
+    """Look whether a folder is there that may be a capture."""
     if not os.path.isdir(path):
         raise FileNotFoundError(f"no folder {path}; expected the folder of a capture")
 
