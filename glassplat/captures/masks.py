@@ -21,17 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from glassplat.errors import InputError, first_names, input_checked
-from glassplat.files.images import (
-    IMAGE_SUFFIXES,
-    SHADES_16,
-    files_below,
-    is_hidden,
-    leads_out,
-    opacity,
-    open_image,
-    picture_paths,
-    read_image,
-)
+from glassplat.files import images
 
 HIGHEST_LABEL = 64
 """Grey values up to this one are labels when nothing brighter occurs; no one paints masks for the eye that dark."""
@@ -60,11 +50,7 @@ class MaskValues:
 
 
 def read_mask_values(path: Path) -> MaskValues:
-    """Read one mask file.
-
-    Raises:
-        InputError: the file is no image, or its values are neither labels nor black and white.
-    """
+    """Read one mask file."""
     shades = _read_shades(path)
     counts = np.bincount(shades.ravel(), minlength=WHITE + 1)
     lossy = path.suffix.lower() in LOSSY_SUFFIXES
@@ -76,11 +62,7 @@ def read_mask_values(path: Path) -> MaskValues:
 
 
 def read_mask_at_threshold(path: Path) -> MaskValues:
-    """Read one mask file of a format that is known to split its greys at one half; label images stay as they are.
-
-    Raises:
-        InputError: the file is no image.
-    """
+    """Read one mask file of a format that is known to split its greys at one half; label images stay as they are."""
     shades = _read_shades(path)
     if path.suffix.lower() not in LOSSY_SUFFIXES and not (shades > HIGHEST_LABEL).any():
         return MaskValues("labels" if shades.any() else "empty", shades)
@@ -91,7 +73,7 @@ def read_mask_at_threshold(path: Path) -> MaskValues:
 def _read_shades(path: Path) -> NDArray[np.uint8]:
     """[H, W] grey values, or the indices of a palette that shows labels in colours; transparency goes before them."""
     image = _open_mask(path)
-    if image.mode in SHADES_16:
+    if image.mode in images.SHADES_16:
         return _in_eight_bits(np.array(image), path)
     if image.mode in ("1", "L", "LA"):
         return np.array(image.convert("L"))
@@ -102,8 +84,8 @@ def _read_shades(path: Path) -> NDArray[np.uint8]:
 def _open_mask(path: Path) -> Image.Image:
     """The mask; where any pixel is transparent, white on those that are opaque by half and black elsewhere."""
     with input_checked():
-        image = open_image(path)
-        opaque = None if image.mode in SHADES_16 else opacity(image)
+        image = images.open_image(path)
+        opaque = None if image.mode in images.SHADES_16 else images.opacity(image)
     image.info.pop("transparency", None)  # Pillow warns of some ways to store it.
     return image if opaque is None else Image.fromarray(np.where(opaque < THRESHOLD, 0, WHITE).astype(np.uint8))
 
@@ -210,11 +192,7 @@ class KeepMask:
     path: Path
 
     def labels(self) -> NDArray[np.uint8]:
-        """[H, W] 1 where a pixel is left out.
-
-        Raises:
-            InputError: the file is no image.
-        """
+        """[H, W] 1 where a pixel is left out."""
         shades = _brightness(self.path)
         return (shades < (THRESHOLD if shades.max() > HIGHEST_LABEL else 1)).astype(np.uint8)
 
@@ -230,13 +208,9 @@ class CutOut:
     path: Path
 
     def labels(self) -> NDArray[np.uint8]:
-        """[H, W] 1 where a pixel is left out.
-
-        Raises:
-            InputError: the file is no image.
-        """
+        """[H, W] 1 where a pixel is left out."""
         with input_checked():
-            pixels = read_image(self.path)
+            pixels = images.read_image(self.path)
         return (
             (pixels[:, :, 3] < THRESHOLD).astype(np.uint8) if pixels.shape[2] == 4 else np.zeros_like(pixels[:, :, 0])
         )
@@ -286,9 +260,6 @@ def find_masks(
         polarity: which value of binary masks is the pane.
         panes: masks of panes where the format says which they are, white on the pane; `masks/` is theirs then.
         kept: masks of what is kept where the format names them; they go before those found by name.
-
-    Raises:
-        InputError: masks that match no photograph, two for one photograph, values of no clear meaning, no pane in any.
     """
     ignored = find_ignored(root, photographs)
     if panes is not None:
@@ -328,11 +299,7 @@ def _found_masks(
 
 
 def _why_panes(root: Path, masks: Mapping[str, Path], *, marked: bool) -> str | None:
-    """Sentence on why masks in `masks/` are taken for panes; None where they are not.
-
-    Raises:
-        InputError: they look like labels of panes, and these are in `panes/`.
-    """
+    """Sentence on why masks in `masks/` are taken for panes; None where they are not."""
     highest = next((value for value in map(_highest_value, masks.values()) if value), 0)
     labels = 0 < highest <= HIGHEST_LABEL
     if marked:
@@ -360,7 +327,7 @@ def _highest_value(path: Path) -> int:
 def _brightness(path: Path) -> NDArray[np.uint8]:
     """[H, W] how bright a mask is, or how opaque where it has transparent pixels."""
     image = _open_mask(path)
-    if image.mode in SHADES_16:
+    if image.mode in images.SHADES_16:
         return _in_eight_bits(np.array(image), path)
     return np.array(image.convert("RGB")).max(axis=2)
 
@@ -381,9 +348,6 @@ def find_ignored(root: Path, photographs: Mapping[str, Path]) -> Mapping[str, Pa
     Args:
         root: the capture's folder.
         photographs: path of every photograph by name.
-
-    Raises:
-        InputError: masks that match no photograph, two for one photograph, files that are no masks.
     """
     found = {name: PaneMask(path, inverted=False) for name, path in _match(root / IGNORE_FOLDER, photographs).items()}
     for mask in found.values():
@@ -471,20 +435,16 @@ def _no_photograph(folder: Path, unmatched: list[str], photographs: Mapping[str,
 
 
 def _image_files(folder: Path, hidden: Container[str]) -> Iterator[Path]:
-    """Image files below a folder, without hidden ones but those that are known by name, of hidden photographs.
-
-    Raises:
-        InputError: something else goes by the folder's or by an image's name, such as a link to nowhere.
-    """
+    """Image files below a folder, without hidden ones but those that are known by name, of hidden photographs."""
     if not folder.is_dir():
         if lexists(folder):
             raise InputError(f"{folder} is no folder that can be read; expected one of mask images, or none")
         return
-    for path in sorted(files_below(folder)):
+    for path in sorted(images.files_below(folder)):
         relative = path.relative_to(folder)
-        if is_hidden(relative) and relative.with_suffix("").as_posix() not in hidden:
+        if images.is_hidden(relative) and relative.with_suffix("").as_posix() not in hidden:
             continue
-        if path.suffix.lower() not in IMAGE_SUFFIXES:
+        if path.suffix.lower() not in images.IMAGE_SUFFIXES:
             continue
         if not path.is_file():
             raise InputError(f"mask {path} is no file that can be read; replace or remove it")
@@ -493,7 +453,7 @@ def _image_files(folder: Path, hidden: Container[str]) -> Iterator[Path]:
 
 def _beside(photograph: Path) -> list[Path]:
     """Masks in the photograph's own folder."""
-    candidates = (photograph.with_name(f"{photograph.stem}{MASK_MARK}{suffix}") for suffix in IMAGE_SUFFIXES)
+    candidates = (photograph.with_name(f"{photograph.stem}{MASK_MARK}{suffix}") for suffix in images.IMAGE_SUFFIXES)
     return [path for path in candidates if path.is_file()]
 
 
@@ -502,7 +462,7 @@ def mask_paths(photographs: Iterable[str]) -> dict[str, Path]:
 
     Photographs in the capture choose first, and then those whose names lead out of it.
     """
-    return picture_paths(sorted(photographs, key=lambda name: (leads_out(name), name)))
+    return images.picture_paths(sorted(photographs, key=lambda name: (images.leads_out(name), name)))
 
 
 Owners = Mapping[str, list[str]]

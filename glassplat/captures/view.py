@@ -32,16 +32,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.captures.cameras import (
-    MOST_SKEW,
-    Pinhole,
-    PixelMap,
-    blank_share,
-    lens_for_image,
-    nearest_resize,
-    pinhole_of,
-    rigid_pose,
-)
+from glassplat.captures import cameras
 from glassplat.captures.capture import RawPoints, Shot
 from glassplat.captures.masks import IgnoredMask, PaneMask
 from glassplat.errors import InputError, input_checked
@@ -407,7 +398,7 @@ class PhotoFile:
     """
 
     path: Path
-    pixel_map: PixelMap
+    pixel_map: cameras.PixelMap
     background: Rgb | None
 
     def __call__(self) -> Tensor:
@@ -423,15 +414,15 @@ class MaskFile:
 
     mask: IgnoredMask
     size: tuple[int, int]
-    pixel_map: PixelMap
+    pixel_map: cameras.PixelMap
 
     def __call__(self) -> Tensor:
         """[H, W] uint8 in the pixel grid of the view's camera."""
-        return torch.from_numpy(self.pixel_map.labels(nearest_resize(self.mask.labels(), *self.size)))
+        return torch.from_numpy(self.pixel_map.labels(cameras.nearest_resize(self.mask.labels(), *self.size)))
 
     def ignored(self) -> Tensor:
         """[H, W] uint8, above zero where a pixel of the view shows anything that has a label."""
-        return torch.from_numpy(self.pixel_map.ignored(nearest_resize(self.mask.labels(), *self.size)))
+        return torch.from_numpy(self.pixel_map.ignored(cameras.nearest_resize(self.mask.labels(), *self.size)))
 
 
 @dataclass(frozen=True)
@@ -439,7 +430,7 @@ class IgnoredFiles:
     """Recipe for reading what any of several masks of one view leaves out, and what lies outside its photograph."""
 
     masks: tuple[MaskFile, ...]
-    blank: PixelMap | None = None
+    blank: cameras.PixelMap | None = None
 
     def __call__(self) -> Tensor:
         """[H, W] uint8, above zero where any mask is."""
@@ -490,12 +481,12 @@ def prepare_view(
     """
     with input_checked():
         width, height = image_size(shot.image_path)
-    lens = lens_for_image(shot.lens, (width, height), shot.name)
-    pinhole, distorted = pinhole_of(lens)
+    lens = cameras.lens_for_image(shot.lens, (width, height), shot.name)
+    pinhole, distorted = cameras.pinhole_of(lens)
     small = _reduced_size(pinhole, options.downscale, shot.name)
-    pixel_map = PixelMap(lens if distorted else None, *small)
-    blank = pixel_map if blank_share(lens) else None
-    pose = torch.from_numpy(rigid_pose(shot.cam_from_world, shot.name)).float()
+    pixel_map = cameras.PixelMap(lens if distorted else None, *small)
+    blank = pixel_map if cameras.blank_share(lens) else None
+    pose = torch.from_numpy(cameras.rigid_pose(shot.cam_from_world, shot.name)).float()
     camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, pinhole.width, pinhole.height).resize(*small)
     view = View(
         name=shot.name,
@@ -511,7 +502,7 @@ def prepare_view(
     return PreparedView(view, lens is not shot.lens)
 
 
-def _reduced_size(pinhole: Pinhole, downscale: float, name: str) -> tuple[int, int]:
+def _reduced_size(pinhole: cameras.Pinhole, downscale: float, name: str) -> tuple[int, int]:
     """Width and height of a photograph that is reduced by a factor.
 
     Raises:
@@ -527,7 +518,7 @@ def _reduced_size(pinhole: Pinhole, downscale: float, name: str) -> tuple[int, i
     return width, height
 
 
-def _mask_file(mask: IgnoredMask, size: tuple[int, int], pixel_map: PixelMap) -> MaskFile:
+def _mask_file(mask: IgnoredMask, size: tuple[int, int], pixel_map: cameras.PixelMap) -> MaskFile:
     """The mask at the photograph's size, which it must have up to an integer factor."""
     with input_checked():
         mask_size = image_size(mask.path)
@@ -543,7 +534,7 @@ def _is_multiple(large: tuple[int, int], small: tuple[int, int]) -> bool:
     """Return whether one size is an integer multiple of the other, up to the rounding of the smaller one."""
     factor = round(large[0] / small[0])
     return factor >= 1 and all(
-        abs(a / factor - b) < min(1, MOST_SKEW * b) and (factor > 1 or a == b)
+        abs(a / factor - b) < min(1, cameras.MOST_SKEW * b) and (factor > 1 or a == b)
         for a, b in zip(large, small, strict=True)
     )
 

@@ -15,17 +15,7 @@ from glassplat.cli.console import say
 from glassplat.cli.progress import WorkProgress
 from glassplat.cli.runs import StoredRun, open_run
 from glassplat.errors import InputError
-from glassplat.evaluate.evaluate import (
-    RENDERED_REGIONS,
-    SCENE_COLORS,
-    TRUE_REGIONS,
-    EvaluatedView,
-    Evaluation,
-    PaneRegions,
-    evaluate,
-    marked_regions,
-    with_aligned_test_views,
-)
+from glassplat.evaluate import evaluate as scoring
 from glassplat.evaluate.metrics import PLANE_COLUMNS, format_value, missing_reasons, shown_metrics
 from glassplat.evaluate.report import Report
 from glassplat.files.writing import check_links, write_text
@@ -40,7 +30,7 @@ if TYPE_CHECKING:
     from glassplat.cli.scene import Align, Evaluate, PaneSource
 
 
-def pane_regions(dataset: Dataset, source: PaneSource) -> PaneRegions:
+def pane_regions(dataset: Dataset, source: PaneSource) -> scoring.PaneRegions:
     """The pixels that show panes, from the source of this name."""
     if source == "auto":
         return _best_regions(dataset)
@@ -48,26 +38,26 @@ def pane_regions(dataset: Dataset, source: PaneSource) -> PaneRegions:
         return _marked_regions(dataset)
     if source == "truth" and dataset.truth is None:
         raise InputError(f"{dataset.root} has no folder gt/ that says where its panes are; use --panes masks")
-    return TRUE_REGIONS if source == "truth" else RENDERED_REGIONS
+    return scoring.TRUE_REGIONS if source == "truth" else scoring.RENDERED_REGIONS
 
 
-def _best_regions(dataset: Dataset) -> PaneRegions:
+def _best_regions(dataset: Dataset) -> scoring.PaneRegions:
     """Those that say most surely where the panes are."""
     if dataset.truth is not None:
-        return TRUE_REGIONS
+        return scoring.TRUE_REGIONS
     try:
         return _marked_regions(dataset)
     except InputError:
-        return RENDERED_REGIONS
+        return scoring.RENDERED_REGIONS
 
 
-def _marked_regions(dataset: Dataset) -> PaneRegions:
+def _marked_regions(dataset: Dataset) -> scoring.PaneRegions:
     """Those of the masks, with planes fitted as any method would begin, so that all are measured alike."""
     if not dataset.pane_labels and dataset.planes is None:
         raise InputError(f"{dataset.root} has no masks that name a pane; use --panes rendered, or add masks")
     try:
         # The rectangle's margin is for training, which must not cut into a pane.
-        return marked_regions(fitted_planes(dataset, None, PlaneFit(margin=1.0)))
+        return scoring.marked_regions(fitted_planes(dataset, None, PlaneFit(margin=1.0)))
     except PlaneFitError as error:
         raise InputError(f"the masks of {dataset.root} lead to no plane: {error}. Use --panes rendered") from error
 
@@ -109,18 +99,20 @@ def evaluate_run(
         def listen(done: int, total: int) -> None:
             show(Working("aligning the cameras of test views", done, total))
 
-        stored = stored._replace(dataset=with_aligned_test_views(stored.scene, photographed, stored.dataset, listen))
+        stored = stored._replace(
+            dataset=scoring.with_aligned_test_views(stored.scene, photographed, stored.dataset, listen)
+        )
     settings, path = stored.directory.settings(), stored.directory.path
     blend = stored.renderer.blend if isinstance(stored.renderer, Planar) else None
     report = Report(path, stored.dataset, blend)
     views = count(1)
 
-    def add(view: EvaluatedView) -> None:
+    def add(view: scoring.EvaluatedView) -> None:
         report.add(view)
         show(Working(RENDERING, next(views), len(stored.dataset.test)))
 
     show(Working(RENDERING, 0, len(stored.dataset.test)))
-    evaluation: Evaluation = evaluate(
+    evaluation: scoring.Evaluation = scoring.evaluate(
         stored.scene, with_photographer(stored.renderer, "beside"), stored.dataset, regions=regions, listen=add
     )
     results = {
@@ -193,7 +185,10 @@ def notes(*results: dict) -> list[str]:
     changed = [
         f"{head}{name} of test views: {result[key]}"
         for head, result in zip(heads, results, strict=True)
-        for name, key, usual in (("cameras", "test_cameras", UNMOVED), ("exposures", "test_exposures", SCENE_COLORS))
+        for name, key, usual in (
+            ("cameras", "test_cameras", UNMOVED),
+            ("exposures", "test_exposures", scoring.SCENE_COLORS),
+        )
         if result.get(key, usual) != usual
     ]
     return changed + [

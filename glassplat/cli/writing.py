@@ -28,18 +28,7 @@ from glassplat.files.records import readable_name
 from glassplat.files.sidecars import read_cameras, write_cameras
 from glassplat.files.writing import SPLAT_WRITERS, atomic_write, real_path, scene_source, write_splats
 from glassplat.methods.splat_recipe import SplatRecipe
-from glassplat.model.model import (
-    CAMERAS,
-    ENVIRONMENT,
-    EXPORTED,
-    GLASS,
-    PANORAMA,
-    PLANES,
-    Model,
-    left_out,
-    save_page,
-    write_beside,
-)
+from glassplat.model import model as models
 from glassplat.publish.camera_paths import fit_to_width, interpolate_cameras, keyframes_of
 from glassplat.publish.film import check_size, side_by_side, wipe_pictures, write_film
 from glassplat.publish.web_page import MOST_GAUSSIANS, PREVIEW, Sharing, check_panes, fits, write_preview
@@ -149,7 +138,7 @@ def film(command: Video, console: Console) -> None:
     say(console, f"{len(cameras)} pictures, {command.output.stat().st_size / 1e6:.2f} MB -> {command.output}")
 
 
-def _cameras(command: Video, model: Model) -> list[Camera]:
+def _cameras(command: Video, model: models.Model) -> list[Camera]:
     frames = max(2, round(command.seconds * command.fps))
     with input_checked():
         if command.keyframes is not None:
@@ -163,7 +152,7 @@ def _cameras(command: Video, model: Model) -> list[Camera]:
     return [fit_to_width(camera, command.width + command.width % 2) for camera in cameras]
 
 
-def _pictures(command: Video, model: Model, cameras: Sequence[Camera]) -> Iterator[NDArray[np.uint8]]:
+def _pictures(command: Video, model: models.Model, cameras: Sequence[Camera]) -> Iterator[NDArray[np.uint8]]:
     """One picture per camera; rendered when it is asked for."""
     renderer = model.renderer.with_layers(command.layers)
     for index, camera in enumerate(cameras):
@@ -226,21 +215,21 @@ def write_files(command: Export, console: Console) -> None:
     if "html" in command.formats:
         with input_checked():
             check_panes(model.scene)
-    splats = {kind: command.output / f"{EXPORTED}.{kind}" for kind in SPLAT_WRITERS}
+    splats = {kind: command.output / f"{models.EXPORTED}.{kind}" for kind in SPLAT_WRITERS}
     beside = [command.output / name for name in BESIDE_SPLATS]
     check_targets(command.output, [*beside, *splats.values()], [])
     is_again = claim_folder(command.output, "export", command.scene)
     if is_again:
         say(console, f"replacing the files of an earlier run of this command in {command.output}")
-    written = [*_write_beside(command, model.scene, console), command.output / CAMERAS]
-    write_cameras(command.output / CAMERAS, model.cameras.items())
+    written = [*_write_beside(command, model.scene, console), command.output / models.CAMERAS]
+    write_cameras(command.output / models.CAMERAS, model.cameras.items())
     for kind in (kind for kind in splats if kind in command.formats):
         options = {"version": command.spz_version} if kind == "spz" else {}
         with input_checked():
             write_splats(kind, splats[kind], model.scene.primary, **options)
         written.append(splats[kind])
         say(console, f"{splats[kind].stat().st_size / 1e6:.2f} MB -> {splats[kind]}")
-        if lost := left_out(model, kind):
+        if lost := models.left_out(model, kind):
             held = f"; {command.scene} holds everything" if command.edits == SceneEdits() else ""
             warn(console, f"{splats[kind].name} leaves out {', '.join(lost)}{held}")
     if "html" in command.formats:
@@ -249,7 +238,15 @@ def write_files(command: Export, console: Console) -> None:
         _remove_earlier(command, [*beside, *splats.values()], written, console)
 
 
-BESIDE_SPLATS = ("index.html", PREVIEW, GLASS, PLANES, ENVIRONMENT, PANORAMA, CAMERAS)
+BESIDE_SPLATS = (
+    "index.html",
+    PREVIEW,
+    models.GLASS,
+    models.PLANES,
+    models.ENVIRONMENT,
+    models.PANORAMA,
+    models.CAMERAS,
+)
 """What `export` may write next to `scene.*`."""
 
 
@@ -269,7 +266,7 @@ def _remove_earlier(command: Export, targets: Sequence[Path], written: Sequence[
         say(console, f"removed {first_names([path.name for path in earlier], len(earlier))} of the earlier run")
 
 
-def _chosen(command: Export, model: Model) -> Model:
+def _chosen(command: Export, model: models.Model) -> models.Model:
     """The model; or the place in its own colours, without anything that reflects, as plain Gaussians."""
     if command.layer == "all":
         return model
@@ -278,7 +275,7 @@ def _chosen(command: Export, model: Model) -> Model:
     return replace(model, scene=Scene(primary, model.scene.extent), recipe=recipe)
 
 
-def _write_page(command: Export, model: Model, console: Console) -> list[Path]:
+def _write_page(command: Export, model: models.Model, console: Console) -> list[Path]:
     """The page and its preview, where it shows the scene and has an address; returns what was written."""
     path = command.output / "index.html"
     if not fits(model.scene):
@@ -286,7 +283,7 @@ def _write_page(command: Export, model: Model, console: Console) -> list[Path]:
             console, f"a page holds {MOST_GAUSSIANS:,} Gaussians: this one shows those that cover most of a photograph"
         )
     title, credit = readable_name(command.title or model.name), command.credit and readable_name(command.credit)
-    save_page(model, path, title, sharing=Sharing(credit, command.url))
+    models.save_page(model, path, title, sharing=Sharing(credit, command.url))
     written = [path]
     if command.url is not None:
         write_preview(command.output / PREVIEW, model.scene, model.renderer, tuple(model.cameras.items()))
@@ -297,9 +294,10 @@ def _write_page(command: Export, model: Model, console: Console) -> list[Path]:
 
 def _write_beside(command: Export, scene: Scene, console: Console) -> list[Path]:
     """Planes, glass and environment, where there are any; returns what was written."""
-    written = write_beside(command.output, scene)
+    written = models.write_beside(command.output, scene)
     if len(scene.planes):
-        say(console, f"{count_noun(len(scene.planes), 'pane')} -> {command.output / PLANES}, their shape -> {GLASS}")
+        panes = count_noun(len(scene.planes), "pane")
+        say(console, f"{panes} -> {command.output / models.PLANES}, their shape -> {models.GLASS}")
     if not scene.environment.is_empty:
-        say(console, f"what it mirrors from afar -> {command.output / ENVIRONMENT}, {PANORAMA}")
+        say(console, f"what it mirrors from afar -> {command.output / models.ENVIRONMENT}, {models.PANORAMA}")
     return written

@@ -12,14 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from glassplat.captures.dataset import Dataset
-from glassplat.methods.mirrors import (
-    DensifyWhilePropagating,
-    GrowShAfterPropagation,
-    Propagate,
-    RefineEnvironment,
-    ResetRaised,
-    found_nothing,
-)
+from glassplat.methods import mirrors
 from glassplat.methods.splat import image_term, population_of
 from glassplat.methods.splat_recipe import Primitive, SplatRecipe
 from glassplat.methods.surroundings import AddEnvironment, AddSurroundings, BeginReflections, StayMatte
@@ -29,17 +22,10 @@ from glassplat.render.splat import Splat
 from glassplat.render.traced import Traced, mirrored_contributions
 from glassplat.scene import logit
 from glassplat.scene.scene import Scene
+from glassplat.training import losses
 from glassplat.training.actions import Densify, GrowSh, Population, PruneIdle, ResetOpacity
 from glassplat.training.corrections import corrections_begun, corrections_learnt
 from glassplat.training.densify import as_discs
-from glassplat.training.losses import (
-    LossTerm,
-    MonocularNormals,
-    mean_strength,
-    normal_consistency,
-    strength_outside,
-    weighted_terms,
-)
 from glassplat.training.options import PUBLISHED_ITERATIONS, GaussianRates, Intervals, Rate
 from glassplat.training.stage import Action, Every, Stage
 
@@ -87,17 +73,16 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
     """Those of a run that is long enough for normals to spread."""
     population = population_of(recipe)
     image, held = image_term(recipe.ssim_weight), recipe.view_dependence_weight
+    regular: tuple[Action, ...] = (GrowSh(Every(recipe.intervals.sh)), *population.resets)
+    # As in `splat`, where a scene has to look right before mirrors can be recognised.
+    regular = regular if recipe.search.begin_found else ()
     bootstrap = Stage(
         name="1 bootstrap",
         share=recipe.bootstrap,
         renderer=Splat(recipe.background or BLACK, depth=False),
         losses=(image, *population.terms),
         rates=(_rates_of_splat(recipe) if recipe.search.begin_found else recipe.rates).of("primary", held),
-        # A scene has to look right before mirrors can be recognised.
-        actions=(
-            *population.edits,
-            *((GrowSh(Every(recipe.intervals.sh)), *population.resets) if recipe.search.begin_found else ()),
-        ),
+        actions=(*population.edits, *regular),
         post_steps=population.post_steps,
         densify_until=population.densify_until,
     )
@@ -105,11 +90,11 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         recipe.intervals.opacity, 0.0, recipe.schedule.stop, recipe.intervals.least, skip_multiples_of=3
     )
     renderer = Deferred(recipe.background or BLACK, depth=recipe.consistency_weight != 0)
-    guidance = weighted_terms(
-        LossTerm("outside", recipe.outside_weight, strength_outside),
-        LossTerm("strength", recipe.strength_weight, mean_strength),
-        LossTerm("consistency", recipe.consistency_weight, normal_consistency),
-        LossTerm("monocular normals", recipe.monocular_weight, MonocularNormals()),
+    guidance = losses.weighted_terms(
+        losses.LossTerm("outside", recipe.outside_weight, losses.strength_outside),
+        losses.LossTerm("strength", recipe.strength_weight, losses.mean_strength),
+        losses.LossTerm("consistency", recipe.consistency_weight, losses.normal_consistency),
+        losses.LossTerm("monocular normals", recipe.monocular_weight, losses.MonocularNormals()),
     )
     reflection = Stage(
         name="2 reflection",
@@ -121,15 +106,15 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
             *_edits(recipe, population),
             # Before the resets: it looks at what is seen, also at the steps that it leaves to them.
             _propagate(recipe, propagate_at, renderer),
-            GrowShAfterPropagation(Every(recipe.intervals.sh)),
+            mirrors.GrowShAfterPropagation(Every(recipe.intervals.sh)),
             *_resets(recipe, population),
-            RefineEnvironment(doublings(recipe.first_texels, recipe.texels, recipe.bootstrap), recipe.texels),
+            mirrors.RefineEnvironment(doublings(recipe.first_texels, recipe.texels, recipe.bootstrap), recipe.texels),
         ),
         post_steps=population.post_steps,
         setup=first_reflections(recipe),
         densify_until=population.densify_until,
         # Normals that nothing shows need not keep to the depths (lab/glossy.md).
-        until=found_nothing,
+        until=mirrors.found_nothing,
     )
     refinement = replace(
         reflection,
@@ -188,7 +173,8 @@ def _edits(recipe: DeferredRecipe, population: Population) -> tuple[Action, ...]
         return population.edits
     slow = replace(recipe.densify, interval=recipe.propagation_interval)
     return tuple(
-        DensifyWhilePropagating(slow, regular=edit) if isinstance(edit, Densify) else edit for edit in population.edits
+        mirrors.DensifyWhilePropagating(slow, regular=edit) if isinstance(edit, Densify) else edit
+        for edit in population.edits
     )
 
 
@@ -196,11 +182,11 @@ def _resets(recipe: DeferredRecipe, population: Population) -> tuple[ResetOpacit
     """The resets during and after propagation."""
     if not recipe.schedule.last_reset:
         return population.resets
-    return tuple(ResetRaised.instead_of(reset) for reset in population.resets)
+    return tuple(mirrors.ResetRaised.instead_of(reset) for reset in population.resets)
 
 
-def _propagate(recipe: DeferredRecipe, when: Every, renderer: Deferred) -> Propagate:
-    return Propagate(
+def _propagate(recipe: DeferredRecipe, when: Every, renderer: Deferred) -> mirrors.Propagate:
+    return mirrors.Propagate(
         when,
         recipe.propagation,
         recipe.schedule,
@@ -304,8 +290,12 @@ def _with_renderer(recipe: TracedRecipe, stage: Stage) -> Stage:
     # What no ray leaves and no environment lights mirrors nothing, and a strength that mirrors nothing cannot grow.
     least_strength = 0.0 if recipe.mirrors == "surroundings" else recipe.least_strength
     renderer = Traced(recipe.background or BLACK, least_strength, faintest=0.0, joint=recipe.joint)
-    kept = [a for a in stage.actions if recipe.mirrors != "surroundings" or not isinstance(a, RefineEnvironment)]
-    actions = [replace(action, renderer=renderer) if isinstance(action, Propagate) else action for action in kept]
+    kept = [
+        a for a in stage.actions if recipe.mirrors != "surroundings" or not isinstance(a, mirrors.RefineEnvironment)
+    ]
+    actions = [
+        replace(action, renderer=renderer) if isinstance(action, mirrors.Propagate) else action for action in kept
+    ]
     return replace(stage, renderer=renderer, actions=tuple(actions))
 
 

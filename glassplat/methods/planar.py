@@ -24,19 +24,7 @@ from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import mirrored_gaussians
 from glassplat.scene.panes import Planes, coplanar_groups, name_labels
 from glassplat.scene.scene import Scene, glass_gaussians
-from glassplat.training import losses
-from glassplat.training.actions import (
-    MOST_ADDED,
-    Densify,
-    GrowSh,
-    PerturbOpacity,
-    Population,
-    ResetOpacity,
-    SeedUnexplained,
-    add_primary,
-    keep_some,
-    seeds_of,
-)
+from glassplat.training import actions, losses
 from glassplat.training.corrections import corrections_begun, corrections_learnt, photographer_learnt
 from glassplat.training.densify import NEIGHBOURS
 from glassplat.training.messages import Working
@@ -304,7 +292,7 @@ class LightLamps(AtMoments):
             return False
         log_gains = scene.primary.channels["log_intensity"] + lamps.gains.log()
         state.scene = replace(scene, primary=scene.primary.with_tensors({"log_intensity": log_gains}))
-        keep_some(state, ~lamps.images)
+        actions.keep_some(state, ~lamps.images)
         count, lit = int(lamps.images.sum()), lamps.gains > 1
         log.info("%d Gaussians behind glass were images of lamps; %d of these shine brighter", count, int(lit.sum()))
         return True
@@ -324,10 +312,10 @@ class FillUnseen(AtMoments):
         for done, panes in enumerate(of_glass):
             yield Working(f"looking for what {name_panes(panes, 'pane')} can mirror", done, len(of_glass))
             places, color, cell = material.unseen_places(state.scene, panes, cameras)
-            if 0 < len(places) < MOST_ADDED * len(state.scene.primary):
+            if 0 < len(places) < actions.MOST_ADDED * len(state.scene.primary):
                 colors = (255 * color).round().to(torch.uint8).expand(len(places), 3)
                 cloud = PointCloud(places.cpu(), colors.cpu())
-                add_primary(state, seeds_of(state.scene.primary, cloud, opacity=0.7, size=0.7 * cell))
+                actions.add_primary(state, actions.seeds_of(state.scene.primary, cloud, opacity=0.7, size=0.7 * cell))
                 added += len(places)
         if added:
             log.info("%d Gaussians added where panes mirror what nothing shows", added)
@@ -339,8 +327,8 @@ def turn_round(state: TrainState, virtual: Tensor, panes: Planes) -> int:
     count = int(virtual.sum())
     if count:
         turned = mirrored_gaussians(state.scene.primary.select(virtual), panes.centers[0], panes.normals[0])
-        keep_some(state, ~virtual)
-        add_primary(state, turned)
+        actions.keep_some(state, ~virtual)
+        actions.add_primary(state, turned)
     return count
 
 
@@ -361,8 +349,8 @@ def seed_reflection(state: TrainState, dataset: Dataset, panes: Planes) -> Work:
     if int(virtual.sum()) <= NEIGHBOURS:  # Too few to tell how large they are.
         return False
     behind = replace(points, positions=points.positions[virtual], colors=points.colors[virtual])
-    seeds = mirrored_gaussians(seeds_of(state.scene.primary, behind), panes.centers[0], panes.normals[0])
-    add_primary(state, seeds)
+    seeds = mirrored_gaussians(actions.seeds_of(state.scene.primary, behind), panes.centers[0], panes.normals[0])
+    actions.add_primary(state, seeds)
     log.info(
         "no photograph shows what is mirrored by %s: %d points from behind added, mirrored, in front",
         name_panes(panes, "pane"),
@@ -433,7 +421,7 @@ def planar_stages(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_I
         renderer=Splat(recipe.background or BLACK, depth=False),
         losses=(image_term(recipe.ssim_weight), *population.terms),
         rates=recipe.rates.of("primary", recipe.view_dependence_weight),
-        actions=(*population.edits, GrowSh(Every(recipe.intervals.sh)), *_early_resets(recipe, population)),
+        actions=(*population.edits, actions.GrowSh(Every(recipe.intervals.sh)), *_early_resets(recipe, population)),
         post_steps=population.post_steps,
         densify_until=population.densify_until,
     )
@@ -471,8 +459,8 @@ def _adjustment(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> Stage:
         rates=_gaussian_rates(recipe) | plane_rates(),
         actions=(
             *population.edits,
-            GrowSh(Every(recipe.intervals.sh)),
-            Densify(recipe.densify, part="glass"),
+            actions.GrowSh(Every(recipe.intervals.sh)),
+            actions.Densify(recipe.densify, part="glass"),
             *_missing(recipe, recipe.stage_shares[0] / sum(recipe.stage_shares) + ADJUSTED_AFTER),
             *_early_resets(recipe, population),
         ),
@@ -500,12 +488,12 @@ def _joint(recipe: PlanarRecipe, share: float) -> Stage:
             *_turns(recipe),
             *_missing(recipe, _joint_start(recipe) + JOINED_AFTER),
             *population.edits,
-            GrowSh(Every(recipe.intervals.sh)),
-            Densify(recipe.densify, part="glass"),
+            actions.GrowSh(Every(recipe.intervals.sh)),
+            actions.Densify(recipe.densify, part="glass"),
             *population.resets,
             *_clearing(recipe),
             *((FillUnseen(),) if recipe.seed_reflections else ()),
-            PerturbOpacity(perturb_at, recipe.perturbation.amplitude, recipe.perturbation.bounds),
+            actions.PerturbOpacity(perturb_at, recipe.perturbation.amplitude, recipe.perturbation.bounds),
         ),
         post_steps=(*_glass_post_steps(recipe), *population.post_steps),
         densify_until=recipe.densify.stop,
@@ -522,14 +510,14 @@ def _glass_post_steps(recipe: PlanarRecipe) -> tuple[PostStep, ...]:
     return (glass_only_darkens,) if recipe.tint else ()
 
 
-def _joint_terms(recipe: PlanarRecipe, population: Population) -> tuple[losses.LossTerm, ...]:
+def _joint_terms(recipe: PlanarRecipe, population: actions.Population) -> tuple[losses.LossTerm, ...]:
     glass = losses.weighted_terms(
         losses.LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, losses.tint_departure)
     )
     return (image_term(recipe.ssim_weight), *reflection_terms(recipe), *glass, *population.terms)
 
 
-def _early_resets(recipe: PlanarRecipe, population: Population) -> tuple[ResetOpacity, ...]:
+def _early_resets(recipe: PlanarRecipe, population: actions.Population) -> tuple[actions.ResetOpacity, ...]:
     """The resets of the first two stages, if there are to be any."""
     return population.resets if recipe.early_resets else ()
 
@@ -544,9 +532,9 @@ ADJUSTED_AFTER, JOINED_AFTER = 0.005, 0.003
 looked for: as soon as it is known where panes are, behind which nothing is to be found."""
 
 
-def _missing(recipe: PlanarRecipe, moment: float) -> tuple[SeedUnexplained, ...]:
+def _missing(recipe: PlanarRecipe, moment: float) -> tuple[actions.SeedUnexplained, ...]:
     """The search for what is missing, if there is to be any."""
-    return (SeedUnexplained((moment,), planar_renderer(recipe)),) if recipe.seed_unexplained else ()
+    return (actions.SeedUnexplained((moment,), planar_renderer(recipe)),) if recipe.seed_unexplained else ()
 
 
 CLEARED_AFTER = 0.02
@@ -554,12 +542,12 @@ CLEARED_AFTER = 0.02
 which are looked for by what hides them, have been turned round by then."""
 
 
-def _clearing(recipe: PlanarRecipe) -> tuple[ResetOpacity, ...]:
+def _clearing(recipe: PlanarRecipe) -> tuple[actions.ResetOpacity, ...]:
     """The one reset under `mcmc`; `default` has its own."""
     moment = _joint_start(recipe) + CLEARED_AFTER
     # A second one would come after the stop.
     once = Every(moment, stop=1.5 * moment)
-    return (ResetOpacity(once),) if recipe.strategy == "mcmc" and recipe.turn_reflections else ()
+    return (actions.ResetOpacity(once),) if recipe.strategy == "mcmc" and recipe.turn_reflections else ()
 
 
 def _joint_start(recipe: PlanarRecipe) -> float:

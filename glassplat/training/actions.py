@@ -18,6 +18,7 @@ from glassplat.scene.camera import Camera, to_device
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import behind_panes, crosses_pane, in_image, nearest_pixels
 from glassplat.scene.scene import Scene
+from glassplat.training import losses
 from glassplat.training.densify import (
     Moments,
     append,
@@ -33,15 +34,6 @@ from glassplat.training.densify import (
     relocate_and_grow,
     reset_opacity,
     sgld_noise,
-)
-from glassplat.training.losses import (
-    LossTerm,
-    counted_pixels,
-    mean_opacity,
-    mean_scale,
-    of_all,
-    residual,
-    weighted_terms,
 )
 from glassplat.training.messages import Working
 from glassplat.training.options import DefaultDensify, Intervals, McmcDensify, Rate
@@ -357,7 +349,7 @@ class Population:
     edits: tuple[Action, ...] = ()
     resets: tuple[ResetOpacity, ...] = ()
     post_steps: tuple[PostStep, ...] = ()
-    terms: tuple[LossTerm, ...] = ()
+    terms: tuple[losses.LossTerm, ...] = ()
     densify_until: float = 0.0
     cap: int | None = None
 
@@ -390,10 +382,13 @@ def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:
     everything (`reach`), which hardly differs where every view shows most of the scene; what a few of many views show,
     such as a room photographed all around, fades and wanders.
     """
-    everywhere = densifier.reach == "all"
-    terms = weighted_terms(
-        LossTerm("opacity", densifier.opacity_weight, of_all(mean_opacity) if everywhere else mean_opacity),
-        LossTerm("scale", densifier.scale_weight, of_all(mean_scale) if everywhere else mean_scale),
+
+    def reaching(term: losses.LossFunction) -> losses.LossFunction:
+        return losses.of_all(term) if densifier.reach == "all" else term
+
+    terms = losses.weighted_terms(
+        losses.LossTerm("opacity", densifier.opacity_weight, reaching(losses.mean_opacity)),
+        losses.LossTerm("scale", densifier.scale_weight, reaching(losses.mean_scale)),
     )
     return Population(
         opacity=MCMC_OPACITY,
@@ -506,12 +501,12 @@ def unexplained_places(
         here = places[rows]
         pixels = nearest_pixels(camera.project(here)[0], camera)
         frame = renderer(scene, camera)
-        looks = counted_pixels(view, device)
+        looks = losses.counted_pixels(view, device)
         if (strength := frame.layers.get("strength")) is not None:
             looks = looks & (strength <= 0)
         looks = looks[pixels]
         looks &= ~crosses_pane(here, scene.planes, camera.center)
-        missing = _missing_pixels(residual(frame, view, scene))[pixels] & looks
+        missing = _missing_pixels(losses.residual(frame, view, scene))[pixels] & looks
         photographed = scene.exposures.undone(to_device(view.photo, device)[pixels].float() / 255, view.name)
         color = photographed.clamp(0, 1) * missing[:, None]
         looking[rows] += looks

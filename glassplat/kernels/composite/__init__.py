@@ -229,7 +229,7 @@ class _CompositeDiscs(torch.autograd.Function):
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
         *tensors, _, outlines, bins, near, low_pass, needs = arguments
         *fields, channels = (tensor.detach().contiguous() for tensor in tensors)
-        discs = Discs(*fields, Splats(*(tensor.detach().contiguous() for tensor in outlines)))
+        discs = Discs(*fields, outlines=Splats(*(tensor.detach().contiguous() for tensor in outlines)))
         *outputs, saved = kernels_for("composite", channels.device).composite_discs(
             discs, channels, bins, near=near, low_pass=low_pass, needs_gradients=needs
         )
@@ -243,7 +243,7 @@ class _CompositeDiscs(torch.autograd.Function):
         *fields, channels = ctx.saved_tensors
         outlines, bins, saved, near, low_pass = ctx.rest
         found = kernels_for("composite", channels.device).composite_discs_gradients(
-            Discs(*fields, outlines), channels, bins, saved, [v.contiguous() for v in v_outputs],
+            Discs(*fields, outlines=outlines), channels, bins, saved, [v.contiguous() for v in v_outputs],
             near=near, low_pass=low_pass, with_absgrad=ctx.needs_input_grad[5],
         )  # fmt: skip
         return (*found, None, None, None, None, None)
