@@ -228,22 +228,24 @@ class _CompositeDiscs(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
         *tensors, _, outlines, bins, near, low_pass, needs = arguments
-        *fields, channels = (tensor.detach().contiguous() for tensor in tensors)
-        discs = Discs(*fields, outlines=Splats(*(tensor.detach().contiguous() for tensor in outlines)))
+        means2d, maps, opacities, depths, channels = (tensor.detach().contiguous() for tensor in tensors)
+        plain = Splats(*(tensor.detach().contiguous() for tensor in outlines))
+        discs = Discs(means2d, maps, opacities, depths, plain)
         *outputs, saved = kernels_for("composite", channels.device).composite_discs(
             discs, channels, bins, near=near, low_pass=low_pass, needs_gradients=needs
         )
-        ctx.save_for_backward(*fields, channels)
-        ctx.rest = (discs.outlines, bins, saved, near, low_pass)
+        ctx.save_for_backward(*discs[:4], channels)
+        ctx.rest = (plain, bins, saved, near, low_pass)
         return tuple(outputs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *v_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        *fields, channels = ctx.saved_tensors
+        means2d, maps, opacities, depths, channels = ctx.saved_tensors
         outlines, bins, saved, near, low_pass = ctx.rest
         found = kernels_for("composite", channels.device).composite_discs_gradients(
-            Discs(*fields, outlines=outlines), channels, bins, saved, [v.contiguous() for v in v_outputs],
+            Discs(means2d, maps, opacities, depths, outlines), channels, bins, saved,
+            [v.contiguous() for v in v_outputs],
             near=near, low_pass=low_pass, with_absgrad=ctx.needs_input_grad[5],
         )  # fmt: skip
         return (*found, None, None, None, None, None)
