@@ -202,7 +202,8 @@ def dataset_of(
     """Make a `Dataset`, as `load_dataset` does, of a capture whose folder was read."""
     check_downscale(downscale)
     root, capture, shots, masks = files.root, files.capture, files.shots, files.masks
-    transparent = _any_transparent(shots)
+    with input_checked():
+        transparent = any(is_transparent(shot.image_path) for shot in shots)
     cut_out = transparent and capture.cut_out
     shown = background if transparent and not cut_out else None
     options = ViewOptions(downscale, None if cut_out else background)
@@ -268,12 +269,6 @@ def _check_axes(train: tuple[View, ...], points: PointCloud | None, format_name:
             "down and +z forward in a COLMAP model, +y up and -z forward in transforms.json; turn the y and z axes of "
             "the poses round"
         )
-
-
-def _any_transparent(shots: Sequence[Shot]) -> bool:
-    """Return whether a photograph has transparent pixels."""
-    with input_checked():
-        return any(is_transparent(shot.image_path) for shot in shots)
 
 
 def _split_views(views: list[View], capture: Capture) -> tuple[tuple[View, ...], tuple[View, ...], str]:

@@ -71,7 +71,8 @@ def read_poses(root: Path | str) -> CaptureFiles:
         raise InputError(f"the path {readable_name(whole)} is no UTF-8; rename the folders in it")
     capture = _load_capture(root)
     shots = tuple(sorted((*capture.shots, *(capture.test_shots or ())), key=lambda shot: shot.name))
-    _check_names(shots)
+    if repeated := [name for name, count in Counter(shot.name for shot in shots).items() if count > 1]:
+        raise InputError(f"photographs that occur more than once: {first_names(repeated)}; keep one pose for each")
     return CaptureFiles(root, capture, shots, MaskSet({}), {}, "auto")
 
 
@@ -97,9 +98,3 @@ def _load_capture(root: Path) -> Capture:
     if any(Path(name).suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) for name in names):
         message += f" Photographs become a capture by: glassplat prepare {shlex.quote(str(root))} --output CAPTURE"
     raise UnknownFormatError(message)
-
-
-def _check_names(shots: tuple[Shot, ...]) -> None:
-    repeated = [name for name, count in Counter(shot.name for shot in shots).items() if count > 1]
-    if repeated:
-        raise InputError(f"photographs that occur more than once: {first_names(repeated)}; keep one pose for each")

@@ -357,10 +357,7 @@ class WorkProgress:
             say(self._console, f"{step.what} ({step.total})")
         elif now - self._shown >= PAUSE:
             self._shown = now
-            say(self._console, f"{step.what}: {step.done} of {step.total}, {self._time_left(step, now)}")
-
-    def _time_left(self, step: messages.Working, now: float) -> str:
-        done = step.done - self._first
-        if done <= 0:
-            return "time left is not known yet"
-        return f"{in_words((now - self._begun) / done * (step.total - step.done))} left"
+            done, left = step.done - self._first, "time left is not known yet"
+            if done > 0:
+                left = f"{in_words((now - self._begun) / done * (step.total - step.done))} left"
+            say(self._console, f"{step.what}: {step.done} of {step.total}, {left}")

@@ -107,7 +107,11 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
             # Before the resets: it looks at what is seen, also at the steps that it leaves to them.
             _propagate(recipe, propagate_at, renderer),
             mirrors.GrowShAfterPropagation(Every(recipe.intervals.sh)),
-            *_resets(recipe, population),
+            *(
+                map(mirrors.ResetRaised.instead_of, population.resets)
+                if recipe.schedule.last_reset
+                else population.resets
+            ),
             mirrors.RefineEnvironment(doublings(recipe.first_texels, recipe.texels, recipe.bootstrap), recipe.texels),
         ),
         post_steps=population.post_steps,
@@ -176,13 +180,6 @@ def _edits(recipe: DeferredRecipe, population: Population) -> tuple[Action, ...]
         mirrors.DensifyWhilePropagating(slow, regular=edit) if isinstance(edit, Densify) else edit
         for edit in population.edits
     )
-
-
-def _resets(recipe: DeferredRecipe, population: Population) -> tuple[ResetOpacity, ...]:
-    """The resets during and after propagation."""
-    if not recipe.schedule.last_reset:
-        return population.resets
-    return tuple(mirrors.ResetRaised.instead_of(reset) for reset in population.resets)
 
 
 def _propagate(recipe: DeferredRecipe, when: Every, renderer: Deferred) -> mirrors.Propagate:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from glassplat.methods.splat_recipe import Primitive
 from glassplat.options import (
@@ -103,6 +103,38 @@ class GlossyOptions(MethodRecipe):
         return None
 
 
+def _published(iterations: int, *, normals: int, resets: int, densify: int, **pruning: float) -> dict[str, Any]:
+    """The options that both papers, or their code, have in common.
+
+    Args:
+        iterations: of a run of the public code.
+        normals: step until which normals spread.
+        resets: step until which opacities are reset.
+        densify: step until which Gaussians are added.
+        pruning: further options of densification.
+    """
+    return {
+        "bootstrap": 3000 / iterations,
+        "search": MirrorSearch(begin_found=False, estimated_normals=False),
+        "find_region": False,
+        "strength_weight": 0.0,
+        "propagation": NormalPropagation(sabotage=0.4 * SH_ZERO),
+        "schedule": PropagationSchedule(end="fixed", stop=normals / iterations, pause=200, last_reset=False),
+        "least_iterations": 1,
+        "raise_rates_matte": False,
+        "raise_rates_found": False,
+        "intervals": Intervals(1000 / iterations, 150, resets / iterations, 1000 / iterations, averaged_passes=0.0),
+        "densify": replace(
+            DefaultDensify.published(),
+            start=500 / iterations,
+            stop=densify / iterations,
+            prune_large_start=3000 / iterations,
+            **pruning,
+        ),
+        "mcmc": McmcDensify.published(),
+    }
+
+
 DEFERRED_CODE_ITERATIONS = 61_000
 """Length of the runs of the public code on synthetic scenes."""
 
@@ -117,40 +149,15 @@ class DeferredRecipe(GlossyOptions):
     @classmethod
     def paper(cls) -> DeferredRecipe:
         """As published; where paper and public code disagree, with the constants of the code (docs/deferred.md)."""
-        published = DefaultDensify.published()
         return cls(
-            bootstrap=3000 / DEFERRED_CODE_ITERATIONS,
-            search=MirrorSearch(begin_found=False, estimated_normals=False),
+            **_published(DEFERRED_CODE_ITERATIONS, normals=24_000, resets=29_000, densify=30_000),
             texels=128,
             first_texels=128,
-            find_region=False,
-            strength_weight=0.0,
             consistency_weight=0.0,
             monocular_weight=0.0,
-            propagation=NormalPropagation(sabotage=0.4 * SH_ZERO),
-            schedule=PropagationSchedule(
-                end="fixed", stop=24_000 / DEFERRED_CODE_ITERATIONS, pause=200, last_reset=False
-            ),
-            least_iterations=1,
-            raise_rates_matte=False,
-            raise_rates_found=False,
             propagation_interval=500,
             rates=GaussianRates(decay=30_000 / DEFERRED_CODE_ITERATIONS, short_run_power=0.0),
             reflection_rates=ReflectionRates(strength=6e-3),
-            intervals=Intervals(
-                opacity=1000 / DEFERRED_CODE_ITERATIONS,
-                least=150,
-                reset_stop=29_000 / DEFERRED_CODE_ITERATIONS,
-                sh=1000 / DEFERRED_CODE_ITERATIONS,
-                averaged_passes=0.0,
-            ),
-            densify=replace(
-                published,
-                start=500 / DEFERRED_CODE_ITERATIONS,
-                stop=30_000 / DEFERRED_CODE_ITERATIONS,
-                prune_large_start=3000 / DEFERRED_CODE_ITERATIONS,
-            ),
-            mcmc=McmcDensify.published(),
         )
 
 
@@ -193,22 +200,20 @@ class TracedRecipe(GlossyOptions):
     @classmethod
     def paper(cls) -> TracedRecipe:
         """As published, for real captures; what the paper leaves open is as in its code (docs/traced.md)."""
-        published = DefaultDensify.published()
         plain = GaussianRates(decay=30_000 / TRACED_CODE_ITERATIONS, short_run_power=0.0)
         return cls(
+            **_published(TRACED_CODE_ITERATIONS, normals=18_000, resets=21_000, densify=21_000, prune_opacity=0.05),
             primitive="disc",
             sh_degree=2,
             harmonics_from_start=True,
             mirrors="surroundings",
             least_strength=0.0,
-            least_iterations=1,
-            bootstrap=3000 / TRACED_CODE_ITERATIONS,
             surroundings=SurroundingsOptions(
                 start=SurroundingsStart(source="box", cells=32),
                 sh_degree=2,
                 rates=plain,
                 densify=replace(
-                    published,
+                    DefaultDensify.published(),
                     interval=500,
                     start=3000 / TRACED_CODE_ITERATIONS,
                     stop=21_000 / TRACED_CODE_ITERATIONS,
@@ -220,35 +225,11 @@ class TracedRecipe(GlossyOptions):
                 ),
                 reset=6000 / TRACED_CODE_ITERATIONS,
             ),
-            search=MirrorSearch(begin_found=False, estimated_normals=False),
-            find_region=False,
-            strength_weight=0.0,
             consistency_weight=0.04,
             normals_throughout=True,
             monocular_weight=0.01,
-            propagation=NormalPropagation(sabotage=0.4 * SH_ZERO),
-            schedule=PropagationSchedule(
-                end="fixed", stop=18_000 / TRACED_CODE_ITERATIONS, pause=200, last_reset=False
-            ),
-            raise_rates_matte=False,
-            raise_rates_found=False,
             rates=plain,
             reflection_rates=ReflectionRates(strength=1e-2),
-            intervals=Intervals(
-                opacity=1000 / TRACED_CODE_ITERATIONS,
-                least=150,
-                reset_stop=21_000 / TRACED_CODE_ITERATIONS,
-                sh=1000 / TRACED_CODE_ITERATIONS,
-                averaged_passes=0.0,
-            ),
-            densify=replace(
-                published,
-                start=500 / TRACED_CODE_ITERATIONS,
-                stop=21_000 / TRACED_CODE_ITERATIONS,
-                prune_opacity=0.05,
-                prune_large_start=3000 / TRACED_CODE_ITERATIONS,
-            ),
-            mcmc=McmcDensify.published(),
         )
 
     def distant(self) -> DeferredRecipe:

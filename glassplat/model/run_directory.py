@@ -263,16 +263,6 @@ class RunDirectory:
 
         return recipe_from_json(self._read("recipe.json"), str(self.path / "recipe.json"))
 
-    def was_begun_with(self, recipe: Any) -> bool:
-        """Return whether `begin` recorded just this recipe.
-
-        Compared as written: `recipe()` gives options that an earlier version did not have their present defaults,
-        with which the run was not made.
-        """
-        from glassplat.methods.recipe import recipe_to_json
-
-        return bool(self.written_recipe() == json.loads(recipe_to_json(recipe)))
-
     def written_recipe(self) -> Any:
         """The recorded recipe's options as they were written."""
         return parse_json(self._read("recipe.json"), "recipe.json")

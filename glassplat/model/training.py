@@ -306,7 +306,8 @@ def resumed_state(
     written = directory.settings()
     has_moved = written.data != settings.data and directory.has_cameras_of(dataset)
     recorded = replace(written, device=settings.device, data=settings.data if has_moved else written.data)
-    if recorded != settings or not directory.was_begun_with(recipe):
+    # Compared as written: `recipe()` gives what an earlier version did not have its present default.
+    if recorded != settings or directory.written_recipe() != json.loads(recipe_to_json(recipe)):
         changes = differences(vars(recorded), vars(settings)) + changes_of_recipe(directory, recipe)
         raise InputError(
             f"{directory.path} was started with other options: {first_names(changes)}; expected the same to resume it. "

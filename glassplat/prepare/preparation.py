@@ -336,15 +336,11 @@ def _advice(figures: Report, missing: list[str], solution: Solution) -> list[str
         advice.append("points are seen in few photographs: take more, with smaller steps")
     if figures.reprojection_error > LARGE_ERROR:
         advice.append("points have large errors for a still scene: see that nothing large moves, or try --lens opencv")
-    model = solution.models[0] if solution.models else None
-    if model is not None and any(not _usual(camera) for camera in model.cameras.values()):
+    model, (least, most) = solution.models[0] if solution.models else None, USUAL_FOCALS
+    cameras = [] if model is None else model.cameras.values()
+    if any(not least <= one.mean_focal_length() / max(one.width, one.height) <= most for one in cameras):
         advice.append("a focal length is unusual, the lens was badly determined: photograph from different distances")
     return advice
-
-
-def _usual(camera: Any) -> bool:
-    least, most = USUAL_FOCALS
-    return bool(least <= camera.mean_focal_length() / max(camera.width, camera.height) <= most)
 
 
 @dataclass(frozen=True)

@@ -28,12 +28,14 @@ def project(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, ne
     """Projects Gaussians into cameras; see `glassplat.kernels.project.project`."""
     with torch.no_grad():
         visible = _project_all(gaussians, cameras, sh_degree, near)[1]
-    # Where nothing is seen the arithmetic runs on harmless stand-ins: a NaN masked afterwards would still reach the
-    # gradients, as NaN times zero.
-    seen = visible.any(dim=0)
-    harmless = RawGaussians(*(_where(seen, tensor, torch.ones_like(tensor)) for tensor in gaussians))
-    projected, _ = _project_all(harmless, cameras, sh_degree, near, visible)
+    projected, _ = _project_all(_harmless(gaussians, visible), cameras, sh_degree, near, visible)
     return Projected(*(_where(visible, tensor, torch.zeros_like(tensor)) for tensor in projected))
+
+
+def _harmless(gaussians: RawGaussians, visible: Tensor) -> RawGaussians:
+    """Ones for Gaussians that nothing shows: a NaN masked afterwards would still reach gradients, as NaN times zero."""
+    seen = visible.any(dim=0)
+    return RawGaussians(*(_where(seen, tensor, torch.ones_like(tensor)) for tensor in gaussians))
 
 
 def _where(mask: Tensor, value: Tensor, other: Tensor) -> Tensor:
@@ -132,14 +134,19 @@ def _visible(projected: Projected, gaussians: RawGaussians, cameras: CameraBatch
     norm = gaussians.quats.square().sum(-1)
     usable = torch.cat(raw, dim=-1).isfinite().all(dim=-1) & norm.isfinite() & (norm > 0)
     visible = usable & (projected.depths > near) & projected.depths.isfinite()
-    if cameras.clip_planes is not None:
-        visible &= cameras.clip_planes[:, :3] @ gaussians.means.T + cameras.clip_planes[:, 3:] > 0
+    low, high = projected.means2d - projected.radii, projected.means2d + projected.radii
+    return visible & _wanted(low, high, gaussians, cameras) & (projected.radii > 0).all(dim=-1)
+
+
+def _wanted(low: Tensor, high: Tensor, gaussians: RawGaussians, cameras: CameraBatch) -> Tensor:
+    """Mask [C, N] of boxes that reach into the window, of Gaussians on the kept side of the clip plane."""
     windows = cameras.windows
     if windows is None:
-        windows = torch.tensor([[0, 0, cameras.width, cameras.height]], dtype=projected.means2d.dtype)
-    first, last = windows[:, None, :2], windows[:, None, 2:]
-    on_screen = (projected.means2d + projected.radii > first) & (projected.means2d - projected.radii < last)
-    return visible & on_screen.all(dim=-1) & (projected.radii > 0).all(dim=-1)
+        windows = torch.tensor([[0, 0, cameras.width, cameras.height]], dtype=low.dtype)
+    found = ((high > windows[:, None, :2]) & (low < windows[:, None, 2:])).all(dim=-1)
+    if cameras.clip_planes is not None:
+        found &= cameras.clip_planes[:, :3] @ gaussians.means.T + cameras.clip_planes[:, 3:] > 0
+    return found
 
 
 SMOOTH = ("means2d", "maps", "depths", "opacities", "colors", "normals")
@@ -149,11 +156,7 @@ def project_discs(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: i
     """Projects discs into cameras; see `glassplat.kernels.project.project_discs`."""
     with torch.no_grad():
         visible = _visible_discs(_project_all_discs(gaussians, cameras, sh_degree, near), gaussians, cameras, near)
-    # Where nothing is seen the arithmetic runs on harmless stand-ins: a NaN masked afterwards would still reach the
-    # gradients, as NaN times zero.
-    seen = visible.any(dim=0)
-    harmless = RawGaussians(*(_where(seen, tensor, torch.ones_like(tensor)) for tensor in gaussians))
-    projected = _project_all_discs(harmless, cameras, sh_degree, near, visible)
+    projected = _project_all_discs(_harmless(gaussians, visible), cameras, sh_degree, near, visible)
     projected = projected._replace(colors=projected.colors.clamp(min=0))
     return ProjectedDiscs(*(_where(visible, tensor, torch.zeros_like(tensor)) for tensor in projected))
 
@@ -240,17 +243,11 @@ def _visible_discs(projected: ProjectedDiscs, gaussians: RawGaussians, cameras: 
     visible = visible & projected.maps.isfinite().all(dim=-1) & projected.colors.isfinite().all(dim=-1)
     visible = visible & projected.depths.isfinite() & _faces(gaussians, cameras)
     visible = visible & (projected.opacities > ALPHA_MIN)
-    if cameras.clip_planes is not None:
-        visible &= cameras.clip_planes[:, :3] @ gaussians.means.T + cameras.clip_planes[:, 3:] > 0
-    windows = cameras.windows
-    if windows is None:
-        windows = torch.tensor([[0, 0, cameras.width, cameras.height]], dtype=projected.means2d.dtype)
-    first, last = windows[:, None, :2], windows[:, None, 2:]
     low, high = projected.outline_centers - projected.radii, projected.outline_centers + projected.radii
     crossing = (projected.outline_conics == 0).all(dim=-1, keepdim=True)
     lowest, highest = _crossing_boxes(gaussians, cameras, projected.opacities, near)
     low, high = torch.where(crossing, lowest, low), torch.where(crossing, highest, high)
-    return visible & ((high > first) & (low < last)).all(dim=-1)
+    return visible & _wanted(low, high, gaussians, cameras)
 
 
 def _crossing_boxes(
