@@ -24,19 +24,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from glassplat.captures import transforms
 from glassplat.captures.capture import Capture, RawPoints, Shot
 from glassplat.captures.masks import MASK_FOLDER, PANE_FOLDER, PaneMask, read_mask_at_threshold
-from glassplat.captures.transforms import (
-    OPENCV_FROM_OPENGL,
-    TEST,
-    TRAIN,
-    VAL,
-    Settings,
-    image_path,
-    read_points,
-    read_settings,
-    shots_of,
-)
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.images import IMAGE_SUFFIXES, image_size
 
@@ -44,7 +34,7 @@ if TYPE_CHECKING:
     from glassplat.captures.axes import AxesEvidence
     from glassplat.captures.view import View
 
-LOOKED_FOR = f"a Mirror-NeRF scene ({TRAIN} and {MASK_FOLDER}/)"
+LOOKED_FOR = f"a Mirror-NeRF scene ({transforms.TRAIN} and {MASK_FOLDER}/)"
 SYNTHETIC_MASK = "MirrorMask_"
 SAME_SIZE = 0.1
 """Relative deviation up to which twice the principal point is the size of the photograph."""
@@ -60,10 +50,10 @@ def load_mirror_nerf(root: Path) -> Capture | None:
     """
     if not _is_mirror_nerf(root):
         return None
-    settings = read_settings(root / TRAIN)
-    train = _shots(root, settings, TRAIN)
-    test_file = next((name for name in (TEST, VAL) if (root / name).is_file()), None)
-    test = _shots(root, read_settings(root / test_file), test_file) if test_file else None
+    settings = transforms.read_settings(root / transforms.TRAIN)
+    train = _shots(root, settings, transforms.TRAIN)
+    test_file = next((name for name in (transforms.TEST, transforms.VAL) if (root / name).is_file()), None)
+    test = _shots(root, transforms.read_settings(root / test_file), test_file) if test_file else None
     tested = {shot.name for shot in test or ()}
     kept = tuple(shot for shot in train if shot.name not in tested)
     warnings = []
@@ -72,32 +62,32 @@ def load_mirror_nerf(root: Path) -> Capture | None:
             f"{len(train) - len(kept)} training photographs are test photographs too; they are not trained on."
         )
     masks = _masks(root, (*kept, *(test or ())))
-    points = read_points(root, settings)
+    points = transforms.read_points(root, settings)
     capture = Capture(kept, test, points, "Mirror-NeRF", tuple(warnings), masks=masks)
     return _with_fitting_axes(capture, _evidence(kept, masks, points))
 
 
 def _is_mirror_nerf(root: Path) -> bool:
     masks = root / MASK_FOLDER
-    if not (root / TRAIN).is_file() or not masks.is_dir():
+    if not (root / transforms.TRAIN).is_file() or not masks.is_dir():
         return False
     if next(masks.glob(f"{SYNTHETIC_MASK}*"), None) is not None:
         return True
     if (root / PANE_FOLDER).is_dir():
         return False
-    settings = read_settings(root / TRAIN)
+    settings = transforms.read_settings(root / transforms.TRAIN)
     return "fx" in settings or "intrinsics" in settings["frames"][0]
 
 
-def _shots(root: Path, settings: Settings, file_name: str) -> tuple[Shot, ...]:
+def _shots(root: Path, settings: transforms.Settings, file_name: str) -> tuple[Shot, ...]:
     """The photographs of one part, with the intrinsics in the spelling that the lens knows."""
     frames = [_plain_frame(root, settings, frame) for frame in settings["frames"]]
-    return tuple(shots_of(root, {**settings, "frames": frames}, file_name).values())
+    return tuple(transforms.shots_of(root, {**settings, "frames": frames}, file_name).values())
 
 
-def _plain_frame(root: Path, settings: Settings, frame: Settings) -> dict[str, Any]:
+def _plain_frame(root: Path, settings: transforms.Settings, frame: transforms.Settings) -> dict[str, Any]:
     """One frame with its photograph where it lies and with `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h` in its pixels."""
-    path = image_path(root, frame)
+    path = transforms.image_path(root, frame)
     in_images = root / "images" / path.name
     if not path.is_file() and in_images.is_file():
         path = in_images
@@ -108,7 +98,7 @@ def _plain_frame(root: Path, settings: Settings, frame: Settings) -> dict[str, A
     return {**frame, **_in_pixels_of(path, intrinsics)}
 
 
-def _intrinsics(settings: Settings, name: str) -> tuple[float, float, float, float] | None:
+def _intrinsics(settings: transforms.Settings, name: str) -> tuple[float, float, float, float] | None:
     """fx, fy, cx, cy as stored, of the frame's matrix or of the file; None where only opening angles are given."""
     try:
         if "intrinsics" in settings:
@@ -211,4 +201,4 @@ def _with_fitting_axes(capture: Capture, evidence: AxesEvidence | None) -> Captu
 
 def _flip_axes(shots: tuple[Shot, ...]) -> tuple[Shot, ...]:
     """The photographs with the y and z axes of their cameras turned round."""
-    return tuple(replace(shot, cam_from_world=OPENCV_FROM_OPENGL @ shot.cam_from_world) for shot in shots)
+    return tuple(replace(shot, cam_from_world=transforms.OPENCV_FROM_OPENGL @ shot.cam_from_world) for shot in shots)

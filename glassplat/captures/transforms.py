@@ -17,20 +17,9 @@ from numpy.typing import NDArray
 from glassplat.captures.cameras import LARGEST_SIDE, Lens, make_lens, rigid_pose
 from glassplat.captures.capture import Capture, RawPoints, Shot
 from glassplat.errors import InputError, first_names, input_checked
+from glassplat.files import records
 from glassplat.files.images import IMAGE_SUFFIXES, image_size
 from glassplat.files.ply_table import point_colors, read_table
-from glassplat.files.records import (
-    COORDINATE,
-    Choice,
-    Field,
-    Flag,
-    Items,
-    Number,
-    Optional,
-    Text,
-    check_fields,
-    read_json,
-)
 
 if TYPE_CHECKING:
     from glassplat.scene.camera import Camera
@@ -85,15 +74,15 @@ PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV",
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 LISTED = ("k1", "k2", "k3", "k4", "p1", "p2")
 """The order of `distortion_params`, as nerfstudio has it."""
-LENS: dict[str, Field] = {
-    "camera_model": Optional(Choice((*PERSPECTIVE, FISHEYE))),
-    "is_fisheye": Optional(Flag(), default=False),
-    **dict.fromkeys(("w", "h"), Optional(Number(1, LARGEST_SIDE))),
-    **dict.fromkeys(("fl_x", "fl_y"), Optional(Number(above=0))),
-    **dict.fromkeys(("camera_angle_x", "camera_angle_y"), Optional(Number(above=0, most=math.pi))),
-    **dict.fromkeys(("cx", "cy"), Optional(Number())),
-    **dict.fromkeys(COEFFICIENTS, Optional(Number(), default=0.0)),
-    "distortion_params": Optional(Items(Number(), len(LISTED))),
+LENS: dict[str, records.Field] = {
+    "camera_model": records.Optional(records.Choice((*PERSPECTIVE, FISHEYE))),
+    "is_fisheye": records.Optional(records.Flag(), default=False),
+    **dict.fromkeys(("w", "h"), records.Optional(records.Number(1, LARGEST_SIDE))),
+    **dict.fromkeys(("fl_x", "fl_y"), records.Optional(records.Number(above=0))),
+    **dict.fromkeys(("camera_angle_x", "camera_angle_y"), records.Optional(records.Number(above=0, most=math.pi))),
+    **dict.fromkeys(("cx", "cy"), records.Optional(records.Number())),
+    **dict.fromkeys(COEFFICIENTS, records.Optional(records.Number(), default=0.0)),
+    "distortion_params": records.Optional(records.Items(records.Number(), len(LISTED))),
 }
 
 
@@ -109,7 +98,7 @@ def lens_from_settings(settings: Mapping[str, Any], image_path: Path, name: str)
     in OpenCV; or `distortion_params`, a list of k1 to k4, p1 and p2, which goes before them.
     """
     with input_checked():
-        found = check_fields(settings, LENS, f"the lens of {name}")
+        found = records.check_fields(settings, LENS, f"the lens of {name}")
         width, height = _size(found, image_path)
         fx, fy = _focal_lengths(found, width, height, name)
     found |= zip(LISTED, found["distortion_params"] or (), strict=False)
@@ -169,16 +158,16 @@ POINT_FILES = ("points3d.ply", "points3D.ply", "sparse_pc.ply")
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 Settings = Mapping[str, Any]
-FRAME: dict[str, Field] = {
-    "file_path": Text(),
-    "transform_matrix": Items(Items(COORDINATE, 4)),
-    "mask_path": Optional(Text()),
+FRAME: dict[str, records.Field] = {
+    "file_path": records.Text(),
+    "transform_matrix": records.Items(records.Items(records.COORDINATE, 4)),
+    "mask_path": records.Optional(records.Text()),
 }
-FILE: dict[str, Field] = {
-    "ply_file_path": Optional(Text()),
-    "train_filenames": Optional(Items(Text())),
-    "val_filenames": Optional(Items(Text())),
-    "test_filenames": Optional(Items(Text())),
+FILE: dict[str, records.Field] = {
+    "ply_file_path": records.Optional(records.Text()),
+    "train_filenames": records.Optional(records.Items(records.Text())),
+    "val_filenames": records.Optional(records.Items(records.Text())),
+    "test_filenames": records.Optional(records.Items(records.Text())),
 }
 """What is read besides the lens (`LENS`); more may be in the file."""
 
@@ -186,13 +175,13 @@ FILE: dict[str, Field] = {
 def read_settings(path: Path) -> dict[str, Any]:
     """The contents of one file, with at least one frame; every frame names a photograph and has a matrix."""
     with input_checked():
-        settings = read_json(path)
+        settings = records.read_json(path)
         frames = settings.get("frames") if isinstance(settings, dict) else None
         if not isinstance(frames, list) or not frames:
             raise ValueError(f"{path} lists no frames; expected a list `frames` of at least one photograph")
         for index, frame in enumerate(frames, start=1):
-            check_fields(frame, FRAME, f"frame {index} of {path}")
-        check_fields(settings, FILE, str(path))
+            records.check_fields(frame, FRAME, f"frame {index} of {path}")
+        records.check_fields(settings, FILE, str(path))
     return settings
 
 

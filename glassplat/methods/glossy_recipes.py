@@ -103,7 +103,9 @@ class GlossyOptions(MethodRecipe):
         return None
 
 
-def _published(iterations: int, *, normals: int, resets: int, densify: int, **pruning: float) -> dict[str, Any]:
+def _published(
+    iterations: int, *, normals: int, resets: int, densify: int, prune_opacity: float = 0.005
+) -> dict[str, Any]:
     """The options that both papers, or their code, have in common.
 
     Args:
@@ -111,7 +113,7 @@ def _published(iterations: int, *, normals: int, resets: int, densify: int, **pr
         normals: step until which normals spread.
         resets: step until which opacities are reset.
         densify: step until which Gaussians are added.
-        pruning: further options of densification.
+        prune_opacity: opacity below which Gaussians are removed.
     """
     return {
         "bootstrap": 3000 / iterations,
@@ -129,7 +131,7 @@ def _published(iterations: int, *, normals: int, resets: int, densify: int, **pr
             start=500 / iterations,
             stop=densify / iterations,
             prune_large_start=3000 / iterations,
-            **pruning,
+            prune_opacity=prune_opacity,
         ),
         "mcmc": McmcDensify.published(),
     }

@@ -12,18 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.panes import PlaneFit, PlaneFitError, search
-from glassplat.panes.masks import (
-    FramedPlanes,
-    PaneView,
-    PlaneEquations,
-    agreement_of_each,
-    join_planes,
-    mask_agreement,
-    pane_views,
-    plane_candidates,
-    without_gaps,
-)
+from glassplat.panes import PlaneFit, PlaneFitError, masks, search
 from glassplat.panes.material import virtual_points
 from glassplat.panes.objective import MIDDLE, JointObjective, Objective, edge_matches, pane_rectangle
 from glassplat.scene import logit
@@ -38,9 +27,9 @@ LEAST_MEETING, LEAST_OF_MEDIAN = 0.3, 0.5
 EDGES_PER_VIEW = 100
 
 
-def report_masks(label: int, plane: FramedPlanes, views: Sequence[PaneView]) -> None:
+def report_masks(label: int, plane: masks.FramedPlanes, views: Sequence[masks.PaneView]) -> None:
     """Logs how well each mask of a pane fits the others on its plane, and warns of those that do not, by name."""
-    meeting, overlap = meeting_of_each(plane, views), agreement_of_each(plane.planes, views)
+    meeting, overlap = meeting_of_each(plane, views), masks.agreement_of_each(plane.planes, views)
     shares = ["nothing to compare" if np.isnan(share) else f"{share:.0%}" for share in meeting]
     found = [f"{view.name} {share}" for view, share in zip(views, shares, strict=True)]
     areas = ", ".join(f"{name} ({area:.2f})" for name, area in zip(found, overlap, strict=True))
@@ -64,7 +53,7 @@ def odd_ones(meeting: Array) -> NDArray[np.bool_]:
     return np.asarray(meeting < limit)
 
 
-def meeting_of_each(plane: FramedPlanes, views: Sequence[PaneView]) -> Array:
+def meeting_of_each(plane: masks.FramedPlanes, views: Sequence[masks.PaneView]) -> Array:
     """[V] share of each mask's outline that meets those of the others on one plane; NaN where nothing is compared.
 
     The overlap of the areas does not tell: masks of one pane from elsewhere overlap by half and more, and a post that
@@ -85,7 +74,7 @@ def meeting_of_each(plane: FramedPlanes, views: Sequence[PaneView]) -> Array:
     return shares
 
 
-def _without_shared_edges(view: PaneView) -> PaneView:
+def _without_shared_edges(view: masks.PaneView) -> masks.PaneView:
     """The view without what other panes may hide: no edge between them counts, and no distance is known there."""
     from scipy import ndimage
 
@@ -176,7 +165,7 @@ def fit_planes(
         clouds = {"the measured points": _usable(measured)} | clouds
     found = []
     for label in labels:
-        views = pane_views(annotations, label, most=options.most_views, names=names)
+        views = masks.pane_views(annotations, label, most=options.most_views, names=names)
         with _advice(label, len(labels)):
             found.append(_found_pane(label, clouds, views, extent=extent, options=options))
     cameras = [camera for camera, _ in annotations] + [camera for _, camera in unmarked]
@@ -223,7 +212,7 @@ class _Found:
 
     label: int
     evidence: Objective
-    plane: FramedPlanes
+    plane: masks.FramedPlanes
     fault: ValueError | None = None
     is_settled: bool = False
 
@@ -239,7 +228,7 @@ class _Found:
 
 
 def _found_pane(
-    label: int, clouds: Mapping[str, Array], views: Sequence[PaneView], *, extent: float, options: PlaneFit
+    label: int, clouds: Mapping[str, Array], views: Sequence[masks.PaneView], *, extent: float, options: PlaneFit
 ) -> _Found:
     """The pane on the plane of its masks, or of what they are without gaps where that tells against it.
 
@@ -248,7 +237,7 @@ def _found_pane(
     """
     _check_views(label, views, extent)
     found = _fitted_pane(label, clouds, views, extent=extent, options=options)
-    filled = [without_gaps(view) for view in views]
+    filled = [masks.without_gaps(view) for view in views]
     if all(other is view for other, view in zip(filled, views, strict=True)):
         return found
     whole = _fitted_pane(label, clouds, filled, extent=extent, options=options)
@@ -264,12 +253,12 @@ def _found_pane(
 
 
 def _fitted_pane(
-    label: int, clouds: Mapping[str, Array], views: Sequence[PaneView], *, extent: float, options: PlaneFit
+    label: int, clouds: Mapping[str, Array], views: Sequence[masks.PaneView], *, extent: float, options: PlaneFit
 ) -> _Found:
     """The plane, of those fitted to each cloud, that masks and the first cloud support best."""
     objectives = {}
     for source, points in clouds.items():
-        chosen = points[plane_candidates(points, views, band=options.band)]
+        chosen = points[masks.plane_candidates(points, views, band=options.band)]
         objectives[source] = Objective(views, chosen, extent, options.inlier_distance * extent)
     evidence = next(iter(objectives.values()))
     sound, faulty = [], []
@@ -282,7 +271,7 @@ def _fitted_pane(
     return _Found(label, evidence, search.best_supported(label, sound, evidence)) if sound else faulty[0]
 
 
-def _fault(plane: FramedPlanes, objective: Objective, options: PlaneFit) -> ValueError | None:
+def _fault(plane: masks.FramedPlanes, objective: Objective, options: PlaneFit) -> ValueError | None:
     """The reason not to trust the plane of a pane; None if there is none."""
     try:
         _check_agreement(plane.planes, objective.views, options.least_agreement)
@@ -336,7 +325,7 @@ def _placed_by_images(pane: _Found, cloud: Array, cameras: Sequence[Camera], opt
     images = search.plane_of_images(pane.plane.planes, outlined.center, cloud[seen], cloud[~seen], pane.evidence.extent)
     if images is None or not images.is_clear:
         return pane
-    plane = FramedPlanes(images.plane, pane.plane.frames)
+    plane = masks.FramedPlanes(images.plane, pane.plane.frames)
     if _loss(pane, plane) > MOST_LOSS:
         return pane
     log.info(
@@ -347,7 +336,7 @@ def _placed_by_images(pane: _Found, cloud: Array, cameras: Sequence[Camera], opt
     return replace(pane, plane=plane, fault=None, is_settled=True)
 
 
-def _loss(pane: _Found, plane: FramedPlanes) -> float:
+def _loss(pane: _Found, plane: masks.FramedPlanes) -> float:
     """The excess of the contradiction of a plane over that of the pane's own."""
     return float((search.contradiction(plane, pane.evidence) - search.contradiction(pane.plane, pane.evidence))[0])
 
@@ -369,7 +358,7 @@ def _joint(panes: Sequence[_Found], seed: int) -> list[_Found]:
     while len(panes) > 1:
         objective = JointObjective([pane.evidence for pane in panes])
         rng = np.random.default_rng((seed, *(pane.label for pane in panes)))
-        plane = search.best_joint_plane(objective, join_planes([pane.plane for pane in panes]), rng)
+        plane = search.best_joint_plane(objective, masks.join_planes([pane.plane for pane in panes]), rng)
         losses = [_loss(pane, plane) for pane in panes]
         if max(losses) <= MOST_LOSS:
             labels, turned = name_labels(pane.label for pane in panes), max(search.angle(p.plane, plane) for p in panes)
@@ -416,7 +405,7 @@ WELL_INSIDE = 0.2
 """Share of the image's sides between them and the middle of a pane that a photograph shows well."""
 
 
-def _worth_marking(views: Sequence[PaneView], unmarked: Sequence[tuple[str, Camera]]) -> str:
+def _worth_marking(views: Sequence[masks.PaneView], unmarked: Sequence[tuple[str, Camera]]) -> str:
     """Names of photographs without masks that should show the pane well from elsewhere, for a message."""
     middle = _seen_middle(views)
     centers = [view.center for view in views]
@@ -431,7 +420,7 @@ def _worth_marking(views: Sequence[PaneView], unmarked: Sequence[tuple[str, Came
     return f": {', '.join(names)} should show it well" if names else ""
 
 
-def _seen_middle(views: Sequence[PaneView]) -> Array:
+def _seen_middle(views: Sequence[masks.PaneView]) -> Array:
     """[3] the point nearest to the rays through the middles of the masks."""
     system, right = np.zeros((3, 3)), np.zeros(3)
     for view in views:
@@ -448,7 +437,7 @@ def _turn(middle: Array, center: Array, other: Array) -> float:
     return float(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second))
 
 
-def _check_views(label: int, views: Sequence[PaneView], extent: float) -> None:
+def _check_views(label: int, views: Sequence[masks.PaneView], extent: float) -> None:
     if len(views) < 2:
         raise PlaneFitError(
             f"pane {label} is annotated in {len(views)} view(s), but its plane shows only between views: "
@@ -458,7 +447,7 @@ def _check_views(label: int, views: Sequence[PaneView], extent: float) -> None:
     _check_outline(label, views)
 
 
-def _check_places(label: int, views: Sequence[PaneView], extent: float) -> None:
+def _check_places(label: int, views: Sequence[masks.PaneView], extent: float) -> None:
     centers = np.stack([view.center for view in views])
     apart = float(np.linalg.norm(centers - centers[0], axis=1).max())
     if apart < LEAST_APART * extent:
@@ -469,7 +458,7 @@ def _check_places(label: int, views: Sequence[PaneView], extent: float) -> None:
         )
 
 
-def _check_outline(label: int, views: Sequence[PaneView]) -> None:
+def _check_outline(label: int, views: Sequence[masks.PaneView]) -> None:
     showing = sum(len(view.edge) > 0 for view in views)
     if showing < 2:
         raise PlaneFitError(
@@ -478,7 +467,7 @@ def _check_outline(label: int, views: Sequence[PaneView]) -> None:
         )
 
 
-def _check_outlines(found: FramedPlanes, objective: Objective) -> None:
+def _check_outlines(found: masks.FramedPlanes, objective: Objective) -> None:
     against = float(search.contradiction(found, objective)[0])
     if against > MOST_CONTRADICTION:
         raise ValueError(
@@ -487,7 +476,7 @@ def _check_outlines(found: FramedPlanes, objective: Objective) -> None:
         )
 
 
-def _tilt_degrees(found: FramedPlanes, objective: Objective) -> float:
+def _tilt_degrees(found: masks.FramedPlanes, objective: Objective) -> float:
     """Degrees by which a plane may be turned before its masks tell."""
     return float(np.degrees(search.tilt_uncertainty(found, objective, MIDDLE)[0]))
 
@@ -500,8 +489,8 @@ def _left_open(degrees: float, objective: Objective) -> str:
     )
 
 
-def _check_agreement(plane: PlaneEquations, views: Sequence[PaneView], least: float) -> None:
-    agreement = float(mask_agreement(plane, views)[0])
+def _check_agreement(plane: masks.PlaneEquations, views: Sequence[masks.PaneView], least: float) -> None:
+    agreement = float(masks.mask_agreement(plane, views)[0])
     if agreement < least:
         raise ValueError(
             f"no plane brings its masks together; on the best one they overlap by {agreement:.2f}, "
@@ -509,7 +498,7 @@ def _check_agreement(plane: PlaneEquations, views: Sequence[PaneView], least: fl
         )
 
 
-def _pane(plane: PlaneEquations, views: Sequence[PaneView], margin: float) -> _Pane:
+def _pane(plane: masks.PlaneEquations, views: Sequence[masks.PaneView], margin: float) -> _Pane:
     centers = np.stack([view.center for view in views])
     normal = plane.normals[0]
     if (np.sign(plane.distances(centers)[0])).sum() < 0:

@@ -21,16 +21,8 @@ from glassplat import __version__
 from glassplat.captures.colmap_library import quiet_pycolmap
 from glassplat.captures.masks import IGNORE_FOLDER
 from glassplat.errors import InputError, first_names
+from glassplat.files import writing
 from glassplat.files.records import read_json, readable_name
-from glassplat.files.writing import (
-    check_folder,
-    file_digest,
-    make_folder,
-    missing_folders,
-    real_path,
-    remove_empty,
-    write_text,
-)
 from glassplat.prepare.photographs import (
     FEWEST,
     PICTURE_SUFFIX,
@@ -76,7 +68,7 @@ class Workplace:
     output: Path
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "output", real_path(self.output))
+        object.__setattr__(self, "output", writing.real_path(self.output))
 
     @property
     def folder(self) -> Path:
@@ -128,13 +120,13 @@ class Workplace:
         if known is not None:
             self._check_unchanged(known, json.loads(json.dumps(settings)))
         if known is None:
-            make_folder(self.folder)
-            write_text(self.folder / "settings.json", json.dumps(settings, indent=1))
+            writing.make_folder(self.folder)
+            writing.write_text(self.folder / "settings.json", json.dumps(settings, indent=1))
         return known is None
 
     def finish(self, record: Mapping[str, Any]) -> None:
         """Writes the record into the finished capture and moves it to the output."""
-        write_text(self.capture / RECORD, json.dumps(record, indent=1) + "\n")
+        writing.write_text(self.capture / RECORD, json.dumps(record, indent=1) + "\n")
         if self.output.exists():
             before = self.folder / "before"
             shutil.rmtree(before, ignore_errors=True)
@@ -168,8 +160,8 @@ class Workplace:
         )
 
     def _check_output(self, force: bool) -> None:
-        check_folder(self.output)
-        check_folder(self.folder)
+        writing.check_folder(self.output)
+        writing.check_folder(self.folder)
         found = sorted(path.name for path in self.output.iterdir()) if self.output.exists() else []
         if not found:
             return
@@ -188,7 +180,7 @@ class Workplace:
         others += [
             path.relative_to(self.output).as_posix()
             for path in sorted((self.output / IGNORE_FOLDER).rglob("*"))
-            if path.is_file() and file_digest(path) not in own
+            if path.is_file() and writing.file_digest(path) not in own
         ]
         pictures = [path for path in (self.output / "images").rglob("[!.]*") if path.is_file()]
         added = {path for path in pictures if path.suffix != PICTURE_SUFFIX} | set(masks_among(pictures))
@@ -366,7 +358,7 @@ class Preparation:
     def record(self) -> dict[str, Any]:
         """Inputs on which the work depends: an interrupted one goes on with the same only."""
         options = {"lens": self.settings.lens, "mapper": self.settings.mapper}
-        source = readable_name(real_path(self.source))
+        source = readable_name(writing.real_path(self.source))
         return {"input": source, "max-size": self.max_size, "frames": self.frames, **options}
 
 
@@ -388,7 +380,7 @@ def prepare(task: Preparation, listen: Listener, *, resume: bool = False, force:
 
 def _prepare(task: Preparation, workplace: Workplace, listen: Listener, *, resume: bool, force: bool) -> Report:
     settings = {**task.record(), PHOTOGRAPHS: file_states(task.source)}
-    missing = missing_folders(workplace.folder.parent)
+    missing = writing.missing_folders(workplace.folder.parent)
     begun = workplace.begin(settings, resume=resume, force=force)
     try:
         photographs = _photographs(task, workplace, listen)
@@ -400,10 +392,10 @@ def _prepare(task: Preparation, workplace: Workplace, listen: Listener, *, resum
         # What an earlier call left is worth more than these photographs, which may be away for a moment.
         if begun or isinstance(error, TooLittleShownError):
             workplace.discard()
-            remove_empty(missing)
+            writing.remove_empty(missing)
         raise
     write_capture(solution, workplace.capture, listen)
-    masks = sorted({file_digest(path) for path in (workplace.capture / IGNORE_FOLDER).rglob("*.png")})
+    masks = sorted({writing.file_digest(path) for path in (workplace.capture / IGNORE_FOLDER).rglob("*.png")})
     made = {"command": "prepare", "version": __version__, **task.record()}
     workplace.finish({**made, "report": asdict(report), **({MASKS: masks} if masks else {})})
     return report
@@ -416,7 +408,7 @@ def is_video(source: Path) -> bool:
 
 def check_places(task: Preparation) -> None:
     """Refuse an input that is no photographs, and an output among them."""
-    source, output = real_path(task.source), real_path(task.output)
+    source, output = writing.real_path(task.source), writing.real_path(task.output)
     if source.is_file() and not is_video(source):
         known = ", ".join(VIDEO_SUFFIXES)
         raise InputError(f"{task.source} is a file; expected a folder of photographs, or a video ({known})")

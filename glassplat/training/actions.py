@@ -18,23 +18,7 @@ from glassplat.scene.camera import Camera, to_device
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import behind_panes, crosses_pane, in_image, nearest_pixels
 from glassplat.scene.scene import Scene
-from glassplat.training import losses
-from glassplat.training.densify import (
-    Moments,
-    append,
-    apply_edit,
-    densify,
-    fog_around,
-    forget,
-    gaussians_from_points,
-    hangs_in_air,
-    in_morton_order,
-    keep,
-    perturb_opacities,
-    relocate_and_grow,
-    reset_opacity,
-    sgld_noise,
-)
+from glassplat.training import densify, losses
 from glassplat.training.messages import Working
 from glassplat.training.options import DefaultDensify, Intervals, McmcDensify, Rate
 from glassplat.training.stage import Action, AtMoments, Clock, Every, PostStep, TrainState, Work
@@ -124,7 +108,7 @@ class Densify:
             gradient_threshold=self.densifier.gradient_threshold * factor,
             absgrad_threshold=self.densifier.absgrad_threshold * factor,
         )
-        edited, moments = densify(
+        edited, moments = densify.densify(
             densifier,
             gaussians,
             state.optimizer.moments,
@@ -184,9 +168,9 @@ class PruneIdle:
         busy = most >= self.densifier.least_contribution
         if self.part == "primary":
             places = torch.stack([view.camera.center for view in dataset.train])
-            busy &= ~fog_around(gaussians, places)
+            busy &= ~densify.fog_around(gaussians, places)
             if dataset.measured_points:
-                hanging = hangs_in_air(gaussians.means, places, dataset.points.positions)
+                hanging = densify.hangs_in_air(gaussians.means, places, dataset.points.positions)
                 busy &= ~hanging | (largest_share >= FAINT_IN_AIR)
         # A scene without Gaussians is reported; surroundings that nothing mirrors yet may still be needed.
         if bool(busy.all()) or (self.part != "primary" and not bool(busy.any())):
@@ -195,10 +179,10 @@ class PruneIdle:
         return True
 
 
-def put_in_order(state: TrainState, gaussians: Gaussians, moments: Moments, part: str = "primary") -> None:
+def put_in_order(state: TrainState, gaussians: Gaussians, moments: densify.Moments, part: str = "primary") -> None:
     """Replaces a part of the scene and its moments, sorted so that neighbours in space are neighbours in memory."""
-    order = in_morton_order(gaussians.means)
-    ordered, moments = apply_edit(gaussians, moments, order, part=part)
+    order = densify.in_morton_order(gaussians.means)
+    ordered, moments = densify.apply_edit(gaussians, moments, order, part=part)
     state.scene = state.scene.with_gaussians(part, ordered)
     # Of a set that has vanished, a scene has no parameters.
     known = state.scene.parameters()
@@ -233,7 +217,7 @@ class Relocate:
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state`, if there is anything to edit."""
         densifier = replace(self.densifier, growth=growth_of(self.densifier, clock.iterations))
-        edited, moments = relocate_and_grow(
+        edited, moments = densify.relocate_and_grow(
             densifier,
             state.scene.primary,
             state.optimizer.moments,
@@ -265,7 +249,9 @@ class AddNoise:
         """Edits `state`."""
         primary, extent = state.scene.primary, state.scene.extent
         rate = self.rate.at(clock.progress, 1.0, clock.iterations) * math.sqrt(clock.batch)
-        offsets = sgld_noise(self.densifier, primary, rate=rate, extent=extent, generator=state.generator("explore"))
+        offsets = densify.sgld_noise(
+            self.densifier, primary, rate=rate, extent=extent, generator=state.generator("explore")
+        )
         if visible is not None and self.densifier.reach == "shown":
             offsets *= visible[:, None]
         state.scene = replace(state.scene, primary=primary.with_tensors({"means": primary.means + offsets}))
@@ -289,7 +275,7 @@ class ResetOpacity:
         gaussians = state.scene.gaussian_sets().get(self.part)
         if gaussians is None:
             return False
-        lowered, state.optimizer.moments = reset_opacity(
+        lowered, state.optimizer.moments = densify.reset_opacity(
             gaussians, state.optimizer.moments, ceiling=self.ceiling, part=self.part
         )
         state.scene = state.scene.with_gaussians(self.part, lowered)
@@ -317,7 +303,7 @@ class PerturbOpacity:
         for done, view in enumerate(dataset.train):
             yield Working("looking for what is seen through panes", done, len(dataset.train))
             selected |= behind_panes(means, planes, [view.camera])
-        perturbed = perturb_opacities(
+        perturbed = densify.perturb_opacities(
             state.scene.primary,
             selected,
             amplitude=self.amplitude,
@@ -325,7 +311,7 @@ class PerturbOpacity:
             generator=state.generator(self.name),
         )
         state.scene = replace(state.scene, primary=perturbed)
-        state.optimizer.moments = forget(state.optimizer.moments, ("primary.logit_opacities",), selected)
+        state.optimizer.moments = densify.forget(state.optimizer.moments, ("primary.logit_opacities",), selected)
         return bool(selected.any())
 
 
@@ -360,7 +346,7 @@ class Population:
             generator = torch.Generator().manual_seed(0)
             kept = torch.randperm(len(points), generator=generator)[: self.cap].to(points.colors.device)
             points = PointCloud(points.positions[kept], points.colors[kept])
-        return gaussians_from_points(points, sh_degree=sh_degree, opacity=self.opacity, spread=self.spread)
+        return densify.gaussians_from_points(points, sh_degree=sh_degree, opacity=self.opacity, spread=self.spread)
 
 
 def default_population(densifier: DefaultDensify, intervals: Intervals) -> Population:
@@ -450,7 +436,7 @@ def seeds_of(primary: Gaussians, points: PointCloud, *, opacity: float = 0.1, si
         opacity: of each.
         size: standard deviation of each; as far as points are apart if None.
     """
-    seeds = gaussians_from_points(points, sh_degree=primary.max_sh_degree, opacity=opacity)
+    seeds = densify.gaussians_from_points(points, sh_degree=primary.max_sh_degree, opacity=opacity)
     if size is not None:
         seeds = seeds.with_tensors({"log_scales": torch.full_like(seeds.log_scales, math.log(size))})
     seeds = seeds.to(primary.means.device)
@@ -461,7 +447,7 @@ def seeds_of(primary: Gaussians, points: PointCloud, *, opacity: float = 0.1, si
 
 def add_primary(state: TrainState, seeds: Gaussians) -> None:
     """Adds Gaussians to the primary ones, of which moments and statistics stay."""
-    primary, state.optimizer.moments = append(state.scene.primary, state.optimizer.moments, seeds)
+    primary, state.optimizer.moments = densify.append(state.scene.primary, state.optimizer.moments, seeds)
     state.scene = replace(state.scene, primary=primary)
     if "primary" in state.statistics:
         state.statistics["primary"] = state.statistics["primary"].with_new(len(seeds))
@@ -473,7 +459,9 @@ def keep_some(state: TrainState, kept: Tensor, part: str = "primary") -> None:
     Else an action of this kind at the step of a densification would take its place (lab/gaussians.md).
     """
     gaussians = state.scene.gaussian_sets()[part]
-    gaussians, state.optimizer.moments = apply_edit(gaussians, state.optimizer.moments, keep(kept), part=part)
+    gaussians, state.optimizer.moments = densify.apply_edit(
+        gaussians, state.optimizer.moments, densify.keep(kept), part=part
+    )
     state.scene = state.scene.with_gaussians(part, gaussians)
     if part in state.statistics:
         state.statistics[part] = state.statistics[part].select(kept)
