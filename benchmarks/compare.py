@@ -476,4 +476,4 @@ if __name__ == "__main__":
     try:
         sys.exit(main())
     except KeyboardInterrupt:
-        sys.exit("interrupted: repeat the command to go on")
+        sys.exit("interrupted: repeat the command to continue")

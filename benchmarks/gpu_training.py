@@ -33,7 +33,7 @@ def training(
         output: folder of the run, new.
         cpu_run: folder of the same run on the CPU, evaluated; None leaves its column empty.
         device: where to train.
-        seed: fixes every random choice.
+        seed: random seed.
 
     Raises:
         ValueError: the CPU's run is another one.

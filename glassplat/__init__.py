@@ -8,10 +8,10 @@
     model.with_mirrors(1).save("shop.html")  # edits are new models
 
 `load` reads a run, or a splat file of any program, as a `Model`, which renders, is edited and is saved. `load_dataset`
-reads a capture as a `Dataset`; `Training` trains on it and tells what happens, message by message. A scene is plain
-data: `Scene`, `Gaussians`, `Planes`, `Camera`; a renderer is a function `(scene, camera) -> Frame`; a recipe is what a
-method trains with. Axes are OpenCV's, poses are `cam_from_world`, images `[H, W, 3]` in sRGB, angles in radians unless
-a name says otherwise.
+reads a capture as a `Dataset`; `Training` trains on it and yields messages. A scene is plain data: `Scene`,
+`Gaussians`, `Planes`, `Camera`; a renderer is a function `(scene, camera) -> Frame`; a recipe holds the options of a
+method. Axes are OpenCV's, poses are `cam_from_world`, images `[H, W, 3]` in sRGB, angles in radians unless a name says
+otherwise.
 """
 
 import os
@@ -41,12 +41,12 @@ if TYPE_CHECKING:
     from glassplat.training.messages import ActionDone, CheckpointWritten, RunBegun, StageEntered, StepDone, Working
     from glassplat.training.stage import Stage
 
-# PyTorch and Numba each keep a pool of threads. Waiting threads that spin, as OpenMP's do unless told otherwise, take
-# the cores from the other pool: a training step then costs up to twice as much. It is read once, when OpenMP loads.
+# PyTorch and Numba each have a thread pool. By default, waiting threads of OpenMP spin and take cores from the other
+# pool, which makes a training step up to twice as slow. The variable is read once, when OpenMP loads.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 __version__ = "0.1.0"
-__all__ = [  # noqa: RUF022 - In the order in which the documentation tells of them.
+__all__ = [  # noqa: RUF022 - In the order of the documentation.
     "load",
     "load_dataset",
     "Model",

@@ -1,4 +1,4 @@
-"""Errors that a wrong input ends with."""
+"""Errors of invalid input."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from contextlib import contextmanager
 
 
 class InputError(ValueError):
-    """An input, an option or a name cannot be used; the message says what was expected, what came and what to do."""
+    """An input, an option or a name is invalid; the message says what was expected, what was found and what to do."""
 
 
 class UnknownFormatError(InputError):
-    """A folder holds no capture of any format that is read."""
+    """A folder is not a capture of any supported format."""
 
 
 class RankLostError(RuntimeError):
-    """Another process of a run has ended; what was trained is intact.
+    """Another process of a run has ended; the training state is intact.
 
     Attributes:
-        ending: label, text and exit code that it ended with; None where it ended without a word.
+        ending: label, text and exit code of the other process; None if it ended unexpectedly.
     """
 
     def __init__(self, text: str, ending: tuple[str, str, int] | None = None) -> None:
@@ -28,10 +28,10 @@ class RankLostError(RuntimeError):
 
 @contextmanager
 def input_checked(where: object = None) -> Iterator[None]:
-    """Turns the ValueError of a reader or an edit, whose message says what is wrong, into an InputError.
+    """Turns the ValueError of a reader or an edit into an InputError.
 
     Args:
-        where: what to name before the message, such as a file, where that does not name it.
+        where: prefix of the message, such as the file, if the message does not name it.
     """
     try:
         yield

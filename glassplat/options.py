@@ -1,7 +1,7 @@
 """Options as dataclasses: ranges in annotations, checked from the command line and from JSON.
 
-An annotation is the only place that says what a value may be: its type, `Literal` choices, and requirements such as
-`Range`. A dataclass whose fields have to fit together has a method `contradiction`.
+Annotations define valid values: type, `Literal` choices, and requirements such as `Range`. A dataclass with
+dependencies between fields has a method `contradiction`.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ import tyro
 from glassplat.errors import InputError
 
 MOST = 1_000_000_000
-"""Of anything that is counted: more than a machine holds, and few enough for every integer type."""
+"""Maximum of all counts: more than a machine holds, and small enough for every integer type."""
 
 
 @runtime_checkable
 class Requirement(Protocol):
-    """Requirement in the annotation of a field; `allows` is asked about values of the annotated type."""
+    """Requirement in the annotation of a field, for values of the annotated type."""
 
     def allows(self, value: Any) -> bool:
-        """Return whether the value will do."""
+        """Return whether the value is valid."""
         ...
 
     @property
@@ -74,10 +74,10 @@ class Range:
 
 @dataclass(frozen=True)
 class Ascending:
-    """Numbers that get no smaller."""
+    """Numbers in ascending order."""
 
     def allows(self, value: Sequence[float]) -> bool:
-        """Return whether they are in order."""
+        """Return whether they are in ascending order."""
         return list(value) == sorted(value)
 
     @property
@@ -87,24 +87,24 @@ class Ascending:
 
 
 Finite = Annotated[float, Range()]
-"""Any number but NaN and infinity, which no option may be."""
+"""Any finite number."""
 Positive = Annotated[float, Range(above=0)]
 NotNegative = Annotated[float, Range(0)]
 Share = Annotated[float, Range(0, 1)]
-"""A part of a whole, nothing and everything included."""
+"""A share, from 0 to 1."""
 PositiveShare = Annotated[float, Range(above=0, high=1)]
 InnerShare = Annotated[float, Range(above=0, below=1)]
-"""Of what is stored as a logit, which 0 and 1 do not have."""
+"""A share stored as a logit, without 0 and 1."""
 LearningRate = Annotated[float, Range(0, 1)]
-"""Of Adam, which moves a raw parameter by about so much at every step; 0 keeps it as it is."""
+"""Learning rate of Adam, about the change of a raw parameter per step; 0 freezes it."""
 Count = Annotated[int, Range(0, MOST)]
 Several = Annotated[int, Range(1, MOST)]
 Downscale = Annotated[float, Range(1, 1000)]
-"""Of photographs: width and height are divided by it."""
+"""Factor by which width and height of photographs are divided."""
 Seed = Annotated[int, Range(0, 2**32 - 1)]
 ShDegree = Annotated[int, Range(0, 3)]
 PaneLabel = Annotated[int, Range(1, 255)]
-"""What a pixel of a mask can hold; 0 is no pane."""
+"""Label of a pane in masks; 0 is no pane."""
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 """The axis of the world that points up."""
 Color = tuple[Share, Share, Share]
@@ -112,24 +112,24 @@ Color = tuple[Share, Share, Share]
 
 
 class Essential(NamedTuple):
-    """Marks an option that many runs need; `--help` shows these, `--help-advanced` all."""
+    """Marks a common option; `--help` shows these, `--help-advanced` all."""
 
 
 ESSENTIAL = Essential()
 
 T = TypeVar("T")
 Internal = Annotated[T, tyro.conf.Fixed, tyro.conf.Suppress]
-"""A value that recipes hold and the command line does not set: a constant of a method, or what its preset decides."""
+"""A value of recipes that the command line does not set: a constant of a method, or part of its preset."""
 
 LONGEST_SHOWN = 80
-"""Characters of a wrong value that a message repeats."""
+"""Maximum length of a wrong value in messages."""
 UNIONS = (typing.Union, types.UnionType)
 PLAIN = {bool: "True or False", int: "a whole number", float: "a number", str: "a text", Path: "a path"}
-"""Types of single values, and what messages call them."""
+"""Types of single values, and their names in messages."""
 
 
 class OptionError(InputError):
-    """A value that its field does not take; the name is that of the field, with those of the fields it lies in."""
+    """An invalid value; the name is that of the field, dotted for nested fields."""
 
     def __init__(self, name: str, value: Any, expected: str) -> None:
         super().__init__(f"{name or 'the value'} is {short_repr(value)}; expected {expected}")
@@ -137,10 +137,10 @@ class OptionError(InputError):
 
 
 def check_options(options: Any) -> None:
-    """Checks a command or a recipe, and all that it consists of.
+    """Checks a command or a recipe, including nested options.
 
     Raises:
-        InputError: a value is out of range, or values contradict; names the option as it is typed.
+        InputError: a value is out of range, or values contradict each other; the message names the option.
     """
     try:
         check_value(type(options), options, "")
@@ -149,10 +149,10 @@ def check_options(options: Any) -> None:
 
 
 def options_from_json(kind: type, value: Any) -> Any:
-    """An instance of a dataclass from what JSON made of it; fields that are missing have their defaults.
+    """An instance of a dataclass from parsed JSON; missing fields get their defaults.
 
     Raises:
-        InputError: not an object, an unknown field, or a value of a wrong type or out of range; names the field.
+        InputError: it is not an object, a field is unknown, or a value is invalid; the message names the field.
     """
     return check_value(kind, value, "")
 
@@ -163,15 +163,15 @@ def as_typed(name: str) -> str:
 
 
 def check_value(hint: Any, value: Any, name: str) -> Any:
-    """The value in the type of its annotation, if it is as that demands.
+    """The value converted to the type of its annotation, if valid.
 
     Args:
         hint: annotation of a field, or a dataclass.
-        value: of this type, or what JSON makes of such a one.
-        name: of the field, for messages.
+        value: a value of this type, or its JSON form.
+        name: name of the field, for messages.
 
     Raises:
-        OptionError: it is not.
+        OptionError: the value is invalid.
     """
     hint, requirements = unwrap_annotation(hint)
     result = _in_type(hint, value, name, requirements)
@@ -182,7 +182,7 @@ def check_value(hint: Any, value: Any, name: str) -> Any:
 
 
 def unwrap_annotation(hint: Any) -> tuple[Any, tuple[Requirement, ...]]:
-    """An annotation without its metadata, and what of them is a requirement."""
+    """An annotation without metadata, and its requirements."""
     if typing.get_origin(hint) is not typing.Annotated:
         return hint, ()
     inner, *metadata = typing.get_args(hint)
@@ -214,7 +214,7 @@ def _structure(hint: Any) -> str:
 
 
 def _in_type(hint: Any, value: Any, name: str, requirements: tuple[Requirement, ...]) -> Any:
-    """The value in a type without metadata; requirements are for the message."""
+    """The value converted to a type without metadata; requirements are for the message."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return _fields(type(value), {field.name: getattr(value, field.name) for field in fields(value)}, name)
     if dataclasses.is_dataclass(hint):
@@ -230,7 +230,7 @@ def _in_type(hint: Any, value: Any, name: str, requirements: tuple[Requirement, 
 
 
 def _is_of(hint: Any, value: Any) -> bool:
-    """Return whether a single value is of a type; a whole number is a number too, but True is not, nor is infinity."""
+    """Return whether a value has a type; integers are floats, too, but booleans and infinity are not."""
     if hint is float:
         return isinstance(value, (int, float)) and not isinstance(value, bool) and is_finite(value)
     if hint is int:
@@ -241,7 +241,7 @@ def _is_of(hint: Any, value: Any) -> bool:
 
 
 def is_finite(value: float) -> bool:
-    """Return whether a number is neither NaN nor infinite, nor a whole one beyond all floats."""
+    """Return whether a number is finite and representable as a float."""
     try:
         return math.isfinite(value)
     except OverflowError:
@@ -275,13 +275,13 @@ def _is_needed(field: dataclasses.Field) -> bool:
 
 
 def inner_name(outer: str, field: str, hint: Any) -> str:
-    """The name of a field of a field; one that the command line does not name has no name of its own."""
+    """Dotted name of a nested field; fields without a name on the command line add nothing."""
     nameless = any(getattr(data, "name", None) == "" for data in typing.get_args(hint)[1:])
     return outer if nameless else f"{outer}.{field}".removeprefix(".")
 
 
 def _alternative(hint: Any, value: Any, name: str) -> Any:
-    """The value in the first type of a union that takes it."""
+    """The value converted to the first type of a union that accepts it."""
     if value is None and type(None) in typing.get_args(hint):
         return None
     options = [option for option in typing.get_args(hint) if option is not type(None)]
@@ -289,7 +289,7 @@ def _alternative(hint: Any, value: Any, name: str) -> Any:
         try:
             return check_value(options[0], value, name)
         except OptionError as error:
-            # Of a field inside of the value there is more to say than of the value.
+            # An error in a nested field is more specific.
             raise OptionError(error.name, error.value, f"{error.expected}, or None") from error
     for option in options:
         try:
@@ -331,7 +331,7 @@ def short_repr(value: Any) -> str:
     """A value for a message, cut short."""
     try:
         text = repr(value) if isinstance(value, str) else str(value)
-    except ValueError:  # A whole number of too many digits to print.
+    except ValueError:  # An integer with too many digits to print.
         text = "a number of thousands of digits"
     return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
 
@@ -340,24 +340,24 @@ Rgb = tuple[float, float, float]
 """sRGB in [0, 1]."""
 WHITE: Rgb = (1.0, 1.0, 1.0)
 BLACK: Rgb = (0.0, 0.0, 0.0)
-"""Behind captures of places, which fill their photographs."""
+"""Default background."""
 CLEAR_GLASS = 0.0817
 """R0 of a clear pane: 2 r / (1 + r) with r = ((n - 1) / (n + 1))^2 for each of its surfaces, n = 1.52."""
 
 Blend = Literal["srgb", "linear"]
-"""The space in which transmission and reflection are blended: as photographed, or in radiance."""
+"""The space in which transmission and reflection are blended: sRGB or linear radiance."""
 
 
 @dataclass(frozen=True)
 class Cleaning:
-    """Rules for what is taken out of a scene; panes, their glass and what is mirrored from afar stay.
+    """Rules for Gaussians to remove; panes, their glass and the environment stay.
 
     Attributes:
-        box: two opposite corners, world units; what has its centre outside goes.
-        isolated: what is that many times its own size (or the median size, if larger) away from its fourth neighbour
-            goes; 0 keeps it.
-        oversized: what has a standard deviation above that share of its distance from the nearest camera goes; 0 keeps
-            it.
+        box: two opposite corners, in world units; Gaussians centred outside are removed.
+        isolated: distance to the fourth neighbour, in multiples of a Gaussian's size (or of the median size, if
+            larger), above which it is removed; 0 keeps all.
+        oversized: standard deviation, as a share of the distance to the nearest camera, above which a Gaussian is
+            removed; 0 keeps all.
     """
 
     box: tuple[Finite, Finite, Finite, Finite, Finite, Finite] | None = None

@@ -18,7 +18,7 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 MOST_BYTES, MOST_SECONDS = 8 << 30, 600
 GOOD_CODES = (0, 1, 2, 129, 130, 141, 143, -signal.SIGINT)  # The last where Ctrl-C comes while Python ends.
-COMPLAINTS = ("Traceback (most recent call last)", "did not foresee", "Fatal Python error", "terminate called")
+COMPLAINTS = ("Traceback (most recent call last)", "unexpected error", "Fatal Python error", "terminate called")
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ def polygon_pane(corners: Array) -> PolygonPane:
     center = corners.mean(axis=0)
     _, sizes, axes = np.linalg.svd(corners - center)
     if sizes[1] <= 1e-6 * sizes[0]:
-        raise ValueError("the corners lie on one line; expected an outline that spans an area")
+        raise ValueError("the corners are collinear; expected an outline that encloses an area")
     axes = axes * np.array([[1.0], [1.0], [np.linalg.det(axes)]])
     return PolygonPane(axes, center, (corners - center) @ axes[:2].T)
 
@@ -362,11 +362,11 @@ def _first_corners(marks: Marks, cameras: Sequence[NumpyCamera]) -> Array:
 def _missing(marks: Marks, known: int) -> str:
     views = marks.views()
     if len(views) < 2:
-        return "mark the same corners in a second photograph, taken from another place"
+        return "mark the same corners in a second photograph, taken from another position"
     corners = "1 corner is" if known == 1 else f"{known} corners are"
     return (
-        f"{corners} known from two places, expected at least 3: mark the same corners in two photographs taken farther "
-        "apart"
+        f"{corners} known from two positions, expected at least 3: mark the same corners in two photographs "
+        "taken farther apart"
     )
 
 

@@ -59,7 +59,7 @@ def grab_outlines(photo: NDArray[np.uint8], outline: Array) -> list[Array]:
     factor = np.array([small.shape[1], small.shape[0]]) / (high - low)
     inside = fill_polygon((outline - low) * factor, (small.shape[1], small.shape[0]))
     if not inside.any():
-        raise InputError("the outline holds nothing of the photograph; draw it round what stands in front of the pane")
+        raise InputError("the outline lies outside the photograph; draw it round what stands in front of the pane")
     if inside.all():
         return [outline]
     found = _foreground(cv2, np.ascontiguousarray(small[:, :, ::-1]), inside)
@@ -139,8 +139,8 @@ def _check_planes(root: Path) -> None:
     written = file_digest(root / PLANES)
     if written and written not in digests and (digests or not masks):
         raise InputError(
-            f"{root / PLANES} was not made by `glassplat annotate`, or somebody has changed it since; nothing was "
-            "written. Move it away and write again; what it had besides can be added to the new one"
+            f"{root / PLANES} was not made by `glassplat annotate`, or was edited since; nothing was written. "
+            "Move it away, write again, and copy your additions to the new file"
         )
 
 
@@ -185,8 +185,8 @@ def capture_to_mark(root: Path) -> Dataset:
         files = with_masks(files)
     if files.masks.masks:
         raise InputError(
-            f"the panes of {root} are marked by masks that were not made by `glassplat annotate`, and one "
-            "capture needs all of one kind: train with them as they are, or move them away and mark the panes here"
+            f"the panes of {root} are marked by masks that were not made by `glassplat annotate`, and the two "
+            "kinds cannot be mixed: train with these masks, or move them away and mark the panes here"
         )
     return dataset_of(files)
 
@@ -202,8 +202,9 @@ def earlier_masks(root: Path) -> set[str]:
     others = sorted(seen - known)
     if others:
         raise InputError(
-            f"{folder} holds masks that were not made by `glassplat annotate` ({first_names(others)}), and one capture "
-            "needs all of one kind: train with them as they are, or move that folder away and mark the panes here"
+            f"{folder} holds masks that were not made by `glassplat annotate` ({first_names(others)}), and the "
+            "two kinds cannot be mixed: train with these masks, or move that folder away and mark the panes "
+            "here"
         )
     return {name for name in known if not leads_out(name)}
 

@@ -135,7 +135,9 @@ def merge_documents(base: Any, theirs: Any, ours: Any) -> Merged:
 def _free_label(used: set[int]) -> int:
     label = next((label for label in range(1, MOST_PANES + 1) if label not in used), None)
     if label is None:
-        raise ValueError(f"all {MOST_PANES} labels are in use; remove a pane here before what is marked elsewhere fits")
+        raise ValueError(
+            f"all {MOST_PANES} labels are in use; remove a pane here to make room for those marked elsewhere"
+        )
     return label
 
 
@@ -292,7 +294,7 @@ class Session:
         """Fits one pane."""
         marks = pane.marks(self._numbers)
         if len(marks.corners) < 3 or not marks.views():
-            return SolvedPane(pane, None, "mark the corners, one after the other round the pane")
+            return SolvedPane(pane, None, "mark the corners in order around the pane")
         try:
             return SolvedPane(pane, fit_pane(marks, self.cameras, pane.shape))
         except TooFewMarksError as error:
@@ -313,7 +315,7 @@ class Session:
             if not removed:
                 raise InputError("no pane is known yet; mark the same corners in two photographs")
             stays = f"; {PLANES} stays: it was not written here" if (self.root / PLANES).exists() else ""
-            told = f"no pane is marked; removed what was written: {first_names(removed)}{stays}"
+            told = f"no pane is marked; removed the earlier output: {first_names(removed)}{stays}"
             return {"masks": [], "planes": [], "told": told}
         written = write_results(self.root, self.views, self.cameras, solved)
         return {

@@ -29,7 +29,7 @@ def rigid_pose(matrix: NDArray[np.float64], name: str) -> NDArray[np.float64]:
     if matrix.shape not in ((3, 4), (4, 4)):
         raise InputError(f"the pose of {name} has shape {list(matrix.shape)}; expected a 4x4 or 3x4 matrix")
     if not np.isfinite(matrix).all():
-        raise InputError(f"the pose of {name} holds values that are not finite; remove this photograph from the model")
+        raise InputError(f"the pose of {name} contains non-finite values; remove this photograph from the model")
     if not (np.abs(matrix) <= LARGEST_COORDINATE).all():
         raise InputError(
             f"the pose of {name} holds the value {np.abs(matrix).max():g}; expected world units of at most "
@@ -232,7 +232,7 @@ def make_lens(model: str, parameters: list[float], size: tuple[int, int]) -> Len
     if model not in PARAMETER_COUNTS:
         raise InputError(f"unknown camera model {model!r}; expected one of {', '.join(PARAMETER_COUNTS)}")
     if not all(1 <= side <= LARGEST_SIDE for side in size):
-        raise InputError(f"the camera is {_size_text(size)} pixels large; expected sides from 1 to {LARGEST_SIDE}")
+        raise InputError(f"the camera is {_size_text(size)} pixels; expected sides from 1 to {LARGEST_SIDE}")
     total = PARAMETER_COUNTS[model].total
     if len(parameters) != total:
         raise InputError(f"camera model {model} takes {total} parameters, got {len(parameters)}")
@@ -268,9 +268,7 @@ def lens_for_image(lens: Lens, size: tuple[int, int], name: str) -> Lens:
     """The lens at the size of the image file; images reduced after calibration rescale it."""
     width, height = size
     if min(size) < LEAST_SIDE:
-        raise InputError(
-            f"{name} is {width}x{height} pixels large; expected a photograph, {LEAST_SIDE} pixels at least"
-        )
+        raise InputError(f"{name} is {width}x{height} pixels; expected at least {LEAST_SIDE} pixels along each side")
     if (lens.width, lens.height) == (width, height):
         return lens
     scale = (width * lens.width + height * lens.height) / (lens.width**2 + lens.height**2)
@@ -278,7 +276,7 @@ def lens_for_image(lens: Lens, size: tuple[int, int], name: str) -> Lens:
     skew = max(_skew(scale * lens.width, width, rounding), _skew(scale * lens.height, height, rounding))
     if skew > MOST_SKEW:
         raise InputError(
-            f"{name} is {width}x{height} pixels large, but its camera {lens.width}x{lens.height}; expected the "
+            f"{name} is {width}x{height} pixels, but its camera {lens.width}x{lens.height}; expected the "
             "same size or a scaled copy; photographs rotated or cropped after calibration cannot be used"
         )
     return lens.rescale(width, height)

@@ -118,8 +118,8 @@ def _records_of(path: Path) -> list[Any]:
     except UnicodeDecodeError as error:
         name = error.object[: error.start].rpartition(b" ")[2] + error.object[error.start :].partition(b"\n")[0]
         raise InputError(
-            f"{path} holds the name {name[:80]!r}, which is no UTF-8; rename the photograph, there and in its folder, "
-            "or export the COLMAP model again"
+            f"{path} holds the name {name[:80]!r}, which is not valid UTF-8; rename the photograph, there and in its "
+            "folder, or export the COLMAP model again"
         ) from error
     except (struct.error, EOFError, ValueError, IndexError, OverflowError) as error:
         raise InputError(f"{path} is cut off or damaged ({error}); export the COLMAP model again") from error
@@ -216,7 +216,7 @@ def _check_observations(line: str, name: str) -> None:
     words = line.split()
     if len(words) % 3 or not (not words or words[-1].lstrip("-").isdigit()):
         raise InputError(
-            f"the line after {name} is no list of observations; expected one after every image, if only an empty line"
+            f"the line after {name} is not a list of observations; expected one after every image, even if it is empty"
         )
 
 
@@ -296,7 +296,7 @@ def _other_models(root: Path, used: Path) -> tuple[str, ...]:
     )
     if not others:
         return ()
-    return (f"{used} is used; there are more models in {sparse} ({first_names(others)}), which are left out.",)
+    return (f"{used} is used; there are more models in {sparse} ({first_names(others)}), which are ignored.",)
 
 
 def _unread_frames(root: Path) -> tuple[str, ...]:

@@ -15,9 +15,9 @@ from typing import Any
 from glassplat.errors import InputError
 
 MISSING = (
-    "pycolmap, which finds out where photographs were taken and undistorts them, is not installed; run "
-    "pip install 'glassplat[prepare]'. There is none for Linux on ARM: prepare the capture on another machine; what "
-    "`glassplat prepare` writes needs it no more"
+    "pycolmap, which estimates camera poses and undistorts photographs, is not installed; run pip install "
+    "'glassplat[prepare]'. It is not available for Linux on ARM: prepare the capture on another machine, after "
+    "which pycolmap is not needed"
 )
 
 

@@ -229,7 +229,7 @@ def dataset_of(
         *_view_warnings(prepared, shown),
         *_blank_warnings(shots),
         *_mask_warnings(files),
-        *(["Transparent pixels of the photographs are left out."] if cut_out else ()),
+        *(["Transparent pixels of the photographs are ignored."] if cut_out else ()),
         *point_warnings,
         *_far_off(train, extent),
     )
@@ -294,7 +294,7 @@ def _extent(train: tuple[View, ...]) -> float:
     centers = torch.stack([view.camera.center.double() for view in train])
     radius = float((centers - centers.mean(0)).norm(dim=1).max())
     if radius <= max(SAME_PLACE * float(centers.norm(dim=1).max()), LEAST_RADIUS):
-        raise InputError("all training cameras stand at one point; expected photographs from different places")
+        raise InputError("all training cameras are at one point; expected photographs from different positions")
     return EXTENT_MARGIN * radius
 
 
@@ -324,7 +324,7 @@ def _points(root: Path, capture: Capture, train: tuple[View, ...]) -> tuple[Poin
     kept = PointCloud(found.positions[usable], found.colors[usable])
     if not len(kept):
         raise InputError(f"no point of the capture is finite and within {LARGEST_COORDINATE:g}; export the model again")
-    return kept, [f"{int((~usable).sum())} points that are not finite or beyond {LARGEST_COORDINATE:g} are left out."]
+    return kept, [f"{int((~usable).sum())} points are ignored: non-finite, or beyond {LARGEST_COORDINATE:g}."]
 
 
 def _unread_points(path: Path) -> str:
@@ -344,8 +344,8 @@ def _view_warnings(prepared: list[PreparedView], background: Rgb | None) -> list
     rescaled = [p.view.name for p in prepared if p.rescaled]
     if rescaled:
         warnings.append(
-            f"{len(rescaled)} photographs are scaled copies of what was calibrated; intrinsics were scaled with them "
-            f"({first_names(rescaled)})."
+            f"{len(rescaled)} photographs are scaled copies of the calibrated ones; their intrinsics were scaled "
+            f"accordingly ({first_names(rescaled)})."
         )
     if background is not None:
         warnings.append(f"The photographs have transparent pixels; they are laid over sRGB {background}.")
@@ -358,8 +358,8 @@ def _blank_warnings(shots: Sequence[Shot]) -> list[str]:
     if share <= MUCH_BLANK:
         return []
     return [
-        f"The lens is so wide that up to {share:.1%} of an undistorted photograph lie outside what it saw; these "
-        "pixels are left out."
+        f"The lens is so wide that up to {share:.1%} of an undistorted photograph was outside its view; these "
+        "pixels are ignored."
     ]
 
 
@@ -370,10 +370,10 @@ def _mask_warnings(files: CaptureFiles) -> list[str]:
     share = sum(shares) / max(len(shares), 1) * len(files.ignored) / len(files.shots)
     if share <= MUCH_LEFT_OUT:
         return []
-    meaning = f"black in {MASK_FOLDER}/ is left out, and white in {IGNORE_FOLDER}/; are the masks inverted?"
+    meaning = f"black in {MASK_FOLDER}/ is ignored, and white in {IGNORE_FOLDER}/; are the masks inverted?"
     if all(shot.name in files.ignored and left_out_share(files.ignored[shot.name]) == 1 for shot in files.shots):
-        raise InputError(f"masks leave out all pixels of all photographs of {files.root}: {meaning}")
-    return [f"Masks leave out about {share:.0%} of the photographs: {meaning}"]
+        raise InputError(f"masks exclude all pixels of all photographs of {files.root}: {meaning}")
+    return [f"Masks exclude about {share:.0%} of the photographs: {meaning}"]
 
 
 @torch.no_grad()

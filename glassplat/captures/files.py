@@ -68,7 +68,7 @@ def read_poses(root: Path | str) -> CaptureFiles:
     """Read a capture as `read_capture` does, but look for no masks."""
     root = Path(root)
     if not is_encodable(whole := str(root.resolve())):  # Runs record it.
-        raise InputError(f"the path {readable_name(whole)} is no UTF-8; rename the folders in it")
+        raise InputError(f"the path {readable_name(whole)} is not valid UTF-8; rename the folders in it")
     capture = _load_capture(root)
     shots = tuple(sorted((*capture.shots, *(capture.test_shots or ())), key=lambda shot: shot.name))
     if repeated := [name for name, count in Counter(shot.name for shot in shots).items() if count > 1]:
@@ -94,7 +94,7 @@ def _load_capture(root: Path) -> Capture:
     looked_for = "; ".join(text for _, text in LOADERS)
     names = sorted(path.name for path in root.iterdir())
     found = first_names(names, limit=8) or "nothing"
-    message = f"{root} is no capture that can be read. Looked for: {looked_for}. Found: {found}."
+    message = f"{root} is not a readable capture. Looked for: {looked_for}. Found: {found}."
     if any(Path(name).suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) for name in names):
         message += f" Photographs become a capture by: glassplat prepare {shlex.quote(str(root))} --output CAPTURE"
     raise UnknownFormatError(message)

@@ -306,12 +306,12 @@ def _why_panes(root: Path, masks: Mapping[str, Path], *, marked: bool) -> str | 
         if labels:
             raise InputError(
                 f"the masks in {root / MASK_FOLDER} have no value above {highest}, as if they were labels of panes, "
-                f"but these are in {root / PANE_FOLDER}; write 0 for what to leave out and 255 for what to keep, or "
-                "remove the folder"
+                f"but these are in {root / PANE_FOLDER}; write 0 for pixels to ignore and 255 for pixels to "
+                "keep, or remove the folder"
             )
         return None
     if labels:
-        keep = " (if 1 is what to keep, write 255 for it)" if highest == 1 else ""
+        keep = " (if 1 marks pixels to keep, write 255 instead)" if highest == 1 else ""
         return f"The masks hold labels of panes{keep}."
     return f"There is a {PLANES} but no {PANE_FOLDER}/." if (masks and (root / PLANES).is_file()) else None
 
@@ -438,7 +438,7 @@ def _image_files(folder: Path, hidden: Container[str]) -> Iterator[Path]:
     """Image files below a folder, without hidden ones but those that are known by name, of hidden photographs."""
     if not folder.is_dir():
         if lexists(folder):
-            raise InputError(f"{folder} is no folder that can be read; expected one of mask images, or none")
+            raise InputError(f"{folder} is not a readable folder; expected one of mask images, or none")
         return
     for path in sorted(images.files_below(folder)):
         relative = path.relative_to(folder)
@@ -447,7 +447,7 @@ def _image_files(folder: Path, hidden: Container[str]) -> Iterator[Path]:
         if path.suffix.lower() not in images.IMAGE_SUFFIXES:
             continue
         if not path.is_file():
-            raise InputError(f"mask {path} is no file that can be read; replace or remove it")
+            raise InputError(f"mask {path} is not a readable file; replace or remove it")
         yield path
 
 

@@ -59,7 +59,7 @@ def load_mirror_nerf(root: Path) -> Capture | None:
     warnings = []
     if len(kept) < len(train):
         warnings.append(
-            f"{len(train) - len(kept)} training photographs are test photographs too; they are not trained on."
+            f"{len(train) - len(kept)} training photographs are test photographs too; they are not used for training."
         )
     masks = _masks(root, (*kept, *(test or ())))
     points = transforms.read_points(root, settings)
@@ -127,7 +127,7 @@ def _in_pixels_of(path: Path, intrinsics: tuple[float, float, float, float]) -> 
     across, down = 2 * cx / width, 2 * cy / height
     if not (across > 0 and abs(down / across - 1) < SAME_SIZE):
         raise InputError(
-            f"{path.name} is {width}x{height} pixels large, but its principal point ({cx:g}, {cy:g}) is the middle of "
+            f"{path.name} is {width}x{height} pixels, but its principal point ({cx:g}, {cy:g}) is the middle of "
             "an image of another shape; photographs rotated or cropped after calibration cannot be used"
         )
     scale = 1.0 if abs(across - 1) < SAME_SIZE else across
@@ -144,7 +144,7 @@ def _masks(root: Path, shots: tuple[Shot, ...]) -> dict[str, Path]:
             found[shot.name] = present[name]
     if not found:
         raise InputError(
-            f"none of the {len(present)} files in {root / MASK_FOLDER} is called like a photograph "
+            f"none of the {len(present)} files in {root / MASK_FOLDER} has the name of a photograph "
             f"({first_names(sorted(present)) or 'the folder is empty'}); expected names such as "
             f"{shots[0].image_path.name}"
         )
@@ -177,7 +177,7 @@ def _view(shot: Shot, mask: Path | None) -> View:
 def _with_fitting_axes(capture: Capture, evidence: AxesEvidence | None) -> Capture:
     """The capture in the axes that the evidence leaves."""
     if evidence is None:
-        unsure = "Nothing tells the axes of the poses; OpenGL is assumed, as the authors' reader does."
+        unsure = "The axes of the poses cannot be determined; OpenGL is assumed, as in the authors' reader."
         return replace(capture, warnings=(*capture.warnings, unsure))
     if evidence.fits_neither:
         raise InputError(

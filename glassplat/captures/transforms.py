@@ -192,7 +192,7 @@ def shots_of(root: Path, settings: Settings, file_name: str) -> dict[str, Shot]:
     if missing:
         raise InputError(
             f"{len(missing)} of {len(paths)} photographs of {root / file_name} are missing: {first_names(missing)}; "
-            "copy them to where file_path says, or delete their entries from `frames`"
+            "copy them to file_path, or delete their entries from `frames`"
         )
     shots = {}
     for frame, path, name in zip(settings["frames"], paths, _names(root, paths), strict=True):
@@ -259,7 +259,7 @@ def read_points(root: Path, settings: Settings) -> RawPoints | None:
         return None
     path = root / candidates[0]
     if not isfile(path):
-        raise InputError(f"{path} is no file that can be read; replace or remove it")
+        raise InputError(f"{path} is not a readable file; replace or remove it")
     with input_checked():
         columns = read_table(path).columns
     lacking = [axis for axis in "xyz" if axis not in columns]
@@ -327,8 +327,8 @@ def _load_split(root: Path) -> Capture:
 
 
 UNTESTED = (
-    f"There is no {TEST}; the test views are those of {VAL}, and are not trained on. Move it away to go on with a run "
-    "that was begun without it."
+    f"There is no {TEST}; the test views are those of {VAL}, and are not used for training. Move it away to "
+    "continue a run that was started without it."
 )
 
 
@@ -384,7 +384,7 @@ def _own_split(
     test = tuple(by_path[name] for name in test_names)
     train = tuple(by_path[name] for name in train_names or by_path if name not in set(test_names))
     left_out = len(shots) - len(train) - len(test)
-    return train, test, [f"{left_out} photographs are in neither part of the split and left out."] if left_out else []
+    return train, test, [f"{left_out} photographs are in neither part of the split and ignored."] if left_out else []
 
 
 def _plain_path(name: str) -> str:

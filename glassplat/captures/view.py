@@ -512,7 +512,7 @@ def _reduced_size(pinhole: cameras.Pinhole, downscale: float, name: str) -> tupl
     if downscale > 1 and min(width, height) < LEAST_SIDE:
         most = max(min(pinhole.width, pinhole.height) / LEAST_SIDE, 1)
         raise InputError(
-            f"{name} is {pinhole.width}x{pinhole.height} pixels large, and {width}x{height} reduced by {downscale:g}; "
+            f"{name} is {pinhole.width}x{pinhole.height} pixels, and {width}x{height} reduced by {downscale:g}; "
             f"expected at least {LEAST_SIDE} pixels along each side: use --downscale {int(10 * most) / 10:g} or less"
         )
     return width, height
@@ -524,7 +524,7 @@ def _mask_file(mask: IgnoredMask, size: tuple[int, int], pixel_map: cameras.Pixe
         mask_size = image_size(mask.path)
     if not (_is_multiple(mask_size, size) or _is_multiple(size, mask_size)):
         raise InputError(
-            f"mask {mask.path} is {mask_size[0]}x{mask_size[1]} pixels large, its photograph {size[0]}x{size[1]}; "
+            f"mask {mask.path} is {mask_size[0]}x{mask_size[1]} pixels, its photograph {size[0]}x{size[1]}; "
             "expected the same size, or one an integer multiple of the other"
         )
     return MaskFile(mask, size, pixel_map)
@@ -594,7 +594,7 @@ def normals_in_file(path: Path, camera: Camera) -> Tensor:
     height, width = vectors.shape[:2]
     if abs(width * camera.height - height * camera.width) > max(width, height, camera.width, camera.height):
         raise InputError(
-            f"{path} is {width}x{height} pixels large, its photograph {camera.width}x{camera.height} here, without "
+            f"{path} is {width}x{height} pixels, its photograph {camera.width}x{camera.height} here, without "
             "the distortion of its lens; expected the same proportions"
         )
     in_picture = torch.from_numpy(vectors).permute(2, 0, 1)[None]
@@ -646,7 +646,7 @@ def _vectors(path: Path) -> NDArray[np.float32]:
         with path.open("rb") as file:  # Not `load`, which opens archives of arrays, too.
             vectors = np.lib.format.read_array(file, allow_pickle=False)
     except Exception as error:  # It evaluates the head of the file, and damaged ones raise what tokens do.
-        raise ValueError(f"{path} is no array that NumPy can read ({error}); save it with numpy.save") from error
+        raise ValueError(f"{path} is not an array that NumPy can read ({error}); save it with numpy.save") from error
     if vectors.ndim != 3 or vectors.shape[2] != 3 or vectors.dtype.kind != "f" or 0 in vectors.shape:
         raise ValueError(f"{path} holds {vectors.dtype} of shape {list(vectors.shape)}; expected floats [H, W, 3]")
     return np.nan_to_num(vectors.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)

@@ -1,4 +1,4 @@
-"""`glassplat prepare` and `glassplat annotate`: photographs to a capture, and its panes marked."""
+"""`glassplat prepare` and `glassplat annotate`: making a capture of photographs, and marking its panes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from glassplat.prepare.reconstruction import Settings
 
 @dataclass(frozen=True)
 class Prepare:
-    """Find out where photographs were taken, and make a capture of them.
+    """Estimate the camera poses of photographs and write them as a capture.
 
     Attributes:
         input: folder of photographs, or a video.
@@ -48,7 +48,7 @@ class Prepare:
     force: bool = False
 
     def ready(self) -> None:
-        """Refuses an input that is no photographs, an output among them, and to begin without pycolmap."""
+        """Checks input and output, and that pycolmap is installed."""
         check_places(self._task())
         quiet_pycolmap()
 
@@ -60,37 +60,37 @@ class Prepare:
 
     @cached_property
     def _output(self) -> Path:
-        """The output; absolute where the current folder is in it, which a finished capture replaces."""
+        """The output folder; absolute if the current folder is inside, because a finished capture replaces it."""
         output = real_path(self.output)
         return output if Path.cwd().is_relative_to(output) else self.output
 
     @cached_property
     def _has_finished(self) -> threading.Event:
-        """Set once this command has made the capture; one that is there may be of an earlier command."""
+        """Set once this command has written the capture; an existing one may be from an earlier command."""
         return threading.Event()
 
     def run(self, console: Console) -> None:
-        """Prepares, with progress, and says what became of the photographs."""
+        """Prepares the capture with progress, and prints a report."""
         with WorkProgress(console) as progress:
             report = prepare(self._task(), progress.show, resume=self.resume, force=self.force)
             self._has_finished.set()
         for line in report.lines():
             label = "advice" if line.startswith("advice: ") else ""
             say(console, line.removeprefix("advice: "), label=label, style="yellow")
-        from glassplat.prepare.report_page import write_page  # PyTorch, which nothing before needs.
+        from glassplat.prepare.report_page import write_page  # Imports PyTorch, which is not needed before.
 
         write_page(self._output, self._output / PAGE)
         say(console, f"capture: {self._output}, report: {self._output / PAGE}")
         say(console, f"next: glassplat annotate {shell_word(self._output)}")
 
     def left_behind(self) -> str:
-        """Text after an interrupt: the state on disk, and how to go on."""
+        """Message after an interrupt: the state on disk, and how to continue."""
         if self._has_finished.is_set():
             page = f"glassplat info {shell_word(self._output)} --page {shell_word(self._output / PAGE)}"
-            return f"the capture in {self._output} is whole; `{page}` writes its report"
+            return f"the capture in {self._output} is complete; `{page}` writes its report"
         if (partial := Workplace(self._output).folder).exists():
-            return f"repeat the command with --resume to go on; what is done so far lies in {partial}"
-        return "nothing was written: repeat the command to begin again"
+            return f"repeat the command with --resume to continue; finished work is in {partial}"
+        return "nothing was written: repeat the command to start again"
 
 
 @dataclass(frozen=True)
@@ -99,12 +99,12 @@ class Annotate(Command):
 
     Attributes:
         capture: directory of the capture.
-        port: to listen on, on this computer only; 0 takes any that is free.
-        open_browser: open the page at once; not over SSH.
+        port: local port of the page; 0 picks a free one.
+        open_browser: open the page in the browser (not over SSH).
     """
 
     work = "serving:serve_marking"
-    left = "what was marked is saved in {capture}: repeat the command to go on"
+    left = "the marks are saved in {capture}: repeat the command to continue"
 
     capture: tyro.conf.Positional[Path]
     port: Annotated[int, Range(0, 65535)] = 8765

@@ -1,7 +1,7 @@
 """The console of commands: printed lines, arguments, signals, imports, and how commands end.
 
-Everything printed may hold a path or a name that somebody else chose. Rich would read `[...]` in it as markup and `:x:`
-as a picture, and break it at 80 columns where the output goes to a file; a control character would reach the terminal.
+Printed text may contain paths and names chosen by others. Rich would interpret `[...]` as markup and `:x:` as an emoji,
+and wrap lines at 80 columns in files; control characters would reach the terminal.
 """
 
 from __future__ import annotations
@@ -39,43 +39,43 @@ from glassplat import __version__
 from glassplat.errors import InputError, RankLostError
 
 UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
-"""Control characters but for tabs and line breaks, and the bytes of a file name that are not text."""
+"""Control characters other than tabs and line breaks, and undecodable bytes of file names."""
 
 
 class MessageConsole(Console):
-    """Rich's console; it leaves it to the command how to end when nobody reads the output any more."""
+    """A Rich console that lets the command decide how to exit on a broken pipe."""
 
     def on_broken_pipe(self) -> NoReturn:
-        """Raises BrokenPipeError again."""
+        """Re-raises BrokenPipeError."""
         raise BrokenPipeError
 
 
 def message_console(*, stderr: bool = False) -> Console:
-    """The console of a command: strings are shown as they are, and break only in a terminal."""
+    """Console of a command: prints strings verbatim, and wraps lines only in a terminal."""
     console = MessageConsole(stderr=stderr, markup=False, emoji=False, highlight=False)
     console.soft_wrap = not console.is_terminal
     return console
 
 
 def shell_word(path: object) -> str:
-    """A path as it is typed in a command, where a leading dash would begin an option."""
+    """A path quoted for the shell; a leading dash is escaped, so that it is not read as an option."""
     word = str(path)
     return quote(f"./{word}" if word.startswith("-") else word)
 
 
 def count_noun(number: int, noun: str) -> str:
-    """A number of things, as in "1 pane" and "2 panes"."""
+    """A count with its noun, as in "1 pane" and "2 panes"."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def say(console: Console, text: object, *, label: str = "", style: str = "") -> None:
-    """Prints a line as it is; a terminal breaks it, so that a command in it is copied as one line.
+    """Prints a line verbatim. The terminal wraps it, so that commands in it can be copied as one line.
 
     Args:
-        console: where to; any console, also one that reads markup.
-        text: what to say.
-        label: a word in front, followed by a colon, such as `warning`.
-        style: the label's colour.
+        console: any console, even one that reads markup.
+        text: text of the line.
+        label: prefix before a colon, such as `warning`.
+        style: colour of the label.
     """
     line = Text(f"{label}:" if label else "", style=style)
     line.append(f"{' ' if label else ''}{printable(str(text))}", style="default")
@@ -83,27 +83,27 @@ def say(console: Console, text: object, *, label: str = "", style: str = "") -> 
 
 
 def warn(console: Console, text: object) -> None:
-    """Prints a warning: the command goes on."""
+    """Prints a warning; the command continues."""
     say(console, text, label="warning", style="yellow")
 
 
 def complain(label: Literal["error", "stopped", "failed"], text: object) -> None:
-    """Prints on standard error why a command ends, or one of its parts.
+    """Prints to standard error why a command, or one of its parts, ends.
 
     Args:
-        label: `error` for wrong input, `stopped` for a failure while running, `failed` for a part that is left out.
-        text: what was expected, what came, and what to do.
+        label: `error` for wrong input, `stopped` for a failure while running, `failed` for a part that is skipped.
+        text: what was expected, what was found, and what to do.
     """
     say(message_console(stderr=True), text, label=label, style="red")
 
 
 def printable(text: str) -> str:
-    r"""The text with what no terminal should get written out, such as `\x1b`."""
+    r"""The text with control characters escaped, such as `\x1b`."""
     return UNPRINTABLE.sub(lambda found: repr(found.group())[1:-1], text)
 
 
 def plain_streams() -> None:
-    """Lets every program be started from: with output that is closed, or in an encoding that lacks a character."""
+    """Makes output robust: closed streams are replaced, and characters missing from the encoding are escaped."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
@@ -113,18 +113,18 @@ def plain_streams() -> None:
 
 
 def silence() -> None:
-    """Says nothing from now on, as ranks do that do not lead: another process speaks for all."""
+    """Discards all further output, as on ranks other than the leader, which prints for all."""
     sys.stdout = sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - Until the process ends.
 
 
 def drop_output() -> None:
-    """Sends what is still to be printed nowhere, since nobody reads it any more."""
+    """Discards pending output after a broken pipe."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
 
 
 class LogLines(logging.Handler):
-    """Shows what is logged among the other lines of a command, above its progress bar; the same line once."""
+    """Prints log records among the lines of a command, above its progress bar; repeated lines once."""
 
     def __init__(self, console: Console) -> None:
         super().__init__()
@@ -132,7 +132,7 @@ class LogLines(logging.Handler):
         self._shown: set[str] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Prints one record, unless its line is there already: planes are fitted twice in a training."""
+        """Prints one record unless its line was printed before: planes are fitted twice in a training run."""
         text = record.getMessage()
         if text in self._shown:
             return
@@ -145,7 +145,7 @@ class LogLines(logging.Handler):
 
 @contextmanager
 def heard_by(console: Console) -> Iterator[None]:
-    """Shows on a console what the package logs and what libraries warn of, each as a line."""
+    """Prints log records of the package and warnings of libraries on a console, each as a line."""
 
     def show(message: Warning | str, *place: Any, **more: Any) -> None:
         warn(console, message)
@@ -168,11 +168,11 @@ WORDS = {
     if hasattr(signal, name)  # Windows has no SIGHUP.
 }
 CODE_OF_SIGNALS = 128
-"""Shells report a process that a signal ended by this plus the signal's number."""
+"""Shells report a process that was killed by a signal as this plus the number of the signal."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """The command was asked to end.
+    """Raised when a signal asks the command to end.
 
     Attributes:
         number: the signal.
@@ -184,16 +184,16 @@ class Interrupted(KeyboardInterrupt):
 
 
 def code_of(stop: KeyboardInterrupt) -> int:
-    """The exit code: 130 after Ctrl-C, 143 and 129 after the two other signals."""
+    """Exit code of an interrupt: 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP."""
     return CODE_OF_SIGNALS + (stop.number if isinstance(stop, Interrupted) else signal.SIGINT)
 
 
 @contextmanager
 def raised_signals(*, is_program: bool = False) -> Iterator[list[Interrupted]]:
-    """Turns the signals into `Interrupted`, raised where the command is, so that half-written files are removed.
+    """Turns signals into `Interrupted` exceptions, so that half-written files are removed.
 
-    Gives the list of those raised: a library that is interrupted may end with an error of its own. Where the process
-    ends after the command, a later signal ends it at once, not with a traceback of what it was tidying up.
+    Yields the list of those raised, because an interrupted library may fail with an error of its own. If the process
+    ends after the command, a later signal kills it at once, without a traceback of the cleanup.
     """
     raised: list[Interrupted] = []
 
@@ -207,10 +207,10 @@ def raised_signals(*, is_program: bool = False) -> Iterator[list[Interrupted]]:
 
 @contextmanager
 def immediate_end() -> Iterator[None]:
-    """Ends the process at the first signal, with one line: for the seconds in which libraries are imported.
+    """Ends the process with one line at the first signal, while libraries are being imported.
 
-    Nothing has been written yet that would be left behind. An exception would not do: a library may take it for its
-    own failure, or go on without the module that it was importing.
+    Nothing has been written yet that would need cleanup. An exception would not work: a library may treat it as its
+    own failure, or continue without the module that it was importing.
     """
 
     def end(number: int, frame: FrameType | None) -> None:
@@ -224,7 +224,7 @@ def immediate_end() -> Iterator[None]:
 
 @contextmanager
 def held_signals() -> Iterator[None]:
-    """Answers signals when the context ends: for imports while something runs that has to be told to end."""
+    """Defers signals to the end of the context, for imports while something runs that needs an orderly shutdown."""
     held: list[int] = []
     with _install_handlers(lambda number, frame: held.append(number)):
         yield
@@ -234,14 +234,14 @@ def held_signals() -> Iterator[None]:
 
 @contextmanager
 def _install_handlers(answer: signal._HANDLER, afterwards: signal._HANDLER | None = None) -> Iterator[None]:
-    """Has the signals answered, but for those that the process was told to ignore, as by `nohup`.
+    """Installs signal handlers, except for signals that the process ignores, as under `nohup`.
 
     Args:
-        answer: to a signal in this context.
-        afterwards: from then on; None for what it was before.
+        answer: handler in this context.
+        afterwards: handler after it; the previous one if None.
     """
     if threading.current_thread() is not threading.main_thread():
-        yield  # Only the main thread may say how signals are answered.
+        yield  # Only the main thread can install handlers.
         return
     numbers = [getattr(signal, name) for name in WORDS]
     before = {number: signal.getsignal(number) for number in numbers}
@@ -259,7 +259,7 @@ BAD_INPUT_CODE, FAILURE_CODE = 2, 1
 BAD_INPUT = ("glassplat.panes.PlaneFitError", "glassplat.kernels.backend.devices.CudaUnavailableError")
 FAILURES = ("glassplat.training.loop.TrainingDivergedError",)
 GPU_IS_FULL = ("torch.OutOfMemoryError",)
-"""By name: this module is loaded before PyTorch, and also where PyTorch is what cannot be loaded."""
+"""By name, because this module is loaded before PyTorch, and even if PyTorch cannot be loaded."""
 BAD_PATH = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 BAD_PATH_NUMBERS = (errno.ENAMETOOLONG, errno.ELOOP, errno.EROFS, errno.EINVAL)
 FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -272,11 +272,11 @@ OUT_OF_MEMORY = (
     "failed to map segment",
 )
 LONGEST_QUOTE = 300
-REMEDY = "photographs made smaller (train with a larger --downscale) or fewer Gaussians need less"
+REMEDY = "smaller photographs (a larger --downscale in training) or fewer Gaussians need less"
 
 
 class Ending(NamedTuple):
-    """Text and exit code of a command's end: `error` for wrong input, `stopped` for a failure."""
+    """Message and exit code of a failed command: `error` for wrong input, `stopped` for a failure."""
 
     label: Literal["error", "stopped"]
     text: str
@@ -284,7 +284,7 @@ class Ending(NamedTuple):
 
 
 def ending(error: BaseException) -> Ending:
-    """The message and the exit code that an error ends a command with; one that nobody foresaw is saved to a file."""
+    """Message and exit code for an error; the traceback of an unexpected one is saved to a file."""
     if isinstance(error, RankLostError):
         said = error.ending or ("stopped", str(error), FAILURE_CODE)
         return Ending("error" if said[0] == "error" else "stopped", *said[1:])
@@ -298,7 +298,7 @@ def ending(error: BaseException) -> Ending:
 
 
 def is_one_of(error: BaseException, names: tuple[str, ...]) -> bool:
-    """Return whether an error is of a class given by name; one whose module is not loaded cannot have been raised."""
+    """Return whether an error is an instance of one of the named classes; those of unloaded modules cannot be."""
     for module, _, name in (full.rpartition(".") for full in names):
         kind = getattr(sys.modules.get(module), name, None)
         if kind is not None and isinstance(error, kind):
@@ -307,9 +307,9 @@ def is_one_of(error: BaseException, names: tuple[str, ...]) -> bool:
 
 
 def described_os_error(error: OSError) -> str:
-    """An error of the operating system in words: what it is about, what is wrong, and what helps."""
+    """An operating-system error in words: the path, the problem and the remedy."""
     if error.errno is None or error.strerror is None:
-        return str(error)  # Our own, whose message says everything.
+        return str(error)  # One of ours, with a complete message.
     subjects = [os.fsdecode(name) for name in (error.filename, error.filename2) if isinstance(name, str | bytes)]
     about = f"{' -> '.join(subjects)}: " if subjects else ""
     remedy = "; free some space, then repeat the command" if error.errno in FULL else ""
@@ -324,11 +324,11 @@ def _failure(error: BaseException) -> str:
     if is_out_of_memory(error):
         return f"out of memory ({first_sentence(error) or 'an allocation failed'}); {REMEDY}; the last checkpoint stays"
     said = first_sentence(error)
-    return f"an error that glassplat did not foresee, {type(error).__name__}: {said}; {saved_traceback(error)}"
+    return f"unexpected error, {type(error).__name__}: {said}; {saved_traceback(error)}"
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether the CPU's memory ran out, or that is what made a library fail; many say so in words only."""
+    """Return whether an error means that memory ran out; many libraries say so only in the message."""
     if isinstance(error, MemoryError):
         return True
     if isinstance(error, RuntimeError | ImportError | OSError) and any(text in str(error) for text in OUT_OF_MEMORY):
@@ -337,13 +337,13 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def first_sentence(error: BaseException) -> str:
-    """The first sentence of somebody else's message, which may have many lines."""
+    """First sentence of a library's message, which may have many lines."""
     first = (str(error).strip().splitlines() or [""])[0].split(". ")[0].rstrip(".")
     return first if len(first) <= LONGEST_QUOTE else f"{first[:LONGEST_QUOTE]} ..."
 
 
 def saved_traceback(error: BaseException) -> str:
-    """Writes the traceback to a file among the temporary ones; says where, or where the error was if it cannot."""
+    """Writes the traceback to a temporary file; returns its location, or that of the error if this fails."""
     trace = "".join(traceback.format_exception(error))
     head = f"{versions()}\n{time.strftime('%Y-%m-%d %H:%M:%S %z')}\n{sys.argv}\n\n"
     try:
@@ -353,12 +353,12 @@ def saved_traceback(error: BaseException) -> str:
             file.write(head + trace)
     except OSError:
         frames = traceback.extract_tb(error.__traceback__)
-        return f"raised in {frames[-1].filename}, line {frames[-1].lineno}" if frames else "its place is not known"
-    return f"the traceback is in {file.name}. Please report it, with what you did"
+        return f"raised in {frames[-1].filename}, line {frames[-1].lineno}" if frames else "at an unknown location"
+    return f"the traceback is in {file.name}. Please report it, and how it came about"
 
 
 def versions() -> str:
-    """The versions of what runs here, the system and its GPU, in a line, without importing any of it."""
+    """Versions of the package, its main dependencies, the system and the GPU in one line, without imports."""
     return (
         f"glassplat {__version__}, Python {platform.python_version()}, PyTorch {_version('torch')}, "
         f"Numba {_version('numba')}, {platform.system()} {platform.release()} {platform.machine()}, "
@@ -374,7 +374,7 @@ def _version(package: str) -> str:
 
 
 def _gpu() -> str:
-    """The NVIDIA GPU that the driver names first."""
+    """The first NVIDIA GPU of the driver."""
     try:
         driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     except OSError:
@@ -386,37 +386,37 @@ def _gpu() -> str:
 
 
 def check_arguments(arguments: Sequence[str]) -> None:
-    """Refuses empty arguments after a command: as a path, an empty text is the folder that it was started in."""
+    """Refuses empty arguments: an empty path would mean the current folder."""
     for before, argument in itertools.pairwise(arguments):
         option, is_joined, value = argument.partition("=")
         if argument == "" or (option.startswith("--") and is_joined and not value):
             name = option or before
-            raise InputError(f"what follows {name} is empty, as of a shell variable that is not set; expected a value")
+            raise InputError(f"the value of {name} is empty (an unset shell variable?); expected a value")
 
 
 def similar(word: str, known: Iterable[str]) -> list[str]:
-    """The known word that a mistyped one resembles most; none where it resembles none."""
+    """The known word closest to a mistyped one, if any is close."""
     return difflib.get_close_matches(word, list(known), n=1, cutoff=0.7)
 
 
 def no_such(what: str, word: str, known: Iterable[str], command: str) -> str:
-    """The message about a word that is no command or method: the one meant perhaps, all of them, and their help."""
+    """Message about an unknown command or method, with the closest one, all of them, and their help."""
     meant = similar(word, known)
     guess = f"did you mean {meant[0]}? There are" if meant else "expected one of"
     return f"there is no {what} {word!r}; {guess} {', '.join(known)}: see {command}"
 
 
 BOX = re.compile(r"\x1b\[[0-9;]*m|[│─╭╮╰╯]|-{5,}")
-"""What frames and colours tyro's messages."""
+"""Frames and colours of tyro's messages."""
 NUMBERS = {"INT": "whole number", "FLOAT": "number"}
-"""Of tyro's signs for what an option takes, those that it explains in Python's words."""
+"""Plain words for tyro's type names."""
 NOT_A_NUMBER = re.compile(
     r"Error parsing (--[\w./-]+):.*Argument helptext:[ \n]+--[\w., -]+? ((?:INT|FLOAT|None|[|{} ])+)"
 )
 
 
 def refused_options(said: str) -> str:
-    """tyro's message about a command line as one line, without its box, its title and its pointer to the help."""
+    """tyro's error message as one line, without its box, title and pointer to the help."""
     title, _, text = BOX.sub("", said).strip().partition("\n")
     text = " ".join(text.partition("For full helptext")[0].split()).removeprefix("Error parsing ")
     text = re.sub(r"\.? \(required\)", ";", text).rstrip(".;")
@@ -424,7 +424,7 @@ def refused_options(said: str) -> str:
 
 
 def wrong_number(said: str, arguments: Sequence[str]) -> str | None:
-    """In place of tyro's message about an option that takes numbers, what it takes and what came; None for others."""
+    """A message on a wrong number that replaces tyro's: expected and given values; None for other errors."""
     if (found := NOT_A_NUMBER.search(" ".join(BOX.sub("", said).split()))) is None:
         return None
     names = found[1].split("/")
@@ -438,24 +438,24 @@ def wrong_number(said: str, arguments: Sequence[str]) -> str | None:
 
 
 def numbers_in_words(signs: str) -> str:
-    """An option's values in words, as in "3 numbers" for "FLOAT FLOAT FLOAT"."""
+    """An option's value types in words, as in "3 numbers" for "FLOAT FLOAT FLOAT"."""
     kinds = signs.split()
     word = NUMBERS.get(kinds[0])
     return signs if word is None else f"a {word}" if len(kinds) == 1 else count_noun(len(kinds), word)
 
 
 LINE = "loading PyTorch ..."
-"""Shown in a terminal only, and gone when the work begins. The cursor stays: Ctrl-C may end the process at once."""
+"""Shown in terminals only, until the import ends. The cursor is not hidden: Ctrl-C may end the process at once."""
 
 
 def import_now(module: str) -> Any:
-    """A module of `glassplat` that imports PyTorch, by its dotted name, imported now if it is not there yet."""
+    """Imports a module that needs PyTorch, by its dotted name."""
     with _without_garbage_collection(), _announce(message_console(stderr=True), module):
         return importlib.import_module(module)
 
 
 def import_held(module: str) -> Any:
-    """The same while a command works: signals are answered after the import, which must not break off."""
+    """The same with signals deferred, for imports during work, which must not be interrupted."""
     with held_signals():
         return import_now(module)
 
@@ -492,7 +492,7 @@ class Command:
 
 @contextmanager
 def _announce(console: Console, module: str) -> Iterator[None]:
-    """Shows the line meanwhile, where somebody may be watching and the module is not there yet."""
+    """Shows the line during the import, in a terminal and if the module is not loaded yet."""
     if module in sys.modules or not console.is_interactive:
         yield
         return
@@ -505,7 +505,7 @@ def _announce(console: Console, module: str) -> Iterator[None]:
 
 @contextmanager
 def _without_garbage_collection() -> Iterator[None]:
-    """Keeps Python from looking for garbage among what is imported, now and later: all of it stays to the end."""
+    """Disables garbage collection during imports, and exempts the imported objects from later ones."""
     if not gc.isenabled():
         yield
         return

@@ -1,4 +1,4 @@
-"""Details of captures and scenes for `glassplat info`, which take PyTorch to read."""
+"""Details of captures and scenes for `glassplat info` that need PyTorch."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from glassplat.training.checkpoint import recorded
 
 FEW_POINTS, FEW_MASKS = 500, 3
 MASKS_LOOKED_AT = 16
-"""Photographs whose share of ignored pixels is measured."""
+"""Number of photographs in which the share of ignored pixels is measured."""
 
 
 def remaining_parts(files: CaptureFiles) -> Iterator[Finding]:
-    """Parts about a capture that its files alone do not give."""
+    """Findings on a capture beyond its list of files."""
     dataset = dataset_of(files)
     finding = Finding()
     sizes = sorted({f"{v.camera.width}x{v.camera.height}" for v in (*dataset.train, *dataset.test)})
@@ -44,10 +44,10 @@ def remaining_parts(files: CaptureFiles) -> Iterator[Finding]:
     finding.problems += dataset.warnings
     if len(dataset.train) + len(dataset.test) < FEW_VIEWS:
         finding.problems.append(
-            f"only {count_noun(len(dataset.train) + len(dataset.test), 'photograph')}; 30 and more do better"
+            f"only {count_noun(len(dataset.train) + len(dataset.test), 'photograph')}; 30 or more work better"
         )
     if dataset.measured_points and len(dataset.points) < FEW_POINTS:
-        finding.problems.append(f"{len(dataset.points)} points are few; more photographs with more overlap give more")
+        finding.problems.append(f"{len(dataset.points)} points only; more photographs with more overlap give more")
     yield finding
     yield _describe_panes(files.root, dataset)
     yield _behind(files.root, dataset)
@@ -57,7 +57,7 @@ def remaining_parts(files: CaptureFiles) -> Iterator[Finding]:
 
 
 def write_capture_page(path: Path, target: Path) -> None:
-    """Writes the report of a prepared capture, with the panes that are marked in it."""
+    """Writes the report of a prepared capture, with its marked panes."""
     dataset = load_dataset(path)
     marked = bool(dataset.pane_labels) or dataset.planes is not None
     write_page(path, target, fitted_planes(dataset, None, PlaneFit()) if marked else None)
@@ -87,12 +87,12 @@ def _describe_panes(path: Path, dataset: Dataset) -> Finding:
         f", planes.json gives {name_labels(given)}" if given else ""
     )
     if annotated < FEW_MASKS and not given:
-        finding.problems.append(f"{annotated} masks are few; three to ten, from places well apart, do better")
+        finding.problems.append(f"{annotated} masks only; three to ten, from positions far apart, work better")
     return finding
 
 
 def _behind(path: Path, dataset: Dataset) -> Finding:
-    """Finding on the panes that are marked: whether planes fit them, and what lies behind these; takes seconds."""
+    """Finding on the marked panes: fitted planes and the points behind them; takes seconds."""
     finding = Finding()
     if not dataset.pane_labels and dataset.planes is None:
         return finding
@@ -100,7 +100,7 @@ def _behind(path: Path, dataset: Dataset) -> Finding:
         planes = fitted_planes(dataset, None, PlaneFit())
     except PlaneFitError as error:
         finding.problems.append(str(error))
-        finding.next.append(f"glassplat annotate {shell_word(path)}    marks panes by corners instead")
+        finding.next.append(f"glassplat annotate {shell_word(path)}    marks panes by their corners instead")
         return finding
     if dataset.measured_points:
         cameras = [view.camera for view in dataset.train]
@@ -116,7 +116,7 @@ FAINT = 0.01
 
 
 def splats_part(path: Path) -> Finding:
-    """Part about a file of Gaussians, with the panes next to it, which `load` takes, too."""
+    """Finding on a file of Gaussians, with the panes next to it, as `load` reads them."""
     beside = path.with_name(PLANES)
     with input_checked():
         gaussians = read_splats(path)
@@ -129,7 +129,7 @@ def splats_part(path: Path) -> Finding:
 
 
 def resume_command(directory: RunDirectory) -> str:
-    """The command that goes on with an interrupted run."""
+    """The command that continues an interrupted run."""
     settings, usual = directory.settings(), RunSettings("", 1)
     method, recipe = directory.recipe().method, shell_word(directory.path / "recipe.json")
     words = [f"glassplat train {method} --config {recipe} --data {shell_word(settings.data)}"]
@@ -141,7 +141,7 @@ def resume_command(directory: RunDirectory) -> str:
 
 
 def trained_part(directory: RunDirectory) -> Finding:
-    """Part about the state of a training."""
+    """Finding on the state of a training run."""
     finding = Finding()
     try:
         scene, step = directory.latest_scene()
@@ -153,9 +153,9 @@ def trained_part(directory: RunDirectory) -> Finding:
             finding.next.append("the train command that began it, again")
             return finding
         if reached < directory.settings().iterations:
-            finding.problems.append(f"it was interrupted at step {reached} of {directory.settings().iterations}")
+            finding.problems.append(f"interrupted at step {reached} of {directory.settings().iterations}")
         else:
-            finding.problems.append(f"its scene is damaged, and can be written again: {error}")
+            finding.problems.append(f"the scene is damaged, but can be written again: {error}")
         finding.next.append(resume_command(directory))
         return finding
     finding.facts["trained to"] = step
@@ -168,7 +168,7 @@ def trained_part(directory: RunDirectory) -> Finding:
 
 
 def imported_part(directory: RunDirectory) -> Finding:
-    """Part about a scene that lies in a run's directory, and that no photographs can be compared with."""
+    """Finding on a scene in the layout of a run, but without a capture."""
     finding = Finding()
     _describe_scene(directory.latest_scene()[0], finding)
     _suggest_looking(directory.path, finding)
@@ -176,7 +176,7 @@ def imported_part(directory: RunDirectory) -> Finding:
 
 
 def scene_part(path: Path) -> Finding:
-    """Part about the scene in a folder."""
+    """Finding on the scene in a folder."""
     try:
         scene = read_scene(path)
     except (ValueError, FileNotFoundError) as error:
@@ -200,13 +200,13 @@ def _describe_scene(scene: Scene, finding: Finding) -> None:
         )
         finding.facts["panes"] = ", ".join(descriptions)
     if len(scene.photographer):
-        finding.facts["photographer"] = f"{len(scene.photographer)} Gaussians, which panes show in photographs only"
+        finding.facts["photographer"] = f"{len(scene.photographer)} Gaussians, shown by panes in photographs only"
     if not scene.environment.is_empty:
         finding.facts["environment"] = f"a cube map of {scene.environment.size} texels a side"
 
 
 def _look_at(gaussians: Gaussians, finding: Finding) -> None:
-    """Number, colours, reach and oddities of Gaussians."""
+    """Number, colours, extent and problems of Gaussians."""
     finding.facts["Gaussians"] = len(gaussians)
     if not len(gaussians):
         finding.problems.append("it holds no Gaussian")
@@ -215,7 +215,7 @@ def _look_at(gaussians: Gaussians, finding: Finding) -> None:
         finding.facts["degree of harmonics"] = gaussians.max_sh_degree
     finite = torch.isfinite(gaussians.means).all(dim=1)
     if not bool(finite.all()):
-        finding.problems.append(f"{int((~finite).sum())} Gaussians have no place that is finite; they are not drawn")
+        finding.problems.append(f"{int((~finite).sum())} Gaussians have non-finite positions; they are not drawn")
     means = gaussians.means[finite]
     if not len(means):
         return
@@ -231,7 +231,7 @@ def _describe_results(directory: RunDirectory, finding: Finding) -> None:
     path = directory.path
     if not directory.results.is_file():
         data = "" if Path(directory.settings().data).is_dir() else " --data CAPTURE"
-        finding.next.append(f"glassplat eval {shell_word(path)}{data}    measures it on its test views")
+        finding.next.append(f"glassplat eval {shell_word(path)}{data}    evaluates it on its test views")
     else:
         try:
             results = read_json(directory.results)
@@ -245,5 +245,5 @@ def _describe_results(directory: RunDirectory, finding: Finding) -> None:
 def _suggest_looking(path: Path, finding: Finding) -> None:
     finding.next.append(f"glassplat view {shell_word(path)}    shows it in the browser")
     finding.next.append(
-        f"glassplat export {shell_word(path)} --output PAGE    makes a page to share, and files for other programs"
+        f"glassplat export {shell_word(path)} --output PAGE    exports a web page and files for other programs"
     )

@@ -1,4 +1,4 @@
-"""The work of `glassplat eval`: metrics and pictures of a run, over the panes of its capture."""
+"""Implementation of `glassplat eval`: metrics and comparison sheets of a run."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ if TYPE_CHECKING:
 
 
 def pane_regions(dataset: Dataset, source: PaneSource) -> scoring.PaneRegions:
-    """The pixels that show panes, from the source of this name."""
+    """Pixels that show panes, from the named source."""
     if source == "auto":
         return _best_regions(dataset)
     if source == "masks":
         return _marked_regions(dataset)
     if source == "truth" and dataset.truth is None:
-        raise InputError(f"{dataset.root} has no folder gt/ that says where its panes are; use --panes masks")
+        raise InputError(f"{dataset.root} has no ground truth (gt/) of its panes; use --panes masks")
     return scoring.TRUE_REGIONS if source == "truth" else scoring.RENDERED_REGIONS
 
 
 def _best_regions(dataset: Dataset) -> scoring.PaneRegions:
-    """Those that say most surely where the panes are."""
+    """Pane pixels from the most reliable source."""
     if dataset.truth is not None:
         return scoring.TRUE_REGIONS
     try:
@@ -52,14 +52,16 @@ def _best_regions(dataset: Dataset) -> scoring.PaneRegions:
 
 
 def _marked_regions(dataset: Dataset) -> scoring.PaneRegions:
-    """Those of the masks, with planes fitted as any method would begin, so that all are measured alike."""
+    """Pane pixels from the masks and freshly fitted planes, the same for all methods."""
     if not dataset.pane_labels and dataset.planes is None:
-        raise InputError(f"{dataset.root} has no masks that name a pane; use --panes rendered, or add masks")
+        raise InputError(f"{dataset.root} has no pane masks; use --panes rendered, or add masks")
     try:
-        # The rectangle's margin is for training, which must not cut into a pane.
+        # The margin of rectangles is only for training, which must not crop a pane.
         return scoring.marked_regions(fitted_planes(dataset, None, PlaneFit(margin=1.0)))
     except PlaneFitError as error:
-        raise InputError(f"the masks of {dataset.root} lead to no plane: {error}. Use --panes rendered") from error
+        raise InputError(
+            f"the masks of {dataset.root} do not determine a plane: {error}. Use --panes rendered"
+        ) from error
 
 
 def evaluate_and_report(command: Evaluate, console: Console) -> None:
@@ -82,13 +84,13 @@ def evaluate_run(
     align: Align = "auto",
     show: Callable[[Working], None] = lambda work: None,
 ) -> dict:
-    """Evaluates a run, writes `results.json`, `per_view.json`, sheets and overview; returns the results.
+    """Evaluates a run; writes `results.json`, `per_view.json`, sheets and an overview; returns the results.
 
     Args:
         stored: the run.
-        panes: what says where panes are.
-        align: whether test cameras are moved first.
-        show: is told how far it is.
+        panes: source of pane pixels.
+        align: when to align test cameras first.
+        show: receives the progress.
     """
     check_links(stored.directory.path, (*EVALUATED, stored.directory.results.name))
     seconds, regions = train_seconds(stored), pane_regions(stored.dataset, panes)
@@ -135,11 +137,11 @@ def cameras_of_test_views(stored: StoredRun, aligned: bool) -> str:
     if aligned:
         return "aligned with their photographs"
     moved = stored.scene.poses.reaches(view.name for view in stored.dataset.test)
-    return "moved as the neighbouring photographs', in the order of names" if moved else UNMOVED
+    return "moved like those of the neighbouring photographs, by name" if moved else UNMOVED
 
 
 def train_seconds(stored: StoredRun) -> float | None:
-    """Training time as the checkpoint recorded it; None where none is whole: the scene does not need it."""
+    """Training time from the checkpoint; None if there is no readable one, which evaluation does not need."""
     try:
         return recorded(stored.directory.checkpoint).seconds
     except (FileNotFoundError, InputError):
@@ -147,7 +149,7 @@ def train_seconds(stored: StoredRun) -> float | None:
 
 
 def print_results(console: Console, *results: dict) -> None:
-    """Shows the main metrics of one or several runs, side by side, and says why some have no value."""
+    """Prints the main metrics of one or several runs, side by side, and the reasons for missing values."""
     console.print(results_table(*results))
     for line in notes(*results):
         say(console, line)
@@ -167,7 +169,7 @@ def results_table(*results: dict) -> Table:
 
 
 def plane_text(plane: dict) -> str:
-    """A pane in one line: its reflectance, and its errors where the truth is known."""
+    """A pane in one line: its reflectance, and its errors if the truth is known."""
     text = f"R0 {format_value(plane['base_reflectance'], PLANE_COLUMNS['base_reflectance'].pattern)}"
     if plane.get("normal_drift_deg") is not None:
         text += f", {plane['normal_drift_deg']:.2f}° from the plane of the masks"
@@ -180,7 +182,7 @@ def plane_text(plane: dict) -> str:
 
 
 def notes(*results: dict) -> list[str]:
-    """One line for each way in which test views were changed, and for each reason why metrics have no value."""
+    """One line for each change to test views, and for each reason of missing metrics."""
     heads = [f"{result['method']}: " if len(results) > 1 else "" for result in results]
     changed = [
         f"{head}{name} of test views: {result[key]}"

@@ -1,4 +1,4 @@
-"""`glassplat info`: what a path holds, whether it is healthy, and what to do next."""
+"""`glassplat info`: description and check of a path, and the next step."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ from glassplat.prepare.photographs import (
 from glassplat.prepare.preparation import PAGE, RECORD, Preparation
 
 KINDS = f"a capture, photographs, a video, a run, an exported scene, or a splat file ({', '.join(SPLAT_SUFFIXES)})"
-"""What there is to be found."""
+"""Kinds of paths."""
 FEW_VIEWS = 20
-"""Photographs, below which more are advised."""
+"""Recommended minimum number of photographs."""
 DETAILS = "glassplat.cli.details"
-"""Imported when something is read that takes PyTorch."""
+"""Imported only for paths that need PyTorch."""
 
 
 @dataclass
 class Finding:
-    """Kind and state of something, with the commands that fit it.
+    """Kind and state of a path, with suitable commands.
 
-    What takes long to find out comes in parts: finders yield them, and each adds to those before.
+    Slow checks are reported in parts: finders yield them, and each adds to the previous ones.
 
     Attributes:
-        kind: what it is, in a few words; the first part says it.
-        facts: by name, in the order in which they are told.
-        problems: what keeps it from being used, or makes it worse, full sentences.
-        next: commands that go on from here, each with what it does.
+        kind: short description, in the first part.
+        facts: by name, in order of display.
+        problems: obstacles and deficiencies, in full sentences.
+        next: commands for the next step, each with its purpose.
     """
 
     kind: str = ""
@@ -56,14 +56,14 @@ class Finding:
     next: list[str] = field(default_factory=list)
 
     def add(self, part: Finding) -> None:
-        """Takes what was found next."""
+        """Adds the next part."""
         self.kind = self.kind or part.kind
         self.facts |= part.facts
         self.problems += part.problems
         self.next += part.next
 
     def as_json(self) -> dict[str, Any]:
-        """For programs."""
+        """JSON representation."""
         return {
             "kind": self.kind,
             "healthy": not self.problems,
@@ -74,14 +74,14 @@ class Finding:
 
 
 Finder = Callable[[Path], Iterator[Finding]]
-"""Finds out what a path holds, part by part."""
+"""Examines a path, and yields findings part by part."""
 
 
 def capture_finding(path: Path) -> Iterator[Finding]:
     """A capture that can be trained.
 
     Raises:
-        UnknownFormatError: it is none.
+        UnknownFormatError: it is not a capture.
         InputError: it cannot be read.
     """
     files = read_capture(path)
@@ -98,7 +98,7 @@ def _first_part(files: CaptureFiles) -> Finding:
 
 
 def _describe_preparation(path: Path, finding: Finding) -> None:
-    """Report of `glassplat prepare` in the capture."""
+    """Facts from the report of `glassplat prepare` in the capture."""
     try:
         report = read_json(path / RECORD)["report"]
         finding.facts["prepared"] = (
@@ -107,7 +107,7 @@ def _describe_preparation(path: Path, finding: Finding) -> None:
         )
         finding.problems += report["advice"]
     except (OSError, ValueError, KeyError, TypeError):
-        return  # Others make captures too.
+        return  # Not all captures are made by `prepare`.
 
 
 def is_photograph(path: Path) -> bool:
@@ -121,20 +121,20 @@ def photographs_finding(path: Path) -> Iterator[Finding]:
     found = sorted(one for one in below if is_photograph(one) and one.is_file())
     if not found:
         names = first_names(sorted(one.name for one in path.iterdir()), 8) or "nothing"
-        raise InputError(f"{path} is nothing that is known; expected {KINDS}; it holds {names}")
+        raise InputError(f"{path} is not a known kind of folder; expected {KINDS}; it holds {names}")
     masks = masks_below(path, found)
     found = [one for one in found if one not in masks]
     yield Finding("photographs without poses", {"photographs": len(found), **({"masks": len(masks)} if masks else {})})
     finding = Finding()
     sound = len(found) - describe_broken(found, finding, LEAST_SIDE)
     if sound < FEW_VIEWS:
-        finding.problems.append(f"only {count_noun(sound, 'photograph')}; 30 and more do better")
-    finding.next.append(f"glassplat prepare {shell_word(path)} --output CAPTURE    finds out where they were taken")
+        finding.problems.append(f"only {count_noun(sound, 'photograph')}; 30 or more work better")
+    finding.next.append(f"glassplat prepare {shell_word(path)} --output CAPTURE    estimates their camera poses")
     yield finding
 
 
 def describe_broken(photographs: Sequence[Path], finding: Finding, least_side: int) -> int:
-    """Finds photographs that are broken, or have fewer pixels a side, and decodes each. Returns how many there are."""
+    """Decodes photographs to find broken and small ones; returns the number of good ones."""
     if broken := broken_photographs(photographs, least_side):
         finding.problems.append(
             f"{len(broken)} are broken, tiny or of a kind that cannot be read ({first_names(broken)}); replace or "
@@ -144,7 +144,7 @@ def describe_broken(photographs: Sequence[Path], finding: Finding, least_side: i
 
 
 def video_finding(path: Path) -> Iterator[Finding]:
-    """A video, or what only has the name of one."""
+    """A video, or a file with a video's suffix."""
     size = path.stat().st_size
     try:
         footage = video_facts(path)
@@ -152,20 +152,20 @@ def video_finding(path: Path) -> Iterator[Finding]:
         yield Finding("a video, by its name", {"bytes": size}, [str(error)])
         return
     if footage is None:
-        problem = "OpenCV can read no picture of it; convert it to an MP4, or give a folder of photographs"
-        yield Finding("a file that has the name of a video", {"bytes": size}, [problem])
+        problem = "OpenCV cannot read a frame of it; convert it to an MP4, or give a folder of photographs"
+        yield Finding("a file with a video's suffix", {"bytes": size}, [problem])
         return
     finding = Finding(
         "a video", {"bytes": size, "frames": footage.frames, "pictures": f"{footage.width}x{footage.height}"}
     )
     finding.next.append(
-        f"glassplat prepare {shell_word(path)} --output CAPTURE    takes photographs from it, and places them"
+        f"glassplat prepare {shell_word(path)} --output CAPTURE    extracts frames and estimates their camera poses"
     )
     yield finding
 
 
 def preparation_finding(path: Path) -> Iterator[Finding]:
-    """The folder of a preparation that was interrupted."""
+    """The folder of an interrupted preparation."""
     settings = path / "settings.json"
     with input_checked():
         given = read_json(settings)
@@ -190,7 +190,7 @@ def splat_finding(path: Path) -> Iterator[Finding]:
 
 
 def run_finding(path: Path) -> Iterator[Finding]:
-    """The directory of a training, or of a scene that was written like one."""
+    """The directory of a training run, or of a scene in that layout."""
     directory = RunDirectory(path)
     if directory.imported.is_file():
         yield Finding("a scene without a capture")
@@ -200,13 +200,13 @@ def run_finding(path: Path) -> Iterator[Finding]:
     finding = Finding(f"a {recipe.method} run")
     finding.facts |= {"capture": settings.data, "iterations": settings.iterations, "downscale": settings.downscale}
     if not os.path.isdir(settings.data):
-        finding.problems.append(f"its capture is no longer at {settings.data}; say with --data where it is now")
+        finding.problems.append(f"its capture is no longer at {settings.data}; give its new location with --data")
     yield finding
     yield import_held(DETAILS).trained_part(directory)
 
 
 def runs_finding(path: Path) -> Iterator[Finding]:
-    """A folder with the directories of trainings in it, as `glassplat demo` writes it."""
+    """A folder of training runs, as `glassplat demo` writes it."""
     runs = sorted(recipe.parent for recipe in path.glob("*/recipe.json"))
     commands = [f"glassplat info {shell_word(run)}" for run in runs]
     yield Finding("a folder of runs", {"runs": ", ".join(run.name for run in runs)}, next=commands)
@@ -230,12 +230,12 @@ def export_finding(path: Path) -> Iterator[Finding]:
 
 @dataclass(frozen=True)
 class Info:
-    """Say what a folder or file is, whether it is healthy, and what to do next.
+    """Describe a folder or file, check it, and suggest the next step.
 
     Attributes:
-        path: anything that glassplat reads or writes.
-        json: print it for programs.
-        page: write the report of `prepare` again, now with the panes and the points behind them, as this HTML file.
+        path: any folder or file that glassplat reads or writes.
+        json: print JSON.
+        page: HTML file for the report of `prepare`, updated with the panes and the points behind them.
     """
 
     path: tyro.conf.Positional[Path]
@@ -243,7 +243,7 @@ class Info:
     page: Path | None = None
 
     def ready(self) -> None:
-        """Refuses what is not known, and a page of what has no report or in the place of something else."""
+        """Checks that the path is known, and that its report can be written."""
         finder_of(self.path)
         if self.page is None:
             return
@@ -254,7 +254,7 @@ class Info:
         check_folder(self.page.parent)
 
     def run(self, console: Console) -> None:
-        """Looks, and tells what is found as soon as it is."""
+        """Examines the path, and prints findings as they come."""
         whole = Finding()
         for part in finder_of(self.path)(self.path):
             if not self.json:
@@ -277,14 +277,14 @@ class Info:
             say(console, f"  {name}: {fact}")
 
     def left_behind(self) -> str:
-        """Text after an interrupt: nothing has changed."""
+        """Message after an interrupt: nothing has changed."""
         return "nothing was changed"
 
 
 def finder_of(path: Path) -> Finder:
     """Function that examines a path."""
     if not os.path.lexists(path):
-        raise FileNotFoundError(f"there is nothing at {path}; expected {KINDS}")
+        raise FileNotFoundError(f"{path} does not exist; expected {KINDS}")
     return _finder_of_folder(path) if path.is_dir() else _finder_of_file(path)
 
 
@@ -294,7 +294,7 @@ def _finder_of_file(path: Path) -> Finder:
         return splat_finding
     if suffix in VIDEO_SUFFIXES:
         return video_finding
-    raise InputError(f"{path} is no file that is known; expected {KINDS}")
+    raise InputError(f"{path} is not a known kind of file; expected {KINDS}")
 
 
 def _finder_of_folder(path: Path) -> Finder:

@@ -1,8 +1,8 @@
 """The command line: `glassplat prepare | annotate | train | eval | render | dereflect | clean | export | info | demo`.
 
-A command's module is imported when the command is chosen, and nothing before that which takes long: the list of
-commands appears at once, and Ctrl-C works from the beginning. What does a command's work, and PyTorch with it, is
-imported when the command has understood its options and refused what can be refused without: its method `ready`.
+A command's module is imported only when the command is chosen, so that the list of commands appears at once and Ctrl-C
+works from the start. PyTorch and the code that does the work are imported by the command's method `ready`, after its
+options and paths were checked.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from typing import Annotated, Any, NamedTuple, Union
 from glassplat.errors import InputError, RankLostError
 
 FAILURE_CODE, USAGE_CODE, INTERRUPTED_CODE, UNREAD_CODE = 1, 2, 130, 141
-"""The last two as shells report a process that Ctrl-C or a closed pipe ended."""
+"""The last two are those that shells report after Ctrl-C or a closed pipe."""
 DESCRIPTION = "Gaussian splatting for scenes with window panes, showcases and mirrors."
 
 
 class Listed(NamedTuple):
-    """A command in the list: its class, the module next to this one that holds it, and the class's first sentence."""
+    """Entry of the list of commands: module in this package, class, and first sentence of its docstring."""
 
     module: str
     kind: str
@@ -32,39 +32,35 @@ class Listed(NamedTuple):
 
 
 COMMANDS = {
-    "prepare": Listed("capture", "Prepare", "Find out where photographs were taken, and make a capture of them."),
+    "prepare": Listed("capture", "Prepare", "Estimate the camera poses of photographs and write them as a capture."),
     "annotate": Listed(
         "capture",
         "Annotate",
-        "Mark the panes of a capture in the browser: corners in a few photographs, and what stands before them.",
+        "Mark the panes of a capture in the browser: their corners in a few photographs, and what occludes them.",
     ),
     "train": Listed("train", "Train", "Train a scene from photographs."),
-    "eval": Listed("scene", "Evaluate", "Measure a run on its test views and write comparison sheets."),
-    "render": Listed(
-        "scene", "Render", "Render the layers of a run from its cameras, with its panes as they are or edited."
-    ),
+    "eval": Listed("scene", "Evaluate", "Evaluate a run on its test views and write comparison sheets."),
+    "render": Listed("scene", "Render", "Render the layers of a run from its cameras, with original or edited panes."),
     "dereflect": Listed(
         "scene",
         "Dereflect",
-        "Take the reflections out of a planar run's photographs; one PNG per photograph, under its name.",
+        "Remove the reflections from the photographs of a planar run; writes one PNG per photograph.",
     ),
-    "clean": Listed("scene", "Clean", "Take floaters out of a scene, and give it metres; writes another scene."),
-    "view": Listed(
-        "scene", "View", "Look at a scene in the browser, layer by layer, with its panes as they are or edited."
-    ),
+    "clean": Listed("scene", "Clean", "Remove floaters from a scene and scale it to metres; writes a new scene."),
+    "view": Listed("scene", "View", "View a scene in the browser, layer by layer, with original or edited panes."),
     "video": Listed(
-        "scene", "Video", "Film a scene along a path: one layer, several side by side, or one wiped over another."
+        "scene", "Video", "Render a video along a camera path: one layer, several side by side, or a wipe between two."
     ),
     "export": Listed(
         "scene",
         "Export",
-        "Write a scene as others read it: PLY, SPZ, GLB, a web page with live panes, and the panes next to them.",
+        "Export a scene to PLY, SPZ, GLB or a web page with live panes, along with its panes.",
     ),
-    "info": Listed("info", "Info", "Say what a folder or file is, whether it is healthy, and what to do next."),
+    "info": Listed("info", "Info", "Describe a folder or file, check it, and suggest the next step."),
     "demo": Listed(
         "train",
         "Demo",
-        "Train planar and splat on the bundled shop window and compare them; goes on where it was interrupted.",
+        "Train planar and splat on the bundled shop window and compare them; continues an interrupted demo.",
     ),
 }
 
@@ -72,25 +68,25 @@ COMMANDS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code.
 
-    That is 0 done, 1 failed, 2 bad input, 130 interrupted (143 and 129 where another signal than Ctrl-C asked for it),
-    141 when nobody reads the output any more.
+    The code is 0 for success, 1 for failure, 2 for bad input, 130 for Ctrl-C (143 and 129 for SIGTERM and SIGHUP), and
+    141 for a closed output pipe.
 
     Raises:
         SystemExit: after help.
     """
     try:
         return run_guarded(sys.argv[1:] if arguments is None else list(arguments), is_program=arguments is None)
-    except KeyboardInterrupt:  # In the moments before anybody listens, or while the end is being reported.
+    except KeyboardInterrupt:  # Before handlers are installed, or while the end is reported.
         print("interrupted", file=sys.stderr)
         return INTERRUPTED_CODE
-    except Exception as error:  # noqa: BLE001 - Even the report failed, as it may when memory has run out.
+    except Exception as error:  # noqa: BLE001 - Even the report failed, as it can when out of memory.
         reason = "out of memory" if isinstance(error, MemoryError) else type(error).__name__
         print(f"stopped: {reason}", file=sys.stderr)
         return FAILURE_CODE
 
 
 def run_guarded(arguments: list[str], *, is_program: bool) -> int:
-    """Runs a command; whatever happens ends in one readable message and an exit code, of a rank at once."""
+    """Runs a command so that any failure ends in one readable message and an exit code; ranks exit at once."""
     from glassplat.training.ranks import leave
 
     try:
@@ -105,7 +101,7 @@ def run_guarded(arguments: list[str], *, is_program: bool) -> int:
 
 
 def run_to_exit_code(arguments: list[str], *, is_program: bool) -> int:
-    """Runs a command and says how it has ended; returns the exit code."""
+    """Runs a command and reports how it ended; returns the exit code."""
     from glassplat.cli import console
     from glassplat.training.ranks import await_leader, leads, tell
 
@@ -126,12 +122,12 @@ def run_to_exit_code(arguments: list[str], *, is_program: bool) -> int:
         except BrokenPipeError:
             console.drop_output()
             return UNREAD_CODE
-        except BaseException as error:  # noqa: BLE001 - The last guard: nobody is to read a traceback.
+        except BaseException as error:  # noqa: BLE001 - The last guard against tracebacks.
             is_lost = isinstance(error, RankLostError)
             if raised and not is_lost:
                 return report_interrupt(raised[-1], command)
             found = console.ending(error)
-            with suppress(OSError):  # Nobody hears it where the output is full or closed.
+            with suppress(OSError):  # Fails if the output is full or closed.
                 console.complain(found.label, found.text)
             if is_training and not is_lost:
                 tell(*found)
@@ -141,10 +137,10 @@ def run_to_exit_code(arguments: list[str], *, is_program: bool) -> int:
 
 
 def prepare_command(arguments: list[str]) -> Any:
-    """The command that the arguments describe, once it has refused what it can and imported what it works with.
+    """The command that the arguments describe, with its inputs checked and its modules imported.
 
     Raises:
-        InputError, OSError: an option is none or out of range, there is nothing at a path, or something that must stay.
+        InputError, OSError: an option is unknown or out of range, a path does not exist, or it must not be overwritten.
         SystemExit: as in `parse_arguments`.
     """
     command = parse_arguments(arguments)
@@ -156,7 +152,7 @@ def parse_arguments(arguments: list[str]) -> Any:
     """The command that the arguments describe.
 
     Raises:
-        InputError: there is no such command, or an option is none, missing or out of range.
+        InputError: the command is unknown, or an option is unknown, missing or out of range.
         SystemExit: they ask for help or the version.
     """
     import tyro
@@ -176,14 +172,14 @@ def parse_arguments(arguments: list[str]) -> Any:
     complete = name.startswith("--tyro-")
     if not complete and name not in ("-h", "--help"):
         raise InputError(no_such("command", name, COMMANDS, "glassplat --help"))
-    # Nothing is left to run after the list of commands; only a shell's completions need to know every option.
+    # After the list of commands, nothing is run; only shell completion needs every option.
     kinds = {known: command_line(known, [])[0] if complete else stub(known) for known in COMMANDS}
     tyro.cli(overview(kinds), prog="glassplat", description=DESCRIPTION, args=arguments, config=settings())
     raise SystemExit(USAGE_CODE)
 
 
 def settings() -> tuple[Any, ...]:
-    """Settings for tyro that every command line shares."""
+    """Settings of tyro for all command lines."""
     import tyro
 
     return tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes
@@ -193,7 +189,7 @@ def parse_options(name: str, arguments: list[str]) -> Any:
     """The command of this name that the arguments describe.
 
     Raises:
-        InputError: there is no such option or method, a value is none that it takes, or something is missing.
+        InputError: an option or method is unknown, a value is invalid, or something is missing.
         SystemExit: they ask for help.
     """
     import tyro
@@ -230,7 +226,7 @@ def pointer(name: str, options: list[str]) -> str:
 
 
 def unknown_option(name: str, options: list[str], unknown: list[str]) -> str:
-    """The message about arguments that a command does not take: what is meant perhaps, and who takes them."""
+    """Message about unknown arguments, with similar ones and the methods that have them."""
     from glassplat.cli.console import similar
 
     option, command, methods = unknown[0].partition("=")[0], f"glassplat {name}", []
@@ -250,7 +246,7 @@ def unknown_option(name: str, options: list[str], unknown: list[str]) -> str:
 
 
 def listed_options(name: str, words: list[str]) -> list[str]:
-    """The options in the full help of a command after some words."""
+    """Options in the full help of a command, given its subcommand."""
     import tyro
 
     kind, arguments = command_line(name, [*words, "--help-advanced" if name == "train" else "--help"])
@@ -285,7 +281,7 @@ def overview(kinds: Mapping[str, type]) -> type:
     import tyro
 
     commands: Any = Union[tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in kinds.items())]  # noqa: UP007
-    version = tyro.conf.arg(help="show the versions of what runs here and exit", help_behavior_hint="")
+    version = tyro.conf.arg(help="show version information and exit", help_behavior_hint="")
     return make_dataclass(
         "Glassplat",
         [
@@ -296,22 +292,22 @@ def overview(kinds: Mapping[str, type]) -> type:
 
 
 def run(command: Any) -> None:
-    """Runs a command; its console shows the package's log too, and what libraries warn of."""
+    """Runs a command whose console also shows log records and warnings."""
     from glassplat.cli.console import heard_by, message_console
 
-    is_for_programs = getattr(command, "json", False)  # Its output is one document, without lines of the log in it.
+    is_for_programs = getattr(command, "json", False)  # The output is one JSON document, without log lines.
     with heard_by(message_console(stderr=is_for_programs)):
         command.run(message_console())
 
 
 def report_interrupt(stop: KeyboardInterrupt, command: Any) -> int:
-    """Says what an interrupted command leaves behind, and how to go on."""
+    """Prints what an interrupted command leaves behind, and how to continue."""
     from glassplat.cli.console import code_of, drop_output, message_console, say
 
     left = "" if command is None else f"; {command.left_behind()}"
     try:
         say(message_console(stderr=True), f"{str(stop) or 'interrupted'}{left}")
-    except OSError:  # A terminal that was closed shows nothing any more.
+    except OSError:  # The terminal may be closed.
         drop_output()
     return code_of(stop)
 

@@ -28,7 +28,7 @@ RECORD = "glassplat.json"
 
 
 def claim_folder(folder: Path, command: str, run: Path) -> bool:
-    """Makes a folder for a command's pictures and records whose it is; returns whether pictures in it are replaced."""
+    """Makes an output folder and records the command that owns it; returns whether images in it are replaced."""
     found = check_claim(folder, command)
     make_folder(folder)
     write_text(folder / RECORD, json.dumps({"command": command, "run": readable_name(run)}) + "\n")
@@ -36,7 +36,7 @@ def claim_folder(folder: Path, command: str, run: Path) -> bool:
 
 
 def check_claim(folder: Path, command: str) -> bool:
-    """Look whether a command may write into a folder; returns whether it has done so before."""
+    """Check that a command may write to a folder; returns whether it has done so before."""
     check_folder(folder)
     found = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
     if found and _recorded_command(folder / RECORD) != command:
@@ -48,12 +48,12 @@ def check_claim(folder: Path, command: str) -> bool:
 
 
 def check_targets(folder: Path, targets: Sequence[Path], photographs: Sequence[Path]) -> None:
-    """Refuse to write where a link leads, in a folder that is written again, out of it or to a photograph.
+    """Refuse to write through links in a reused folder that lead outside or to a photograph.
 
     Args:
-        folder: what the pictures are written into.
+        folder: output folder.
         targets: the files to write, in it, and folders that they go into.
-        photographs: what must stay whatever happens.
+        photographs: files that must never be overwritten.
     """
     inside, kept = real_path(folder), {real_path(path) for path in photographs}
     for target in (folder / RECORD, *targets):
@@ -63,13 +63,12 @@ def check_targets(folder: Path, targets: Sequence[Path], photographs: Sequence[P
             raise InputError(f"{target} {what}; nothing was written. Choose a new folder for --output")
         if os.path.lexists(real) and not (os.path.isfile(real) or os.path.isdir(real)):
             raise InputError(
-                f"{target} is a pipe, a device or a link to nothing; nothing was written. Choose a new folder for "
-                "--output"
+                f"{target} is a pipe, a device or a broken link; nothing was written. Choose a new folder for --output"
             )
 
 
 def _recorded_command(record: Path) -> str | None:
-    """Command that wrote the folder; None if it is not recorded."""
+    """Command that wrote the folder; None if not recorded."""
     try:
         content = read_json(record)
     except (OSError, ValueError):
@@ -78,20 +77,20 @@ def _recorded_command(record: Path) -> str | None:
 
 
 def check_scene(path: Path) -> None:
-    """Refuses a folder that neither a run was begun in nor a scene exported to, and a file that cannot be read."""
+    """Checks that a path is a run, an exported scene or a readable splat file."""
     path = scene_source(path)
     if path.is_file() or (path.suffix and not path.is_dir()):
         check_file(path)
         return
     if not path.exists():
-        raise FileNotFoundError(f"there is nothing at {path}; expected {LOADED}")
+        raise FileNotFoundError(f"{path} does not exist; expected {LOADED}")
     if not (path / "recipe.json").is_file():
         raise InputError(f"{path} holds no scene; expected {LOADED}")
     RunDirectory(path).check_begun()
 
 
 def say_scene(path: Path) -> None:
-    """Says what the records of a run tell, or how large a file is: the first that is known of a scene."""
+    """Prints the method and length of a run, or the size of a splat file, before it is loaded."""
     say(message_console(), f"{path}: {_in_words(path)}")
 
 
@@ -107,26 +106,26 @@ def _in_words(path: Path) -> str:
 
 
 def check_file(path: Path) -> None:
-    """Refuses a file that cannot be read."""
+    """Checks that a file can be read."""
     with input_checked(), reading(path), path.open("rb"):
         pass
 
 
 @dataclass(frozen=True)
 class SplatFile:
-    """Facts that a splat file leaves out and a run records.
+    """Properties of a scene that a run records and a splat file does not.
 
     Attributes:
-        planes: panes of a splat file: planes.json, written by hand or by `export`; the one next to it if not given.
-        up: which way is up in a splat file, for the cameras that look at it; y points down in most. A cameras.json
-            next to the file, as `export` writes it, is taken instead.
+        planes: panes of a splat file: planes.json, written by hand or by `export`; by default the one next to it.
+        up: up direction of a splat file, from which its cameras are placed (y points down in most files); ignored if
+            there is a cameras.json next to the file, as `export` writes it.
     """
 
     planes: Path | None = None
     up: Up = "-y"
 
     def check(self) -> None:
-        """Refuses panes that cannot be read."""
+        """Checks that the panes can be read."""
         if self.planes is not None:
             check_file(self.planes)
 
@@ -139,17 +138,17 @@ class SplatFile:
 
 @dataclass(frozen=True)
 class SceneEdits:
-    """Changes to panes and surroundings; the run itself stays as it is. Pane labels are those of the masks.
+    """Changes to panes and surroundings, which leave the run unchanged. Pane labels are those of the masks.
 
     Attributes:
-        remove_glass: no reflections at all, only what is behind the panes.
-        as_mirror: labels of panes that become perfect mirrors.
-        reflectance: pane label and its reflectance R0, that at normal incidence, 0 to 1; `--reflectance 1 0.5 2 0`.
+        remove_glass: remove all reflections and show only what is behind the panes.
+        as_mirror: labels of panes to turn into perfect mirrors.
+        reflectance: pane label and its reflectance R0 at normal incidence, 0 to 1; `--reflectance 1 0.5 2 0`.
         tilt: pane label and two angles in degrees, about the pane's first and second side; `--tilt 1 10 0`.
-        shift: pane label and a distance along the pane's normal in world units, those of the capture's poses;
-            the normal is in results.json, and a negative distance goes the other way; `--shift 1 0.05`.
-        surroundings: panorama (.exr or .png, equirectangular, z up) that glossy things mirror instead of their own,
-            near and far.
+        shift: pane label and a signed distance along the pane's normal, in world units (those of the capture's poses);
+            results.json has the normal; `--shift 1 0.05`.
+        surroundings: panorama (.exr or .png, equirectangular, z up) to be reflected by glossy objects instead of their
+            learned surroundings.
     """
 
     remove_glass: bool = False
@@ -199,13 +198,13 @@ class SceneEdits:
 
 
 def in_surroundings(scene: Scene, panorama: Path) -> Scene:
-    """The scene with another environment, as finely divided as its own, and without near surroundings before it."""
+    """The scene with another environment, at the resolution of its own, and without near surroundings."""
     from glassplat.files.sidecars import read_equirect
     from glassplat.render.deferred import environment_from_equirect
     from glassplat.scene.gaussians import Gaussians
 
     if scene.environment.is_empty and not len(scene.surroundings):
-        raise InputError("nothing in the run mirrors its surroundings; train it with `glassplat train deferred`")
+        raise InputError("nothing in the run reflects an environment; train it with `glassplat train deferred`")
     try:
         image = read_equirect(panorama)
         size = scene.environment.size or min(LARGEST_FACE, max(1, image.shape[0] // 2))
@@ -217,7 +216,7 @@ def in_surroundings(scene: Scene, panorama: Path) -> Scene:
 
 
 LARGEST_FACE = 512
-"""Texels along a face of an environment where the scene had none of its own."""
+"""Texels along a face of the new environment if the scene had none."""
 
 
 Split = Literal["train", "test", "all"]

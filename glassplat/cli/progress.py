@@ -16,20 +16,20 @@ from glassplat.prepare.photographs import Note
 from glassplat.training import messages
 
 FIRST_PAUSE, LONGEST_PAUSE = 1.0, 10.0
-"""Seconds between two lines: at first, so that a newcomer sees that something happens, and in the end."""
+"""Seconds between two lines, at the start of a run and later."""
 SPEED_SECONDS = 60.0
-"""How far back the speed is measured from which the time left follows."""
+"""Time window over which the speed is measured, for the remaining time."""
 LONG_WORK = 5.0
-"""Seconds of work between two steps from which on it is no part of the speed. What begins a stage never is."""
+"""Longer work between two steps is excluded from the speed, as is all work at the start of a stage."""
 SMOOTHING = 0.98
 WIDE = 110
-"""Columns of a terminal from which on the last checkpoint has room in the bar."""
+"""Minimum width of a terminal, in columns, for the last checkpoint in the bar."""
 FORECAST_STEPS, FORECAST_SECONDS = 10, 5.0
-"""After so many steps and seconds the whole run is forecast; the first step, which may compile, does not count."""
+"""Steps and seconds before the duration of the run is estimated; the first step, which may compile, is excluded."""
 LONG_SECONDS = 600.0
-"""A run from which on it is worth saying what would make it shorter."""
+"""For longer runs, the estimate suggests how to shorten them."""
 FREQUENT = ("densify", "grow")
-"""Actions of which nobody wants to read each time, by how their names begin."""
+"""Prefixes of actions that are too frequent to be printed."""
 
 
 @dataclass
@@ -51,8 +51,8 @@ class Plan:
 
     Attributes:
         ends: last step of each stage.
-        costs: typical seconds of a step in each, in any unit; the speed of one stage tells that of the next by them.
-        shortcuts: what would make the run shorter, as the end of a sentence; nothing if empty.
+        costs: typical seconds of a step in each, in any unit; they extrapolate the speed of one stage to the next.
+        shortcuts: ways to shorten the run, as the end of a sentence; empty for none.
     """
 
     ends: tuple[int, ...]
@@ -65,7 +65,7 @@ class Plan:
         return self.ends[-1]
 
     def work(self, step: int) -> float:
-        """Work of all steps up to one, in the unit of the costs."""
+        """Total cost of all steps up to a step."""
         total, begin = 0.0, 0
         for end, cost in zip(self.ends, self.costs, strict=True):
             total += cost * max(min(step, end) - begin, 0)
@@ -78,7 +78,7 @@ class Plan:
 
 
 class Pace:
-    """The speed of this session over its last minute, or since the last long work, and the time left by it."""
+    """Speed over the last minute, or since the last long work between steps, and the remaining time."""
 
     def __init__(self, plan: Plan, clock: Callable[[], float] = time.monotonic) -> None:
         self._plan, self._clock = plan, clock
@@ -87,15 +87,15 @@ class Pace:
         self._stepped = clock()
 
     def work(self) -> None:
-        """Notes that there is more between two steps than the step."""
+        """Records that there was other work since the last step."""
         self._has_worked = True
 
     def enter_stage(self) -> None:
-        """Measures the speed anew: what comes before a stage comes once, and its first step may compile."""
+        """Restarts the measurement: setup of a stage happens once, and its first step may compile."""
         self._passed.clear()
 
     def step(self, number: int) -> None:
-        """Notes a step, now and then."""
+        """Records a step, at intervals."""
         now = self._clock()
         if self._has_worked and now - self._stepped >= LONG_WORK:
             self._passed.clear()
@@ -106,7 +106,7 @@ class Pace:
             self._passed.popleft()
 
     def seconds_left(self, number: int) -> float | None:
-        """Seconds from a step to the end of the run; None where the speed is not known yet."""
+        """Seconds from a step to the end of the run; None if the speed is not known yet."""
         plan = self._plan
         seconds, steps = self._since_first(number)
         if not steps or seconds <= 0:
@@ -115,7 +115,7 @@ class Pace:
         return speed * (plan.work(plan.iterations) - plan.work(number))
 
     def forecast(self, number: int) -> str | None:
-        """Sentence on the whole run's time and what would make it shorter: once, as soon as it is known."""
+        """Sentence on the duration of the run and ways to shorten it; once, as soon as it is known."""
         seconds, steps = self._since_first(number)
         if self._is_forecast or steps < FORECAST_STEPS or seconds < FORECAST_SECONDS:
             return None
@@ -123,7 +123,7 @@ class Pace:
         return _forecast(self._plan, number, seconds / steps, self.seconds_left(number) or 0.0)
 
     def _since_first(self, number: int) -> tuple[float, int]:
-        """Seconds and steps since the first one that is remembered."""
+        """Seconds and steps since the first recorded step."""
         if not self._passed:
             return 0.0, 0
         since, first = self._passed[0]
@@ -131,7 +131,7 @@ class Pace:
 
 
 def _forecast(plan: Plan, number: int, seconds: float, left: float) -> str:
-    """The forecast, from the seconds of a step and those left."""
+    """The estimate, from the seconds per step and the remaining seconds."""
     later = [
         f"{_brief(seconds * cost / plan.cost(number))} from step {end} on"
         for end, before, cost in zip(plan.ends, plan.costs, plan.costs[1:], strict=False)
@@ -147,7 +147,7 @@ def _brief(seconds: float) -> str:
 
 
 class TrainingProgress:
-    """Shows a run's messages; a context, so that a bar ends with the run."""
+    """Displays the messages of a run; a context manager, which closes the bar."""
 
     def __init__(self, console: Console, plan: Plan, clock: Callable[[], float] = time.monotonic) -> None:
         self._console, self._standing = console, Standing(plan.iterations)
@@ -158,11 +158,11 @@ class TrainingProgress:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        with suppress(OSError):  # A terminal that was closed must not hide why the run ends.
+        with suppress(OSError):  # A closed terminal must not hide the error.
             self._display.stop()
 
     def show(self, message: messages.Message) -> None:
-        """Follows a run's messages."""
+        """Displays a message of the run."""
         standing = self._standing
         if isinstance(message, messages.RunBegun):
             self._begin(message)
@@ -184,17 +184,17 @@ class TrainingProgress:
             standing.count = sum(count for part, count in message.counts.items() if part != "planes")
             self._pace.step(message.step)
             seconds = self._pace.seconds_left(message.step)
-            standing.left = "time left is not known yet" if seconds is None else f"{in_words(seconds)} left"
+            standing.left = "estimating the remaining time" if seconds is None else f"{in_words(seconds)} left"
             if forecast := self._pace.forecast(message.step):
                 self._say(forecast)
             self._display.step(standing)
 
     def _begin(self, message: messages.RunBegun) -> None:
         if message.anew:
-            warn(self._console, "an earlier run in this folder was begun and never saved; it is replaced")
+            warn(self._console, "replacing an earlier run in this folder, which was never saved")
         if message.step:
             self._standing.step = message.step
-            self._say(f"going on from step {message.step} of {message.iterations}")
+            self._say(f"continuing from step {message.step} of {message.iterations}")
 
     def _say(self, text: str) -> None:
         say(self._console, text)
@@ -235,7 +235,7 @@ class StepBar:
         self._bar.update(task, description=standing.stage, completed=standing.step, **fields)  # type: ignore[arg-type]
 
     def work(self, standing: Standing, work: messages.Working) -> None:
-        """Shows the work in the stage's place; before the first step a line, as errors stood below an empty bar."""
+        """Shows the work instead of the stage; before the first step as a line, without a bar."""
         if self._begun:
             self._bar.update(self._bar.task_ids[0], description=f"{work.what} {work.done}/{work.total}")
         elif work.done == 0:
@@ -248,14 +248,14 @@ class StepBar:
 
 
 class StepLines:
-    """A line every few seconds, which a file or a job scheduler's log can hold."""
+    """Prints a line every few seconds, for files and logs of job schedulers."""
 
     def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
         self._console, self._clock = console, clock
         self._pause, self._shown_at = FIRST_PAUSE, clock()
 
     def step(self, standing: Standing) -> None:
-        """Shows a step, if it is time for a line."""
+        """Prints a step, if a line is due."""
         if not self._is_time():
             return
         saved = "" if standing.saved is None else f", saved at step {standing.saved}"
@@ -266,14 +266,14 @@ class StepLines:
         )
 
     def work(self, standing: Standing, work: messages.Working) -> None:
-        """Shows the work when it is time for a line, or where there will be no other moment for it."""
+        """Prints the work if a line is due, or if it consists of one part."""
         if work.total == 1:
             say(self._console, f"step {standing.step}: {work.what}")
         elif self._is_time():
             say(self._console, f"step {standing.step}: {work.what}, {work.done} of {work.total} done")
 
     def stop(self) -> None:
-        """Ends the display; lines need no end."""
+        """Does nothing; lines need no cleanup."""
 
     def _is_time(self) -> bool:
         now = self._clock()
@@ -284,7 +284,7 @@ class StepLines:
 
 
 def in_words(seconds: float) -> str:
-    """A duration as someone who waits would say it."""
+    """A duration, rounded to minutes or seconds."""
     minutes = round(seconds / 60)
     if minutes < 1:
         return f"{seconds:.0f} s"
@@ -297,11 +297,11 @@ def _smoothed(known: float, loss: float) -> float:
 
 
 PAUSE = 10.0
-"""Seconds between two lines about the same work."""
+"""Seconds between two lines on the same work."""
 
 
 class WorkProgress:
-    """Shows messages of work; a context, so that a bar ends with it."""
+    """Displays the progress of work outside of training; a context manager, which closes the bar."""
 
     def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
         self._console, self._clock = console, clock
@@ -329,11 +329,11 @@ class WorkProgress:
 
     def __exit__(self, *exception: object) -> None:
         if self._bar is not None:
-            with suppress(OSError):  # A terminal that was closed must not hide why the work ends.
+            with suppress(OSError):  # A closed terminal must not hide the error.
                 self._bar.stop()
 
     def show(self, message: messages.Working | Note) -> None:
-        """Follows the work."""
+        """Displays a message."""
         if isinstance(message, Note):
             warn(self._console, message.text)
             self._what = ""
@@ -357,7 +357,7 @@ class WorkProgress:
             say(self._console, f"{step.what} ({step.total})")
         elif now - self._shown >= PAUSE:
             self._shown = now
-            done, left = step.done - self._first, "time left is not known yet"
+            done, left = step.done - self._first, "estimating the remaining time"
             if done > 0:
                 left = f"{in_words((now - self._begun) / done * (step.total - step.done))} left"
             say(self._console, f"{step.what}: {step.done} of {step.total}, {left}")

@@ -36,10 +36,13 @@ if TYPE_CHECKING:
 
 
 def announce(viewer: Viewer, console: Console) -> None:
-    """Says where to look."""
-    say(console, f"look at {viewer.address}")
+    """Prints the address of the viewer."""
+    say(console, f"viewer: {viewer.address}")
     if is_local(viewer.host):
-        say(console, f"from elsewhere: ssh -L {viewer.port}:localhost:{viewer.port} <this machine>, then the same")
+        say(
+            console,
+            f"from another machine: ssh -L {viewer.port}:localhost:{viewer.port} <this machine>, then the same address",
+        )
 
 
 class StoredRun(NamedTuple):
@@ -60,14 +63,14 @@ def open_run(
 
     Args:
         path: the run's directory.
-        device: where to render.
-        data: where the capture is now; where it was during training if None.
-        downscale: by how much photographs are reduced; as in training if None.
+        device: rendering device.
+        data: location of the capture; that of the training if None.
+        downscale: factor by which photographs are reduced; that of the training if None.
 
     Raises:
-        CudaUnavailableError: the GPU was asked for and cannot be used.
-        InputError: the directory holds no finished run, or the capture is another one.
-        FileNotFoundError: the capture is no longer where it was.
+        CudaUnavailableError: a GPU was requested, but cannot be used.
+        InputError: the directory has no finished run, or the capture is a different one.
+        FileNotFoundError: the capture has moved.
     """
     directory = RunDirectory(path)
     recorded = directory.recipe()
@@ -86,14 +89,14 @@ def open_run(
 def capture_of(
     directory: RunDirectory, recipe: Any, moved: Path | None = None, downscale: float | None = None
 ) -> Dataset:
-    """The capture of a run, where it was or where it is said to be now; of a scene without one its cameras alone."""
+    """The capture of a run, at its recorded or given location; only the cameras for a scene without a capture."""
     if directory.imported.is_file() and moved is None:
         return _without_photographs(directory)
     settings = directory.settings()
     data = Path(settings.data) if moved is None else moved
     if moved is None and not data.is_dir():
         raise FileNotFoundError(
-            f"the capture of {directory.path} is no longer at {data}; say with --data where it is now"
+            f"the capture of {directory.path} is no longer at {data}; give its new location with --data"
         )
     return load_dataset(
         data,
@@ -104,12 +107,12 @@ def capture_of(
 
 
 def _without_photographs(directory: RunDirectory) -> Dataset:
-    """The cameras of a scene that has no capture, as views that have no photographs."""
+    """The cameras of a scene without a capture, as views without photographs."""
     with input_checked():
         cameras = sorted(read_cameras(directory.path / "cameras.json"), key=lambda named: named[0])
 
     def no_photograph() -> Tensor:
-        raise InputError(f"{directory.path} has no photographs; this command needs those it shows")
+        raise InputError(f"{directory.path} has no photographs, which this command needs")
 
     views = tuple(View(name, camera, directory.path / name, no_photograph) for name, camera in cameras)
     points = PointCloud(torch.zeros(0, 3, dtype=torch.float32), torch.zeros(0, 3, dtype=torch.uint8))
@@ -119,7 +122,7 @@ def _without_photographs(directory: RunDirectory) -> Dataset:
 
 
 def pictures_of(dataset: Dataset) -> dict[str, Path]:
-    """The file of each view's picture in a folder, the same whichever views are asked for."""
+    """File name of each view's image; independent of the chosen views."""
     return picture_paths([view.name for view in chosen_views(dataset, "all")])
 
 
@@ -164,11 +167,11 @@ def train(asked: Train[Any], console: Console) -> None:
 STEP_COSTS = {"Planar": 2.6, "Deferred": 1.2, "Traced": 4.5}
 """Seconds of a step with a renderer, in those of a step of `splat`; measured on two cores (docs/performance.md)."""
 USUAL_ITERATIONS = 7000
-"""What the pages of the methods recommend."""
+"""The recommended length of a run."""
 
 
 def plan_of(asked: Train[Any]) -> Plan:
-    """Lengths and typical costs of a run's stages, and what would make it shorter."""
+    """Lengths and typical costs of a run's stages, and ways to shorten it."""
     stages = asked.recipe.stages(asked.seed, asked.iterations)
     costs = tuple(STEP_COSTS.get(type(stage.renderer).__name__, 1.0) for stage in stages)
     return Plan(tuple(stage_starts(stages, asked.iterations)[1:]), costs, shortcuts(asked))
@@ -188,7 +191,7 @@ def shortcuts(asked: Train[Any]) -> str:
 
 @contextmanager
 def _viewer_listeners(asked: Train[Any], training: Training, dataset: Dataset, console: Console) -> Iterator[Listener]:
-    """Further listeners: the viewer, if asked for; of several ranks the first one has it."""
+    """The viewer as a further listener, if requested; only on rank 0."""
     if not asked.view or not leads():
         yield lambda message: None
         return
@@ -205,7 +208,7 @@ def _viewer_listeners(asked: Train[Any], training: Training, dataset: Dataset, c
 
 
 def describe(dataset: Dataset, console: Console) -> None:
-    """Says what was loaded, with the loader's warnings."""
+    """Prints a summary of the capture, with the loader's warnings."""
     annotated = sum(view.is_annotated for view in dataset.train)
     given = f", {len(dataset.planes)} in planes.json" if dataset.planes is not None else ""
     say(
@@ -219,7 +222,7 @@ def describe(dataset: Dataset, console: Console) -> None:
         say(
             console,
             f"the training photographs take {needed / GIGABYTE:.1f} GB: {room / GIGABYTE:.1f} GB stay in memory "
-            "(--memory), the others are read ahead of their steps",
+            "(--memory), the others are read in the background",
         )
     for warning in dataset.warnings:
         warn(console, warning)

@@ -22,26 +22,26 @@ from glassplat.viewer.render_loop import LOCAL, check_port
 
 PaneSource = Literal["auto", "truth", "masks", "rendered"]
 Align = Literal["auto", "always", "never"]
-"""Whether test cameras are moved before they are scored."""
+"""When to move test cameras before scoring."""
 
 
 @dataclass(frozen=True)
 class Evaluate(Command):
-    """Measure a run on its test views and write comparison sheets.
+    """Evaluate a run on its test views and write comparison sheets.
 
     Attributes:
-        run_directory: the run's directory.
-        device: where to render; auto takes an NVIDIA GPU where one can be used.
-        data: where the capture is now, if it has moved since training.
-        panes: where views show panes, for the metric over them: what the ground truth says, the masks and the planes
-            that are fitted to them, or the mask that the run renders; auto takes the first of these that there is.
-            Runs of different methods compare over the same pixels with the first two.
-        align: move the camera of each test view to where its photograph agrees best with the scene, before it is
-            scored; auto does so for runs that refined the cameras of training views.
+        run_directory: directory of the run.
+        device: rendering device; auto uses an NVIDIA GPU if available.
+        data: location of the capture, if it has moved since training.
+        panes: source of the pixels of panes, for the metrics over panes: the ground truth, the masks (by the planes
+            fitted to them), or the mask that the run renders; auto uses the first available. Only with the first two
+            are the pixels the same for all methods.
+        align: before scoring, move each test camera to where its photograph best matches the scene; auto does so for
+            runs that refined the cameras of training views.
     """
 
     work = "evaluation:evaluate_and_report"
-    left = "{run_directory} itself is as it was: repeat the command to evaluate it"
+    left = "{run_directory} itself is unchanged: repeat the command to evaluate it"
 
     run_directory: tyro.conf.Positional[Path]
     device: DeviceName = "auto"
@@ -58,21 +58,21 @@ class Evaluate(Command):
 
 @dataclass(frozen=True)
 class Render(Command):
-    """Render the layers of a run from its cameras, with its panes as they are or edited.
+    """Render the layers of a run from its cameras, with original or edited panes.
 
     Attributes:
-        run_directory: the run's directory.
-        output: where the images go, one folder per layer; a new folder, or one that this command wrote.
-        layers: rgb, normal, depth, alpha and those of the method, such as transmission and reflection; a layer
-            that it does not render is refused with the list of those that it does.
-        split: which cameras.
+        run_directory: directory of the run.
+        output: output folder, with a folder per layer; new, or written by this command before.
+        layers: rgb, normal, depth, alpha and the layers of the method, such as transmission and reflection; an unknown
+            layer is refused with a list of those available.
+        split: cameras to render.
         edits: changes to the panes.
-        device: where to render; auto takes an NVIDIA GPU where one can be used.
-        data: where the capture is now, if it has moved since training.
+        device: rendering device; auto uses an NVIDIA GPU if available.
+        data: location of the capture, if it has moved since training.
     """
 
     work = "writing:write_layers"
-    left = "images already written to {output} are whole: repeat the command for all of them"
+    left = "images already written to {output} are complete: repeat the command to write all of them"
 
     run_directory: tyro.conf.Positional[Path]
     output: Path
@@ -91,21 +91,21 @@ class Render(Command):
 
 @dataclass(frozen=True)
 class View(Command):
-    """Look at a scene in the browser, layer by layer, with its panes as they are or edited.
+    """View a scene in the browser, layer by layer, with original or edited panes.
 
     Attributes:
-        scene: a run's directory, an exported folder, or a splat file (.ply, .spz, .glb, .splat, .sog, .ksplat).
-        port: where the browser finds it; 0 takes any that is free.
-        host: who may look with the link; 127.0.0.1 is this machine alone, 0.0.0.0 everybody who can reach it.
-        output: folder for edited scenes and keyframes that are saved in the browser; the one that holds the scene if
-            not given. Where others may look, too, nothing can be saved unless it is given.
-        file: what a splat file does not say of itself.
+        scene: directory of a run, exported folder, or splat file (.ply, .spz, .glb, .splat, .sog, .ksplat).
+        port: port of the viewer; 0 picks a free one.
+        host: address to listen on; 127.0.0.1 is for this machine only, 0.0.0.0 for the whole network.
+        output: folder for edited scenes and keyframes saved in the browser; by default the folder of the scene. If
+            others can connect, nothing can be saved without this option.
+        file: what a splat file does not record.
         edits: changes to the panes.
-        device: where to render; auto takes an NVIDIA GPU where one can be used.
+        device: rendering device; auto uses an NVIDIA GPU if available.
     """
 
     work = "serving:serve_viewer"
-    left = "what was saved in the browser stays"
+    left = "everything saved in the browser is kept"
 
     scene: tyro.conf.Positional[Path]
     port: Annotated[int, Range(0, 65535)] = 8080
@@ -127,23 +127,23 @@ class View(Command):
 
 @dataclass(frozen=True)
 class Video(Command):
-    """Film a scene along a path: one layer, several side by side, or one wiped over another.
+    """Render a video along a camera path: one layer, several side by side, or a wipe between two.
 
     Attributes:
-        scene: a run's directory, an exported folder, or a splat file (.ply, .spz, .glb, .splat, .sog, .ksplat).
-        output: the film: .mp4 (VP9, plays in browsers; needs glassplat[video]), .webp or .gif.
-        path: once around, or in a loop before what was photographed from one side; through the photographs' cameras;
-            or through those of --keyframes.
-        keyframes: cameras to go through, as `export` writes cameras.json, for --path keyframes.
-        layers: which layers.
+        scene: directory of a run, exported folder, or splat file (.ply, .spz, .glb, .splat, .sog, .ksplat).
+        output: video file: .mp4 (VP9, plays in browsers; needs glassplat[video]), .webp or .gif.
+        path: orbit around the scene (a loop in front of it if it was photographed from one side), the cameras of the
+            photographs, or those of --keyframes.
+        keyframes: camera file for --path keyframes, in the format of the cameras.json that `export` writes.
+        layers: layers to show.
         layout: side by side, or the second layer wiped over the first.
-        seconds: length.
-        fps: pictures per second.
-        width: of one layer's picture, pixels.
-        force: replace a film of that name.
-        file: what a splat file does not say of itself.
+        seconds: duration.
+        fps: frames per second.
+        width: width of one layer in pixels.
+        force: overwrite an existing video.
+        file: what a splat file does not record.
         edits: changes to the panes.
-        device: where to render; auto takes an NVIDIA GPU where one can be used.
+        device: rendering device; auto uses an NVIDIA GPU if available.
     """
 
     work = "writing:film"
@@ -173,12 +173,12 @@ class Video(Command):
                 f"{self.output.suffix} needs OpenCV ({error}); pip install 'glassplat[video]', or end --output in .webp"
             ) from error
         if self.output.is_dir():
-            raise InputError(f"{self.output} is a folder; expected a name for a film as --output")
+            raise InputError(f"{self.output} is a folder; expected a video file as --output")
         if os.path.lexists(self.output) and not self.force:
-            raise InputError(f"{self.output} is already there; pass --force to replace it, or choose another --output")
+            raise InputError(f"{self.output} already exists; pass --force to overwrite it, or choose another --output")
         check_folder(self.output.parent)
         if self.layout == "wipe" and len(self.layers) != 2:
-            raise InputError(f"a wipe takes two --layers, not {len(self.layers)}, such as rgb transmission")
+            raise InputError(f"--layout wipe needs two --layers, not {len(self.layers)}, such as rgb transmission")
         if (self.path == "keyframes") != (self.keyframes is not None):
             raise InputError("--path keyframes and --keyframes FILE belong together; give both or neither")
         check_scene(self.scene)
@@ -196,15 +196,15 @@ else:
 
 @dataclass(frozen=True)
 class Clean(Command):
-    """Take floaters out of a scene, and give it metres; writes another scene.
+    """Remove floaters from a scene and scale it to metres; writes a new scene.
 
     Attributes:
-        scene: a run's directory, an exported folder, or a splat file (.ply, .spz, .glb, .splat, .sog, .ksplat).
-        output: where the clean scene goes, a new folder; `glassplat view` and `export` read it like a run.
-        rules: what goes.
-        scale: two points, x y z each in world units, and how many metres apart they are; `view` measures points.
-        file: what a splat file does not say of itself.
-        device: where to work; auto takes an NVIDIA GPU where one can be used.
+        scene: directory of a run, exported folder, or splat file (.ply, .spz, .glb, .splat, .sog, .ksplat).
+        output: new folder for the cleaned scene, which `glassplat view` and `export` read like a run.
+        rules: what is removed.
+        scale: two points, x y z each in world units, and their distance in metres; `view` measures points.
+        file: what a splat file does not record.
+        device: device to use; auto uses an NVIDIA GPU if available.
     """
 
     work = "writing:write_clean"
@@ -218,11 +218,11 @@ class Clean(Command):
     device: DeviceName = "auto"
 
     def check(self) -> None:
-        """Refuses what is no scene, points that do not differ, and an output that is there."""
+        """Checks the scene, the two points and the output folder."""
         check_scene(self.scene)
         self.file.check()
         if self.scale is not None and self.scale[:3] == self.scale[3:6]:
-            raise InputError(f"--scale got the point {self.scale[:3]} twice; expected two points that are apart")
+            raise InputError(f"--scale has the point {self.scale[:3]} twice; expected two different points")
         check_folder(self.output)
         if os.path.lexists(self.output) and any(self.output.iterdir()):
             raise InputError(f"{self.output} is not empty; nothing was written. Choose a new folder for --output")
@@ -231,27 +231,26 @@ class Clean(Command):
 
 @dataclass(frozen=True)
 class Export(Command):
-    """Write a scene as others read it: PLY, SPZ, GLB, a web page with live panes, and the panes next to them.
+    """Export a scene to PLY, SPZ, GLB or a web page with live panes, along with its panes.
 
     Attributes:
-        scene: a run's directory, an exported folder, or a splat file (.ply, .spz, .glb, .splat, .sog, .ksplat).
-        output: where the files go; a new folder, or one that this command wrote: what it does not write again there
-            is removed.
-        formats: which files; glb is glTF with KHR_gaussian_splatting, html a page that shows the scene in any browser,
-            by itself and without a server.
-        layer: all is the scene with its panes next to it, as planes.json and glass.ply; transmission is the place
-            without its panes and what they and glossy things reflect.
-        title: of the page; the run's name if not given.
-        credit: shown on the page: who made the scene, and its licence.
-        url: where the page will lie on the web. Previews of links to it show preview.jpg, which then lies next to it.
-        spz_version: 3, which every reader knows, or 4.
-        file: what a splat file does not say of itself.
+        scene: directory of a run, exported folder, or splat file (.ply, .spz, .glb, .splat, .sog, .ksplat).
+        output: output folder; new, or written by this command before, in which case its old files are removed.
+        formats: files to write; glb is glTF with KHR_gaussian_splatting, html a self-contained page that shows the
+            scene in any browser without a server.
+        layer: all writes the scene along with its panes, as planes.json and glass.ply; transmission writes the scene
+            without panes and without reflections of panes and glossy objects.
+        title: title of the page; by default the name of the run.
+        credit: author and licence to show on the page.
+        url: address at which the page will be published, for link previews; also writes preview.jpg.
+        spz_version: version of the SPZ file: 3, which every reader supports, or 4.
+        file: what a splat file does not record.
         edits: changes to the panes.
-        device: where to render what has to be rendered; auto takes an NVIDIA GPU where one can be used.
+        device: rendering device; auto uses an NVIDIA GPU if available.
     """
 
     work = "writing:write_files"
-    left = "files already written to {output} are whole: repeat the command for all of them"
+    left = "files already written to {output} are complete: repeat the command to write all of them"
 
     scene: tyro.conf.Positional[Path]
     output: Path
@@ -266,7 +265,7 @@ class Export(Command):
     device: DeviceName = "auto"
 
     def check(self) -> None:
-        """Refuses what contradicts itself, what is no scene, and an output that holds something else."""
+        """Checks the options, the scene and the output folder."""
         if not self.formats:
             raise InputError(f"nothing to write without --formats; expected some of {', '.join(WRITTEN)}")
         if {f".{kind}" for kind in self.formats} & {*FORGED_SUFFIXES} and find_spec("gaussforge") is None:
@@ -281,21 +280,20 @@ class Export(Command):
 
 @dataclass(frozen=True)
 class Dereflect(Command):
-    """Take the reflections out of a planar run's photographs; one PNG per photograph, under its name.
+    """Remove the reflections from the photographs of a planar run; writes one PNG per photograph.
 
     Attributes:
-        run_directory: the run's directory.
-        output: where the images go; a new folder, or one that this command wrote.
-        split: which photographs.
-        source: photo keeps the photograph, and takes the rendered reflection off it where a pane is; render shows
-            the rendered scene without its panes.
-        downscale: factor by which the images are smaller than the photographs, whatever it was in training.
-        device: where to render; auto takes an NVIDIA GPU where one can be used.
-        data: where the capture is now, if it has moved since training.
+        run_directory: directory of the run.
+        output: output folder; new, or written by this command before.
+        split: photographs to process.
+        source: photo subtracts the rendered reflection from the photograph; render renders the scene without panes.
+        downscale: factor by which the images are smaller than the photographs, independent of training.
+        device: rendering device; auto uses an NVIDIA GPU if available.
+        data: location of the capture, if it has moved since training.
     """
 
     work = "writing:write_dereflected"
-    left = "images already written to {output} are whole: repeat the command for all of them"
+    left = "images already written to {output} are complete: repeat the command to write all of them"
 
     run_directory: tyro.conf.Positional[Path]
     output: Path

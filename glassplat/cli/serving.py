@@ -1,4 +1,4 @@
-"""Pages served to a browser: the viewer, and the marking of panes."""
+"""Servers for the browser: the viewer and the annotation page."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 def serve_viewer(command: View, console: Console) -> None:
-    """Serves until it is interrupted."""
+    """Serves until interrupted."""
     model = command.file.open(command.scene, command.device)
     model = model.with_scene(command.edits.apply(model.scene))
     viewer = Viewer(
@@ -49,14 +49,14 @@ def serve_viewer(command: View, console: Console) -> None:
 
 
 def writer_for(command: View, model: Model) -> FolderWriter | None:
-    """Writer of edited scenes; viewers from other machines may write only if asked for."""
+    """Writer of edited scenes; with remote clients, writing must be requested explicitly."""
     if command.output is None and not is_local(command.host):
         return None
     return FolderWriter(model, command.output or Path(os.path.abspath(command.scene)).parent)
 
 
 def photographs_of(run: Path) -> dict[str, Callable[[], Tensor]]:
-    """The photographs of a run by name, where they still are."""
+    """Existing photographs of a run, by name."""
     directory = RunDirectory(run)
     if not run.is_dir() or directory.imported.is_file():
         return {}
@@ -69,7 +69,7 @@ def photographs_of(run: Path) -> dict[str, Callable[[], Tensor]]:
 
 
 def serve_marking(command: Annotate, console: Console) -> None:
-    """Serves the page until it is closed, or Ctrl-C."""
+    """Serves the page until it is closed or interrupted."""
     session = opened_session(command.capture)
     with AnnotationServer(session, command.port) as server, ExitStack() as until_the_end:
         port = server.server_address[1]
@@ -83,9 +83,9 @@ def serve_marking(command: Annotate, console: Console) -> None:
 
 @contextmanager
 def opened_in_browser(address: str, folder: Path) -> Iterator[None]:
-    """Open an address through a file in a folder that leads there, which only this user can read.
+    """Open an address through a redirecting file that only this user can read.
 
-    All users of a computer can see what a browser is started with, and the address holds the key.
+    All users of a computer can see a browser's command line, and the address contains the key.
     """
     descriptor, name = mkstemp(dir=folder, prefix="marking-", suffix=".html")
     page = Path(name).absolute()
@@ -99,7 +99,7 @@ def opened_in_browser(address: str, folder: Path) -> Iterator[None]:
 
 
 def has_screen() -> bool:
-    """Return whether a browser that is opened here is seen by whoever typed the command."""
+    """Return whether a browser opened here is visible to the user of the command."""
     if "SSH_CONNECTION" in os.environ:
         return False
     return sys.platform in ("darwin", "win32") or bool({"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ))

@@ -1,4 +1,4 @@
-"""`glassplat train`: its methods, the presets they begin from, and how much of them help shows."""
+"""`glassplat train`: methods, presets, and the options that help shows."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ class Train(Generic[RecipeKind]):
     """Train a scene from photographs.
 
     Attributes:
-        recipe: method and its options; `glassplat train planar --help` lists those that most runs need.
-        preset: what the options are unless they are given: the best that this project found, or those of the paper.
-        data: directory of the capture: COLMAP or transforms.json, panes in panes/.
+        recipe: method and its options; `glassplat train planar --help` lists the most common ones.
+        preset: default values of the options: the best known, or those of the paper.
+        data: directory of the capture: COLMAP or transforms.json, with pane masks in panes/.
         output: directory of the run.
-        iterations: length of the run; every schedule stretches with it.
-        downscale: shrink the photographs by this factor.
-        seed: fixes every random choice.
-        device: where to train; auto takes an NVIDIA GPU where one can be used.
-        resume: go on with the run in `output`.
-        mask_polarity: which value of masks is the pane.
+        iterations: length of the run; all schedules scale with it.
+        downscale: factor by which to downscale the photographs.
+        seed: random seed.
+        device: training device; auto uses an NVIDIA GPU if available.
+        resume: continue the run in `output`.
+        mask_polarity: mask value that marks panes.
         checkpoint_every: seconds between checkpoints.
-        memory: gigabytes for photographs; a quarter of the machine's if not given.
-        config: a recipe.json to begin from.
-        view: look at it in the browser meanwhile.
+        memory: gigabytes of memory for photographs; by default a quarter of the machine's.
+        config: recipe.json with default values of the options.
+        view: watch the training in the browser.
     """
 
     recipe: Annotated[RecipeKind, tyro.conf.arg(name="")]
@@ -70,7 +70,7 @@ class Train(Generic[RecipeKind]):
     view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
 
     def ready(self) -> None:
-        """Refuses what stands in the way, says what the capture's folder holds, and imports what trains."""
+        """Checks options, capture and output, prints a summary of the capture, and imports the training code."""
         if real_path(self.output) == real_path(self.data):
             raise InputError(f"{self.output} is the capture itself; choose another folder for --output")
         recipe: Any = self.recipe
@@ -79,14 +79,14 @@ class Train(Generic[RecipeKind]):
         check_output(RunDirectory(self.output), resume=self.resume)
         say(message_console(), self.files)
         import_now("glassplat.cli.runs")
-        self.recipe.renderer()  # Imports what this method trains with, too, before anything is written.
+        self.recipe.renderer()  # Imports the method's modules before anything is written.
         from glassplat.training.stage import check_length
 
         check_length(self.recipe.stages(self.seed, self.iterations), self.iterations)
 
     @cached_property
     def files(self) -> CaptureFiles:
-        """Contents of the capture's folder, read at first use and without PyTorch."""
+        """Contents of the capture's folder, read at first use, without PyTorch."""
         return read_capture(self.data, mask_polarity=self.mask_polarity)
 
     def run(self, console: Console) -> None:
@@ -96,29 +96,29 @@ class Train(Generic[RecipeKind]):
         train(self, console)
 
     def left_behind(self) -> str:
-        """Text after an interrupt: the state on disk, and how to go on."""
+        """Message after an interrupt: the state on disk, and how to continue."""
         if RunDirectory(self.output).checkpoint.is_file():
-            return f"{self.output} holds a checkpoint: repeat the command with --resume to go on from it"
-        return "no checkpoint was written yet: repeat the command to begin again"
+            return f"{self.output} holds a checkpoint: repeat the command with --resume to continue from it"
+        return "no checkpoint was written yet: repeat the command to start again"
 
     def settings(self) -> RunSettings:
-        """Record of the run's settings apart from the recipe."""
+        """Settings of the run apart from the recipe."""
         device = str(chosen_device(self.device))
-        data = str(self.data.resolve())  # The run may be looked at from another folder than it was started in.
+        data = str(self.data.resolve())  # Later commands may be started in another folder.
         return RunSettings(data, self.iterations, self.downscale, self.seed, device, self.mask_polarity)
 
     def resuming(self, begun: bool) -> Train:
-        """The same run, going on from its checkpoint if it has begun."""
+        """The same run, resumed from its checkpoint if it has one."""
         return replace(self, resume=begun)
 
 
 PATH_OPTIONS = ("--data", "--output", "--config")
 HELP, FULL_HELP = ("-h", "--help"), "--help-advanced"
-POINTER = f"These are the options that most runs need; {FULL_HELP} in place of --help shows all of them."
+POINTER = f"These are the most common options; {FULL_HELP} shows all of them."
 
 
 def help_of_method(arguments: Sequence[str]) -> str:
-    """A pointer to all options of the method that arguments name; tyro points to a list that has none of them."""
+    """Pointer to the full help of the method that the arguments name, instead of tyro's, which lists none."""
     method = asked_method(arguments) or PlanarRecipe.method
     return f"all options of a method: glassplat train {method} {FULL_HELP}"
 
@@ -127,8 +127,8 @@ def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:
     """Type and settings for tyro of a command line of `train`.
 
     Returns:
-        `Train`, with the recipes of the preset or of the file that the arguments name as defaults and, where they ask
-        for help, with the options that help should show; and the arguments for it.
+        `Train` with the recipes of the named preset or file as defaults, reduced to common options for `--help`; and
+        the arguments for it.
     """
     first = arguments[0] if arguments else "-"
     if first not in RECIPES and not first.startswith("-"):
@@ -141,7 +141,7 @@ def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:
         given = read_recipe(Path(config), arguments)
         recipes = [given if recipe.method == given.method else recipe for recipe in recipes]
     if not full and any(help_option in arguments for help_option in HELP):
-        note = POINTER if asked_method(arguments) else ""  # Once, not with each method in their list.
+        note = POINTER if asked_method(arguments) else ""  # Once, not for each method of the list.
         recipes = [in_brief(recipe, note) for recipe in recipes]
     choices = [Annotated[type(r), tyro.conf.subcommand(r.method, default=r)] for r in recipes]
     any_recipe: Any = functools.reduce(operator.or_, choices)
@@ -149,7 +149,7 @@ def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:
 
 
 def read_recipe(path: Path, arguments: Sequence[str]) -> Any:
-    """The recipe in a file, which is of the method that the arguments name."""
+    """The recipe in a file, checked against the method that the arguments name."""
     with input_checked():
         recipe = recipe_from_json(read_text(path), str(path))
     asked = asked_method(arguments) or recipe.method
@@ -159,13 +159,13 @@ def read_recipe(path: Path, arguments: Sequence[str]) -> Any:
 
 
 def asked_method(arguments: Sequence[str]) -> str | None:
-    """The first word that is a method's name, and not a folder's; None if there is none."""
+    """The first argument that is a method's name and not a path; None if there is none."""
     words = itertools.pairwise(["", *arguments])
     return next((word for before, word in words if word in RECIPES and before not in PATH_OPTIONS), None)
 
 
 def last_value(arguments: Sequence[str], option: str) -> str | None:
-    """The value that arguments give to an option last; None where they give none."""
+    """The last value of an option in the arguments; None if it is absent."""
     found = None
     for before, argument in itertools.pairwise(["", *arguments]):
         if argument.startswith(f"{option}="):
@@ -176,7 +176,7 @@ def last_value(arguments: Sequence[str], option: str) -> str | None:
 
 
 def in_brief(options: Any, note: str = "") -> Any:
-    """The same options as another type, of which help shows the essential ones only, and a note; parses no others."""
+    """The same options as a type whose help shows only the essential ones, and a note."""
     kind, hints = type(options), typing.get_type_hints(type(options), include_extras=True)
     values = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
     fields: list[Any] = []
@@ -204,20 +204,20 @@ def is_essential(hint: Any) -> bool:
 
 SCENE = Path(__file__).parents[1] / "demo_scene"
 DEMO_DOWNSCALE = 3.2
-"""By which the bundled photographs are reduced: 200x150 pixels train in minutes on two cores."""
+"""Reduces the bundled photographs to 200x150 pixels, which train in minutes on two cores."""
 LEAST_ITERATIONS = 8
-"""Of which each stage of `planar` gets one."""
+"""One for each stage of `planar` and more."""
 
 
 @dataclass(frozen=True)
 class Demo:
-    """Train planar and splat on the bundled shop window and compare them; goes on where it was interrupted.
+    """Train planar and splat on the bundled shop window and compare them; continues an interrupted demo.
 
     Attributes:
-        output: where the two runs go.
+        output: directory of the two runs.
         iterations: length of each run.
-        seed: fixes every random choice.
-        device: where to train; auto takes an NVIDIA GPU where one can be used.
+        seed: random seed.
+        device: training device; auto uses an NVIDIA GPU if available.
     """
 
     output: Path = Path("runs/demo")
@@ -226,7 +226,7 @@ class Demo:
     device: DeviceName = "auto"
 
     def ready(self) -> None:
-        """Refuses an output that cannot be written, and a run that is too short for the stages of `planar`."""
+        """Checks the output folder, and that the runs are long enough for the stages of `planar`."""
         check_folder(self.output)
         check_targets(self.output, self.folders, [])
         if self.iterations < LEAST_ITERATIONS:
@@ -234,11 +234,11 @@ class Demo:
 
     @property
     def folders(self) -> list[Path]:
-        """Of the two runs."""
+        """Directories of the two runs."""
         return [self.output / method for method in (PlanarRecipe.method, SplatRecipe.method)]
 
     def run(self, console: Console) -> None:
-        """Trains both methods, evaluates them and says where the pictures are."""
+        """Trains and evaluates both methods, and prints where the images are."""
         recipes: tuple[Recipe, ...] = (PlanarRecipe(), SplatRecipe())
         for recipe, folder in zip(recipes, self.folders, strict=True):
             run = Train(recipe, SCENE, folder, self.iterations, DEMO_DOWNSCALE, seed=self.seed, device=self.device)
@@ -253,5 +253,5 @@ class Demo:
         say(console, f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
 
     def left_behind(self) -> str:
-        """Text after an interrupt: the state on disk, and how to go on."""
-        return f"what is finished stays in {self.output}: repeat the command to go on"
+        """Message after an interrupt: the state on disk, and how to continue."""
+        return f"finished work stays in {self.output}: repeat the command to continue"

@@ -1,4 +1,4 @@
-"""Files written by commands: layers as pictures, photographs without reflections, films, other formats."""
+"""Files written by commands: layers as images, photographs without reflections, videos, other formats."""
 
 from __future__ import annotations
 
@@ -89,42 +89,42 @@ def write_dereflected(command: Dereflect, console: Console) -> None:
 
 
 def dereflect_view(command: Dereflect, stored: StoredRun, renderer: Planar, view: View) -> Tensor:
-    """The photograph of a view without its reflections, or the render in its place."""
+    """The photograph of a view without its reflections, or a render instead."""
     frame, _ = timed_render(renderer, stored.scene, view)
     if command.source == "render":
         return quantize(frame.layers["without_panes"])
-    # Not `view.photo`, which stays in memory: a capture may be larger than that.
+    # Not `view.photo`, which is kept in memory: a capture may be larger.
     exposures = stored.scene.exposures.to("cpu")
     return dereflected_photo(frame, view.read_photo(), renderer.blend, exposures=exposures, name=view.name)
 
 
 def planar_renderer(stored: StoredRun) -> Planar:
-    """The renderer of a run that has reflections to take off, that of the photographer among them."""
+    """The renderer of a run with reflections to remove, including that of the photographer."""
     renderer = stored.renderer
     if isinstance(renderer, Planar) and len(stored.scene.planes):
         return replace(renderer, photographer="present")
     data = "CAPTURE" if stored.directory.imported.is_file() else shell_word(stored.directory.settings().data)
     raise InputError(
-        f"{stored.directory.path} is a {stored.recipe.method} run without panes, so it knows no reflection; train one "
-        f"that does, with pane masks: glassplat train planar --data {data} --output RUN"
+        f"{stored.directory.path} is a {stored.recipe.method} run without panes, which has no reflections; "
+        f"train one with pane masks: glassplat train planar --data {data} --output RUN"
     )
 
 
 def mirror_warnings(stored: StoredRun) -> list[str]:
     """Warnings about panes that transmit nothing."""
     return [
-        f"pane {label} is a mirror, and nothing is seen through it; without its reflection it shows what the scene "
-        "happens to hold behind it"
+        f"pane {label} is a mirror; without its reflection, it shows whatever the scene has behind it, which no "
+        "photograph shows"
         for label in stored.scene.planes.mirrors
     ]
 
 
 WIPE_SPAN = 0.9
-"""Part of the picture that a wipe goes over, there and back."""
+"""Share of the frame that the wipe covers, moving there and back."""
 
 
 def film(command: Video, console: Console) -> None:
-    """Renders the pictures and encodes them one by one."""
+    """Renders the frames and encodes them one by one."""
     model = command.file.open(command.scene, command.device)
     check_layers(model.renderer, model.scene, command.layers, model.recipe.method)
     model = model.with_scene(command.edits.apply(model.scene))
@@ -153,7 +153,7 @@ def _cameras(command: Video, model: models.Model) -> list[Camera]:
 
 
 def _pictures(command: Video, model: models.Model, cameras: Sequence[Camera]) -> Iterator[NDArray[np.uint8]]:
-    """One picture per camera; rendered when it is asked for."""
+    """Frames, one per camera, rendered lazily."""
     renderer = model.renderer.with_layers(command.layers)
     for index, camera in enumerate(cameras):
         with torch.no_grad():
@@ -167,7 +167,7 @@ def _pictures(command: Video, model: models.Model, cameras: Sequence[Camera]) ->
 
 
 def _picture(image: torch.Tensor) -> NDArray[np.uint8]:
-    """A layer [H, W] or [H, W, 3] as a picture."""
+    """A layer [H, W] or [H, W, 3] as an 8-bit image."""
     if image.dim() == 2:
         image = image[..., None].expand(-1, -1, 3)
     picture: NDArray[np.uint8] = quantize(image).cpu().contiguous().numpy()
@@ -175,7 +175,7 @@ def _picture(image: torch.Tensor) -> NDArray[np.uint8]:
 
 
 def track_progress(what: str, things: Iterable[Thing], total: int, progress: WorkProgress) -> Iterator[Thing]:
-    """The things, such as pictures or views, with a progress shown as they are taken."""
+    """Iterates over items while showing progress."""
     progress.show(Working(what, 0, total))
     for number, thing in enumerate(things, start=1):
         yield thing
@@ -183,17 +183,17 @@ def track_progress(what: str, things: Iterable[Thing], total: int, progress: Wor
 
 
 LARGEST_FACTOR = 1e6
-"""Of what one unit of a scene may be in metres, either way; beyond, files could not be read again."""
+"""Largest factor of `--scale` in either direction; beyond, files could not be read again."""
 
 
 def write_clean(command: Clean, console: Console) -> None:
-    """Writes the clean scene, and says what went."""
+    """Writes the clean scene, and reports what was removed."""
     model = command.file.open(command.scene, command.device)
     tidy, found = model.clean(command.rules)
     summary = ", ".join(f"{count} {rule}" for rule, count in found.items() if count) or "no floaters"
     say(console, f"{len(tidy.scene.primary)} of {len(model.scene.primary)} Gaussians stay; found {summary}")
     if found["outside"] > len(model.scene.primary) / 2:
-        warn(console, f"--box takes out {found['outside']} Gaussians, more than half; is it in the scene's own units?")
+        warn(console, f"--box removes {found['outside']} Gaussians, more than half; is it in the scene's own units?")
     if command.scale is not None:
         *points, metres = command.scale
         factor = metres / math.dist(points[:3], points[3:])
@@ -203,13 +203,13 @@ def write_clean(command: Clean, console: Console) -> None:
                 f"{LARGEST_FACTOR:g}: give two places in the scene's own units, and their distance in metres"
             )
         tidy = tidy.scale(factor)
-        say(console, f"one unit is a metre now; it was {factor:.4g} m")
+        say(console, f"one unit is now a metre; it was {factor:.4g} m")
     tidy.save(command.output)
     say(console, f"next: glassplat view {shell_word(command.output)}")
 
 
 def write_files(command: Export, console: Console) -> None:
-    """Writes the files, and removes what an earlier run of the command wrote and this one does not."""
+    """Writes the files, and removes those of an earlier run of the command that were not written again."""
     model = command.file.open(command.scene, command.device)
     model = _chosen(command, model.with_scene(command.edits.apply(model.scene)))
     if "html" in command.formats:
@@ -247,14 +247,14 @@ BESIDE_SPLATS = (
     models.PANORAMA,
     models.CAMERAS,
 )
-"""What `export` may write next to `scene.*`."""
+"""Files that `export` may write next to `scene.*`."""
 
 
 def _remove_earlier(command: Export, targets: Sequence[Path], written: Sequence[Path], console: Console) -> None:
-    """Removes those files of an earlier run that this one did not replace: they may show another scene, or its panes.
+    """Removes files of an earlier run that were not replaced, as they may belong to another scene.
 
-    Of a folder that is exported onto itself the splats stay, since edits leave them as they are; where there are none,
-    everything does.
+    If a folder is exported onto itself, its splats stay, since edits do not change them; without any, everything
+    stays.
     """
     earlier = [path for path in targets if path not in written and os.path.lexists(path) and not path.is_dir()]
     if real_path(scene_source(command.scene)).parent == real_path(command.output):
@@ -267,7 +267,7 @@ def _remove_earlier(command: Export, targets: Sequence[Path], written: Sequence[
 
 
 def _chosen(command: Export, model: models.Model) -> models.Model:
-    """The model; or the place in its own colours, without anything that reflects, as plain Gaussians."""
+    """The model, or its transmission as plain Gaussians without reflections."""
     if command.layer == "all":
         return model
     primary = replace(model.scene.primary, channels={})
@@ -276,12 +276,10 @@ def _chosen(command: Export, model: models.Model) -> models.Model:
 
 
 def _write_page(command: Export, model: models.Model, console: Console) -> list[Path]:
-    """The page and its preview, where it shows the scene and has an address; returns what was written."""
+    """Writes the page, and its preview if it has an address; returns the written files."""
     path = command.output / "index.html"
     if not fits(model.scene):
-        warn(
-            console, f"a page holds {MOST_GAUSSIANS:,} Gaussians: this one shows those that cover most of a photograph"
-        )
+        warn(console, f"a page holds {MOST_GAUSSIANS:,} Gaussians: this one shows those that cover the largest areas")
     title, credit = readable_name(command.title or model.name), command.credit and readable_name(command.credit)
     models.save_page(model, path, title, sharing=Sharing(credit, command.url))
     written = [path]
@@ -293,11 +291,11 @@ def _write_page(command: Export, model: models.Model, console: Console) -> list[
 
 
 def _write_beside(command: Export, scene: Scene, console: Console) -> list[Path]:
-    """Planes, glass and environment, where there are any; returns what was written."""
+    """Writes planes, glass and environment, if present; returns the written files."""
     written = models.write_beside(command.output, scene)
     if len(scene.planes):
         panes = count_noun(len(scene.planes), "pane")
         say(console, f"{panes} -> {command.output / models.PLANES}, their shape -> {models.GLASS}")
     if not scene.environment.is_empty:
-        say(console, f"what it mirrors from afar -> {command.output / models.ENVIRONMENT}, {models.PANORAMA}")
+        say(console, f"its environment -> {command.output / models.ENVIRONMENT}, {models.PANORAMA}")
     return written

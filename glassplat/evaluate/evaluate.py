@@ -132,11 +132,11 @@ def aligned_camera(scene: Scene, renderer: Renderer, view: View) -> Camera:
 
 MIRROR_STRENGTH = 0.999
 """From this true strength on, nothing is transmitted."""
-ALL_IGNORED = f"all but fewer than {metrics.SMALLEST_REGION} pixels are ignored"
-LEFT_IGNORED = f"all but fewer than {metrics.SMALLEST_REGION} pixels of the left half are ignored"
+ALL_IGNORED = f"fewer than {metrics.SMALLEST_REGION} pixels are not ignored"
+LEFT_IGNORED = f"fewer than {metrics.SMALLEST_REGION} pixels of the left half are not ignored"
 TOO_FEW = f"fewer than {metrics.SMALLEST_REGION} pixels show a pane"
 
-SCENE_COLORS, NEIGHBOURS_COLORS = "the scene's own", "mean of the neighbouring photographs, in the order of names"
+SCENE_COLORS, NEIGHBOURS_COLORS = "the scene's own", "mean of the neighbouring photographs, by name"
 """How test views are taken to be exposed."""
 
 Truths = tuple[GroundTruth | None, TrueView | None]
@@ -294,9 +294,7 @@ def timed_render(renderer: Renderer, scene: Scene, view: View) -> tuple[Frame, f
         seconds = time.perf_counter() - start
     frame = Frame(frame.rgb.cpu(), {name: layer.cpu() for name, layer in frame.layers.items()})
     if not bool(torch.isfinite(frame.rgb).all()):
-        raise InputError(
-            f"the render of {view.name} holds values that are not finite; the scene is broken, train it again"
-        )
+        raise InputError(f"the render of {view.name} contains non-finite values; the scene is broken, train it again")
     return frame, seconds
 
 
@@ -305,7 +303,7 @@ def peak_memory_mib() -> metrics.Outcome:
     try:
         import resource  # Windows has none.
     except ImportError:
-        return f"{sys.platform} does not tell"
+        return f"not available on {sys.platform}"
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
 

@@ -59,55 +59,55 @@ METRICS = {
     "corrected_psnr": Metric(
         "PSNR, colours corrected",
         "{:.2f} dB",
-        "the same after the affine transform of colours that brings each image closest to its photograph",
+        "the same after the affine colour transform that best matches each image to its photograph",
     ),
     "right_half_psnr": Metric(
-        "PSNR, right halves", "{:.2f} dB", "of the right half of each image after the transform found on its left half"
+        "PSNR, right halves",
+        "{:.2f} dB",
+        "the same for the right half of each image, with the transform fitted to its left half",
     ),
     "ssim": Metric("SSIM", "{:.4f}", "structural similarity, 1 for equal images; higher is better"),
     "lpips": Metric("LPIPS", "{:.4f}", "perceptual distance by a trained network, 0 for equal images; lower is better"),
     "pane_psnr": Metric("PSNR, pane", "{:.2f} dB", "PSNR of the pixels that show a pane; higher is better"),
-    "transmission_psnr": Metric(
-        "PSNR, transmission", "{:.2f} dB", "of what is seen through the panes, against the truth"
-    ),
+    "transmission_psnr": Metric("PSNR, transmission", "{:.2f} dB", "PSNR of the transmission over the panes"),
     "reflection_psnr": Metric(
-        "PSNR, reflection", "{:.2f} dB", "of what the panes mirror, times the reflection gain, against the truth"
+        "PSNR, reflection", "{:.2f} dB", "PSNR of the reflection over the panes, scaled by the reflection gain"
     ),
 }
 SURFACE_METRICS = {
     "reflective_psnr": Metric(
-        "PSNR, reflective", "{:.2f} dB", "PSNR of the pixels of which the surface mirrors more than half"
+        "PSNR, reflective", "{:.2f} dB", "PSNR of the pixels whose surface reflects more than half"
     ),
     "normal_error_deg": Metric("normal error", "{:.2f}°", "mean angle between rendered and true surface normals"),
     "reflective_normal_error_deg": Metric(
-        "normal error, reflective", "{:.2f}°", "the same where the surface mirrors more than half"
+        "normal error, reflective", "{:.2f}°", "the same where the surface reflects more than half"
     ),
-    "strength_error": Metric("strength error", "{:.3f}", "mean difference of the share that is mirrored, 0 to 1"),
+    "strength_error": Metric("strength error", "{:.3f}", "mean absolute error of the reflection strength, 0 to 1"),
     "environment_psnr": Metric(
-        "PSNR, environment", "{:.2f} dB", "of the learned surroundings, times the environment gain, against the truth"
+        "PSNR, environment", "{:.2f} dB", "PSNR of the learned environment, scaled by the environment gain"
     ),
     "environment_lpips": Metric("LPIPS, environment", "{:.4f}", "the same as a perceptual distance; lower is better"),
 }
 """Shown where they are known: only synthetic captures of objects have the truth they need."""
 FACTS = {
     "num_gaussians": Metric("Gaussians", "{:,}", "how many the scene has"),
-    "train_seconds": Metric("training", "{:.0f} s", "time that training took, without compiling kernels"),
-    "seconds_per_frame": Metric("per frame", "{:.3f} s", "time for one test image, median"),
+    "train_seconds": Metric("training", "{:.0f} s", "training time, without compilation of kernels"),
+    "seconds_per_frame": Metric("per frame", "{:.3f} s", "median time to render a test image"),
     "reflection_gain": Metric(
         "reflection gain",
         "{:.2f}",
-        "the one factor that brings all rendered reflections closest to the true ones: their brightness cannot be told "
-        "from the panes' strength; 1 where both are equally bright",
+        "the common factor that best matches the rendered reflections to the true ones, because brightness and "
+        "strength cannot be told apart; 1 if both are equally bright",
     ),
 }
 SURFACE_FACTS = {
     "environment_gain": Metric(
-        "environment gain", "{:.2f}", "the one factor that brings the learned surroundings closest to the true ones"
+        "environment gain", "{:.2f}", "the factor that best matches the learned environment to the true one"
     )
 }
 PLANE_COLUMNS = {
     "label": Metric("pane", "{}", "its label in the masks"),
-    "base_reflectance": Metric("R0", "{:.3f}", "share of the light that the pane mirrors when seen head-on"),
+    "base_reflectance": Metric("R0", "{:.3f}", "share of light that the pane reflects at normal incidence"),
     "normal_error_deg": Metric("normal error", "{:.2f}°", "angle between the fitted plane and the true pane"),
     "offset_error": Metric(
         "offset error, of the extent",
@@ -159,7 +159,7 @@ def quantize(image: Tensor) -> Tensor:
     if not image.is_floating_point():
         raise TypeError(f"expected a uint8 or floating-point image, got {image.dtype}; convert it first")
     if not bool(torch.isfinite(image).all()):
-        raise ValueError("the image holds values that are not finite; expected sRGB in [0, 1]")
+        raise ValueError("the image contains non-finite values; expected sRGB in [0, 1]")
     return torch.round(image.detach().clamp(0, 1) * 255).to(torch.uint8)
 
 
@@ -183,7 +183,7 @@ def psnr(image: Tensor, target: Tensor, region: Tensor | None = None) -> float:
             )
         difference = difference[region]
     if difference.numel() == 0:
-        raise ValueError("no pixel to compare; give a region that is not empty")
+        raise ValueError("no pixels to compare; expected a non-empty region")
     mean_square = difference.square().mean().item()
     return math.inf if mean_square == 0 else 10 * math.log10(255**2 / mean_square)
 
@@ -335,8 +335,8 @@ REFLECTIVE = 0.5
 NO_DIRECTION_DEG = 90.0
 """The error of a vector without direction: what guessing comes to."""
 NO_NORMALS, NO_STRENGTH = "the method renders no normals", "the method renders no strength"
-NO_TRUE_NORMALS = "no true normals lie next to the photograph"
-NO_TRUE_STRENGTH = "no true strength lies next to the photograph"
+NO_TRUE_NORMALS = "there are no true normals for the photograph"
+NO_TRUE_STRENGTH = "there is no true strength for the photograph"
 UNCOVERED = f"fewer than {SMALLEST_REGION} pixels show a surface"
 UNREFLECTIVE = f"fewer than {SMALLEST_REGION} pixels reflect more than half"
 
@@ -535,7 +535,7 @@ def environment_psnr(learned: Tensor, truth: Tensor) -> tuple[float, float]:
         truth: [h, 2h, 3] panorama, floating point or uint8; averaged down where it is larger.
 
     Raises:
-        ValueError: a panorama is not twice as wide as high, or holds values that are not finite.
+        ValueError: a panorama is not twice as wide as high, or contains non-finite values.
     """
     image, target, gain = _equalise(learned, truth)
     difference = quantize(image).to(torch.float64) - quantize(target).to(torch.float64)
@@ -572,7 +572,7 @@ def _panorama(pixels: Tensor, which: str) -> Tensor:
         raise ValueError(f"expected the {which} environment as a panorama [H, 2H, 3], got {list(pixels.shape)}")
     values = pixels.detach().cpu().to(torch.float64) / (255 if pixels.dtype == torch.uint8 else 1)
     if not bool(torch.isfinite(values).all()):
-        raise ValueError(f"the {which} environment holds values that are not finite; expected sRGB in [0, 1]")
+        raise ValueError(f"the {which} environment contains non-finite values; expected sRGB in [0, 1]")
     return values
 
 

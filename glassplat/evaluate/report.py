@@ -263,7 +263,7 @@ class Uses:
 
     def picture(self) -> NDArray[np.uint8] | None:
         """The views kept [H, W, 3], one per row; None where no view shows a pane."""
-        return compose_sheet([row for _, row in self._rows], "What the layers are good for", "") if self._rows else None
+        return compose_sheet([row for _, row in self._rows], "Uses of the layers", "") if self._rows else None
 
 
 USES_FILE = "uses.png"

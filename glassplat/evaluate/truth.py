@@ -221,7 +221,7 @@ def _read_beside(view: View, mark: str) -> NDArray[np.float32] | None:
     pixels = _read_image(path)
     if pixels.shape[1::-1] != photo_size:
         raise InputError(
-            f"{path} is {pixels.shape[1]}x{pixels.shape[0]} pixels large, its photograph {photo_size[0]}x"
+            f"{path} is {pixels.shape[1]}x{pixels.shape[0]} pixels, its photograph {photo_size[0]}x"
             f"{photo_size[1]}; expected the same size"
         )
     return pixels

@@ -130,7 +130,7 @@ class GltfWriter:
         text += b" " * (-len(text) % 4)
         size = HEADER.size + 2 * CHUNK.size + len(text) + self._size
         if size > MOST_BYTES:
-            raise ValueError(f"a GLB of {size} bytes cannot be written; expected at most {MOST_BYTES}: take PLY or SPZ")
+            raise ValueError(f"a GLB of {size} bytes cannot be written; expected at most {MOST_BYTES}: use PLY or SPZ")
         head = HEADER.pack(MAGIC, VERSION, size) + CHUNK.pack(len(text), JSON_CHUNK) + text
         return head + CHUNK.pack(self._size, BINARY_CHUNK) + b"".join(self._parts)
 
@@ -200,7 +200,7 @@ class GltfReader:
 def _chunks(data: bytes, path: Path) -> tuple[str, bytes]:
     """The document's text, and the buffer, which may be empty."""
     if len(data) < HEADER.size + CHUNK.size or data[:4] != MAGIC:
-        raise ValueError(f"{path} is no GLB: expected glTF at its beginning; give a .glb file")
+        raise ValueError(f"{path} is not a GLB: expected glTF at its beginning; give a .glb file")
     _, version, announced = HEADER.unpack_from(data)
     if version != VERSION:
         raise ValueError(f"{path} is a GLB of version {version}; expected 2: export it again")
@@ -214,7 +214,7 @@ def _chunks(data: bytes, path: Path) -> tuple[str, bytes]:
     try:
         text = data[start : start + size].decode("utf-8")
     except UnicodeDecodeError as error:
-        raise ValueError(f"the document of {path} is no text in UTF-8 ({error.reason}); it is damaged") from error
+        raise ValueError(f"the document of {path} is not UTF-8 text ({error.reason}); it is damaged") from error
     at = start + size
     if at + CHUNK.size > announced:
         return text, b""

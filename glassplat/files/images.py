@@ -119,7 +119,7 @@ def write_image(path: Path | str, image: Tensor | NDArray[np.generic]) -> None:
     """
     pixels = _to_uint8(image if isinstance(image, np.ndarray) else image.detach().cpu().numpy())
     if Path(path).suffix.lower() not in IMAGE_SUFFIXES:
-        raise ValueError(f"cannot tell the image format of {path}; use one of the suffixes {', '.join(IMAGE_SUFFIXES)}")
+        raise ValueError(f"unknown image format of {path}; use one of the suffixes {', '.join(IMAGE_SUFFIXES)}")
     with atomic_write(path) as temporary:
         Image.fromarray(pixels).save(temporary, compress_level=COMPRESSION)
 
@@ -130,12 +130,12 @@ def checked_image(path: Path) -> Iterator[Image.Image]:
     try:
         with Image.open(path, formats=(*FORMATS, "HEIF") if reads_heif() else FORMATS) as image:
             if image.width * image.height > MOST_PIXELS:
-                size = f"{image.width}x{image.height} pixels large"
+                size = f"{image.width}x{image.height} pixels"
                 raise ValueError(f"it is {size}; expected at most {MOST_PIXELS / 1e6:.0f} megapixels: reduce it")
             _turn_back(image)
             yield image
     except FileNotFoundError as error:
-        raise FileNotFoundError(f"no image {path}; expected it there") from error
+        raise FileNotFoundError(f"{path} does not exist; expected an image") from error
     except MemoryError:
         raise
     except Exception as error:  # Its parsers raise whatever damaged bytes lead to, from KeyError to struct.error.
@@ -299,7 +299,7 @@ def _to_uint8(pixels: NDArray[np.generic]) -> NDArray[np.uint8]:
         raise TypeError(f"expected uint8 or floating-point pixels, got {pixels.dtype}; convert them first")
     values = pixels.astype(np.float64)
     if not np.isfinite(values).all():
-        raise ValueError("the image holds values that are not finite; expected numbers in [0, 1]")
+        raise ValueError("the image contains non-finite values; expected numbers in [0, 1]")
     return np.ascontiguousarray(np.round(np.clip(values, 0, 1) * 255).astype(np.uint8))
 
 

@@ -209,7 +209,7 @@ def _read_ascii(
     try:
         values = np.array(rows, dtype=np.float64).reshape(element.count, width)
     except ValueError as error:
-        raise ValueError(f"{path} holds something that is not a number ({error}); the file is damaged") from error
+        raise ValueError(f"{path} contains something that is not a number ({error}); the file is damaged") from error
     return {
         name: _in_declared_type(values[:, i], str(kind), name, path)
         for i, (name, kind) in enumerate(element.properties)

@@ -35,7 +35,7 @@ def reading(path: Path) -> Iterator[None]:
             raise ValueError(f"{path} cannot be read (it is a folder, a pipe or a device); expected a file")
         yield
     except FileNotFoundError as error:
-        raise FileNotFoundError(f"no file {path}; expected it there") from error
+        raise FileNotFoundError(f"{path} does not exist; expected a file") from error
     except OSError as error:
         reason = error.strerror or str(error)
         raise ValueError(f"{path} cannot be read ({reason}); expected a file that may be read") from error
@@ -52,7 +52,7 @@ def read_text(path: Path) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(
-            f"{path} is no text in UTF-8 ({error.reason} at byte {error.start}); save it as such"
+            f"{path} is not UTF-8 text ({error.reason} at byte {error.start}); save it as UTF-8"
         ) from error
 
 
@@ -96,7 +96,7 @@ def _check_nesting_and_text(value: Any, where: str) -> None:
     for _ in range(DEEPEST):
         unprintable = next((text for text in level if isinstance(text, str) and not is_encodable(text)), None)
         if unprintable is not None:
-            raise ValueError(f"{where} holds the text {unprintable!r}, which is no valid Unicode; write it again")
+            raise ValueError(f"{where} holds the text {unprintable!r}, which is not valid Unicode; write it again")
         level = [inner for outer in level for inner in _inside(outer)]
         if not level:
             return

@@ -184,7 +184,7 @@ def read_splats(path: Path | str) -> Gaussians:
         return read_forged(path)
     if path.suffix.lower() == ".splat":
         return _read_rows(path)
-    raise ValueError(f"{path} is no splat file that can be read; expected one of {', '.join(SPLAT_SUFFIXES)}")
+    raise ValueError(f"{path} is not a readable splat file; expected one of {', '.join(SPLAT_SUFFIXES)}")
 
 
 def drawable(gaussians: Gaussians, path: Path | str) -> tuple[Gaussians, int]:
@@ -205,7 +205,7 @@ def drawable(gaussians: Gaussians, path: Path | str) -> tuple[Gaussians, int]:
     lost = len(gaussians) - int(good.sum())
     if lost and lost == len(gaussians):
         raise ValueError(
-            f"none of the {lost} Gaussians in {path} can be drawn: values that are no numbers or too large"
+            f"none of the {lost} Gaussians in {path} can be drawn: they contain NaN or values that are too large"
         )
     kept = gaussians.select(good) if lost else gaussians
     held = {
@@ -220,7 +220,7 @@ def _read_rows(path: Path) -> Gaussians:
     size = os.stat(path).st_size
     if size == 0 or size % SPLAT_ROW.itemsize:
         raise ValueError(
-            f"{path} has {size} bytes; expected {SPLAT_ROW.itemsize} per Gaussian: it is cut off, or no .splat"
+            f"{path} has {size} bytes; expected {SPLAT_ROW.itemsize} per Gaussian: it is cut off, or not a .splat"
         )
     with records.reading(path):
         rows = np.fromfile(path, dtype=SPLAT_ROW)

@@ -91,7 +91,7 @@ def opened_tensors(path: Path, file_format: str, what: str) -> Iterator[TensorsF
             yield TensorsFile(header, file)
     except SafetensorError as error:
         reason = str(error)[:LONGEST_REASON]  # It may repeat all of the header.
-        raise ValueError(f"{path} is truncated or not {what} ({reason}); expected a whole file") from error
+        raise ValueError(f"{path} is truncated or not {what} ({reason}); expected a complete file") from error
 
 
 @contextmanager
@@ -469,7 +469,7 @@ def read_equirect(path: Path | str) -> Tensor:
         _check_size(path, *image_size(path))
         image = torch.from_numpy(_color(read_image_float(path), path))
     if not bool(torch.isfinite(image).all()):
-        raise ValueError(f"{path} holds values that are not finite; expected radiance of at least 0")
+        raise ValueError(f"{path} contains non-finite values; expected radiance of at least 0")
     return image.clamp(0, 1)
 
 
@@ -485,7 +485,7 @@ def write_equirect(path: Path | str, image: Tensor) -> None:
     if image.ndim != 3 or tuple(image.shape[1:]) != (2 * image.shape[0], 3) or image.shape[0] == 0:
         raise ValueError(f"the panorama has shape {tuple(image.shape)}; expected (H, 2 H, 3)")
     if not bool(torch.isfinite(image).all()):
-        raise ValueError("the panorama holds values that are not finite; expected sRGB in [0, 1]")
+        raise ValueError("the panorama contains non-finite values; expected sRGB in [0, 1]")
     if path.suffix.lower() == PNG:
         write_image(path, image)
         return
@@ -502,7 +502,7 @@ def write_equirect(path: Path | str, image: Tensor) -> None:
 
 def _check_suffix(path: Path) -> None:
     if path.suffix.lower() not in (EXR, PNG):
-        raise ValueError(f"cannot tell the format of the panorama {path}; use the suffix {EXR} or {PNG}")
+        raise ValueError(f"unknown format of the panorama {path}; use the suffix {EXR} or {PNG}")
 
 
 def _check_size(path: Path, width: int, height: int) -> None:

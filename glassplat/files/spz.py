@@ -206,8 +206,8 @@ def spz_bytes(gaussians: Gaussians, version: int = 3) -> bytes:
     farthest = float(gaussians.means.abs().max()) if len(gaussians) else 0.0
     if farthest > LARGEST_POSITION:
         raise ValueError(
-            f"a Gaussian lies {farthest:.3g} units from the origin, and SPZ ends at {LARGEST_POSITION}; take it out "
-            "with `glassplat clean`, or write another format"
+            f"a Gaussian lies {farthest:.3g} units from the origin, and SPZ ends at {LARGEST_POSITION}; remove "
+            "it with `glassplat clean`, or write another format"
         )
     gaussians = replace(gaussians, sh=gaussians.sh[:, : (gaussians.active_sh_degree + 1) ** 2])
     layout = Layout(version, len(gaussians), gaussians.max_sh_degree, fractional_bits_for(gaussians.means))
@@ -215,7 +215,7 @@ def spz_bytes(gaussians: Gaussians, version: int = 3) -> bytes:
     if len(gaussians) and step > float(gaussians.log_scales.amax(dim=1).median().exp()):
         log.warning(
             "SPZ rounds positions to %g units, which is more than half of the Gaussians measure, because one lies %.3g "
-            "units from the origin; take it out with `glassplat clean`, or write another format",
+            "units from the origin; remove it with `glassplat clean`, or write another format",
             step,
             farthest,
         )
@@ -242,8 +242,8 @@ def _warn_of_sizes(log_scales: Tensor) -> None:
     share = float((small | (largest > highest + within)).double().mean())
     if share > MOST_CLIPPED:
         log.warning(
-            "SPZ and the web page hold sizes of %.2g to %.3g units; those of %.3g %% of the Gaussians are clipped, and "
-            "they look different. Bring the scene to other units with `glassplat clean --scale`, or write a PLY",
+            "SPZ and the web page hold sizes of %.2g to %.3g units; those of %.3g %% of the Gaussians are "
+            "clipped and look different. Change the units of the scene with `glassplat clean --scale`, or write a PLY",
             math.exp(lowest),
             math.exp(highest),
             100 * share,
@@ -263,7 +263,7 @@ def read_spz(path: Path | str) -> Gaussians:
     elif data[:4] == struct.pack("<I", MAGIC):
         layout, sections = _read_streams(data, path)
     else:
-        raise ValueError(f"{path} is no SPZ file: expected it to begin with gzip or NGSP; give a .spz file")
+        raise ValueError(f"{path} is not an SPZ file: expected it to begin with gzip or NGSP; give a .spz file")
     return unpack_gaussians(sections, layout)
 
 
@@ -294,7 +294,7 @@ def _read_gzip(data: bytes, path: Path) -> tuple[Layout, list[Bytes]]:
     if len(body) < size:
         raise ValueError(
             f"{path} is cut off: its header announces {layout.number} Gaussians, which take {size} bytes, but "
-            f"{len(body)} are there; copy or export it again"
+            f"it has {len(body)}; copy or export it again"
         )
     whole, at, sections = np.frombuffer(body, dtype=np.uint8), 0, []
     for length in layout.sizes():
@@ -320,8 +320,8 @@ def _read_streams(data: bytes, path: Path) -> tuple[Layout, list[Bytes]]:
         packed, announced = STREAM.unpack_from(data, table + index * STREAM.size)
         if announced != size or packed > len(data) - at:
             raise ValueError(
-                f"section {index} of {path} has {announced} bytes, packed in {packed}; expected {size}, packed in what "
-                "is left of the file: it is cut off or damaged"
+                f"section {index} of {path} has {announced} bytes, packed in {packed}; expected {size}, packed "
+                "in the rest of the file: it is cut off or damaged"
             )
         found.append(_unpacked_stream(data[at : at + packed], size, index, path))
         at += packed
@@ -347,7 +347,7 @@ def _layout(header: bytes, file_size: int, path: Path) -> Layout:
         raise ValueError(f"{path} ends within its header; the file is cut off: copy or export it again")
     magic, version, count, degree, bits, *_ = HEADER.unpack(header)
     if magic != MAGIC:
-        raise ValueError(f"{path} is compressed, but no SPZ: expected NGSP at its beginning; give a .spz file")
+        raise ValueError(f"{path} is compressed, but not SPZ: expected NGSP at its beginning; give a .spz file")
     if version not in VERSIONS:
         raise ValueError(f"{path} is SPZ of version {version}; expected one of {VERSIONS}: save it in an earlier one")
     if degree >= len(HARMONICS) or (bits > MOST_FRACTIONAL_BITS + 4 and version > 1):

@@ -71,7 +71,7 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
         os.replace(temporary, target)
     except OSError as error:
         reason = error.strerror or str(error)
-        message = f"could not write {path} ({reason}); whatever was there before is unchanged"
+        message = f"could not write {path} ({reason}); the previous contents are unchanged"
         raise (OSError(message) if error.errno is None else OSError(error.errno, message)) from error
     finally:
         with suppress(OSError):  # never hide the error above behind one from the clean-up
@@ -126,13 +126,13 @@ def check_folder(path: Path) -> None:
     whole = Path(os.path.abspath(path))
     found = next(folder for folder in (whole, *whole.parents) if os.path.lexists(folder))
     if not found.is_dir():
-        kind = "a link that leads nowhere" if found.is_symlink() and not found.exists() else "a file"
-        where = "" if found == whole else f", so there can be no folder {path}"
-        raise NotADirectoryError(
-            f"{found} is {kind}{where}; expected a folder, or a name for a new one, for the output"
-        )
+        kind = "a broken link" if found.is_symlink() and not found.exists() else "a file"
+        where = "" if found == whole else f", so {path} cannot be created"
+        raise NotADirectoryError(f"{found} is {kind}{where}; expected an existing or new folder for the output")
     if not os.access(found, os.W_OK | os.X_OK):
-        raise PermissionError(f"nothing may be written in {found}; choose another folder for the output, or allow it")
+        raise PermissionError(
+            f"no permission to write to {found}; choose another output folder, or change its permissions"
+        )
 
 
 def check_capture_folder(path: Path) -> None:
@@ -158,7 +158,7 @@ def make_folder(path: Path) -> None:
         if error.errno not in IN_THE_WAY:
             raise
         raise NotADirectoryError(
-            f"there can be no folder {path} ({error.strerror}); choose another folder for the output"
+            f"cannot create the folder {path} ({error.strerror}); choose another output folder"
         ) from error
 
 

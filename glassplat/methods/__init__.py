@@ -1,1 +1,1 @@
-"""Methods: how each trains, and with which options."""
+"""Methods: their recipes and training stages."""

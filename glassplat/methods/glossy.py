@@ -1,6 +1,6 @@
 """Training of `deferred` (3D Gaussian Splatting with Deferred Reflection) and `traced` (EnvGS).
 
-`traced` begins like `deferred`; then rays find what is mirrored among Gaussians that only reflections show.
+`traced` starts like `deferred`; then, reflections are traced through a second set of Gaussians.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 def deferred_scene(recipe: DeferredRecipe, dataset: Dataset) -> Scene:
-    """The first scene: one Gaussian per point that hardly reflects, and no environment yet."""
+    """The initial scene: one Gaussian per point with almost no reflection, and no environment."""
     primary = population_of(recipe).initial(dataset.points, recipe.sh_degree)
     strengths = torch.full((len(primary),), logit(recipe.first_strength), dtype=torch.float32)
     primary = replace(primary, channels={"logit_strength": strengths})
@@ -47,7 +47,7 @@ def deferred_renderer(recipe: DeferredRecipe) -> Deferred:
 
 
 def deferred_stages(recipe: DeferredRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
-    """Bootstrap, then everything; what changes in between is up to `Propagate`. A short run has no reflections."""
+    """Bootstrap, then joint training, which `Propagate` controls. A short run has no reflections."""
     short = iterations < recipe.least_iterations
     if short:
         return corrections_learnt(recipe, _matte_stages(recipe, "ellipsoid", seed, iterations))
@@ -55,13 +55,13 @@ def deferred_stages(recipe: DeferredRecipe, seed: int, iterations: int = PUBLISH
 
 
 LEAST_BOOTSTRAP = 300
-"""Steps after which mirrors can be told from what has not been learned yet."""
+"""Minimum number of steps before mirrors can be distinguished from unlearned parts."""
 
 
 def _bootstrapped(recipe: DeferredRecipe, iterations: int) -> DeferredRecipe:
-    """The recipe with a bootstrap of `LEAST_BOOTSTRAP` steps at least, as far as the time until `schedule.stop` allows.
+    """The recipe with a bootstrap of at least `LEAST_BOOTSTRAP` steps, if there is time before `schedule.stop`.
 
-    Of a mirror ball at 700 iterations, 42 steps left 7.7 dB and 262 leave 21.4; as `splat` it has 21.9.
+    A mirror ball at 700 iterations has 7.7 dB after a bootstrap of 42 steps, 21.4 after 262, and 21.9 with `splat`.
     """
     if not recipe.search.begin_found:
         return recipe
@@ -70,7 +70,7 @@ def _bootstrapped(recipe: DeferredRecipe, iterations: int) -> DeferredRecipe:
 
 
 def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
-    """Those of a run that is long enough for normals to spread."""
+    """Stages of a run long enough for normal propagation."""
     population = population_of(recipe)
     image, held = image_term(recipe.ssim_weight), recipe.view_dependence_weight
     regular: tuple[Action, ...] = (GrowSh(Every(recipe.intervals.sh)), *population.resets)
@@ -104,7 +104,7 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         rates=recipe.rates.of("primary", held) | recipe.reflection_rates.of(),
         actions=(
             *_edits(recipe, population),
-            # Before the resets: it looks at what is seen, also at the steps that it leaves to them.
+            # Before the resets, because it examines the visible scene even at steps of resets.
             _propagate(recipe, propagate_at, renderer),
             mirrors.GrowShAfterPropagation(Every(recipe.intervals.sh)),
             *(
@@ -117,7 +117,7 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         post_steps=population.post_steps,
         setup=first_reflections(recipe),
         densify_until=population.densify_until,
-        # Normals that nothing shows need not keep to the depths (lab/glossy.md).
+        # Without propagation, the consistency of normals is not needed (lab/glossy.md).
         until=mirrors.found_nothing,
     )
     refinement = replace(
@@ -133,7 +133,7 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
 
 
 def _matte_stages(recipe: DeferredRecipe, primitive: Primitive, seed: int, iterations: int) -> tuple[Stage, ...]:
-    """Those of a run that is too short for normals to spread: as in `splat`."""
+    """Stages of a run too short for normal propagation, as in `splat`."""
     usual = Intervals()
     plain = SplatRecipe(
         primitive=primitive,
@@ -152,7 +152,7 @@ def _matte_stages(recipe: DeferredRecipe, primitive: Primitive, seed: int, itera
 
 
 def _rates_of_splat(recipe: DeferredRecipe) -> GaussianRates:
-    """The learning rates where nothing reflects that higher ones would spoil."""
+    """The learning rates if nothing reflects whose normals higher rates would corrupt."""
     return (
         replace(recipe.rates, short_run_power=GaussianRates().short_run_power)
         if recipe.raise_rates_matte
@@ -161,18 +161,18 @@ def _rates_of_splat(recipe: DeferredRecipe) -> GaussianRates:
 
 
 def first_reflections(recipe: DeferredRecipe) -> BeginReflections:
-    """Begin reflections."""
+    """Setup that starts reflections."""
     seen_by = Splat(recipe.background or BLACK, depth=False)
     return BeginReflections(_environment(recipe), None, recipe.search, seen_by, harmonics_wait=True)
 
 
 def _environment(recipe: DeferredRecipe) -> AddEnvironment:
-    """Environment to mirror."""
+    """Setup that adds the environment."""
     return AddEnvironment(min(recipe.first_texels, recipe.texels), recipe.region, recipe.find_region)
 
 
 def _edits(recipe: DeferredRecipe, population: Population) -> tuple[Action, ...]:
-    """Actions that change the number of Gaussians once they reflect."""
+    """Actions that change the number of Gaussians, after the bootstrap."""
     if recipe.propagation_interval is None or recipe.strategy == "mcmc":
         return population.edits
     slow = replace(recipe.densify, interval=recipe.propagation_interval)
@@ -194,7 +194,7 @@ def _propagate(recipe: DeferredRecipe, when: Every, renderer: Deferred) -> mirro
 
 
 def _matte_rates(recipe: DeferredRecipe) -> dict[str, Rate]:
-    """Factors that bring the learning rates to those of `splat`, where no normals can be spoiled."""
+    """Factors that raise the learning rates to those of `splat`."""
     if not recipe.raise_rates_matte:
         return {}
     missing = GaussianRates().short_run_power - recipe.rates.short_run_power
@@ -206,15 +206,15 @@ def _matte_rates(recipe: DeferredRecipe) -> dict[str, Rate]:
 
 
 FIRST_DOUBLING, LAST_DOUBLING = 0.45, 0.65
-"""Shares of the run at which the environment's edge length doubles for the first and for the last time."""
+"""Shares of the run of the first and last doubling of the environment's resolution."""
 LEAST_WAIT = 0.1
-"""Share of what is left of the run after the bootstrap that passes before the first time, at least."""
+"""Minimum delay of the first doubling, as a share of the run after the bootstrap."""
 
 
 def doublings(first_texels: int, texels: int, bootstrap: float) -> tuple[float, ...]:
-    """The shares of the run, evenly from the first to the last, at which an edge length doubles until it is reached.
+    """Evenly spaced shares of the run at which the edge length doubles until it reaches the final one.
 
-    They come later after a long bootstrap, during which there is no environment.
+    They are delayed by a long bootstrap, in which there is no environment.
     """
     count = max(math.ceil(math.log2(texels / first_texels)), 0)
     first = max(FIRST_DOUBLING, bootstrap + LEAST_WAIT * (1 - bootstrap))
@@ -226,7 +226,7 @@ NORMAL_TERMS = ("consistency", "monocular normals")
 
 
 def traced_scene(recipe: TracedRecipe, dataset: Dataset) -> Scene:
-    """The first scene: one Gaussian per point that hardly reflects, and nothing to mirror yet."""
+    """The initial scene: one Gaussian per point with almost no reflection, and no surroundings."""
     scene = recipe.distant().initialise(dataset)
     return replace(scene, primary=as_discs(scene.primary)) if recipe.primitive == "disc" else scene
 
@@ -239,7 +239,7 @@ def traced_renderer(recipe: TracedRecipe) -> Traced | Deferred:
 
 
 def traced_stages(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
-    """Bootstrap, reflections, everything without propagation; a short run learns as `splat` does."""
+    """Bootstrap, reflections with propagation, and joint training without it; a short run trains like `splat`."""
     if iterations < recipe.least_iterations:
         return corrections_learnt(recipe, _matte_stages(recipe.distant(), recipe.primitive, seed, iterations))
     known = recipe.distant().stages(seed, iterations)
@@ -266,13 +266,13 @@ def traced_stages(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHED_I
 
 
 def _with_normal_terms(recipe: TracedRecipe, bootstrap: Stage, reflecting: Stage) -> Stage:
-    """The first stage of a scene of discs, with what a later one asks of normals."""
+    """The first stage of a scene of discs, with the normal terms of later stages."""
     terms = tuple(term for term in reflecting.losses if term.name in NORMAL_TERMS)
     return replace(bootstrap, renderer=Splat(recipe.background or BLACK), losses=(*bootstrap.losses, *terms))
 
 
 def _tracing(recipe: TracedRecipe, stage: Stage) -> Stage:
-    """A stage of `deferred` in which rays find what is mirrored."""
+    """A stage of `deferred` with ray-traced reflections."""
     stage = _with_renderer(recipe, stage)
     return replace(
         stage,
@@ -283,8 +283,8 @@ def _tracing(recipe: TracedRecipe, stage: Stage) -> Stage:
 
 
 def _with_renderer(recipe: TracedRecipe, stage: Stage) -> Stage:
-    """A stage of `deferred` with this method's renderer, which propagation looks through as well."""
-    # What no ray leaves and no environment lights mirrors nothing, and a strength that mirrors nothing cannot grow.
+    """A stage of `deferred` with this method's renderer, also for propagation."""
+    # Without rays or an environment there is no reflection, so that strengths could not grow.
     least_strength = 0.0 if recipe.mirrors == "surroundings" else recipe.least_strength
     renderer = Traced(recipe.background or BLACK, least_strength, faintest=0.0, joint=recipe.joint)
     kept = [
@@ -297,7 +297,7 @@ def _with_renderer(recipe: TracedRecipe, stage: Stage) -> Stage:
 
 
 def _surroundings_actions(recipe: TracedRecipe) -> list[Action]:
-    """Actions that change the surroundings, apart from learning."""
+    """Densification and resets of the surroundings."""
     options = recipe.surroundings
     reset = ResetOpacity(Every(options.reset, stop=options.densify.stop), part="surroundings")
     return [

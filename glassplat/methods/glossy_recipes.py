@@ -36,38 +36,37 @@ from glassplat.training.options import (
 
 @dataclass(frozen=True)
 class GlossyOptions(MethodRecipe):
-    """Options of `deferred` and `traced`: a strength and a normal for every Gaussian, and how both are learnt.
+    """Options of `deferred` and `traced`, which learn a reflection strength and a normal for every Gaussian.
 
     Attributes:
-        sh_degree: highest degree of the view-dependent colour, which grows once propagation has ended unless a
-            method says otherwise.
-        bootstrap: share of the run without reflection, 300 steps at least (paper: a few thousand). Where mirrors are
-            searched for afterwards it is a run of `splat`, else harmonics wait.
-        texels: edge length of the environment's cube faces in the end.
-        first_texels: edge length at the start.
+        sh_degree: maximum SH degree of the view-dependent colour; by default it grows after propagation.
+        bootstrap: share of the run without reflection, at least 300 steps (paper: a few thousand). If mirrors are
+            searched for afterwards it is a run of `splat`, else the SH degree stays 0.
+        texels: final edge length of the environment's cube faces.
+        first_texels: initial edge length.
         first_strength: reflection strength of every Gaussian at the start.
-        search: what is taken for a mirror at once when reflections begin.
-        region: only what lies in this sphere may reflect: centre and radius, world units; if not given, what the
-            cameras stand around.
-        find_region: look for the place that the cameras stand around; if not, everything may reflect unless `region`
-            says otherwise, as in the paper.
-        outside_weight: weight of the mean strength outside of the region in the objective.
-        strength_weight: of the mean strength of all Gaussians in the objective, which the paper does not have: a matte
-            thing would learn to reflect a little.
-        consistency_weight: weight of the difference between normals and the slope of the depths, while normals spread.
-        monocular_weight: of the difference between normals and those that lie in `normals/` next to the photographs;
-            nothing where there are none (3DGS-DR: none; EnvGS: 0.01).
-        propagation: how normals spread and colours are sabotaged.
-        schedule: when they do.
-        least_iterations: of the shortest run in which anything reflects. A shorter one would be over before the colours
-            have learnt what the reflections leave to them; it trains like one of `splat`.
-        raise_rates_matte: raise the learning rates to those of `splat` for the rest of a run in which nothing was found
-            that reflects, and for all of one that is too short to look for it.
-        raise_rates_found: raise them after propagation where something reflects, too; before, high rates would spoil
+        search: search for mirrors at the start of reflections.
+        region: sphere outside which nothing reflects: centre and radius, in world units; by default the place that the
+            cameras surround.
+        find_region: determine the place that the cameras surround; otherwise, everything may reflect without a
+            `region`, as in the paper.
+        outside_weight: weight of the mean strength outside the region.
+        strength_weight: weight of the mean strength of all Gaussians, which keeps matte surfaces from reflecting a
+            little (not in the paper).
+        consistency_weight: weight of the difference between normals and those of the depths, during propagation.
+        monocular_weight: weight of the difference between normals and estimated ones in `normals/` next to the
+            photographs, if there are any (3DGS-DR: none; EnvGS: 0.01).
+        propagation: normal propagation and colour sabotage.
+        schedule: schedule of both.
+        least_iterations: length of the shortest run with reflections. In a shorter one, colours could not adapt to the
+            reflections; it trains like `splat`.
+        raise_rates_matte: raise the learning rates to those of `splat` once nothing reflective was found, and in runs
+            too short for reflections.
+        raise_rates_found: raise them after propagation even if something reflects; earlier, high rates would corrupt
             its normals.
-        propagation_interval: steps between densifications while normals spread; None keeps `densify.interval`.
-        rates: learning rates of the Gaussians; in short runs they rise before and after normals spread
-            (`raise_rates_matte`, `raise_rates_found`), not meanwhile: that costs a mirror ball its normals
+        propagation_interval: steps between densifications during propagation; None keeps `densify.interval`.
+        rates: learning rates of the Gaussians; in short runs they are higher before and after propagation
+            (`raise_rates_matte`, `raise_rates_found`), but not during it, which would corrupt normals
             (lab/training.md).
         reflection_rates: learning rates of strength and environment.
     """
@@ -143,14 +142,14 @@ DEFERRED_CODE_ITERATIONS = 61_000
 
 @dataclass(frozen=True)
 class DeferredRecipe(GlossyOptions):
-    """3DGS-DR: a strength and a normal for every Gaussian, one environment, and shading per pixel."""
+    """3DGS-DR: a reflection strength and a normal for every Gaussian, an environment map, deferred shading."""
 
     method = "deferred"
     functions = "glassplat.methods.glossy:deferred"
 
     @classmethod
     def paper(cls) -> DeferredRecipe:
-        """As published; where paper and public code disagree, with the constants of the code (docs/deferred.md)."""
+        """As published; if paper and public code disagree, with the constants of the code (docs/deferred.md)."""
         return cls(
             **_published(DEFERRED_CODE_ITERATIONS, normals=24_000, resets=29_000, densify=30_000),
             texels=128,
@@ -164,26 +163,25 @@ class DeferredRecipe(GlossyOptions):
 
 
 TRACED_CODE_ITERATIONS = 40_000
-"""Length of a run of the public code, but for two captures, whose runs are longer."""
+"""Length of a run of the public code, except for two captures with longer runs."""
 Mirrors = Literal["both", "surroundings", "environment"]
 
 
 @dataclass(frozen=True)
 class TracedRecipe(GlossyOptions):
-    """EnvGS: a strength and a normal for every Gaussian, and a second set of Gaussians that reflections show.
+    """EnvGS: a reflection strength and a normal for every Gaussian, and ray-traced Gaussians as surroundings.
 
     Attributes:
-        primitive: what scene and surroundings are made of: ellipsoids, or discs (paper).
-        harmonics_from_start: let the SH degree grow from the first step on (its code), and not only once propagation
-            has ended.
-        mirrors: what is mirrored: `surroundings` (paper), an `environment` infinitely far away (ablation), or `both`,
-            the environment behind the surroundings.
-        joint: reflections also move the surfaces; without, they only teach the surroundings (ablation).
-        least_strength: rays are traced where the strength is larger; elsewhere the environment alone is mirrored. Where
-            there is none, training traces them everywhere.
-        surroundings: how the Gaussians learn that reflections show.
-        normals_throughout: keep the term of `consistency_weight` after propagation, and where the Gaussians are discs,
-            have it and that of `monocular_weight` from the first step on (paper).
+        primitive: primitives of scene and surroundings: ellipsoids, or discs (paper).
+        harmonics_from_start: increase the SH degree from the first step on (public code), not only after propagation.
+        mirrors: what is reflected: `surroundings` (paper), an `environment` map at infinity (ablation), or `both`, the
+            environment behind the surroundings.
+        joint: reflections also train the surfaces; otherwise only the surroundings (ablation).
+        least_strength: strength above which rays are traced; below, only the environment is reflected. Without an
+            environment, training traces all rays.
+        surroundings: Gaussians that are reflected.
+        normals_throughout: keep the term of `consistency_weight` after propagation; for discs, use it and that of
+            `monocular_weight` from the first step on (paper).
     """
 
     method = "traced"

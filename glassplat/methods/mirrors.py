@@ -1,12 +1,11 @@
-"""Mirrors found in a matte scene, and normals propagated from them (3DGS-DR, Section 3.3).
+"""Search for mirrors in a matte scene, and propagation of normals from them (3DGS-DR, Section 3.3).
 
-3DGS-DR and EnvGS begin with hardly any reflection, and let it spread from where it happens to explain something. What
-mirrors its neighbourhood has become a picture of it by then. But a mirror betrays itself earlier, by looking different
-from every side, and depths tell coarsely which way it faces: from there its normals find their way.
+3DGS-DR and EnvGS start with almost no reflection, which spreads from where it happens to explain something. By then, a
+mirror has learned its reflections as its own texture. But mirrors can be detected earlier, because their colours vary
+with the view, and depths give rough normals, from which training finds the right ones.
 
-How much reflects is counted over what the views show. The paper counts reflective Gaussians. But a mirror ball that
-fills a third of the images may be a hundredth of the Gaussians, of which most stand in empty space at first, and in a
-matte scene as many reflect a little.
+The amount of reflection is measured over pixels of the views. The paper counts reflective Gaussians; but a mirror ball
+that fills a third of the images may have a hundredth of the Gaussians, and in a matte scene, as many reflect slightly.
 """
 
 from __future__ import annotations
@@ -36,21 +35,21 @@ from glassplat.training.options import MirrorSearch, NormalPropagation, Propagat
 from glassplat.training.stage import AtMoments, Clock, Every, TrainState
 
 LEAST_SHOWN = 0.1
-"""Pixels, of all views together, below which a Gaussian is not seen."""
+"""Minimum contribution of a visible Gaussian, in pixels over all views."""
 
 
 @dataclass(frozen=True)
 class Search:
-    """Search for what reflects, by what the views show of the region in which anything may.
+    """Search for reflective Gaussians in the views, within the region.
 
-    A Gaussian's residual in a view is the mean difference between photograph and render over its pixels, by its
-    blending weights. Detail that is not resolved yet is the same in all views; a reflection is another in each. So it
-    is the residual's spread over the views that tells them apart.
+    A Gaussian's residual in a view is the difference between photograph and render, averaged over its pixels with its
+    blending weights. Unresolved detail has the same residual in all views, reflections a different one in each. The
+    spread of the residual over views distinguishes the two.
 
     Attributes:
-        views: how many training views to look at.
-        strength: Gaussians of more than this strength cannot have been overlooked (the paper's "reflective").
-        spread: standard deviation of the residual over the views, sRGB, from which it turns with the view.
+        views: number of training views used.
+        strength: strength above which Gaussians count as reflective (paper).
+        spread: standard deviation of the residual over the views, sRGB, above which it is view-dependent.
     """
 
     views: int = 12
@@ -59,7 +58,7 @@ class Search:
 
     @torch.no_grad()
     def reflective(self, scene: Scene, views: Sequence[View]) -> float:
-        """Share of what is seen that is reflection: the mean strength."""
+        """Reflected share of the visible scene: the mean strength."""
         shown = sum(
             (contributions(scene, view.camera) for view in evenly(views, self.views)),
             torch.zeros((), dtype=torch.float32),
@@ -68,20 +67,20 @@ class Search:
 
     @torch.no_grad()
     def turning(self, scene: Scene, views: Sequence[View], renderer: Renderer) -> float:
-        """Share of what is seen that does not reflect, although its residual turns with the view."""
+        """Share of the visible scene that does not reflect, although its residual is view-dependent."""
         shown, spreads = residual_spreads(scene, evenly(views, self.views), renderer)
         reflects = scene.primary.channels["logit_strength"] > logit(self.strength)
         return mean_in_region(scene, shown, ~reflects & (spreads > self.spread))
 
 
 def mean_in_region(scene: Scene, shown: Tensor, values: Tensor) -> float:
-    """Mean of values [N] over what is shown [N] of the Gaussians in the region; 0 where nothing is."""
+    """Mean of values [N] over the Gaussians in the region, weighted by visibility [N]; 0 if there are none."""
     shown = torch.where(in_region(scene), shown, 0)
     return float((shown * values).sum() / shown.sum().clamp(min=1e-6))
 
 
 def in_region(scene: Scene) -> Tensor:
-    """[N] bool: which primary Gaussians lie where something may reflect."""
+    """[N] bool: primary Gaussians inside the region."""
     means = scene.primary.means
     if scene.environment.region is None:
         return torch.ones(len(means), dtype=torch.bool, device=means.device)
@@ -90,9 +89,9 @@ def in_region(scene: Scene) -> Tensor:
 
 
 def residual_spreads(scene: Scene, views: Sequence[View], renderer: Renderer) -> tuple[Tensor, Tensor]:
-    """Of each primary Gaussian what the views show, in pixels, and how its residual spreads over them; [N] each.
+    """Visibility of each primary Gaussian, in pixels, and the spread of its residual over the views; [N] each.
 
-    Pixels that a view ignores say nothing: a residual of 0 there would look like one that turns with the view.
+    Ignored pixels are excluded: a residual of 0 there would look view-dependent.
     """
     count, device = len(scene.primary), scene.primary.means.device
     shown, squares = torch.zeros(2, count, device=device, dtype=torch.float32)
@@ -112,7 +111,7 @@ def residual_spreads(scene: Scene, views: Sequence[View], renderer: Renderer) ->
 def residual_sums(scene: Scene, view: View, renderer: Renderer) -> Tensor:
     """[N, 3] photograph minus render, summed over the pixels of each primary Gaussian by its blending weights.
 
-    That is the gradient with respect to its colour of the sum over pixels of residual times render.
+    This is the gradient of the sum of residual times render with respect to the Gaussian's colour.
     """
     with torch.enable_grad():
         sh = scene.primary.sh.detach().requires_grad_()
@@ -124,24 +123,24 @@ def residual_sums(scene: Scene, view: View, renderer: Renderer) -> Tensor:
 
 
 COLOR_NEIGHBOURS, NORMAL_NEIGHBOURS = 16, 4
-"""Gaussians, itself among them, over which the spread of colours and the normals are averaged."""
+"""Number of neighbours, including itself, over which spreads and normals are averaged."""
 FACING = 1e-3
-"""Length of a sum of normals, in pixels, from which it tells a direction."""
+"""Minimum length of a sum of normals, in pixels, for a direction."""
 
 
 @torch.no_grad()
 def mirror_lookalikes(
     options: MirrorSearch, scene: Scene, views: Sequence[View], renderer: Renderer
 ) -> tuple[Tensor, Tensor]:
-    """[N] bool each: which primary Gaussians the views show, and which of these look like mirrors.
+    """[N] bool each: visible primary Gaussians, and those that look like mirrors.
 
-    That is a Gaussian of the region whose pixels, but for one constant colour, differ from view to view. One by
-    itself may lie where a pattern is not resolved yet; so its neighbours count as well.
+    The latter are Gaussians of the region whose residual varies with the view. Neighbours are averaged, because a
+    single Gaussian may be on an unresolved pattern.
 
     Args:
-        options: what looks like one.
-        scene: with an environment of which the region is known, or everywhere is.
-        views: those that are trained on.
+        options: thresholds.
+        scene: scene with an environment, which defines the region.
+        views: training views.
         renderer: draws the primary Gaussians.
     """
     plain = replace(scene, primary=replace(scene.primary, active_sh_degree=0))
@@ -157,9 +156,10 @@ def mirror_lookalikes(
 
 @torch.no_grad()
 def made_mirrors(options: MirrorSearch, scene: Scene, views: Sequence[View], chosen: Tensor) -> Gaussians:
-    """The primary Gaussians, the chosen [N] ones as mirrors that face as the views say (`seen_normals`).
+    """The primary Gaussians with the chosen [N] ones turned into mirrors, with normals from the views
+    (`seen_normals`).
 
-    Their colours stay, but for what turns with the view: what the reflection explains, it takes from them.
+    Their constant colours stay, and view-dependent ones are removed: reflections will explain these.
     """
     gaussians = scene.primary
     looked_at = evenly(views, options.views)
@@ -184,10 +184,12 @@ def made_mirrors(options: MirrorSearch, scene: Scene, views: Sequence[View], cho
 
 
 def neighbours(points: Tensor, count: int) -> Tensor:
-    """[N, count] rows of the nearest of points [N, 3], each its own first neighbour; fewer where there are fewer."""
+    """[N, count] rows of the nearest neighbours of points [N, 3], starting with itself; fewer if there are fewer
+    points.
+    """
     if not len(points):
         return torch.zeros(0, 1, dtype=torch.int64, device=points.device)
-    from scipy.spatial import cKDTree  # Takes long to import, and most commands never need it.
+    from scipy.spatial import cKDTree  # Slow to import, and rarely needed.
 
     places = points.detach().cpu().numpy()
     _, rows = cKDTree(places).query(places, k=range(1, min(count, len(places)) + 1), workers=-1)
@@ -195,15 +197,14 @@ def neighbours(points: Tensor, count: int) -> Tensor:
 
 
 def seen_normals(scene: Scene, views: Sequence[View], estimated: bool = False) -> Tensor:
-    """[N, 3] normals that the views show, summed over the pixels of each primary Gaussian, world axes.
+    """[N, 3] normals of the depth maps, summed over the pixels of each primary Gaussian, world axes.
 
-    A surface that is seen at a grazing angle counts by the cosine.
+    Weighted by the cosine of the viewing angle.
 
     Args:
-        scene: with primary Gaussians.
-        views: those that are looked at.
-        estimated: take normals that were estimated from a photograph where they lie next to it; all others are those of
-            the depth maps.
+        scene: the scene.
+        views: views to average over.
+        estimated: use normals estimated from photographs if available, instead of those of depth maps.
     """
     normals = torch.zeros_like(scene.primary.means)
     for view in views:
@@ -216,14 +217,14 @@ def seen_normals(scene: Scene, views: Sequence[View], estimated: bool = False) -
 
 
 def slopes_of_depths(scene: Scene, camera: Camera) -> Tensor:
-    """[H, W, 3] normals of a camera's depth map, world axes; zero where they cannot be trusted."""
+    """[H, W, 3] normals of a camera's depth map, world axes; zero where unreliable."""
     surface = seen_surface(scene, camera, background=(0.0, 0.0, 0.0))
     cells, trusted = depth_normals(surface.depth, surface.alpha, camera)
     return _whole_size(cells * trusted[..., None], cell_side(camera), surface.depth.shape)
 
 
 def _whole_size(cells: Tensor, side: int, size: Sequence[int]) -> Tensor:
-    """[H, W, 3] unit vectors between those of cells [h, w, 3] of so many pixels, and zero where these are."""
+    """[H, W, 3] unit vectors interpolated between cells [h, w, 3] of several pixels; zero where these are."""
     height, width = (side * count for count in cells.shape[:2])
     large = interpolate(cells.permute(2, 0, 1)[None], (height, width), mode="bilinear")[0].permute(1, 2, 0)
     image = cells.new_zeros(*size, 3)
@@ -232,14 +233,14 @@ def _whole_size(cells: Tensor, side: int, size: Sequence[int]) -> Tensor:
 
 
 def facing(gaussians: Gaussians, normals: Tensor, log_flatness: float) -> tuple[Tensor, Tensor]:
-    """Orientations [N, 4] and log scales of Gaussians whose normals are turned to others [N, 3], on the shortest way.
+    """Orientations [N, 4] and log scales of Gaussians, rotated by the smallest angle to the given normals [N, 3].
 
-    Ellipsoids become flat; a disc is as flat as can be.
+    Ellipsoids become flat.
     """
     axes, log_scales = rotation_from_quat(gaussians.quats), gaussians.log_scales
     shortest = torch.full_like(log_scales[:, 0], 2).long() if gaussians.are_discs else log_scales.argmin(dim=1)
     now = axes.gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0]
-    # A normal and its opposite are the same.
+    # A normal and its opposite are equivalent.
     wanted = torch.where((now * normals).sum(1, keepdim=True) < 0, -normals, normals)
     half_turn = torch.cat([1 + (now * wanted).sum(1, keepdim=True), torch.linalg.cross(now, wanted)], dim=1)
     quats = quat_product(normalize(half_turn, dim=1), normalize(gaussians.quats, dim=1))
@@ -254,7 +255,7 @@ def facing(gaussians: Gaussians, normals: Tensor, log_flatness: float) -> tuple[
 def normals_propagated(
     options: NormalPropagation, gaussians: Gaussians, moments: Moments
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
-    """Raised opacities and strengths, and reflective Gaussians grown; what changed forgets its moments."""
+    """Raises opacities and strengths, and grows reflective Gaussians; moments of changed values are zeroed."""
     opacities = gaussians.logit_opacities.clamp(min=logit(options.least_opacity))
     strengths = gaussians.channels["logit_strength"].clamp(min=logit(options.least_strength))
     grows = strengths >= logit(options.reflective)
@@ -268,7 +269,7 @@ def normals_propagated(
 def colors_disturbed(
     options: NormalPropagation, gaussians: Gaussians, moments: Moments, generator: torch.Generator
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
-    """Noise on the constant colour of what does not reflect yet, which hinders it from explaining reflections."""
+    """Adds noise to the constant colours of non-reflective Gaussians, so that these cannot explain reflections."""
     if options.sabotage == 0:
         return gaussians, dict(moments)
     unit = torch.rand(gaussians.sh[:, 0].shape, generator=generator, device=gaussians.sh.device, dtype=torch.float32)
@@ -279,7 +280,7 @@ def colors_disturbed(
 
 
 def _within_surface(gaussians: Gaussians) -> Tensor:
-    """[N, 3] or of discs [N, 2] bool: which axes lie within the surface, all but the shortest and all of a disc's."""
+    """[N, 3] bool, or [N, 2] for discs: axes within the surface; all but the shortest, or both of a disc."""
     if gaussians.are_discs:
         return torch.ones_like(gaussians.log_scales, dtype=torch.bool)
     return ~torch.nn.functional.one_hot(gaussians.log_scales.argmin(dim=1), 3).bool()
@@ -288,49 +289,49 @@ def _within_surface(gaussians: Gaussians) -> Tensor:
 log = logging.getLogger("glassplat.training")
 
 ENDED, MOST, GREW, TURNS = "propagation ended", "most reflective", "reflective grew", "turns with the view"
-"""Names in `TrainState.records`: the step of the end, the largest share of reflection, the step of its growth, and the
-share that does not reflect, but turns with the view."""
+"""Keys of `TrainState.records`: step of the end, largest reflected share, step of its last growth, and the
+view-dependent, non-reflective share."""
 RAISED, LOWERED = "opacities raised", "opacities lowered"
-"""The same: the last step at which each was done."""
+"""Further keys: the last step of each."""
 GROWTH = 0.01
-"""By how much the share has to rise to count as growing; a ratio would let the little that noise makes of it in a matte
-scene go on for ever."""
+"""Minimum increase of the reflected share that counts as growth; not a ratio, which would let the noise of a matte
+scene count forever."""
 FOUND = 0.03
-"""Share from which on something reflective has been found."""
+"""Reflected share above which something reflective has been found."""
 LOOKS_REFLECTIVE = 0.16
-"""Share that turns with the view, below which propagation would cost more than it finds: two metal eggs with 0.07 lost
-1.3 dB by it at 7000 iterations, a mirror ball with 0.30 gained (lab/glossy.md)."""
-NOTHING_FOUND = "step %d: little or nothing reflective was found, so that normals are not propagated any further%s; %s"
-AS_SPLAT = " and the rest of the run learns as fast as splat"
+"""View-dependent share below which propagation costs more than it gains: two metal eggs with 0.07 lost 1.3 dB at 7000
+iterations, a mirror ball with 0.30 gained (lab/glossy.md)."""
+NOTHING_FOUND = "step %d: little or nothing reflective was found, so normal propagation stops%s; %s"
+AS_SPLAT = ", and the rest of the run uses the learning rates of splat"
 MATTE = (
-    "no more than %.0f %% of what is seen looks different from different sides. If something reflects anyway, "
-    "--region X Y Z RADIUS names its place"
+    "at most %.0f %% of the visible scene changes with the viewing direction. If something reflects anyway, "
+    "give its location with --region X Y Z RADIUS"
 )
 EMPTY = (
-    "no Gaussian lies in the sphere in which anything may reflect, of radius %.3g around (%.3g, %.3g, %.3g). "
-    "--region X Y Z RADIUS names another, in the units of the capture's poses"
+    "no Gaussian lies in the sphere outside which nothing reflects, of radius %.3g around (%.3g, %.3g, %.3g). "
+    "--region X Y Z RADIUS sets another one, in the units of the capture's poses"
 )
 OVERLOOKED = (
-    "but %.0f %% of what is seen looks different from different sides. More --iterations give normals more time to "
-    "spread, and --region X Y Z RADIUS names the place where something reflects"
+    "but %.0f %% of the visible scene changes with the viewing direction. More --iterations give propagation "
+    "more time, and --region X Y Z RADIUS tells where something reflects"
 )
 
 
 @dataclass(frozen=True)
 class Propagate:
-    """Propagates normals and disturbs the colours of what does not reflect, until no more reflectors are found.
+    """Propagates normals and sabotages the colours of non-reflective Gaussians, until reflection stops growing.
 
-    Where none has been found, the run goes on like one of `splat`, and the log says what may help.
+    If nothing reflective is found, the run continues like `splat`, with advice in the log.
 
     Attributes:
-        when: the intervals at which it happens; whether to go on is asked at those that it skips, too.
-        propagation: what it does.
-        schedule: when it ends.
-        renderer: that of the stage; its frames have a layer `base`.
-        matte_rates: factors on learning rates after the end where nothing reflective was found, by dotted parameter
-            name; of them the value for a run of this length is taken.
-        search: what tells how much reflects.
-        raises_rates_found: they count after the end where something was found, too.
+        when: intervals of propagation; the end is checked at skipped intervals, too.
+        propagation: options of propagation and sabotage.
+        schedule: end of propagation.
+        renderer: renderer of the stage, whose frames have a layer `base`.
+        matte_rates: factors on learning rates after the end if nothing reflective was found, by dotted parameter name;
+            evaluated for the length of the run.
+        search: measures the amount of reflection.
+        raises_rates_found: apply them even if something was found.
     """
 
     when: Every
@@ -365,18 +366,18 @@ class Propagate:
         return True
 
     def _first(self, clock: Clock) -> int:
-        """The first step that is left to a reset.
+        """The first step reserved for a reset.
 
-        Before it, what random points became is still in the way everywhere; made opaque, it hides the surfaces.
+        Before it, remains of random points would be made opaque, and hide the surfaces.
         """
         return self.when.interval(clock) * (self.when.skip_multiples_of or 1)
 
     def _last(self, clock: Clock) -> int:
-        """The step at which it ends at the latest."""
+        """The latest step at which it ends."""
         return round(self.schedule.stop * clock.iterations)
 
     def _settles(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Return whether what reflects has not grown for long enough; keeps the records."""
+        """Return whether reflection has stopped growing for long enough; updates the records."""
         if self.schedule.end == "fixed":
             return False
         share = self.search.reflective(state.scene, dataset.train)
@@ -386,10 +387,10 @@ class Propagate:
         return waited >= self.schedule.patience or self._looks_matte(state, dataset, clock)
 
     def _looks_matte(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Return whether nothing reflects nor turns with the view; keeps the record.
+        """Return whether nothing reflects or is view-dependent; updates the record.
 
-        That is asked before opacities are raised for the first time, and one interval after a reset. At others,
-        whatever stands in the way turns with the view.
+        This is checked before opacities are first raised, and one interval after a reset. At other times, floaters are
+        view-dependent.
         """
         if state.records[MOST] >= FOUND:
             return False
@@ -398,18 +399,20 @@ class Propagate:
         return state.records[TURNS] < LOOKS_REFLECTIVE
 
     def _end(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
-        """Notes the end and says what was found."""
+        """Records the end, and logs what was found."""
         state.records[ENDED] = clock.step
         share = max(self.search.reflective(state.scene, dataset.train), state.records.get(MOST, 0.0))
         state.records[MOST] = share
         if share < FOUND or self.raises_rates_found:
-            # Faster where there is no normal that this would spoil.
+            # Faster, if there are no normals to corrupt.
             state.optimizer.raised_rates = {
                 name: rate.at(0.0, 1.0, clock.iterations) for name, rate in self.matte_rates.items()
             }
         if share >= FOUND:
             log.info(
-                "step %d: normal propagation has ended, %.0f %% of what is seen is reflection", clock.step, 100 * share
+                "step %d: normal propagation has ended, %.0f %% of the visible scene is reflection",
+                clock.step,
+                100 * share,
             )
             return
         region = state.scene.environment.region
@@ -426,40 +429,38 @@ class Propagate:
 
 @dataclass(frozen=True)
 class GrowShAfterPropagation(GrowSh):
-    """Raises the SH degree, but not while normals are propagated: colours that turn with the view would explain
-    what reflects.
-    """
+    """Raises the SH degree, but not during propagation, when view-dependent colours would explain reflections."""
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Edits `state`, once propagation has ended."""
+        """Edits `state` after propagation."""
         return has_ended(state) and super().apply(state, dataset, clock)
 
 
 @dataclass(frozen=True)
 class ResetRaised(ResetOpacity):
-    """Resets opacities regularly while normals are propagated, and once more afterwards if they have been raised since.
+    """Resets opacities regularly during propagation, and once afterwards if they were raised since the last reset.
 
-    Propagation raises every opacity, also of what only stands in the way, as in the hole of a ring. Most of that is
-    never lowered again without a reset. A scene whose opacities have not come back is worse than one in which something
-    stands in the way: the rest of the run has to be as long as the time between two resets.
+    Propagation raises every opacity, including those of floaters, such as in the hole of a ring, most of which only a
+    reset lowers again. Opacities need as many steps as between two resets to recover, so without these a reset does
+    more harm than floaters.
 
     Attributes:
-        when: its moments, to the end of the run.
-        regular: those of them at which resets happen while normals are propagated.
+        when: times of resets, to the end of the run.
+        regular: times of resets during propagation.
     """
 
     regular: Every = field(kw_only=True)
 
     @staticmethod
     def instead_of(reset: ResetOpacity) -> ResetRaised:
-        """The one that takes the place of regular resets, at the same moments and those at which they would go on."""
+        """The action that replaces regular resets, at the same times and their continuation."""
         return ResetRaised(replace(reset.when, stop=1.0), reset.ceiling, regular=reset.when)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Edits `state`, where something is to be lowered and there is time to recover."""
+        """Edits `state` if opacities have been raised and there is time to recover."""
         raised = state.records.get(RAISED, 0) > state.records.get(LOWERED, 0)
         wanted = raised if has_ended(state) else self.regular.due(clock)
-        # Opacities come back in the steps between two resets.
+        # Opacities recover within the steps between two resets.
         recovery = self.when.interval(clock) * (self.when.only_multiples_of or 1)
         if not wanted or clock.step + recovery > clock.iterations:
             return False
@@ -469,10 +470,10 @@ class ResetRaised(ResetOpacity):
 
 @dataclass(frozen=True)
 class DensifyWhilePropagating(Densify):
-    """Densifies at an interval of its own while normals are propagated, and as at any other time once that has ended.
+    """Densifies at a different interval during propagation.
 
     Attributes:
-        regular: what densifies then.
+        regular: densification after propagation.
     """
 
     regular: Densify = field(kw_only=True)
@@ -482,20 +483,20 @@ class DensifyWhilePropagating(Densify):
         return super().due(clock) or self.regular.due(clock)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Edits `state`, if this is a moment of the interval that holds."""
+        """Edits `state`, if due in the current phase."""
         turn: Densify = self.regular if has_ended(state) else Densify(self.densifier, self.part)
         return turn.due(clock) and turn.apply(state, dataset, clock)
 
 
 @dataclass(frozen=True)
 class RefineEnvironment(AtMoments):
-    """Doubles the environment's texels at certain moments, twice where two fall on one step.
+    """Doubles the environment's resolution at certain times.
 
-    A normal has a gradient only as far as the texels that its reflection meets reach. Large texels at first let normals
-    find their way from farther off; small ones make the reflection sharp in the end.
+    Normals get gradients only within the texel that their reflection hits. Large texels initially let normals converge
+    from farther away; small ones finally make the reflection sharp.
 
     Attributes:
-        largest: texels along a face that are enough.
+        largest: final number of texels along a face.
     """
 
     largest: int
@@ -503,7 +504,7 @@ class RefineEnvironment(AtMoments):
 
     @torch.no_grad()
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Edits `state`, until the environment is as fine as it gets; the optimiser forgets its moments."""
+        """Edits `state` until the final resolution is reached; moments of the environment are zeroed."""
         environment = state.scene.environment
         if environment.size >= self.largest:
             return False
@@ -514,10 +515,10 @@ class RefineEnvironment(AtMoments):
 
 
 def has_ended(state: TrainState) -> bool:
-    """Return whether normal propagation is over."""
+    """Return whether propagation has ended."""
     return ENDED in state.records
 
 
 def found_nothing(state: TrainState) -> bool:
-    """Return whether normal propagation is over, and nothing reflects."""
+    """Return whether propagation has ended, and nothing reflects."""
     return has_ended(state) and state.records[MOST] < FOUND

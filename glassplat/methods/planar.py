@@ -37,24 +37,24 @@ if TYPE_CHECKING:
 log = logging.getLogger("glassplat.training")
 
 LEAST_WITHIN = 0.25
-"""Share of a pane's marked pixels that lie in the rectangle that the capture gives, at the least."""
+"""Minimum share of a pane's marked pixels inside the rectangle of planes.json."""
 LEAST_COVERAGE = 0.5
-"""Where the panes mirror less than this share of what they could, the photographs do not show the room directly."""
+"""Share of the reflection covered by Gaussians below which photographs do not show the room directly."""
 
 
 @dataclass(frozen=True)
 class PaneSetup:
-    """Fits the planes and places the glass when reflections begin (Appendix A).
+    """Fits the planes and places the glass at the start of reflections (Appendix A).
 
     Attributes:
-        fit: how planes are found.
-        glass_count: glass Gaussians on each pane.
-        seed: of the glass Gaussians' places.
-        detect_mirrors: tell mirrors from glass, unless `fit` names the mirrors.
-        fixed_mirrors: mirrors keep their reflectance, and what is behind them moves to their front; if not, they only
-            start at that reflectance.
-        seed_reflections: start what no photograph shows directly from the virtual points behind the panes.
-        tint: whether panes may be tinted.
+        fit: options of plane fitting.
+        glass_count: number of glass Gaussians on each pane.
+        seed: random seed of the glass Gaussians' positions.
+        detect_mirrors: detect mirrors, unless `fit` names them.
+        fixed_mirrors: freeze the reflectance of mirrors and move Gaussians behind them to the front; otherwise, mirrors
+            only start with that reflectance.
+        seed_reflections: initialise parts that no photograph shows directly from the virtual points behind panes.
+        tint: learn the tint of panes.
     """
 
     fit: PlaneFit
@@ -66,17 +66,17 @@ class PaneSetup:
     tint: bool = False
 
     def __call__(self, state: TrainState, dataset: Dataset) -> Work:
-        """Edits `state`, and tells how far it is."""
+        """Edits `state`, and yields its progress."""
         yield Working("fitting planes to the masks", 0, 1)
         scene = self._with_glass(state.scene, fitted_planes(dataset, state.scene.primary.means, self.fit))
         if self.detect_mirrors or self.fit.mirror_labels:
-            # Finding mirrors aligns them.
+            # The search for mirrors aligns them.
             scene = self._with_glass(scene, (yield from self._with_mirrors_found(scene, dataset)))
         planes = scene.planes if self.fixed_mirrors else replace(scene.planes, mirrors=())
         state.scene = replace(scene, planes=planes.that_may_tint() if self.tint else planes)
         state.statistics.clear()
         for mirrors in surfaces(planes, mirrors=True):
-            yield Working(f"moving what was built behind {name_panes(mirrors, 'mirror')}", 0, 1)
+            yield Working(f"moving Gaussians from behind {name_panes(mirrors, 'mirror')} to the front", 0, 1)
             turn_virtual_scene_round(state, dataset, mirrors)
         for panes in surfaces(planes, mirrors=False) if self.seed_reflections else ():
             yield from seed_reflection(state, dataset, panes)
@@ -87,9 +87,9 @@ class PaneSetup:
         return replace(scene, planes=planes, glass=glass_gaussians(planes, count=self.glass_count, seed=self.seed))
 
     def _with_mirrors_found(self, scene: Scene, dataset: Dataset) -> Generator[Working, None, Planes]:
-        """The scene's planes, with those as mirrors that look like it, each where the photographs show it.
+        """The scene's planes with detected mirrors marked and aligned.
 
-        What `fit` names is a mirror, and nothing else then; of planes that the capture gives it says what they are.
+        If `fit` names mirrors, only these are; planes of planes.json are as stated there.
         """
         given = Planes.empty() if dataset.planes is None else dataset.planes
         untold = [label for label in scene.planes.labels if label not in given.labels]
@@ -102,7 +102,7 @@ class PaneSetup:
 
 
 def with_poses_of(planes: Planes, panes: Sequence[Planes]) -> Planes:
-    """The planes with centre and normal of some of them, by label, as in `panes` of one plane each."""
+    """The planes with centres and normals replaced from `panes`, single planes by label."""
     centers, normals = planes.centers.clone(), planes.raw_normals.clone()
     for pane in panes:
         row = planes.labels.index(pane.labels[0])
@@ -111,22 +111,22 @@ def with_poses_of(planes: Planes, panes: Sequence[Planes]) -> Planes:
 
 
 def glass_only_darkens(state: TrainState, clock: Clock, visible: Tensor | None) -> None:
-    """Takes logarithms of transmittances that a step has led above 0 back to it: glass adds no light."""
+    """Clamps log transmittances at 0: glass does not add light."""
     logarithms = state.scene.planes.log_transmittances
     if logarithms is not None:
         logarithms.detach().clamp_(max=0)
 
 
 def fitted_planes(dataset: Dataset, centers: Tensor | None, fit: PlaneFit) -> Planes:
-    """The planes of all panes: those that the capture gives, and those that only its masks name, fitted to them.
+    """The planes of all panes: those of planes.json, and others fitted to masks.
 
     Args:
         dataset: the capture.
-        centers: [N, 3] those of Gaussians; None fits to the capture's own points.
-        fit: how planes are found.
+        centers: [N, 3] centres of Gaussians; None for the capture's points.
+        fit: options of plane fitting.
 
     Raises:
-        PlaneFitError: the masks do not do.
+        PlaneFitError: the masks do not determine a plane.
     """
     given = Planes.empty() if dataset.planes is None else _as_given(dataset.planes, fit)
     labels = [label for label in dataset.pane_labels if label not in given.labels]
@@ -151,7 +151,7 @@ def fitted_planes(dataset: Dataset, centers: Tensor | None, fit: PlaneFit) -> Pl
 
 
 def _check_given(planes: Planes, shown: Sequence[tuple[Camera, Tensor]]) -> None:
-    """Raises PlaneFitError where a plane that the capture gives is not where its masks show it."""
+    """Raises PlaneFitError if a plane of planes.json contradicts its masks."""
     for row, label in enumerate(planes.labels):
         marked = within = 0
         for camera, labels in shown:
@@ -161,27 +161,27 @@ def _check_given(planes: Planes, shown: Sequence[tuple[Camera, Tensor]]) -> None
                 marked, within = marked + count, within + int((pixels & (hits.pane == 0)).sum())
         if within < LEAST_WITHIN * marked:
             raise PlaneFitError(
-                f"planes.json and the masks put pane {label} into different places: {within / marked:.0%} of the "
-                "pixels that show it lie in the rectangle of the file. Were the poses found again? Mark it again, or "
-                "remove it from the file"
+                f"planes.json and the masks disagree about the position of pane {label}: {within / marked:.0%} of the "
+                "pixels that show it lie in the rectangle of the file. Were the poses estimated anew? Mark it again, "
+                "or remove it from the file"
             )
 
 
 def _check_marked(labels: Sequence[int], masks: Sequence[Tensor], dataset: Dataset) -> None:
-    """Raises PlaneFitError where only photographs that are held out for tests show a pane."""
+    """Raises PlaneFitError if only test photographs mark a pane."""
     for label in labels:
         if any(bool((mask == label).any()) for mask in masks):
             continue
         shown = ((view.name, view.pane_labels) for view in dataset.test)
         if held_out := [name for name, seen in shown if seen is not None and bool((seen == label).any())]:
             raise PlaneFitError(
-                f"pane {label} is marked in {', '.join(held_out)} only, and test photographs teach nothing; expected "
-                "it in two others at least, better three, taken from places well apart"
+                f"pane {label} is marked only in {', '.join(held_out)}, which are test photographs; expected it "
+                "in at least two others, better three, from positions far apart"
             )
 
 
 def _as_given(planes: Planes, fit: PlaneFit) -> Planes:
-    """Given rectangles with the margin that fitted ones get, mirrors as mirrors, and R0 of clear glass as unknown."""
+    """Given rectangles with the margin of fitted ones, marked mirrors, and the initial R0."""
     is_clear = (planes.base_reflectances - CLEAR_GLASS).abs() < 1e-5
     begun = torch.full_like(planes.logit_reflectances, logit(fit.glass_reflectance))
     logits = torch.where(is_clear, begun, planes.logit_reflectances)
@@ -194,17 +194,17 @@ def _as_given(planes: Planes, fit: PlaneFit) -> Planes:
 def judged_panes(
     scene: Scene, dataset: Dataset, labels: Sequence[int]
 ) -> Generator[Working, None, dict[int, material.JudgedPane]]:
-    """Likeness of each pane to a mirror, by label."""
+    """Mirror score of each pane, by label."""
     photographs = material.photographs_of(scene, dataset.train) if labels else []
     judged = {}
     for done, label in enumerate(labels):
-        yield Working("telling mirrors from glass", done, len(labels))
+        yield Working("detecting mirrors", done, len(labels))
         judged[label] = material.judged_pane(scene, label, photographs)
     return judged
 
 
 def mirrors_among(planes: Planes, judged: Mapping[int, material.JudgedPane]) -> list[int]:
-    """Labels of the panes that are mirrors, those in a front of glass only if they are so beyond doubt."""
+    """Labels of the panes that are mirrors; between panes of glass in the same plane, only if unambiguous."""
     alike = {label for label, found in judged.items() if found.is_mirror}
     rows = [row for row, label in enumerate(planes.labels) if label in judged]
     for group in coplanar_groups(planes, rows):
@@ -215,53 +215,57 @@ def mirrors_among(planes: Planes, judged: Mapping[int, material.JudgedPane]) -> 
 
 
 def surfaces(planes: Planes, *, mirrors: bool) -> list[Planes]:
-    """The mirrors, or the panes that are none, those in one plane together.
+    """The mirrors, or the other panes, grouped by plane.
 
-    Behind one pane of a glass front lies what is mirrored in it and its neighbours: most views show it through these.
+    Reflections of a glass front lie behind all of its panes, and most views show them through neighbouring ones.
     """
     rows = [row for row, label in enumerate(planes.labels) if (label in planes.mirrors) == mirrors]
     return [planes.select(group) for group in coplanar_groups(planes, rows)]
 
 
 def name_panes(panes: Planes, kind: str) -> str:
-    """Name of panes in messages: "pane 2", "panes 2, 3", "panes 1 to 24"."""
+    """Panes in messages: "pane 2", "panes 2, 3", "panes 1 to 24"."""
     return f"{kind}{'s' if len(panes) > 1 else ''} {name_labels(panes.labels)}"
 
 
 def reflects_little(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Work:
-    """Return whether Gaussians cover hardly anything of what panes could mirror; False where no view shows any."""
+    """Return whether Gaussians cover almost nothing of the reflections of panes; False if no view shows any."""
     covered, whole = 0.0, 0
     for done, camera in enumerate(cameras):
-        yield Working(f"looking for what {name_panes(panes, 'pane')} can mirror", done, len(cameras))
+        yield Working(f"searching for what {name_panes(panes, 'pane')} can reflect", done, len(cameras))
         of_view, pixels = material.mirrored_coverage(scene, panes, camera)
         covered, whole = covered + of_view, whole + pixels
     return covered < LEAST_COVERAGE * whole
 
 
 def turn_virtual_scene_round(state: TrainState, dataset: Dataset, mirrors: Planes) -> None:
-    """Moves what the first stage built behind a mirror, or several in one plane, to where it really is, in front."""
+    """Moves Gaussians of the first stage from behind a mirror, or several in one plane, to their true positions in
+    front.
+    """
     virtual = material.virtual_points(state.scene.primary.means, mirrors, [view.camera for view in dataset.train])
     if moved := turn_round(state, virtual, mirrors):
         log.info("%d Gaussians behind %s moved to the front", moved, name_panes(mirrors, "mirror"))
 
 
 TURN_AFTER = 0.005
-"""Share of a run after the beginning of joint optimisation at which reflections behind glass are turned round: before
-the first reset of opacities. A second and a third time take things that are really there."""
+"""Share of a run after the start of joint optimisation at which reflections behind glass are moved: before the first
+opacity reset. Repetitions would move real objects."""
 
 
 @dataclass(frozen=True)
 class TurnReflections(AtMoments):
-    """Moves what was built behind panes of glass, for what they mirror, to where that is, in front (lab/layers.md)."""
+    """Moves Gaussians behind panes of glass that represent reflections to their true positions in front
+    (lab/layers.md).
+    """
 
     name: str = "turn reflections"
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
-        """Edits `state`, if there is anything to edit, and tells how far it is."""
+        """Edits `state` if necessary, and yields its progress."""
         cameras = [view.camera for view in dataset.train]
         of_glass, moved = surfaces(state.scene.planes, mirrors=False), 0
         for done, panes in enumerate(of_glass):
-            yield Working(f"looking behind {name_panes(panes, 'pane')} for what it mirrors", done, len(of_glass))
+            yield Working(f"searching behind {name_panes(panes, 'pane')} for reflections", done, len(of_glass))
             moved += turn_round(state, material.reflections_behind(state.scene, panes, cameras), panes)
         if moved:
             log.info("%d Gaussians behind glass moved to the front", moved)
@@ -269,19 +273,19 @@ class TurnReflections(AtMoments):
 
 
 LIT_AT, FILLED_AT = (0.4, 0.6), (0.5,)
-"""Shares of a run at which lamps are looked for, and at which what no view shows is filled."""
+"""Shares of a run of the search for lamps, and of filling parts that no view shows."""
 
 
 @dataclass(frozen=True)
 class LightLamps(AtMoments):
-    """Takes the images of lamps from behind panes of glass, and makes the lamps as bright as their reflections are."""
+    """Removes images of lamps from behind glass, and makes the lamps as bright as their reflections."""
 
     moments: tuple[float, ...] = LIT_AT
     name: str = "light lamps"
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
-        """Edits `state`, if there is anything to edit, and tells how far it is."""
-        yield Working("looking for lamps that panes mirror", 0, 1)
+        """Edits `state` if necessary, and yields its progress."""
+        yield Working("searching for lamps that panes reflect", 0, 1)
         scene = state.scene
         rows = [row for row, label in enumerate(scene.planes.labels) if label not in scene.planes.mirrors]
         if not rows:
@@ -294,23 +298,25 @@ class LightLamps(AtMoments):
         state.scene = replace(scene, primary=scene.primary.with_tensors({"log_intensity": log_gains}))
         actions.keep_some(state, ~lamps.images)
         count, lit = int(lamps.images.sum()), lamps.gains > 1
-        log.info("%d Gaussians behind glass were images of lamps; %d of these shine brighter", count, int(lit.sum()))
+        log.info(
+            "%d Gaussians behind glass were images of lamps; %d of the lamps are brighter now", count, int(lit.sum())
+        )
         return True
 
 
 @dataclass(frozen=True)
 class FillUnseen(AtMoments):
-    """Adds Gaussians where panes of glass mirror something that no photograph shows, and nothing stands."""
+    """Adds Gaussians for reflections of objects that no photograph shows directly and the scene lacks."""
 
     moments: tuple[float, ...] = FILLED_AT
     name: str = "fill unseen"
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
-        """Edits `state`, if there is anything to edit, and tells how far it is."""
+        """Edits `state` if necessary, and yields its progress."""
         cameras, added = [view.camera for view in dataset.train], 0
         of_glass = surfaces(state.scene.planes, mirrors=False)
         for done, panes in enumerate(of_glass):
-            yield Working(f"looking for what {name_panes(panes, 'pane')} can mirror", done, len(of_glass))
+            yield Working(f"searching for what {name_panes(panes, 'pane')} can reflect", done, len(of_glass))
             places, color, cell = material.unseen_places(state.scene, panes, cameras)
             if 0 < len(places) < actions.MOST_ADDED * len(state.scene.primary):
                 colors = (255 * color).round().to(torch.uint8).expand(len(places), 3)
@@ -318,12 +324,12 @@ class FillUnseen(AtMoments):
                 actions.add_primary(state, actions.seeds_of(state.scene.primary, cloud, opacity=0.7, size=0.7 * cell))
                 added += len(places)
         if added:
-            log.info("%d Gaussians added where panes mirror what nothing shows", added)
+            log.info("%d Gaussians added for reflections of unseen parts", added)
         return added > 0
 
 
 def turn_round(state: TrainState, virtual: Tensor, panes: Planes) -> int:
-    """Mirrors some primary Gaussians at panes in one plane; returns how many."""
+    """Mirrors some primary Gaussians at coplanar panes; returns their number."""
     count = int(virtual.sum())
     if count:
         turned = mirrored_gaussians(state.scene.primary.select(virtual), panes.centers[0], panes.normals[0])
@@ -333,26 +339,25 @@ def turn_round(state: TrainState, virtual: Tensor, panes: Planes) -> int:
 
 
 def seed_reflection(state: TrainState, dataset: Dataset, panes: Planes) -> Work:
-    """Adds the mirror images of the measured points behind panes in one plane, if these hardly have a thing to mirror.
+    """Adds mirror images of SfM points behind coplanar panes that have almost nothing to reflect.
 
-    Structure from motion places points on reflected things where they seem to be, behind the pane. In a capture from
-    the front these are the only trace of what is reflected; the true points behind the pane, mirrored along, are
-    wrong and fade.
+    SfM places points of reflected objects at their virtual positions, behind the pane. In a capture from the front,
+    these are the only evidence of reflected objects; mirror images of true points behind the pane are wrong, and fade.
     """
     cameras = [view.camera for view in dataset.train]
-    # The coverage is rendered over all views, so it comes last.
+    # The coverage is expensive, so it is checked last.
     if not dataset.measured_points or not (yield from reflects_little(state.scene, panes, cameras)):
         return False
     points = dataset.points
     device = panes.centers.device
     virtual = material.virtual_points(points.positions.to(device), panes, cameras).cpu()
-    if int(virtual.sum()) <= NEIGHBOURS:  # Too few to tell how large they are.
+    if int(virtual.sum()) <= NEIGHBOURS:  # Too few to estimate their size.
         return False
     behind = replace(points, positions=points.positions[virtual], colors=points.colors[virtual])
     seeds = mirrored_gaussians(actions.seeds_of(state.scene.primary, behind), panes.centers[0], panes.normals[0])
     actions.add_primary(state, seeds)
     log.info(
-        "no photograph shows what is mirrored by %s: %d points from behind added, mirrored, in front",
+        "no photograph directly shows what is reflected by %s: %d points behind added as mirror images in front",
         name_panes(panes, "pane"),
         len(seeds),
     )
@@ -360,16 +365,16 @@ def seed_reflection(state: TrainState, dataset: Dataset, panes: Planes) -> Work:
 
 
 def planar_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
-    """The first scene: one Gaussian per point, no planes yet.
+    """The initial scene: one Gaussian per point, without planes.
 
     Raises:
-        PlaneFitError: a mirror is named that is none of the panes, or the masks do not do. The planes are fitted to
-            the measured points once and forgotten, because a bad mask should end a run before the first iteration and
-            not at the second stage.
+        PlaneFitError: a mirror is named that is none of the panes, or the masks do not determine a plane. The planes
+            are fitted to the measured points once and forgotten, because a bad mask should end a run before the first
+            iteration and not at the second stage.
     """
     if not dataset.pane_labels and dataset.planes is None:
         raise PlaneFitError(
-            f"{_lack_of_masks(dataset)}, and planar needs to know where the panes are: expected masks of 3 to "
+            f"{_lack_of_masks(dataset)}, and planar needs to know the panes: expected masks of 3 to "
             f"10 photographs in {dataset.root / 'panes'}, named <photograph's name>.png, each pixel the label 1, "
             "2, ... of a pane, or 0 (`glassplat annotate` writes them). `glassplat train splat` needs none"
         )
@@ -431,13 +436,12 @@ def planar_stages(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_I
 
 
 JOINT_FACTOR = 0.1
-"""On the learning rates of where panes are, in stage 3 (the paper's)."""
+"""Factor on the learning rates of plane poses in stage 3 (paper)."""
 
 
 def plane_rates(factor: float = 1.0) -> dict[str, Rate]:
-    """Learning rates of planes and glass, which the paper leaves out; see lab/training.md.
-
-    Those of centre, per scene extent, and normal are multiplied by a factor.
+    """Learning rates of planes and glass, which the paper does not give; see lab/training.md. Those of centres, per
+    scene extent, and normals are multiplied by a factor.
     """
     return {
         "planes.centers": Rate(1e-4 * factor, per_extent=True),
@@ -471,7 +475,7 @@ def _adjustment(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> Stage:
 
 
 def _joint(recipe: PlanarRecipe, share: float) -> Stage:
-    """Stage 3: everything learns, opacities are perturbed, planes move slowly."""
+    """Stage 3: joint optimisation, with perturbed opacities and slowly moving planes."""
     population = population_of(recipe)
     perturb_at = Every(
         recipe.intervals.opacity, 0.0, recipe.perturbation.stop, recipe.intervals.least, skip_multiples_of=3
@@ -506,7 +510,7 @@ def _gaussian_rates(recipe: PlanarRecipe) -> dict[str, Rate]:
 
 
 def _glass_post_steps(recipe: PlanarRecipe) -> tuple[PostStep, ...]:
-    """Steps that keep transmittances possible; before the means of the last passes are taken."""
+    """Steps that clamp transmittances, before parameters are averaged."""
     return (glass_only_darkens,) if recipe.tint else ()
 
 
@@ -518,40 +522,40 @@ def _joint_terms(recipe: PlanarRecipe, population: actions.Population) -> tuple[
 
 
 def _early_resets(recipe: PlanarRecipe, population: actions.Population) -> tuple[actions.ResetOpacity, ...]:
-    """The resets of the first two stages, if there are to be any."""
+    """The opacity resets of the first two stages, if enabled."""
     return population.resets if recipe.early_resets else ()
 
 
 def _turns(recipe: PlanarRecipe) -> tuple[TurnReflections | LightLamps, ...]:
-    """The turning round of reflections behind glass, and the lighting of lamps, if there are to be any."""
+    """The actions on reflections and lamps behind glass, if enabled."""
     return (TurnReflections((_joint_start(recipe) + TURN_AFTER,)), LightLamps()) if recipe.turn_reflections else ()
 
 
 ADJUSTED_AFTER, JOINED_AFTER = 0.005, 0.003
-"""Shares of a run after the beginning of plane adjustment, and of joint optimisation, at which missing things are
-looked for: as soon as it is known where panes are, behind which nothing is to be found."""
+"""Shares of a run after the start of plane adjustment and of joint optimisation at which missing objects are searched
+for: early, but with known panes, behind which nothing is added."""
 
 
 def _missing(recipe: PlanarRecipe, moment: float) -> tuple[actions.SeedUnexplained, ...]:
-    """The search for what is missing, if there is to be any."""
+    """The search for missing objects, if enabled."""
     return (actions.SeedUnexplained((moment,), planar_renderer(recipe)),) if recipe.seed_unexplained else ()
 
 
 CLEARED_AFTER = 0.02
-"""Share of a run after the beginning of joint optimisation at which `mcmc` resets opacities: reflections behind glass,
-which are looked for by what hides them, have been turned round by then."""
+"""Share of a run after the start of joint optimisation at which `mcmc` resets opacities: after reflections behind
+glass were moved, which needs opaque Gaussians."""
 
 
 def _clearing(recipe: PlanarRecipe) -> tuple[actions.ResetOpacity, ...]:
-    """The one reset under `mcmc`; `default` has its own."""
+    """The single reset of `mcmc`; `default` has its own."""
     moment = _joint_start(recipe) + CLEARED_AFTER
-    # A second one would come after the stop.
+    # A second one would be after the stop.
     once = Every(moment, stop=1.5 * moment)
     return (actions.ResetOpacity(once),) if recipe.strategy == "mcmc" and recipe.turn_reflections else ()
 
 
 def _joint_start(recipe: PlanarRecipe) -> float:
-    """Share of the run after which all three parts learn together."""
+    """Share of the run after which joint optimisation starts."""
     first, second, third = recipe.stage_shares
     return (first + second) / (first + second + third)
 

@@ -30,15 +30,15 @@ from glassplat.training.options import (
 
 @dataclass(frozen=True)
 class ReflectionWeights:
-    """Weights of the terms that tell reflection from transmission (TR-Gaussians, Eq. 17).
+    """Weights of the loss terms that separate reflection from transmission (TR-Gaussians, Eq. 17).
 
     Attributes:
-        depth: of the depth deviation behind panes (Eq. 14).
-        conflict: of edges that transmission and reflection share (Eq. 15).
-        mask: of the difference between glass and annotation (Eq. 16).
-        intensity: of the departure of a(u) from one, which the paper leaves free.
-        reflectance: of the departure of R0 from `--plane-fit.glass-reflectance`, which decides where no photograph
-            shows what is mirrored.
+        depth: weight of the depth deviation behind panes (Eq. 14).
+        conflict: weight of edges shared by transmission and reflection (Eq. 15).
+        mask: weight of the difference between glass and masks (Eq. 16).
+        intensity: weight of the deviation of a(u) from one, which the paper leaves free.
+        reflectance: weight of the deviation of R0 from `--plane-fit.glass-reflectance`; it decides R0 where no
+            photograph shows what is reflected.
     """
 
     depth: NotNegative = 0.005
@@ -50,15 +50,15 @@ class ReflectionWeights:
 
 @dataclass(frozen=True)
 class Perturbation:
-    """Perturbation of the opacity of what lies behind a pane: times and amount (Section III-C3).
+    """Perturbation of opacities behind panes: times and amplitude (Section III-C3).
 
     It happens at the intervals of `Intervals.opacity` that do not reset the opacities.
 
     Attributes:
-        amplitude: half width of the uniform noise on the opacity; 0 switches it off.
-        stop: share of the run after which nothing is perturbed any more.
-        bounds: of the new opacities. The paper does not give them; the lower one lies above the pruning threshold, so
-            that what was wrongly lowered can return.
+        amplitude: half width of the uniform noise on the opacity; 0 disables it.
+        stop: share of the run after which perturbation ends.
+        bounds: bounds of the new opacities, which the paper does not give; the lower one is above the pruning
+            threshold, so that wrongly lowered opacities can recover.
     """
 
     amplitude: Share = 0.4
@@ -71,39 +71,38 @@ class PlanarRecipe(MethodRecipe):
     """TR-Gaussians: transmission, reflection and planes, trained in three stages.
 
     Attributes:
-        view_dependence_weight: of the squares of the spherical harmonics beyond the constant one. Mirrored views see
-            Gaussians from where no photograph does, so that harmonics extrapolate; the paper has no such term.
+        view_dependence_weight: weight of the squared SH coefficients beyond the constant one. Mirrored views see
+            Gaussians from directions that no photograph covers; the paper has no such term.
         stage_shares: lengths of the three stages in relation to each other (paper: 3000, 3000 and 24,000 iterations).
-        fresnel: how the strength rises with the angle: as that of a pane with two surfaces, by Schlick's curve of one
-            surface as in the paper, or not at all (ablation).
+        fresnel: angular dependence of the strength: a pane with two surfaces, Schlick's approximation for one surface
+            (paper), or none (ablation).
         intensity: False drops the reflection intensity a(u) (ablation).
         blend: space in which transmission and reflection are blended: linear radiance, or sRGB as in the paper.
         panes: which panes on a ray reflect: all of them, one behind the other, or the nearest one as in the paper.
-        detect_mirrors: treat panes that look like mirrors as mirrors, unless `--plane-fit.mirror-labels` names them.
-        fixed_mirrors: mirrors keep their reflectance, and what the first stage built behind them moves to their front;
-            if not, they only start at that reflectance, as in the paper.
-        seed_reflections: start what no photograph shows directly from the virtual points behind the panes, and fill
-            what no Gaussian stands for halfway through the run.
-        turn_reflections: move what was built behind glass, for what that mirrors, to its front in the joint stage, and
-            make lamps as bright as their reflections are.
-        seed_unexplained: add Gaussians where photographs agree on something that the scene lacks, twice early in a run.
-        tint: panes may be tinted: each learns what share of red, green and blue light gets through (not in the paper).
-        tint_weight: of the mean square of the logarithm of that share in the objective.
-        glass_count: glass Gaussians placed on each pane.
-        weights: of the loss terms; zero switches a term off (ablation).
-        conflict: where edges that the layers share count (L_c): in cells, and as far as a pane could have left them in
-            the transmission, or pixel by pixel as in the paper.
-        perturbation: of opacities; amplitude zero switches it off (ablation).
-        moving_mean: let the gradient of the depth deviation pass through the mean depth too, as Eq. 14 is written; if
-            not, Gaussians are drawn to the mean, and the mean not to them.
-        plane_fit: how planes are found from masks.
-        strategy: what decides how many primary Gaussians there are and where: densification, or MCMC (Eq. 20), under
-            which opacities are reset once, after reflections were turned round.
-        early_resets: reset opacities in the first two stages too, at the intervals of the third, as in the paper.
-        densify_by: the views by which primary Gaussians are densified: those that show them directly, or their mirror
-            images if these need more detail, each counting by what panes leave of it; or all views and mirror images
-            alike.
-        photographer: whether panes show who took the photographs.
+        detect_mirrors: detect which panes are mirrors, unless `--plane-fit.mirror-labels` names them.
+        fixed_mirrors: freeze the reflectance of mirrors and move Gaussians behind them to the front; otherwise, mirrors
+            only start with that reflectance (paper).
+        seed_reflections: initialise parts that no photograph shows directly from the virtual points behind panes, and
+            fill missing parts halfway through the run.
+        turn_reflections: move Gaussians behind glass that represent reflections to the front in the joint stage, and
+            make lamps as bright as their reflections.
+        seed_unexplained: add Gaussians where photographs agree on a missing object, twice early in a run.
+        tint: learn the transmittance of each pane for red, green and blue light (not in the paper).
+        tint_weight: weight of the mean squared logarithm of that transmittance.
+        glass_count: number of glass Gaussians on each pane.
+        weights: weights of the loss terms; 0 disables a term (ablation).
+        conflict: evaluation of L_c: over cells, limited to edges that a pane could have left in the transmission, or
+            per pixel as in the paper.
+        perturbation: perturbation of opacities; amplitude 0 disables it (ablation).
+        moving_mean: propagate the gradient of the depth deviation through the mean depth, too, as Eq. 14 is written;
+            otherwise the mean is constant.
+        plane_fit: fitting of planes to masks.
+        strategy: strategy for adding and removing primary Gaussians: densification, or MCMC (Eq. 20), which resets
+            opacities once, after reflections behind panes were moved to their front.
+        early_resets: also reset opacities in the first two stages, as in the paper.
+        densify_by: views for the densification of primary Gaussians: `direct` ones, or mirror images (weighted by their
+            strength) if these need more detail; or `all` direct and mirrored views alike (paper).
+        photographer: reflection of the photographer in the panes.
     """
 
     method = "planar"
@@ -133,7 +132,7 @@ class PlanarRecipe(MethodRecipe):
 
     @classmethod
     def paper(cls) -> PlanarRecipe:
-        """As published, as far as the paper says; docs/planar.md lists what it leaves open."""
+        """As published, as far as the paper specifies it; docs/planar.md lists the rest."""
         return cls(
             view_dependence_weight=0.0,
             fresnel="schlick",

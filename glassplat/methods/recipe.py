@@ -1,4 +1,4 @@
-"""Recipes by method name, their form on disk, and the colour behind everything."""
+"""Recipes by method name, their JSON form, and their background."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class Recipe(Protocol):
-    """Recipe of a method: data, an initialiser and stages."""
+    """Recipe of a method: options, an initialiser and stages."""
 
     @property
     def method(self) -> str:
@@ -33,15 +33,15 @@ class Recipe(Protocol):
 
     @property
     def background(self) -> Rgb | None:
-        """Colour behind everything, sRGB; None leaves it to the photographs."""
+        """Background colour, sRGB; None for that of the photographs."""
         ...
 
     def initialise(self, dataset: Dataset) -> Scene:
-        """The first scene."""
+        """The initial scene."""
         ...
 
     def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
-        """The training stages of a run of this length; only where a method needs one does it matter."""
+        """The training stages of a run of this length."""
         ...
 
     def renderer(self) -> Renderer:
@@ -52,7 +52,7 @@ class Recipe(Protocol):
 log = logging.getLogger("glassplat.training")
 
 OWN = "recipe"
-"""Name, in JSON, of the class of a recipe of the user's own."""
+"""JSON key of the class name of a custom recipe."""
 REMEDY = "Train again, or use the version that wrote it"
 Preset = Literal["glassplat", "paper"]
 RECIPES: dict[str, type] = {
@@ -61,24 +61,25 @@ RECIPES: dict[str, type] = {
 
 
 def recipe_of(method: str, preset: Preset = "glassplat") -> Any:
-    """The recipe of a method: as this project found it best, or as it was published."""
+    """The recipe of a method: the best known one, or that of the paper."""
     kind: Any = RECIPES[method]
     return kind.paper() if preset == "paper" else kind()
 
 
 def recipe_to_json(recipe: Any) -> str:
-    """A recipe as readable JSON; of one of the user's own also the name of its class."""
+    """A recipe as readable JSON; with the class name of a custom one."""
     name = {} if type(recipe) in RECIPES.values() else {OWN: type(recipe).__name__}
     return json.dumps({"method": recipe.method, **name, **dataclasses.asdict(recipe)}, indent=2)
 
 
 def recipe_from_json(text: str, where: str = "the recipe") -> Any:
-    """The recipe that `recipe_to_json` wrote; `where` names the text in messages.
+    """The recipe written by `recipe_to_json`; `where` names the file in messages.
 
-    One of the user's own comes back as that of its method, without the options that it adds.
+    A custom recipe is read as that of its method, without additional options.
 
     Raises:
-        InputError: not a recipe, or written by a version with other fields; says which value is wrong.
+        InputError: it is not a recipe, or was written by a version with other fields; the message names the wrong
+            value.
     """
     with input_checked():
         fields = parse_json(text, where)
@@ -87,30 +88,30 @@ def recipe_from_json(text: str, where: str = "the recipe") -> Any:
         raise InputError(f"{where}: the method is {short_repr(method)}; expected one of {', '.join(RECIPES)}. {REMEDY}")
     kind: Any = RECIPES[method]
     if (own := fields.pop(OWN, None)) is not None:
-        log.warning("%s is of a recipe of one's own, %s; taken as %s", where, short_repr(own), kind.__name__)
+        log.warning("%s is of a custom recipe, %s; read as %s", where, short_repr(own), kind.__name__)
         known = {field.name for field in dataclasses.fields(kind)}
         fields = {name: value for name, value in fields.items() if name in known}
     try:
         return options_from_json(kind, fields)
     except InputError as error:
-        raise InputError(f"{where} is not one that this version can read: {error}. {REMEDY}") from error
+        raise InputError(f"{where} cannot be read by this version: {error}. {REMEDY}") from error
 
 
 def photo_background(recipe: Any) -> Rgb:
-    """Colour behind transparent photographs: the recipe's background, or white, as results are published over."""
+    """Background of transparent photographs: that of the recipe, or white, as in published results."""
     return WHITE if recipe.background is None else recipe.background
 
 
 def with_background(recipe: Any, background: Rgb | None) -> Any:
-    """The recipe over a background, unless it names one itself."""
+    """The recipe with a background, unless it has one."""
     return recipe if recipe.background is not None else replace(recipe, background=background)
 
 
 def resolve_background(recipe: Any, dataset: Dataset) -> Any:
-    """The recipe with a background: its own, or else what transparent photographs are laid over, or else black.
+    """The recipe with a background: its own, that of transparent photographs, or black.
 
     Raises:
-        InputError: the photographs are laid over another colour than the recipe names.
+        InputError: the photographs have a different background than the recipe.
     """
     chosen = with_background(recipe, dataset.background or BLACK)
     if dataset.background not in (None, chosen.background):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def splat_scene(recipe: SplatRecipe, dataset: Dataset) -> Scene:
-    """The first scene: one Gaussian per point."""
+    """The initial scene: one Gaussian per point."""
     first = population_of(recipe).initial(dataset.points, recipe.sh_degree)
     scene = Scene(as_discs(first) if recipe.primitive == "disc" else first, dataset.extent)
     return corrections_begun(recipe, scene, dataset)
@@ -33,7 +33,7 @@ def splat_renderer(recipe: SplatRecipe) -> Splat:
 
 
 def splat_stages(recipe: SplatRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
-    """One stage; of discs a new one whenever one of their terms begins to count."""
+    """One stage; for discs, a new one whenever one of their loss terms starts."""
     population = population_of(recipe)
     first = Stage(
         name="splat",
@@ -59,16 +59,16 @@ def splat_stages(recipe: SplatRecipe, seed: int, iterations: int = PUBLISHED_ITE
 
 
 def _bare(recipe: SplatRecipe, *, normal: bool = False) -> Splat:
-    """The renderer with what the losses need and no more."""
+    """The renderer with only the layers that the losses need."""
     return Splat(recipe.background or BLACK, depth=False, normal=normal)
 
 
 SEED_AT = (0.105, 0.203)
-"""Shares of a run after which missing things are looked for, as in `planar`."""
+"""Shares of a run at which missing objects are searched for, as in `planar`."""
 
 
 def _missing(recipe: SplatRecipe) -> tuple[SeedUnexplained, ...]:
-    """The search for what is missing, if there is to be any."""
+    """The search for missing objects, if enabled."""
     wanted = recipe.seed_unexplained and recipe.primitive == "ellipsoid" and recipe.strategy == "default"
     return tuple(SeedUnexplained((moment,), _bare(recipe)) for moment in SEED_AT if wanted)
 
@@ -85,13 +85,13 @@ def population_of(recipe: MethodRecipe) -> Population:
 
 
 LEAST_DISTORTION_START = 400
-"""Steps before which discs are not on surfaces yet; to draw them together then makes them fog."""
+"""Steps before discs are on surfaces; an earlier distortion loss would turn them into fog."""
 
 
 def terms_by_start(options: DiscTerms, iterations: int) -> tuple[tuple[float, LossTerm], ...]:
-    """The terms that count at all, with the shares of the run after which they do, in order.
+    """The terms with non-zero weights, with the shares of the run after which they apply, in order.
 
-    Of a mirror ball at 800 iterations, a distortion term from step 80 on left 11.0 dB, from step 400 on 21.2.
+    On a mirror ball at 800 iterations, a distortion term from step 80 on gave 11.0 dB, from step 400 on 21.2.
     """
     distortion_start = max(options.distortion_start, LEAST_DISTORTION_START / iterations)
     terms = (

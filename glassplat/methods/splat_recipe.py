@@ -22,10 +22,10 @@ class DiscTerms:
     """Terms that keep discs on one surface (2DGS, Section 4.2); ellipsoids have none.
 
     Attributes:
-        distortion_weight: of how far apart along a ray lies what a pixel shows; 2DGS takes 1000 for bounded scenes.
-        distortion_start: share of the run after which it counts, if that is 400 steps or more; else after 400.
-        normal_weight: of how far the discs' normals are from those of their depths.
-        normal_start: share of the run after which it counts.
+        distortion_weight: weight of the depth distortion; 2DGS uses 1000 for bounded scenes.
+        distortion_start: share of the run after which it applies, but not before step 400.
+        normal_weight: weight of the difference between the discs' normals and those of their depths.
+        normal_start: share of the run after which it applies.
     """
 
     distortion_weight: NotNegative = 100.0
@@ -36,13 +36,13 @@ class DiscTerms:
 
 @dataclass(frozen=True)
 class SplatRecipe(MethodRecipe):
-    """Plain Gaussian Splatting, the baseline: of ellipsoids (3DGS) or discs (2DGS).
+    """Plain Gaussian Splatting as a baseline, with ellipsoids (3DGS) or discs (2DGS).
 
     Attributes:
-        primitive: what the scene is made of: ellipsoids, or discs, which have normals and lie on surfaces.
-        seed_unexplained: add ellipsoids where photographs agree on something that the scene lacks, twice early in a
-            run; not under `mcmc`, which moves its own.
-        discs: what keeps discs on one surface.
+        primitive: primitives of the scene: ellipsoids, or discs, which lie on surfaces and have normals.
+        seed_unexplained: add ellipsoids where photographs agree on a missing object, twice early in a run; not with
+            `mcmc`, which relocates its own.
+        discs: loss terms that keep discs on one surface.
     """
 
     method = "splat"

@@ -1,4 +1,4 @@
-"""First surroundings, an environment or Gaussians that rays can meet, and the setup of stages that reflect them."""
+"""Initial surroundings, an environment or Gaussians for ray tracing, and the setup of stages with reflections."""
 
 from __future__ import annotations
 
@@ -25,20 +25,19 @@ from glassplat.training.options import MirrorSearch, SurroundingsStart
 from glassplat.training.stage import TrainState
 
 LARGEST_MISS = 0.35
-"""Share of their distance by which optical axes may pass the common point and still count as looking at it."""
+"""Maximum distance of an optical axis from the common point, as a share of the camera's distance."""
 SHARE = 0.6
 """Radius of the region, as a share of the nearest camera's distance."""
 LARGER_PART, ROUNDS = 0.6, 10
-"""Share of the cameras that have to look at it, and how often those are chosen anew that do."""
+"""Minimum share of cameras that look at it, and number of iterations of their selection."""
 
 
 def reflective_region(cameras: Sequence[Camera]) -> tuple[float, float, float, float] | None:
-    """Centre and radius, world units, of the sphere that the cameras look at from around; None where there is none.
+    """Centre and radius, world units, of the sphere that the cameras surround; None without one.
 
-    The centre is the point nearest to all optical axes in the least-squares sense. It counts if the axes pass it
-    within a share of their distance, on average, and if the cameras are in front of it on more than one side. Where it
-    does not, those may be left out that look elsewhere, such as into the room that is mirrored: the point then is that
-    of the larger part of the cameras, which have to pass it twice as closely.
+    The centre is the point nearest to all optical axes in the least-squares sense. It is valid if the axes pass it
+    within a share of their distance, on average, and if the cameras are on more than one side. Otherwise, cameras that
+    look elsewhere, such as into the reflected room, are excluded, and the threshold for the majority is halved.
     """
     centers = torch.stack([camera.center.double().cpu() for camera in cameras])
     forward = torch.stack([camera.cam_from_world[2, :3].double().cpu() for camera in cameras])
@@ -62,7 +61,9 @@ def reflective_region(cameras: Sequence[Camera]) -> tuple[float, float, float, f
 
 
 def _seen_from(point: torch.Tensor, centers: torch.Tensor, forward: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """[C] whether a point lies ahead of each camera, and by which share of its distance the axis passes it."""
+    """[C] bool: point in front of each camera; and [C] distance of the axis from it, as a share of the camera's
+    distance.
+    """
     towards = point - centers
     along = (towards * forward).sum(1)
     return along > 0, (towards - along[:, None] * forward).norm(dim=1) / towards.norm(dim=1)
@@ -78,21 +79,21 @@ def _common_point(centers: torch.Tensor, forward: torch.Tensor) -> torch.Tensor 
 
 
 MOST_CELLS = 32
-"""Along an edge of the box (EnvGS, Section 4.3)."""
+"""Default number of cells along an edge of the box (EnvGS, Section 4.3)."""
 GAUSSIANS_PER_PIXEL = 0.5
-"""Where the number of cells is left open: about so many Gaussians for each pixel of a photograph."""
+"""Default number of Gaussians per pixel of a photograph."""
 NARROWEST = 1e-3
-"""Smallest side of the box, as a share of the largest: points may all lie in one plane."""
+"""Minimum side of the box, as a share of the largest, for coplanar points."""
 
 
 def suitable_cells(pixels: int, per_cell: int) -> int:
-    """Cells along an edge of the box that suit photographs of so many pixels; the paper's 32 from a megapixel on."""
+    """Cells along an edge of the box for a size of photographs in pixels; the paper's 32 above a megapixel."""
     wanted = (GAUSSIANS_PER_PIXEL * pixels / per_cell) ** (1 / 3)
     return min(max(round(wanted), 2), MOST_CELLS)
 
 
 def percentile_box(points: PointCloud, outside: float) -> tuple[Tensor, Tensor]:
-    """Lowest and highest corner [3] of the box that leaves out a share of the points at either end of every axis."""
+    """Lowest and highest corner [3] of the box that excludes a share of the points at either end of every axis."""
     positions = points.positions.double()
     low, high = (positions.quantile(share, dim=0) for share in (outside, 1 - outside))
     middle, half = (low + high) / 2, (high - low) / 2
@@ -103,17 +104,17 @@ def percentile_box(points: PointCloud, outside: float) -> tuple[Tensor, Tensor]:
 def surroundings_in_box(
     box: tuple[Tensor, Tensor], *, cells: int, per_cell: int, sh_degree: int, opacity: float, generator: torch.Generator
 ) -> Gaussians:
-    """Grey round Gaussians, as many in every cell of a box and anywhere in it (EnvGS, Section 4.3).
+    """Grey isotropic Gaussians at random positions in every cell of a box (EnvGS, Section 4.3).
 
-    The standard deviation is the mean distance of neighbours that so many points in a cell have.
+    The standard deviation is the mean distance between neighbours at this density.
 
     Args:
         box: lowest and highest corner [3].
-        cells: along each edge.
-        per_cell: in each cell.
-        sh_degree: highest degree to make room for; degree 0 is active.
+        cells: number of cells along each edge.
+        per_cell: number of Gaussians in each cell.
+        sh_degree: stored SH degree; degree 0 is active.
         opacity: of every Gaussian.
-        generator: source of the places; the Gaussians are on its device.
+        generator: random generator of the positions; the Gaussians are on its device.
     """
     low, high = (corner.to(generator.device) for corner in box)
     size = (high - low) / cells
@@ -123,7 +124,7 @@ def surroundings_in_box(
         low + (corners + torch.rand(corners.shape, generator=generator, device=low.device, dtype=torch.float32)) * size
     )
     count = means.shape[0]
-    # Of points at random with density rho the nearest one is 0.554 rho^(-1/3) away on average.
+    # For random points of density rho, the mean distance of the nearest one is 0.554 rho^(-1/3).
     spread = 0.554 * (float(size.prod()) / per_cell) ** (1 / 3)
     return Gaussians(
         means=means,
@@ -136,12 +137,12 @@ def surroundings_in_box(
 
 
 def copied_surroundings(primary: Gaussians, chosen: Tensor, *, sh_degree: int) -> Gaussians:
-    """Copies of what stands in the scene and does not reflect: that is what mirrors show of it.
+    """Copies of the scene's non-reflective Gaussians, which mirrors show.
 
     Args:
         primary: the scene's Gaussians.
-        chosen: [N] bool, which ones to copy.
-        sh_degree: highest degree to make room for; degree 0 is active.
+        chosen: [N] bool, Gaussians to copy.
+        sh_degree: stored SH degree; degree 0 is active.
     """
     kept = primary.select(chosen)
     coefficients = (sh_degree + 1) ** 2
@@ -161,19 +162,19 @@ def copied_surroundings(primary: Gaussians, chosen: Tensor, *, sh_degree: int) -
 log = logging.getLogger("glassplat.training")
 
 TOO_SHORT = (
-    "%d iterations are too few for normals to spread: nothing will reflect, and the run trains like splat, which has "
-    "the better picture then. Reflections need %d --iterations; --least-iterations 1 looks for them anyway"
+    "%d iterations are too few for normal propagation: the run trains like splat, without reflections, which "
+    "gives better images. Reflections need %d --iterations; --least-iterations 1 forces them"
 )
 
 
 @dataclass(frozen=True)
 class AddEnvironment:
-    """Surrounds the scene with an environment of noise, drawn by the run's seed.
+    """Adds an environment of random noise.
 
     Attributes:
-        texels: along the edge of a face; 0 for no environment but its region, where only near things are mirrored.
-        region: centre and radius of the sphere that holds all that may reflect, world units; None for everywhere.
-        find_region: without a region, take the place that the cameras stand around, if there is one.
+        texels: texels along the edge of a face; 0 for none, if only near surroundings are reflected.
+        region: centre and radius of the sphere outside which nothing reflects, world units; None for everywhere.
+        find_region: without a region, use the place that the cameras surround, if there is one.
     """
 
     texels: int
@@ -193,11 +194,11 @@ class AddEnvironment:
 
 @dataclass(frozen=True)
 class StayMatte:
-    """Says that a run is too short for reflections; its scene has an environment all the same, which nothing mirrors.
+    """Warns that a run is too short for reflections; adds an environment that nothing reflects.
 
     Attributes:
         iterations: length of the run.
-        least: length of the shortest run in which things learn to reflect.
+        least: length of the shortest run with reflections.
         environment: adds the environment.
     """
 
@@ -213,26 +214,26 @@ class StayMatte:
 
 @dataclass(frozen=True)
 class AddSurroundings:
-    """Surrounds the scene with Gaussians for reflections to show, drawn by the run's seed.
+    """Adds Gaussians as surroundings for reflections.
 
     Attributes:
-        start: what they are.
-        sh_degree: highest degree of their colours.
+        start: options of the surroundings.
+        sh_degree: maximum SH degree of their colours.
     """
 
     start: SurroundingsStart
     sh_degree: int
 
     def __call__(self, state: TrainState, dataset: Dataset, matte: Tensor) -> None:
-        """Edits `state`; `matte` [N] bool tells which primary Gaussians may be copied."""
+        """Edits `state`; `matte` [N] bool are the primary Gaussians that may be copied."""
         parts = [part for part in self._parts(state, dataset, matte) if len(part)]
-        # A scene in which everything reflects has nothing to copy.
+        # Nothing to copy if everything reflects.
         found = reduce(Gaussians.concat, parts or [self._in_box(state, dataset)])
         ordered, _ = apply_edit(found, {}, in_morton_order(found.means), part="surroundings")
         state.scene = replace(state.scene, surroundings=ordered)
 
     def _parts(self, state: TrainState, dataset: Dataset, matte: Tensor) -> list[Gaussians]:
-        """Those of the highest active SH degree, which the whole set has, come first."""
+        """The set with the highest active SH degree, which the result has, comes first."""
         parts = []
         if self.start.source != "box":
             parts.append(copied_surroundings(state.scene.primary, matte, sh_degree=self.sh_degree))
@@ -255,15 +256,15 @@ class AddSurroundings:
 
 @dataclass(frozen=True)
 class BeginReflections:
-    """Adds what is there to be mirrored, and takes for mirrors what looks like them.
+    """Adds the surroundings, and turns Gaussians that look like mirrors into mirrors.
 
     Attributes:
-        environment: adds an environment, and says where anything may reflect.
-        surroundings: adds what is near; None where only the environment is mirrored.
-        mirrors: what looks like a mirror.
-        renderer: that of the stage before.
-        harmonics_wait: where mirrors were found, colours are again the same from all sides, until harmonics rise anew:
-            what they had learnt by then is what those mirrors show.
+        environment: adds an environment and the region of reflections.
+        surroundings: adds near surroundings; None if only the environment is reflected.
+        mirrors: search for mirrors.
+        renderer: renderer of the previous stage.
+        harmonics_wait: if mirrors were found, reset the SH degree to 0, because higher coefficients have learned their
+            reflections.
     """
 
     environment: AddEnvironment

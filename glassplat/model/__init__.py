@@ -1,1 +1,1 @@
-"""Names that `import glassplat` offers."""
+"""Public names of `import glassplat`."""

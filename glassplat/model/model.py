@@ -1,4 +1,4 @@
-"""A scene that can be looked at, edited and saved."""
+"""A trained scene with its cameras, to be rendered, edited and saved."""
 
 from __future__ import annotations
 
@@ -53,16 +53,16 @@ NOTEBOOK_WIDTH = 480
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Model:
-    """A scene, the method that renders it, and the cameras it was photographed from.
+    """A scene, the method that renders it, and the cameras of its photographs.
 
-    Models are values: what edits one returns another, and the tensors that were not edited are shared.
+    Models are immutable: edits return a new model, which shares unedited tensors.
 
     Attributes:
-        scene: Gaussians and panes; `scene.parameters()` are all its trainable tensors by name.
-        recipe: how it was trained, and with that how it is rendered.
-        cameras: by the names of their photographs; of a foreign file, some that look at it.
-        name: what to call it.
-        path: where it was loaded from; None if it was not.
+        scene: Gaussians and panes; `scene.parameters()` has all trainable tensors by name.
+        recipe: options of the method, which also define the renderer.
+        cameras: by the names of their photographs; for a splat file without cameras, some around it.
+        name: name for display.
+        path: where it was loaded from; None if created in memory.
     """
 
     scene: Scene
@@ -79,7 +79,7 @@ class Model:
         )
 
     def _repr_html_(self) -> str:
-        """A small picture from a photograph's camera that shows the panes well, for notebooks."""
+        """A small image from a camera that shows the panes well, for notebooks."""
         text = html.escape(repr(self))
         if not self.cameras:
             return f"<p>{text}</p>"
@@ -92,7 +92,7 @@ class Model:
         return f'<p>{text}</p><img src="data:image/jpeg;base64,{picture}" alt="{html.escape(name)}">'
 
     def show(self) -> Viewer:
-        """Shows it in the browser as `glassplat view` does, at the `address` of what it returns, until its `stop()`.
+        """Starts the viewer of `glassplat view`, at the `address` of the returned object, until its `stop()`.
 
         Raises:
             InputError: viser is not installed.
@@ -109,7 +109,7 @@ class Model:
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """Names of the layers that are worth looking at, `rgb` the first."""
+        """Names of the layers for display, starting with `rgb`."""
         return self.renderer.layers(self.scene)
 
     @property
@@ -119,7 +119,7 @@ class Model:
 
     @property
     def viewpoints(self) -> Mapping[str, Camera]:
-        """Its cameras; where it has none, some that look at the scene from around it, -y up.
+        """Its cameras; without any, some around the scene, with -y up.
 
         Raises:
             InputError: it has neither cameras nor Gaussians.
@@ -133,22 +133,22 @@ class Model:
         Kernels have first derivatives only: a gradient of a gradient, as with `create_graph=True`, is refused.
 
         `frame.rgb` is [H, W, 3] in sRGB, not clamped; `frame.layers` are further images by name, [H, W] or [H, W, 3].
-        Under `torch.no_grad()` it is faster.
+        It is faster under `torch.no_grad()`.
 
         Args:
             camera: any pinhole camera, or the name of one of `cameras`.
-            layers: which ones the frame has.
+            layers: layers of the frame.
 
         Raises:
-            InputError: the method renders no such layer, or no camera has that name; says which there are. Or the
-                camera or the layers are of another type.
+            InputError: a layer or camera name is unknown, in which case the message lists the known ones; or an
+                argument has the wrong type.
         """
         layers = layers if isinstance(layers, str) else tuple(layers)
         frame = self._frame(camera, layers)
         return replace(frame, layers={name: layer for name, layer in frame.layers.items() if name in layers})
 
     def _frame(self, camera: Camera | str, layers: Sequence[str]) -> Frame:
-        """The frame with these layers, and with what else the renderer makes on the way."""
+        """The frame with these layers, and with by-products of the renderer."""
         if isinstance(layers, str):
             raise InputError(f"layers is {layers!r}; expected a sequence of names, such as ({layers!r},)")
         check_layers(self.renderer, self.scene, layers, self.recipe.method)
@@ -156,13 +156,13 @@ class Model:
             raise InputError(f"camera is {camera!r}; expected a Camera, or the name of one of `cameras`")
         if isinstance(camera, str):
             if camera not in self.cameras:
-                raise InputError(f"no camera is called {camera!r}; expected one of {first_names(list(self.cameras))}")
+                raise InputError(f"there is no camera {camera!r}; expected one of {first_names(list(self.cameras))}")
             camera = self.cameras[camera]
         return self.renderer.with_layers(layers)(self.scene, camera)
 
     @torch.no_grad()
     def image(self, camera: Camera | str, layer: str = "rgb") -> Tensor:
-        """One layer to look at: [H, W, 3] in [0, 1], on the CPU. Depth is colour-mapped, normals are (n + 1) / 2.
+        """One layer for display: [H, W, 3] in [0, 1], on the CPU. Depth is colour-mapped, normals are (n + 1) / 2.
 
         Args:
             camera: any pinhole camera, or the name of one of `cameras`.
@@ -175,21 +175,21 @@ class Model:
         return image if image.dim() == 3 else image[..., None].expand(-1, -1, 3)
 
     def orbit(self, frames: int) -> list[Camera]:
-        """Cameras once around what the photographs show, or in a loop before what was photographed from one side."""
+        """Cameras on an orbit, or on a loop in front of a scene photographed from one side."""
         return orbit(list(self.viewpoints.values()), self.scene.extent, frames)
 
     def evaluate(self, dataset: Dataset) -> dict[str, Any]:
         """Metrics over the test views of a data set, by name: `psnr`, `ssim`, `pane_psnr` ...
 
-        Where one is None, `<name>_reason` says why. Unlike `glassplat eval`, it takes panes from the ground truth or
-        else from the rendered mask, never from masks of the capture, and where cameras were corrected, it moves those
-        of the test views as their neighbours' instead of aligning them with their photographs. It writes nothing.
+        If a metric is None, `<name>_reason` has the reason. Unlike `glassplat eval`, it takes panes from the ground
+        truth or the rendered mask, never from masks of the capture; after pose refinement, test cameras are moved like
+        their neighbours instead of being aligned with their photographs. Nothing is written.
 
         Raises:
             InputError: `dataset` is something else, or its photographs lie over another background than the model's.
         """
         check_dataset(dataset)
-        from glassplat.evaluate.evaluate import evaluate  # Training imports this file, and may never need it.
+        from glassplat.evaluate.evaluate import evaluate  # Imported here, because training rarely needs it.
 
         resolve_background(with_background(self.recipe, BLACK), dataset)
         scene, renderer = self.scene, with_photographer(self.renderer, "beside")
@@ -208,28 +208,28 @@ class Model:
         return replace(self, scene=self.scene.to(device), cameras=cameras)
 
     def with_scene(self, scene: Scene) -> Model:
-        """Another scene, rendered in the same way from the same cameras."""
+        """The model with another scene."""
         return replace(self, scene=scene)
 
     def with_parameters(self, parameters: Mapping[str, Tensor]) -> Model:
-        """The same with some tensors replaced, by their names in `scene.parameters()`; gradients flow to them."""
+        """The model with some tensors replaced, by their names in `scene.parameters()`; gradients flow to them."""
         return self.with_scene(self.scene.with_parameters(parameters))
 
     def clean(self, cleaning: Cleaning | None = None) -> tuple[Model, dict[str, int]]:
-        """The model without floaters, and how many Gaussians each rule found.
+        """The model without floaters, and the number of Gaussians found by each rule.
 
         Args:
-            cleaning: the rules; the usual ones if None.
+            cleaning: the rules; the default ones if None.
 
         Raises:
-            InputError: nothing would be left, or nothing is there.
+            InputError: no Gaussians would be left, or there are none.
         """
         centers = torch.stack([camera.center for camera in self.viewpoints.values()])
         bare, found = clean_scene(self.scene, Floaters(self.scene.primary, centers), cleaning or Cleaning())
         return self.with_scene(bare), found
 
     def scale(self, factor: float) -> Model:
-        """The model in other units, its cameras too; it belongs to no capture any more, whose units are the old ones.
+        """The model and its cameras in other units; it no longer matches the capture.
 
         Raises:
             ValueError: the factor is not positive and finite.
@@ -242,11 +242,11 @@ class Model:
         return replace(self, scene=scene.scale_scene(self.scene, factor), cameras=cameras, path=None)
 
     def without_glass(self) -> Model:
-        """Without any panes: what is seen when nothing reflects."""
+        """The model without panes, so that nothing reflects."""
         return self.with_scene(scene.without_glass(self.scene))
 
     def without_pane(self, label: int) -> Model:
-        """Without one of its panes.
+        """The model without one of its panes.
 
         Raises:
             ValueError: no pane has the label.
@@ -254,7 +254,7 @@ class Model:
         return self.with_scene(scene.without_pane(self.scene, label))
 
     def with_mirrors(self, *labels: int) -> Model:
-        """The panes with these labels reflect everything, from every angle.
+        """The model with the panes of these labels turned into perfect mirrors.
 
         Raises:
             ValueError: no pane has one of the labels.
@@ -262,9 +262,9 @@ class Model:
         return self.with_scene(scene.as_mirrors(self.scene, labels))
 
     def with_reflectance(self, label: int, base_reflectance: float) -> Model:
-        """A pane reflects this share of light at normal incidence; Fresnel's laws add to it at an angle.
+        """The model with another reflectance R0 of a pane, at normal incidence; Fresnel's laws add to it at an angle.
 
-        With less than 1, it is no mirror any more, whose reflectance gets no gradient.
+        Below 1, a mirror becomes an ordinary pane, whose reflectance is trainable.
 
         Raises:
             ValueError: no pane has the label, or the reflectance is not in [0, 1].
@@ -272,7 +272,7 @@ class Model:
         return self.with_scene(scene.with_reflectance(self.scene, label, base_reflectance))
 
     def shift_pane(self, label: int, distance: float) -> Model:
-        """A pane moved along its normal by a distance in world units.
+        """The model with a pane shifted along its normal by a distance in world units.
 
         Raises:
             ValueError: no pane has the label, or the distance is not finite.
@@ -280,7 +280,7 @@ class Model:
         return self.with_scene(scene.shift_pane(self.scene, label, distance))
 
     def tilt_pane(self, label: int, about_tangent: float, about_bitangent: float = 0.0) -> Model:
-        """A pane turned about its middle, by degrees about its first and its second side.
+        """The model with a pane tilted about its centre, by degrees about its first and second side.
 
         Raises:
             ValueError: no pane has the label, or an angle is not finite.
@@ -297,19 +297,19 @@ class Model:
         base_reflectance: float = CLEAR_GLASS,
         label: int | None = None,
     ) -> Model:
-        """One more pane, also in a scene that was trained without any.
+        """The model with an additional pane, even if it was trained without any.
 
         Args:
-            center: [3] the rectangle's middle, world units.
+            center: [3] centre of the rectangle, world units.
             normal: [3] of any length.
             half_sizes: half its sides along tangent and bitangent, world units.
-            tangent: [3] direction of its first side; if None a horizontal one, as the cameras are held upright.
+            tangent: [3] direction of its first side; horizontal if None, assuming upright cameras.
             base_reflectance: R0; that of clear glass if not given, 1 makes a mirror.
-            label: what to call it, 1 to 255; the first number that is free if None.
+            label: label of the pane, 1 to 255; the first free one if None.
 
         Raises:
-            ValueError: the label is taken, a direction has no length, or a value is out of range; or the scene is of
-                another method than `planar` and `splat`, or of discs.
+            ValueError: the label is taken, a direction has length 0, a value is out of range, the method is neither
+                `planar` nor `splat`, or the Gaussians are discs.
         """
         free = next(number for number in range(1, len(self.panes) + 2) if number not in self.panes)
         tangent = self._level_direction(normal) if tangent is None else tangent
@@ -321,30 +321,30 @@ class Model:
         return model.with_mirrors(*pane.labels) if base_reflectance == 1 else model
 
     def _level_direction(self, normal: Sequence[float]) -> list[float] | None:
-        """[3] a direction at right angles to a normal that is level; None where all of them or none are."""
+        """[3] horizontal direction perpendicular to a normal; None if undetermined."""
         up = upward([*self.cameras.values()]) if self.cameras else DEFAULT_UP
         across = np.asarray([*normal], np.float64)
         level = np.cross(up, across) if across.shape == (3,) else np.zeros(3)
         return level.tolist() if np.linalg.norm(level) > LEAST_SINE * np.linalg.norm(across) else None
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
-        """Writes the model; `glassplat.load` reads a folder whole, and of a splat file what such files hold.
+        """Writes the model; `glassplat.load` reads folders completely, and splat files as far as their format allows.
 
-        A scene from a splat file is rendered over black and by the default options of `planar`, without what shiny
-        things mirror. A warning says what of this model is left out.
+        A scene from a splat file is rendered on black with the default options of `planar`, without reflections of
+        glossy objects. A warning lists what the format cannot store.
 
         Args:
-            path: without a suffix a folder, like a run's, whose float32 tensors are loaded bit for bit; .ply, .spz or
+            path: without suffix a folder in the layout of a run, with bit-identical float32 tensors; .ply, .spz or
                 .glb for other programs, with the panes next to it as `planes.json` and `glass.ply`, the cameras as
                 `cameras.json`, and an environment, which only other programs read, as `environment.png` and `.json`;
                 .html for a page that shows it with live panes in a browser, and is not loaded again.
-            overwrite: replace files that are there.
+            overwrite: replace existing files.
 
         Returns:
             The path.
 
         Raises:
-            FileExistsError: it is there, or something else next to it; nothing was written.
+            FileExistsError: a file exists already; nothing was written.
             InputError: the format is not known, or cannot hold this model.
         """
         return save_model(self, Path(path), overwrite=overwrite)
@@ -353,12 +353,12 @@ class Model:
 def viewer_state(
     model: Model, photographs: Mapping[str, Callable[[], Tensor]], writer: Writer | None = None
 ) -> ViewerState:
-    """A model as the viewer shows it.
+    """The content of the viewer for a model.
 
     Args:
-        model: to be looked at.
+        model: the model to show.
         photographs: [H, W, 3] uint8 by name, read when asked for.
-        writer: writes what is made in the browser; None where nothing may be written.
+        writer: saves edits and keyframes of the browser; None if saving is disabled.
     """
     layers: list[str] = [layer for layer in model.layers if layer not in HIDDEN_LAYERS]
     if photographs:
@@ -369,10 +369,10 @@ def viewer_state(
 
 
 def planar_of(recipe: Any) -> PlanarRecipe:
-    """The recipe by which a scene of another method is rendered when it gets a pane.
+    """The `planar` recipe that renders a scene of another method with a pane.
 
     Raises:
-        ValueError: panes cannot mirror what it renders.
+        ValueError: the method does not support panes.
     """
     if isinstance(recipe, PlanarRecipe):
         return recipe
@@ -384,7 +384,7 @@ def planar_of(recipe: Any) -> PlanarRecipe:
 
 
 def by_name(cameras: Iterable[tuple[str, Camera]]) -> dict[str, Camera]:
-    """Cameras by name; of several with one name the later ones get a number."""
+    """Cameras by name; duplicates get a number."""
     named: dict[str, Camera] = {}
     for name, camera in cameras:
         free, number = name, 1
@@ -397,7 +397,7 @@ def by_name(cameras: Iterable[tuple[str, Camera]]) -> dict[str, Camera]:
 
 PLANES, GLASS, CAMERAS = "planes.json", "glass.ply", "cameras.json"
 EXPORTED = "scene"
-"""Name without suffix of the splats that `export` writes, next to their panes."""
+"""File name, without suffix, of exported splats."""
 SETTINGS = "settings.json"
 PANORAMA, ENVIRONMENT = "environment.png", "environment.json"
 
@@ -406,7 +406,7 @@ def save_model(model: Model, path: Path, *, overwrite: bool) -> Path:
     """Writes a model in the format that the path's suffix names, see `Model.save`; returns the path.
 
     Raises:
-        FileExistsError: something is there; nothing was written.
+        FileExistsError: a file exists already; nothing was written.
         InputError: the format is not known, or cannot hold this model.
     """
     kind = path.suffix.lower().removeprefix(".")
@@ -420,7 +420,7 @@ def save_model(model: Model, path: Path, *, overwrite: bool) -> Path:
     found = [] if overwrite else [str(target) for target in (path, *_foreign(model, beside)) if target.exists()]
     if found:
         raise FileExistsError(
-            f"{first_names(found)} is already there; nothing was written. Choose another folder, or overwrite=True"
+            f"{first_names(found)} already exists; nothing was written. Choose another folder, or overwrite=True"
         )
     writing.make_folder(path.parent)
     if kind not in writing.SPLAT_WRITERS:
@@ -432,13 +432,13 @@ def save_model(model: Model, path: Path, *, overwrite: bool) -> Path:
         log.warning("%s leaves out %s; a folder, saved without a suffix, holds everything", path, ", ".join(lost))
     write_beside(path.parent, model.scene)
     if not len(model.scene.planes) and (path.parent / PLANES).exists():
-        write_planes(path.parent / PLANES, model.scene.planes)  # Panes of what was there must not be taken for its own.
+        write_planes(path.parent / PLANES, model.scene.planes)  # Panes of a previous file must not be used.
     write_cameras(path.parent / CAMERAS, model.cameras.items())
     return path
 
 
 def _foreign(model: Model, beside: Sequence[Path]) -> list[Path]:
-    """The files next to a splat file that are there already and not what the model writes, as in another format."""
+    """Existing files next to a splat file that differ from what the model would write."""
     there = [target for target in beside if target.exists()]
     if not there:
         return []
@@ -446,25 +446,25 @@ def _foreign(model: Model, beside: Sequence[Path]) -> list[Path]:
         own = [*write_beside(Path(folder), model.scene), Path(folder) / CAMERAS]
         write_cameras(own[-1], model.cameras.items())
         contents = {file.name: file.read_bytes() for file in own}
-    if not len(model.scene.planes):  # An earlier model's panes are taken away; its glass stays, and nobody reads it.
+    if not len(model.scene.planes):  # Panes of an earlier model are removed; its glass stays, but is never read.
         contents[PLANES] = planes_json(model.scene.planes).encode()
         there = [target for target in there if target.name != GLASS or not (target.parent / PLANES).exists()]
     return [target for target in there if not target.is_file() or target.read_bytes() != contents.get(target.name)]
 
 
 CHANNELED = ("ply", "glb")
-"""Formats of splats that hold channels, too."""
+"""Splat formats that can store channels."""
 
 
 def left_out(model: Model, kind: str) -> list[str]:
-    """Parts of a model's look that a splat file of this kind does not hold, nor what `load` reads next to it."""
+    """Parts of a model that neither the splat file nor the files next to it can store."""
     scene = model.scene
     own, read = (recipe.renderer().page_settings() for recipe in (model.recipe, recipe_of_splats(scene.primary)))
     names = read if len(scene.planes) else ("background",)
     lost = [f"{name}={own[name]}" for name in names if name in own and own[name] != read[name]]
     logs = scene.primary.channels.get("log_intensity")
     if kind not in CHANNELED and len(scene.planes) and logs is not None and bool(logs.any()):
-        lost.append("how bright Gaussians are in panes")
+        lost.append("the intensity of Gaussians in panes")
     if len(scene.surroundings) or not scene.environment.is_empty:
         lost.append("what shiny things mirror")
     if kind == "spz" and scene.primary.are_discs:
@@ -479,7 +479,7 @@ def save_page(model: Model, path: Path, title: str, *, sharing: web_page.Sharing
 
 
 def write_beside(folder: Path, scene: Scene) -> list[Path]:
-    """Writes planes, glass and environment, where there are any, and returns what was written."""
+    """Writes planes, glass and environment, if present; returns the written files."""
     written = []
     if len(scene.planes):
         write_planes(folder / PLANES, scene.planes)
@@ -492,7 +492,7 @@ def write_beside(folder: Path, scene: Scene) -> list[Path]:
 
 
 def write_environment_files(folder: Path, scene: Scene) -> None:
-    """The surroundings as a panorama, and a description that says how to read it."""
+    """Writes the environment as a panorama, with a description of its format."""
     environment = scene.environment
     write_equirect(folder / PANORAMA, equirect_from_environment(environment, 2 * environment.size))
     description = {
@@ -507,14 +507,14 @@ def write_environment_files(folder: Path, scene: Scene) -> None:
 
 
 def write_as_run(folder: Path, model: Model, source: Path | None) -> None:
-    """Writes a scene as a run that was not trained; the record comes last, so that a part of one is none.
+    """Writes a scene in the layout of a run; the record comes last, to mark the folder as complete.
 
-    What comes of a run knows its capture, as far as the run does.
+    A scene from a run refers to the run's capture.
 
     Args:
         folder: new or empty.
-        model: what to write.
-        source: where the scene was read from, for the record.
+        model: the model to write.
+        source: origin of the scene, for the record.
     """
     writing.make_folder(folder)
     directory = RunDirectory(folder)
@@ -529,11 +529,11 @@ def write_as_run(folder: Path, model: Model, source: Path | None) -> None:
 
 
 def save_folder(model: Model, folder: Path, *, overwrite: bool = False) -> Path:
-    """Writes a model as a run of its own, whose float32 tensors are loaded bit for bit; returns the folder.
+    """Writes a model in the layout of a run, with bit-identical float32 tensors; returns the folder.
 
     Raises:
-        FileExistsError: something is there, and it is no saved model that may be replaced; nothing was written.
-        InputError: the model has no cameras, without which nothing reads the folder again.
+        FileExistsError: the folder exists and is not a saved model to be overwritten; nothing was written.
+        InputError: the model has no cameras, which the layout requires.
     """
     if not model.cameras:
         raise InputError(
@@ -547,7 +547,7 @@ def save_folder(model: Model, folder: Path, *, overwrite: bool = False) -> Path:
     if not (overwrite and is_saved):
         more = ", or overwrite=True" if is_saved else ""
         raise FileExistsError(
-            f"{folder} is already there and not empty; nothing was written. Choose a new folder{more}"
+            f"{folder} already exists and is not empty; nothing was written. Choose a new folder{more}"
         )
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as beside:
         write_as_run(Path(beside) / "new", model, model.path)
@@ -564,7 +564,7 @@ log = logging.getLogger(__name__)
 
 
 def extent_of(gaussians: Gaussians, cameras: NamedCameras) -> float:
-    """Extent of the scene as training defines it; of a single camera that of the scene."""
+    """Extent of the scene as defined for training; with a single camera, that stored in the scene."""
     centers = torch.stack([camera.center for _, camera in cameras])
     radius = float((centers - centers.mean(0)).norm(dim=1).max())
     return EXTENT_MARGIN * (radius or web_page.bounding_ball(gaussians)[1])
@@ -574,15 +574,15 @@ def _planes(file: Path, planes_file: Path | None) -> Planes:
     beside = file.with_name("planes.json")
     if planes_file is None and not beside.is_file():
         if file.with_name(GLASS).is_file():
-            log.warning("%s has panes no more: next to it is %s, but no %s", file, GLASS, PLANES)
+            log.warning("%s no longer has panes: next to it is %s, but no %s", file, GLASS, PLANES)
         return Planes.empty()
     if planes_file is None and file.stem != EXPORTED:
-        log.info("%s gets the panes of %s; move it into a folder of its own if they are not its panes", file, beside)
+        log.info("%s gets the panes of %s; move it to another folder if they are not its panes", file, beside)
     return read_planes(planes_file or beside)
 
 
 def _glass(file: Path, planes: Planes, *, own: bool) -> Gaussians:
-    """The glass that lies next to the file, or else an even sheet on each pane."""
+    """The glass stored next to the file, or an even sheet of Gaussians on each pane."""
     beside = file.with_name("glass.ply")
     if not len(planes) or not own or not beside.is_file():
         return closed_glass(planes)
@@ -607,26 +607,27 @@ def load(
     planes: str | os.PathLike[str] | None = None,
     up: Up = "-y",
 ) -> Model:
-    """Opens a trained run, a model that was saved as one, or a splat file of any program.
+    """Loads a trained run, a saved model, or a splat file of any program.
 
-    Next to a splat file, `planes.json`, `glass.ply` and `cameras.json` are read if they are there, as `Model.save` and
-    `glassplat export` write them.
+    `planes.json`, `glass.ply` and `cameras.json` next to a splat file are read, too, as written by `Model.save` and
+    `glassplat export`.
 
     Args:
         path: a run's directory, a folder of `Model.save` or `glassplat export`, or a .ply, .spz, .glb, .splat, .sog or
                 .ksplat.
-        device: where the scene's tensors go; `auto` takes an NVIDIA GPU where one can be used.
-        planes: panes of a splat file, a planes.json written by hand or by `export`; the one next to it if not given.
-        up: which way is up in a splat file, for the cameras that look at it, if no cameras.json is next to it.
+        device: device of the tensors; `auto` uses an NVIDIA GPU if available.
+        planes: planes.json with the panes of a splat file, written by hand or by `export`; by default the one next to
+            it.
+        up: up direction of a splat file without a cameras.json, from which cameras are placed.
 
     Raises:
-        CudaUnavailableError: the GPU was asked for and cannot be used.
-        InputError: nothing that can be looked at is there, it cannot be read, or panes are given to a run.
-        FileNotFoundError: nothing is there.
+        CudaUnavailableError: a GPU was requested, but cannot be used.
+        InputError: the path is not a scene, cannot be read, or is a run and `planes` was given.
+        FileNotFoundError: the path does not exist.
     """
     path = Path(path)
     if not path.exists():
-        raise FileNotFoundError(f"there is nothing at {path}; expected {writing.LOADED}")
+        raise FileNotFoundError(f"{path} does not exist; expected {writing.LOADED}")
     source = writing.scene_source(path)
     if not source.is_dir():
         model = _from_file(source, device, None if planes is None else Path(planes), up)
@@ -638,7 +639,7 @@ def load(
 
 def _from_run(path: Path, device: DeviceName) -> Model:
     directory = RunDirectory(path)
-    recipe: Any = with_background(directory.recipe(), BLACK)  # Runs record theirs, but for those of earlier versions.
+    recipe: Any = with_background(directory.recipe(), BLACK)  # Runs of earlier versions have no cameras.json.
     scene, _ = directory.latest_scene()
     with input_checked():
         recipe.renderer().check(scene)
@@ -649,7 +650,7 @@ def _from_run(path: Path, device: DeviceName) -> Model:
 
 
 def _from_file(path: Path, device: DeviceName, planes_file: Path | None, up: Up) -> Model:
-    """A scene that was not trained here, over black, with the files that `export` writes next to its splats."""
+    """A model from a splat file, on black, with the files that `export` writes next to it."""
     with input_checked():
         gaussians, lost = drawable(read_splats(path), path)
         if not len(gaussians):
@@ -660,11 +661,11 @@ def _from_file(path: Path, device: DeviceName, planes_file: Path | None, up: Up)
         cameras = _cameras(path, gaussians, up)
         scene = Scene(with_intensity(gaussians), extent_of(gaussians, cameras), glass=glass, planes=planes)
     if lost:
-        log.warning("%d Gaussians of %s are left out: values that are no numbers or too large to draw", lost, path)
+        log.warning("%d Gaussians of %s are left out: they contain NaN or values too large to draw", lost, path)
     recipe = recipe_of_splats(scene.primary)
     return Model(scene.to(chosen_device(device)), recipe, by_name(cameras), path.stem, path)
 
 
 def recipe_of_splats(gaussians: Gaussians) -> Any:
-    """The recipe that renders a file's Gaussians: discs, before which no pane can stand, as `splat` draws them."""
+    """The recipe for a file's Gaussians: `planar` for ellipsoids, `splat` for discs, which do not support panes."""
     return SplatRecipe(background=BLACK, primitive="disc") if gaussians.are_discs else PlanarRecipe(background=BLACK)

@@ -1,6 +1,6 @@
 """The directory of a run: its settings, log, lock, and whether it may be written.
 
-Where it must not be written, or holds no run, is found out without PyTorch.
+Its checks do not need PyTorch.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 log = logging.getLogger("glassplat.training")
 
 NAME = "train.lock"
-"""The file stays behind, empty; the lock on it ends with the process, however that ends."""
+"""The empty file remains; its lock ends with the process."""
 WITHOUT_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
-"""What file systems answer that know no locks."""
+"""Errors of file systems without locks."""
 
 
 def _is_near(recorded: Camera, camera: Camera, extent: float) -> bool:
@@ -48,23 +48,23 @@ def _is_near(recorded: Camera, camera: Camera, extent: float) -> bool:
 
 @contextmanager
 def run_lock(folder: Path) -> Iterator[None]:
-    """Holds the folder against other trainings; a file system that knows no locks is used without one.
+    """Locks the folder against other training processes, if the file system supports it.
 
     Raises:
-        InputError: another training writes into it.
+        InputError: another training process writes to it.
     """
     lock = FileLock(folder / NAME, blocking=False, mode=0o666, thread_local=False)
     try:
         lock.acquire()
     except Timeout as error:
         raise InputError(
-            f"another training is writing into {folder}; expected a folder for each. Wait until it has ended, or "
+            f"another training is writing to {folder}; each needs its own folder. Wait until it has finished, or "
             "choose another --output"
         ) from error
     except OSError as error:
         if error.errno not in WITHOUT_LOCKS:
             raise
-        log.warning("%s cannot be locked (%s); see that no second training writes into it", folder, error.strerror)
+        log.warning("%s cannot be locked (%s); make sure that no second training writes to it", folder, error.strerror)
     try:
         yield
     finally:
@@ -72,10 +72,10 @@ def run_lock(folder: Path) -> Iterator[None]:
 
 
 def check_unlocked(folder: Path) -> None:
-    """Look whether another training writes into a folder.
+    """Check that no other training process writes to a folder.
 
     Raises:
-        InputError: one does.
+        InputError: another one does.
     """
     if (folder / NAME).is_file():
         with run_lock(folder):
@@ -83,7 +83,7 @@ def check_unlocked(folder: Path) -> None:
 
 
 CHECKPOINT_SECONDS = 120.0
-"""What a power cut may cost at the most, unless the user says otherwise."""
+"""Default interval of checkpoints, the most that a power cut can cost."""
 
 
 @dataclass(frozen=True)
@@ -94,9 +94,9 @@ class RunSettings:
         data: directory of the capture, from the root of the file system.
         iterations: length of the run.
         downscale: factor by which photographs are shrunk.
-        seed: fixes every random choice.
-        device: where training runs.
-        mask_polarity: which value of black-and-white masks is the pane.
+        seed: random seed.
+        device: training device.
+        mask_polarity: value of black-and-white masks that marks panes.
     """
 
     data: str
@@ -109,13 +109,13 @@ class RunSettings:
 
 EVALUATED = ("per_view.json", "sheets", "uses.png", "index.html")
 FILES = ("recipe.json", "settings.json", "log.jsonl", "cameras.json", *EVALUATED)
-"""What a run writes next to its checkpoint, scene and metrics."""
+"""Other files of a run."""
 MOST_MOVED = 0.02
-"""Share of the scene's extent by which two cameras may differ that are taken for one."""
+"""Tolerance of camera positions, as a share of the scene's extent."""
 ROUNDING = 1e-5
-"""Share of a camera's distance from the origin by which single precision may displace it as well."""
+"""Additional tolerance for single precision, as a share of the distance from the origin."""
 NUMBERED = re.compile(r"iteration_([0-9]{1,18})")
-"""The folder of a scene; people keep copies under other names next to it."""
+"""Name of a scene's folder; users may keep renamed copies."""
 
 
 @dataclass(frozen=True)
@@ -154,17 +154,17 @@ class RunDirectory:
 
     @property
     def imported(self) -> Path:
-        """Path of the record of a scene's source if it has no capture: it was made in a program."""
+        """Path of the record of a scene's origin, for scenes that were not trained."""
         return self.path / "imported.json"
 
     @property
     def is_saved(self) -> bool:
-        """Return whether there is something in it that took training to make."""
+        """Return whether it contains results of training."""
         return any((self.path / name).exists() for name in (self.checkpoint.name, self.results.name, "point_cloud"))
 
     @property
     def is_begun(self) -> bool:
-        """Return whether a run was begun here, whatever has become of it."""
+        """Return whether a run was started here."""
         try:
             self.recipe()
         except InputError:
@@ -172,25 +172,25 @@ class RunDirectory:
         return True
 
     def check_begun(self) -> None:
-        """Refuse what no run was begun in.
+        """Refuse a folder in which no run was started.
 
         Raises:
             FileNotFoundError: nothing is there.
             InputError: there is no recipe.
         """
         if not self.path.exists():
-            raise FileNotFoundError(f"there is nothing at {self.path}; expected what `glassplat train --output` wrote")
+            raise FileNotFoundError(f"{self.path} does not exist; expected what `glassplat train --output` wrote")
         self._read("recipe.json")
 
     def check_vacant(self) -> None:
-        """Refuse to begin a run where something would be lost by it.
+        """Refuse to start a run that would overwrite something.
 
         Raises:
-            InputError: the directory holds a run, or files of somebody else that have the names of a run's.
+            InputError: the directory holds a run, or other files with the same names.
         """
         if self.checkpoint.exists():
             raise InputError(
-                f"{self.path} already holds a run; pass --resume to go on with it, or choose another --output"
+                f"{self.path} already holds a run; pass --resume to continue it, or choose another --output"
             )
         if self.is_saved:
             raise InputError(f"{self.path} already holds a trained scene; choose another --output, or move it away")
@@ -202,7 +202,7 @@ class RunDirectory:
             )
 
     def check_saved(self) -> None:
-        """Refuse to go on with a run of which there is no checkpoint.
+        """Refuse to resume a run without a checkpoint.
 
         Raises:
             InputError: there is none.
@@ -211,13 +211,13 @@ class RunDirectory:
             return
         if self.is_saved:
             raise InputError(
-                f"{self.path} holds a trained scene, but no {self.checkpoint.name} to go on from; train it again with "
-                "another --output"
+                f"{self.path} holds a trained scene, but no {self.checkpoint.name} to continue from; train it again "
+                "with another --output"
             )
-        raise InputError(f"nothing was saved yet in {self.path}; begin again without --resume")
+        raise InputError(f"nothing was saved yet in {self.path}; start again without --resume")
 
     def begin(self, recipe: Any, settings: RunSettings, dataset: Dataset) -> None:
-        """Creates the directory and records what is about to run."""
+        """Creates the directory and records recipe and settings."""
         from glassplat.files.sidecars import write_cameras
         from glassplat.methods.recipe import recipe_to_json
 
@@ -231,19 +231,19 @@ class RunDirectory:
         write_text(self.path / "settings.json", json.dumps(dataclasses.asdict(settings), indent=2) + "\n")
 
     def clear(self) -> None:
-        """Removes what a training left half-written that was killed; for who holds the lock.
+        """Removes partial files of a killed run; requires the lock.
 
-        Other commands may be writing JSON and pictures here.
+        Other commands may be writing JSON and images here.
         """
         remove_unfinished(self.path, (self.checkpoint.suffix,))
         for folder in self.path.glob("point_cloud/iteration_*"):
             remove_unfinished(folder, (".ply", ".json", ".safetensors", ".png"))
 
     def write_trained_cameras(self, dataset: Dataset, scene: Scene) -> None:
-        """Writes the recorded cameras again, as training found them if it looked for them.
+        """Writes the cameras, with refined poses if training refined them.
 
-        Then `sparse/0` is the same as a COLMAP model, of the photographs as training saw them: undistorted and reduced.
-        Random points are not in it.
+        With refined poses, `sparse/0` has them as a COLMAP model of the undistorted, downscaled photographs, without
+        random points.
         """
         from glassplat.captures.dataset import with_corrected_cameras
         from glassplat.files.sidecars import write_cameras, write_colmap
@@ -264,7 +264,7 @@ class RunDirectory:
         return recipe_from_json(self._read("recipe.json"), str(self.path / "recipe.json"))
 
     def written_recipe(self) -> Any:
-        """The recorded recipe's options as they were written."""
+        """The recorded options, as written."""
         return parse_json(self._read("recipe.json"), "recipe.json")
 
     def settings(self) -> RunSettings:
@@ -278,14 +278,14 @@ class RunDirectory:
             raise InputError(f"{path} cannot be read: {error}; train again") from error
 
     def photographs(self) -> set[str] | None:
-        """Names of the photographs that the run was begun with; None where that is not recorded legibly."""
+        """Names of the photographs of the run; None if they cannot be read."""
         try:
             return {entry["img_name"] for entry in read_json(self.path / "cameras.json")}
         except (OSError, ValueError, TypeError, KeyError):
             return None
 
     def has_cameras_of(self, dataset: Dataset) -> bool:
-        """Return whether the recorded cameras are the capture's, give or take what pose refinement may move them."""
+        """Return whether the recorded cameras match the capture's, up to pose refinement."""
         recorded = self._cameras()
         cameras = {view.name: view.camera for view in (*dataset.train, *dataset.test)}
         return recorded.keys() == cameras.keys() and all(
@@ -295,19 +295,19 @@ class RunDirectory:
         )
 
     def _check_poses(self, dataset: Dataset) -> None:
-        """Refuse a capture most of whose cameras are elsewhere: its world is another one than that of the scene."""
+        """Refuse a capture in which most cameras have moved, since it has another world frame."""
         recorded = self._cameras()
         known = {v.name: v.camera for v in (*dataset.train, *dataset.test) if v.name in recorded}
         moved = [name for name, camera in known.items() if not _is_near(recorded[name], camera, dataset.extent)]
         if 2 * len(moved) > len(known):
             raise InputError(
-                f"{len(moved)} of {len(known)} cameras of {dataset.root} are elsewhere than when {self.path} was "
-                f"trained: {first_names(sorted(moved))}. Has the capture been prepared again? Give the capture as it "
-                "was to --data, or train again"
+                f"{len(moved)} of {len(known)} cameras of {dataset.root} have moved since {self.path} was "
+                f"trained: {first_names(sorted(moved))}. Was the capture prepared again? Give the original "
+                "capture to --data, or train again"
             )
 
     def _cameras(self) -> dict[str, Camera]:
-        """The recorded cameras by name; none where they cannot be read."""
+        """The recorded cameras by name; empty if they cannot be read."""
         from glassplat.files.sidecars import read_cameras
 
         try:
@@ -316,12 +316,12 @@ class RunDirectory:
             return {}
 
     def check_photographs(self, dataset: Dataset) -> None:
-        """Refuse a capture of other photographs than the run was trained on, or with other poses.
+        """Refuse a capture whose photographs or poses differ from those of the run.
 
-        Which of them are for testing follows from all of them; with one more or less, they would be others.
+        A missing or additional photograph would change the split into training and test views.
 
         Raises:
-            InputError: says which ones only the run or only the capture has, or that the cameras are elsewhere.
+            InputError: photographs are missing or additional, or cameras have moved.
         """
         trained, found = self.photographs(), {view.name for view in (*dataset.train, *dataset.test)}
         if trained is None or trained == found:
@@ -338,7 +338,7 @@ class RunDirectory:
         )
 
     def export(self, scene: Scene, step: int) -> Path:
-        """Writes the scene in the formats that others read; returns its folder."""
+        """Writes the scene as an export; returns its folder."""
         from glassplat.files.scene_folder import write_scene
         from glassplat.files.sidecars import write_equirect
         from glassplat.render.deferred import equirect_from_environment
@@ -351,7 +351,7 @@ class RunDirectory:
         return folder
 
     def latest_scene(self) -> tuple[Scene, int]:
-        """The exported scene of the highest iteration, and that iteration."""
+        """The scene of the last saved iteration, and that iteration."""
         from glassplat.files.scene_folder import read_scene
 
         named = {NUMBERED.fullmatch(folder.name): folder for folder in self.path.glob("point_cloud/*")}
@@ -383,10 +383,10 @@ def check_output(directory: RunDirectory, *, resume: bool) -> None:
         InputError: a fresh run would overwrite something, there is nothing to go on from, another training writes
             there, or a link leads out of it.
         NotADirectoryError: it is a file, or goes through one.
-        PermissionError: nothing may be written there.
+        PermissionError: the folder is not writable.
     """
     if not leads():
-        return  # Rank 0 writes, and may have begun already.
+        return  # Rank 0 may have started writing.
     check_folder(directory.path)
     check_links(directory.path, (*FILES, directory.checkpoint.name, directory.results.name, "point_cloud", "sparse"))
     check_unlocked(directory.path)
@@ -406,10 +406,10 @@ class RunLog:
         self._file, self._path, self._step = file, path, step
 
     def write(self, message: Message) -> None:
-        """Appends a message; of the steps the first in every ten iterations, and nothing of work between two.
+        """Appends a message, but only every tenth step and no progress of work.
 
         Raises:
-            OSError: the disk is full or fails; names the log.
+            OSError: the disk is full or fails.
         """
         if isinstance(message, Working):
             return
@@ -426,9 +426,9 @@ class RunLog:
 
 @contextmanager
 def open_log(path: Path, step: int) -> Iterator[RunLog]:
-    """The log, cut back to the step from which the run goes on.
+    """The log, truncated at the step from which the run continues.
 
-    A run that was killed may leave half a line, or the zeros of a power cut; such lines are left out.
+    A killed run or a power cut may leave partial lines or zeros; these are dropped.
     """
     kept = lines_until(path, step) if step and path.is_file() else []
     write_text(path, "".join(line + "\n" for line in kept))
@@ -436,18 +436,18 @@ def open_log(path: Path, step: int) -> Iterator[RunLog]:
     try:
         yield RunLog(file, path, step)
     finally:
-        with suppress(OSError):  # Every line was flushed when it was written.
+        with suppress(OSError):  # Every line was flushed after writing.
             file.close()
 
 
 def lines_until(path: Path, step: int) -> list[str]:
-    """The legible lines of a log up to a step."""
+    """The valid lines of a log up to a step."""
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     return [line for line in lines if 0 <= _step_of(line) <= step]
 
 
 def _step_of(line: str) -> int:
-    """The step of a line; -1 where it is none of a log."""
+    """The step of a line; -1 if it is not a log line."""
     try:
         step = json.loads(line)["step"]
     except (ValueError, KeyError, TypeError, IndexError, RecursionError):

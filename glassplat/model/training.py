@@ -1,4 +1,4 @@
-"""Training runs: data in, run directory out, with checkpoints, a log and a clean stop."""
+"""Training runs: from data to a run directory, with checkpoints, a log and orderly interruption."""
 
 from __future__ import annotations
 
@@ -48,16 +48,16 @@ log = logging.getLogger("glassplat.training")
 
 Listener = Callable[[Message], None]
 STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-"""Ctrl-C, what a shut-down or a job scheduler sends before it kills, and what a closed terminal leaves behind."""
+"""Ctrl-C, termination by a shutdown or job scheduler, and a closed terminal."""
 
 
 @dataclass(eq=False)
 class StopRequest:
-    """Set when the user asks a run to stop; the run ends after the current step.
+    """A request to stop the run after the current step.
 
     Attributes:
-        number: the signal by which it was asked; None as long as it was not.
-        answer: what the signal did before the run began.
+        number: the signal; None without a request.
+        answer: handler of the signal before the run.
     """
 
     number: int | None = None
@@ -65,27 +65,27 @@ class StopRequest:
 
     @property
     def requested(self) -> bool:
-        """Return whether the run is to stop."""
+        """Return whether a stop was requested."""
         return self.number is not None
 
     def end(self) -> NoReturn:
-        """Ends the run as the signal would have ended it, so that the caller can tell one from the other."""
+        """Ends the run in the way of the signal, so that the caller can distinguish signals."""
         if callable(self.answer) and self.number is not None:
             self.answer(self.number, None)
         raise KeyboardInterrupt
 
 
 _asked: list[StopRequest] = []
-"""Of the runs that go on in the main thread; there may be several, followed by turns."""
+"""Requests of the active runs in the main thread; several may be iterated alternately."""
 _before: dict[int, Any] = {}
-"""Handlers of the signals as they were before these runs."""
+"""Handlers of the signals before these runs."""
 
 
 @contextmanager
 def stop_on_interrupt() -> Iterator[StopRequest]:
-    """Turns the first Ctrl-C, termination or hang-up into a request to stop after the step; a second one interrupts.
+    """Turns the first SIGINT, SIGTERM or SIGHUP into a request to stop after the step; a second one interrupts.
 
-    What is ignored stays ignored, as a hang-up is under `nohup`. Only the main thread can be asked.
+    Ignored signals stay ignored, as under `nohup`. Works only in the main thread.
     """
     request = StopRequest()
     if threading.current_thread() is threading.main_thread():
@@ -104,11 +104,11 @@ def stop_on_interrupt() -> Iterator[StopRequest]:
 
 
 def _ask(number: int, frame: FrameType | None) -> None:
-    """Asks all runs to stop; once they have been asked, interrupts.
+    """Requests all runs to stop; interrupts if they were requested before.
 
-    `torchrun` passes on what a scheduler may have sent already; there, a second signal says nothing new.
+    Under `torchrun`, which forwards signals of a scheduler, repeated signals are ignored.
     """
-    if not _asked:  # The last run ended in another thread, where handlers cannot be set.
+    if not _asked:  # The last run ended in another thread, where handlers could not be restored.
         is_own = signal.getsignal(number) is _ask
         _put_handlers_back()
         if is_own:
@@ -116,7 +116,7 @@ def _ask(number: int, frame: FrameType | None) -> None:
     elif not all(request.requested for request in _asked):
         for request in _asked:
             request.number, request.answer = number, _before[number]
-    elif "TORCHELASTIC_RUN_ID" not in os.environ:  # It is set where `torchrun` has started a single process, too.
+    elif "TORCHELASTIC_RUN_ID" not in os.environ:  # Also set if `torchrun` started a single process.
         _asked[-1].end()
 
 
@@ -127,9 +127,9 @@ def _put_handlers_back() -> None:
 
 
 def with_gradients(messages: Generator[Message, None, None]) -> Generator[Message, None, None]:
-    """Passes messages on, made where gradients are switched on; between them that is as the caller has it.
+    """Forwards messages, with gradients enabled only inside of the generator.
 
-    PyTorch's own decorators of generators throw in a way that Python is about to give up.
+    PyTorch's decorators for generators use a deprecated form of `throw`.
     """
     following = partial(next, messages)
     while True:
@@ -144,18 +144,18 @@ def with_gradients(messages: Generator[Message, None, None]) -> Generator[Messag
             with torch.inference_mode(False):
                 messages.close()
             raise
-        except BaseException as error:  # noqa: BLE001 - It is the messages' to answer.
+        except BaseException as error:  # noqa: BLE001 - The generator handles it.
             following = partial(messages.throw, error)
         else:
             following = partial(next, messages)
 
 
 class Run:
-    """A training run in its directory, followed message by message.
+    """A training run in its directory, as a sequence of messages.
 
-    A recipe that names no background gets the one that transparent photographs are laid over; it is recorded. Nothing
-    is written before the first scene has been made. Who stops following leaves a checkpoint behind, from which the run
-    can be resumed. Of several ranks the first one makes the scene and writes; the others train along.
+    A recipe without a background gets that of the photographs, which is recorded. Nothing is written before the
+    initial scene exists. If the consumer stops iterating, a checkpoint is written, from which the run can be resumed.
+    Of several ranks, the first one makes the scene and writes files.
     """
 
     def __init__(
@@ -169,20 +169,20 @@ class Run:
         checkpoint_every: float = run_directory.CHECKPOINT_SECONDS,
         ranks: Ranks | None = None,
     ) -> None:
-        """Checks what can be known beforehand.
+        """Checks the arguments.
 
         Args:
-            recipe: how to train.
+            recipe: method and options.
             settings: the other settings.
-            directory: where everything goes.
+            directory: output directory.
             dataset: photographs to fit.
-            resume: go on from the checkpoint in `directory`.
-            checkpoint_every: seconds from one checkpoint to the next; there is one at the end in any case.
-            ranks: the processes that train together; this one alone if not given.
+            resume: continue from the checkpoint in `directory`.
+            checkpoint_every: seconds between checkpoints; one is always written at the end.
+            ranks: processes that train together; by default only this one.
 
         Raises:
-            InputError: the directory is not fit for it (`check_output`), the run is too short for its stages, or as
-                `resolve_background` does.
+            InputError: the directory is unsuitable (`check_output`), the run is too short for its stages, or
+                backgrounds differ (`resolve_background`).
         """
         self.recipe = resolve_background(recipe, dataset)
         self._stages = self.recipe.stages(settings.seed, settings.iterations)
@@ -195,36 +195,36 @@ class Run:
         self.state: TrainState | None = None
 
     def to_the_end(self, listen: Listener) -> TrainState:
-        """Trains to the end or to the user's interrupt; raises what `listen` raises, once all is saved."""
+        """Trains to the end or to an interrupt; re-raises exceptions of `listen` after saving."""
         messages = self.messages()
         for message in messages:
             try:
                 listen(message)
-            except BaseException as error:  # noqa: BLE001 - The run saves itself, and raises it again.
+            except BaseException as error:  # noqa: BLE001 - The run saves its state and re-raises.
                 messages.throw(error)
         assert self.state is not None
         return self.state
 
     def messages(self) -> Generator[Message, None, None]:
-        """Trains from one message to the next; begun again after it ended, from the checkpoint on.
+        """Trains from one message to the next; restarting the iteration continues from the checkpoint.
 
         Raises:
-            InputError: the run was recorded with other settings or photographs, or a photograph cannot be read, of the
-                test views too; what was trained by then is saved.
-            KeyboardInterrupt: the user stopped the run; the checkpoint is written.
-            TrainingDivergedError: training cannot go on; the last checkpoint stays.
+            InputError: settings or photographs differ from the recorded ones, or a photograph cannot be read, in which
+                case the state is saved.
+            KeyboardInterrupt: the user stopped the run; a checkpoint is written.
+            TrainingDivergedError: training diverged; the last checkpoint stays.
             OSError: the disk is full or fails; the last checkpoint stays.
-            RankLostError: another rank has ended; the checkpoint is written.
+            RankLostError: another rank has ended; a checkpoint is written.
         """
         return with_gradients(self._messages())
 
     def _messages(self) -> Generator[Message, None, None]:
         self._ranks.check_alike(traits(self.recipe, self._settings, self._dataset) | {"resume": self._resume})
         yield from self._leading() if self._ranks.leads else self._following()
-        self._ranks.exchange()  # The others stay until the leader has written the scene.
+        self._ranks.exchange()  # Other ranks wait until the leader has written the scene.
 
     def _following(self) -> Generator[Message, None, None]:
-        """Trains along, and writes nothing."""
+        """Trains on a rank that does not write."""
         self.state = self._ranks.broadcast(self.state, self._settings.device)
         self._session = TrainingSession(self.state, self._ranks)
         with self._dataset.memory.spool_to(self._directory.path):
@@ -240,7 +240,7 @@ class Run:
         make_folder(directory.path)
         with run_directory.run_lock(directory.path):
             directory.clear()
-            # Another training may have ended here meanwhile.
+            # Another process may have finished training here.
             anew = directory.is_begun and not resume
             if state is None:
                 state = resumed_state(self.recipe, settings, directory, self._dataset)
@@ -258,20 +258,20 @@ class Run:
 
     @property
     def is_stopping(self) -> bool:
-        """Return whether the user has asked the run to end; it does after the step."""
+        """Return whether a stop after the step was requested."""
         return self._session is not None and self._session.is_stopping
 
     def save(self) -> None:
-        """Writes a checkpoint and the scene, between two messages of which the last one is `StageEntered` or later.
+        """Writes a checkpoint and the scene; between two messages, after the first `StageEntered`.
 
-        Of several ranks the first one writes, and the others do nothing.
+        Of several ranks, only the first one writes.
 
         Raises:
-            RuntimeError: the run has not begun.
+            RuntimeError: the run has not started.
             OSError: the disk is full or fails.
         """
         if self._session is None or self.state is None:
-            raise RuntimeError("nothing to save: the run has not begun")
+            raise RuntimeError("nothing to save: the run has not started")
         self._session.save()
         if self._ranks.leads:
             self._export()
@@ -289,20 +289,20 @@ class Run:
 
 
 def first_state(recipe: Any, settings: run_directory.RunSettings, dataset: Dataset) -> TrainState:
-    """The state from which a fresh run starts."""
+    """The initial state of a new run."""
     return TrainState(recipe.initialise(dataset), settings.seed, method=recipe.method).to(settings.device)
 
 
 def resumed_state(
     recipe: Any, settings: run_directory.RunSettings, directory: run_directory.RunDirectory, dataset: Dataset
 ) -> TrainState:
-    """The checkpoint's state.
+    """The state of the checkpoint.
 
     Raises:
-        InputError: the run was recorded with other settings or photographs, or nothing is saved.
+        InputError: settings or photographs differ from the recorded ones, or there is no checkpoint.
     """
     directory.check_saved()
-    # A run may go on on another device, and its capture may have been moved.
+    # A run may be resumed on another device, and its capture may have moved.
     written = directory.settings()
     has_moved = written.data != settings.data and directory.has_cameras_of(dataset)
     recorded = replace(written, device=settings.device, data=settings.data if has_moved else written.data)
@@ -322,15 +322,15 @@ def resumed_state(
     known = state.scene.planes.labels
     if known and (later := [label for label in dataset.pane_labels if label not in known]):
         log.warning(
-            "the planes of this run were fitted before pane %s was marked: it is learned like all else; to have it as "
-            "a pane, train again",
+            "the planes of this run were fitted before pane %s was marked: it is learned like everything else; train "
+            "again to make it a pane",
             name_labels(later),
         )
     return state.to(settings.device)
 
 
 def traits(recipe: Any, settings: run_directory.RunSettings, dataset: Dataset) -> dict[str, object]:
-    """The options, versions and capture of a run, which must be the same on every rank; only its folder may differ."""
+    """Options, versions and capture of a run, which must agree on all ranks; only the folder may differ."""
     views = (*dataset.train, *dataset.test)
     shapes = [(v.name, v.camera.intrinsics.tolist(), v.camera.cam_from_world.tolist(), v.is_annotated) for v in views]
     sizes = [view.image_path.stat().st_size if view.image_path.is_file() else 0 for view in views]
@@ -348,9 +348,9 @@ def traits(recipe: Any, settings: run_directory.RunSettings, dataset: Dataset) -
 
 
 def changes_of_recipe(directory: run_directory.RunDirectory, recipe: Any) -> list[str]:
-    """The options of a recipe that differ from those that a run was begun with, as they were written."""
+    """The options of a recipe that differ from the recorded ones."""
     recorded = directory.recipe()
-    if recorded.method != recipe.method:  # The options of two methods have little in common.
+    if recorded.method != recipe.method:  # Options of different methods are not comparable.
         return differences({"method": recorded.method}, {"method": recipe.method})
     of_both = directory.written_recipe(), json.loads(recipe_to_json(recipe))
     kind = type(recorded).__name__
@@ -358,13 +358,13 @@ def changes_of_recipe(directory: run_directory.RunDirectory, recipe: Any) -> lis
 
 
 def differences(before: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
-    """The options that differ, each with both values."""
+    """The differing options, each with both values."""
     names = [name for name in dict.fromkeys((*before, *now)) if before.get(name, UNKNOWN) != now.get(name, UNKNOWN)]
     return [f"{name} was {before.get(name, UNKNOWN)} and is {now.get(name, UNKNOWN)}" for name in names]
 
 
 def _values(options: Any, name: str) -> Iterator[tuple[str, object]]:
-    """Every value of nested options by its dotted name."""
+    """All values of nested options by dotted name."""
     if isinstance(options, dict):
         for key, inner in options.items():
             yield from _values(inner, f"{name}.{key}" if name else key)
@@ -373,11 +373,11 @@ def _values(options: Any, name: str) -> Iterator[tuple[str, object]]:
 
 
 UNKNOWN = "unknown"
-"""Said of an option that a version does not have."""
+"""Shown for options that a version does not have."""
 
 
 class Record(NamedTuple):
-    """Files that the leader writes while it trains: a checkpoint every so many seconds, and the log.
+    """Files that the leader writes during training: checkpoints at intervals, and the log.
 
     Before a checkpoint, `restore` sees to it that its directory is that of a run.
     """
@@ -389,21 +389,21 @@ class Record(NamedTuple):
 
 
 class TrainingSession:
-    """One stretch of a run: from its beginning or a checkpoint to its end or an interrupt."""
+    """One session of a run: from its start or a checkpoint to its end or an interrupt."""
 
     def __init__(self, state: TrainState, ranks: Ranks, record: Record | None = None) -> None:
         self._state, self._ranks, self._record = state, ranks, record
         self._seconds_before, self._started = state.seconds, time.perf_counter()
         self._compiled_before = compile_seconds()
         self._saved = self._started
-        self._stepped: float | None = None  # The first step may compile kernels, and says nothing of the next.
+        self._stepped: float | None = None  # The first step may compile kernels, and is not representative.
         self._longest = self._writing = 0.0
         self._stop = StopRequest()
 
     def run_stages(
         self, stages: tuple[Stage, ...], dataset: Dataset, iterations: int
     ) -> Generator[Message, None, None]:
-        """Trains to the end, or raises KeyboardInterrupt after the step in which the user asks for it."""
+        """Trains to the end, or raises KeyboardInterrupt after the step of a stop request."""
         with stop_on_interrupt() as self._stop, photographs_read(dataset) as check_photographs:
             self._ranks.asked = lambda: self._stop.requested
             messages = train(stages, dataset, self._state, iterations, ranks=self._ranks)
@@ -415,7 +415,7 @@ class TrainingSession:
                     yield from self._saved_in_time(message, iterations, setups)
 
     def _saved_where_it_fails(self, messages: Iterator[Message], check: Callable[[], None]) -> Iterator[Message]:
-        """Passes messages on; where a rank is lost, or a photograph cannot be read or is gone, it saves first."""
+        """Forwards messages; if a rank is lost or a photograph cannot be read, it saves first."""
         begun = self._state.step
         try:
             for message in messages:
@@ -428,14 +428,14 @@ class TrainingSession:
             if not isinstance(error, InputError):
                 raise
             step = self._state.step
-            raise InputError(f"{error}; step {step} is saved; mend that, then repeat with --resume") from error
+            raise InputError(f"{error}; step {step} is saved; fix that, then repeat with --resume") from error
 
     def _saved_in_time(
         self, message: StepDone, iterations: int, setups: Container[int] = ()
     ) -> Generator[Message, None, None]:
-        """Writes a checkpoint where it is time for one, and ends training where it was asked to end.
+        """Writes a checkpoint if one is due, and ends training if a stop was requested.
 
-        It is time before a setup, too, at whichever of these steps: a setup may refuse what it is given, such as masks.
+        One is also due before a setup, which may fail, for example because of masks.
         """
         is_last, is_ending = message.step == iterations, self._ranks.is_ending
         is_time = self._record is not None and (message.step in setups or self._is_time(self._record.every))
@@ -447,10 +447,10 @@ class TrainingSession:
         self._stepped = time.perf_counter()
 
     def _is_time(self, every: float) -> bool:
-        """Return whether a checkpoint that is written after the next step would come later than every so many seconds.
+        """Return whether a checkpoint after the next step would exceed the interval.
 
-        The longest step so far is expected, with what is edited before it, and the time that the last checkpoint took;
-        both together no longer than half of the time, so that checkpoints become twice as frequent at most.
+        The next step is assumed to take as long as the longest one so far, and the checkpoint as long as the last one;
+        together at most half of the interval, so that checkpoints are at most twice as frequent.
         """
         now = time.perf_counter()
         if self._stepped is not None:
@@ -458,7 +458,7 @@ class TrainingSession:
         return now - self._saved + min(self._longest + self._writing, every / 2) >= every
 
     def deliver(self, message: Message) -> Generator[Message, None, None]:
-        """Passes a message on; should nobody be there any more to hear it, what was trained is saved first."""
+        """Forwards a message; if the consumer stops iterating, the state is saved first."""
         try:
             if self._record is not None:
                 self._record.log.write(message)
@@ -467,17 +467,17 @@ class TrainingSession:
             if isinstance(message, StageEntered | StepDone | ActionDone):
                 self.save()
             if self._stop.requested and isinstance(error, OSError):
-                self._stop.end()  # A terminal that was closed can show nothing, and that is no failure.
+                self._stop.end()  # A closed terminal is not a failure.
             raise
 
     @property
     def is_stopping(self) -> bool:
-        """Return whether a signal asked for the end."""
+        """Return whether a signal requested the end."""
         return self._stop.requested
 
     def save(self) -> None:
-        """Writes a checkpoint, if this process is to; the state must not be in the middle of a change."""
-        self._saved = time.perf_counter()  # Before it is written: what is trained from now on is not in it.
+        """Writes a checkpoint if this process is the leader; the state must be consistent."""
+        self._saved = time.perf_counter()  # Before writing, as later steps are not in it.
         compiling = compile_seconds() - self._compiled_before
         self._state.seconds = self._seconds_before + self._saved - self._started - compiling
         if self._record is not None:
@@ -487,21 +487,20 @@ class TrainingSession:
 
 
 class Training:
-    """A training run: iterate over it, and it trains from one message to the next.
+    """A training run: iterating over it trains from one message to the next.
 
         for message in glassplat.Training(dataset, "planar", iterations=7000, output="runs/shop"):
             match message:
                 case glassplat.StepDone(step=step, loss=loss):
                     print(step, loss)
 
-    Started by `torchrun`, several processes train together, one view of each step for each.
-    Between two messages, from the first `StepDone` on, `model` is the scene as trained so far. With an `output` the run
-    is written as `glassplat train` writes it, `for` may be left with `break`, Ctrl-C ends it after a step, and either
-    way `resume=True` goes on. Without one, everything stays in memory, and a `break` at a `Working` message loses the
-    edit that it tells of.
+    Under `torchrun`, several processes train together, each with one view per step. Between two messages, after the
+    first `StepDone`, `model` is the current scene. With an `output`, the run is written as by `glassplat train`; after
+    `break` or Ctrl-C, `resume=True` continues it. Without `output`, everything stays in memory, and a `break` at a
+    `Working` message loses the edit in progress.
 
     Attributes:
-        recipe: how to train, with the background that the photographs have.
+        recipe: method and options, with the background of the photographs.
         iterations: length of the run.
     """
 
@@ -517,33 +516,33 @@ class Training:
         resume: bool = False,
         checkpoint_every: float = run_directory.CHECKPOINT_SECONDS,
     ) -> None:
-        """Checks what can be known beforehand; nothing is trained or written yet.
+        """Checks the arguments; nothing is trained or written yet.
 
         Args:
             dataset: photographs to fit.
-            recipe: the name of a method, with its options as they are by default; or a recipe, such as
-                `PlanarRecipe(fresnel="schlick")`, or one of your own.
-            iterations: length of the run; every schedule stretches with it.
+            recipe: name of a method, for its default options; or a recipe, such as `PlanarRecipe(fresnel="schlick")` or
+                a custom one.
+            iterations: length of the run; all schedules scale with it.
             output: directory of the run.
-            seed: fixes every random choice.
-            device: where to train; `auto` takes an NVIDIA GPU where one can be used.
-            resume: go on with the run in `output`.
-            checkpoint_every: seconds from one checkpoint to the next; there is one at the end in any case.
+            seed: random seed.
+            device: training device; `auto` uses an NVIDIA GPU if available.
+            resume: continue the run in `output`.
+            checkpoint_every: seconds between checkpoints; one is always written at the end.
 
         Raises:
-            CudaUnavailableError: the GPU was asked for and cannot be used.
-            InputError: `dataset` is something else, or has no training views; no method has that name; an option has a
-                value that it cannot have; `output` holds something else, or nothing to go on from; the run is too short
-                for its stages; or the photographs lie over another background than the recipe's.
+            CudaUnavailableError: a GPU was requested, but cannot be used.
+            InputError: `dataset` is not a data set or has no training views; the method is unknown; an option is
+                invalid; `output` holds something else, or nothing to resume; the run is too short for its stages; or
+                the photographs have a different background than the recipe.
         """
         check_dataset(dataset)
         if not dataset.train:
             raise InputError(f"{dataset.root} has no training views; expected one or more in `dataset.train`")
         chosen = chosen_recipe(recipe)
-        if type(chosen) in RECIPES.values():  # A recipe of one's own may hold anything.
+        if type(chosen) in RECIPES.values():  # A custom recipe may hold anything.
             check_value(type(chosen), chosen, "")
         self._ranks = join()
-        root = str(dataset.root.resolve())  # The run may be looked at from another folder than it was started in.
+        root = str(dataset.root.resolve())  # Later commands may be started in another folder.
         self.iterations, self._dataset = iterations, dataset
         self._settings = run_directory.RunSettings(
             root, iterations, dataset.downscale, seed, str(chosen_device(device)), dataset.mask_polarity
@@ -553,7 +552,7 @@ class Training:
         self._state: TrainState | None = None
         if output is None:
             if resume:
-                raise InputError("resume=True needs the output that it is to go on with")
+                raise InputError("resume=True needs the output of the run to continue")
             self.recipe: Any = resolve_background(chosen, dataset)
             self._stages = self.recipe.stages(seed, iterations)
             check_length(self._stages, iterations)
@@ -570,14 +569,14 @@ class Training:
         self.recipe = self._run.recipe
 
     def __iter__(self) -> Generator[Message, None, None]:
-        """Trains from one message to the next, to the end.
+        """Trains to the end, from one message to the next.
 
         Raises:
-            InputError: a photograph cannot be read; or the run in `output` was recorded with other options.
+            InputError: a photograph cannot be read, or the run in `output` has other options.
             KeyboardInterrupt: the user stopped the run.
-            TrainingDivergedError: training cannot go on.
+            TrainingDivergedError: training diverged.
             OSError: the disk is full or fails.
-            RankLostError: another process that `torchrun` started has ended.
+            RankLostError: another process of `torchrun` has ended.
         """
         return with_gradients(self._in_memory()) if self._run is None else self._run.messages()
 
@@ -585,7 +584,7 @@ class Training:
         """Trains to the end; returns the trained model.
 
         Args:
-            listen: gets every message; what it raises ends the run, once what was trained is saved.
+            listen: receives every message; its exceptions end the run after saving.
         """
         if self._run is not None:
             self._run.to_the_end(listen or _nobody)
@@ -596,52 +595,52 @@ class Training:
 
     @property
     def state(self) -> TrainState:
-        """Everything that changes while training: scene, optimiser, statistics.
+        """The mutable state of training: scene, optimiser, statistics.
 
         Raises:
-            RuntimeError: the first scene has not been made yet.
+            RuntimeError: the initial scene does not exist yet.
         """
         state = self._state if self._run is None else self._run.state
         if state is None:
-            raise RuntimeError("the run has not begun; ask after its first message from a step")
+            raise RuntimeError("the run has not started; ask after the first message of a step")
         return state
 
     @property
     def step(self) -> int:
-        """Iterations done; 0 before the run begins."""
+        """Iterations done; 0 before the run starts."""
         state = self._state if self._run is None else self._run.state
         return 0 if state is None else state.step
 
     @property
     def seconds(self) -> float:
-        """Time spent training, over all sessions, up to the last checkpoint; without compiling kernels."""
+        """Training time over all sessions, up to the last checkpoint, without compilation of kernels."""
         return self.state.seconds
 
     @property
     def is_stopping(self) -> bool:
-        """Return whether the user has asked the run to end, as with Ctrl-C; it does after the step."""
+        """Return whether a stop after the step was requested, as by Ctrl-C."""
         return self._run is not None and self._run.is_stopping
 
     @property
     def model(self) -> Model:
-        """The scene as trained so far; its tensors go on changing, so `save` it, or clone what has to stay.
+        """The current scene; its tensors keep changing, so `save` it, or clone the tensors to keep.
 
-        Its cameras are where training has found them by now, if it looks for them.
+        Its cameras have the current refined poses, if poses are refined.
 
         Raises:
-            RuntimeError: the first scene has not been made yet.
+            RuntimeError: the initial scene does not exist yet.
         """
         seen = with_corrected_cameras(self._dataset, self.state.scene)
         cameras = {view.name: view.camera for view in (*seen.train, *seen.test)}
         return Model(self.state.scene, self.recipe, cameras, self._dataset.root.name)
 
     def save(self) -> None:
-        """Writes a checkpoint and the scene into `output` now; between two messages, from the first `StageEntered` on.
+        """Writes a checkpoint and the scene to `output` now; between two messages, after the first `StageEntered`.
 
-        Of several processes the first one writes, and the others do nothing.
+        Of several processes, only the first one writes.
 
         Raises:
-            RuntimeError: there is no `output`, or the run has not begun.
+            RuntimeError: there is no `output`, or the run has not started.
         """
         if self._run is None:
             raise RuntimeError("this training has no output to save to; use `training.model.save(path)`")
@@ -657,15 +656,15 @@ class Training:
 
 
 def chosen_recipe(recipe: str | Recipe) -> Any:
-    """The recipe, or that of a method's name.
+    """The recipe itself, or the default one of a method's name.
 
     Raises:
-        InputError: no method has that name, or it is no recipe.
+        InputError: the method is unknown, or the object is not a recipe.
     """
     given: Any = recipe
     if isinstance(given, str):
         if given not in RECIPES:
-            raise InputError(f"no method is called {given!r}; expected {', '.join(RECIPES)}, or a recipe")
+            raise InputError(f"there is no method {given!r}; expected {', '.join(RECIPES)}, or a recipe")
         return RECIPES[given]()
     if isinstance(given, type) or not dataclasses.is_dataclass(given) or not hasattr(given, "stages"):
         raise InputError(f"recipe is {short_repr(given)}; expected a method's name, or a recipe such as SplatRecipe()")
@@ -673,4 +672,4 @@ def chosen_recipe(recipe: str | Recipe) -> Any:
 
 
 def _nobody(message: Message) -> None:
-    """Listens to nothing."""
+    """Ignores messages."""

@@ -1,4 +1,4 @@
-"""A model, or a training while it goes on, as something to look at."""
+"""Content of the viewer: a model, or a training run in progress."""
 
 from __future__ import annotations
 
@@ -30,86 +30,86 @@ LEAST_KEYFRAMES = 2
 
 
 class FolderWriter:
-    """Writes edited scenes and keyframes into one folder, under names of which none is taken.
+    """Writes edited scenes and keyframes to a folder, under unused names.
 
-    The names come from browsers, so that none leads out of the folder.
+    Names come from browsers, and are checked not to lead out of the folder.
     """
 
     def __init__(self, model: Model, folder: Path) -> None:
         """Writes nothing yet.
 
         Args:
-            model: what is looked at; an edited scene is saved with its recipe and cameras.
-            folder: where things go; made when it is needed.
+            model: the viewed model; edited scenes are saved with its recipe and cameras.
+            folder: output folder; created when needed.
         """
         self._model, self._folder = model, folder
 
     def write_scene(self, scene: Scene, name: str) -> str:
-        """Writes a scene as a run of its own; returns what to say.
+        """Writes a scene in the layout of a run; returns a message.
 
         Raises:
-            InputError: it cannot have that name.
+            InputError: the name is not valid.
             FileExistsError: the name is taken; nothing was written.
-            OSError: the disk is full, or nothing may be written.
+            OSError: the disk is full, or the folder is not writable.
         """
         path = self._path(name)
         save_folder(self._model.with_scene(scene.to("cpu")), path)
-        return f"{path}: look at it with `glassplat view {quote(str(path))}`"
+        return f"{path}: view it with `glassplat view {quote(str(path))}`"
 
     def write_keyframes(self, cameras: Sequence[Camera], name: str) -> str:
-        """Writes the cameras of a film; returns what to say.
+        """Writes keyframe cameras; returns a message.
 
         Raises:
-            InputError: they are too few, or cannot have that name.
+            InputError: there are too few keyframes, or the name is not valid.
             FileExistsError: the name is taken; nothing was written.
-            OSError: the disk is full, or nothing may be written.
+            OSError: the disk is full, or the folder is not writable.
         """
         if len(cameras) < LEAST_KEYFRAMES:
-            raise InputError(f"a film needs at least two keyframes, not {len(cameras)}; add views first")
+            raise InputError(f"a video needs at least two keyframes, not {len(cameras)}; add views first")
         path = self._path(f"{name.strip().removesuffix('.json')}.json")
         if os.path.lexists(path):
-            raise FileExistsError(f"{path} is already there; nothing was written. Choose another name")
+            raise FileExistsError(f"{path} already exists; nothing was written. Choose another name")
         make_folder(self._folder)
         write_cameras(path, [(f"keyframe {index}", camera) for index, camera in enumerate(cameras, start=1)])
         source = "RUN" if self._model.path is None else quote(str(self._model.path))
         return (
-            f"{path}: film them with `glassplat video {source} --path keyframes --keyframes {quote(str(path))} "
-            "--output film.mp4`"
+            f"{path}: render them with `glassplat video {source} --path keyframes --keyframes {quote(str(path))} "
+            "--output video.mp4`"
         )
 
     def _path(self, name: str) -> Path:
         if NAME.fullmatch(name.strip()) is None:
             raise InputError(
-                f"{name[:100]!r} cannot be a name here; expected one that begins with a letter or digit, then letters, "
+                f"{name[:100]!r} is not a valid name; expected one that begins with a letter or digit, then letters, "
                 "digits, spaces, dots, + and -, at most 100 of them"
             )
         return self._folder / name.strip()
 
 
 REFRESH_SECONDS = 2.0
-"""From one picture of a scene that is being trained to the next, where nobody moves."""
+"""Seconds between two images of a scene in training while the camera does not move."""
 PAUSE_SECONDS = 0.2
-"""How soon a paused training hears that it should end."""
+"""Seconds between checks for a stop request while training is paused."""
 
 
 class WatchedTraining:
-    """A viewer next to a training, which draws between its steps.
+    """A viewer of a training run, which draws between its steps.
 
-    The thread that trains draws, so that no kernel is entered twice and every picture is of a finished step. Drawing
-    takes at most 15 % of the time while a browser is connected, and none while there is none.
+    The training thread draws, so that kernels are never entered concurrently and images show finished steps. Drawing
+    takes at most 15 % of the time while a browser is connected.
     """
 
     def __init__(
         self, training: Training, dataset: Dataset, *, host: str, port: int, announce: Callable[[Viewer], None]
     ) -> None:
-        """Does nothing yet: there is something to look at after the first step.
+        """Prepares the viewer, which starts after the first step.
 
         Args:
-            training: to be watched; its messages go to `hear`.
-            dataset: whose photographs are shown.
-            host: who may look.
-            port: where the browser finds it.
-            announce: is told once the viewer is there.
+            training: the training run; its messages have to be passed to `hear`.
+            dataset: data set with the photographs to show.
+            host: address to listen on.
+            port: port to listen on.
+            announce: called once the viewer runs.
 
         Raises:
             InputError: the port cannot be used.
@@ -123,7 +123,7 @@ class WatchedTraining:
         self._is_paused, self._is_save_asked = False, False
 
     def hear(self, message: Message) -> None:
-        """Follows the training; here it is drawn, paused and saved."""
+        """Handles a message of the training run: draws, pauses and saves."""
         if not isinstance(message, StepDone):
             return
         if self._viewer is None or self._share is None:
@@ -136,7 +136,7 @@ class WatchedTraining:
         self._obey(self._viewer, message)
 
     def stop(self) -> None:
-        """Ends the viewer."""
+        """Stops the viewer."""
         if self._viewer is not None:
             self._viewer.stop()
 
@@ -145,8 +145,8 @@ class WatchedTraining:
         return viewer_state(self._training.model, {view.name: view.read_photo for view in views})
 
     def _update(self, viewer: Viewer, message: StepDone) -> None:
-        """Shows the scene as it is now, and asks for pictures of it now and then."""
-        scene = self._training.state.scene  # Not that of its model, whose cameras would be corrected at every step.
+        """Shows the current scene, and requests new images at intervals."""
+        scene = self._training.state.scene  # Not `model`, which would correct all cameras at every step.
         viewer.change(scene, renderer_now(self._training.recipe, scene))
         now = time.monotonic()
         if now - self._refreshed >= REFRESH_SECONDS and viewer.loop.expected_seconds() is None:
@@ -154,14 +154,14 @@ class WatchedTraining:
             viewer.refresh(self._status(message))
 
     def _obey(self, viewer: Viewer, message: StepDone) -> None:
-        """Saves, and waits while it is paused; pictures are then drawn as fast as they can be."""
+        """Saves if requested, and waits while paused, drawing without a time limit."""
         while self._is_save_asked or (self._is_paused and not self._training.is_stopping):
             if self._is_save_asked:
                 self._is_save_asked = False
                 try:
                     self._training.save()
                     outcome = "saved"
-                except Exception as error:  # noqa: BLE001 - Whatever it is, the training does not end by a click.
+                except Exception as error:  # noqa: BLE001 - A click must never end the training.
                     outcome = f"not saved: {error}"
                 viewer.refresh(f"{self._status(message)}, {outcome}")
             if self._is_paused and not viewer.loop.serve():
@@ -172,7 +172,7 @@ class WatchedTraining:
         return f"step {message.step} of {self._training.iterations}, loss {message.loss:.4f}{paused}"
 
     def _pause(self) -> None:
-        """Pauses, or goes on; called by the viewer's threads."""
+        """Pauses or continues; called from the viewer's threads."""
         self._is_paused = not self._is_paused
         if self._viewer is not None:
             self._viewer.refresh("paused" if self._is_paused else "going on")
@@ -182,7 +182,7 @@ class WatchedTraining:
 
 
 def renderer_now(recipe: Any, scene: Scene) -> Renderer:
-    """The recipe's renderer, or, where the scene lacks what that needs yet, a plain one."""
+    """The recipe's renderer, or a plain one while the scene lacks the parts that it needs."""
     renderer: Renderer = recipe.renderer()
     try:
         renderer.check(scene)

@@ -17,8 +17,8 @@ class PlaneFit:
     """Options for finding planes from masks.
 
     Attributes:
-        mirror_labels: panes that are mirrors; they get a base reflectance near one, and keep it.
-        glass_reflectance: base reflectance R0 to expect of glass, where it starts: by default that of a clear pane.
+        mirror_labels: labels of panes that are mirrors; their R0 is fixed close to one.
+        glass_reflectance: initial and expected R0 of glass; by default that of a clear pane.
         mirror_reflectance: base reflectance of mirrors; one has no finite logit.
         band: half width of the band along a mask's edge in which candidates lie, as a share of the
             image diagonal; the paper's 20 pixels at 960x720.
@@ -26,7 +26,7 @@ class PlaneFit:
         hypotheses: number of planes drawn by RANSAC, and again through the masks.
         refined: number of the best of them that are refined at last.
         most_views: number of annotated views that are used; a few that were taken far apart tell enough.
-        least_agreement: intersection over union of the masks on the plane below which a fit is refused.
+        least_agreement: intersection over union of the masks on the plane below which the fit is refused.
         margin: factor on the rectangle's sides, which must not cut into the pane.
         seed: of RANSAC.
     """

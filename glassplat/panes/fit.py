@@ -40,8 +40,8 @@ def report_masks(label: int, plane: masks.FramedPlanes, views: Sequence[masks.Pa
     odd = odd_ones(meeting).nonzero()[0]
     if len(odd):
         log.warning(
-            "pane %d: %d of its %d masks do not fit the others, their outlines hardly meet on any plane: %s; check "
-            "that each belongs to its photograph, and that label %d means the same flat pane in it",
+            "pane %d: %d of its %d masks do not fit the others, their outlines hardly meet on any plane: %s; "
+            "check that each belongs to its photograph, and that label %d is the same flat pane in it",
             label, len(odd), len(views), ", ".join(found[number] for number in odd), label,
         )  # fmt: skip
 
@@ -124,11 +124,11 @@ def fit_planes(
 ) -> Planes:
     """A reflection plane for every pane that the masks name, in the order of their labels.
 
-    As in the paper, candidates are points that project near a mask's edge, RANSAC draws planes
-    through them, and rotating calipers bound the rectangle. Beyond the paper, the masks themselves
-    choose among the planes and place the best one exactly: on the pane's own plane, and on no other,
-    the masks of all views coincide (`mask_agreement`), and their edges do (`edge_matches`). RANSAC alone often prefers
-    a wall or the floor. No points are needed: further planes are drawn through the masks.
+    As in the paper, candidates are points that project near a mask's edge, RANSAC draws planes through them, and
+    rotating calipers bound the rectangle. Beyond the paper, the masks themselves choose among the planes and place the
+    best one exactly: on the pane's own plane, and on no other, the masks of all views coincide (`mask_agreement`), and
+    their edges do (`edge_matches`). RANSAC alone often prefers a wall or the floor. No points are needed: further
+    planes are drawn through the masks.
 
     Gaussians may mislead, so that each pane is fitted to the measured points as well, and of both planes the one is
     kept that masks and measured points support better (`best_supported`). Panes of one front get one plane, which the
@@ -185,7 +185,7 @@ def _advice(label: int, count: int) -> Iterator[None]:
     except PlaneFitError as error:
         if count == 1:
             raise
-        without = f"Or do without it: with label {label} erased from the masks, it is learned like all else"
+        without = f"Or erase label {label} from the masks: then the pane is learned like everything else"
         raise PlaneFitError(f"{error}. {without}") from error
 
 
@@ -246,8 +246,8 @@ def _found_pane(
     if found.fault is None and _loss(whole, found.plane) <= MOST_LOSS:
         return found
     log.info(
-        "pane %d: without the gaps of its masks, where things may stand before it, its plane is another one, %.2f "
-        "degrees away; it takes that plane", label, np.degrees(search.angle(found.plane, whole.plane)),
+        "pane %d: without the gaps of its masks, where it may be occluded, its plane is %.2f degrees away; "
+        "using that plane", label, np.degrees(search.angle(found.plane, whole.plane)),
     )  # fmt: skip
     return whole
 
@@ -303,7 +303,7 @@ def _choose_plane(pane: _Found, trusted: Sequence[_Found]) -> _Found:
         return pane
     other = trusted[int(np.argmin(losses))]
     reason = pane.fault or "two views alone leave it open"
-    log.warning("pane %d takes the plane of pane %d, on which its masks meet: %s", pane.label, other.label, reason)
+    log.warning("pane %d gets the plane of pane %d, on which its masks meet: %s", pane.label, other.label, reason)
     return replace(pane, plane=other.plane, fault=None, is_settled=True)
 
 
@@ -330,7 +330,7 @@ def _placed_by_images(pane: _Found, cloud: Array, cameras: Sequence[Camera], opt
         return pane
     log.info(
         "pane %d: %.0f points seen through it are mirror images of others on a plane %.2f degrees from that of its "
-        "masks, which has %.0f; it takes that plane",
+        "masks, which has %.0f; using that plane",
         pane.label, images.pairs, np.degrees(search.angle(pane.plane, plane)), images.before,
     )  # fmt: skip
     return replace(pane, plane=plane, fault=None, is_settled=True)
@@ -385,9 +385,9 @@ def _finish(pane: _Found, options: PlaneFit, unmarked: Sequence[tuple[str, Camer
         return _pane(pane.plane.planes, views, options.margin)
     except ValueError as error:
         raise PlaneFitError(
-            f"pane {pane.label}, annotated in {len(views)} views: {error}. Check that label {pane.label} means the "
-            "same flat pane in every mask, and annotate more views, from places well apart, that show its outline "
-            f"inside of the image with nothing standing before it{_worth_marking(views, unmarked)}"
+            f"pane {pane.label}, annotated in {len(views)} views: {error}. Check that label {pane.label} is the "
+            f"same flat pane in every mask, and annotate more views, from positions far apart, that show its "
+            f"whole outline inside the image, unoccluded{_worth_marking(views, unmarked)}"
         ) from error
 
 
@@ -440,8 +440,8 @@ def _turn(middle: Array, center: Array, other: Array) -> float:
 def _check_views(label: int, views: Sequence[masks.PaneView], extent: float) -> None:
     if len(views) < 2:
         raise PlaneFitError(
-            f"pane {label} is annotated in {len(views)} view(s), but its plane shows only between views: "
-            "annotate at least two more views of it, taken from places well apart"
+            f"pane {label} is annotated in {len(views)} view(s), but a plane can only be found from several "
+            "views: annotate at least two more, from positions far apart"
         )
     _check_places(label, views, extent)
     _check_outline(label, views)
@@ -452,9 +452,8 @@ def _check_places(label: int, views: Sequence[masks.PaneView], extent: float) ->
     apart = float(np.linalg.norm(centers - centers[0], axis=1).max())
     if apart < LEAST_APART * extent:
         raise PlaneFitError(
-            f"pane {label}: its {len(views)} annotated views were taken from places at most {apart:.3g} apart in a "
-            f"capture of radius {extent:.3g}, and its plane shows only between places: annotate views "
-            "of it from farther apart"
+            f"pane {label}: its {len(views)} annotated views were taken at most {apart:.3g} apart in a capture "
+            f"of radius {extent:.3g}: annotate views from farther apart"
         )
 
 
@@ -462,8 +461,8 @@ def _check_outline(label: int, views: Sequence[masks.PaneView]) -> None:
     showing = sum(len(view.edge) > 0 for view in views)
     if showing < 2:
         raise PlaneFitError(
-            f"pane {label}: its outline lies inside of the image in {showing} of {len(views)} annotated views, "
-            "expected at least two: annotate views that show where it ends, from places well apart"
+            f"pane {label}: its outline lies inside the image in {showing} of {len(views)} annotated views, "
+            "expected at least two: annotate views that show its border, from positions far apart"
         )
 
 
@@ -471,8 +470,8 @@ def _check_outlines(found: masks.FramedPlanes, objective: Objective) -> None:
     against = float(search.contradiction(found, objective)[0])
     if against > MOST_CONTRADICTION:
         raise ValueError(
-            f"on no plane do the outlines of its masks meet; on the best one {against:.2f} of what is known tells "
-            f"against it, expected at most {MOST_CONTRADICTION}"
+            f"the outlines of its masks meet on no plane; on the best one {against:.2f} of the evidence "
+            f"contradicts it, expected at most {MOST_CONTRADICTION}"
         )
 
 
@@ -484,8 +483,8 @@ def _tilt_degrees(found: masks.FramedPlanes, objective: Objective) -> float:
 def _left_open(degrees: float, objective: Objective) -> str:
     """A plane that may be turned by so many degrees, for a message."""
     return (
-        f"the plane could turn by {min(degrees, 90):.0f} degrees before its masks tell: they show too little of its "
-        f"outline or are from places too close together, and {len(objective.points)} points lie along it"
+        f"the masks determine the plane only to {min(degrees, 90):.0f} degrees: they show too little of its "
+        f"outline or were taken too close together, and {len(objective.points)} points lie along it"
     )
 
 

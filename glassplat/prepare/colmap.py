@@ -238,7 +238,7 @@ def check_database(path: Path) -> Iterator[None]:
         if "disk is full" in reason:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
         raise InputError(
-            f"{path} is damaged, or cannot be written ({short_repr(reason)}); begin the preparation again with --force"
+            f"{path} is damaged, or cannot be written ({short_repr(reason)}); start the preparation again with --force"
         ) from error
 
 

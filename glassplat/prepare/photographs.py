@@ -72,8 +72,8 @@ PICTURE_SUFFIX = ".jpg"
 CAPTURE_FOLDERS = ("sparse", "panes", "gt", "ignore")
 MASK_FOLDERS = (PANE_FOLDER, MASK_FOLDER, IGNORE_FOLDER)
 NOT_CARRIED = (
-    "They are not carried into the capture: make masks for its own photographs, which have no distortion and may be "
-    "smaller, and put them into its masks/, ignore/ or panes/."
+    "They are not copied to the capture: make masks for its undistorted, possibly smaller photographs, and put "
+    "them into its masks/, ignore/ or panes/."
 )
 
 
@@ -96,7 +96,7 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
     same: list[tuple[Path, bytes]] = []
     broken: dict[str, InputError] = {}
     for done, path in enumerate(paths):
-        listen(Working("looking at the photographs", done, len(paths)))
+        listen(Working("checking the photographs", done, len(paths)))
         try:
             photograph, contents = _examine(path, names[path], max_size)
         except InputError as error:
@@ -112,13 +112,13 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
         raise _refusal(broken, len(paths))
     twins = [f"{path.name} (as {found[contents].path.name})" for path, contents in same]
     if len(found) < FEWEST:
-        again = f", and {first_names(twins)} the same again" if twins else ""
+        again = f", and duplicates of them ({first_names(twins)})" if twins else ""
         raise InputError(
-            f"{folder} holds too few photographs: {len(found)}{again}; expected at least {FEWEST}, and better 30 or "
-            "more, taken from places a step apart"
+            f"{folder} holds too few photographs: {len(found)}{again}; expected at least {FEWEST}, better 30 or "
+            "more, taken a step apart"
         )
     if twins:
-        listen(Note(f"Left out, as the same photographs again: {first_names(twins)}."))
+        listen(Note(f"Duplicates, left out: {first_names(twins)}."))
     cut_out = [one.path for one in found.values() if one.transparent]
     if cut_out:
         listen(
@@ -231,8 +231,8 @@ def _photograph_paths(folder: Path) -> list[Path]:
         kinds = "/".join(sorted(set(unreadable.values())))
         raise InputError(
             f"{len(unreadable)} photographs in {folder} are {kinds} files, which cannot be read "
-            f"({first_names(list(unreadable))}); save them as JPEG and remove these (a telephone does so by itself "
-            "with 'most compatible' in the camera's settings). HEIC is read after pip install 'glassplat[heic]'"
+            f"({first_names(list(unreadable))}); save them as JPEG and remove these (a phone does so if its "
+            "camera is set to 'most compatible'). to read HEIC: pip install 'glassplat[heic]'"
         )
     suffixes = (*images.IMAGE_SUFFIXES, *(images.HEIF_SUFFIXES if images.reads_heif() else ()))
     paths = [path for path in files if path.suffix.lower() in suffixes]
@@ -280,7 +280,7 @@ def _examine(path: Path, name: str, max_size: int, least_side: int = LEAST_SIDE)
         raise InputError(str(error)) from error
     if min(size) < least_side:
         raise InputError(
-            f"{path} is {size[0]}x{size[1]} pixels large; expected a photograph, {least_side} pixels at least along "
+            f"{path} is {size[0]}x{size[1]} pixels; expected a photograph, {least_side} pixels at least along "
             "each side: remove it"
         )
     width, height = size[::-1] if sideways else size
@@ -343,15 +343,15 @@ def frames_of(video: Path, folder: Path, most: int, listen: Listener) -> list[Pa
     chosen = chosen_frames(footage, most)
     if len(chosen) < FEWEST_FRAMES:
         raise InputError(
-            f"{video} shows {len(chosen)} different places in {len(footage.sharpness)} frames; expected at least "
-            f"{FEWEST_FRAMES}: film while walking slowly past what you want to capture, with enough light"
+            f"{video} has {len(chosen)} sufficiently different views in {len(footage.sharpness)} frames; expected at "
+            f"least {FEWEST_FRAMES}: walk slowly past the subject, with enough light"
         )
     folder.mkdir(parents=True, exist_ok=True)
     paths = {int(number): folder / f"frame_{number:06d}.png" for number in chosen}
     missing = {number for number, path in paths.items() if not path.is_file()}
     for number, frame in enumerate(_frames(cv2, video) if missing else ()):
         if number in missing:
-            listen(Working("taking photographs from the video", sorted(paths).index(number), len(paths)))
+            listen(Working("extracting frames", sorted(paths).index(number), len(paths)))
             images.write_image(paths[number], frame[:, :, ::-1])
     return list(paths.values())
 
@@ -407,7 +407,7 @@ def _measure_motion(cv2: Any, video: Path, listen: Listener) -> Footage:
     total = _length(cv2, video)
     for number, frame in enumerate(_frames(cv2, video)):
         if number % 10 == 0:
-            listen(Working("looking through the video", min(number, total), total))
+            listen(Working("reading the video", min(number, total), total))
         small = _small_grey(cv2, frame)
         if before is not None:
             way += _motion(cv2, before, small)
@@ -415,7 +415,7 @@ def _measure_motion(cv2: Any, video: Path, listen: Listener) -> Footage:
         sharpness.append(float(cv2.Laplacian(small, cv2.CV_64F).var()))
         before = small
     if not travelled:
-        raise InputError(f"{video} holds no picture that OpenCV can read; expected a video, or a folder of photographs")
+        raise InputError(f"{video} has no frame that OpenCV can read; expected a video, or a folder of photographs")
     return Footage(np.array(travelled), np.array(sharpness))
 
 

@@ -90,7 +90,7 @@ class Workplace:
             lock.acquire()
         except Timeout as error:
             raise InputError(
-                f"another preparation is making {self.output}; wait until it has ended, or choose another --output"
+                f"another preparation is writing {self.output}; wait until it has finished, or choose another --output"
             ) from error
         except OSError as error:
             log.debug("%s is not locked: %s", self.output, error)
@@ -114,8 +114,8 @@ class Workplace:
             known = None
         if known is not None and not resume:
             raise InputError(
-                f"{self.folder} holds an interrupted preparation of {self.output}; go on from it with --resume, or "
-                "begin again with --force"
+                f"{self.folder} holds an interrupted preparation of {self.output}; continue it with --resume, or "
+                "start again with --force"
             )
         if known is not None:
             self._check_unchanged(known, json.loads(json.dumps(settings)))
@@ -143,20 +143,21 @@ class Workplace:
         changed = sorted(key for key in {*known, *settings} if known.get(key) != settings.get(key))
         if set(changed) - {PHOTOGRAPHS}:
             raise InputError(
-                f"{self.folder} was begun with another {first_names([key for key in changed if key != PHOTOGRAPHS])}; "
-                "give the same to --resume, or begin again with --force"
+                f"{self.folder} was started with another "
+                f"{first_names([key for key in changed if key != PHOTOGRAPHS])}; give the same "
+                "to --resume, or start again with --force"
             )
         if not changed:
             return
         before, now = known.get(PHOTOGRAPHS), settings[PHOTOGRAPHS]
         if not isinstance(before, dict):
             raise InputError(
-                f"{self.folder} does not say which photographs it was begun with; begin again with --force"
+                f"{self.folder} does not record the photographs it was started with; start again with --force"
             )
         names = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
         raise InputError(
-            f"photographs have changed since {self.folder} was begun (added, removed or written again: "
-            f"{first_names(names)}); put them back to go on with --resume, or begin again with --force"
+            f"photographs have changed since {self.folder} was started (added, removed or written again: "
+            f"{first_names(names)}); put them back to continue with --resume, or start again with --force"
         )
 
     def _check_output(self, force: bool) -> None:
@@ -187,8 +188,8 @@ class Workplace:
         others += sorted(path.relative_to(self.output).as_posix() for path in added)
         if others:
             raise InputError(
-                f"{self.output} holds {first_names(others)}, which somebody made and --force would remove; expected "
-                "only what `glassplat prepare` makes: move the folder away, or choose a new one for --output"
+                f"{self.output} holds {first_names(others)}, which are not from `glassplat prepare` and would "
+                "be removed by --force: move the folder away, or choose a new one for --output"
             )
 
     def _known_settings(self) -> dict[str, Any] | None:
@@ -311,27 +312,30 @@ def _advice(figures: Report, missing: list[str], solution: Solution) -> list[str
     advice = []
     if missing:
         advice.append(
-            f"photograph once more around {first_names(missing, 3)}: steps of half a metre, each picture sharing two "
-            "thirds with the one before, and some that show what stands next to the glass"
+            f"take more photographs around {first_names(missing, 3)}: in steps of half a metre, with two thirds "
+            f"overlap, and some that show what is next to the glass"
         )
     if len(figures.groups) > 1:
         advice.append(
-            f"the photographs fall into {len(figures.groups)} groups that share nothing "
-            f"({', '.join(map(str, figures.groups))} photographs): take some that connect them, or prepare each alone"
+            f"the photographs fall into {len(figures.groups)} groups without matches between them "
+            f"({', '.join(map(str, figures.groups))} photographs): take some that connect them, or prepare each "
+            "group separately"
         )
     if figures.features < FEW_FEATURES:
         advice.append(
-            f"photographs have only {figures.features} features on average: more light, a steadier hand, or a larger "
-            "--max-size"
+            f"photographs have only {figures.features} features on average: use more light, a steadier camera, "
+            f"or a larger --max-size"
         )
     if figures.points and figures.track_length < SHORT_TRACK:
-        advice.append("points are seen in few photographs: take more, with smaller steps")
+        advice.append("points are visible in few photographs: take more, in smaller steps")
     if figures.reprojection_error > LARGE_ERROR:
-        advice.append("points have large errors for a still scene: see that nothing large moves, or try --lens opencv")
+        advice.append(
+            "points have large errors for a static scene: make sure that nothing large moves, or try --lens opencv"
+        )
     model, (least, most) = solution.models[0] if solution.models else None, USUAL_FOCALS
     cameras = [] if model is None else model.cameras.values()
     if any(not least <= one.mean_focal_length() / max(one.width, one.height) <= most for one in cameras):
-        advice.append("a focal length is unusual, the lens was badly determined: photograph from different distances")
+        advice.append("a focal length is implausible: take photographs from different distances")
     return advice
 
 
@@ -414,7 +418,7 @@ def check_places(task: Preparation) -> None:
         raise InputError(f"{task.source} is a file; expected a folder of photographs, or a video ({known})")
     if output == source or source in output.parents:
         raise InputError(
-            f"the output {task.output} lies inside of the photographs' folder {task.source}; choose a folder next to it"
+            f"the output {task.output} is inside the photographs' folder {task.source}; choose a folder next to it"
         )
     if os.path.ismount(output):
         raise InputError(
@@ -440,7 +444,7 @@ def _check_enough(report: Report, task: Preparation) -> None:
     remedy = (
         "nothing was written"
         if kind is TooLittleShownError
-        else f"if that is enough, repeat with --resume --least-registered {int(100 * report.share) / 100:g}"
+        else f"to accept this, repeat with --resume --least-registered {int(100 * report.share) / 100:g}"
     )
     raise kind(
         f"{report.registered} of {report.photographs} photographs could be registered, expected at least "

@@ -46,9 +46,9 @@ USUAL = Features(most=4096, least_contrast=1 / 150)
 MANY = Features(most=12_000, least_contrast=1 / 600, guided=True)
 ATTEMPTS = (
     Attempt("the usual settings", USUAL, Mapping()),
-    Attempt("lower demands on what a photograph has to share with others", USUAL, Mapping(8, 20)),
-    Attempt("three times the features, weak ones too", MANY, Mapping()),
-    Attempt("many features and lower demands", MANY, Mapping(8, 20)),
+    Attempt("lower thresholds for matches between photographs", USUAL, Mapping(8, 20)),
+    Attempt("three times as many features, including weak ones", MANY, Mapping()),
+    Attempt("many features and lower thresholds", MANY, Mapping(8, 20)),
 )
 
 
@@ -149,9 +149,9 @@ def _check_texture(database: FeatureDatabase) -> None:
     poor = [one.path.name for one, count in zip(database.photographs, counts, strict=True) if count < FEWEST_FEATURES]
     if 2 * len(poor) > len(counts):
         raise TooLittleShownError(
-            f"{len(poor)} of {len(counts)} photographs show fewer than {FEWEST_FEATURES} places that could be "
-            f"recognised ({first_names(poor)}): they are blurred, dark or without texture. Photograph with more light, "
-            "hold still, and let things with texture be in the picture, such as the pane's surroundings"
+            f"{len(poor)} of {len(counts)} photographs have fewer than {FEWEST_FEATURES} features "
+            f"({first_names(poor)}): they are blurred, dark or without texture. Use more light, hold the camera still, "
+            "and include textured objects, such as the surroundings of the pane"
         )
 
 
@@ -170,7 +170,7 @@ def write_capture(solution: Solution, folder: Path, listen: Listener) -> None:
     images = image_numbers(model)
     for done, (number, image) in enumerate(sorted(images.items())):
         photograph = solution.database.photographs[number]
-        listen(Working("writing photographs without distortion", done, len(images)))
+        listen(Working("undistorting photographs", done, len(images)))
         pixels = undistort(read_photograph(photograph), lenses[image.camera_id])
         target = folder / "images" / photograph.name
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -180,7 +180,7 @@ def write_capture(solution: Solution, folder: Path, listen: Listener) -> None:
             height, width = pixels.shape[:2]
             write_image(mask, 255 * PixelMap(wide[image.camera_id], width, height).blank())
         image.name = photograph.name
-    listen(Working("taking the colours of points from the photographs", 0, len(images)))
+    listen(Working("colouring points from the photographs", 0, len(images)))
     model.extract_colors_for_all_images(folder / "images")
     sparse = folder / "sparse" / "0"
     sparse.mkdir(parents=True, exist_ok=True)

@@ -204,7 +204,7 @@ def _read_report(path: Path) -> dict[str, Any]:
         report = record.get("report") if isinstance(record, dict) else record
         return check_fields(report, REPORT, f"the report in {path}")
     except ValueError as error:
-        raise InputError(f"{error}; prepare the capture again to have a page about it") from error
+        raise InputError(f"{error}; prepare the capture again to get its report") from error
 
 
 def _page(report: Mapping[str, Any], dataset: Dataset, model: Any, planes: Planes | None, title: str) -> str:

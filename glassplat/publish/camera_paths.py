@@ -70,7 +70,7 @@ def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     from scipy.spatial.transform import Rotation, RotationSpline
 
     if len(cameras) < 2:
-        raise ValueError(f"{len(cameras)} cameras make no path; expected at least two")
+        raise ValueError(f"{len(cameras)} cameras do not make a path; expected at least two")
     knots = np.arange(len(cameras), dtype=np.float64)
     times = np.linspace(0, knots[-1], frames)
     poses = [camera.cam_from_world.double().cpu().numpy() for camera in cameras]

@@ -70,6 +70,6 @@ def clean_scene(scene: Scene, floaters: Floaters, cleaning: Cleaning) -> tuple[S
     found = floaters.masks(cleaning)
     kept = ~torch.stack(list(found.values())).any(dim=0)
     if not bool(kept.any()):
-        raise InputError(f"nothing would be left of {len(kept)} Gaussians; expected a larger box, or milder rules")
+        raise InputError(f"nothing would be left of {len(kept)} Gaussians; expected a larger box, or looser limits")
     primary = scene.primary.select(kept.to(scene.primary.means.device))
     return replace(scene, primary=primary), {rule: int(gone.sum()) for rule, gone in found.items()}

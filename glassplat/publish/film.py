@@ -42,7 +42,7 @@ def write_film(path: Path, pictures: Iterable[Picture], *, count: int, fps: int)
     stream = iter(pictures)
     first = next(stream, None)
     if first is None or path.suffix not in SUFFIXES:
-        raise ValueError(f"a film needs a picture and a name that ends in one of {', '.join(SUFFIXES)}")
+        raise ValueError(f"a video needs a frame and a name that ends in one of {', '.join(SUFFIXES)}")
     if path.suffix in ANIMATIONS:
         _write_animation(path, first, stream, _durations(path, count, fps))
     else:
@@ -57,10 +57,10 @@ def check_encoder(path: Path, fps: int) -> None:
         ValueError: the suffix is none of `SUFFIXES`, or a GIF cannot show so many pictures per second.
     """
     if path.suffix not in SUFFIXES:
-        raise ValueError(f"{path.name} is no name of a film; expected it to end in one of {', '.join(SUFFIXES)}")
+        raise ValueError(f"{path.name} is not a video name; expected one that ends in one of {', '.join(SUFFIXES)}")
     if path.suffix == ".gif" and fps > MOST_IN_GIF:
         raise ValueError(
-            f"a .gif shows at most {MOST_IN_GIF} pictures per second, not {fps}; lower --fps, or end the name in .webp"
+            f"a .gif shows at most {MOST_IN_GIF} frames per second, not {fps}; lower --fps, or end the name in .webp"
         )
     if path.suffix in CODECS:
         import cv2  # noqa: F401
@@ -141,7 +141,7 @@ def _write_video(path: Path, first: Picture, rest: Iterator[Picture], fps: int) 
         writer.release()
     # The encoder says nothing of a disk that is full.
     if _pictures_in(path) != count:
-        raise OSError(f"the film could not be written whole to {path}; is the disk full?")
+        raise OSError(f"the video could not be written completely to {path}; is the disk full?")
 
 
 def _pictures_in(path: Path) -> int:

@@ -178,8 +178,8 @@ RANKING_VIEWS, RANKING_WIDTH = 64, 480
 """Views by which Gaussians are ranked, and their width in pixels."""
 POSTER_WIDTH, POSTER_QUALITY = 640, 70
 LEAST_OPACITY = 1 / 255
-DESCRIPTION = "Look around, take the reflections off the glass, or turn it into a mirror."
-DESCRIPTIONS = ("Look around a scene of Gaussians.", "Look around, and take the reflections off what shines.")
+DESCRIPTION = "Look around, remove the reflections from the glass, or turn it into a mirror."
+DESCRIPTIONS = ("Look around a scene of Gaussians.", "Look around, and remove reflections from glossy objects.")
 """Of scenes without panes: matte ones, and those with glossy things."""
 PREVIEW = "preview.jpg"
 PREVIEW_WIDTH, PREVIEW_HEIGHT = 1200, 630

@@ -1,5 +1,5 @@
-"""`deferred`: glossy things under distant light (3D Gaussian Splatting with Deferred Reflection), and surfaces to
-shade.
+"""`deferred`: glossy objects under distant light (3D Gaussian Splatting with Deferred Reflection), and blended
+surfaces.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from glassplat.scene.camera import Camera
 from glassplat.scene.scene import FACES, Environment, Scene
 
 COLOR_MARGIN = 1e-3
-"""Colours are kept this far from 0 and 1, whose logits are infinite; eight bits do not tell the difference."""
+"""Margin of colours to 0 and 1, whose logits are infinite; invisible in 8 bits."""
 
 
 def equirect_from_environment(environment: Environment, height: int) -> Tensor:
-    """The environment as a panorama [H, 2H, 3] sRGB in (0, 1); each pixel is the mean of what it covers.
+    """The environment as a panorama [H, 2H, 3] sRGB in (0, 1); each pixel is an area mean.
 
     Differentiable in the environment.
 
     Args:
-        environment: not empty.
+        environment: a non-empty environment.
         height: rows of the panorama; 2 S shows every texel.
 
     Raises:
@@ -61,10 +61,10 @@ def equirect_from_environment(environment: Environment, height: int) -> Tensor:
 
 
 def environment_from_equirect(image: Tensor, size: int) -> Environment:
-    """The environment that a panorama shows; each texel is the mean of what it covers.
+    """The environment from a panorama; each texel is an area mean.
 
     Args:
-        image: [H, 2H, 3] sRGB in [0, 1]; values within `COLOR_MARGIN` of 0 and 1 are held there.
+        image: [H, 2H, 3] sRGB in [0, 1]; values are clamped to `COLOR_MARGIN` from 0 and 1.
         size: texels along the side of a face.
 
     Raises:
@@ -74,9 +74,7 @@ def environment_from_equirect(image: Tensor, size: int) -> Environment:
     if height < 1 or tuple(image.shape) != (height, 2 * height, 3):
         raise ValueError(f"the panorama has shape {tuple(image.shape)}; expected (H, 2 H, 3)")
     if not image.is_floating_point() or not bool(torch.isfinite(image).all()):
-        raise ValueError(
-            "the panorama holds values that are not finite floating-point numbers; expected sRGB in [0, 1]"
-        )
+        raise ValueError("the panorama contains non-finite values floating-point numbers; expected sRGB in [0, 1]")
     if size < 1:
         raise ValueError(f"the environment's size is {size}; expected at least 1 texel along a face")
     samples = max(1, math.ceil(height / (2 * size)))
@@ -86,7 +84,7 @@ def environment_from_equirect(image: Tensor, size: int) -> Environment:
 
 
 def resize_environment(environment: Environment, size: int) -> Environment:
-    """The environment with another number of texels; raw values are interpolated between texel centres."""
+    """The environment at another resolution; raw values are interpolated between texel centres."""
     _check_lit(environment)
     return replace(environment, raw=cube_lookup(environment.raw, texel_directions(size).to(environment.raw)))
 
@@ -117,9 +115,9 @@ def _check_lit(environment: Environment) -> None:
 
 
 def _looked_up(image: Tensor, directions: Tensor) -> Tensor:
-    """The panorama in directions [..., 3], by a bilinear filter that goes on across its ends and poles."""
+    """The panorama in directions [..., 3], with bilinear interpolation across its ends and poles."""
     height, width = image.shape[:2]
-    # Beyond a pole the meridian on the other side begins.
+    # Beyond a pole, the opposite meridian follows.
     rows = torch.cat([image[:1].roll(height, dims=1), image, image[-1:].roll(height, dims=1)])
     padded = torch.cat([rows[:, -1:], rows, rows[:, :1]], dim=1)
     x, y, z = directions.unbind(-1)
@@ -134,9 +132,10 @@ CELLS_ACROSS = 32
 """Cells along the longer side of an image; depths and normals are averaged over cells before they are compared."""
 LEAST_COVERAGE = 0.5
 LEAST_ACROSS = 3
-"""Cells along the shorter side, where it has so many pixels: a normal takes a cell and its neighbours."""
+"""Minimum number of cells along the shorter side, if there are enough pixels: a normal needs a cell and its
+neighbours."""
 STEEPEST = 0.15
-"""Largest change of depth between neighbouring cells, as a share of the depth, that is a slope and not an edge."""
+"""Maximum change of depth between neighbouring cells, as a share of the depth, on one surface."""
 
 
 def cell_side(camera: Camera) -> int:
@@ -146,12 +145,12 @@ def cell_side(camera: Camera) -> int:
 
 
 def depth_normals(depth: Tensor, alpha: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Normals [h, w, 3] of a depth map's cells, world axes, facing the camera; and [h, w] 1 where they count, else 0.
+    """Normals [h, w, 3] of a depth map's cells, world axes, facing the camera; and their validity [h, w], 1 or 0.
 
     Args:
         depth: [H, W] along the optical axis.
         alpha: [H, W] coverage.
-        camera: whose pixels they are.
+        camera: camera of the depth map.
     """
     side = cell_side(camera)
     covered = (alpha > LEAST_COVERAGE).to(depth.dtype)
@@ -186,15 +185,15 @@ class Surface:
 
     Attributes:
         image: [H, W, D] blended channels, as `shade_environment` reads them.
-        color: [H, W, 3] blended colour without reflection, without what lies behind it.
-        normal: [H, W, 3] blended normal, world axes, turned to the camera, not normalised.
-        strength: [H, W] share of the reflection.
-        depth: [H, W] mean camera z, 0 where nothing is; empty if it was not asked for.
+        color: [H, W, 3] blended colour without reflection and background.
+        normal: [H, W, 3] blended normal, world axes, facing the camera, not normalised.
+        strength: [H, W] reflection strength.
+        depth: [H, W] mean camera z, 0 where empty; no elements if not requested.
         alpha: [H, W] coverage.
-        background: colour behind everything, sRGB.
-        direct: [N] bool, which Gaussians reach a pixel.
-        screen: the record of the pass, if asked for `with_absgrad`.
-        extra: further layers, of discs those that say how thin the surface is.
+        background: background colour, sRGB.
+        direct: [N] bool, visible Gaussians.
+        screen: record of the pass, if requested by `with_absgrad`.
+        extra: further layers; for discs, those of the surface's thickness.
     """
 
     image: Tensor
@@ -210,11 +209,11 @@ class Surface:
 
     @cached_property
     def base(self) -> Tensor:
-        """[H, W, 3] colour without reflection, over the background; `shade_environment` gives it as well."""
+        """[H, W, 3] colour without reflection, over the background, as `shade_environment` returns it."""
         return over_background(self.color, self.alpha, self.background)
 
     def layers(self, base: Tensor) -> dict[str, Tensor]:
-        """The layers of a frame, with the colour without reflection [H, W, 3] from where it is at hand."""
+        """The layers of a frame, given the colour without reflection [H, W, 3]."""
         return {
             **self.extra,
             "base": base,
@@ -233,10 +232,8 @@ def seen_surface(
     depth: bool = True,
     with_absgrad: bool = False,
 ) -> Surface:
-    """Blends the surfaces of the primary Gaussians, which have a `logit_strength`.
-
-    Depths of ellipsoids are those of their centres, and without `depth` there are none, which saves a channel; those of
-    discs are where rays meet them.
+    """Blends the surfaces of the primary Gaussians, which have a `logit_strength`. Depths of ellipsoids are those of
+    their centres, and are omitted without `depth`, which saves a channel; those of discs are at ray intersections.
     """
     near = NEAR_PER_EXTENT * scene.extent
     extra: dict[str, Tensor] = {}
@@ -257,7 +254,7 @@ def seen_surface(
         channels = ellipsoid_channels(scene.primary, projected, camera, depths)
         result = blended_ellipsoids(projected, channels[None], camera, screen=screen)
         image, alpha = result.image[0], result.alpha[0]
-        # Split at once: a slice has a gradient as large as the image.
+        # Split in one operation, because slices have gradients as large as the image.
         color, normal, strength, *last = image.split((3, 3, 1, 1) if depth else (3, 3, 1), dim=2)
         distance = mean_depth(last[0].squeeze(2), alpha) if depth else alpha.new_zeros(0)
         direct = reaches_pixel(projected)
@@ -276,7 +273,7 @@ def seen_surface(
 
 
 def reflected_rays(surface: Surface, camera: Camera, chosen: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-    """Places [R, 3] of the surface at pixels (rows and columns [R]), and unit vectors [R, 3] mirrored there (Eq. 4).
+    """Positions [R, 3] of the surface at pixels (rows and columns [R]), and reflected unit directions [R, 3] (Eq. 4).
 
     Blended positions need no channels: with d the ray of a pixel whose camera z is 1, x = o + D d, D the blended depth.
     """
@@ -298,7 +295,7 @@ def shaded_pixels(
     background: tuple[float, float, float],
     least_strength: float,
 ) -> Shaded:
-    """Blended surfaces [H, W, D] with coverage [H, W], and what they mirror of the scene's environment."""
+    """Shades blended surfaces [H, W, D] with coverage [H, W] by the scene's environment."""
     return shade_environment(
         image,
         alpha,
@@ -317,12 +314,12 @@ def view_directions(camera: Camera) -> Tensor:
 
 
 def page_settings(background: tuple[float, float, float], mirrored: str) -> dict[str, Any]:
-    """Settings with which the web page shades surfaces; `mirrored` says whether what they mirror is distant or near."""
+    """Settings of the web page for surfaces; `mirrored` is the kind of surroundings, distant or near."""
     return {"background": background, "fresnel": "none", "blend": "srgb", "intensity": False, "mirrored": mirrored}
 
 
 INVISIBLE = 1 / 512
-"""A pixel that reflects less changes by at most half a step of eight bits, from black to white."""
+"""Weaker reflections change a pixel by at most half a step of 8 bits."""
 
 
 @dataclass(frozen=True)
@@ -332,18 +329,18 @@ class Deferred(OverBackground):
         C, N, R = sum_i (c_i, n_i, r_i) alpha_i T_i                   (Eqs. 1 and 2)
         C' = (1 - R) C + R E(2 (v . n) n - v),  n = N / |N|           (Eq. 3)
 
-    n_i is the shortest axis of a Gaussian, turned to the camera, v the direction to the camera, E the environment.
+    n_i is the shortest axis of a Gaussian, facing the camera, v the direction to the camera, E the environment.
     Colours are sRGB, as in the paper.
 
     Layers: `base` C, `reflection` E, `normal` N in world axes, blended and not normalised [H, W, 3]; `strength` R,
-    `alpha`, `depth` [H, W]; `environment` [H, W, 3], what surrounds the scene behind each pixel, if asked for.
+    `alpha`, `depth` [H, W]; `environment` [H, W, 3], the environment behind each pixel, if requested.
 
     Attributes:
-        background: colour behind everything, sRGB.
+        background: background colour, sRGB.
         depth: also render the depth layer.
         environment: also render the layer `environment`.
-        least_strength: pixels that reflect less are not shaded, and their `reflection` is 0. Not for training, where a
-            strength learns from what it would reflect.
+        least_strength: pixels below it are not shaded, and their `reflection` is 0. Not for training, where strengths
+            need the gradient of potential reflections.
     """
 
     depth: bool = True
@@ -351,10 +348,10 @@ class Deferred(OverBackground):
     least_strength: float = 0.0
 
     def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
-        """Renders `scene` from `camera`, where the scene's tensors are.
+        """Renders `scene` from `camera`, on the scene's device.
 
         Raises:
-            ValueError: the scene has no environment, or its Gaussians no reflection strength.
+            ValueError: the scene has no environment, or its Gaussians have no reflection strength.
         """
         check_reflective(scene)
         camera = camera.to(scene.primary.means.device)
@@ -366,34 +363,34 @@ class Deferred(OverBackground):
         return Frame(shaded.rgb, layers, direct=surface.direct, screen=surface.screen)
 
     def check(self, scene: Scene) -> None:
-        """Raises ValueError where a scene lacks colours, or what reflection needs."""
+        """Raises ValueError if a scene lacks colours, or tensors for reflection."""
         check_colored(scene.primary)
         check_ellipsoids(scene.primary)
         check_reflective(scene)
 
     def layers(self, scene: Scene) -> tuple[str, ...]:
-        """Names of the layers that are worth looking at."""
+        """Names of the layers for display."""
         return ("rgb", "base", "reflection", "strength", "normal", "environment", "depth", "alpha")
 
     def with_layers(self, layers: Sequence[str]) -> Deferred:
-        """The renderer, also of `depth` and `environment` where they are among the layers."""
+        """The renderer with `depth` and `environment` enabled if they are among the layers."""
         environment = self.environment or "environment" in layers
         return replace(self, depth=self.depth or "depth" in layers, environment=environment)
 
     def page_settings(self) -> Mapping[str, Any]:
-        """Settings for the web page, which shades pixels and looks up distant light."""
+        """Settings of the web page: shading with distant light."""
         return page_settings(self.background, "distant")
 
 
 def check_reflective(scene: Scene) -> None:
-    """Raises ValueError where a scene lacks what reflection needs."""
+    """Raises ValueError if a scene lacks tensors for reflection."""
     if scene.environment.is_empty:
         raise ValueError("the scene has no environment; expected one trained with `deferred`")
     check_strengths(scene, "deferred")
 
 
 def check_strengths(scene: Scene, method: str) -> None:
-    """Raises ValueError where nothing mirrors, or what is mirrored from afar cannot be drawn."""
+    """Raises ValueError without reflection strengths, or if the environment cannot be drawn."""
     if "logit_strength" not in scene.primary.channels:
         raise ValueError(
             f"the Gaussians have the channels {sorted(scene.primary.channels)}; expected logit_strength, as "

@@ -1,4 +1,4 @@
-"""Frames, the result of every renderer, and the steps that rasterising renderers share."""
+"""Frames, the results of renderers, and steps shared by rasterising renderers."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from glassplat.scene.scene import Scene
 class ScreenPass:
     """Screen positions of the Gaussians of one scene part, in one rasterisation pass.
 
-    The gradients of a loss with respect to `means2d` and `absgrad` are the statistics that densification collects;
-    ask for them with `torch.autograd.grad`.
+    The gradients of a loss with respect to `means2d` and `absgrad`, by `torch.autograd.grad`, are the statistics for
+    densification.
 
     Attributes:
         part: name of the scene part, as in `Scene.gaussian_sets`.
         means2d: [C, N, 2] projected centres, pixels; part of the autograd graph.
         absgrad: [C, N, 2] given to `composite`; its gradient is the absolute gradient of the centres (AbsGS).
         radii: [C, N, 2] half extents in pixels; 0 where not visible.
-        weight: how much of what is drawn there is left in the image, of the whole pass or [C, N] of each Gaussian: 1
-            but for what is seen in or through a pane.
-        direct: whether it shows the Gaussians themselves, and not their mirror images.
+        weight: share of the drawn light that is left in the image, of the whole pass or [C, N] of each Gaussian: 1,
+            except in and behind panes.
+        direct: true for the Gaussians themselves, false for their mirror images.
     """
 
     part: str
@@ -47,11 +47,11 @@ class ScreenPass:
 
 @dataclass(frozen=True)
 class SpacePass:
-    """The record of one scene part whose Gaussians rays meet in space, where there is no screen; for densification.
+    """The record of a ray-traced scene part, which has no screen positions, for densification.
 
     Attributes:
         part: name of the scene part, as in `Scene.gaussian_sets`.
-        contributions: [N, 2] given to `trace`; its gradient tells how far away Gaussians were met.
+        contributions: [N, 2] given to `trace`; its gradient holds the weights and distances of Gaussians along rays.
     """
 
     part: str
@@ -65,10 +65,10 @@ class Frame:
     Attributes:
         rgb: [H, W, 3] the image, sRGB, not clamped.
         layers: further images by name, [H, W] or [H, W, 3]; a renderer's docstring lists its own.
-        direct: [N] bool, which primary Gaussians reach a pixel themselves; None where the renderer does not say.
-        mirrored: [N] bool, which ones reach a pixel as mirror images; None where nothing is mirrored.
-        screen: one record per rasterised part and pass, if asked for `with_absgrad`.
-        space: one record per traced part, if asked for `with_absgrad`.
+        direct: [N] bool, primary Gaussians that are visible directly; None if unknown.
+        mirrored: [N] bool, those visible as mirror images; None without reflections.
+        screen: one record per rasterised part and pass, if requested by `with_absgrad`.
+        space: one record per traced part, if requested by `with_absgrad`.
     """
 
     rgb: Tensor
@@ -84,39 +84,39 @@ class Frame:
 
     @property
     def photographed(self) -> Tensor:
-        """[H, W, 3] what a photograph shows: the image, with the photographer where panes show one and it was asked."""
+        """[H, W, 3] the image as photographed: with the photographer in panes, if rendered."""
         return self.layers.get("photographed", self.rgb)
 
     @property
     def visible(self) -> Tensor | None:
-        """[N] bool, which primary Gaussians reach a pixel in either way; None where the renderer does not say."""
+        """[N] bool, primary Gaussians visible directly or mirrored; None if unknown."""
         return self.direct if self.direct is None or self.mirrored is None else self.direct | self.mirrored
 
 
 class Renderer(Protocol):
-    """Anything that turns a scene and a camera into a frame."""
+    """A function from a scene and a camera to a frame."""
 
     def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
         """Renders `scene` from `camera`; differentiable in every tensor of the scene.
 
         Args:
-            scene: what is there.
-            camera: from where it is seen.
-            with_absgrad: also prepare all records of densification, `Frame.screen` and `Frame.space`, not absolute
-                gradients alone; the backward pass is slower.
+            scene: the scene.
+            camera: the camera.
+            with_absgrad: also prepare the records of densification, `Frame.screen` and `Frame.space`; slows down the
+                backward pass.
         """
         ...
 
     def check(self, scene: Scene) -> None:
-        """Looks whether a scene that was read from files has all that this draws.
+        """Checks that a scene has everything that the renderer needs.
 
         Raises:
-            ValueError: it lacks something; says what.
+            ValueError: something is missing; the message names it.
         """
         ...
 
     def layers(self, scene: Scene) -> tuple[str, ...]:
-        """Names of the layers of a scene that are worth looking at, `rgb` the first; frames hold more for losses."""
+        """Names of the layers of a scene for display, starting with `rgb`; frames have more for losses."""
         ...
 
     def with_layers(self, layers: Sequence[str]) -> Renderer:
@@ -124,16 +124,16 @@ class Renderer(Protocol):
         ...
 
     def page_settings(self) -> Mapping[str, Any]:
-        """Settings with which the web page draws the same."""
+        """Settings with which the web page renders the same."""
         ...
 
 
 @dataclass(frozen=True)
 class OverBackground:
-    """The colour behind everything, which all renderers draw over.
+    """Base class of renderers, with the background.
 
     Attributes:
-        background: colour behind everything, sRGB.
+        background: background colour, sRGB.
     """
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -144,14 +144,14 @@ class OverBackground:
 
 
 MEDIAN_DEPTH = "median_depth"
-"""A layer that any renderer has of discs."""
+"""Layer that all renderers have for discs."""
 
 
 def check_layers(renderer: Renderer, scene: Scene, layers: Sequence[str], method: str) -> None:
-    """Refuses layers that a method does not render of a scene, before anything is rendered.
+    """Refuses unknown layers before anything is rendered.
 
     Raises:
-        InputError: there are such, or none is asked for.
+        InputError: a layer is unknown, or no layers are given.
     """
     known = renderer.layers(scene)
     foreign = [layer for layer in layers if layer not in known]
@@ -183,20 +183,20 @@ def project_gaussians(
         near: depth below which a Gaussian is culled, world units.
         poses: [C, 4, 4] `cam_from_world` of the cameras; may be left-handed.
         clip_planes: [C, 4] world planes (n, d); a Gaussian whose centre has n . x + d <= 0 is culled.
-        windows: [C, 4] left, top, right and bottom edge of the part of each image that is wanted, pixels.
-        total: the same for all projections of one set whose gradients are to be added up; see `project`.
+        windows: [C, 4] left, top, right and bottom edge of the required part of each image, pixels.
+        total: shared by all projections of one set whose gradients are summed; see `project`.
     """
     cameras = camera_batch(camera, poses)._replace(clip_planes=clip_planes, windows=windows)
     return project(raw_gaussians(gaussians), cameras, sh_degree=gaussians.active_sh_degree, near=near, total=total)
 
 
 def raw_gaussians(gaussians: Gaussians) -> RawGaussians:
-    """The tensors of a set as the kernels take them."""
+    """The tensors of a set in the form of the kernels."""
     return RawGaussians(gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities, gaussians.sh)
 
 
 def camera_batch(camera: Camera, poses: Tensor | None = None) -> CameraBatch:
-    """One camera as the kernels take it, or several of its intrinsics at the `poses` [C, 4, 4]."""
+    """A camera in the form of the kernels, or several with its intrinsics at the `poses` [C, 4, 4]."""
     poses = camera.cam_from_world[None] if poses is None else poses
     intrinsics = camera.shared_intrinsics.expand(poses.shape[0], 4).contiguous()
     return CameraBatch(poses, intrinsics, camera.width, camera.height)
@@ -212,19 +212,19 @@ def joined_splats(*parts: Projected) -> Splats:
 
 
 def reaches_pixel(projected: Projected | ProjectedDiscs) -> Tensor:
-    """[N] bool: which Gaussians reach a pixel of some of the cameras."""
+    """[N] bool: Gaussians visible in any of the cameras."""
     reached = projected.radii[..., 0] > 0
     return reached[0] if len(reached) == 1 else reached.any(dim=0)
 
 
 def screen_pass(part: str, projected: Projected | ProjectedDiscs, *, direct: bool = True) -> ScreenPass:
-    """The record of a projected scene part, with an `absgrad` that asks for a gradient."""
+    """The record of a projected scene part, with an `absgrad` that requires a gradient."""
     absgrad = torch.zeros_like(projected.means2d).requires_grad_()
     return ScreenPass(part, projected.means2d, absgrad, projected.radii, direct=direct)
 
 
 def joined_absgrad(screen: Sequence[ScreenPass]) -> Tensor | None:
-    """The `absgrad` [C, G, 2] that `composite` wants for the parts in this order; None without records."""
+    """The `absgrad` [C, G, 2] for `composite`, for parts in this order; None without records."""
     absgrads = [record.absgrad for record in screen]
     return torch.cat(absgrads, dim=1) if len(absgrads) > 1 else next(iter(absgrads), None)
 
@@ -238,7 +238,7 @@ def over_background(image: Tensor, alpha: Tensor, background: tuple[float, ...])
 
 
 class _OverBackground(torch.autograd.Function):
-    """One node: PyTorch's own four would go through an image for each."""
+    """One autograd node instead of four, each of which would traverse the image."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
@@ -253,29 +253,29 @@ class _OverBackground(torch.autograd.Function):
 
 
 def check_ellipsoids(gaussians: Gaussians) -> None:
-    """Raises ValueError where a set that is splatted as ellipsoids holds discs."""
+    """Raises ValueError if a set to be splatted as ellipsoids has discs."""
     if gaussians.are_discs:
         raise ValueError("the Gaussians are discs, with two scales; expected three scales, as this method trains them")
 
 
 def check_colored(gaussians: Gaussians) -> None:
-    """Raises ValueError where a set that is seen has no colours."""
+    """Raises ValueError if a visible set has no colours."""
     if gaussians.max_sh_degree < 0:
         raise ValueError("the Gaussians have no colours; expected f_dc_0 to f_dc_2, as every trained splat has them")
 
 
 _sound: WeakIdKeyDictionary = WeakIdKeyDictionary()
-"""Tensors that `check_numbers` has found right: the version of their values, and the largest one that was allowed."""
+"""Tensors that passed `check_numbers`: the version of their values, and the allowed maximum."""
 
 
 def check_numbers(values: Mapping[str, Tensor], most: float = math.inf) -> None:
-    """Refuses values that would leave pixels without a number; those of Gaussians' shapes are culled one by one.
+    """Refuses values that would give NaN pixels; invalid shapes of Gaussians are culled individually.
 
-    Values that ask for a gradient are not looked at: a training ends with the loss that is not finite, and its view.
-    Others are looked at once until they change, as each look makes the processor wait for the GPU.
+    Tensors that require gradients are not checked: training stops at a non-finite loss instead. Others are checked
+    once until they change, because each check synchronises with the GPU.
 
     Raises:
-        ValueError: a value is NaN or infinite, or above `most`; names the tensor.
+        ValueError: a value is NaN, infinite or above `most`; the message names the tensor.
     """
     for name, tensor in values.items():
         mark = None if tensor.is_inference() else (tensor._version, most)

@@ -1,4 +1,4 @@
-"""Layers as pictures in false colours, sums over windows, and what each Gaussian adds to a view."""
+"""Layers as images in false colours, sums over windows, and contributions of Gaussians to a view."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ LABEL_COLORS = (
     (160, 160, 160),
 )
 ERROR_SCALE = 0.2
-"""The colour error that is drawn brightest; the same everywhere, so that pictures can be compared."""
+"""Colour error drawn brightest; fixed, so that images can be compared."""
 COVERED = 0.5
-"""Below this coverage a pixel has no depth worth showing."""
+"""Minimum coverage for the display of depth."""
 
 
 def heat_colors(values: Tensor) -> Tensor:
-    """Colours [..., 3] in [0, 1] of values [...]; 0 is black, 1 pale yellow, what lies outside is clamped."""
+    """Colours [..., 3] in [0, 1] of values [...]: 0 is black, 1 pale yellow; values are clamped."""
     stops = torch.tensor(HEAT_STOPS, dtype=torch.float32, device=values.device) / 255
     position = values.to(torch.float32).nan_to_num(0.0).clamp(0, 1) * (len(HEAT_STOPS) - 1)
     lower = position.floor().clamp(max=len(HEAT_STOPS) - 2).long()
@@ -57,19 +57,21 @@ def heat_colors(values: Tensor) -> Tensor:
 
 
 def error_colors(image: Tensor, photo: Tensor) -> Tensor:
-    """Colours [H, W, 3] in [0, 1] of how far an image [H, W, 3] is from a photograph [H, W, 3] of 0 to 255, by mean."""
+    """Colours [H, W, 3] in [0, 1] of the mean absolute error between an image [H, W, 3] and a photograph [H, W, 3], 0
+    to 255.
+    """
     error = (image.clamp(0, 1) - photo.to(image) / 255).abs().mean(dim=-1)
     return heat_colors(error / ERROR_SCALE)
 
 
 def depth_colors(depth: Tensor, alpha: Tensor | None = None) -> Tensor:
-    """Colours [H, W, 3] in [0, 1] of a depth map [H, W]: near is bright, what is not covered is black.
+    """Colours [H, W, 3] in [0, 1] of a depth map [H, W]: near is bright, empty is black.
 
     Colour is even in inverse depth between its 2nd and 98th percentile in this image.
 
     Args:
         depth: camera z, world units; 0 or less is no depth.
-        alpha: [H, W] coverage; None takes every pixel with a depth.
+        alpha: [H, W] coverage; None uses every pixel with a depth.
     """
     shown = torch.isfinite(depth) & (depth > 0)
     if alpha is not None:
@@ -77,19 +79,19 @@ def depth_colors(depth: Tensor, alpha: Tensor | None = None) -> Tensor:
     if not bool(shown.any()):
         return torch.zeros(*depth.shape, 3, device=depth.device, dtype=torch.float32)
     inverse = torch.where(shown, 1 / torch.where(shown, depth, torch.ones_like(depth)), torch.zeros_like(depth))
-    # Every n-th pixel is enough for percentiles, and `quantile` takes no more than 16 million.
+    # Every n-th pixel suffices for percentiles, and `quantile` is limited to 16 million values.
     sample = inverse[shown]
     low, high = torch.quantile(
         sample[:: max(1, len(sample) // 100_000)].double(), sample.new_tensor([0.02, 0.98]).double()
     )
     span = (high - low).clamp(min=1e-12 + 1e-6 * high)
-    # The dark end is kept for what has no depth.
+    # The dark end is reserved for pixels without depth.
     brightness = 0.08 + 0.92 * ((inverse - low) / span).clamp(0, 1)
     return heat_colors(brightness) * shown[..., None]
 
 
 def normal_colors(normals: Tensor) -> Tensor:
-    """Colours [..., 3] in [0, 1] of normals [..., 3]: (n + 1) / 2, so that what has none is grey."""
+    """Colours [..., 3] in [0, 1] of normals [..., 3]: (n + 1) / 2; zero is grey."""
     return (0.5 * normals.nan_to_num(0.0) + 0.5).clamp(0, 1)
 
 
@@ -103,7 +105,7 @@ def label_colors(labels: Tensor) -> Tensor:
 def layer_image(frame: Frame, layer: str) -> Tensor:
     """A layer as an image [H, W] or [H, W, 3] in [0, 1]; depth is colour-mapped (near bright), normals (n + 1) / 2.
 
-    What panes reflect ends where they do: whole tiles of it are rendered.
+    Reflections are masked by their panes, because whole tiles are rendered.
     """
     if layer in ("rgb", "photographed"):
         image: Tensor = getattr(frame, layer)
@@ -119,18 +121,18 @@ def layer_image(frame: Frame, layer: str) -> Tensor:
 
 
 def contributions(scene: Scene, camera: Camera) -> Tensor:
-    """[N] how many pixels' worth each primary Gaussian adds to a view: the sum of its blending weights alpha_i T_i.
+    """[N] contribution of each primary Gaussian to a view, in pixels: the sum of its blending weights alpha_i T_i.
 
-    That is in the direct image or in those that the panes mirror, wherever it is most; a mirrored pixel counts as much
-    as a direct one, however weak the reflection. After RadSplat (arXiv 2403.13806), which takes the largest weight
-    instead of their sum: what covers a hundredth of a pixel is superfluous however opaque it is there.
+    It is the maximum over the direct image and those in panes; mirrored pixels count fully, however weak the
+    reflection. After RadSplat (arXiv 2403.13806), which uses the largest weight instead of the sum: a Gaussian that
+    covers a hundredth of a pixel is superfluous, however opaque.
 
     Args:
         scene: with or without panes.
-        camera: of the view.
+        camera: camera of the view.
     """
     camera = camera.to(scene.primary.means.device)
-    # Colours do not matter here.
+    # Colours are not needed.
     primary, near = replace(detach_gaussians(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
     if primary.are_discs:
         return _disc_sums(primary, camera, near, primary.means.new_ones(camera.height, camera.width, 1))[:, 0]
@@ -143,7 +145,7 @@ def contributions(scene: Scene, camera: Camera) -> Tensor:
 
 
 def gather_pixels(scene: Scene, camera: Camera, values: Tensor) -> Tensor:
-    """[N, D] an image [H, W, D] summed over the pixels of each primary Gaussian, by its blending weights."""
+    """[N, D] an image [H, W, D] summed over the pixels of each primary Gaussian, with its blending weights."""
     camera = camera.to(scene.primary.means.device)
     primary, near = replace(detach_gaussians(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
     if primary.are_discs:
@@ -152,7 +154,7 @@ def gather_pixels(scene: Scene, camera: Camera, values: Tensor) -> Tensor:
 
 
 def gathered_mirrored(scene: Scene, camera: Camera, values: Tensor) -> Tensor:
-    """[N, D] the same, by the weights in what the nearest pane of each pixel mirrors."""
+    """[N, D] the same, with the weights in the reflection of each pixel's nearest pane."""
     camera = camera.to(scene.primary.means.device)
     primary, near = replace(detach_gaussians(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
     seen = seen_panes(scene.planes, camera, nearest_hits(panes_in_camera(scene.planes, camera), camera), most=1)
@@ -170,7 +172,7 @@ def _weight_sums(projected: Projected, camera: Camera, tiles: Tensor | None = No
 
 
 def _sums(projected: Projected, camera: Camera, values: Tensor, tiles: Tensor | None = None) -> Tensor:
-    """[C, N, D] what a constant channel has for a gradient where `values` are those of the images.
+    """[C, N, D] gradient of a constant channel if `values` are the gradients of the images.
 
     They are [C, H, W, D], or [H, W, D] for all images.
     """
@@ -183,7 +185,7 @@ def _sums(projected: Projected, camera: Camera, values: Tensor, tiles: Tensor | 
 
 
 def _disc_sums(discs: Gaussians, camera: Camera, near: float, values: Tensor) -> Tensor:
-    """[N, D] as `_sums`, of discs and one camera."""
+    """[N, D] as `_sums`, for discs and one camera."""
     projected = projected_discs(discs, camera, near=near)
     with torch.enable_grad():
         ones = projected.depths.new_ones(*projected.depths.shape, values.shape[-1]).requires_grad_()
@@ -193,7 +195,7 @@ def _disc_sums(discs: Gaussians, camera: Camera, near: float, values: Tensor) ->
 
 
 def window_means(image: Tensor, region: Tensor, reach: int) -> Tensor:
-    """[H, W, D] float64 means over that part of a window, as of `window_sums`, which lies in a region [H, W]."""
+    """[H, W, D] float64 means over the part of each window (see `window_sums`) inside a region [H, W]."""
     inside = region.to(image.dtype)[..., None]
     sums = window_sums(torch.cat([image * inside, inside], dim=-1), reach)
     return sums[..., :-1] / sums[..., -1:].clamp(min=1)
@@ -202,7 +204,7 @@ def window_means(image: Tensor, region: Tensor, reach: int) -> Tensor:
 def window_sums(image: Tensor, reach: int) -> Tensor:
     """[H, W, D] float64 sums over the square of pixels up to `reach` away, cut off at the image's border.
 
-    Differences of running sums, one axis after the other: as much work for a window of any size.
+    Differences of running sums along each axis, so that the cost does not depend on the window.
     """
     sums = image.double()
     for axis in (0, 1):

@@ -1,4 +1,4 @@
-"""Panes in a view: which it shows, what they mirror, and how they are laid before an image."""
+"""Panes in a view: visibility, mirrored images, and compositing over an image."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from glassplat.scene.scene import Scene
 
 @dataclass(frozen=True)
 class SeenPanes:
-    """The panes that a view shows; only the nearest on each ray, or several that are seen through one another.
+    """The panes visible in a view: the nearest on each ray, or several behind each other.
 
     Attributes:
-        planes: the K panes that some tile shows.
+        planes: the K visible panes.
         rows: [K] their positions among the scene's planes.
-        order: L tensors [H, W] int32, L >= 1: the panes that each pixel's ray meets, nearest first, as positions in
-            `planes`; -1 where there is none left.
-        tiles: [K, rows, columns] bool, tiles in which a pixel shows the pane, in front or through others.
-        windows: [K, 4] left, top, right and bottom edge, in pixels, of the pixels that show it.
+        order: L tensors [H, W] int32, L >= 1: the panes on each pixel's ray, nearest first, as positions in `planes`;
+            -1 for none.
+        tiles: [K, rows, columns] bool, tiles with pixels of the pane, in front or through others.
+        windows: [K, 4] left, top, right and bottom edge, in pixels, of its bounding box.
         views: the camera mirrored about each of `planes`.
     """
 
@@ -49,7 +49,7 @@ class SeenPanes:
 
 
 def panes_in_camera(planes: Planes, camera: Camera) -> Panes:
-    """The rectangles in the camera frame; no gradient."""
+    """The rectangles in the camera frame, without gradients."""
     pose = camera.cam_from_world
     if waits(pose.device):
         given = planes.centers, planes.raw_normals, planes.tangents, planes.half_sizes
@@ -78,11 +78,11 @@ def seen_panes(
     a pixel that shows C through A `order` has 0 first and 1 next; where there is A alone it has 0 first and -1 next.
 
     Args:
-        planes: the scene's.
-        camera: of the view.
-        first: `nearest_hits` of these.
+        planes: planes of the scene.
+        camera: camera of the view.
+        first: result of `nearest_hits` for these.
         mask: [H, W] as given to `nearest_hits`.
-        most: how many of them on one ray, the nearest ones; all if None.
+        most: maximum number per ray, nearest first; all if None.
     """
     hits, seen = [first], _visible_panes(first)
     if not any(seen):
@@ -100,7 +100,7 @@ def seen_panes(
     rows = constant(positions, torch.int64, tiles.device)
     if len(positions) == len(planes):
         return SeenPanes(planes, rows, tuple(h.pane for h in hits), tiles, windows, mirrored_views(planes, camera))
-    # The last entry is for index -1, pixels without a pane.
+    # The last entry is for index -1: pixels without a pane.
     found = (*(positions.index(k) if is_seen else -1 for k, is_seen in enumerate(seen)), -1)
     position = constant(found, torch.int32, tiles.device)
     order = tuple(position[h.pane.long()] for h in hits)
@@ -109,13 +109,13 @@ def seen_panes(
 
 
 def _visible_panes(hits: PaneHits) -> list[bool]:
-    """Panes that some tile shows. The one thing that the program asks of a GPU here, and waits for."""
+    """Visible panes. The only synchronisation with a GPU here."""
     found: list[bool] = hits.tiles.flatten(1).any(dim=1).tolist()
     return found
 
 
 def _joined_windows(hits: list[PaneHits]) -> Tensor:
-    """[K, 4] the smallest windows around those of all hits; an empty window is all 0."""
+    """[K, 4] bounding boxes of the windows of all hits; zeros if empty."""
     windows = torch.stack([h.windows for h in hits])
     empty = (windows[..., 2] == 0)[..., None]
     first = torch.where(empty, torch.inf, windows[..., :2]).amin(dim=0)
@@ -130,10 +130,10 @@ def project_mirrored(
 
     Args:
         gaussians: the set to project.
-        camera: whose mirror images are wanted.
-        seen: the planes that it sees, and where; what lies outside of a plane's window is culled.
+        camera: the camera to mirror.
+        seen: visible planes; Gaussians outside a plane's window are culled.
         near: depth below which a Gaussian is culled, world units.
-        total: as for `project_gaussians`.
+        total: see `project_gaussians`.
     """
     return project_gaussians(
         gaussians,
@@ -147,15 +147,15 @@ def project_mirrored(
 
 
 def project_photographer(scene: Scene, camera: Camera, seen: SeenPanes, *, near: float) -> Projected:
-    """Projects the photographer's mirror images: what `project_mirrored` does, of Gaussians that the camera carries.
+    """Projects the photographer's mirror images, like `project_mirrored`, for Gaussians in the photographer's frame.
 
-    Mirrored about plane k, the camera sees them at `cam_from_world @ M_k @ world_from_photographer`; all else, also
-    the depths by which they are sorted into the room, follows from that pose.
+    Mirrored about plane k, the camera has the pose `cam_from_world @ M_k @ world_from_photographer`, which also
+    defines the depths for sorting.
 
     Args:
-        scene: with a photographer.
-        camera: that the photographer holds.
-        seen: the planes that it sees, and where.
+        scene: scene with a photographer.
+        camera: the photographer's camera.
+        seen: visible planes.
         near: depth below which a Gaussian is culled, world units.
     """
     frame = world_from_photographer(camera, scene.up)
@@ -164,16 +164,16 @@ def project_photographer(scene: Scene, camera: Camera, seen: SeenPanes, *, near:
         camera,
         near=near,
         poses=seen.views.poses @ frame,
-        # A plane n . x + d = 0 is (n, d) as a row vector, so that frames change it from the right.
+        # A plane n . x + d = 0 is the row vector (n, d), which transforms from the right.
         clip_planes=seen.views.half_spaces @ frame.detach(),
         windows=seen.windows,
     )
 
 
 def mirrored_views(planes: Planes, camera: Camera) -> MirroredViews:
-    """The camera mirrored about each plane, and the clip planes that keep the side on which it stands.
+    """The camera mirrored about each plane, and the clip planes that keep the camera's side.
 
-    The half spaces have no gradient. On a GPU that is one kernel, as some sixty operations on few numbers would take
+    The clip planes have no gradient. On a GPU this is one kernel, because sixty operations on few numbers would take
     longer than all Gaussians.
     """
     pose = camera.cam_from_world
@@ -189,14 +189,14 @@ def mirrored_views(planes: Planes, camera: Camera) -> MirroredViews:
 
 
 FAINT = 0.5
-"""A pane that is less visible in a pixel, as at its rim, leaves the layers to the pane behind it."""
+"""Visibility in a pixel below which the layers are those of the pane behind, as at a pane's border."""
 
 
 class CompositedPanes(NamedTuple):
     """An image behind panes.
 
-    rgb [H, W, 3]; transmission and reflection [H, W, 3] and strength [H, W] of the nearest pane that is not `FAINT`
-    in a pixel, joined with those before it; and share [H, W], how much of what is seen all panes add.
+    rgb [H, W, 3]; transmission and reflection [H, W, 3] and strength [H, W] of the nearest pane above `FAINT`,
+    combined with those in front; and share [H, W] of the image added by all panes.
     """
 
     rgb: Tensor
@@ -210,19 +210,19 @@ def composite_panes(
     image: Tensor, seen: SeenPanes, masks: Sequence[Tensor], reflections: Tensor, camera: Camera,
     *, fresnel: Fresnel, intensity: bool, blend: Blend,
 ) -> CompositedPanes:  # fmt: skip
-    """Applies Eq. 1 of TR-Gaussians for each pane on a ray, C_t being what all panes behind it make of the image.
+    """Applies Eq. 1 of TR-Gaussians for each pane on a ray; C_t is the image with all panes behind it.
 
-    Tinted glass, which the paper does not have, lets through a share of each primary of C_t.
+    Tinted glass, which the paper does not have, scales the channels of C_t.
 
     Args:
-        image: [H, W, 3] without panes.
-        seen: the K panes, and their order.
-        masks: [H, W] for each of `seen.order`, visibility of that pane.
-        reflections: [K, H, W, 4] what each pane mirrors, and its intensity minus 1.
-        camera: of the view.
+        image: [H, W, 3] image without panes.
+        seen: the K visible panes.
+        masks: visibility [H, W] for each of `seen.order`.
+        reflections: [K, H, W, 4] mirrored image of each pane, and its intensity minus 1.
+        camera: camera of the view.
         fresnel: as for `blend_panes`.
         intensity: as for `blend_panes`.
-        blend: the space in which light adds up.
+        blend: space of blending.
     """
     laid = []
     transmittances = seen.planes.transmittances
@@ -262,17 +262,17 @@ def composite_panes(
 
 
 def tint_by_panes(image: Tensor, mask: Tensor, pane: Tensor, transmittances: Tensor, blend: Blend) -> Tensor:
-    """[H, W, 3] what gets through panes of the transmittances [K, 3].
+    """[H, W, 3] light transmitted by panes of the transmittances [K, 3].
 
     Args:
-        image: [H, W, 3] what is behind them.
+        image: [H, W, 3] image behind the panes.
         mask: [H, W] visibility of the pane in each pixel.
-        pane: [H, W] which one it is, -1 where there is none.
-        transmittances: of all panes.
-        blend: the space in which light is let through.
+        pane: [H, W] index of the pane, -1 for none.
+        transmittances: transmittances of all panes.
+        blend: space in which transmittances apply.
     """
     decode, encode = curves(blend)
-    # An embedding's gradient has the same bits for any number of threads, that of an index has not.
+    # The gradient of an embedding is deterministic for any number of threads, unlike that of indexing.
     through = torch.nn.functional.embedding(pane.clamp(min=0).long(), transmittances)
     shown = (mask > 0) & (pane >= 0)
     return torch.where(shown[..., None], encode(decode(image) * (1 - mask[..., None] * (1 - through))), image)
@@ -280,15 +280,15 @@ def tint_by_panes(image: Tensor, mask: Tensor, pane: Tensor, transmittances: Ten
 
 @torch.no_grad()
 def tint_of_panes(seen: SeenPanes, masks: Sequence[Tensor], transmittances: Tensor) -> Tensor:
-    """[H, W, 3] share of the light that gets through the glass of all panes on a ray, where light adds up."""
+    """[H, W, 3] transmittance of all panes on a ray, in the space of blending."""
     tint = torch.ones_like(masks[0][..., None]).expand(-1, -1, 3)
     for mask, pane in zip(masks, seen.order, strict=True):
-        tint = tint_by_panes(tint, mask, pane, transmittances, "srgb")  # As it is: shares have no curve.
+        tint = tint_by_panes(tint, mask, pane, transmittances, "srgb")  # Unchanged: shares have no transfer curve.
     return tint
 
 
 def _all_of_them(strengths: Sequence[Tensor]) -> Tensor:
-    """[H, W] how much of what is seen panes of these strengths add, the farthest first."""
+    """[H, W] share of the image added by panes of these strengths, farthest first."""
     share, *nearer = strengths
     for strength in nearer:
         share = strength + (1 - strength) * share
@@ -302,7 +302,7 @@ Layers = tuple[Tensor, Tensor, Tensor]
 def _joined_layers(layers: Layers, farther: Layers, where: Tensor, blend: Blend) -> Layers:
     """Those of a pane and of one seen through its glass as if they were one, in some pixels.
 
-    They make the same image: R = R_1 + (1 - R_1) R_2 and R C_r = R_1 C_1 + (1 - R_1) R_2 C_2.
+    They give the same image: R = R_1 + (1 - R_1) R_2 and R C_r = R_1 C_1 + (1 - R_1) R_2 C_2.
     """
     decode, encode = curves(blend)
     (transmission, reflection, strength), (behind, mirrored, share) = layers, farther
@@ -319,7 +319,7 @@ def _joined_layers(layers: Layers, farther: Layers, where: Tensor, blend: Blend)
 
 
 def curves(blend: Blend) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
-    """Into the space in which light is blended, and back to sRGB."""
+    """Conversions to the space of blending and back to sRGB."""
     return (linear_from_srgb, srgb_from_linear) if blend == "linear" else (_unchanged, _unchanged)
 
 
@@ -328,11 +328,11 @@ def _unchanged(color: Tensor) -> Tensor:
 
 
 def visibilities(seen: SeenPanes, joint: Tensor, own: Tensor) -> list[Tensor]:
-    """[H, W] for each of `seen.order`: how much of that pane is visible.
+    """Visibility [H, W] for each of `seen.order`.
 
     Args:
-        seen: panes seen through one another.
-        joint: [H, W] mask of all panes together, which holds where a ray meets one pane.
+        seen: panes behind each other.
+        joint: [H, W] mask of all panes together, valid where a ray meets one pane.
         own: [K, H, W] mask of each, from `own_masks`.
     """
     nearest, *farther = (own.gather(0, pane.clamp(min=0).long()[None])[0] for pane in seen.order)
@@ -340,15 +340,15 @@ def visibilities(seen: SeenPanes, joint: Tensor, own: Tensor) -> list[Tensor]:
 
 
 def own_masks(seen: SeenPanes, splats: Splats, marks: Tensor, owners: Tensor, size: tuple[int, int]) -> Tensor:
-    """[K, H, W] mask of each pane as if it were the only one, in tiles where it is one of several.
+    """[K, H, W] mask of each pane as if it were the only one, in tiles with several.
 
-    As M of TR-Gaussians, Eq. 7, but other panes, through which it is seen, do not hide it.
+    As M of TR-Gaussians, Eq. 7, but not occluded by other panes.
 
     Args:
-        seen: panes seen through one another.
-        splats: [1, G] primary ones, then glass.
-        marks: [1, M] of the glass ones.
-        owners: [M] the pane that each glass one is part of, position among the scene's planes.
+        seen: panes behind each other.
+        splats: [1, G] primary splats, then glass.
+        marks: [1, M] marks of the glass.
+        owners: [M] pane of each glass Gaussian, as position among the scene's planes.
         size: height and width of the image.
     """
     count, (height, width), several = len(seen.planes), size, seen.order[1] >= 0
@@ -369,9 +369,9 @@ def own_masks(seen: SeenPanes, splats: Splats, marks: Tensor, owners: Tensor, si
 
 @torch.no_grad()
 def _splats_near(splats: Splats, pixels: Tensor) -> Tensor:
-    """Positions, in order, of the splats [1, G] that may reach the smallest window around the pixels [H, W] bool."""
+    """Positions, in order, of the splats [1, G] that may reach the bounding box of the pixels [H, W] bool."""
     columns, rows = (pixels.any(dim=axis).nonzero().aminmax() for axis in (0, 1))
-    # Whole tiles, all of which are traversed.
+    # Extended to whole tiles.
     low = torch.stack([columns.min, rows.min]) // TILE * TILE
     high = (torch.stack([columns.max, rows.max]) // TILE + 1) * TILE
     means, radii = splats.means2d[0], splats.radii[0]

@@ -54,15 +54,15 @@ from glassplat.scene.panes import nearest_panes
 from glassplat.scene.scene import Scene
 
 DEPTH_CHANNEL = 3
-"""Of the first pass, after the colours."""
+"""Channels of the first pass, after the colours."""
 PHOTOGRAPHED = "photographed"
-"""The layer that shows the photographer in the panes, next to an image without."""
+"""Layer with the photographer in the panes, in addition to an image without."""
 PhotographerMode = Literal["absent", "present", "beside"]
-"""Whether panes show who took a photograph."""
+"""Modes of rendering the photographer in panes."""
 
 
 class FirstPass(NamedTuple):
-    """Everything seen straight through the camera."""
+    """Result of the first pass, without reflections."""
 
     image: Tensor
     alpha: Tensor
@@ -77,7 +77,7 @@ class FirstPass(NamedTuple):
 
 
 class SecondPass(NamedTuple):
-    """Images in the panes: colours and intensity minus 1 [K, H, W, 4] of each, and their coverage [K, H, W]."""
+    """Mirrored images: colours and intensity minus 1 [K, H, W, 4] of each, and their coverage [K, H, W]."""
 
     reflections: Tensor
     alpha: Tensor
@@ -93,39 +93,36 @@ class Planar(OverBackground):
         R = M sum_k H_k R_k                          (Eqs. 5, 19)
         C_r = C_raw A                                (Eq. 13)
 
-    The first pass blends the primary Gaussians into C_t and, with the glass Gaussians among them,
-    the mask M (Eq. 7). The second pass renders the primary Gaussians of the camera's side through
-    cameras mirrored about each plane, which is the same as mirroring the Gaussians (Eqs. 8-12), and
-    only in tiles where that pane is seen.
+    The first pass blends the primary Gaussians into C_t and, with the glass Gaussians among them, the mask M (Eq. 7).
+    The second pass renders the primary Gaussians of the camera's side through cameras mirrored about each plane, which
+    is the same as mirroring the Gaussians (Eqs. 8-12), and only in tiles where that pane is visible.
 
-    Where panes are seen through one another, Eq. 1 holds for one after the other, from the farthest on: the C_t of a
-    pane is the C of the pane behind it (the paper shows the nearest only). The layers R, C_r and C_t are those of the
-    nearest one that is more than `FAINT`ly visible; see `glassplat.render.panes.composite_panes`.
+    If there are several panes on a ray, Eq. 1 is applied from the farthest to the nearest: the C_t of a pane is the C
+    of the pane behind it (the paper renders only the nearest). The layers R, C_r and C_t are those of the nearest pane
+    with a visibility above `FAINT`; see `glassplat.render.panes.composite_panes`.
 
-    Layers: `transmission`, `reflection` [H, W, 3]; `strength`, `mask`, `depth`, `alpha` [H, W]; `without_panes`
-    [H, W, 3], the image were there no panes. Who calls the renderer also gets `pane` [H, W] int32, the pane whose
-    rectangle is nearest, -1 for none; `share` [H, W], how much of what is seen the panes add, all of them together;
-    `tint` [H, W, 3], the share of light that their glass lets through, where it is tinted; `deviation` [H, W] (Eq. 14)
-    if asked for.
+    Layers: `transmission`, `reflection` [H, W, 3]; `strength`, `mask`, `depth`, `alpha` [H, W]; `without_panes` [H, W,
+    3], the image without panes. Frames also have `pane` [H, W] int32, the nearest pane, -1 for none; `share` [H, W],
+    the share of the image added by all panes; `tint` [H, W, 3], the transmittance of tinted glass; and, if requested,
+    `deviation` [H, W] (Eq. 14).
 
-    A photograph also shows who took it, in the panes: `Scene.photographer`, Gaussians in a frame that goes along with
-    the camera. They are drawn among those that a pane mirrors, through the camera mirrored about it, and nowhere else.
+    Photographs also show their photographer in the panes: `Scene.photographer`, Gaussians in a frame that moves with
+    the camera. They are only rendered in mirrored images.
 
     Attributes:
-        background: colour behind everything, sRGB.
-        fresnel: how R_k rises from R0 at normal incidence: as that of a pane with its two surfaces, by Schlick's curve
-            of one surface (Eq. 6), or not at all; see `glassplat.kernels.panes.blend_panes`.
+        background: background colour, sRGB.
+        fresnel: angular dependence of R_k: a pane with two surfaces, Schlick's approximation for one surface (Eq. 6),
+            or none; see `glassplat.kernels.panes.blend_panes`.
         intensity: use the learned intensity a(u); False sets C_r = C_raw.
-        reflection_gradient: what the reflection image's gradient reaches: everything, or the planes alone.
-        deviation: also compute the depth deviation where a pane is hit (Eq. 14), for training.
-        deviation_depth_gradient: let the deviation's gradient pass through the mean depth D_t.
-        blend: space in which Eqs. 1 and 13 hold: linear radiance, where light adds up, or sRGB as in the paper.
-        nearest_only: of panes that are seen through one another, show the nearest only, as the paper does.
-        photographer: whether panes show the scene's photographer: not, so that the image is what nobody disturbs; in
-            the image and its reflection, as photographs do, for training; or in a layer `photographed` [H, W, 3] beside
-            the image without.
-        tells_mirrored: whether the records in `Frame.screen` tell mirror images from what is seen directly, and how
-            much is left of either; if not, all of them count alike.
+        reflection_gradient: parameters that receive the gradient of the reflection: all, or only planes.
+        deviation: also compute the depth deviation at pixels of panes (Eq. 14), for training.
+        deviation_depth_gradient: propagate the deviation's gradient through the mean depth D_t.
+        blend: space of Eqs. 1 and 13: linear radiance, or sRGB as in the paper.
+        nearest_only: render only the nearest of several panes on a ray, as in the paper.
+        photographer: rendering of the photographer in panes: none; in the image and its reflection, for training; or in
+            a separate layer `photographed` [H, W, 3].
+        tells_mirrored: let the records in `Frame.screen` distinguish mirror images from direct views, with their
+            weights; otherwise all count alike.
     """
 
     fresnel: Fresnel = "pane"
@@ -144,7 +141,7 @@ class Planar(OverBackground):
             raise ValueError(f"blend is {self.blend!r}; expected one of {get_args(Blend)}")
 
     def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
-        """Renders `scene` from `camera`, where the scene's tensors are.
+        """Renders `scene` from `camera`, on the scene's device.
 
         Raises:
             ValueError: an intensity, mark or reflectance is missing or cannot be drawn.
@@ -176,9 +173,9 @@ class Planar(OverBackground):
     def reflections(
         self, scene: Scene, camera: Camera, backgrounds: Sequence[Rgb], first: FirstPass | None = None
     ) -> list[Tensor]:
-        """The layer `reflection` [H, W, 3] before each of several backgrounds.
+        """The layer `reflection` [H, W, 3] over each of several backgrounds.
 
-        `first` is what is seen directly, if that is known already.
+        `first` is the result of the first pass, if available.
         """
         check_panes(scene)
         camera = camera.to(scene.primary.means.device)
@@ -192,18 +189,18 @@ class Planar(OverBackground):
         return [self._composite_panes(first, seen, masks, one, camera).reflection for one in passes]
 
     def first_pass(self, scene: Scene, camera: Camera) -> FirstPass:
-        """The first pass: all that is seen directly, the same wherever the planes of the panes are."""
+        """The first pass: the direct view, independent of the poses of panes."""
         camera = camera.to(scene.primary.means.device)
         return self._first_pass(scene, camera, panes_in_camera(scene.planes, camera), False)
 
     def check(self, scene: Scene) -> None:
-        """Raises ValueError where a scene lacks colours, or its panes what they need; there may be no panes."""
+        """Raises ValueError if a scene lacks colours, or tensors of its panes, if it has any."""
         check_colored(scene.primary)
         check_ellipsoids(scene.primary)
         check_channels(scene)
 
     def layers(self, scene: Scene) -> tuple[str, ...]:
-        """Names of the layers that are worth looking at; with `photographed` where a photographer is known."""
+        """Names of the layers for display; with `photographed` if the scene has a photographer."""
         known = (PHOTOGRAPHED,) if len(scene.photographer) else ()
         panes = ("transmission", "without_panes", "reflection", "strength", "mask")
         return ("rgb", *panes, "normal", "depth", "alpha", *known)
@@ -214,7 +211,7 @@ class Planar(OverBackground):
         return WithNormals(renderer) if "normal" in layers else renderer
 
     def page_settings(self) -> Mapping[str, Any]:
-        """Settings with which the web page lays panes before the image."""
+        """Settings of the web page for panes."""
         return {
             "background": self.background,
             "fresnel": self.fresnel,
@@ -226,7 +223,7 @@ class Planar(OverBackground):
     def _direct(
         self, scene: Scene, camera: Camera, *, with_absgrad: bool = False, first: FirstPass | None = None
     ) -> tuple[FirstPass, PaneHits, SeenPanes | None]:
-        """The first pass, the nearest panes, and all panes that are visible, None if there are none."""
+        """The first pass, the nearest panes, and all visible panes (None if there are none)."""
         rectangles = panes_in_camera(scene.planes, camera)
         first = self._first_pass(scene, camera, rectangles, with_absgrad) if first is None else first
         hits = nearest_hits(rectangles, camera, first.mask)
@@ -256,7 +253,7 @@ class Planar(OverBackground):
             absgrad=joined_absgrad(screen),
         )
         alpha = result.alpha.squeeze(0)
-        # Squeezed and split, because the gradient of an indexed image is a whole one of zeros first.
+        # Squeezed and split, because indexing an image allocates a gradient of zeros.
         color, depth = result.image.squeeze(0).split((3, 1), dim=-1)
         return FirstPass(
             image=over_background(color.contiguous(), alpha, self.background),
@@ -278,18 +275,18 @@ class Planar(OverBackground):
         if self.reflection_gradient == "planes":
             primary, total = detach_gaussians(scene.primary), GradientSum()
         projected = project_mirrored(primary, camera, seen, near=NEAR_PER_EXTENT * scene.extent, total=total)
-        # By how much it departs from 1: what is behind all Gaussians has 0 then, and needs no blending.
+        # As the difference from 1, so that the background has 0 and needs no blending.
         gain = torch.expm1(primary.channels["log_intensity"])[None].expand(len(seen.planes), -1)
         channels = torch.cat([projected.colors, gain[..., None]], dim=-1)
         mirrored = [projected]
         screen: tuple[ScreenPass, ...] = (screen_pass("primary", projected, direct=False),) if with_absgrad else ()
         if self.photographer == "present" and len(scene.photographer):
             body = project_photographer(scene, camera, seen, near=NEAR_PER_EXTENT * scene.extent)
-            # A body is as bright as it is: an intensity of its own would be a second factor on its colours.
+            # The photographer has no intensity, which would be a second factor on the colours.
             plain = torch.nn.functional.pad(body.colors, (0, channels.shape[-1] - 3))
             channels = torch.cat([channels, plain], dim=1)
             mirrored.append(body)
-            # No view shows it directly, so that mirror images are what it is densified by.
+            # Densified by mirror images, as no view shows it directly.
             screen += (screen_pass("photographer", body),) if with_absgrad else ()
         splats = joined_splats(*mirrored)
         bins = bin_tiles(splats, camera.width, camera.height, seen.tiles)
@@ -300,7 +297,7 @@ class Planar(OverBackground):
     def _composite_panes(
         self, first: FirstPass, seen: SeenPanes, masks: Sequence[Tensor], second: SecondPass, camera: Camera
     ) -> CompositedPanes:
-        """Lays the panes and what they mirror before the image."""
+        """Composites the panes and their reflections over the image."""
         return composite_panes(
             first.image,
             seen,
@@ -330,11 +327,11 @@ class Planar(OverBackground):
 
 
 LARGEST_LOG = 80.0
-"""Of a factor on colours, which is finite in single precision."""
+"""Maximum of a factor on colours that is finite in single precision."""
 
 
 def check_channels(scene: Scene) -> None:
-    """Raises ValueError where the Gaussians lack a channel that panes need."""
+    """Raises ValueError if the Gaussians lack a channel that panes need."""
     if len(scene.planes) and "log_intensity" not in scene.primary.channels:
         raise ValueError(
             f"the Gaussians have the channels {sorted(scene.primary.channels)}; expected log_intensity, as "
@@ -345,7 +342,7 @@ def check_channels(scene: Scene) -> None:
 
 
 def check_panes(scene: Scene) -> None:
-    """Raises ValueError where a value that only panes need is missing or cannot be drawn."""
+    """Raises ValueError if a tensor for panes is missing or invalid."""
     check_channels(scene)
     check_numbers({"logit_mark": scene.glass.channels["logit_mark"]})
     if len(scene.planes):
@@ -360,10 +357,10 @@ def check_panes(scene: Scene) -> None:
 def weighted_screen(
     first: FirstPass, second: SecondPass, hits: PaneHits, result: CompositedPanes, blend: Blend
 ) -> tuple[ScreenPass, ...]:
-    """The records of both passes, weighted by how much of each layer is left in the image (see `layer_slopes`).
+    """The records of both passes, weighted by the share of each layer in the image (see `layer_slopes`).
 
-    What is behind a pane counts by what the pane lets through at its centre, mirror images by the mean over the pixels
-    that show a pane.
+    Gaussians behind a pane are weighted by the transmission at their centres, mirror images by the mean over pixels of
+    panes.
     """
     hit = hits.pane >= 0
     layers = result.strength, result.transmission, result.reflection
@@ -376,50 +373,49 @@ def weighted_screen(
 
 
 def detach_gaussians(gaussians: Gaussians) -> Gaussians:
-    """The same Gaussians, cut off from the autograd graph."""
+    """The Gaussians, detached from the autograd graph."""
     return gaussians.with_tensors({name: tensor.detach() for name, tensor in gaussians.tensors().items()})
 
 
 def with_photographer(renderer: Renderer, photographer: PhotographerMode) -> Renderer:
-    """A renderer whose frames tell what photographs show, as far as it knows of anybody; see `Planar.photographer`."""
+    """The renderer with this mode for the photographer, if it supports one; see `Planar.photographer`."""
     return replace(renderer, photographer=photographer) if isinstance(renderer, Planar) else renderer
 
 
 TRUSTED_STRENGTH, DISTRUSTED_STRENGTH = 0.35, 0.65
-"""Between these shares of reflected light, the photograph gives way to the rendered transmission."""
+"""Shares of reflected light between which the photograph is faded into the rendered transmission."""
 CLIPPING_BEGINS = 0.96
-"""From this sRGB value on, a photograph's brightest channel says less and less about the light."""
+"""Brightest sRGB channel above which a photograph is increasingly clipped."""
 FAINT_LIGHT, PLAIN_LIGHT = 0.01, 0.05
-"""Reflected light, of 1, that a clipped pixel may hide without harm, and that it may not."""
+"""Reflected light, of 1, that is harmless and harmful in clipped pixels."""
 TRUSTED_PART, DISTRUSTED_PART = 0.3, 0.8
-"""Between these parts of the photographed light, taking the reflection off leaves less and less that is certain."""
+"""Remaining shares of the photographed light between which subtraction becomes unreliable."""
 TRUST_WINDOW = 5
-"""Pixels over which trust is averaged, so that noise does not switch it from pixel to pixel."""
+"""Pixels over which trust is averaged, against noise."""
 DARKEST = 1e-3
 DARKEST_GLASS = 0.1
-"""Least share of the light through tinted glass that counts: detail and noise are brightened by ten at most."""
+"""Minimum transmittance of tinted glass, so that details and noise are amplified by at most ten."""
 
 
 def dereflected_photo(
     frame: Frame, photo: Tensor, blend: Blend, *, exposures: Exposures | None = None, name: str = ""
 ) -> Tensor:
-    """The photograph [H, W, 3] uint8 with the reflection taken off where the frame shows a pane.
+    """The photograph [H, W, 3] uint8 with the reflections of panes removed.
 
-    Solves Eq. 1, C = (1 - R) C_t + R C_r, for C_t from the photographed C and the rendered R and R C_r, so that detail
-    the scene does not hold survives. What tinted glass takes away is given back. Of panes seen through one another it
-    takes off all: C_t is the image without panes, and R and R C_r are what they add together. The rendered C_t takes
-    over smoothly where most of the light is reflected, and where the photograph is clipped and the reflection can be
-    seen; there, the difference would show the errors of the rendered reflection instead. Pixels without a pane are the
-    photograph's, bit for bit.
+    Solves Eq. 1, C = (1 - R) C_t + R C_r, for C_t from the photographed C and the rendered R and R C_r, so that
+    details which the scene lacks survive. The absorption of tinted glass is undone. All panes on a ray are removed:
+    C_t is the image without panes, and R and R C_r are their total contribution. The rendered C_t is faded in where
+    most of the light is reflected, and where the photograph is clipped by a visible reflection; there, the difference
+    would mostly show errors of the rendered reflection. Pixels without panes are unchanged.
 
     Args:
         frame: a view rendered by `planar`, with `without_panes`, `share`, and `tint` where glass is tinted; on the CPU.
-            Where it has the layer `photographed`, who took the photograph is taken off as well.
-        photo: [H, W, 3] uint8, of that view.
-        blend: the space in which the run holds Eq. 1.
-        exposures: of the photographs of the run, in whose scene's colours layers add up; a photograph that has none, as
-            it was held out, has the mean of its neighbours'.
-        name: of this photograph among them.
+            With the layer `photographed`, the photographer's reflection is removed as well.
+        photo: [H, W, 3] uint8, photograph of that view.
+        blend: space of Eq. 1 in the run.
+        exposures: exposures of the run's photographs; layers are blended in scene colours. Held-out photographs get the
+            mean of their neighbours.
+        name: name of this photograph.
 
     Raises:
         ValueError: photograph and frame differ in size.
@@ -430,12 +426,12 @@ def dereflected_photo(
     without_panes, share = frame.layers["without_panes"], frame.layers["share"][..., None]
     exposures = exposures.interpolate(name) if exposures and name else Exposures.neutral()
     photographed = photo.to(torch.float32) / 255
-    # Clipping is the camera's, all else the scene's.
+    # Clipping is evaluated in the camera's colours, the rest in the scene's.
     clipped = photographed
     photographed = exposures.undone(photographed, name).clamp(0, 1)
     tint = frame.layers.get("tint", torch.ones((), dtype=torch.float32)).clamp(min=DARKEST_GLASS)
     light, reflected = decode(photographed), decode(frame.photographed) - (1 - share) * tint * decode(without_panes)
-    # The trust is almost zero before this division would blow up noise.
+    # Trust is almost zero before this division would amplify noise.
     solved = (light - reflected) / ((1 - share).clamp(min=1 - DISTRUSTED_STRENGTH) * tint)
     rendered = decode(without_panes.clamp(0, 1))
     trust = _trust(clipped, light, reflected, share[..., 0])
@@ -446,14 +442,14 @@ def dereflected_photo(
 
 
 def as_mirror_image(frame: Frame, blend: Blend) -> Tensor:
-    """The image [H, W, 3] that the frame would be if its panes reflected everything (R0 = 1), sRGB.
+    """The image [H, W, 3] of the frame with perfect mirrors as panes (R0 = 1), sRGB.
 
-    Costs no rendering: the reflection layer already holds what the panes mirror, at full strength. Of panes seen
-    through one another the nearest becomes a mirror, and what its rim lets through shows the others as they are.
+    Needs no rendering: the reflection layer has the mirrored image at full strength. Of several panes on a ray, the
+    nearest becomes a mirror; through its border, the others are visible unchanged.
 
     Args:
         frame: a view rendered by `planar`, with all its layers.
-        blend: the space in which the run holds Eq. 1.
+        blend: space of Eq. 1 in the run.
     """
     decode, encode = curves(blend)
     layers = frame.layers
@@ -467,7 +463,7 @@ def _trust(photographed: Tensor, light: Tensor, reflected: Tensor, strength: Ten
     overwhelmed = _smooth_step(strength, TRUSTED_STRENGTH, DISTRUSTED_STRENGTH)
     clipped = _smooth_step(photographed.amax(-1), CLIPPING_BEGINS, 1.0)
     visible = _smooth_step(reflected.amax(-1), FAINT_LIGHT, PLAIN_LIGHT)
-    # A small difference of two large amounts of light is mostly the error of the rendered one.
+    # A small difference of two large values is mostly the error of the rendered one.
     drowned = _smooth_step(reflected.mean(-1) / (light.mean(-1) + DARKEST), TRUSTED_PART, DISTRUSTED_PART)
     trust = (1 - overwhelmed) * (1 - clipped * visible) * (1 - drowned)
     return torch.nn.functional.avg_pool2d(
@@ -476,6 +472,6 @@ def _trust(photographed: Tensor, light: Tensor, reflected: Tensor, strength: Ten
 
 
 def _smooth_step(values: Tensor, low: float, high: float) -> Tensor:
-    """0 up to `low`, 1 from `high` on, and a curve without kinks between."""
+    """Smooth step from 0 at `low` to 1 at `high`."""
     share = ((values - low) / (high - low)).clamp(0, 1)
     return share * share * (3 - 2 * share)

@@ -1,4 +1,4 @@
-"""Rasterisation with gsplat's signature, so that programs written for it run on a CPU, too."""
+"""Rasterisation with the signature of gsplat, so that programs written for it also run on CPUs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 LEAST_SCALE = 1e-20
 LEAST_ALPHA = 1e-10
 ANYWHERE = 1e9
-"""Pixels. Edges of a window that culls nothing."""
+"""Edges of a window that culls nothing, in pixels."""
 
 
 def rasterization(
@@ -53,11 +53,11 @@ def rasterization(
     covars: Tensor | None = None,
     **others: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Render Gaussians into cameras, called as `gsplat.rasterization` is, on the CPU or on CUDA.
+    """Render Gaussians into cameras, with the signature of `gsplat.rasterization`, on the CPU or on CUDA.
 
     Differentiable in the Gaussians, `viewmats` and `backgrounds`, not in `Ks`. Coverage is cut off at 0.99 and below
-    1/255, as in 3DGS and gsplat's main branch (its release 1.5.3 cuts off at 0.999). Gradients of `viewmats` are
-    gsplat's along rigid motions; it inverts them for view directions as if they might be any matrix.
+    1/255, as in 3DGS and gsplat's main branch (its release 1.5.3 cuts off at 0.999). Gradients of `viewmats` equal
+    gsplat's along rigid motions; for view directions, gsplat inverts them as general matrices.
 
     Args:
         means: [N, 3] centres, world units.
@@ -67,35 +67,35 @@ def rasterization(
         colors: [N, D] or [C, N, D] values of any kind; with `sh_degree`, [N, K, 3] or [C, N, K, 3] coefficients.
         viewmats: [C, 4, 4] world to camera, OpenCV axes.
         Ks: [C, 3, 3] pinhole intrinsics, pixels.
-        width: of the images, pixels.
-        height: of the images, pixels.
-        near_plane: smallest depth.
-        far_plane: largest depth.
-        radius_clip: Gaussians that reach no farther than this, in pixels, are left out.
-        eps2d: variance in px^2 that is added on screen.
-        sh_degree: how many degrees of the coefficients are used, up to 3.
-        packed: taken and not heeded; the last result is laid out as without.
-        tile_size: taken and not heeded.
-        backgrounds: [C, D] values behind everything; nothing is behind depths.
+        width: width of the images, pixels.
+        height: height of the images, pixels.
+        near_plane: minimum depth.
+        far_plane: maximum depth.
+        radius_clip: Gaussians with a radius up to this, in pixels, are culled.
+        eps2d: variance added on screen, px^2.
+        sh_degree: SH degree to use, up to 3.
+        packed: ignored; results are not packed.
+        tile_size: ignored.
+        backgrounds: [C, D] background values; none for depths.
         render_mode: `D` is the depth weighted by coverage, `ED` the expected depth; it comes after the colours.
-        sparse_grad: has to be False.
-        absgrad: `loss.backward()` sets `meta["means2d"].absgrad`, [C, N, 2], where a shape or a camera has gradients.
-        rasterize_mode: `antialiased` makes Gaussians fainter by what `eps2d` widens them.
-        channel_chunk: so many channels are blended at once, at most 32.
-        distributed: has to be False.
-        camera_model: has to be `pinhole`.
-        segmented: taken and not heeded.
-        covars: has to be None.
-        others: further options of gsplat; they have to be off.
+        sparse_grad: must be False.
+        absgrad: `loss.backward()` sets `meta["means2d"].absgrad`, [C, N, 2], if shapes or cameras require gradients.
+        rasterize_mode: `antialiased` compensates opacities for the widening by `eps2d`.
+        channel_chunk: number of channels blended at once, at most 32.
+        distributed: must be False.
+        camera_model: must be `pinhole`.
+        segmented: ignored.
+        covars: must be None.
+        others: further options of gsplat, which must be off.
 
     Returns:
         [C, height, width, X] colours, depths or both; [C, height, width, 1] coverage; and a dictionary with `means2d`
         [C, N, 2] (on which `retain_grad` may be called before the backward pass), `radii` [C, N, 2] int32, `depths`,
-        `conics`, `opacities`, sizes, and None for what only packed results have.
+        `conics`, `opacities`, sizes, and None for keys of packed results.
 
     Raises:
-        InputError: an option that is not supported, or a shape that does not fit.
-        ValueError, TypeError: tensors of other shapes, types or devices than the rest.
+        InputError: an option is not supported, or a shape is wrong.
+        ValueError, TypeError: shapes, types or devices of tensors do not match.
     """
     on = {"sparse_grad": sparse_grad, "distributed": distributed, "covars": covars is not None} | {
         name: value is not None and value is not False for name, value in others.items()
@@ -135,9 +135,9 @@ def _check_options(render_mode: str, rasterize_mode: str, camera_model: str, on:
     if rasterize_mode not in ("classic", "antialiased"):
         raise InputError(f"rasterize_mode is {rasterize_mode!r}; expected classic or antialiased")
     if camera_model != "pinhole":
-        raise InputError(f"camera_model is {camera_model!r}; expected pinhole, the only one there is here")
+        raise InputError(f"camera_model is {camera_model!r}; expected pinhole, the only supported one")
     if on:
-        raise InputError(f"rasterization has no {', '.join(on)} here; leave out what gsplat has beyond this signature")
+        raise InputError(f"rasterization has no {', '.join(on)} here; it supports this signature only")
 
 
 def _check_colors(colors: Tensor, means: Tensor, viewmats: Tensor, sh_degree: int | None) -> None:
@@ -172,9 +172,9 @@ def _project(
     sh_degree: int | None,
     near: float,
 ) -> Projected:
-    """The Gaussians on screen; coefficients that differ by camera are projected camera by camera."""
+    """The projected Gaussians; per-camera coefficients are projected camera by camera."""
     log_scales = scales.abs().clamp(min=LEAST_SCALE).log()
-    # For the bounds only: `_splats` hands on the opacities themselves.
+    # For the bounds only: `_splats` passes on the opacities themselves.
     logits = opacities.detach().logit(eps=torch.finfo(opacities.dtype).eps)
     if sh_degree is None or colors.ndim == 3:
         sh = means.new_zeros(len(means), 0, 3) if sh_degree is None else colors
@@ -197,7 +197,7 @@ def _project(
 
 
 def _splats(projected: Projected, opacities: Tensor, eps2d: float, *, antialiased: bool) -> Splats:
-    """The splats with another variance than 3DGS adds on screen."""
+    """The splats with another added screen variance than that of 3DGS."""
     conics, shown, radii = projected.conics, opacities.expand(projected.depths.shape), projected.radii
     if antialiased or eps2d != LOW_PASS:
         a, b, c = _inverse(torch.where(radii[..., :1] > 0, conics, conics.new_tensor([1.0, 0.0, 1.0])))
@@ -205,7 +205,7 @@ def _splats(projected: Projected, opacities: Tensor, eps2d: float, *, antialiase
         wide = torch.stack([a + eps2d, b, c + eps2d], dim=-1)
         if antialiased:
             determinant = (a * c - b * b).clamp(min=0)
-            # The root has no slope at zero, where a Gaussian is a line on screen.
+            # The root is not differentiable at zero, where a Gaussian is a line on screen.
             share = determinant / (wide[..., 0] * wide[..., 2] - b * b)
             shown = shown * torch.where(share > 0, share, 1).sqrt() * (share > 0)
         conics = torch.stack(_inverse(wide), dim=-1)
@@ -234,7 +234,7 @@ def _blend(
 
 
 def _finish(image: Tensor, alpha: Tensor, backgrounds: Tensor | None, render_mode: str) -> Tensor:
-    """The image over its background, its depth divided by the coverage where that is asked for."""
+    """The image over its background, with the expected depth if requested."""
     colors, depth = (image, image[..., :0]) if render_mode == "RGB" else (image[..., :-1], image[..., -1:])
     if backgrounds is not None and render_mode.startswith("RGB"):
         if tuple(backgrounds.shape) != (len(image), colors.shape[-1]):
@@ -248,7 +248,7 @@ def _finish(image: Tensor, alpha: Tensor, backgrounds: Tensor | None, render_mod
 
 
 def _meta(splats: Splats, width: int, height: int) -> dict[str, Any]:
-    """The intermediate results by gsplat's names, as without `packed`."""
+    """The intermediate results with gsplat's names, not packed."""
     rows, columns = tile_grid(width, height)
     return {
         "camera_ids": None,

@@ -36,8 +36,8 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 
 NDC_NEAR = 0.05
-"""Near plane of the depths whose distortion is measured, in scene extents; 0.2 world units in 2DGS, whose captures have
-an extent of about four."""
+"""Near plane of the depth distortion, in scene extents; 0.2 world units in 2DGS, whose captures have an extent of
+about four."""
 
 
 def projected_discs(gaussians: Gaussians, camera: Camera, *, near: float) -> ProjectedDiscs:
@@ -46,7 +46,7 @@ def projected_discs(gaussians: Gaussians, camera: Camera, *, near: float) -> Pro
     Args:
         gaussians: the set, of discs.
         camera: intrinsics, pose and image size.
-        near: depth below which a disc's centre is culled and a hit is left out, world units.
+        near: depth below which disc centres are culled and hits ignored, world units.
     """
     return project_discs(
         raw_gaussians(gaussians), camera_batch(camera), sh_degree=gaussians.active_sh_degree, near=near
@@ -59,11 +59,11 @@ def blended_discs(
     """Blends channels [1, N, D] of discs over the pixels of a camera; fields of one camera, [1, H, W, ...].
 
     Args:
-        projected: what `projected_discs` made, with the same `near`.
+        projected: result of `projected_discs` with the same `near`.
         channels: values to blend.
-        camera: image size.
-        near: as for `projected_discs`.
-        screen: the record whose `absgrad` gets its gradient, if any.
+        camera: camera with the image size.
+        near: see `projected_discs`.
+        screen: record whose `absgrad` receives its gradient, if any.
     """
     discs = Discs(projected.means2d, projected.maps, projected.opacities, projected.depths, projected.outlines)
     bins = bin_tiles(projected.outlines, camera.width, camera.height)
@@ -71,10 +71,10 @@ def blended_discs(
 
 
 def disc_layers(blended: BlendedDiscs, extent: float) -> dict[str, Tensor]:
-    """Layers [H, W] that blending discs gives in any case: coverage, depths, distortion.
+    """Layers [H, W] of blended discs: coverage, depths, distortion.
 
-    The distortion is that of depths in NDC with a near plane at `NDC_NEAR` extents and none far away, so that it does
-    not depend on the capture's units.
+    The distortion uses depths in NDC with a near plane at `NDC_NEAR` extents and an infinite far plane, independent of
+    the capture's units.
     """
     alpha = blended.alpha[0]
     return {
@@ -88,12 +88,12 @@ def disc_layers(blended: BlendedDiscs, extent: float) -> dict[str, Tensor]:
 def ellipsoid_channels(
     gaussians: Gaussians, projected: Projected, camera: Camera, extra: Tensor | None = None
 ) -> Tensor:
-    """Values [N, D] for ellipsoids to blend: colour, normal towards the camera, strength, and what is extra.
+    """Values [N, D] of ellipsoids to blend: colour, normal towards the camera, strength, and extra values.
 
     Args:
-        gaussians: the set; without a `logit_strength` the strengths mean nothing.
+        gaussians: the set; without a `logit_strength`, strengths are meaningless.
         projected: the set in that camera.
-        camera: at which the normals point.
+        camera: camera that the normals face.
         extra: [N, E] further values.
     """
     strengths = gaussians.channels.get("logit_strength")
@@ -112,7 +112,7 @@ def ellipsoid_channels(
 def blended_ellipsoids(
     projected: Projected, channels: Tensor, camera: Camera, *, screen: Sequence[ScreenPass] = ()
 ) -> Composite:
-    """Blends channels [1, N, D] of ellipsoids over the pixels of a camera; arguments as of `blended_discs`."""
+    """Blends channels [1, N, D] of ellipsoids over the pixels of a camera; arguments as for `blended_discs`."""
     splats = joined_splats(projected)
     bins = bin_tiles(splats, camera.width, camera.height)
     return composite(splats, channels, bins, absgrad=joined_absgrad(screen))
@@ -120,12 +120,12 @@ def blended_ellipsoids(
 
 @dataclass(frozen=True)
 class WithNormals:
-    """A renderer's frames, with a layer `normal` [H, W, 3] where they have none; discs get theirs from the renderer.
+    """A renderer with an additional layer `normal` [H, W, 3]; for discs, the renderer itself provides it.
 
         n(u) = sum_i n_i alpha_i T_i
 
-    n_i is the shortest axis of ellipsoid i, turned to the camera (3DGS-DR, Section 3.1). Of what panes stand before it
-    is the things behind them, as the layer `depth` is. Costs a pass of its own.
+    n_i is the shortest axis of ellipsoid i, facing the camera (3DGS-DR, Section 3.1). At panes, it shows the objects
+    behind them, like the layer `depth`. It needs a pass of its own.
 
     Attributes:
         renderer: renders everything else.
@@ -134,7 +134,7 @@ class WithNormals:
     renderer: Renderer
 
     def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
-        """Renders `scene` from `camera`, where the scene's tensors are."""
+        """Renders `scene` from `camera`, on the scene's device."""
         frame = self.renderer(scene, camera, with_absgrad=with_absgrad)
         if "normal" in frame.layers:
             return frame
@@ -174,13 +174,13 @@ class Splat(OverBackground):
 
     Layers: `alpha` [H, W] coverage; `depth` [H, W] blended depth, if asked for.
 
-    Of discs (2DGS) alpha_i is that of the place where the ray of the pixel meets disc i, and depths are those of these
-    places. Then the layers are `alpha`; `depth`, the expected depth, and `median_depth`, that at which half of the
-    light is gone; `distortion`, how far apart along the ray lies what the pixel shows (2DGS, Eq. 13); and if asked for
-    `normal` [H, W, 3], blended, world axes, towards the camera.
+    For discs (2DGS), alpha_i and depths are those at the intersection of the pixel's ray with disc i. Then the layers
+    are `alpha`; `depth`, the expected depth; `median_depth`, at which half of the light is absorbed; `distortion`, the
+    spread of depths along the ray (2DGS, Eq. 13); and, if requested, `normal` [H, W, 3], blended, world axes, towards
+    the camera.
 
     Attributes:
-        background: colour behind everything, sRGB.
+        background: background colour, sRGB.
         depth: also render the depth layer of ellipsoids; costs one more channel.
         normal: also render the normals of discs; costs three more channels.
     """
@@ -189,7 +189,7 @@ class Splat(OverBackground):
     normal: bool = True
 
     def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
-        """Renders `scene` from `camera`, where the scene's tensors are."""
+        """Renders `scene` from `camera`, on the scene's device."""
         camera = camera.to(scene.primary.means.device)
         if scene.primary.are_discs:
             return self._discs(scene, camera, with_absgrad)
@@ -199,7 +199,7 @@ class Splat(OverBackground):
             channels = torch.cat([channels, projected.depths[..., None]], dim=-1)
         screen = (screen_pass("primary", projected),) if with_absgrad else ()
         result = blended_ellipsoids(projected, channels, camera, screen=screen)
-        # As a batch of one and split, because the gradient of an indexed image is a whole one of zeros first.
+        # As a batch of one, then split, because indexing an image allocates a gradient of zeros.
         color, *depth = result.image.squeeze(0).split((3, 1) if self.depth else 3, dim=-1)
         alpha = result.alpha.squeeze(0)
         layers = {"alpha": alpha}
@@ -223,11 +223,11 @@ class Splat(OverBackground):
         return Frame(rgb, layers, direct=reaches_pixel(projected), screen=screen)
 
     def check(self, scene: Scene) -> None:
-        """Raises ValueError where the Gaussians have no colours."""
+        """Raises ValueError if the Gaussians have no colours."""
         check_colored(scene.primary)
 
     def layers(self, scene: Scene) -> tuple[str, ...]:
-        """Names of the layers that are worth looking at."""
+        """Names of the layers for display."""
         return ("rgb", "normal", "depth", "alpha", *((MEDIAN_DEPTH,) if scene.primary.are_discs else ()))
 
     def with_layers(self, layers: Sequence[str]) -> Renderer:
@@ -236,5 +236,5 @@ class Splat(OverBackground):
         return WithNormals(renderer) if "normal" in layers else renderer
 
     def page_settings(self) -> Mapping[str, Any]:
-        """Settings for the web page: there are no panes."""
+        """Settings of the web page: no panes."""
         return {"background": self.background, "fresnel": "none", "blend": "srgb", "intensity": False}

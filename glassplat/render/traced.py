@@ -1,4 +1,4 @@
-"""`traced`: glossy things that mirror what is near (EnvGS), by rays through Gaussians."""
+"""`traced`: glossy objects with near surroundings (EnvGS), by ray tracing of Gaussians."""
 
 from __future__ import annotations
 
@@ -38,34 +38,35 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 
 START_PER_EXTENT = 0.005
-"""Distance from a surface, as a share of the scene extent, before which a reflected ray meets nothing: the surroundings
-hold the surface too."""
+"""Minimum distance of hits from the reflecting surface, as a share of the scene extent, because the surroundings
+include the surface."""
 
 
 @dataclass(frozen=True)
 class Traced(OverBackground):
-    """Blends colour, normal, strength and depth of surfaces, then traces what each pixel mirrors (EnvGS, Section 4.1).
+    """Blends colour, normal, strength and depth of surfaces, then traces the reflection of each pixel (EnvGS, Section
+    4.1).
 
         v = sum_i v_i alpha_i T_i,  v in {c_base, x, n, beta}                   (Eq. 3)
         d_ref = d - 2 (d . n) n,    n = N / |N|                                 (Eq. 4)
         c = (1 - beta) c_base + beta c_ref                                      (Eq. 5)
 
-    The scene's Gaussians are discs, as in the paper, or ellipsoids, whose n_i is the shortest axis, turned to the
-    camera. c_ref is what the ray from x along d_ref meets of the scene's `surroundings`, a set of Gaussians of their
-    own, and behind these the `environment` where the scene has one (not in the paper), else the background. Without
-    surroundings it is the environment alone. Colours are sRGB, as in the paper.
+    The scene's Gaussians are discs, as in the paper, or ellipsoids, whose n_i is the shortest axis, facing the camera.
+    c_ref is the colour along the ray from x in direction d_ref through the `surroundings`, a separate set of Gaussians,
+    over the `environment` if the scene has one (not in the paper), or the background. Without surroundings, it is the
+    environment. Colours are sRGB, as in the paper.
 
     Layers: `base`, `reflection` [H, W, 3]; `normal` [H, W, 3] in world axes, blended and not normalised; `strength`,
-    `depth`, `alpha` [H, W], of discs also `median_depth` and `distortion`; `surroundings` [H, W, 3], with the
-    environment those behind each pixel, if asked for.
+    `depth`, `alpha` [H, W], for discs also `median_depth` and `distortion`; `surroundings` [H, W, 3], surroundings and
+    environment behind each pixel, if requested.
 
     Attributes:
-        background: colour behind everything, also behind surroundings without an environment, sRGB.
-        least_strength: rays are traced where the strength is larger (Table 6). Elsewhere the environment alone is
-            mirrored, and nothing where there is none.
-        faintest: what reflects less mirrors nothing. 0 for training, where a strength learns from what it would
-            reflect.
-        joint: False keeps the reflection's gradient from the surfaces (Table 4, ablation).
+        background: background colour, also behind surroundings without an environment, sRGB.
+        least_strength: strength above which rays are traced (Table 6). Below, only the environment is reflected, if
+            there is one.
+        faintest: strength below which nothing is reflected. 0 for training, where strengths need the gradient of
+            potential reflections.
+        joint: False stops the reflection's gradient at the surfaces (Table 4, ablation).
         surroundings: also render the layer `surroundings`.
     """
 
@@ -75,10 +76,11 @@ class Traced(OverBackground):
     surroundings: bool = False
 
     def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
-        """Renders `scene` from `camera`, where the scene's tensors are.
+        """Renders `scene` from `camera`, on the scene's device.
 
         Raises:
-            ValueError: the scene has neither surroundings nor an environment, or its Gaussians no reflection strength.
+            ValueError: the scene has neither surroundings nor an environment, or its Gaussians have no reflection
+                strength.
         """
         check_mirrored(scene)
         camera = camera.to(scene.primary.means.device)
@@ -100,7 +102,7 @@ class Traced(OverBackground):
     def _shade(
         self, scene: Scene, camera: Camera, surface: Surface, contributions: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """The image and what it mirrors, [H, W, 3] each (Eq. 5)."""
+        """The image and its reflection, [H, W, 3] each (Eq. 5)."""
         rgb, reflection = self._distant(scene, camera, surface)
         if not len(scene.surroundings):
             return rgb, reflection
@@ -115,7 +117,7 @@ class Traced(OverBackground):
         return rgb.index_put(chosen, mixed), reflection.index_put(chosen, colors)
 
     def _distant(self, scene: Scene, camera: Camera, surface: Surface) -> tuple[Tensor, Tensor]:
-        """The image and what it mirrors if the environment is all that is mirrored; without one nothing is."""
+        """The image and its reflection of the environment, if there is one."""
         image = surface.image
         if scene.environment.is_empty:
             return surface.base, torch.zeros_like(surface.base)
@@ -126,25 +128,25 @@ class Traced(OverBackground):
         return shaded.rgb, shaded.reflection
 
     def check(self, scene: Scene) -> None:
-        """Raises ValueError where a scene lacks colours, or what reflection needs."""
+        """Raises ValueError if a scene lacks colours, or tensors for reflection."""
         check_colored(scene.primary)
         check_mirrored(scene)
 
     def layers(self, scene: Scene) -> tuple[str, ...]:
-        """Names of the layers that are worth looking at."""
+        """Names of the layers for display."""
         discs = (MEDIAN_DEPTH,) if scene.primary.are_discs else ()
         return ("rgb", "base", "reflection", "strength", "normal", "surroundings", "depth", "alpha", *discs)
 
     def with_layers(self, layers: Sequence[str]) -> Traced:
-        """The renderer, also of `surroundings` where that is among the layers."""
+        """The renderer with `surroundings` enabled if it is among the layers."""
         return replace(self, surroundings=self.surroundings or "surroundings" in layers)
 
     def page_settings(self) -> Mapping[str, Any]:
-        """Settings for the web page, which looks up the surroundings as they are seen from the middle of the things."""
+        """Settings of the web page, which looks up the surroundings as seen from the centre of the region."""
         return page_settings(self.background, "near")
 
     def behind(self, scene: Scene, camera: Camera) -> Tensor:
-        """[H, W, 3] the surroundings that a ray through each pixel meets."""
+        """[H, W, 3] the surroundings along the ray of each pixel."""
         d = view_directions(camera).reshape(-1, 3)
         origins = camera.center.expand_as(d).contiguous()
         seen = traced_colors(scene, origins, d, NEAR_PER_EXTENT * scene.extent, self.background)
@@ -159,9 +161,9 @@ def traced_colors(
     background: tuple[float, float, float],
     contributions: Tensor | None = None,
 ) -> Tensor:
-    """Colours [R, 3] of the surroundings along rays, from `near` lengths of their directions on.
+    """Colours [R, 3] of the surroundings along rays, starting at `near` lengths of their directions.
 
-    Behind them is the scene's environment, or without one the background.
+    Behind them is the scene's environment, or the background without one.
     """
     found = traced_surroundings(scene.surroundings, origins, directions, near, contributions)
     if scene.environment.is_empty:
@@ -180,9 +182,9 @@ def traced_surroundings(
 
 
 def mirrored_contributions(scene: Scene, camera: Camera) -> Tensor:
-    """[N] how many pixels' worth each Gaussian of the surroundings adds to a view: its blending weights times strength.
+    """[N] contribution of each Gaussian of the surroundings to a view, in pixels: its blending weights times strength.
 
-    Rays are traced where the strength can be seen.
+    Rays are traced where the strength is visible.
     """
     camera = camera.to(scene.primary.means.device)
     with torch.no_grad():
@@ -191,7 +193,7 @@ def mirrored_contributions(scene: Scene, camera: Camera) -> Tensor:
         places, directions = reflected_rays(surface, camera, chosen)
     part = scene.surroundings
     with torch.enable_grad():
-        # The blending weight is what a constant colour has for a gradient; that of this one is 1.
+        # The blending weight is the gradient of a constant colour.
         ones = torch.full_like(part.sh[:, :1], 0.5 / SH_ZERO).requires_grad_()
         plain = replace(part.with_tensors({n: t.detach() for n, t in part.tensors().items()}), active_sh_degree=0)
         found = traced_surroundings(replace(plain, sh=ones), places, directions, START_PER_EXTENT * scene.extent)
@@ -200,9 +202,9 @@ def mirrored_contributions(scene: Scene, camera: Camera) -> Tensor:
 
 
 def check_mirrored(scene: Scene) -> None:
-    """Raises ValueError where there is nothing to mirror, or nothing mirrors.
+    """Raises ValueError without surroundings and environment, or without reflection strengths.
 
-    An environment alone will do, as before the surroundings have begun.
+    An environment alone is valid, as before the surroundings are added.
     """
     if not len(scene.surroundings) and scene.environment.is_empty:
         raise ValueError("the scene has no surroundings; expected one trained with `traced`")

@@ -11,15 +11,15 @@ SH_ZERO = 0.28209479177387814
 
 
 def logit(share: float) -> float:
-    """The raw parameter whose sigmoid is `share`, strictly between 0 and 1."""
+    """The logit of `share`, which is strictly between 0 and 1."""
     return math.log(share / (1 - share))
 
 
 def among_known(tensors: Mapping[str, Any], known: Iterable[str], owner: str) -> dict[str, Any]:
-    """The tensors by name, all of which the `owner` has.
+    """The tensors by name, checked against those of `owner`.
 
     Raises:
-        ValueError: a name is not among those that are `known`.
+        ValueError: a name is not in `known`.
     """
     unknown = set(tensors) - set(known)
     if unknown:

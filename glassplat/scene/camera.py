@@ -17,7 +17,7 @@ from torch import Tensor
 
 
 def waits(device: torch.device) -> bool:
-    """Return whether the program has to wait before it can look at what this device computes, as for a GPU."""
+    """Return whether reading results from this device synchronises, as on a GPU."""
     return device.type == "cuda"
 
 
@@ -25,19 +25,19 @@ def to_device(tensor: Tensor, device: torch.device | torch.dtype | str) -> Tenso
     """The tensor on a device, perhaps on its way there, or of another type; what is computed from it comes later."""
     if isinstance(device, torch.dtype) or tensor.device.type != "cpu" or torch.device(device).type != "cuda":
         return tensor.to(device)
-    # Only from memory that stays in its place can a GPU fetch by itself.
+    # Asynchronous copies need pinned memory.
     return tensor.pin_memory().to(device, non_blocking=True)
 
 
 @lru_cache(maxsize=1024)
-@torch.inference_mode(False)  # A later call may need it for gradients.
+@torch.inference_mode(False)  # A later call may need gradients.
 def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """A tensor of these numbers, or rows of them: the same one at every call, so leave it as it is."""
+    """A constant tensor of these numbers or rows, shared between calls; do not modify it."""
     return to_device(torch.tensor(values, dtype=dtype, device="cpu"), device)
 
 
 LEAST_SINE = 1e-6
-"""Of the angle between two directions that still tell which way is up."""
+"""Minimum sine of the angle between viewing direction and up."""
 
 
 def rotation_from_quat(quats: Tensor) -> Tensor:
@@ -52,8 +52,8 @@ def rotation_from_quat(quats: Tensor) -> Tensor:
 
 
 def quat_from_rotation(rotation: Tensor) -> Tensor:
-    """One of the two unit quaternions [4], `wxyz`, of a rotation [3, 3]; float64, on the CPU, without a gradient."""
-    from scipy.spatial.transform import Rotation  # Slow to import, and few runs need it.
+    """A unit quaternion [4], `wxyz`, of a rotation [3, 3]; float64, on the CPU, without gradients."""
+    from scipy.spatial.transform import Rotation  # Slow to import, and rarely needed.
 
     x, y, z, w = Rotation.from_matrix(rotation.detach().double().cpu().numpy()).as_quat().tolist()
     return torch.tensor([w, x, y, z], dtype=torch.float64)
@@ -73,11 +73,11 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
 
     Args:
         eye: [3] camera centre, world units.
-        target: [3] what is in the middle of the picture.
-        up: [3] away from the ground, of any length.
+        target: [3] point in the middle of the image.
+        up: [3] up direction, of any length.
 
     Raises:
-        ValueError: the camera stands where it looks, or looks straight up or down.
+        ValueError: `eye` and `target` coincide, or the camera looks straight up or down.
     """
     eye, target, up = (vector.detach().to("cpu", torch.float64) for vector in (eye, target, up))
     forward = torch.nn.functional.normalize(target - eye, dim=0)
@@ -117,8 +117,8 @@ class Camera:
     """One pinhole view of the world.
 
     Attributes:
-        cam_from_world: [4, 4] rigid transform, world to camera. A mirrored camera is left-handed
-            (determinant -1); its upper 3x3 block is orthogonal all the same.
+        cam_from_world: [4, 4] rigid transform, world to camera. A mirrored camera is left-handed (determinant -1), with
+            an orthogonal upper 3x3 block.
         fx, fy, cx, cy: intrinsics in pixels.
         width, height: image size in pixels.
     """
@@ -145,7 +145,7 @@ class Camera:
         if self.width != int(self.width) or self.height != int(self.height):
             raise ValueError(f"an image of {self.width}x{self.height} pixels; expected whole numbers")
         for name, kind in (("fx", float), ("fy", float), ("cx", float), ("cy", float), ("width", int), ("height", int)):
-            object.__setattr__(self, name, kind(getattr(self, name)))  # A tensor could change under its camera.
+            object.__setattr__(self, name, kind(getattr(self, name)))  # A tensor could change later.
 
     @staticmethod
     def look_at(
@@ -161,14 +161,15 @@ class Camera:
 
         Args:
             eye: [3] camera centre, world units.
-            target: [3] what is in the middle of the picture.
-            up: [3] away from the ground; (0, -1, 0) in most captures.
+            target: [3] point in the middle of the image.
+            up: [3] up direction; (0, -1, 0) in most captures.
             fov_rad: vertical field of view, radians.
-            width: of the image, pixels.
-            height: of the image, pixels.
+            width: width of the image, pixels.
+            height: height of the image, pixels.
 
         Raises:
-            ValueError: the camera stands where it looks, or looks straight up or down, or sees nothing.
+            ValueError: `eye` and `target` coincide, the camera looks straight up or down, or the field of view or size
+                is invalid.
         """
         if not 0 < fov_rad < math.pi:
             raise ValueError(f"fov_rad is {fov_rad}; expected radians between 0 and pi")
@@ -190,7 +191,7 @@ class Camera:
 
     @property
     def shared_intrinsics(self) -> Tensor:
-        """The intrinsics in the same tensor for all cameras that have them, for kernels; leave it as it is."""
+        """The intrinsics as a tensor for kernels, shared between equal cameras; do not modify it."""
         matrix = self.cam_from_world
         return constant((self.fx, self.fy, self.cx, self.cy), matrix.dtype, matrix.device)
 
@@ -205,7 +206,7 @@ class Camera:
         return self if pose is self.cam_from_world else replace(self, cam_from_world=pose)
 
     def resize(self, width: int, height: int) -> Camera:
-        """The same camera over another pixel grid that spans the same image."""
+        """The same camera with another pixel grid over the same image."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
@@ -253,7 +254,7 @@ class NumpyCamera:
 
     @property
     def diagonal(self) -> float:
-        """Of the image, in pixels."""
+        """Length of the image diagonal, in pixels."""
         return float(np.hypot(*self.size))
 
     def in_camera(self, points: Array) -> Array:
@@ -261,7 +262,7 @@ class NumpyCamera:
         return np.asarray((points - self.center) @ self.rotation.T)
 
     def pixels(self, in_camera: Array) -> Array:
-        """[..., 2] of points [..., 3] in the camera's axes; those behind it are mirrored, as the formula has it."""
+        """[..., 2] pixels of points [..., 3] in the camera's axes; points behind it are mirrored."""
         fx, fy, cx, cy = self.intrinsics
         depth = np.where(np.abs(in_camera[..., 2]) < 1e-12, 1e-12, in_camera[..., 2])
         return np.stack([fx * in_camera[..., 0] / depth + cx, fy * in_camera[..., 1] / depth + cy], axis=-1)
@@ -271,14 +272,14 @@ class NumpyCamera:
         return self.pixels(self.in_camera(points))
 
     def rays(self, pixels: Array) -> Array:
-        """[..., 3] unit world directions through pixels [..., 2], which may lie outside of the image."""
+        """[..., 3] unit world directions through pixels [..., 2], which may be outside the image."""
         fx, fy, cx, cy = self.intrinsics
         x, y = (pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy
         world = np.stack([x, y, np.ones_like(x)], axis=-1) @ self.rotation
         return np.asarray(world / np.linalg.norm(world, axis=-1, keepdims=True))
 
     def holds(self, points: Array, margin: float = 0.0) -> NDArray[np.bool_]:
-        """[...] which world points lie in the image, or up to `margin` of its sides outside it."""
+        """[...] bool: world points inside the image, enlarged by `margin` of its sides."""
         in_camera = self.in_camera(points)
         pixels = self.pixels(in_camera)
         room = margin * self.size

@@ -16,10 +16,10 @@ from glassplat.scene.camera import Camera
 
 
 def neighbours(name: str, names: Sequence[str]) -> list[int]:
-    """Rows of the last of `names` before `name` and of the first after it; one of them at an end.
+    """Rows of the neighbours of `name` in sorted `names`; only one at either end.
 
-    Numbers in names count as numbers: 9 comes before 10. Photographs of other folders are no neighbours, since nobody
-    knows when they were taken; the list is empty where there are no others.
+    Numbers in names are sorted numerically. Photographs of other folders are not neighbours, since their order in time
+    is unknown; the list may be empty.
     """
     folder, here = PurePosixPath(name).parent, in_order(name)
     beside = [row for row, known in enumerate(names) if PurePosixPath(known).parent == folder and known != name]
@@ -39,17 +39,17 @@ def in_order(name: str) -> tuple[list[tuple[int, str]], str]:
 
 @dataclass(frozen=True)
 class ByPhotograph:
-    """Values for each of V photographs; a subclass says what they mean.
+    """Base class of per-photograph values.
 
     Attributes:
-        values: [V, ...] all zero for a photograph that is taken as it is.
-        names: of the V photographs.
+        values: [V, ...] zero for photographs without a correction.
+        names: names of the V photographs.
     """
 
     TENSOR: ClassVar[str]
     """Name of the values."""
     SHAPE: ClassVar[tuple[int, ...]]
-    """Of those of one photograph."""
+    """Shape of the values of one photograph."""
 
     values: Tensor
     names: tuple[str, ...]
@@ -67,13 +67,13 @@ class ByPhotograph:
         return len(self.names)
 
     def of(self, name: str) -> Tensor | None:
-        """Values of a photograph; None for one that has none and is taken as it is."""
+        """Values of a photograph; None if it has none."""
         return self.values[self.names.index(name)] if name in self.names else None
 
     def interpolate(self, name: str) -> Self:
-        """The same with values for a photograph that has none: the mean of its neighbours' in the order of names.
+        """The corrections with values for a missing photograph: the mean of its neighbours' by name.
 
-        Itself where the photograph has its own, or no neighbours.
+        Unchanged if the photograph has values, or no neighbours.
         """
         rows = [] if name in self.names else neighbours(name, self.names)
         if not rows:
@@ -82,7 +82,7 @@ class ByPhotograph:
         return replace(self, values=torch.cat([self.values, mean]), names=(*self.names, name))
 
     def reaches(self, names: Iterable[str]) -> bool:
-        """Return whether any of these photographs has values, its own or its neighbours'."""
+        """Return whether any of these photographs has values of its own or of neighbours."""
         return any(name in self.interpolate(name).names for name in names)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -90,7 +90,7 @@ class ByPhotograph:
         return {self.TENSOR: self.values}
 
     def with_tensors(self, tensors: Mapping[str, Tensor]) -> Self:
-        """The same with its tensors replaced by name."""
+        """The corrections with tensors replaced by name."""
         known = among_known(tensors, self.tensors(), "these corrections")
         return replace(self, values=known.get(self.TENSOR, self.values))
 
@@ -100,18 +100,18 @@ class ByPhotograph:
 
     @classmethod
     def neutral(cls, names: tuple[str, ...] = ()) -> Self:
-        """All photographs taken as they are."""
+        """Neutral corrections of all photographs."""
         return cls(torch.zeros(len(names), *cls.SHAPE, dtype=torch.float32), names)
 
 
 @dataclass(frozen=True)
 class Exposures(ByPhotograph):
-    """For each photograph what makes its colours of those of the scene: c' = c + A c + b, sRGB.
+    """For each photograph, the affine map from scene colours to its own: c' = c + A c + b, sRGB.
 
-    Cameras change exposure and white balance from one photograph to the next. In sRGB, a power of the radiance, both
-    are nearly factors on the channels.
+    Exposure and white balance vary between photographs. In sRGB, a power of radiance, both are approximately factors
+    on the channels.
 
-    `values` are [V, 3, 4] A and b; zero for a photograph in the scene's own colours.
+    `values` are [V, 3, 4] A and b; zero for photographs with the colours of the scene.
     """
 
     TENSOR = "affine"
@@ -125,7 +125,7 @@ class Exposures(ByPhotograph):
         return image @ (torch.eye(3, dtype=image.dtype, device=image.device) + own[:, :3].T) + own[:, 3]
 
     def undone(self, photo: Tensor, name: str) -> Tensor:
-        """A photograph [..., 3] in the colours of the scene: what `apply` would have made the photograph."""
+        """A photograph [..., 3] in the colours of the scene: the inverse of `apply`."""
         own = self.of(name)
         if own is None:
             return photo
@@ -135,26 +135,26 @@ class Exposures(ByPhotograph):
 
 @dataclass(frozen=True)
 class PoseCorrections(ByPhotograph):
-    """For each photograph a small motion of its camera about its own centre, in axes parallel to the world's.
+    """For each photograph, a small motion of its camera about its own centre, in axes parallel to the world's.
 
-    cam_from_world = [R | t] becomes exp(twist turned by R) cam_from_world. In these axes a shift that all cameras have
-    in common is the mean of their twists, and the motion of a camera between two others is about the mean of theirs. A
-    turn of all cameras about one place is no common twist: it shifts each of them differently.
+    cam_from_world = [R | t] becomes exp(twist turned by R) cam_from_world. In these axes, a common shift of all
+    cameras is the mean of their twists, and the motion of a camera between two others is about the mean of theirs. A
+    common rotation about a point is not a common twist, because it shifts each camera differently.
 
     `values` are [V, 6] twists: rotation vectors in radians, and translations in scene extents; zero for a camera that
-    stays. So both are small numbers whatever the capture's units.
+    stays. Both are small numbers in any units.
     """
 
     TENSOR = "twists"
     SHAPE = (6,)
 
     def correct(self, camera: Camera, name: str, extent: float) -> Camera:
-        """The camera of a photograph where it really is; differentiable in the twists.
+        """The corrected camera of a photograph; differentiable in the twists.
 
         Args:
-            camera: as the capture says.
-            name: of the photograph.
-            extent: of the scene, world units.
+            camera: camera of the capture.
+            name: name of the photograph.
+            extent: extent of the scene, world units.
         """
         twist = self.of(name)
         if twist is None:
@@ -167,16 +167,16 @@ def moved_camera(camera: Camera, twist: Tensor, extent: float) -> Camera:
     """The camera after a motion in its own frame.
 
     Args:
-        camera: before it.
+        camera: camera before the motion.
         twist: [6] rotation vector, radians, and translation, in extents.
-        extent: world units.
+        extent: extent of the scene, world units.
     """
     pose = camera.cam_from_world
     return replace(camera, cam_from_world=motion(twist, extent).to(pose.dtype) @ pose.to(twist.device))
 
 
 def motion(twist: Tensor, extent: float) -> Tensor:
-    """[4, 4] the rigid motion of a twist [6], as `moved_camera` takes it; smooth everywhere, also at zero."""
+    """[4, 4] the rigid motion of a twist [6] of `moved_camera`; smooth everywhere, including at zero."""
     x, y, z, *shift = twist.unbind()
     zero = torch.zeros_like(x)
     u, v, w = (extent * along for along in shift)
@@ -187,22 +187,22 @@ def motion(twist: Tensor, extent: float) -> Tensor:
 
 Direction = tuple[float, float, float]
 DEFAULT_UP: Direction = (0.0, -1.0, 0.0)
-"""Of most captures, where no camera tells."""
+"""Default up direction, if the cameras do not determine it."""
 
 LEVEL_SHARE = 0.2
-"""Of the image's own horizontal axis, which decides where a camera looks straight down or up."""
+"""Weight of the image's horizontal axis, which defines the frame if the camera looks straight up or down."""
 TILT_PENALTY = 0.01
-"""Against an upward direction that only fits because all cameras look the same way."""
+"""Regularisation against a degenerate up direction if all cameras look the same way."""
 LEAST_AGREEMENT = 0.1
-"""Length of a mean of unit vectors below which they tell no direction."""
+"""Length of a mean of unit vectors below which its direction is undefined."""
 
 
 def upward(cameras: Sequence[Camera]) -> Direction:
-    """The direction away from the ground, as the cameras tell: unit, world axes.
+    """Up direction estimated from the cameras: unit, world axes.
 
-    Handheld cameras are tilted up and down, but hardly rolled: their x axes are level. Of the directions at right
-    angles to these the one along which images stand upright is taken; where all cameras look the same way, that of
-    the mean image. Cameras that look straight down, rolled in all directions, look away from it.
+    Handheld cameras are pitched, but hardly rolled, so that their x axes are horizontal. The up direction is
+    perpendicular to these, with the sign of upright images; if all cameras look the same way, it is that of the mean
+    image. If they look straight down with all rolls, it is opposite to their viewing direction.
     """
     rotations = torch.stack([camera.cam_from_world[:3, :3] for camera in cameras]).double().cpu()
     level = rotations[:, 0]
@@ -216,11 +216,11 @@ def upward(cameras: Sequence[Camera]) -> Direction:
 
 
 def world_from_photographer(camera: Camera, up: Direction | None) -> Tensor:
-    """[4, 4] the frame of whoever holds the camera: its origin, x to the right, y down, z ahead; differentiable.
+    """[4, 4] the frame of the photographer, at the camera: x to the right, y down, z ahead; differentiable.
 
     Args:
-        camera: held; OpenCV axes, not mirrored.
-        up: the direction in which people stand, unit; None leans the frame with the camera.
+        camera: OpenCV axes, not mirrored.
+        up: unit up direction; None tilts the frame with the camera.
     """
     rotation = camera.cam_from_world[:3, :3].T
     if up is not None:
@@ -230,7 +230,7 @@ def world_from_photographer(camera: Camera, up: Direction | None) -> Tensor:
 
 
 def _stood_up(world_from_cam: Tensor, up: Tensor) -> Tensor:
-    """[3, 3] the rotation whose y axis points down and whose z axis points where the camera does."""
+    """[3, 3] the rotation whose y axis points down and whose z axis is the horizontal viewing direction."""
     right, ahead = world_from_cam[:, 0], world_from_cam[:, 2]
     across = torch.linalg.cross(ahead, up) + LEVEL_SHARE * (right - (right @ up) * up)
     across = torch.nn.functional.normalize(across, dim=0)

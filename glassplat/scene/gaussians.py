@@ -11,9 +11,9 @@ from torch import Tensor
 from glassplat.scene import among_known
 
 DISC_SCALES = 2
-"""Scales of a disc; an ellipsoid has one more."""
+"""Number of scales of a disc; ellipsoids have one more."""
 SH_COEFFICIENTS = (0, 1, 4, 9, 16)
-"""Harmonics per colour: none, or those up to a degree from 0 to 3."""
+"""Possible numbers of SH coefficients: none, or those of degrees 0 to 3."""
 ALL_DEGREES = -1
 PER_GAUSSIAN = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
@@ -47,7 +47,7 @@ class Gaussians:
         sh: [N, K, 3] spherical-harmonic colour coefficients, K in {0, 1, 4, 9, 16}; K = 0 for
             Gaussians without a colour of their own (glass).
         channels: named raw per-Gaussian values, each [N] (`log_intensity`, `logit_mark`, ...).
-        active_sh_degree: highest degree in use; grows during training. All that `sh` holds if not given.
+        active_sh_degree: SH degree in use; grows during training. All that `sh` holds if not given.
     """
 
     means: Tensor
@@ -84,12 +84,12 @@ class Gaussians:
 
     @property
     def max_sh_degree(self) -> int:
-        """Highest degree the coefficients can hold; -1 when there are none."""
+        """SH degree of the stored coefficients; -1 without any."""
         return round(self.sh.shape[1] ** 0.5) - 1
 
     @property
     def are_discs(self) -> bool:
-        """Return whether they are flat, with two scales each (2DGS)."""
+        """Return whether the Gaussians are flat, with two scales (2DGS)."""
         return self.log_scales.shape[1] == DISC_SCALES
 
     @property
@@ -103,7 +103,7 @@ class Gaussians:
         return {name: getattr(self, name) for name in PER_GAUSSIAN} | dict(self.channels)
 
     def with_tensors(self, tensors: Mapping[str, Tensor]) -> Gaussians:
-        """The same set with some tensors, channels included, replaced by name."""
+        """The set with some tensors or channels replaced by name."""
         changed = among_known(tensors, self.tensors(), "these Gaussians")
         channels = {name: changed.pop(name, tensor) for name, tensor in self.channels.items()}
         return replace(self, **changed, channels=channels)
@@ -113,7 +113,7 @@ class Gaussians:
         return self.with_tensors({name: tensor[index] for name, tensor in self.tensors().items()})
 
     def concat(self, other: Gaussians) -> Gaussians:
-        """These Gaussians, then others with the same tensors.
+        """These Gaussians followed by others with the same tensors.
 
         Raises:
             ValueError: the others have other tensors, or some of other sizes.
@@ -130,7 +130,7 @@ class Gaussians:
 
     @staticmethod
     def empty(sh_coefficients: int = 0, channels: tuple[str, ...] = ()) -> Gaussians:
-        """A set of no Gaussians."""
+        """An empty set."""
         return Gaussians(
             means=torch.zeros(0, 3, dtype=torch.float32),
             quats=torch.zeros(0, 4, dtype=torch.float32),
@@ -144,10 +144,10 @@ class Gaussians:
 
 @torch.no_grad()
 def mirrored_gaussians(gaussians: Gaussians, center: Tensor, normal: Tensor) -> Gaussians:
-    """The Gaussians as a plane mirrors them: the same shapes, opacities and constant colours.
+    """Mirror images of the Gaussians at a plane, with the same shapes, opacities and constant colours.
 
-    A mirrored ellipsoid is the ellipsoid turned half around the normal, about the mirrored centre. View-dependent
-    colour is dropped: its spherical harmonics would have to be mirrored too.
+    A mirrored ellipsoid is the ellipsoid rotated by 180 degrees about the normal, at the mirrored centre.
+    View-dependent colour is dropped.
 
     Args:
         gaussians: any set.
@@ -168,11 +168,11 @@ HALF_TURNED_HARMONICS = {
     (1.0, -1.0, -1.0): (1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1),
     (-1.0, -1.0, 1.0): (1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1),
 }
-"""How each harmonic changes its sign when x, y and z change theirs so."""
+"""Signs of the harmonics under these sign changes of x, y and z."""
 
 
 def half_turned(gaussians: Gaussians, signs: tuple[float, float, float]) -> Gaussians:
-    """The Gaussians after half a turn about the x axis, signs (1, -1, -1), or the z axis, (-1, -1, 1); exact."""
+    """The Gaussians rotated by 180 degrees about the x axis, signs (1, -1, -1), or the z axis, (-1, -1, 1); exact."""
     flip = gaussians.means.new_tensor(signs)
     harmonics = gaussians.sh.new_tensor(HALF_TURNED_HARMONICS[signs][: gaussians.sh.shape[1]])[:, None]
     quats = gaussians.quats * torch.cat([flip.new_ones(1), flip])

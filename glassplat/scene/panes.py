@@ -1,4 +1,4 @@
-"""Panes as learnable rectangles (TR-Gaussians, Section III-A2), and what cameras see through them."""
+"""Panes as learnable rectangles (TR-Gaussians, Section III-A2), and visibility through them."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from glassplat.scene.camera import Camera, constant
 from glassplat.scene.gaussians import check_rows
 
 LEAST_SINE = 1e-6
-"""Of the angle between a pane's normal and its tangent."""
+"""Minimum sine of the angle between a pane's normal and its tangent."""
 HIGHEST_LABEL = 255
 PANE_TENSORS = ("centers", "raw_normals", "logit_reflectances", "log_transmittances")
 LONGEST_LIST = 3
-"""Labels that follow each other, of which messages name every one."""
+"""Consecutive labels that messages list individually."""
 
 
 def name_labels(labels: Iterable[int]) -> str:
-    """Different labels in order, as messages name them: "2, 3, 5", "1 to 24, 30"."""
+    """Sorted labels as text: "2, 3, 5", "1 to 24, 30"."""
     runs: list[list[int]] = []
     for label in sorted(set(labels)):
         if runs and label == runs[-1][-1] + 1:
@@ -34,7 +34,7 @@ def name_labels(labels: Iterable[int]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Planes:
-    """K rectangles that reflect, one per pane.
+    """K reflecting rectangles, one per pane.
 
     The rectangle's size and in-plane orientation get no gradient (the hit mask is piecewise
     constant in them); they are set large enough to cover the pane, and the rendered mask cuts
@@ -47,9 +47,9 @@ class Planes:
         tangents: [K, 3] direction of the rectangle's first side; made orthogonal to the normal in use.
         half_sizes: [K, 2] half the side lengths along tangent and bitangent; world units.
         labels: pane label of each plane, as found in the masks, 1 to 255.
-        mirrors: labels of the planes that transmit nothing; their base reflectance gets no gradient.
-        log_transmittances: [K, 3] logarithm of the share of red, green and blue light that gets through, of what does
-            not come back. None where all panes are clear.
+        mirrors: labels of mirrors, which transmit nothing; their base reflectance gets no gradient.
+        log_transmittances: [K, 3] logarithm of the transmitted share of the unreflected red, green and blue light. None
+            if all panes are clear.
     """
 
     centers: Tensor
@@ -93,19 +93,19 @@ class Planes:
 
     @property
     def are_mirrors(self) -> Tensor:
-        """[K] bool, the planes that transmit nothing; the same tensor at every call, so leave it as it is."""
+        """[K] bool, true for mirrors; shared between calls, do not modify it."""
         return constant(tuple(label in self.mirrors for label in self.labels), torch.bool, self.centers.device)
 
     @property
     def transmittances(self) -> Tensor | None:
-        """[K, 3] share of red, green and blue light that gets through; None where all panes are clear.
+        """[K, 3] transmitted share of red, green and blue light; None if all panes are clear.
 
-        Training keeps it in (0, 1]. There is no bound here, which would take the gradient of what lies beyond it.
+        Training keeps it in (0, 1]. It is not clamped here, which would remove the gradient outside.
         """
         return None if self.log_transmittances is None else self.log_transmittances.exp()
 
     def that_may_tint(self) -> Planes:
-        """The same planes, still clear where they were, with transmittances that can be learnt."""
+        """The planes with trainable transmittances, initially clear."""
         clear = self.centers.new_zeros(len(self), 3)
         return self if self.log_transmittances is not None else replace(self, log_transmittances=clear)
 
@@ -122,7 +122,7 @@ class Planes:
         return {name: tensor for name, tensor in named.items() if tensor is not None}
 
     def with_tensors(self, tensors: Mapping[str, Tensor]) -> Planes:
-        """The same planes with some tensors replaced by name."""
+        """The planes with some tensors replaced by name."""
         return replace(self, **among_known(tensors, self.tensors(), "planes"))
 
     def select(self, rows: Sequence[int]) -> Planes:
@@ -160,15 +160,15 @@ class Planes:
         """A single plane, with a base reflectance of one half.
 
         Args:
-            center: [3] its middle, world units.
+            center: [3] centre, world units.
             normal: [3] of any length.
             half_sizes: half its sides along tangent and bitangent, world units.
-            tangent: [3] direction of its first side; some direction in the plane if None.
-            label: what to call it, 1 to 255.
+            tangent: [3] direction of its first side; any direction in the plane if None.
+            label: label of the pane, 1 to 255.
 
         Raises:
-            ValueError: a value is not finite, a size is not above 0, a direction has no length in the plane, or the
-                label is out of range.
+            ValueError: a value is not finite, a size is not positive, a direction has length 0, or the label is out of
+                range.
         """
         middle, across, half = (
             torch.tensor(list(values), dtype=torch.float32) for values in (center, normal, half_sizes)
@@ -189,7 +189,7 @@ class Planes:
 
     @staticmethod
     def empty() -> Planes:
-        """No planes at all."""
+        """An empty set of planes."""
         return Planes(
             torch.zeros(0, 3, dtype=torch.float32),
             torch.zeros(0, 3, dtype=torch.float32),
@@ -202,19 +202,19 @@ class Planes:
 
 LARGEST_ANGLE = math.radians(1.0)
 LARGEST_OFFSET = 0.02
-"""Of the middle of one pane from the plane of the other, as a share of the larger one's longer half side."""
+"""Maximum distance of one pane's centre from the other's plane, as a share of the longer half side."""
 
 
 @torch.no_grad()
 def coplanar_groups(planes: Planes, rows: Sequence[int]) -> list[list[int]]:
-    """Groups of panes that lie in one plane, directly or by way of third ones; the largest of each first.
+    """Groups of coplanar panes (transitively), each with its largest pane first.
 
     Args:
         planes: the panes.
-        rows: positions of those that are asked about.
+        rows: positions of the panes to group.
 
     Returns:
-        Every row in one group, the groups in the order of their first rows.
+        Groups that partition the rows, in order of their first rows.
     """
     groups = linked_groups(rows, lambda one, other: _coplanar(planes, one, other))
     areas = planes.half_sizes.prod(dim=1)
@@ -222,7 +222,7 @@ def coplanar_groups(planes: Planes, rows: Sequence[int]) -> list[list[int]]:
 
 
 def linked_groups(rows: Sequence[int], are_linked: Callable[[int, int], bool]) -> list[list[int]]:
-    """Groups of rows that are linked, directly or by way of third ones, in the order of their smallest rows."""
+    """Connected components of linked rows, in order of their smallest rows."""
     groups: list[list[int]] = []
     for row in rows:
         near = [group for group in groups if any(are_linked(row, other) for other in group)]
@@ -239,9 +239,9 @@ def _coplanar(planes: Planes, one: int, other: int) -> bool:
 
 
 def rectangle_offsets(points: Tensor, planes: Planes) -> Tensor:
-    """[N, K, 3] how far points [N, 3] lie beyond the sides of each rectangle, and off its plane; world units.
+    """[N, K, 3] distances of points [N, 3] beyond the sides of each rectangle, and from its plane; world units.
 
-    The length of a row is the distance from the rectangle.
+    The norm of a row is the distance from the rectangle.
     """
     offsets = points[:, None] - planes.centers
     along = torch.stack([(offsets * axis).sum(-1) for axis in planes.axes()], dim=-1)
@@ -252,13 +252,13 @@ def rectangle_offsets(points: Tensor, planes: Planes) -> Tensor:
 
 @torch.no_grad()
 def nearest_panes(points: Tensor, planes: Planes) -> Tensor:
-    """[N] the plane whose rectangle is nearest to each of the points [N, 3], position in `planes`."""
+    """[N] position in `planes` of the rectangle nearest to each of the points [N, 3]."""
     return rectangle_offsets(points, planes).square().sum(-1).argmin(dim=1)
 
 
 @torch.no_grad()
 def behind_panes(points: Tensor, planes: Planes, cameras: Sequence[Camera]) -> Tensor:
-    """[N] bool: which points some camera sees through some pane.
+    """[N] bool: points that some camera sees through some pane.
 
     A point counts if a camera, on either side of a pane, has the point in its image and the segment from the camera's
     centre to the point crosses the pane's rectangle.
@@ -271,14 +271,14 @@ def behind_panes(points: Tensor, planes: Planes, cameras: Sequence[Camera]) -> T
     found = torch.zeros(points.shape[0], dtype=torch.bool, device=points.device)
     if len(planes) == 0:
         return found
-    # The views are taken one by one: all of them at once would need views x panes x points values.
+    # One view at a time, to avoid views x panes x points values.
     for camera in (camera.to(points.device) for camera in cameras):
         found |= crosses_pane(points, planes, camera.center) & in_image(points, camera)
     return found
 
 
 def crosses_pane(points: Tensor, planes: Planes, camera_center: Tensor) -> Tensor:
-    """[N] bool: whether the segment from `camera_center` to the point crosses any of the panes."""
+    """[N] bool: true if the segment from `camera_center` to the point crosses a pane."""
     normals = planes.normals
     camera_distance = ((camera_center - planes.centers) * normals).sum(-1)
     distances = points @ normals.T - (planes.centers * normals).sum(-1)
@@ -293,13 +293,13 @@ def crosses_pane(points: Tensor, planes: Planes, camera_center: Tensor) -> Tenso
 
 
 def nearest_pixels(positions: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Row and column [N] of the pixels that are nearest to positions [N, 2] in an image or outside it."""
+    """Row and column [N] of the pixels nearest to positions [N, 2] inside or outside an image."""
     column, row = positions.nan_to_num().unbind(dim=1)
     return row.clamp(0, camera.height - 1).long(), column.clamp(0, camera.width - 1).long()
 
 
 def in_image(points: Tensor, camera: Camera) -> Tensor:
-    """[N] bool: whether the points lie in the image of a camera, hidden or not."""
+    """[N] bool: points inside the image of a camera, occluded or not."""
     pixels, depths = camera.project(points)
     size = pixels.new_tensor([camera.width, camera.height])
     return (depths > 0) & ((pixels >= 0) & (pixels <= size)).all(dim=1)

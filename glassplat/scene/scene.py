@@ -1,4 +1,4 @@
-"""Everything a renderer may draw, distant surroundings among it, and edits of panes and their glass."""
+"""The scene that renderers draw, including its environment, and edits of panes and their glass."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from glassplat.scene.panes import PANE_TENSORS, Planes, name_labels, nearest_pan
 ENVIRONMENT_TENSORS = ("raw",)
 FACES = 6
 NOISE = 5.0
-"""Of the logits of an environment before training."""
+"""Amplitude of the initial logits of an environment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class Environment:
 
     @property
     def is_empty(self) -> bool:
-        """Return whether there is no environment at all."""
+        """Return whether there is no environment."""
         return self.size == 0
 
     def tensors(self) -> dict[str, Tensor]:
@@ -63,7 +63,7 @@ class Environment:
         return {name: getattr(self, name) for name in ENVIRONMENT_TENSORS}
 
     def with_tensors(self, tensors: Mapping[str, Tensor]) -> Environment:
-        """The same environment with its tensors replaced by name."""
+        """The environment with its tensors replaced by name."""
         return replace(self, **among_known(tensors, ENVIRONMENT_TENSORS, "environments"))
 
     def to(self, device: torch.device | torch.dtype | str) -> Environment:
@@ -77,7 +77,7 @@ class Environment:
 
     @staticmethod
     def random(size: int, *, generator: torch.Generator) -> Environment:
-        """Noise to start training from: raw values uniform in [-NOISE, NOISE], on the generator's device.
+        """Initial environment: raw values uniform in [-NOISE, NOISE], on the generator's device.
 
         Raises:
             ValueError: the size is below 1.
@@ -90,28 +90,27 @@ class Environment:
 
 GAUSSIAN_SETS = ("primary", "glass", "surroundings", "photographer")
 OPTIONAL_SETS = GAUSSIAN_SETS[2:]
-"""Those that most scenes have not."""
+"""Sets of Gaussians that most scenes lack."""
 PARTS = (*GAUSSIAN_SETS, "planes", "environment", "exposures", "poses")
 """Fields of `Scene` that hold tensors."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Primary Gaussians, glass Gaussians, reflection planes, and what shiny surfaces mirror.
+    """Primary and glass Gaussians, reflection planes, and the surroundings that glossy surfaces reflect.
 
     Attributes:
         primary: the scene itself, in front of the panes and behind them.
         glass: Gaussians that mark where a pane reflects; they appear in the mask only.
         planes: the panes; empty for a scene without reflection.
         extent: radius of the capture in world units; learning rates and distances scale with it.
-        environment: what shiny surfaces mirror from far away; empty for most methods.
-        surroundings: Gaussians that shiny surfaces mirror from near by, and nothing else shows (EnvGS); empty for most
-            methods.
-        photographer: Gaussians in the frame of whoever held the camera (`world_from_photographer`), which only panes
-            show; empty for most methods.
-        up: the direction in which the photographer stands, unit; None where the body leans with the camera.
-        exposures: how the photographs were exposed that it was trained on; empty where all are taken as alike.
-        poses: how far their cameras are from where they were said to be; empty where they are taken as right.
+        environment: distant light reflected by glossy surfaces; empty for most methods.
+        surroundings: Gaussians visible only in reflections of glossy surfaces (EnvGS); empty for most methods.
+        photographer: Gaussians in the photographer's frame (`world_from_photographer`), visible only in panes; empty
+            for most methods.
+        up: unit up direction of the photographer; None if they tilt with the camera.
+        exposures: learned exposures of the training photographs; empty if not learned.
+        poses: learned pose corrections of the training photographs; empty if not learned.
     """
 
     primary: Gaussians
@@ -130,19 +129,19 @@ class Scene:
         return f"Scene({', '.join(sets)}, planes={self.planes}, extent={self.extent:.4g})"
 
     def gaussian_sets(self) -> dict[str, Gaussians]:
-        """The sets of Gaussians by name; surroundings and photographer are among them where there are any."""
+        """The sets of Gaussians by name, with surroundings and photographer if present."""
         sets = {"primary": self.primary, "glass": self.glass}
         return sets | {name: getattr(self, name) for name in OPTIONAL_SETS if len(getattr(self, name))}
 
     @property
     def num_gaussians(self) -> int:
-        """Gaussians of all sets."""
+        """Number of Gaussians in all sets."""
         return sum(map(len, self.gaussian_sets().values()))
 
     def tensors(self) -> dict[str, Tensor]:
         """Every tensor by dotted name (`primary.means`, `planes.tangents`, ...).
 
-        The environment (`environment.raw`), the exposures and the poses are among them where there are any.
+        Includes the environment (`environment.raw`), exposures and poses if present.
         """
         parts: dict[str, Any] = {**self.gaussian_sets(), "planes": self.planes}
         parts |= {} if self.environment.is_empty else {"environment": self.environment}
@@ -150,12 +149,12 @@ class Scene:
         return {f"{part}.{name}": t for part, held in parts.items() for name, t in held.tensors().items()}
 
     def parameters(self) -> dict[str, Tensor]:
-        """Every trainable tensor by dotted name: all but those that say which part of a plane a pane is."""
+        """Every trainable tensor by dotted name: all but those that define the rectangles of panes."""
         fixed = {f"planes.{name}" for name in self.planes.tensors().keys() - set(PANE_TENSORS)}
         return {name: tensor for name, tensor in self.tensors().items() if name not in fixed}
 
     def with_parameters(self, parameters: Mapping[str, Tensor]) -> Scene:
-        """The same scene with some tensors replaced by dotted name."""
+        """The scene with some tensors replaced by dotted name."""
         parts: dict[str, dict[str, Tensor]] = {name: {} for name in PARTS}
         for dotted, tensor in parameters.items():
             part, _, name = dotted.partition(".")
@@ -166,7 +165,7 @@ class Scene:
         return replace(self, **changed)
 
     def with_gaussians(self, part: str, gaussians: Gaussians) -> Scene:
-        """The same scene with one set of Gaussians replaced."""
+        """The scene with one set of Gaussians replaced."""
         if part not in GAUSSIAN_SETS:
             raise ValueError(f"unknown set of Gaussians {part!r}; expected one of {sorted(GAUSSIAN_SETS)}")
         changed: dict[str, Any] = {part: gaussians}
@@ -179,11 +178,11 @@ class Scene:
 
 
 LARGEST_LOGIT = 50.0
-"""Its sigmoid is 1 in both precisions, and it is finite, so that the scene can still be written."""
+"""Its sigmoid is 1 in both precisions; finite, so that the scene can be written."""
 
 
 def scale_scene(scene: Scene, factor: float) -> Scene:
-    """The scene in other units: all lengths times a factor, about the origin; 1 changes no bit.
+    """The scene in other units: all lengths scaled about the origin; exact for 1.
 
     Raises:
         ValueError: the factor is not positive and finite.
@@ -204,14 +203,14 @@ def scale_scene(scene: Scene, factor: float) -> Scene:
 
 
 def without_glass(scene: Scene) -> Scene:
-    """The scene without panes: what is seen when nothing reflects."""
+    """The scene without panes."""
     return replace(
         scene, glass=scene.glass.select(torch.zeros(len(scene.glass), dtype=torch.bool)), planes=Planes.empty()
     )
 
 
 def without_pane(scene: Scene, label: int) -> Scene:
-    """The scene without one of its panes: what is behind it is seen, and nothing reflects.
+    """The scene without one of its panes.
 
     Raises:
         ValueError: no pane has the label.
@@ -224,7 +223,7 @@ def without_pane(scene: Scene, label: int) -> Scene:
 
 
 def as_mirrors(scene: Scene, labels: Sequence[int]) -> Scene:
-    """The panes with these labels reflect everything, from every angle.
+    """The scene with the panes of these labels turned into perfect mirrors.
 
     Raises:
         ValueError: no pane has one of the labels.
@@ -236,9 +235,9 @@ def as_mirrors(scene: Scene, labels: Sequence[int]) -> Scene:
 
 
 def with_reflectance(scene: Scene, label: int, base_reflectance: float) -> Scene:
-    """The pane reflects this share of light at normal incidence; Fresnel's laws add to it at an angle.
+    """The scene with another reflectance R0 of a pane, at normal incidence; Fresnel's laws add to it at an angle.
 
-    With less than 1, it is no mirror any more, whose reflectance gets no gradient.
+    Below 1, a mirror becomes an ordinary pane, whose reflectance is trainable.
 
     Raises:
         ValueError: no pane has the label, or the reflectance is not in [0, 1].
@@ -255,7 +254,7 @@ def with_reflectance(scene: Scene, label: int, base_reflectance: float) -> Scene
 def tilt_pane(
     scene: Scene, label: int, about_tangent: float, about_bitangent: float, *, owned: Tensor | None = None
 ) -> Scene:
-    """The pane and its glass, turned about the rectangle's middle; zero angles change no bit.
+    """The scene with a pane and its glass tilted about the rectangle's centre; exact for zero angles.
 
     Args:
         scene: what to edit; it is left as it is.
@@ -280,12 +279,12 @@ def tilt_pane(
 
 
 def shift_pane(scene: Scene, label: int, distance: float, *, owned: Tensor | None = None) -> Scene:
-    """The pane and its glass, moved along the pane's normal; zero changes no bit.
+    """The scene with a pane and its glass shifted along the pane's normal; exact for zero.
 
     Args:
         scene: what to edit; it is left as it is.
         label: which pane.
-        distance: world units, positive to where the normal points.
+        distance: world units, positive along the normal.
         owned: [N] bool, the pane's glass; if None, what is nearest to it.
 
     Raises:
@@ -300,9 +299,9 @@ def shift_pane(scene: Scene, label: int, distance: float, *, owned: Tensor | Non
 
 
 class PaneMove(NamedTuple):
-    """Movement of a pane: a rotation about its middle, then a step, in world axes and units.
+    """Movement of a pane: a rotation about its centre, then a translation, in world axes and units.
 
-    label: which pane. turn: quaternion `wxyz`, of any length. step: from where the middle was to where it is.
+    label: label of the pane. turn: quaternion `wxyz`, of any length. step: translation of the centre.
     """
 
     label: int
@@ -311,13 +310,13 @@ class PaneMove(NamedTuple):
 
 
 def move_panes(scene: Scene, moves: Sequence[PaneMove]) -> Scene:
-    """Panes and their glass, turned and then taken elsewhere; not to move changes no bit.
+    """The scene with panes and their glass rotated, then translated; exact for identity.
 
-    The glass of a pane is what lies nearest to it before any of them moves.
+    Each glass Gaussian belongs to the nearest pane before the movements.
 
     Args:
         scene: what to edit; it is left as it is.
-        moves: one after the other.
+        moves: movements, applied one after the other.
 
     Raises:
         ValueError: no pane has a label, a number is not finite, or a quaternion has no length.
@@ -337,7 +336,7 @@ def move_panes(scene: Scene, moves: Sequence[PaneMove]) -> Scene:
 
 
 def glass_of_pane(scene: Scene, row: int) -> Tensor:
-    """[N] bool: the glass Gaussians that are nearer to this pane's rectangle than to any other."""
+    """[N] bool: glass Gaussians that are nearest to this pane's rectangle."""
     return nearest_panes(scene.glass.means, scene.planes) == row
 
 
@@ -345,7 +344,7 @@ def row_of(planes: Planes, label: int) -> int:
     """The position of the pane with a label.
 
     Raises:
-        ValueError: there is none; lists the labels there are.
+        ValueError: there is none; the message lists the known labels.
     """
     if label not in planes.labels:
         there_are = f"the panes are {name_labels(planes.labels)}" if len(planes) else "it has no panes"
@@ -354,7 +353,7 @@ def row_of(planes: Planes, label: int) -> int:
 
 
 def _turn_pane(scene: Scene, row: int, turn: Tensor, owned: Tensor) -> Scene:
-    """A pane and the glass [N] bool that it owns, turned about its middle by a unit quaternion [4]."""
+    """The scene with a pane and its glass [N] bool rotated about its centre by a unit quaternion [4]."""
     rotation = rotation_from_quat(turn)
     planes = scene.planes
     turned = {name: _with_row(getattr(planes, name), row, rotation) for name in ("raw_normals", "tangents")}
@@ -367,7 +366,7 @@ def _turn_pane(scene: Scene, row: int, turn: Tensor, owned: Tensor) -> Scene:
 
 
 def _translate_pane(scene: Scene, row: int, step: Tensor, owned: Tensor) -> Scene:
-    """A pane and the glass [N] bool that it owns, taken elsewhere by a step [3]."""
+    """The scene with a pane and its glass [N] bool translated by a step [3]."""
     centers = scene.planes.centers.clone()
     centers[row] += step
     means = scene.glass.means
@@ -389,28 +388,27 @@ def _check_finite(label: int, *numbers: float) -> None:
 
 
 OVERLAP = 0.7
-"""Standard deviation of a disc, in distances between neighbours; the discs blend into an even sheet."""
+"""Standard deviation of a glass Gaussian, in distances between neighbours; together, they form an even sheet."""
 THICKNESS = 0.05
-"""Standard deviation across the pane, as a share of that along it."""
+"""Standard deviation along the normal, as a share of that in the plane."""
 CLOSED_OPACITY, CLOSED_MARK, CLOSED_OVERLAP = 0.99, 0.9999, 1.2
-"""Of discs on a pane which nobody trains; they leave no gap through which a mirror would show what is behind it."""
+"""The same for untrained panes, without gaps through which a mirror would transmit."""
 
 MARK = 0.99
-"""m of glass that nobody has trained; the paper's 1 has no finite logit."""
+"""Mark m of untrained glass; the paper's 1 has no finite logit."""
 
 
 def glass_gaussians(planes: Planes, *, count: int = 1000, seed: int = 0, opacity: float = 0.5) -> Gaussians:
     """Glass Gaussians on every pane's rectangle, on the device and of the type of its centre.
 
-    They are spread by a scrambled Sobol sequence, so that chance leaves no holes. At the default
-    opacity the sheet shows a mask of about 0.8 from the first step on, and training thins it out where
-    the rectangle is larger than the pane.
+    Positions are a scrambled Sobol sequence, to avoid holes. At the default opacity, the rendered mask is initially
+    about 0.8, and training removes glass where the rectangle is larger than the pane.
 
     Args:
         planes: the panes.
-        count: Gaussians on each pane.
-        seed: of the places.
-        opacity: of each Gaussian, in (0, 1).
+        count: number of Gaussians on each pane.
+        seed: random seed of the positions.
+        opacity: opacity of each Gaussian, in (0, 1).
     """
     panes = [_pane_discs(planes, index, count=count, seed=seed) for index in range(len(planes))]
     if not panes:
@@ -429,7 +427,7 @@ def glass_gaussians(planes: Planes, *, count: int = 1000, seed: int = 0, opacity
 
 
 def closed_glass(planes: Planes) -> Gaussians:
-    """Glass Gaussians for panes that nobody trains: they cover every rectangle wholly, with a mask of almost 1."""
+    """Glass Gaussians for untrained panes: they cover every rectangle with a mask of almost 1."""
     glass = glass_gaussians(planes, opacity=CLOSED_OPACITY)
     wider = glass.log_scales + math.log(CLOSED_OVERLAP / OVERLAP)
     marks = torch.full_like(glass.channels["logit_mark"], logit(CLOSED_MARK))
@@ -437,11 +435,11 @@ def closed_glass(planes: Planes) -> Gaussians:
 
 
 def with_pane(scene: Scene, pane: Planes) -> Scene:
-    """The scene with one more pane, its rectangle evenly covered with glass; on its device, in its precision.
+    """The scene with an additional pane, evenly covered with glass, on the device and in the precision of the scene.
 
     Args:
-        scene: any; Gaussians that do not say how bright they are in a pane are as bright as they are.
-        pane: a single plane.
+        scene: any scene; Gaussians without a reflection intensity get one of 1.
+        pane: a single pane.
 
     Raises:
         ValueError: the scene has a pane of that label.
@@ -459,7 +457,7 @@ def with_pane(scene: Scene, pane: Planes) -> Scene:
 
 
 def with_intensity(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians with an intensity of 1 in what panes mirror, unless they have one."""
+    """The Gaussians with a reflection intensity of 1, unless they have one."""
     if "log_intensity" in gaussians.channels:
         return gaussians
     return replace(gaussians, channels={**gaussians.channels, "log_intensity": torch.zeros_like(gaussians.means[:, 0])})

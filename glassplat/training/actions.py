@@ -26,20 +26,20 @@ from glassplat.training.stage import Action, AtMoments, Clock, Every, PostStep, 
 log = logging.getLogger("glassplat.training")
 
 LARGE_ENOUGH = 250_000
-"""Pixels of a photograph from which the published densification thresholds hold (lab/gaussians.md)."""
+"""Size of photographs, in pixels, above which the published densification thresholds apply (lab/gaussians.md)."""
 GAUSSIANS_PER_PIXEL = 0.5
-"""Where `McmcDensify` stops to grow unless told otherwise. Of 400x300, default densification ends near one."""
+"""Default cap of `McmcDensify`, in Gaussians per pixel; at 400x300, default densification ends near one."""
 GROWTH_SHARE = 1 / 300
-"""Share of the run in which `McmcDensify` grows by its factor: 100 of the published 30,000 iterations."""
+"""Share of the run over which `McmcDensify` grows by its factor: 100 of the published 30,000 iterations."""
 LARGE_ARE_PRUNED = ("primary", "surroundings")
-"""The sets from which what is too large is removed; glass is as large as its pane."""
+"""Sets whose oversized Gaussians are removed; glass Gaussians may be as large as their pane."""
 MOST_GROWTH = 2.0
 """Largest factor of one relocation, however short the run."""
 
 
 @dataclass(frozen=True)
 class GrowSh:
-    """Raises the SH degree in use by one, up to the highest that is stored."""
+    """Raises the active SH degree by one, up to the stored degree."""
 
     when: Every
     part: str = "primary"
@@ -50,7 +50,7 @@ class GrowSh:
         return self.when.due(clock)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Edits `state`, if there is anything to edit."""
+        """Edits `state` if necessary."""
         gaussians = state.scene.gaussian_sets().get(self.part)
         if gaussians is None or gaussians.active_sh_degree == gaussians.max_sh_degree:
             return False
@@ -62,15 +62,15 @@ class GrowSh:
 def threshold_factor(dataset: Dataset) -> float:
     """Factor on the densification threshold for small photographs; 1 from `LARGE_ENOUGH` on.
 
-    The published threshold was found on photographs of about a megapixel. The loss is a mean over pixels, so a
-    Gaussian a few pixels wide has a larger gradient in a smaller image, and one of 400x300 would grow twice as many
-    Gaussians as it has pixels (lab/gaussians.md).
+    The published threshold was chosen for photographs of about a megapixel. The loss is a mean over pixels, so a
+    Gaussian a few pixels wide has a larger gradient in a smaller image; at 400x300, there would be twice as many
+    Gaussians as pixels (lab/gaussians.md).
     """
     return max(1.0, math.sqrt(LARGE_ENOUGH / dataset.photograph_pixels))
 
 
 def limit_of(densifier: DefaultDensify, dataset: Dataset) -> int | None:
-    """The largest number of Gaussians to grow to: the one that was asked for, or one that suits the photographs."""
+    """Maximum number of Gaussians: the requested one, or one that suits the photographs."""
     if densifier.cap is not None or densifier.per_pixel == 0:
         return densifier.cap
     return round(densifier.per_pixel * sum(view.camera.width * view.camera.height for view in dataset.train))
@@ -96,7 +96,7 @@ class Densify:
         return Every(0.0, self.densifier.start, self.densifier.stop, least).due(clock)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Edits `state`, if there is anything to edit."""
+        """Edits `state` if necessary."""
         statistics = state.statistics.pop(self.part, None)
         gaussians = state.scene.gaussian_sets().get(self.part)
         if statistics is None or gaussians is None or len(gaussians) == 0:
@@ -123,21 +123,20 @@ class Densify:
 
 
 FAINT_IN_AIR = 1e-4
-"""Share of its pixels that what hangs in the air before a camera must add to some view, if it is to stay."""
+"""Minimum contribution, as a share of a view's pixels, of a Gaussian in mid-air in front of a camera."""
 
 
 @dataclass(frozen=True)
 class PruneIdle:
-    """Removes the Gaussians of one set that add next to nothing to any training view, or stand where a camera stood.
-
-    What stood behind a pane for a reflection, and has lost that to the mirrored image, ends as such. No photograph
-    was taken in a fog; see `fog_around`. And what hangs in the air before a camera must be needed by another; see
+    """Removes the Gaussians of one set that contribute almost nothing to any training view, or surround a camera. The
+    former include Gaussians behind a pane whose reflection is now explained by the mirrored image. For those around a
+    camera see `fog_around`; Gaussians in mid-air in front of a camera must contribute to other views, see
     `hangs_in_air`.
 
     Attributes:
-        densifier: holds what is next to nothing, and when.
+        densifier: holds the threshold and the times.
         part: the set.
-        measure: [N] what each of its Gaussians adds to a view, in pixels.
+        measure: [N] contribution of each of its Gaussians to a view, in pixels.
     """
 
     densifier: DefaultDensify
@@ -155,13 +154,13 @@ class PruneIdle:
 
     @torch.no_grad()
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
-        """Edits `state`, if there is anything to edit, and tells how far it is."""
+        """Edits `state` if necessary, and yields its progress."""
         gaussians = state.scene.gaussian_sets().get(self.part)
         if gaussians is None:
             return False
         most, largest_share = (torch.zeros_like(gaussians.logit_opacities) for _ in range(2))
         for done, view in enumerate(dataset.train):
-            yield Working("looking for Gaussians that no view needs", done, len(dataset.train))
+            yield Working("searching for unnecessary Gaussians", done, len(dataset.train))
             added = self.measure(state.scene, view.camera)
             most = torch.maximum(most, added)
             largest_share = torch.maximum(largest_share, added / (view.camera.width * view.camera.height))
@@ -172,7 +171,7 @@ class PruneIdle:
             if dataset.measured_points:
                 hanging = densify.hangs_in_air(gaussians.means, places, dataset.points.positions)
                 busy &= ~hanging | (largest_share >= FAINT_IN_AIR)
-        # A scene without Gaussians is reported; surroundings that nothing mirrors yet may still be needed.
+        # A scene without Gaussians is an error; surroundings that nothing reflects yet may still be needed.
         if bool(busy.all()) or (self.part != "primary" and not bool(busy.any())):
             return False
         keep_some(state, busy, self.part)
@@ -180,25 +179,25 @@ class PruneIdle:
 
 
 def put_in_order(state: TrainState, gaussians: Gaussians, moments: densify.Moments, part: str = "primary") -> None:
-    """Replaces a part of the scene and its moments, sorted so that neighbours in space are neighbours in memory."""
+    """Replaces a part of the scene and its moments, sorted in Morton order."""
     order = densify.in_morton_order(gaussians.means)
     ordered, moments = densify.apply_edit(gaussians, moments, order, part=part)
     state.scene = state.scene.with_gaussians(part, ordered)
-    # Of a set that has vanished, a scene has no parameters.
+    # An empty set has no parameters.
     known = state.scene.parameters()
     state.optimizer.moments = {name: pair for name, pair in moments.items() if name in known}
-    state.means = {}  # Of rows that are others now, even where their number is the same.
+    state.means = {}  # The rows have changed, even if their number has not.
 
 
 def cap_of(densifier: McmcDensify, dataset: Dataset) -> int:
-    """The number of Gaussians to grow to: the one that was asked for, or one that suits the photographs."""
+    """The cap: the requested number of Gaussians, or one that suits the photographs."""
     if densifier.cap is not None:
         return densifier.cap
     return round(GAUSSIANS_PER_PIXEL * dataset.photograph_pixels)
 
 
 def growth_of(densifier: McmcDensify, iterations: int) -> float:
-    """The factor by which the set grows at one relocation, so that it reaches its cap at the same share of any run."""
+    """Growth factor per relocation, such that any run reaches its cap after the same share."""
     factor: float = densifier.growth ** (densifier.interval / (GROWTH_SHARE * iterations))
     return min(factor, MOST_GROWTH)
 
@@ -215,7 +214,7 @@ class Relocate:
         return Every(0.0, self.densifier.start, self.densifier.stop, self.densifier.interval).due(clock)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Edits `state`, if there is anything to edit."""
+        """Edits `state` if necessary."""
         densifier = replace(self.densifier, growth=growth_of(self.densifier, clock.iterations))
         edited, moments = densify.relocate_and_grow(
             densifier,
@@ -225,21 +224,21 @@ class Relocate:
             generator=state.generator(self.name),
         )
         put_in_order(state, edited, moments)
-        # Nothing here reads the screen gradients, but what was gathered no longer fits the rows.
+        # MCMC does not use screen gradients, but the statistics no longer match the rows.
         state.statistics.pop("primary", None)
         return True
 
 
 @dataclass(frozen=True)
 class AddNoise:
-    """Moves the primary Gaussians that a step's view shows at random, the transparent ones most (3DGS-MCMC).
+    """Adds noise to the positions of the primary Gaussians in view, most to transparent ones (3DGS-MCMC).
 
-    The paper moves all of them in every step, as `densifier.reach` may ask for. Those that the view does not show have
-    nothing to pull them back, and what few views show would wander off.
+    The paper moves all Gaussians in every step (`densifier.reach`). Nothing pulls those outside the view back, so
+    Gaussians that few views show would drift away.
 
     Attributes:
-        densifier: holds how strong the noise is, and what it reaches.
-        rate: learning rate of the positions, which the noise follows; as that, it grows with the views of a step.
+        densifier: holds the amplitude and the reach of the noise.
+        rate: learning rate of the positions, to which the noise is proportional; both grow with the views per step.
     """
 
     densifier: McmcDensify
@@ -271,7 +270,7 @@ class ResetOpacity:
         return self.when.due(clock)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Edits `state`, if there is anything to edit."""
+        """Edits `state` if necessary."""
         gaussians = state.scene.gaussian_sets().get(self.part)
         if gaussians is None:
             return False
@@ -284,7 +283,7 @@ class ResetOpacity:
 
 @dataclass(frozen=True)
 class PerturbOpacity:
-    """Adds noise to the opacity of what is seen through a pane (TR-Gaussians, Section III-C3)."""
+    """Adds noise to the opacities of Gaussians visible through a pane (TR-Gaussians, Section III-C3)."""
 
     when: Every
     amplitude: float
@@ -297,11 +296,11 @@ class PerturbOpacity:
 
     @torch.no_grad()
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
-        """Edits `state`, if there is anything to edit, and tells how far it is."""
+        """Edits `state` if necessary, and yields its progress."""
         means, planes = state.scene.primary.means, state.scene.planes
         selected = torch.zeros(len(means), dtype=torch.bool, device=means.device)
         for done, view in enumerate(dataset.train):
-            yield Working("looking for what is seen through panes", done, len(dataset.train))
+            yield Working("finding what is visible through panes", done, len(dataset.train))
             selected |= behind_panes(means, planes, [view.camera])
         perturbed = densify.perturb_opacities(
             state.scene.primary,
@@ -320,14 +319,14 @@ class Population:
     """Contribution of a strategy to every stage of a recipe.
 
     Attributes:
-        opacity: of the first Gaussians.
-        spread: standard deviation of the first Gaussians, as a share of the distance to their neighbours.
-        edits: what changes the number of primary Gaussians.
-        resets: opacity resets; a recipe decides in which stages they happen.
-        post_steps: what follows the optimiser in every step.
+        opacity: opacity of the initial Gaussians.
+        spread: standard deviation of the initial Gaussians, as a share of the distance to their neighbours.
+        edits: actions that change the number of primary Gaussians.
+        resets: opacity resets, in the stages that the recipe chooses.
+        post_steps: operations after the optimiser in every step.
         terms: regularisers of the objective.
         densify_until: share of the run until which `edits` read screen gradients.
-        cap: largest number of first Gaussians; None or 0 for no limit.
+        cap: maximum number of initial Gaussians; None or 0 for no limit.
     """
 
     opacity: float = 0.1
@@ -340,7 +339,7 @@ class Population:
     cap: int | None = None
 
     def initial(self, points: PointCloud, sh_degree: int) -> Gaussians:
-        """The first primary Gaussians, one per point; under a cap, of points drawn at random, in every run the same."""
+        """Initial primary Gaussians, one per point; with a cap, a random subset that is the same in every run."""
         if self.cap and len(points) > self.cap:
             log.info("The first Gaussians are %d of the %d points, as many as the cap allows", self.cap, len(points))
             generator = torch.Generator().manual_seed(0)
@@ -350,23 +349,23 @@ class Population:
 
 
 def default_population(densifier: DefaultDensify, intervals: Intervals) -> Population:
-    """3DGS: clone, split, prune, and reset the opacities; and what adds to no view is removed in the end."""
+    """3DGS: clone, split, prune and reset opacities; finally remove Gaussians that contribute to no view."""
     reset = ResetOpacity(Every(intervals.opacity, 0.0, intervals.reset_stop, intervals.least, only_multiples_of=3))
     edits = (Densify(densifier), PruneIdle(densifier))
     return Population(edits=edits, resets=(reset,), densify_until=densifier.stop, cap=densifier.cap)
 
 
 MCMC_OPACITY = 0.5
-"""Of the first Gaussians under `mcmc`."""
+"""Opacity of the initial Gaussians with `mcmc`."""
 
 
 def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:
-    """3DGS-MCMC: relocate, add, explore, and regularise opacities and scales; opacities are never reset.
+    """3DGS-MCMC: relocate, add, add noise, and regularise opacities and scales; opacities are never reset.
 
-    The regularisers are those of TR-Gaussians, Eq. 20, which adds them to whatever the objective is otherwise. They
-    act on what a step's view shows directly, and the noise on what it shows, also as mirror images. The papers' act on
-    everything (`reach`), which hardly differs where every view shows most of the scene; what a few of many views show,
-    such as a room photographed all around, fades and wanders.
+    The regularisers are those of TR-Gaussians, Eq. 20. They act on Gaussians that a step's view shows directly, and
+    the noise also on those that it shows as mirror images. In the papers, both act on all Gaussians (`reach`). This
+    hardly matters if every view shows most of the scene; in a room photographed all around, Gaussians that few views
+    show would fade and drift.
     """
 
     def reaching(term: losses.LossFunction) -> losses.LossFunction:
@@ -387,54 +386,53 @@ def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:
 
 
 UNEXPLAINED = 0.1
-"""Mean difference of a photograph from its render, sRGB, over a window of `WINDOW` of its width, that is no detail."""
+"""Mean residual over a window of `WINDOW` of the width, sRGB, above which something is missing, not just detail."""
 WINDOW = 0.03
 CELLS = 96
-"""Places along the longest side of the box that is searched."""
+"""Grid cells along the longest side of the searched box."""
 MOST_LOOKED_AT = 100
-"""Photographs that search it."""
+"""Maximum number of photographs used for the search."""
 FEWEST_AGREEING, LEAST_AGREEING, MOST_SPREAD, MOST_ALIKE = 5, 0.7, 0.08, 0.98
-"""Photographs that must see something unexplained at a place; their share of all that look there directly; the standard
-deviation of its colour; and the length of the mean direction from which they look, 1 if all look from one side."""
+"""Minimum number of photographs with a residual at a cell; their minimum share of all that see it directly; maximum
+standard deviation of its colour; and maximum length of the mean viewing direction, 1 if all are equal."""
 
 MOST_ADDED = 0.05
-"""Of the Gaussians there are, how many may be added; where more is missing, the scene has hardly been learned yet."""
+"""Maximum share of Gaussians to add; if more is missing, the scene has hardly been learned yet."""
 
 
 @dataclass(frozen=True)
 class SeedUnexplained(AtMoments):
-    """Adds Gaussians where several photographs agree that something is, and the scene does not.
+    """Adds Gaussians where several photographs agree on an object that the scene lacks.
 
-    Densification moves and copies what is there. A plain thing in an open space, such as a lamp, has no points, and
-    is found late or by chance (lab/gaussians.md). It stands where the photographs of it meet: in the visual hull of
-    what they show differently.
+    Densification only moves and copies existing Gaussians. A textureless object in open space, such as a lamp, has no
+    points, and is found late or by chance (lab/gaussians.md). It is found here as the visual hull of the residuals.
 
     Attributes:
-        renderer: shows the scene as the photographs do.
+        renderer: renders the scene as in the photographs.
     """
 
     renderer: Renderer
     name: str = "seed unexplained"
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
-        """Edits `state`, if there is anything to edit, and tells how far it is."""
+        """Edits `state` if necessary, and yields its progress."""
         cloud, size = yield from unexplained_places(state.scene, dataset.train, self.renderer)
         primary = state.scene.primary
         if not 0 < len(cloud) < MOST_ADDED * len(primary):
             return False
         add_primary(state, seeds_of(primary, cloud, opacity=0.5, size=size))
-        log.info("Gaussians added where photographs agree on something that was not there: %d", len(cloud))
+        log.info("Gaussians added where photographs agree on a missing object: %d", len(cloud))
         return True
 
 
 def seeds_of(primary: Gaussians, points: PointCloud, *, opacity: float = 0.1, size: float | None = None) -> Gaussians:
-    """Gaussians like the primary ones, from points; what points do not tell of a channel is the median there.
+    """Gaussians from points, like the primary ones; other channels get the median of these.
 
     Args:
-        primary: those that are there.
+        primary: the existing Gaussians.
         points: at least one.
-        opacity: of each.
-        size: standard deviation of each; as far as points are apart if None.
+        opacity: opacity of each.
+        size: standard deviation of each; the distance between points if None.
     """
     seeds = densify.gaussians_from_points(points, sh_degree=primary.max_sh_degree, opacity=opacity)
     if size is not None:
@@ -446,7 +444,7 @@ def seeds_of(primary: Gaussians, points: PointCloud, *, opacity: float = 0.1, si
 
 
 def add_primary(state: TrainState, seeds: Gaussians) -> None:
-    """Adds Gaussians to the primary ones, of which moments and statistics stay."""
+    """Adds Gaussians to the primary ones, whose moments and statistics are kept."""
     primary, state.optimizer.moments = densify.append(state.scene.primary, state.optimizer.moments, seeds)
     state.scene = replace(state.scene, primary=primary)
     if "primary" in state.statistics:
@@ -454,9 +452,8 @@ def add_primary(state: TrainState, seeds: Gaussians) -> None:
 
 
 def keep_some(state: TrainState, kept: Tensor, part: str = "primary") -> None:
-    """Removes Gaussians but those where `kept` [N] is true, of which moments and statistics stay.
-
-    Else an action of this kind at the step of a densification would take its place (lab/gaussians.md).
+    """Removes the Gaussians where `kept` [N] is false; moments and statistics of the others are kept. Otherwise, a
+    removal at the step of a densification would cancel it (lab/gaussians.md).
     """
     gaussians = state.scene.gaussian_sets()[part]
     gaussians, state.optimizer.moments = densify.apply_edit(
@@ -471,10 +468,10 @@ def keep_some(state: TrainState, kept: Tensor, part: str = "primary") -> None:
 def unexplained_places(
     scene: Scene, views: Sequence[View], renderer: Renderer
 ) -> Generator[Working, None, tuple[PointCloud, float]]:
-    """Places where photographs agree on something that the scene lacks, and the size of a Gaussian there.
+    """Positions where photographs agree on something that the scene lacks, and the size of Gaussians there.
 
-    They are searched in a grid around the cameras. A pane hides what is behind it, because what it mirrors would be
-    found there.
+    The search uses a grid around the cameras. Panes count as opaque, because their reflections would be found behind
+    them.
     """
     views = evenly(views, MOST_LOOKED_AT)
     device = scene.primary.means.device
@@ -483,7 +480,7 @@ def unexplained_places(
     looking, agreeing = places.new_zeros(2, len(places))
     colors, squares, sides = places.new_zeros(3, len(places), 3)
     for done, view in enumerate(views):
-        yield Working("looking for what is missing", done, len(views))
+        yield Working("searching for missing objects", done, len(views))
         camera = view.camera.to(device)
         rows = in_image(places, camera).nonzero()[:, 0]
         here = places[rows]
@@ -513,7 +510,7 @@ def unexplained_places(
 def grid_around(cameras: Sequence[Camera], extent: float) -> tuple[Tensor, float]:
     """[P, 3] centres of the cells of a grid over a box around the cameras, one extent larger, and a cell's side.
 
-    Its axes are those of the first camera, so that it does not matter which way the world is turned.
+    Its axes are those of the first camera, so that the result does not depend on the orientation of the world.
     """
     axes = cameras[0].cam_from_world[:3, :3].cpu()
     centers = torch.stack([camera.center.cpu() for camera in cameras]) @ axes.T

@@ -41,7 +41,7 @@ HEADER: dict[str, Field] = {
     "corrected": Optional(Items(Text()), ()),
     "up": Optional(DIRECTION),
 }
-"""What is `Optional` was added after the first checkpoints were written."""
+"""`Optional` fields were added after the first checkpoints were written."""
 GAUSSIAN_SHAPES = {"means": (3,), "quats": (4,), "log_scales": None, "logit_opacities": ()}
 PLANE_SHAPES: dict[str, tuple[int, ...] | None] = {
     "centers": (3,),
@@ -51,16 +51,16 @@ PLANE_SHAPES: dict[str, tuple[int, ...] | None] = {
     "half_sizes": (2,),
 }
 FURTHER_PLANE_SHAPES: dict[str, tuple[int, ...] | None] = {"log_transmittances": (3,)}
-"""Of panes that are tinted."""
+"""Tensor of tinted panes."""
 SCALE_SHAPES = [(DISC_SCALES,), (DISC_SCALES + 1,)]
 SH_SHAPES = [(count, 3) for count in (0, 1, 4, 9, 16)]
 
 
 def save_checkpoint(path: Path, state: TrainState) -> None:
-    """Writes `state` so that training goes on from it with the same result; atomic.
+    """Writes `state` atomically, such that training continues from it with the same result.
 
     Raises:
-        OSError: the disk is full or not writable; an older file at `path` stays as it was.
+        OSError: the disk is full or not writable; an older file at `path` is unchanged.
     """
     scene = state.scene
     tensors = {f"scene/{name.replace('.', '/', 1)}": tensor for name, tensor in scene.tensors().items()}
@@ -98,13 +98,13 @@ def load_checkpoint(
 
     Args:
         path: the file.
-        method: what the run that goes on trains; None takes any.
-        seed: that of the run; None takes any.
-        iterations: the length of the run; None takes any step.
+        method: method of the run to continue; None accepts any.
+        seed: seed of the run; None accepts any.
+        iterations: length of the run; None accepts any step.
 
     Raises:
-        InputError: the file is truncated, is no checkpoint of glassplat, or one of another run.
-        FileNotFoundError: there is no such file.
+        InputError: the file is truncated, not a checkpoint of glassplat, or one of another run.
+        FileNotFoundError: the file does not exist.
     """
     with opened_checkpoint(path) as file:
         state = restored_state(file.header, file.tensors())
@@ -120,11 +120,11 @@ class Recorded(NamedTuple):
 
 
 def recorded(path: Path) -> Recorded:
-    """Step and training time of a checkpoint; reads its header and no tensor, so it costs nothing.
+    """Step and training time of a checkpoint; fast, because only the header is read.
 
     Raises:
-        InputError: the file is truncated, or is no checkpoint of glassplat.
-        FileNotFoundError: there is no such file.
+        InputError: the file is truncated, or not a checkpoint of glassplat.
+        FileNotFoundError: the file does not exist.
     """
     with opened_checkpoint(path) as file:
         return Recorded(int(file.header["step"]), float(file.header["seconds"]))
@@ -133,10 +133,10 @@ def recorded(path: Path) -> Recorded:
 def check_belongs(
     state: TrainState, path: Path, *, method: str | None, seed: int | None, iterations: int | None
 ) -> None:
-    """Refuses the checkpoint of another run, with which training would go on to nonsense.
+    """Refuses the checkpoint of another run.
 
     Raises:
-        InputError: another method's or seed's, or of a step beyond the run's end.
+        InputError: method or seed differ, or the step is beyond the end of the run.
     """
     remedy = "put the run's own checkpoint there, or train again"
     if method and state.method and state.method != method:
@@ -149,7 +149,7 @@ def check_belongs(
 
 @contextmanager
 def opened_checkpoint(path: Path) -> Iterator[TensorsFile]:
-    """An open checkpoint, its header checked; what is wrong with its contents is an error that names the file."""
+    """An open checkpoint with a checked header; errors in its contents name the file."""
     if not os.path.isfile(path):
         raise FileNotFoundError(f"no checkpoint at {path}; expected the file that training writes there")
     try:
@@ -162,10 +162,10 @@ def opened_checkpoint(path: Path) -> Iterator[TensorsFile]:
 
 
 def restored_state(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> TrainState:
-    """The training state of a checkpoint's header, which is checked, and tensors.
+    """Training state from a checked header and tensors.
 
     Raises:
-        InputError: the tensors do not belong to the header, or to one another.
+        InputError: the tensors do not match the header or each other.
     """
     check_types(tensors)
     with input_checked():
@@ -196,7 +196,7 @@ def restored_state(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
 
 
 def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Scene:
-    """The scene; ValueError where a tensor is missing or of another shape."""
+    """The scene; raises ValueError if a tensor is missing or has the wrong shape."""
     empty = Scene(Gaussians.empty(), extent=header["extent"])
     if header["active_sh_degree"].keys() - set(OPTIONAL_SETS) != empty.gaussian_sets().keys():
         raise InputError(
@@ -231,7 +231,7 @@ def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
 
 
 def restored_gaussians(tensors: Mapping[str, Tensor], part: str, active_sh_degree: int) -> Gaussians:
-    """A set of Gaussians from its named tensors; ValueError where one is missing or of another shape."""
+    """A set of Gaussians from named tensors; raises ValueError if one is missing or has the wrong shape."""
     channels = {name: t for name, t in tensors.items() if name not in PER_GAUSSIAN}
     main = {name: t for name, t in tensors.items() if name in PER_GAUSSIAN}
     check_shapes(tensors, {**GAUSSIAN_SHAPES, "sh": None, **dict.fromkeys(channels, ())}, part)
@@ -259,7 +259,7 @@ def restored_statistics(tensors: Mapping[str, Tensor], scene: Scene) -> dict[str
 
 
 def check_types(tensors: Mapping[str, Tensor]) -> None:
-    """Raises InputError unless all tensors hold floating-point numbers of one precision."""
+    """Raises InputError unless all tensors have the same floating-point type."""
     for name, tensor in tensors.items():
         if not tensor.is_floating_point():
             raise InputError(f"{name} holds {tensor.dtype}; expected floating-point numbers")
@@ -269,7 +269,7 @@ def check_types(tensors: Mapping[str, Tensor]) -> None:
 
 
 def check_shapes(tensors: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...] | None], of: str) -> None:
-    """Raises InputError unless there is just one tensor of each name, its rows of the shape given; None for any."""
+    """Raises InputError unless the names are as expected and rows have the given shapes (None for any)."""
     if tensors.keys() != shapes.keys():
         raise InputError(f"{of} has the tensors {sorted(tensors)}; expected {sorted(shapes)}")
     for name, shape in shapes.items():
@@ -287,5 +287,5 @@ def check_like(tensors: Mapping[str, Tensor], examples: Mapping[str, Tensor], of
 
 
 def under(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """The tensors whose name begins with a prefix, which is cut off."""
+    """The tensors whose names have a prefix, without the prefix."""
     return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}

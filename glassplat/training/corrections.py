@@ -25,39 +25,39 @@ from glassplat.training.stage import Clock, Setup, Stage, TrainState, Work, carr
 END_SHARE = 0.1
 """Learning rate at the end of the run, as a share of that at the start."""
 CORRECTIONS: dict[str, type[ByPhotograph]] = {"exposures": Exposures, "poses": PoseCorrections}
-"""Of photographs, by part of the scene."""
+"""Corrections of photographs, by part of the scene."""
 
 
 def _rates(recipe: MethodRecipe) -> dict[str, float]:
-    """Learning rates at the start, by part of the scene, of those that learn at all."""
+    """Initial learning rates, by part of the scene, of the corrections that are learned."""
     rates = {"exposures": recipe.exposure.rate, "poses": recipe.poses.rate}
     return {part: rate for part, rate in rates.items() if rate}
 
 
 def corrections_begun(recipe: MethodRecipe, scene: Scene, dataset: Dataset) -> Scene:
-    """The first scene, with corrections that change nothing yet."""
+    """The initial scene, with neutral corrections."""
     names = tuple(view.name for view in dataset.train)
     begun: dict[str, Any] = {part: CORRECTIONS[part].neutral(names) for part in _rates(recipe)}
     return replace(scene, **begun)
 
 
 def corrections_learnt(recipe: MethodRecipe, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
-    """The stages, in which the corrections learn as well."""
+    """The stages with learning of the corrections added."""
     for part, start in _rates(recipe).items():
         rate = {f"{part}.{CORRECTIONS[part].TENSOR}": Rate(start, start * END_SHARE)}
-        # Before the motions that take means over steps.
+        # Before post-steps that average over steps.
         stages = tuple(replace(s, rates={**s.rates, **rate}, post_steps=(Center(part), *s.post_steps)) for s in stages)
     return stages
 
 
 @dataclass(frozen=True)
 class Center:
-    """Takes the mean of all corrections off each of them.
+    """Subtracts the mean of all corrections from each of them.
 
-    What all photographs have in common belongs to the scene: were it twice as bright and all photographs half as much,
-    training would see no difference, and views that nobody photographed would have the wrong colours. Were all cameras
-    and the scene shifted together, training would see none either, and test cameras stay behind. Of a turn of all
-    this takes off what turns each camera about its own centre, so that the mean orientation stays.
+    A common factor of all photographs belongs to the scene: a scene twice as bright, with exposures half as large, has
+    the same training loss, but wrong colours in novel views. The same holds for a common shift of cameras and scene,
+    relative to the test cameras. Of a common rotation, the part about each camera's own centre is subtracted, so that
+    the mean orientation is unchanged.
 
     Attributes:
         part: exposures or poses.
@@ -72,8 +72,8 @@ class Center:
 
 
 NEAREST, FARTHEST = 0.03, 0.6
-"""Of the cloud from the camera, as shares of the distance to the panes: what a body measures in the capture's units is
-not known, and from head to feet it is ten times as far as from the camera to the head."""
+"""Distances of the cloud from the camera, as shares of the distance to the panes: the size of a body in the capture's
+units is unknown, and the feet are ten times as far from the camera as the head."""
 SPREAD = 0.2
 """Standard deviation of each Gaussian, as a share of its distance from the camera."""
 OPACITY = 0.05
@@ -82,14 +82,14 @@ OPACITY = 0.05
 def first_photographer(
     planes: Planes, cameras: Sequence[Camera], *, count: int, sh_degree: int, seed: int
 ) -> Gaussians:
-    """A faint grey cloud behind the camera, as dense in the logarithm of the distance from it everywhere.
+    """A faint grey cloud behind the camera, with constant density in the logarithm of the distance.
 
     Args:
         planes: the panes, at least one.
-        cameras: of the training views.
-        count: of Gaussians.
-        sh_degree: highest degree of their colours.
-        seed: fixes the places.
+        cameras: cameras of the training views.
+        count: number of Gaussians.
+        sh_degree: maximum SH degree of their colours.
+        seed: random seed of the positions.
 
     Returns:
         In the photographer's frame, with x to the right, y down and z ahead.
@@ -99,7 +99,7 @@ def first_photographer(
     low, high = math.log(NEAREST * distance), math.log(FARTHEST * distance)
     radii = torch.exp(low + (high - low) * torch.rand(count, generator=generator, dtype=torch.float32))
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float32), dim=1)
-    # Behind the camera; where the face is, all around it.
+    # Behind the camera; near the face, all around it.
     directions[:, 2] = -directions[:, 2].abs()
     device = planes.centers.device
     found = Gaussians(
@@ -124,12 +124,12 @@ PART = "photographer"
 
 @dataclass(frozen=True)
 class AddPhotographer:
-    """Puts somebody behind the camera once there are panes.
+    """Adds the photographer once there are panes.
 
     Attributes:
-        options: who.
-        seed: of the first Gaussians' places.
-        after: what comes before that: it finds the panes.
+        options: options of the photographer.
+        seed: random seed of the initial positions.
+        after: the setup that finds the panes, which runs first.
     """
 
     options: Photographer
@@ -137,7 +137,7 @@ class AddPhotographer:
     after: Setup | None
 
     def __call__(self, state: TrainState, dataset: Dataset) -> Work:
-        """Edits `state`, and tells how far it is."""
+        """Edits `state`, and yields its progress."""
         if self.after is not None:
             yield from carried_out(self.after(state, dataset))
         cameras = [view.camera for view in dataset.train]
@@ -152,7 +152,7 @@ class AddPhotographer:
 def photographer_learnt(
     options: Photographer, stages: tuple[Stage, ...], densify: DefaultDensify, seed: int
 ) -> tuple[Stage, ...]:
-    """The stages: in those that know panes the photographer is shown and learns, from the first of them on."""
+    """The stages with the photographer rendered and learned in all that have panes."""
     if not options.learn:
         return stages
     first = next(number for number, stage in enumerate(stages) if isinstance(stage.renderer, Planar))

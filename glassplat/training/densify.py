@@ -28,9 +28,9 @@ from glassplat.training.options import DefaultDensify, McmcDensify
 
 NEIGHBOURS = 3
 SMALLEST_SCALE = 1e-6
-"""Floor of the standard deviation, as a share of the cloud's size: points that coincide would have none."""
+"""Minimum standard deviation, as a share of the cloud's size, for coinciding points."""
 DARKEST = 0.25
-"""Least value of a channel of a point's colour, of 255. What is black from the start gets no gradient and stays so."""
+"""Minimum colour of a point, of 255: a channel that starts at 0 would get no gradient."""
 
 
 def gaussians_from_points(
@@ -60,7 +60,7 @@ def gaussians_from_points(
         raise ValueError(f"sh_degree is {sh_degree} and opacity {opacity}; expected 0..3 and a number between 0 and 1")
     if not spread > 0:
         raise ValueError(f"spread is {spread}; expected a positive share of the distance between points")
-    # In float64, so that the size of the cloud is not rounded.
+    # In float64, to avoid rounding of the cloud's size.
     order = in_morton_order(points.positions.double()).source
     means = points.positions[order]
     count, device = len(points), means.device
@@ -78,7 +78,7 @@ def gaussians_from_points(
 
 
 def as_discs(spheres: Gaussians, *, seed: int = 0) -> Gaussians:
-    """Discs as large as the spheres, turned at random: nothing is known yet of the surface that they lie on."""
+    """Discs as large as the spheres, with random orientations, as the surface is not known yet."""
     generator = torch.Generator().manual_seed(seed)
     quats = torch.randn(spheres.quats.shape, generator=generator, dtype=torch.float32).to(spheres.quats)
     log_scales = spheres.log_scales[:, :DISC_SCALES].contiguous()
@@ -86,7 +86,7 @@ def as_discs(spheres: Gaussians, *, seed: int = 0) -> Gaussians:
 
 
 def _spacing(means: Tensor) -> Tensor:
-    """[P] float64 mean distance to the nearest other points, floored; a single point is taken to be one unit wide."""
+    """[P] float64 mean distance to the nearest other points, with a floor; 1 for a single point."""
     positions = means.double().numpy()
     neighbours = min(NEIGHBOURS, len(positions) - 1)
     size = float(np.linalg.norm(positions.max(axis=0) - positions.min(axis=0))) or 1.0
@@ -99,10 +99,9 @@ def _spacing(means: Tensor) -> Tensor:
 
 
 def in_morton_order(means: Tensor) -> Edit:
-    """The edit that puts Gaussians at `means` [N, 3] into Morton order; equal places keep their order.
+    """The edit that sorts Gaussians at `means` [N, 3] into Morton order; equal positions keep their order.
 
-    A tile of an image fetches Gaussians that lie near each other in space, so that more of what a cache line or a wide
-    load brings is used.
+    A tile of an image fetches Gaussians that are close in space, so cache lines and wide loads are used better.
     """
     source = torch.argsort(morton_codes(means), stable=True)
     return Edit(source, torch.zeros_like(source, dtype=torch.bool))
@@ -161,16 +160,16 @@ def clone(count: int, index: Tensor) -> Edit:
 
 
 THICK_FOG = 0.1
-"""Opacity of a Gaussian at a place, from which on it is no place for a camera."""
+"""Opacity of a Gaussian at a camera's position above which it is removed."""
 
 
 @torch.no_grad()
 def fog_around(gaussians: Gaussians, places: Tensor) -> Tensor:
-    """[N] bool: which Gaussians would hide what is seen from one of the places [P, 3].
+    """[N] bool: Gaussians that would obstruct the view from one of the positions [P, 3].
 
-    A Gaussian is drawn if its centre lies before the camera. One around the camera itself is therefore seen in some
-    directions and not in others: it may hang between two cameras, where only a pane mirrors it, and cover all that a
-    third one sees. Discs hide nothing, as they have no volume.
+    A Gaussian is drawn if its centre is in front of the camera. One that surrounds the cameras is therefore drawn in
+    some views and not in others: it may be visible to two cameras only in a pane, and cover the whole image of a
+    third. Discs have no volume and are never selected.
     """
     hiding = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     if gaussians.are_discs:
@@ -185,20 +184,20 @@ def fog_around(gaussians: Gaussians, places: Tensor) -> Tensor:
 
 
 FREE_SHARE, SURFACE_POINTS = 0.15, 3
-"""What is nearer to a camera than this share of the distance to its third nearest measured point hangs in the air."""
+"""Gaussians closer to a camera than this share of the distance to its third nearest SfM point are in mid-air."""
 
 
 @torch.no_grad()
 def hangs_in_air(means: Tensor, places: Tensor, points: Tensor) -> Tensor:
-    """[N] bool: which means [N, 3] are so near to one of the places [P, 3] of cameras that no surface can be there.
+    """[N] bool: means [N, 3] so close to one of the cameras at [P, 3] that no surface can be there.
 
-    A small Gaussian on the way of a camera is a few pixels wide in views from afar, where it explains their noise, and
-    covers what a camera between them sees.
+    A small Gaussian on the camera path is a few pixels wide in distant views, where it explains noise, and covers the
+    image of a camera in between.
 
     Args:
-        means: of Gaussians.
-        places: of cameras.
-        points: [M, 3] measured points; with fewer than three nothing is known of any surface.
+        means: centres of Gaussians.
+        places: positions of cameras.
+        points: [M, 3] SfM points; with fewer than three, nothing is selected.
     """
     hanging = torch.zeros(len(means), dtype=torch.bool, device=means.device)
     if len(points) < SURFACE_POINTS:
@@ -211,7 +210,7 @@ def hangs_in_air(means: Tensor, places: Tensor, points: Tensor) -> Tensor:
 
 
 CHILDREN = 2
-"""Gaussians that take the place of one that is split."""
+"""Gaussians that replace one that is split."""
 SHRINK = 1.6
 """Factor by which their axes are shorter."""
 
@@ -248,12 +247,12 @@ def split(gaussians: Gaussians, index: Tensor, *, generator: torch.Generator) ->
 def apply_edit(
     gaussians: Gaussians, moments: Moments, edit: Edit, *, part: str = "primary"
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
-    """The edited Gaussians and moments; nothing is changed in place and nothing requires a gradient.
+    """The edited Gaussians and moments, without gradients; the arguments are not modified.
 
     Args:
         gaussians: the set that is edited.
-        moments: moments of any number of parameters; those of other scene parts pass through as
-            they are, and a tensor without moments (not trained yet) stays without.
+        moments: moments of any number of parameters; those of other scene parts pass through as they are, and a tensor
+            without moments (not trained yet) keeps none.
         edit: what to do.
         part: the scene part that `gaussians` is, first half of the names in `moments`.
     """
@@ -313,19 +312,18 @@ def forget(moments: Moments, names: Collection[str], rows: Tensor | None = None)
 class ScreenStatistics:
     """Statistics of each Gaussian over the views since the last densification.
 
-    Gradients are in normalised device coordinates, in which the image spans [-1, 1] both ways: thresholds do not
-    depend on its resolution. Sums and counts have two rows, over all views and over those that see the Gaussian
-    directly. Mirror images are averaged apart from these, and the larger mean counts. Taken together they would hide
-    each other: in a mirror a thing is farther away, but what photographs show from far off or in passing may be seen
-    best in a mirror. Images in glass, little of which is left in a photograph, are averaged over as many as there are
-    direct views.
+    Gradients are in normalised device coordinates, in which the image spans [-1, 1], so that thresholds do not depend
+    on the resolution. Sums and counts have two rows, over all views and over those that see the Gaussian directly.
+    Mirror images are averaged separately, and the larger mean counts; a joint mean would be too small, because objects
+    are farther away in a mirror, or are seen directly only from afar. The divisor for mirror images is at least the
+    number of direct views, since reflections in glass are weak.
 
     Attributes:
         gradient_sum: [2, N] sum over views of the norm of the loss gradient with respect to the centre on screen.
-        absgrad_sum: [2, N] the same of what single pixels contribute to that gradient, added up without signs.
-        view_count: [2, N] number of views that saw the Gaussian; one in or through a pane counts by how much of what is
-            drawn is left in the image. Gradients are smaller by as much; counted as a full view, a weak reflection
-            would look as if it needed no more detail.
+        absgrad_sum: [2, N] the same for the sum of absolute per-pixel contributions.
+        view_count: [2, N] number of views that saw the Gaussian, weighted by the share of its light that a pane leaves
+            in the image. Gradients are smaller by the same factor; with a weight of 1, weak reflections would never be
+            densified.
     """
 
     gradient_sum: Tensor
@@ -334,15 +332,15 @@ class ScreenStatistics:
 
     @staticmethod
     def zeros(count: int, *, device: torch.device | str = "cpu") -> ScreenStatistics:
-        """Statistics of `count` Gaussians that no view has seen."""
+        """Empty statistics of `count` Gaussians."""
         return ScreenStatistics(*torch.zeros(3, 2, count, device=device, dtype=torch.float32))
 
     def select(self, kept: Tensor) -> ScreenStatistics:
-        """Those of the Gaussians where `kept` [N] is true."""
+        """The rows where `kept` [N] is true."""
         return ScreenStatistics(*(sums[:, kept] for sums in self.sums))
 
     def with_new(self, count: int) -> ScreenStatistics:
-        """Those of the Gaussians, followed by `count` that no view has seen."""
+        """The rows, followed by `count` empty ones."""
         return ScreenStatistics(*(torch.nn.functional.pad(sums, (0, count)) for sums in self.sums))
 
     def add(self, views: Views) -> None:
@@ -351,15 +349,15 @@ class ScreenStatistics:
 
     @torch.no_grad()
     def add_in_space(self, means_gradient: Tensor, met: Tensor) -> None:
-        """Adds a training step in which rays met the Gaussians in space, in place (EnvGS, Section 5.1).
+        """Adds a training step with ray tracing, in place (EnvGS, Section 5.1).
 
-        A gradient times half of the distance at which a Gaussian was met is what on a screen would be one in normalised
-        device coordinates; without that factor, what is far away would get too few Gaussians.
+        The gradient times half the distance corresponds to a screen gradient in normalised device coordinates; without
+        this factor, distant parts would get too few Gaussians.
 
         Args:
             means_gradient: [N, 3] gradient of one view's loss with respect to the centres.
-            met: [N, 2] what they added to the rays: the sums of their blending weights, and of these times the
-                distances in world units.
+            met: [N, 2] contributions to the rays: the sums of blending weights, and of weights times distances in world
+                units.
         """
         weights, products = met.unbind(dim=1)
         norms = means_gradient.norm(dim=-1)
@@ -370,11 +368,11 @@ class ScreenStatistics:
 
     @property
     def sums(self) -> Sums:
-        """All of them, as the kernel takes them."""
+        """All sums, in the form that the kernel takes."""
         return Sums(self.gradient_sum, self.absgrad_sum, self.view_count)
 
     def include(self, other: ScreenStatistics) -> None:
-        """Adds what other views have shown of the same Gaussians, in place."""
+        """Adds statistics of the same Gaussians from other views, in place."""
         for total, added in zip(self.sums, other.sums, strict=True):
             total += added
 
@@ -413,15 +411,14 @@ def densify(
     Statistics start again at `ScreenStatistics.zeros` afterwards.
 
     Args:
-        options: when and how.
+        options: thresholds and times.
         gaussians: the set to edit.
         moments: optimiser moments by dotted name; those of other parts pass through.
-        statistics: what was gathered since the last call, one row per Gaussian.
+        statistics: statistics since the last call, one row per Gaussian.
         extent: radius of the capture in world units.
         generator: source of randomness, on the device of `gaussians`.
         part: the scene part that `gaussians` is.
-        prune_large: also remove what is too large; 3DGS does so once the opacities have been
-            reset for the first time.
+        prune_large: also remove oversized Gaussians, as 3DGS does after the first opacity reset.
     """
     if statistics.view_count.shape[1] != len(gaussians):
         raise ValueError(
@@ -447,13 +444,13 @@ def _growth(
         needs = torch.where(large, statistics.mean_absgrad / options.absgrad_threshold, needs)
     chosen = _within_cap(options, needs)
     halved = split(gaussians, (chosen & large).nonzero().squeeze(1), generator=generator)
-    # What was not split moved forward by as many rows as were split before it.
+    # Unsplit rows moved forward by the number of split rows before them.
     row_after_split = (~(chosen & large)).cumsum(dim=0) - 1
     return halved.then(clone(len(halved), row_after_split[chosen & ~large]))
 
 
 def _within_cap(options: DefaultDensify, need: Tensor) -> Tensor:
-    """[N] bool: what to clone or split, of what needs it by 1 or more; under a cap, what needs it most."""
+    """[N] bool: Gaussians to clone or split, whose need is at least 1; with a cap, those with the largest need."""
     chosen = need >= 1
     if options.cap is None:
         return chosen
@@ -479,38 +476,37 @@ def _superfluous(
 def reset_opacity(
     gaussians: Gaussians, moments: Moments, *, ceiling: float = 0.01, part: str = "primary"
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
-    """Lowers every opacity to at most `ceiling` and forgets the opacities' moments (3DGS, Section 5.2).
-
-    What the photographs need grows back; what does not is pruned.
+    """Lowers every opacity to at most `ceiling` and zeroes the moments of opacities (3DGS, Section 5.2). Opacities
+    that the photographs support grow back; the other Gaussians are pruned.
     """
     lowered = gaussians.logit_opacities.clamp(max=logit(ceiling))
     return gaussians.with_tensors({"logit_opacities": lowered}), forget(moments, (f"{part}.logit_opacities",))
 
 
 DEAD_OPACITY = 0.005
-"""Gaussians at most this opaque are relocated."""
+"""Maximum opacity of Gaussians to relocate."""
 NOISE_SHARPNESS = 100.0
-"""How fast the noise fades above that."""
+"""Steepness of the noise's decline above that opacity."""
 MOST_COPIES = 51
-"""Gaussians that may share one place, the first one included; the sum of `shared_contribution` is exact up to here."""
+"""Maximum number of Gaussians at one position, for which the sum of `shared_contribution` is exact."""
 MOST_LOGIT = 16.0
-"""Opacity 1 - 1e-7, all that float32 tells from 1. The terms of the alternating sum grow with the logit."""
+"""Opacity 1 - 1e-7, the limit of float32. The terms of the alternating sum grow with the logit."""
 
 
 @torch.no_grad()
 def relocate_and_grow(
     options: McmcDensify, gaussians: Gaussians, moments: Moments, *, cap: int, generator: torch.Generator
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
-    """A set of Gaussians and their moments after relocation and growth; what it renders stays nearly the same.
+    """A set of Gaussians and their moments after relocation and growth, which change renders very little.
 
-    The moments are zeroed for every row that moved or is new, and for the live ones they were placed on, whose
-    opacity and size changed.
+    Moments are zeroed for moved and new rows, and for the live ones at their new positions, whose opacity and size
+    changed.
 
     Args:
-        options: when and how.
+        options: thresholds and times.
         gaussians: the primary ones.
         moments: optimiser moments by dotted name; those of other parts pass through.
-        cap: largest number of Gaussians to grow to; a set that is larger stays as large.
+        cap: maximum number of Gaussians; a larger set does not shrink.
         generator: source of randomness, on the device of `gaussians`.
     """
     relocated, moments = apply_edit(gaussians, moments, relocation(options, gaussians, generator))
@@ -520,7 +516,7 @@ def relocate_and_grow(
 def relocation(options: McmcDensify, gaussians: Gaussians, generator: torch.Generator) -> Edit:
     """Moves every dead Gaussian onto a live one, drawn with a probability proportional to its opacity.
 
-    Without live ones nothing moves; where more than `MOST_COPIES` would share a place, the surplus stays dead.
+    Without live ones, nothing moves; if more than `MOST_COPIES` would share a position, the surplus stays dead.
     """
     live = _live(gaussians)
     dead = (~live).nonzero().squeeze(1)
@@ -534,7 +530,7 @@ def relocation(options: McmcDensify, gaussians: Gaussians, generator: torch.Gene
 def addition(options: McmcDensify, gaussians: Gaussians, cap: int, generator: torch.Generator) -> Edit:
     """Appends new Gaussians up to the growth factor and the cap, placed as relocated ones are."""
     count = len(gaussians)
-    # Rounded up, because a set of a few Gaussians would never grow otherwise.
+    # Rounded up, so that small sets can grow.
     room = max(min(cap, math.ceil(options.growth * count)) - count, 0)
     targets = drawn_by_opacity(gaussians, _live(gaussians), room, generator)
     targets = targets[rank_among_equals(targets) < MOST_COPIES - 1]
@@ -552,7 +548,7 @@ def sgld_noise(
     depends on the capture's; else both are in scene extents, which is the same where the extent is one.
 
     Args:
-        options: how strong it is, and where.
+        options: amplitude and units of the noise.
         gaussians: the set whose centres are moved.
         rate: learning rate of the positions per scene extent, as it stands at this step.
         extent: radius of the capture in world units.
@@ -571,7 +567,7 @@ def sgld_noise(
 
 
 def _live(gaussians: Gaussians) -> Tensor:
-    """[N] bool: which Gaussians are opaque enough to stay."""
+    """[N] bool: Gaussians that are opaque enough to stay."""
     return torch.sigmoid(gaussians.logit_opacities) > DEAD_OPACITY
 
 
@@ -582,13 +578,13 @@ def drawn_by_opacity(gaussians: Gaussians, live: Tensor, count: int, generator: 
         return rows
     cumulative = torch.sigmoid(gaussians.logit_opacities[rows].double()).cumsum(dim=0)
     unit = torch.rand(count, generator=generator, dtype=torch.float64, device=rows.device)
-    # A product that rounds up to the total would fall behind the last row.
+    # A product rounded up to the total would give an index past the last row.
     found = torch.searchsorted(cumulative, unit * cumulative[-1], right=True).clamp(max=rows.shape[0] - 1)
     return rows[found]
 
 
 def rank_among_equals(values: Tensor) -> Tensor:
-    """[I] how many equal values come before each one in `values` [I]."""
+    """[I] number of equal values before each one in `values` [I]."""
     ordered, order = values.sort(stable=True)
     ranks = torch.empty_like(values)
     ranks[order] = torch.arange(values.shape[0], device=values.device) - torch.searchsorted(ordered, ordered)
@@ -596,7 +592,7 @@ def rank_among_equals(values: Tensor) -> Tensor:
 
 
 def shared_among_copies(gaussians: Gaussians, source: Tensor) -> Edit:
-    """The edit in which new rows copy the rows `source` [M], and copies of one row share what it contributed."""
+    """The edit in which new rows copy the rows `source` [M], and copies of a row share its contribution."""
     copies = torch.bincount(source, minlength=len(gaussians))[source]
     shared = copies > 1
     logit_opacities, log_scales = gaussians.logit_opacities[source], gaussians.log_scales[source]
@@ -607,7 +603,7 @@ def shared_among_copies(gaussians: Gaussians, source: Tensor) -> Edit:
 
 
 def shared_contribution(logit_opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
-    """Opacity and size with which N copies at one place render like the one Gaussian they replace (relocation there).
+    """Opacity and size with which N copies at one position render like the Gaussian they replace (3DGS-MCMC).
 
     The opacity o' satisfies 1 - (1 - o')^N = o, so that the centre stays as opaque. The size keeps the integral of
     the composited profile sum_i o' G (1 - o' G)^(i-1) along a line through the centre: sigma' / sigma is o over
@@ -645,14 +641,14 @@ def _profile_coefficients() -> Tensor:
 def perturb_opacities(
     gaussians: Gaussians, selected: Tensor, *, generator: torch.Generator, amplitude: float, bounds: tuple[float, float]
 ) -> Gaussians:
-    """Adds uniform noise to the opacity of the Gaussians that are seen through a pane.
+    """Adds uniform noise to the opacities of Gaussians visible through a pane.
 
-    Where the transmission image still holds part of the reflection, the depth loss and the gradient
-    loss have reached a balance; a random change of opacities upsets both at once.
+    If the transmission still contains part of the reflection, the depth and gradient losses are in equilibrium; random
+    changes of opacities disturb it.
 
     Args:
         gaussians: the primary Gaussians.
-        selected: [N] bool, which of them are seen through a pane (`behind_panes`).
+        selected: [N] bool, those visible through a pane (`behind_panes`).
         generator: source of the noise, on the device of `gaussians`.
         amplitude: the noise is uniform in [-amplitude, amplitude] and acts on the activated opacity.
         bounds: range the new opacities are clamped to. The paper does not give it; the lower bound
@@ -660,7 +656,7 @@ def perturb_opacities(
             those that were wrongly lowered can return.
 
     Returns:
-        The Gaussians; forget the opacity moments of those selected.
+        The Gaussians; the caller has to zero the opacity moments of those selected.
     """
     opacities = torch.sigmoid(gaussians.logit_opacities)
     unit = torch.rand(opacities.shape, generator=generator, dtype=opacities.dtype, device=opacities.device)

@@ -1,4 +1,4 @@
-"""The training loop; it knows stages, losses and actions, and no method by name."""
+"""The training loop, independent of methods: it only uses stages, losses and actions."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class TrainingDivergedError(FloatingPointError):
 
 
 class NoGaussiansError(TrainingDivergedError):
-    """There is nothing to train: no Gaussians, or none that a view shows."""
+    """There are no Gaussians, or none that a view shows."""
 
 
 ENTERED = "set up"
-"""Name in `TrainState.records`: the stage last set up, or entered early, by the step at which it was to begin."""
+"""Key of `TrainState.records`: the stage last set up, or entered early, by its scheduled first step."""
 WHERE_TO_LOOK = (
     "Expected cameras that look at the points: check their poses and focal lengths, and whether the points are those "
     "of this capture; photographs of a few pixels (--downscale) or high learning rates end like this too"
@@ -41,8 +41,8 @@ WHERE_TO_LOOK = (
 
 
 class Differentiated(NamedTuple):
-    """One view's losses and their gradients. Of each pass on screen there are those of its centres and of `absgrad`, of
-    each pass in space those of `contributions`. `visible` is the frame's.
+    """Losses of a view and their gradients. Screen passes have those of the centres and of `absgrad`, ray-traced
+    passes those of `contributions`. `visible` is that of the frame.
     """
 
     losses: dict[str, float]
@@ -53,13 +53,13 @@ class Differentiated(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Losses, gradients and statistics of all views of a step, whichever rank has rendered them.
+    """Losses, gradients and statistics of all views of a step, from all ranks.
 
     Attributes:
-        losses: of each view.
+        losses: losses of each view.
         gradients: means over the views.
-        statistics: what the step adds to those of the state; empty where it is there already.
-        visible: [N] bool, which primary Gaussians any view showed; None if that is not known.
+        statistics: additions to the statistics of the state; empty if already added.
+        visible: [N] bool, primary Gaussians that any view showed; None if unknown.
     """
 
     losses: list[dict[str, float]]
@@ -71,26 +71,25 @@ class Step(NamedTuple):
 def train(
     stages: tuple[Stage, ...], dataset: Dataset, state: TrainState, iterations: int, *, ranks: Ranks | None = None
 ) -> Iterator[Message]:
-    """Trains until `iterations`, from wherever `state` stands.
+    """Trains from the step of `state` to `iterations`.
 
-    `state` is edited in place and is consistent whenever `StageEntered`, `StepDone` or an `ActionDone` after it is out,
-    so a consumer may save it or stop iterating there; training goes on later from it, saved or not, with the same
-    result.
+    `state` is edited in place. It is consistent after each `StageEntered`, `StepDone` and `ActionDone`, where a
+    consumer may save it or stop iterating; training can continue later with the same result.
 
     Args:
         stages: the recipe's stages.
         dataset: photographs to fit.
         state: initial or resumed state.
-        iterations: length of the whole run in views, over which all schedules stretch.
-        ranks: the processes that train together, all with the same state; this one alone if not given.
+        iterations: length of the whole run in views, with which all schedules scale.
+        ranks: processes that train together with the same state; by default only this one.
 
     Yields:
         `StageEntered`, `StepDone`, `ActionDone` and `Working` messages.
 
     Raises:
-        TrainingDivergedError: a loss is not finite; names the term, the step and the view.
-        NoGaussiansError: nothing is left, or nothing is in sight of any view.
-        RankLostError: another rank has ended; the state is that after the last `StepDone`, or `ActionDone` after it.
+        TrainingDivergedError: a loss is not finite; the message names term, step and view.
+        NoGaussiansError: no Gaussians are left, or none are visible in any view.
+        RankLostError: another rank has ended; the state is that of the last message.
     """
     ranks = ranks or Ranks()
     check_population(state)
@@ -127,7 +126,7 @@ def advance(
     ranks: Ranks,
     visibility: VisibilityCheck,
 ) -> Iterator[Message]:
-    """One optimisation step of some views, and the actions that are due after it."""
+    """One optimisation step of a batch of views, and the actions due after it."""
     found = step_of(stage, state, views, ranks, with_absgrad=state.step < stage.densify_until * iterations)
     visibility.note(found.visible, state.step, len(views))
     state.is_whole = False
@@ -154,12 +153,12 @@ def advance(
     for action in done:
         yield ActionDone(state.step, action.name, counts_of(state.scene))
     if due:
-        # Even where nothing was done: another rank may have rounded a number to the other side.
+        # Even if nothing was done: another rank may have rounded differently.
         ranks.settle(state)
 
 
 def step_of(stage: Stage, state: TrainState, views: Sequence[View], ranks: Ranks, *, with_absgrad: bool) -> Step:
-    """Differentiate the views of a step, of which this rank renders its own; the scene is not changed yet."""
+    """Differentiate the views of a step, each rank its own; the scene is not changed yet."""
     own = views[ranks.rank :: ranks.count]
     results = [differentiate(stage, state.scene, view, with_absgrad=with_absgrad) for view in own]
     if len(views) == ranks.count == 1:
@@ -170,7 +169,7 @@ def step_of(stage: Stage, state: TrainState, views: Sequence[View], ranks: Ranks
     for view, result in zip(own, results, strict=True):
         collect(statistics, result, view)
     exchanged = ranks.exchange((list(statistics), [(r.losses, set(r.gradients), r.visible is None) for r in results]))
-    # Rank r has the views r, r + count, ...
+    # Rank r renders the views r, r + count, ...
     of_views = [exchanged[i % ranks.count][1][i // ranks.count] for i in range(len(views))]
     for number, (view, (losses, _, _)) in enumerate(zip(views, of_views, strict=True), 1):
         check_losses(losses, state.step + number, view)
@@ -189,7 +188,7 @@ def totals(
     names: Sequence[str],
     ranks: Ranks,
 ) -> Step:
-    """The sums over all ranks of gradients and statistics, of the parameters and parts named."""
+    """Sums over all ranks of the gradients and statistics of the named parameters and parts."""
     parameters, sets = scene.parameters(), scene.gaussian_sets()
     gradients = [sum_of([r.gradients[n] for r in results if n in r.gradients], parameters[n]) for n in names]
     empty = {part: ScreenStatistics.zeros(len(sets[part]), device=sets[part].means.device) for part in statistics}
@@ -205,12 +204,12 @@ def totals(
 
 
 def sum_of(gradients: Sequence[Tensor], parameter: Tensor) -> Tensor:
-    """The sum of a parameter's gradients over some views, of which there may be none."""
+    """Sum of a parameter's gradients over views, possibly none."""
     return sum(gradients[1:], gradients[0]) if gradients else torch.zeros_like(parameter)
 
 
 def mean_losses(losses: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Every term's mean over the views of a step; one that does not apply to a view adds nothing there."""
+    """Mean of each term over the views of a step; terms that do not apply to a view count as 0."""
     names = dict.fromkeys(name for of_view in losses for name in of_view)
     return {name: sum(of_view.get(name, 0.0) for of_view in losses) / len(losses) for name in names}
 
@@ -235,10 +234,10 @@ def check_population(state: TrainState) -> None:
 
 
 class VisibilityCheck:
-    """Check that the views show anything at all.
+    """Check that the views show any Gaussians.
 
-    One view that shows no Gaussian learns nothing, and the run goes on; a whole pass of them is a broken capture. That
-    is asked once a pass, so that no step has to wait for a GPU's answer.
+    A single view without Gaussians is tolerated; a whole pass of them means a broken capture. This is checked once per
+    pass, so that steps need not synchronise with the GPU.
     """
 
     def __init__(self, views: int) -> None:
@@ -246,12 +245,12 @@ class VisibilityCheck:
         self._seen: Tensor | bool = False
 
     def note(self, visible: Tensor | None, step: int, count: int = 1) -> None:
-        """Notes what the views of a step showed.
+        """Records what the views of a step showed.
 
         Args:
-            visible: [N] bool, which primary Gaussians they showed; None if that is not known.
-            step: iterations done before it, from which follows where a pass begins.
-            count: of the views.
+            visible: [N] bool, primary Gaussians that they showed; None if unknown.
+            step: iterations done before it, which determine the start of a pass.
+            count: number of views.
 
         Raises:
             NoGaussiansError: no view of a whole pass showed any.
@@ -267,23 +266,23 @@ class VisibilityCheck:
 
 
 def scheduled_views(dataset: Dataset, state: TrainState, count: int) -> list[View]:
-    """The views of this step: every view once per pass, in an order drawn anew for each pass."""
+    """The views of this step: every view once per pass, in a new random order for each pass."""
     places = (divmod(step, len(dataset.train)) for step in range(state.step, state.step + count))
     return [dataset.train[order_of_views(len(dataset.train), state.seed, n)[position]] for n, position in places]
 
 
 @lru_cache(maxsize=8)
 def order_of_views(count: int, seed: int, number: int) -> list[int]:
-    """The order of so many views in one pass over them."""
+    """Random order of the views in a pass."""
     generator = torch.Generator().manual_seed(seed * 1_000_003 + number)
     order: list[int] = torch.randperm(count, generator=generator).tolist()
     return order
 
 
 def differentiate(stage: Stage, scene: Scene, view: View, *, with_absgrad: bool) -> Differentiated:
-    """Renders a view and returns the weighted losses with the gradients of all that learns.
+    """Renders a view; returns the weighted losses and the gradients of all learned parameters.
 
-    Those of passes come only `with_absgrad`.
+    Gradients of passes are included only `with_absgrad`.
     """
     leaves = {
         name: tensor.detach().requires_grad_()
@@ -297,7 +296,7 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, with_absgrad: bool)
     tracked = [record for record in frame.screen if record.means2d.requires_grad and record.means2d.numel() > 0]
     centers, absgrads = [record.means2d for record in tracked], [record.absgrad for record in tracked]
     values = torch.stack([*terms.values()]) * weights
-    # Of their sum, and not of the terms with the weights as `grad_outputs`: to check these, PyTorch imports SymPy.
+    # Of their sum, not of the terms with weights as `grad_outputs`, for which PyTorch imports SymPy.
     sums = [values.sum()] if values.requires_grad else []
     inputs = ([*leaves.values()], centers, absgrads, [record.contributions for record in frame.space])
     found = iter(torch.autograd.grad(sums, [*itertools.chain(*inputs)], allow_unused=True))
@@ -311,13 +310,13 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, with_absgrad: bool)
 
 
 def seen_from(view: View, scene: Scene) -> View:
-    """The view from where the scene says that its camera is; differentiable."""
+    """The view with its camera pose corrected by the scene; differentiable."""
     camera = scene.poses.correct(view.camera, view.name, scene.extent)
     return view if camera is view.camera else view.with_camera(camera)
 
 
 def loss_terms(stage: Stage, frame: Frame, view: View, scene: Scene) -> tuple[dict[str, Tensor], Tensor]:
-    """Every loss term that applies to the view, and the weights of these terms, in the same order."""
+    """All loss terms that apply to the view, and their weights, in the same order."""
     values = {term.name: term.function(frame, view, scene) for term in stage.losses}
     terms = {name: value for name, value in values.items() if value is not None}
     for name, value in terms.items():
@@ -331,7 +330,7 @@ def loss_terms(stage: Stage, frame: Frame, view: View, scene: Scene) -> tuple[di
 def update(
     stage: Stage, state: TrainState, gradients: Mapping[str, Tensor], iterations: int, *, views: int = 1
 ) -> None:
-    """Steps the optimiser at the stage's learning rates, with the mean gradients of so many views."""
+    """Steps the optimiser at the stage's learning rates, with gradients averaged over the batch."""
     parameters = state.scene.parameters()
     progress = state.step / iterations
     extent = state.scene.extent
@@ -341,7 +340,7 @@ def update(
 
 
 def collect(statistics: dict[str, ScreenStatistics], result: Differentiated, view: View) -> None:
-    """Adds a view's gradients on screen, and in space of what rays met, to the statistics that densification reads."""
+    """Adds a view's screen gradients, and those of ray-traced Gaussians, to the densification statistics."""
     size = view.camera.width, view.camera.height
     for record, v_means, v_absgrad in result.screen:
         known = statistics_of(statistics, record.part, v_means.shape[1], v_means.device)
@@ -354,7 +353,7 @@ def collect(statistics: dict[str, ScreenStatistics], result: Differentiated, vie
 
 
 def counted_radii(record: ScreenPass, view: View) -> Tensor:
-    """The radii [C, N, 2] of a pass, 0 where the centre lies on a pixel that the view ignores."""
+    """The radii [C, N, 2] of a pass, 0 if the centre is on an ignored pixel."""
     if view.ignored is None:
         return record.radii
     pixels = nearest_pixels(record.means2d.detach().flatten(0, 1), view.camera)
@@ -365,7 +364,7 @@ def counted_radii(record: ScreenPass, view: View) -> Tensor:
 def statistics_of(
     statistics: dict[str, ScreenStatistics], part: str, count: int, device: torch.device
 ) -> ScreenStatistics:
-    """Statistics of a part of the scene; empty ones for so many Gaussians where none exist."""
+    """Statistics of a part of the scene; new, empty ones if none exist."""
     if part not in statistics:
         statistics[part] = ScreenStatistics.zeros(count, device=device)
     return statistics[part]

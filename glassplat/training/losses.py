@@ -34,7 +34,7 @@ class LossTerm:
 
 
 def weighted_terms(*terms: LossTerm) -> tuple[LossTerm, ...]:
-    """The terms whose weight is not zero; the others are not even computed."""
+    """The terms with non-zero weights; the others are not computed."""
     return tuple(term for term in terms if term.weight != 0)
 
 
@@ -49,7 +49,7 @@ class PhotometricLoss:
     ssim_weight: float
 
     def __call__(self, frame: Frame, view: View, scene: Scene) -> Tensor:
-        """The loss of a view, in the colours of its photograph; scalar. Ignored pixels count as if they were right."""
+        """Loss of a view, in the colours of its photograph; scalar. Ignored pixels have no error."""
         image = with_ignored_right(scene.exposures.apply(frame.rgb, view.name), view)
         found = photometric(image, to_device(view.photo, image.device))
         return found.l1.lerp(1 - found.ssim, self.ssim_weight)
@@ -58,9 +58,10 @@ class PhotometricLoss:
 def mean_opacity(frame: Frame, view: View, scene: Scene) -> Tensor:
     """Opacity regularisation L_o (TR-Gaussians, Eq. 20): the L1 norm of the opacities, per Gaussian in view.
 
-    Differentiable in the raw opacities. What no photograph holds up fades until it is relocated. Those that the view
-    does not show are left out, unlike in the papers: what few views show would fade in all the others. Mirror images
-    do not count: what a pane shows at a tenth of its strength would fade as fast as what is seen directly.
+    Differentiable in the raw opacities. Gaussians that no photograph supports fade until they are relocated. Unlike in
+    the papers, Gaussians outside the view are excluded, because those visible in few views would fade in all others.
+    Mirror images do not count either: Gaussians visible only in a weak reflection would fade as fast as those seen
+    directly.
     """
     return _direct_mean(scene.primary.logit_opacities, torch.sigmoid, frame)
 
@@ -68,23 +69,23 @@ def mean_opacity(frame: Frame, view: View, scene: Scene) -> Tensor:
 def mean_scale(frame: Frame, view: View, scene: Scene) -> Tensor:
     """Covariance regularisation L_Sigma (TR-Gaussians, Eq. 20): the L1 norm of its eigenvalues' roots, per axis.
 
-    Those roots are the standard deviations. Divided by the scene extent, so that the weight does not depend on the
-    capture's units. Differentiable in the raw scales. Of what the view shows directly, as `mean_opacity`.
+    The roots are the standard deviations. They are divided by the scene extent, so that the weight does not depend on
+    the capture's units. Differentiable in the raw scales; for Gaussians in view, as `mean_opacity`.
     """
     return _direct_mean(scene.primary.log_scales, torch.exp, frame) / scene.extent
 
 
 def of_all(term: LossFunction) -> LossFunction:
-    """A term of what the view shows directly, as one of all Gaussians."""
+    """The same term over all Gaussians instead of those in view."""
     return lambda frame, view, scene: term(replace(frame, direct=None), view, scene)
 
 
 def _direct_mean(values: Tensor, activation: Callable[[Tensor], Tensor], frame: Frame) -> Tensor:
-    """Mean of the activated `values` [N, ...] of what the frame shows directly; of all if it does not say."""
+    """Mean of the activated `values` [N, ...] over Gaussians in direct view; over all if visibility is unknown."""
     if frame.direct is None or not camera.waits(values.device):
         chosen = activation(values if frame.direct is None else values[frame.direct])
         return chosen.sum() / max(chosen.numel(), 1)
-    # How many there are, only the GPU knows: they are not gathered but all others left out.
+    # Masked instead of gathered, because their number is only known on the GPU.
     shown = frame.direct.reshape(-1, *[1] * (values.dim() - 1))
     total = torch.where(shown, activation(torch.where(shown, values, 0)), 0).sum()
     return total / (frame.direct.sum() * math.prod(values.shape[1:])).clamp(min=1)
@@ -134,7 +135,7 @@ def disc_normals(frame: Frame, view: View, scene: Scene) -> Tensor:
 def normals_of_depths(depth: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
     """Unit normals of a depth map [H, W] in camera axes, towards the camera, each coordinate an image [H - 2, W - 2].
 
-    Zero where it is empty. In that layout every operation runs over a contiguous image.
+    Zero where it is empty. This layout makes all operations contiguous.
     """
     x = (torch.arange(camera.width, dtype=depth.dtype, device=depth.device) + 0.5 - camera.cx) / camera.fx
     y = (torch.arange(camera.height, dtype=depth.dtype, device=depth.device) + 0.5 - camera.cy) / camera.fy
@@ -149,27 +150,27 @@ def normals_of_depths(depth: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Te
 
 
 PAPER_PIXELS = 960 * 720
-"""Size of the photographs for which the paper's weight of L_c was chosen."""
+"""Size of photographs for which the paper chose the weight of L_c."""
 SIZE_POWER = 0.8
-"""How L_c shrinks as photographs grow, as a power of their number of pixels: between 0.5, where all slopes are steps
-between two pixels, and 1, where all are ramps. Measured on one scene from 100x75 to 800x600: 0.0525, 0.0193, 0.0062,
+"""Exponent by which L_c shrinks with the number of pixels: between 0.5, if all edges are steps, and 1, if all are
+ramps. Measured on one scene from 100x75 to 800x600: 0.0525, 0.0193, 0.0062,
 0.0018."""
 
 
 CELLS_ACROSS = 36
-"""Cells in which shared edges are added up, along the longer side of a photograph."""
+"""Cells along the longer side of a photograph, in which shared edges are summed."""
 
 
 def gradient_conflict(frame: Frame, view: View, scene: Scene) -> Tensor:
     """Gradient conflict loss L_c (TR-Gaussians, Eq. 15).
 
-    The image mean of H |grad C_t . sg(grad C_r)|, per colour channel: an edge of the reflection should
-    not appear in the transmission. No gradient reaches the reflection. C_t is the image without any pane, also where
-    panes are seen through one another. H leaves out the pixels where the reflection ends or passes to another pane's:
-    that edge is the pane's own, and the frame behind it has every right to be there.
+    The image mean of H |grad C_t . sg(grad C_r)|, per colour channel: an edge of the reflection should not appear in
+    the transmission. No gradient reaches the reflection. C_t is the image without any pane, also where panes are seen
+    through one another. H excludes pixels at the border of a reflection or between two panes, where the transmission
+    may have an edge, too.
 
-    Slopes per pixel are steeper in a smaller photograph of the same view. The loss is scaled to what it would be in
-    one of `PAPER_PIXELS`, so that one weight serves photographs of any size.
+    Gradients per pixel are larger in smaller photographs. The loss is scaled to its value at `PAPER_PIXELS`, so that
+    one weight suits all sizes.
     """
     layers = frame.layers
     inside = inside_panes(layers["pane"], layers["strength"])
@@ -177,13 +178,12 @@ def gradient_conflict(frame: Frame, view: View, scene: Scene) -> Tensor:
 
 
 def reflection_left(frame: Frame, view: View, scene: Scene) -> Tensor:
-    """Edges of the reflection that the transmission still holds: L_c in cells, as far as panes could have left them.
+    """L_c in cells: edges of the reflection that remain in the transmission, limited to what panes could have left.
 
-    Counted pixel by pixel, three fifths of L_c are edges that only happen to meet. And where the true edge of something
-    behind the glass is in the reflection too, L_c takes it out of the transmission; the reflection grows brighter to
-    make up for it, and L_c grows along. So edges are added up in cells first, a cell with more of them than a pane
-    could have left counts for nothing (see `gradient_conflict` of `kernels.panes`), and what is brighter than white
-    counts as white.
+    Pixel by pixel, three fifths of L_c are edges that coincide by chance. If a true edge behind the glass coincides
+    with one in the reflection, L_c removes it from the transmission; the reflection becomes brighter to compensate,
+    which increases L_c further. Therefore, edges are summed in cells first, cells with more than a pane could have
+    left do not count (see `gradient_conflict` of `kernels.panes`), and values are clipped at white.
     """
     layers = frame.layers
     inside = inside_panes(layers["pane"], layers["strength"])
@@ -194,7 +194,7 @@ def reflection_left(frame: Frame, view: View, scene: Scene) -> Tensor:
 
 
 def _size_factor(inside: Tensor) -> float:
-    """Factor on slopes shared in a photograph [H, W], as if it had `PAPER_PIXELS`."""
+    """Factor that scales L_c of a photograph [H, W] to `PAPER_PIXELS`."""
     return float((inside.numel() / PAPER_PIXELS) ** SIZE_POWER)
 
 
@@ -204,14 +204,14 @@ def _where_counted(errors: Tensor, view: View) -> Tensor:
 
 
 def counted_pixels(view: View, device: torch.device) -> Tensor:
-    """[H, W] bool: which pixels the view does not ignore."""
+    """[H, W] bool: pixels that the view does not ignore."""
     if view.ignored is None:
         return torch.ones(view.camera.height, view.camera.width, dtype=torch.bool, device=device)
     return ~view.ignored.to(device)
 
 
 def residual(frame: Frame, view: View, scene: Scene) -> Tensor:
-    """[H, W, 3] photograph minus render, sRGB, 0 where the view is ignored."""
+    """[H, W, 3] photograph minus render, sRGB, 0 at ignored pixels."""
     image = scene.exposures.apply(frame.rgb.detach(), view.name)
     difference = view.photo.to(image) / 255 - image
     if view.ignored is not None:
@@ -220,7 +220,7 @@ def residual(frame: Frame, view: View, scene: Scene) -> Tensor:
 
 
 def mask_loss(frame: Frame, view: View, scene: Scene) -> Tensor | None:
-    """Reflection mask loss L_m (TR-Gaussians, Eq. 16), on annotated views only. Ignored pixels count as right."""
+    """Reflection mask loss L_m (TR-Gaussians, Eq. 16), on annotated views only. Ignored pixels have no error."""
     if view.pane_labels is None:
         return None
     annotated = to_device(view.pane_labels > 0, frame.rgb.device).to(frame.rgb.dtype)
@@ -229,31 +229,31 @@ def mask_loss(frame: Frame, view: View, scene: Scene) -> Tensor | None:
 
 
 def intensity_departure(frame: Frame, view: View, scene: Scene) -> Tensor:
-    """Mean square of log a(u) over the Gaussians: how far reflections are from as bright as what they mirror.
+    """Mean square of log a(u) over the Gaussians: deviation of reflections from the brightness of what they reflect.
 
-    A dim reflection of a bright thing looks like a bright reflection by a pane of lower R0. Photographs tell the two
-    apart by little; this decides where they do not (not in the paper).
+    A dim reflection of a bright object looks like a bright one in a pane of lower R0. Photographs hardly distinguish
+    the two; this term resolves the ambiguity (not in the paper).
     """
     return scene.primary.channels["log_intensity"].square().mean()
 
 
 @dataclass(frozen=True)
 class ReflectanceDeparture:
-    """Departure of R0 from that of the glass which is to be expected (not in the paper).
+    """Deviation of R0 from the expected one of glass (not in the paper).
 
-    A darker thing before a pane of higher R0 looks like a brighter one before a pane of lower R0. Photographs tell the
-    two apart where they show what is mirrored directly; this decides where none does.
+    A dark object reflected by a pane of high R0 looks like a bright one and a low R0. Photographs that show the object
+    directly distinguish the two; this term decides if none do.
 
     Attributes:
-        reflectance: R0 to expect, between 0 and 1.
+        reflectance: expected R0, between 0 and 1.
     """
 
     reflectance: float
 
     def __call__(self, frame: Frame, view: View, scene: Scene) -> Tensor | None:
-        """Squares of the difference between logits, of all panes that are no mirrors; None where there is no pane.
+        """Squared differences of logits over all panes except mirrors; None without panes.
 
-        A pane counts by its share of the image, as it does in the photometric loss.
+        Panes are weighted by their share of the image, as in the photometric loss.
         """
         planes, pane = scene.planes, frame.layers["pane"].flatten()
         if not len(planes):
@@ -264,18 +264,18 @@ class ReflectanceDeparture:
 
 
 def tint_departure(frame: Frame, view: View, scene: Scene) -> Tensor | None:
-    """Mean square of the logarithms of the panes' transmittances: how far the glass is from clear (not in the paper).
+    """Mean squared logarithm of the panes' transmittances: deviation from clear glass (not in the paper).
 
-    Where all that is behind a pane is seen through it, its tint may as well be that of the things.
+    If objects are only visible through a pane, its tint and their colours cannot be distinguished.
     """
     logarithms = scene.planes.log_transmittances
     return None if logarithms is None or not len(logarithms) else logarithms.square().mean()
 
 
 def strength_outside(frame: Frame, view: View, scene: Scene) -> Tensor | None:
-    """Mean reflection strength of the Gaussians outside of the environment's region; None where it has none.
+    """Mean reflection strength of the Gaussians outside the environment's region; None without a region.
 
-    What only a few views saw looks reflective, because nothing contradicts it, and would spoil the environment.
+    Gaussians that few views see may become reflective, and would corrupt the environment.
     """
     if scene.environment.region is None:
         return None
@@ -287,7 +287,7 @@ def strength_outside(frame: Frame, view: View, scene: Scene) -> Tensor | None:
 
 
 def mean_strength(frame: Frame, view: View, scene: Scene) -> Tensor:
-    """Mean reflection strength of all Gaussians: a price, so that what a colour explains as well does not reflect."""
+    """Mean reflection strength of all Gaussians: a penalty that prefers plain colours where these suffice."""
     return torch.sigmoid(scene.primary.channels["logit_strength"]).mean()
 
 
@@ -298,14 +298,14 @@ log = logging.getLogger("glassplat.training")
 class MonocularNormals:
     """The mean of 1 - n . N_m over the pixels of an image, n the blended normal made unit, N_m the estimated one.
 
-    Pixels without an estimate, that show nothing or that the view ignores count as 0; a view without a file of normals
-    has no such term.
+    Pixels that are empty, ignored or without an estimate count as 0; views without estimated normals have no such
+    term.
     """
 
     _lacking: set[str] = field(default_factory=set, init=False, repr=False, compare=False)
 
     def __call__(self, frame: Frame, view: View, scene: Scene) -> Tensor | None:
-        """The loss of a view; None where no normals lie next to its photograph."""
+        """Loss of a view; None if there are no normals for its photograph."""
         normals = view.normals
         if normals is None:
             folders = view.image_path.parents[: len(PurePosixPath(view.name).parts) + 1]

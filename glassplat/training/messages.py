@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class RunBegun:
-    """A run begins, or goes on from a checkpoint.
+    """A run starts, or continues from a checkpoint.
 
     Attributes:
         step: iterations done so far.
         iterations: length of the whole run.
-        anew: it replaces one in the same folder that was begun and never saved.
+        anew: it replaces a run in the same folder that was never saved.
     """
 
     step: int
@@ -23,7 +23,7 @@ class RunBegun:
 
 @dataclass(frozen=True)
 class StageEntered:
-    """A stage begins; `counts` says how many Gaussians and planes there are, by scene part."""
+    """A stage starts; `counts` has the numbers of Gaussians and planes, by scene part."""
 
     step: int
     stage: str
@@ -43,7 +43,7 @@ class StepDone:
 
 @dataclass(frozen=True)
 class ActionDone:
-    """An action edited the state after a step; one that found nothing to edit says nothing."""
+    """An action edited the state after a step; actions that change nothing send no message."""
 
     step: int
     action: str
@@ -52,12 +52,12 @@ class ActionDone:
 
 @dataclass(frozen=True)
 class Working:
-    """Something takes its time; between two steps the state is in the middle of a change and must not be saved.
+    """Progress of long work; between two steps, the state is incomplete and must not be saved.
 
     Attributes:
-        what: is being done, as a gerund: "fitting planes".
+        what: description of the work, as a gerund: "fitting planes".
         done: parts that are finished.
-        total: parts in all.
+        total: number of parts.
     """
 
     what: str
@@ -67,7 +67,7 @@ class Working:
 
 @dataclass(frozen=True)
 class CheckpointWritten:
-    """The run can go on from this step whatever happens."""
+    """The run can be resumed from this step."""
 
     step: int
 

@@ -83,9 +83,9 @@ class GaussianRates:
     """Learning rates of a set of Gaussians (3DGS).
 
     Attributes:
-        means: position, per scene extent, at the start of the run; decays to `MEANS_END`.
+        means: positions, in scene extents, at the start of the run; decays to 1.6e-6.
         decay: share of the run at which it has done so.
-        sh: constant SH coefficient; the others get a twentieth.
+        sh: constant SH coefficients; a twentieth for the others.
         opacity, scale, rotation: of the raw values.
         intensity: of the reflection intensity's logarithm.
         short_run_power: in a run of n < 30,000 iterations the rates of position, colour, scale and rotation are
@@ -155,8 +155,7 @@ class Intervals:
         least: fewest iterations between them; the scene needs as many to recover.
         reset_stop: share of the run after which no reset happens; the `mcmc` strategy has none.
         sh: distance between rises of the SH degree, as a share of the run.
-        averaged_passes: passes over the views at the end of the run of which the scene becomes the mean; 0 keeps the
-            last step.
+        averaged_passes: final passes over the views over which the parameters are averaged; 0 keeps the last step.
     """
 
     opacity: Internal[PositiveShare] = 1 / 30
@@ -183,21 +182,22 @@ class DefaultDensify:
             every Gaussian has been seen when it is judged.
         adapt_to_size: raise the thresholds where photographs are smaller than a quarter of a megapixel.
         start: share of the run after which densification begins.
-        stop: share of the run after which it ends.
+        stop: share of the run after which densification ends.
         gradient_threshold: mean gradient norm, in normalised device coordinates, above which a small Gaussian is
             cloned.
         absgrad_threshold: mean absolute gradient, in the same unit, above which a large Gaussian is split.
         dense_fraction: Gaussians whose longest axis is above this share of the scene extent are
             split, smaller ones cloned.
-        prune_opacity: Gaussians less opaque than this are removed.
+        prune_opacity: opacity below which Gaussians are removed.
         prune_large_start: share of the run after which what is too large is removed as well; 1 never does.
         prune_scale_fraction: from `prune_large_start` on, Gaussians with an axis above this share of the
             scene extent are removed. 3DGS also states a limit of 20 pixels on screen, but clears the radii before it
             looks at them, so that its published results have none.
-        cap: largest number of Gaussians, from the start; None leaves it to `--densify.per-pixel`, 0 adds none.
-        per_pixel: largest number of Gaussians to grow to for each pixel of all training photographs, which is reached
-            where these contradict each other, by cars and leaves, and never stop asking for more; 0 for no limit.
-        least_contribution: Gaussians that add less than so many pixels to every training view, directly and mirrored,
+        cap: maximum number of Gaussians, including the initial ones; by default `--densify.per-pixel` decides. 0 adds
+            none.
+        per_pixel: maximum number of Gaussians per pixel of all training photographs, a limit for captures whose
+            photographs contradict each other (moving cars, leaves); 0 sets no limit.
+        least_contribution: contribution in pixels to every training view, directly and mirrored, below which Gaussians
             are removed; 0 keeps them.
         contribution_moments: shares of the run at which they are: when the set has stopped growing, when `planar`
             perturbs nothing any longer, and at the end.
@@ -238,18 +238,17 @@ class McmcDensify:
     """Options for relocating, adding and moving Gaussians (Kheradmand et al. 2024).
 
     Attributes:
-        cap: largest number of Gaussians, from the start; None grows to half as many as a photograph has pixels.
+        cap: maximum number of Gaussians, including the initial ones; by default half the pixels of a photograph.
         interval: steps between relocations.
         start: share of the run after which relocation begins.
         stop: share of the run after which relocation and growth end; the noise goes on.
         growth: factor by which the number grows in every three hundredth of the run, until the cap: with the published
             30,000 iterations at every relocation. A single relocation at most doubles it.
-        noise_rate: noise on the positions, as a multiple of their learning rate; 0 switches it
-            off.
+        noise_rate: noise on the positions, as a multiple of their learning rate; 0 disables it.
         noise_units: in which variances and learning rate are multiplied: scene `extents`, so that the noise is the same
             whatever the capture's units, or as published `world` units.
-        opacity_weight: lambda_o, weight of the mean opacity in the objective.
-        scale_weight: lambda_Sigma, weight of the mean standard deviation in the objective.
+        opacity_weight: lambda_o, weight of the mean opacity in the loss.
+        scale_weight: lambda_Sigma, weight of the mean standard deviation in the loss.
         reach: what noise and regularisers act on at a step: what its view shows (`shown`; the regularisers on what it
             shows directly), or as published on `all` Gaussians.
         initial_spread: standard deviation of the first Gaussians, as a share of the distance to their neighbours. The
@@ -328,7 +327,7 @@ class PhotoExposure:
     """An affine transform of colours for each photograph (3DGS's public code has one).
 
     Attributes:
-        rate: learning rate at the start; 0 takes all photographs as exposed alike.
+        rate: initial learning rate; 0 assumes equal exposures.
     """
 
     rate: LearningRate = 0.0
@@ -339,7 +338,7 @@ class PoseRefinement:
     """A small rigid motion of each training camera, by the gradient that the image has to its pose.
 
     Attributes:
-        rate: learning rate at the start, radians and extents; 0 takes the capture's cameras as they are.
+        rate: initial learning rate, in radians and scene extents; 0 keeps the poses of the capture.
     """
 
     rate: LearningRate = 0.0
@@ -350,9 +349,9 @@ class Photographer:
     """Options for the photographer in the panes: Gaussians that the camera carries along.
 
     Attributes:
-        learn: look for one.
-        upright: the body stands on the ground however the camera is tilted; if not, it leans with the camera.
-        count: Gaussians at first.
+        learn: model the photographer's reflection.
+        upright: keep the photographer upright when the camera is tilted; otherwise they tilt with it.
+        count: number of initial Gaussians.
         sh_degree: highest degree of their colours.
         rates: learning rates.
     """
@@ -373,7 +372,7 @@ class PropagationSchedule:
 
     Attributes:
         end: `settled` ends it when what reflects has stopped growing (the paper's criterion), `fixed` at `stop`.
-        stop: share of the run after which nothing is propagated any more.
+        stop: share of the run after which propagation ends.
         patience: intervals without growth after which it counts as settled; a strength needs some hundred steps to be
             seen, however short the run. None is needed where nothing reflects nor looks as if it did.
         pause: steps for which raised opacities are held.
@@ -393,9 +392,9 @@ class SurroundingsStart:
     """Options for the first surroundings.
 
     Attributes:
-        source: Gaussians all over the box of the scene (the paper's), or copies of what stands in the scene and does
-            not reflect, or both.
-        cells: along an edge of the box; None takes as many as suit the photographs, 32 at the most (paper: 32).
+        source: Gaussians on a grid over the scene's bounding box (paper), copies of the scene's Gaussians that do not
+            reflect, or both.
+        cells: grid cells along an edge of the box; by default as many as suit the photographs, at most 32 (paper: 32).
         per_cell: Gaussians in each cell.
         outside: share of the points left out of the box at either end of each axis.
         opacity: of those in the box.
@@ -413,10 +412,10 @@ class SurroundingsOptions:
     """Options for learning the surroundings.
 
     Attributes:
-        start: what they are at first.
-        sh_degree: highest degree of the colours that turn with the ray.
+        start: initial surroundings.
+        sh_degree: maximum SH degree of their view-dependent colour.
         rates: learning rates.
-        densify: when and how Gaussians are added and pruned, by gradients in space times half of the distance.
+        densify: densification and pruning, by gradients in space times half of the distance.
         reset: share of the run between two resets of their opacities, while they are densified; 0 never resets them.
     """
 
@@ -438,17 +437,17 @@ class MethodRecipe:
     Attributes:
         method: its name on the command line.
         functions: module, and beginning of the names, of its functions `*_scene`, `*_renderer` and `*_stages`.
-        sh_degree: highest degree of the view-dependent colour.
+        sh_degree: maximum SH degree of the view-dependent colour.
         ssim_weight: lambda, share of D-SSIM in the photometric loss.
-        view_dependence_weight: of the squares of the spherical harmonics beyond the constant one.
-        background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
+        view_dependence_weight: weight of the squared SH coefficients beyond the constant one.
+        background: background colour, sRGB; by default white if photographs are transparent, else black.
         rates: learning rates of the Gaussians.
-        intervals: when opacities are reset and the SH degree grows.
-        strategy: what decides how many Gaussians there are and where; `densify` or `mcmc` holds its options.
-        densify: when and how Gaussians are added and pruned under `default`.
-        mcmc: when and how Gaussians are relocated and added under `mcmc`.
-        exposure: whether the exposure of each photograph is learned.
-        poses: whether the camera of each photograph is corrected.
+        intervals: intervals of opacity resets and SH degree increases.
+        strategy: strategy for adding and removing Gaussians, with its options in `densify` or `mcmc`.
+        densify: densification and pruning of the `default` strategy.
+        mcmc: relocation and growth of the `mcmc` strategy.
+        exposure: learned exposure of each photograph.
+        poses: refined camera pose of each training photograph.
     """
 
     method: ClassVar[str]

@@ -1,11 +1,11 @@
-"""Training by several processes, which `torchrun` starts on one machine or many.
+"""Training with several processes, started by `torchrun` on one or several machines.
 
-Every process, a rank, holds the whole scene and renders one view of each step. Gradients, statistics and what the views
-show are added up, so that all take the same step and make the same edits. Rank 0, the leader, writes, shows progress
-and answers errors; the others are silent.
+Every process, a rank, holds the whole scene and renders one view of each step. Gradients, statistics and visible sets
+are reduced over ranks, so that all ranks take the same steps and make the same edits. Rank 0, the leader, writes files
+and reports progress and errors; the others are silent.
 
-PyTorch carries what the ranks tell each other: tensors on GPUs by NCCL, everything else by Gloo. Whatever they do
-together begins with an `exchange`, in which a rank that has failed says so instead; nobody waits for it in vain.
+Tensors on GPUs are communicated by NCCL, everything else by Gloo. Every collective operation starts with an
+`exchange`, in which a failed rank reports its failure, so that the others do not wait for it.
 """
 
 from __future__ import annotations
@@ -30,14 +30,13 @@ if TYPE_CHECKING:
     from glassplat.training.stage import TrainState
 
 LONGEST_WAIT = timedelta(minutes=10)
-"""For a rank that lives and does not answer: it may save a large scene, compile kernels, or be paused in the viewer.
-One that dies is missed at once."""
+"""Timeout for a live rank: it may save a large scene, compile kernels, or be paused in the viewer. Dead ranks are
+noticed at once."""
 LAST_WAIT = 15.0
-"""Seconds for which a process that was asked to end waits for the others: `torchrun` kills it after 30, and it has to
-save before that."""
+"""Seconds for which a terminated process waits for the others: it has to save before `torchrun` kills it after 30."""
 LOST = (
-    "another process of the run has ended without a word, or its machine does not answer ({}); repeat the command with "
-    "--resume to go on from the last checkpoint"
+    "another process of the run has ended unexpectedly, or its machine does not respond ({}); repeat the command with "
+    "--resume to continue from the last checkpoint"
 )
 LONGEST_QUOTE = 150
 
@@ -48,12 +47,12 @@ def is_launched() -> bool:
 
 
 def leads() -> bool:
-    """Return whether this process writes and talks: it is alone, or rank 0."""
+    """Return whether this process writes and reports: it is the only one, or rank 0."""
     return not is_launched() or os.environ.get("RANK", "0") == "0"
 
 
 class Said(NamedTuple):
-    """Part of one rank in an exchange: its value, whether it was asked to end, or how it has failed."""
+    """Contribution of a rank to an exchange: its value, whether it was asked to end, or its failure."""
 
     value: Any = None
     is_asked: bool = False
@@ -61,13 +60,13 @@ class Said(NamedTuple):
 
 
 class Ranks:
-    """The processes of a run, as seen from one of them.
+    """The processes of a run, from the point of view of one of them.
 
     Attributes:
-        rank: number of this one.
-        count: how many there are.
-        batch: views of a step, rank r has the views r, r + count, ... of them; one for each rank unless said otherwise.
-        asked: tells whether this process was asked to end.
+        rank: number of this process.
+        count: number of processes.
+        batch: views per step, of which rank r renders r, r + count, ...; by default one per rank.
+        asked: returns whether this process was asked to end.
     """
 
     def __init__(self, rank: int = 0, count: int = 1, batch: int | None = None) -> None:
@@ -84,14 +83,14 @@ class Ranks:
 
     @property
     def is_ending(self) -> bool:
-        """Return whether any process was asked to end; all say the same after the same exchange."""
+        """Return whether any process was asked to end; the same on all ranks after an exchange."""
         return self.asked() if self.count == 1 else self._is_ending
 
     def exchange(self, value: Any = None) -> list[Any]:
         """The values of all ranks, in their order.
 
         Raises:
-            RankLostError: one has failed, or has ended without a word.
+            RankLostError: one has failed, or ended unexpectedly.
         """
         if self.count == 1:
             return [value]
@@ -113,10 +112,10 @@ class Ranks:
         return everything
 
     def _waited_for(self, call: Callable[[], object]) -> None:
-        """Runs a call in a thread: inside of one that waits for others, Python answers no signal.
+        """Runs a collective call in a thread, because Python handles no signals inside of it.
 
         Raises:
-            RuntimeError: this process was asked to end, and the others have not answered for `LAST_WAIT`.
+            RuntimeError: this process was asked to end, and the others did not respond within `LAST_WAIT`.
         """
         asked_at = None
         waiting = self._thread.submit(call)
@@ -124,15 +123,15 @@ class Ranks:
             if asked_at is None and self.asked():
                 asked_at = time.monotonic()
             if asked_at is not None and time.monotonic() - asked_at > LAST_WAIT:
-                raise RuntimeError("no answer since this one was asked to end")
+                raise RuntimeError("no answer since this process was asked to stop")
         waiting.result()
 
     def sum_tensors(self, tensors: Sequence[Tensor]) -> list[Tensor]:
-        """The sums over all ranks, of tensors of one type and device; call after an exchange."""
+        """Sums over all ranks of tensors of one type and device; to be called after an exchange."""
         return self._reduce(tensors, "SUM")
 
     def largest(self, tensors: Sequence[Tensor]) -> list[Tensor]:
-        """The largest values over all ranks, of tensors of one type and device; call after an exchange."""
+        """Maxima over all ranks of tensors of one type and device; to be called after an exchange."""
         return self._reduce(tensors, "MAX")
 
     def _reduce(self, tensors: Sequence[Tensor], operation: str) -> list[Tensor]:
@@ -141,7 +140,7 @@ class Ranks:
         import torch
         import torch.distributed as dist
 
-        # One message instead of dozens, each of which would cost its own delay.
+        # One message instead of dozens, each with its own latency.
         flat = torch.cat([tensor.detach().reshape(-1) for tensor in tensors])
         with _others_needed():
             reduce = partial(dist.all_reduce, flat, getattr(dist.ReduceOp, operation))
@@ -150,7 +149,7 @@ class Ranks:
         return [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)]
 
     def broadcast(self, state: TrainState | None, device: str) -> TrainState:
-        """The leader's state, on this rank's device; the others need none of their own."""
+        """The leader's state on this rank's device; other ranks need no state."""
         if self.count > 1:
             import torch.distributed as dist
 
@@ -164,22 +163,22 @@ class Ranks:
         return state
 
     def settle(self, state: TrainState) -> None:
-        """Sees to it that all have the same state after an edit, to the bit: where not, the leader's.
+        """Ensures that all ranks have bit-identical states after an edit, if necessary by copying the leader's.
 
-        All draw the same numbers, but machines of different kinds round differently, and some sums of GPUs do so each
-        time.
+        All draw the same random numbers, but different machines round differently, and some GPU sums are not
+        deterministic.
         """
         if self.count > 1 and len(set(self.exchange(fingerprint(state)))) > 1:
             vars(state).update(vars(self.broadcast(state, str(state.scene.primary.means.device))))
 
     def check_alike(self, traits: Mapping[str, object]) -> None:
-        """Refuses ranks that were not started alike.
+        """Refuses ranks that were started with different settings.
 
         Args:
-            traits: what has to be the same everywhere, by what it is called.
+            traits: values that have to agree, by name.
 
         Raises:
-            InputError: something differs; says what, and on which rank.
+            InputError: a value differs; the message names it and the rank.
         """
         first, *others = self.exchange(dict(traits))
         for rank, other in enumerate(others, 1):
@@ -192,7 +191,7 @@ class Ranks:
 
 
 def fingerprint(state: TrainState) -> int:
-    """A number that changes with any bit of what is trained, of its moments, and of what edits remember."""
+    """A checksum of all parameters, moments and records."""
     import torch
 
     tensors = state.scene.parameters() | {f"mean {name}": mean for name, mean in state.means.items()}
@@ -208,9 +207,9 @@ def fingerprint(state: TrainState) -> int:
 
 
 def join() -> Ranks:
-    """The processes that `torchrun` started with this one; this one alone if it did not.
+    """The processes started by `torchrun`; only this one without it.
 
-    Each takes the GPU of its number on its machine, and on the CPU as many threads as PyTorch has been given.
+    Each uses the GPU of its local rank, or on the CPU as many threads as PyTorch.
 
     Raises:
         RankLostError: the others cannot be reached.
@@ -228,9 +227,9 @@ def join() -> Ranks:
 
 
 def tell(label: str, text: str, code: int) -> None:
-    """Tells the other ranks how this one has failed, in place of the next exchange; waits until the leader has ended.
+    """Reports a failure to the other ranks in the next exchange; waits until the leader has ended.
 
-    Without others it does nothing. The leader returns at once, and has the last word.
+    It does nothing in a single process. The leader returns at once.
     """
     if not is_launched():
         return
@@ -241,7 +240,7 @@ def tell(label: str, text: str, code: int) -> None:
 
 
 def await_leader() -> None:
-    """Waits until the leader has ended: `torchrun` gives all others little time once the first has."""
+    """Waits until the leader has ended, because `torchrun` soon kills all ranks after the first one ends."""
     if leads():
         return
     with suppress(RankLostError):
@@ -251,10 +250,9 @@ def await_leader() -> None:
 
 
 def leave(code: int) -> None:
-    """Ends the process if it is one of several, at once; else does nothing.
+    """Ends the process immediately if it is one of several; else does nothing.
 
-    Without what Python does at its end: PyTorch aborts now and then where connections are taken down while another rank
-    still speaks.
+    Python's cleanup is skipped: PyTorch sometimes aborts when connections close while another rank still communicates.
     """
     if is_launched() and "torch.distributed" in sys.modules:
         with suppress(OSError, ValueError):
@@ -265,7 +263,7 @@ def leave(code: int) -> None:
 
 @contextmanager
 def _others_needed() -> Iterator[None]:
-    """Turns what PyTorch raises where another rank has gone into a RankLostError."""
+    """Turns PyTorch's error about a lost rank into a RankLostError."""
     try:
         yield
     except (RuntimeError, ValueError) as error:
@@ -276,7 +274,7 @@ def _others_needed() -> Iterator[None]:
 
 
 def _hold_termination() -> None:
-    """Lets the process save and say why it ends: `torchrun`, which terminates it meanwhile, waits for 30 seconds."""
+    """Lets the process save and report before it ends: `torchrun` waits 30 seconds after SIGTERM."""
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
 
@@ -289,7 +287,7 @@ def _backend() -> str:
 
 
 def _take_threads() -> None:
-    """Gives Numba as many threads as PyTorch: `torchrun` speaks of OpenMP's alone."""
+    """Gives Numba as many threads as PyTorch, because `torchrun` sets only OpenMP's."""
     import numba
     import torch
 
@@ -298,7 +296,7 @@ def _take_threads() -> None:
 
 
 def _take_gpu() -> None:
-    """Shows this process only the GPU of its number; before anything asks for one."""
+    """Makes only the GPU of this rank visible; to be called before CUDA is initialised."""
     number = int(os.environ.get("LOCAL_RANK", "0"))
     known = os.environ.get("CUDA_VISIBLE_DEVICES")
     names = known.split(",") if known else None

@@ -1,4 +1,4 @@
-"""Training stages, and the state that changes during a run: the scene, and Adam over named tensors."""
+"""Training stages, and the state of a run: the scene, and Adam over named tensors."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Moments = dict[str, tuple[Tensor, Tensor]]
 
 
 BETAS = (0.9, 0.999)
-"""Of Adam, for steps of one view."""
+"""Adam's betas, for steps of one view."""
 
 
 @dataclass
@@ -36,9 +36,9 @@ class Optimizer:
 
     Attributes:
         moments: first and second moment of each parameter.
-        updates: by how many views each parameter was stepped, for the bias correction.
-        paused: for how many more views a parameter is left as it is.
-        raised_rates: by what the rate of a parameter is multiplied from now on; 1 where nothing is said.
+        updates: number of views by which each parameter was stepped, for the bias correction.
+        paused: number of further views for which a parameter is frozen.
+        raised_rates: factors on the learning rates of parameters; 1 if absent.
     """
 
     moments: Moments = field(default_factory=dict)
@@ -55,13 +55,13 @@ class Optimizer:
         decays: Mapping[str, Tensor] | None = None,
         views: int = 1,
     ) -> None:
-        """Updates `parameters` in place for every name in `gradients`, which are means over so many views.
+        """Updates `parameters` in place for every name in `gradients`, which are means over the views of the step.
 
-        `decays` are those of `glassplat.kernels.adam.Update`, of the parameters that have one.
+        `decays` are those of `glassplat.kernels.adam.Update`, for parameters that have one.
 
-        Rates are those of a step of one view. They grow by the root of the number of views, and moments remember as
-        many views as ever: so a step leads as far as so many steps would whose gradients agree on nothing (Malladi et
-        al. 2022, "On the SDEs and Scaling Rules for Adaptive Gradient Algorithms").
+        Rates are for steps of one view. They are scaled by the square root of the number of views, and the moments
+        average over as many views as before (Malladi et al. 2022, "On the SDEs and Scaling Rules for Adaptive Gradient
+        Algorithms").
         """
         learning = [name for name in gradients if parameters[name].numel() > 0 and not self._waits(name, views)]
         known = decays or {}
@@ -74,7 +74,7 @@ class Optimizer:
     def _update(
         self, name: str, parameter: Tensor, gradient: Tensor, rate: float | Tensor, decay: Tensor | None, views: int
     ) -> Update:
-        """The next step of a parameter, which so many views have asked for; counts them."""
+        """The update of a parameter for a number of views, which are counted."""
         moments = self.moments_of(name, parameter)
         self.updates[name] = self.updates.get(name, 0) + views
         factor = math.sqrt(views) * self.raised_rates.get(name, 1.0)
@@ -89,7 +89,7 @@ class Optimizer:
         return left > 0
 
     def moments_of(self, name: str, parameter: Tensor) -> tuple[Tensor, Tensor]:
-        """The moments of a parameter, zero for one that is new."""
+        """The moments of a parameter; zero for a new one."""
         known = self.moments.get(name)
         if known is None or known[0].shape != parameter.shape:
             known = (torch.zeros_like(parameter), torch.zeros_like(parameter))
@@ -99,7 +99,7 @@ class Optimizer:
 
 
 def rate_tensor(rate: Rate, parameter: Tensor, progress: float, extent: float, iterations: int) -> float | Tensor:
-    """The rate as `adam` takes it: one number, or one per column where SH bands differ."""
+    """The rate in the form of `adam`: one number, or one per column for SH coefficients."""
     value = rate.at(progress, extent, iterations)
     if rate.rest is None:
         return value
@@ -107,7 +107,7 @@ def rate_tensor(rate: Rate, parameter: Tensor, progress: float, extent: float, i
 
 
 def decay_tensor(rate: Rate, parameter: Tensor) -> Tensor | None:
-    """The decay that gives the gradient of `Rate.penalty`; None where there is no penalty."""
+    """The weight decay equivalent to `Rate.penalty`; None without a penalty."""
     if not rate.penalty or not parameter.numel():
         return None
     rest = 2 * rate.penalty / len(parameter)
@@ -117,9 +117,10 @@ def decay_tensor(rate: Rate, parameter: Tensor) -> Tensor | None:
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)
 def _columns(constant: float, rest: float, shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """One number per column of spherical harmonics [N, K, 3]: of the constant one, and of all others.
+    """One number per column of SH coefficients [N, K, 3]: one value for the constant coefficient, another for the
+    rest.
 
-    Steps share the tensor: leave it as it is.
+    The tensor is shared between steps; do not modify it.
     """
     columns = torch.full(shape, rest, dtype=dtype, device=device)
     columns[:1].fill_(constant)
@@ -132,15 +133,15 @@ class TrainState:
 
     Attributes:
         scene: the scene as trained so far.
-        seed: fixes every random choice of the run.
+        seed: random seed of the run.
         step: iterations done.
         optimizer: Adam's moments.
         statistics: screen gradients collected for densification, by scene part.
-        seconds: time spent training so far, over all sessions; without compiling kernels.
-        records: numbers that an action keeps from one turn to the next, and which setup was carried out last, by name.
+        seconds: training time so far, over all sessions, without compilation of kernels.
+        records: numbers that actions keep between calls, and the last setup, by name.
         means: running means of the parameters over the last steps of the run, see `AverageLast`.
-        method: the name of what is trained, so that a checkpoint tells whose it is; None where nobody said.
-        is_whole: whether it may be saved; not in the middle of a step or an edit.
+        method: name of the method, for checkpoints; None if unknown.
+        is_whole: true if it can be saved; false during a step or an edit.
     """
 
     scene: Scene
@@ -157,8 +158,8 @@ class TrainState:
     def generator(self, purpose: str) -> torch.Generator:
         """A random generator for one purpose at this step.
 
-        It depends on the seed, the step and the purpose alone, so that a resumed run draws the same numbers, and is
-        for tensors on the scene's device; each kind of device has numbers of its own.
+        It depends only on the seed, the step and the purpose, so that a resumed run draws the same numbers. It is for
+        the scene's device; different kinds of devices draw different numbers.
         """
         key = zlib.crc32(f"{self.seed}/{self.step}/{purpose}".encode())
         return torch.Generator(self.scene.primary.means.device).manual_seed(key)
@@ -199,19 +200,19 @@ class Clock:
         return self.step / self.iterations
 
     def is_at(self, shares: Iterable[float]) -> bool:
-        """Return whether this step is one of those that lie at these shares of the run."""
+        """Return whether this step is at one of these shares of the run."""
         return self.step in {round(share * self.iterations) for share in shares}
 
 
 @dataclass(frozen=True)
 class Every:
-    """A recurring moment, in shares of the run, so that shortening a run keeps its shape.
+    """A recurring event, in shares of the run, so that schedules scale with its length.
 
     Attributes:
         share: distance between two occurrences.
-        start, stop: first and last moment at which one may happen; `start` itself is not one.
-        least: smallest distance in iterations, below which results suffer however short the run.
-        skip_multiples_of: leave out every n-th occurrence (for interleaving two events).
+        start, stop: range in which events happen, `start` excluded.
+        least: minimum distance in iterations, also for short runs.
+        skip_multiples_of: skip every n-th occurrence (for interleaving two events).
         only_multiples_of: keep every n-th occurrence only.
     """
 
@@ -227,7 +228,7 @@ class Every:
         return max(round(self.share * clock.iterations), self.least, 1)
 
     def due(self, clock: Clock) -> bool:
-        """Return whether the moment is now."""
+        """Return whether the event happens at this step."""
         count, remainder = divmod(clock.step, self.interval(clock))
         if remainder or not self.start * clock.iterations < clock.step <= self.stop * clock.iterations:
             return False
@@ -237,14 +238,14 @@ class Every:
 
 
 MOST_TRIED = 1000
-"""Lengths that are tried when one is looked for in which every stage has a step."""
+"""Lengths to try in the search for one in which every stage has a step."""
 
 Work = Generator[Working, None, bool]
-"""An edit that tells how far it is, and whether there was anything to edit in the end."""
+"""An edit that yields its progress, and returns whether there was anything to edit."""
 
 
 def carried_out(edit: Work | bool | None) -> Work:
-    """Follows an edit of the state that may tell how far it is, as long ones do, or be done at once."""
+    """Carries out an edit of the state, which may yield progress or return at once."""
     return (yield from edit) if isinstance(edit, Generator) else bool(edit)
 
 
@@ -261,13 +262,13 @@ class Action(Protocol):
         ...
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work | bool:
-        """Edits `state`; False where there was nothing to edit. What may take seconds tells how far it is."""
+        """Edits `state`; returns False if there was nothing to edit. Long edits yield progress."""
         ...
 
 
 @dataclass(frozen=True)
 class AtMoments:
-    """Base of actions that are due a few times in a run.
+    """Base class of actions that are due a few times in a run.
 
     Attributes:
         moments: shares of the run at which to act.
@@ -281,24 +282,24 @@ class AtMoments:
 
 
 class PostStep(Protocol):
-    """A change of values that belongs to every step, like the noise of Langevin dynamics; no message reports it."""
+    """A change of values in every step, such as the noise of Langevin dynamics; without messages."""
 
     def __call__(self, state: TrainState, clock: Clock, visible: Tensor | None) -> None:
         """Edits `state`.
 
         Args:
             state: after the optimiser's step.
-            clock: where the run stands.
-            visible: [N] bool, which primary Gaussians the step's view showed, also as mirror images; all if None.
+            clock: position in the run.
+            visible: [N] bool, primary Gaussians that the step's view showed, directly or mirrored; all if None.
         """
         ...
 
 
 class Setup(Protocol):
-    """Prepares the state when a stage begins (fitting planes, adding an environment)."""
+    """Prepares the state at the start of a stage (fitting planes, adding an environment)."""
 
     def __call__(self, state: TrainState, dataset: Dataset) -> Work | None:
-        """Edits `state`; what may take seconds tells how far it is."""
+        """Edits `state`; long edits yield progress."""
         ...
 
 
@@ -309,14 +310,14 @@ class Stage:
     Attributes:
         name: for the log.
         share: length as a share of the run; a recipe's shares add up to one.
-        renderer: what turns the scene into an image.
-        losses: terms of the objective.
-        rates: learning rate of every parameter that learns; one that is missing is frozen.
+        renderer: renderer of the training views.
+        losses: loss terms.
+        rates: learning rates of parameters; parameters without one are frozen.
         actions: recurring edits, in the order in which they act.
-        post_steps: what follows the optimiser at every step, before the actions.
-        setup: what to do once when the stage begins.
-        densify_until: share of the run until which screen gradients are collected, for whoever densifies by them.
-        until: whether the stage is over before its share is; the next one then begins at once. Asked before every step.
+        post_steps: operations after the optimiser in every step, before the actions.
+        setup: preparation at the start of the stage.
+        densify_until: share of the run until which screen gradients are collected for densification.
+        until: condition that ends the stage early, checked before every step; the next stage then starts at once.
     """
 
     name: str
@@ -341,7 +342,7 @@ class Stage:
 
 
 def stage_starts(stages: tuple[Stage, ...], iterations: int) -> list[int]:
-    """The first step of each stage, and the end of the run last."""
+    """The first step of each stage, followed by the end of the run."""
     total = sum(stage.share for stage in stages)
     starts, passed = [], 0.0
     for stage in stages:
@@ -351,49 +352,49 @@ def stage_starts(stages: tuple[Stage, ...], iterations: int) -> list[int]:
 
 
 def check_length(stages: tuple[Stage, ...], iterations: int) -> None:
-    """Refuse a run in which a stage falls out, because it is too short or the stage has no share of it.
+    """Refuse a run in which a stage has no step, because the run is too short or the stage has no share.
 
     Raises:
-        InputError: names the stage, and how many iterations do.
+        InputError: the message names the stage and the required number of iterations.
     """
     missed = missed_stages(stages, iterations)
     if not missed:
         return
     name, share = missed[0].name, missed[0].share / sum(stage.share for stage in stages)
     if share <= 0:
-        raise InputError(f"the stage {name!r} has no share of the run, but begins with what the next ones need")
+        raise InputError(f"the stage {name!r} has no share of the run, but later stages depend on it")
     likely = itertools.islice(itertools.count(max(iterations, math.ceil(0.5 / share))), MOST_TRIED)
     enough = next((length for length in likely if not missed_stages(stages, length)), math.ceil(2 / share))
-    raise InputError(f"{iterations} iterations leave no room for the stage {name!r}; expected at least {enough}")
+    raise InputError(f"{iterations} iterations are too few for the stage {name!r}; expected at least {enough}")
 
 
 def missed_stages(stages: tuple[Stage, ...], iterations: int) -> list[Stage]:
-    """The stages without a single step; one without a share that begins with nothing is meant to have none."""
+    """The stages without a step, except for those with neither a share nor a setup."""
     starts = stage_starts(stages, iterations)
     spans = zip(stages, starts[:-1], starts[1:], strict=True)
     return [stage for stage, start, end in spans if start >= end and (stage.share > 0 or stage.setup is not None)]
 
 
 LONGEST_SHARE = 0.1
-"""Share of the run over which the mean may reach, because a short run still changes much during its last pass."""
+"""Maximum share of the run to average over, because short runs still change much during their last pass."""
 STEPS = "averaged steps"
 
 
 @dataclass(frozen=True)
 class AverageLast:
-    """Gives the scene, at the end of the run, the mean of its parameters over the last passes over the views.
+    """Replaces the parameters at the end of the run by their mean over the last passes over the views.
 
-    Each step pulls the scene towards one view, and learning rates are high to the end; the mean over a pass has no
-    favourite view (averaged gradient descent: Polyak and Juditsky 1992; not in the papers).
+    Each step pulls the scene towards one view, and learning rates are high to the end; the mean over a pass favours
+    none (Polyak and Juditsky 1992; not in the papers).
 
     Attributes:
-        passes: over the training views; 0 keeps the parameters of the last step.
+        passes: number of passes over the training views; 0 keeps the parameters of the last step.
     """
 
     passes: float
 
     def __call__(self, state: TrainState, clock: Clock, visible: Tensor | None) -> None:
-        """Edits `state`; should the set of Gaussians change meanwhile, the mean begins anew."""
+        """Edits `state`; the mean restarts if the set of Gaussians changes."""
         length = min(round(self.passes * clock.views), int(LONGEST_SHARE * clock.iterations))
         if clock.step <= clock.iterations - length:
             return

@@ -32,7 +32,7 @@ def log_errors(callback: Callable[..., Any]) -> Callable[..., None]:
         try:
             callback(*given)
         except Exception as error:  # noqa: BLE001 - Whatever a client did, the others and the server go on.
-            logger.warning("a browser asked for something that failed: %s: %s", type(error).__name__, error)
+            logger.warning("a request of a browser failed: %s: %s", type(error).__name__, error)
 
     return call
 

@@ -213,8 +213,8 @@ def guarded_server(access: Access, *, host: str, port: int, title: str) -> viser
         if not made:
             found.stop()
             raise InputError(
-                f"viser {viser.__version__} makes its server in a way that glassplat cannot guard: anybody could look; "
-                "pip install viser==1.1.1"
+                f"viser {viser.__version__} starts its server in a way that glassplat cannot protect: anybody "
+                "could connect; pip install viser==1.1.1"
             )
     found.get_event_loop().set_exception_handler(_log_error)
     return found
@@ -222,4 +222,4 @@ def guarded_server(access: Access, *, host: str, port: int, title: str) -> viser
 
 def _log_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     """Note an error of one message in place of printing its traceback."""
-    logger.debug("a message of a browser was not followed: %s", context.get("exception") or context.get("message"))
+    logger.debug("a message of a browser was rejected: %s", context.get("exception") or context.get("message"))

@@ -34,7 +34,7 @@ def vacant_port(host: str) -> int:
         except InputError:
             continue
         return port
-    raise InputError(f"no port from {FIRST_PORT} on can be used; end what serves there")
+    raise InputError(f"no port from {FIRST_PORT} on can be used; stop the programs that use them")
 
 
 def check_port(host: str, port: int) -> int:
@@ -52,7 +52,7 @@ def check_port(host: str, port: int) -> int:
         except OSError as error:
             if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
                 raise InputError(
-                    f"{host} is no address of this machine ({error.strerror or error}); choose another --host"
+                    f"{host} is not an address of this machine ({error.strerror or error}); choose another --host"
                 ) from error
             reason = "in use by another program" if error.errno == errno.EADDRINUSE else (error.strerror or str(error))
             raise InputError(f"port {port} of {host} cannot be used ({reason}); choose another --port") from error

@@ -248,8 +248,8 @@ class Viewer:
             from glassplat.viewer.gate import guarded_server
         except ImportError as error:
             raise InputError(
-                f"the viewer needs viser, which is not installed ({error}); pip install 'glassplat[view]', or look at "
-                "the page of `glassplat export`, which needs nothing"
+                f"the viewer needs viser, which is not installed ({error}); pip install 'glassplat[view]', or "
+                "use the page of `glassplat export`, which needs no server"
             ) from error
         self.state, self.host, self.buttons = state, host, buttons or {}
         self.loop: RenderLoop[drawing.ViewRequest] = RenderLoop(self._draw, self._show, self._fail)

@@ -59,7 +59,7 @@ def test_an_outline_that_leaves_the_photograph_is_cut_there() -> None:
 
 def test_an_outline_beside_the_photograph_is_refused() -> None:
     photo, _ = hedge_before_a_wall()
-    with pytest.raises(InputError, match="holds nothing of the photograph"):
+    with pytest.raises(InputError, match="lies outside the photograph"):
         grab_outlines(photo, ROUGH + np.array([1000, 0]))
 
 

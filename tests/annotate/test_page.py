@@ -98,7 +98,9 @@ def test_a_pane_is_marked_cut_and_written(page: Page) -> None:
     assert cut[round(inside[1]), round(inside[0])] == 0
     assert 0.35 < (cut == 1).sum() / (read_image(page.root / "images" / NAMES[0])[:, :, 0] == 150).sum() < 0.65
     saved(page.server.session, {"version": 1, "panes": []})
-    assert page.write().startswith("no pane is marked; removed what was written: planes.json, panes/0.png, panes/1.png")
+    assert page.write().startswith(
+        "no pane is marked; removed the earlier output: planes.json, panes/0.png, panes/1.png"
+    )
 
 
 def test_what_stands_before_the_pane_is_found_within_a_rough_outline(room: Path) -> None:

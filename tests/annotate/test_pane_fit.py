@@ -194,7 +194,7 @@ def test_edges_of_five_corners_are_fitted_too() -> None:
     [
         ({0: 4}, "a second photograph, taken from another place"),
         ({0: 4, 1: 1}, "1 corner is known from two places"),
-        ({0: 4, 1: 2}, "2 corners are known from two places, expected at least 3"),
+        ({0: 4, 1: 2}, "2 corners are known from two positions, expected at least 3"),
     ],
 )
 def test_too_few_marks_say_what_is_missing(kept: dict[int, int], expected: str) -> None:
@@ -225,5 +225,5 @@ def test_the_rectangle_of_a_polygon_keeps_its_order_and_hand() -> None:
 
 @pytest.mark.parametrize("step", [1.0, 0.0], ids=["line", "place"])
 def test_corners_on_a_line_are_no_outline(step: float) -> None:
-    with pytest.raises(ValueError, match="lie on one line"):
+    with pytest.raises(ValueError, match="are collinear"):
         polygon_pane(step * np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]]))

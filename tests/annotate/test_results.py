@@ -177,7 +177,7 @@ def test_the_last_pane_can_be_unmarked(unmarked: dict, tmp_path: Path) -> None:
     finish(root, renamed(marked_document(), names))
     removed = "planes.json, panes/left/0.png, panes/left/1.png, panes/right/2.png"
     told = finish(root, unmarked)
-    assert told == {"masks": [], "planes": [], "told": f"no pane is marked; removed what was written: {removed}"}
+    assert told == {"masks": [], "planes": [], "told": f"no pane is marked; removed the earlier output: {removed}"}
     assert sorted(root.rglob("*")) == sorted([*before, root / "annotations.json"])
     with pytest.raises(InputError, match="no pane is known yet"):
         finish(root, unmarked)
@@ -229,7 +229,7 @@ def test_what_another_program_has_saved_is_what_is_written(room: Path) -> None:
     (room / "annotations.json").write_text(json.dumps(marked_document((0, 1, 2, 3))))
     assert session.finish()["masks"] == NAMES[:4]
     (room / "annotations.json").unlink()
-    assert session.finish()["told"].startswith("no pane is marked; removed what was written")
+    assert session.finish()["told"].startswith("no pane is marked; removed the earlier output")
 
 
 def test_without_a_pane_nothing_is_written(room: Path) -> None:
@@ -333,7 +333,7 @@ def test_masks_of_bent_photographs_are_bent_too(room: Path) -> None:
 def test_the_command_needs_a_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "photographs").mkdir()
     assert main(["annotate", str(tmp_path / "photographs")]) == 2
-    assert "is no capture that can be read" in " ".join(capsys.readouterr().err.split())
+    assert "is not a readable capture" in " ".join(capsys.readouterr().err.split())
 
 
 def test_photographs_without_poses_are_told_what_makes_a_capture_of_them(

@@ -25,7 +25,7 @@ def test_every_eighth_image_by_name_is_held_out(capture) -> None:
 
 
 def test_a_path_that_no_run_can_record_is_refused(capture) -> None:
-    with pytest.raises(InputError, match=r"caf.* is no UTF-8; rename"):
+    with pytest.raises(InputError, match=r"caf.* is not valid UTF-8; rename"):
         load_dataset(capture.root / "caf\udce9")
 
 
@@ -100,7 +100,7 @@ def test_transparent_pixels_of_colmap_captures_are_left_out(capture) -> None:
         np.testing.assert_array_equal(view.ignored.numpy(), pixels[:, :, 3] < 128)
         np.testing.assert_array_equal(view.photo.numpy(), pixels[:, :, :3])
     assert data.background is None
-    assert "Transparent pixels of the photographs are left out." in data.warnings
+    assert "Transparent pixels of the photographs are ignored." in data.warnings
 
 
 def test_photographs_that_store_an_opaque_alpha_channel_are_opaque(capture) -> None:
@@ -144,7 +144,7 @@ def test_unknown_format_says_what_was_looked_for_and_found(tmp_path: Path) -> No
 
 def test_a_photograph_that_would_be_reduced_to_nothing_is_refused(capture) -> None:
     capture.write_colmap()
-    with pytest.raises(InputError, match=r" is 32x24 pixels large, and 1x1 reduced by 1000; expected at least"):
+    with pytest.raises(InputError, match=r" is 32x24 pixels, and 1x1 reduced by 1000; expected at least"):
         load_dataset(capture.root, downscale=1000.0)
 
 
@@ -167,7 +167,7 @@ def test_cameras_at_one_point(capture) -> None:
     for pose in capture.poses:
         pose[:3, 3] = -pose[:3, :3] @ [1.0, 2.0, 3.0]
     capture.write_colmap()
-    with pytest.raises(InputError, match="stand at one point"):
+    with pytest.raises(InputError, match="are at one point"):
         load_dataset(capture.root)
 
 

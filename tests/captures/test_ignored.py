@@ -117,10 +117,10 @@ def test_masks_that_leave_out_most_are_questioned_and_those_that_leave_nothing_r
     assert not any("inverted" in text for text in load_dataset(root).warnings)
     for name in names:
         write_shades(root / "masks" / name, 255 - KEPT)
-    assert any("leave out about 87% of the photographs: black" in text for text in load_dataset(root).warnings)
+    assert any("exclude about 87% of the photographs: black" in text for text in load_dataset(root).warnings)
     for name in names:
         write_shades(root / "masks" / name, np.zeros_like(KEPT))
-    with pytest.raises(InputError, match=r"all pixels of all photographs .* black in masks/ is left out.* inverted\?"):
+    with pytest.raises(InputError, match=r"all pixels of all photographs .* black in masks/ is ignored.* inverted\?"):
         load_dataset(root)
     write_shades(root / "masks" / names[-1], KEPT)
     assert any("inverted" in text for text in load_dataset(root).warnings)

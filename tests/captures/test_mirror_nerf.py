@@ -205,7 +205,7 @@ def test_masks_of_other_photographs(capture) -> None:
     write_real(capture)
     for path in (capture.root / "masks").iterdir():
         path.rename(path.with_name(f"other_{path.name}"))
-    with pytest.raises(InputError, match=r"none of the 10 files .*called like a photograph"):
+    with pytest.raises(InputError, match=r"none of the 10 files .*has the name of a photograph"):
         load_dataset(capture.root)
 
 

@@ -75,7 +75,7 @@ def test_what_is_no_map_of_normals_is_refused(tmp_path: Path) -> None:
     for vectors, message in [
         (
             np.zeros((SIZE, 2 * SIZE, 3), dtype=np.float32),
-            "24x12 pixels large, its photograph 12x12 here, without",
+            "24x12 pixels, its photograph 12x12 here, without",
         ),
         (np.zeros((SIZE, SIZE), dtype=np.float32), r"holds float32 of shape \[12, 12\]; expected floats \[H, W, 3\]"),
         (np.zeros((SIZE, SIZE, 3), dtype=np.int64), "holds int64 of shape"),
@@ -87,7 +87,7 @@ def test_what_is_no_map_of_normals_is_refused(tmp_path: Path) -> None:
     head = b"\x93NUMPY\x01\x00v\x00\xd8'descr': '<f4', 'fortran_order': False, 'shape': (2, 3, 3), }" + b" " * 60
     for damaged in (b"no", head):
         (tmp_path / "normals" / "a.npy").write_bytes(damaged)
-        with pytest.raises(InputError, match="is no array that NumPy can read"):
+        with pytest.raises(InputError, match="is not an array that NumPy can read"):
             estimated_normals(view_in(tmp_path))
 
 
@@ -95,7 +95,7 @@ def test_an_archive_by_the_name_of_an_array_is_refused(tmp_path: Path) -> None:
     (tmp_path / "normals").mkdir()
     with (tmp_path / "normals" / "a.npy").open("wb") as file:
         np.savez(file, normals=all_along((0.0, 0.0, 1.0)))
-    with pytest.raises(InputError, match=r"a\.npy is no array that NumPy can read .*; save it with numpy\.save"):
+    with pytest.raises(InputError, match=r"a\.npy is not an array that NumPy can read .*; save it with numpy\.save"):
         estimated_normals(view_in(tmp_path))
 
 

@@ -324,7 +324,7 @@ def test_points_that_are_a_link_to_nowhere_are_not_replaced_by_random_ones(captu
     capture.write_images()
     capture.write_transforms({**LENS, "frames": capture.frames()})
     (capture.root / "points3d.ply").symlink_to("/nowhere")
-    with pytest.raises(InputError, match=r"points3d\.ply is no file that can be read"):
+    with pytest.raises(InputError, match=r"points3d\.ply is not a readable file"):
         load_dataset(capture.root)
     points = capture.write_colmap(binary=binary) / f"points3D.{'bin' if binary else 'txt'}"
     points.unlink()

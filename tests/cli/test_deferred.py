@@ -47,7 +47,7 @@ def test_a_run_too_short_to_reflect_tells_its_user_and_can_be_measured_and_rende
     capture, run = write_object_capture(tmp_path / "ball"), tmp_path / "run"
     options = ["--data", str(capture), "--iterations", "12", "--sh-degree", "1"]
     assert main(["train", "deferred", *options, "--output", str(run)]) == 0
-    assert "12 iterations are too few for normals to spread" in caplog.text
+    assert "12 iterations are too few for normal propagation" in caplog.text
     assert main(["train", "splat", *options, "--output", str(tmp_path / "splat")]) == 0
     psnr = []
     for trained in (run, tmp_path / "splat"):
@@ -92,7 +92,7 @@ def test_surroundings_can_be_exchanged(run: Path, capsys: pytest.CaptureFixture[
 
 def test_what_mirrors_nothing_has_no_surroundings_to_exchange(run: Path) -> None:
     scene = replace(open_run(run, "cpu").scene, environment=Environment.empty())
-    with pytest.raises(InputError, match="nothing in the run mirrors its surroundings"):
+    with pytest.raises(InputError, match="nothing in the run reflects an environment"):
         SceneEdits(surroundings=run.parent / "red.png").apply(scene)
 
 

@@ -43,7 +43,7 @@ def test_what_a_file_leaves_out_is_said(tmp_path: Path, capsys: pytest.CaptureFi
     run, output = write_run(tmp_path / "run"), tmp_path / "an export"
     assert main(["export", str(run), "--output", str(output), "--formats", "ply", "spz"]) == 0
     told = capsys.readouterr().out
-    assert f"warning: scene.spz leaves out how bright Gaussians are in panes; {run} holds everything\n" in told
+    assert f"warning: scene.spz leaves out the intensity of Gaussians in panes; {run} holds everything\n" in told
     assert "scene.ply leaves out" not in told
 
 
@@ -104,7 +104,7 @@ def test_foreign_folders_and_missing_runs_are_left_alone(tmp_path: Path, capsys:
     assert main(["export", str(run), "--output", str(output)]) == 2
     assert (output / "scene.ply").read_text() == "mine"
     assert main(["export", str(tmp_path / "none"), "--output", str(tmp_path / "new")]) == 2
-    assert f"there is nothing at {tmp_path / 'none'}; expected" in " ".join(capsys.readouterr().err.split())
+    assert f"{tmp_path / 'none'} does not exist; expected" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "new").exists()
 
 

@@ -55,4 +55,4 @@ def test_what_was_killed_before_it_saved_says_how_to_go_on(tmp_path: Path, capsy
     assert main(["train", "splat", *options, "--iterations", str(LENGTH), "--resume"]) == 2
     assert "nothing was saved yet" in capsys.readouterr().err
     assert main(["train", "splat", *options, "--iterations", "5"]) == 0
-    assert "was begun and never saved; it is replaced" in capsys.readouterr().out
+    assert "replacing an earlier run" in capsys.readouterr().out

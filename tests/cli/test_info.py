@@ -94,7 +94,7 @@ def test_a_video_is_looked_into(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert any("glassplat prepare" in line for line in found["next"])
     (tmp_path / "notes.mp4").write_text("no video")
     found = told(tmp_path / "notes.mp4", capsys)
-    assert found["kind"] == "a file that has the name of a video" and not found["next"]
+    assert found["kind"] == "a file with a video's suffix" and not found["next"]
     assert "OpenCV can read no picture of it" in found["problems"][0]
 
 
@@ -137,14 +137,14 @@ def test_small_photographs_of_a_capture_are_sound(tmp_path: Path, capsys: pytest
         with Image.open(path) as image:
             image.resize((80, 60)).save(path)
     (scaled,) = told(capture, capsys)["problems"]
-    assert "are scaled copies of what was calibrated" in scaled
+    assert "are scaled copies of the calibrated ones" in scaled
 
 
 def test_a_folder_of_few_photographs_is_said_to_be_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "few").mkdir()
     shutil.copy(SCENE / "images" / "0000.jpg", tmp_path / "few")
     (tmp_path / "few" / "._0000.jpg").write_bytes(b"what a Mac leaves on foreign disks")
-    assert told(tmp_path / "few", capsys)["problems"] == ["only 1 photograph; 30 and more do better"]
+    assert told(tmp_path / "few", capsys)["problems"] == ["only 1 photograph; 30 or more work better"]
 
 
 def test_what_was_interrupted_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -196,7 +196,7 @@ def test_an_interrupted_run_says_its_step_and_the_command_that_goes_on(
     with pytest.raises(KeyboardInterrupt):
         Run(recipe, settings, RunDirectory(tmp_path / "run"), load_dataset(settings.data)).to_the_end(stop)
     found = told(tmp_path / "run", capsys)
-    assert "it was interrupted at step 5 of 12" in found["problems"]
+    assert "interrupted at step 5 of 12" in found["problems"]
     (command,) = (line for line in found["next"] if "--resume" in line)
     assert all(word in shlex.split(command) for word in options)
     assert main([*shlex.split(command)[1:], "--device", "cpu"]) == 0
@@ -286,7 +286,7 @@ def test_gaussians_without_a_finite_place_are_told(tmp_path: Path, capsys: pytes
     nowhere = gaussians.with_tensors({"means": torch.full_like(gaussians.means, torch.nan)})
     write_gaussians(tmp_path / "splat.ply", nowhere)
     (problem,) = told(tmp_path / "splat.ply", capsys)["problems"]
-    assert problem.startswith(f"{len(gaussians)} Gaussians have no place that is finite")
+    assert problem.startswith(f"{len(gaussians)} Gaussians have non-finite positions")
 
 
 def test_glass_without_colours_has_no_degree(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -298,7 +298,7 @@ def test_glass_without_colours_has_no_degree(tmp_path: Path, capsys: pytest.Capt
 
 @pytest.mark.parametrize(
     ("name", "expected"),
-    [("nowhere", "there is nothing at"), ("notes.txt", "no file that is known"), ("empty", "nothing that is known")],
+    [("nowhere", "does not exist"), ("notes.txt", "not a known kind of file"), ("empty", "not a known kind of folder")],
 )
 def test_what_is_not_known_is_said_to_be(
     name: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -139,7 +139,7 @@ def test_a_capture_that_has_moved_is_found_again(
     shutil.move(tmp_path / "capture", moved)
     options = [command, str(run), *([] if command == "eval" else ["--output", str(tmp_path / "output")])]
     assert main(options) == 2
-    assert "say with --data where it is now" in " ".join(capsys.readouterr().err.split())
+    assert "give its new location with --data" in " ".join(capsys.readouterr().err.split())
     assert main([*options, "--data", str(moved), "--device", "cpu"]) == 0
 
 

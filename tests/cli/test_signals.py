@@ -124,7 +124,7 @@ def test_a_signal_while_running_says_what_is_left_and_removes_what_is_half_writt
     monkeypatch.setattr(Evaluate, "run", work)
     assert main(["eval", "my_run"]) == CODES[number]
     said = capsys.readouterr().err
-    assert said.startswith(f"{WORDS[number]}; my_run itself is as it was") and said.count("\n") == 1
+    assert said.startswith(f"{WORDS[number]}; my_run itself is unchanged") and said.count("\n") == 1
     assert not list(tmp_path.iterdir())
     assert [signal.getsignal(getattr(signal, name)) for name in CODES] == before
 

@@ -97,7 +97,7 @@ def test_broken_normals_beside_the_photographs_are_named(run: Path, capsys: pyte
         "1",
     ]
     assert main(["train", "traced", *options, "--surroundings.start.cells", "3"]) == 2
-    assert "r_0.npy is no array that NumPy can read" in " ".join(capsys.readouterr().err.split())
+    assert "r_0.npy is not an array that NumPy can read" in " ".join(capsys.readouterr().err.split())
 
 
 def test_its_own_colours_are_exported_as_plain_gaussians(run: Path) -> None:

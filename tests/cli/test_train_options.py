@@ -1,4 +1,4 @@
-"""The options of the command line: what is out of range ends in one line, and help shows what most runs need."""
+"""The options of the command line: what is out of range ends in one line, and help shows the most common ones."""
 
 from __future__ import annotations
 
@@ -156,9 +156,9 @@ def test_help_shows_what_most_runs_need_and_says_how_to_see_the_rest(
 
 
 def test_how_to_see_the_rest_is_said_once(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    assert help_of(["planar", "--help"], capsys, monkeypatch).count("These are the options") == 1
+    assert help_of(["planar", "--help"], capsys, monkeypatch).count("These are the most common options") == 1
     listed = help_of(["--help"], capsys, monkeypatch)
-    assert "These are the options" not in listed and "those that most runs need" in " ".join(listed.split())
+    assert "These are the most common options" not in listed and "the most common ones" in " ".join(listed.split())
 
 
 @pytest.mark.parametrize("method", list(RECIPES))

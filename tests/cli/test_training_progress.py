@@ -31,7 +31,7 @@ from tests.training.tiny_capture import write_tiny_capture
 
 PLAN = Plan((1000,), (1.0,))
 COUNTS = {"primary": 1000, "glass": 20, "planes": 1}
-BUSY = [Working("looking for Gaussians that no view needs", done, 40) for done in range(40)]
+BUSY = [Working("searching for unnecessary Gaussians", done, 40) for done in range(40)]
 
 
 def step(number: int, loss: float = 0.25) -> StepDone:
@@ -75,7 +75,7 @@ def test_a_terminal_that_redraws_nothing_gets_the_lines_of_a_file() -> None:
 
 def test_the_time_left_is_that_of_this_session_and_its_last_minute() -> None:
     lines = lines_of([RunBegun(899, 1000), *(step(number) for number in range(900, 1000))], 6.0)
-    assert lines[0] == "going on from step 899 of 1000"
+    assert lines[0] == "continuing from step 899 of 1000"
     assert lines[-1].endswith(f"{in_words(6 * (1000 - int(lines[-1].split()[1])))} left")
 
 
@@ -139,7 +139,7 @@ def test_what_begins_a_stage_is_no_part_of_the_speed_even_if_it_is_short() -> No
 
 
 def test_what_recurs_between_steps_is_part_of_the_speed() -> None:
-    assert left_after([Working("looking for Gaussians that no view needs", 0, 2)], 4.0) == "8 min left"
+    assert left_after([Working("searching for unnecessary Gaussians", 0, 2)], 4.0) == "8 min left"
 
 
 @pytest.mark.parametrize("method", RECIPES)
@@ -155,7 +155,7 @@ def test_every_method_has_a_plan(method: str, tmp_path: Path) -> None:
 def test_what_takes_long_between_steps_is_shown() -> None:
     lines = lines_of([Working("fitting planes to the masks", 0, 1), step(7), *BUSY], 1.0)
     assert lines[0] == "step 0: fitting planes to the masks"
-    busy = [line for line in lines if "no view needs" in line]
+    busy = [line for line in lines if "unnecessary Gaussians" in line]
     assert len(busy) >= 3
     assert all(re.fullmatch(r"step 7: looking for .* needs, \d+ of 40 done", line) for line in busy)
 
@@ -174,7 +174,7 @@ def test_events_are_lines_but_for_frequent_ones() -> None:
     actions = [ActionDone(5, name, COUNTS) for name in ("densify primary", "grow SH", "reset opacity")]
     lines = lines_of([RunBegun(0, 1000, anew=True), StageEntered(0, "1 [stage]", COUNTS), *actions], 0.0)
     assert lines == [
-        "warning: an earlier run in this folder was begun and never saved; it is replaced",
+        "warning: replacing an earlier run in this folder, which was never saved",
         "step 0: stage 1 [stage], 1000 primary, 20 glass, 1 planes",
         "step 5: reset opacity",
     ]
@@ -204,7 +204,7 @@ def test_the_bar_shows_loss_count_work_and_checkpoint() -> None:
     shown = terminal([step(499), CheckpointWritten(499), *BUSY[:13], step(500, 0.5)])
     last = shown.rpartition("\x1b[2K")[2]
     assert all(text in last for text in ("500/1000", "loss 0.2550", "1020 Gaussians", "saved at 499"))
-    assert "looking for Gaussians that no view needs 12/40" in terminal([step(499), *BUSY[:13]])
+    assert "searching for unnecessary Gaussians 12/40" in terminal([step(499), *BUSY[:13]])
 
 
 def test_a_closed_terminal_does_not_hide_why_a_run_ends() -> None:

@@ -58,7 +58,7 @@ def test_an_interrupted_film_leaves_nothing(
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ("--output film.avi", "no name of a film"),
+        ("--output film.avi", "not a video name"),
         ("--output there.webp", "pass --force"),
         ("--output folder.webp --force", "folder.webp is a folder"),
         ("--output there.webp/film.webp", "there.webp is a file"),
@@ -67,7 +67,7 @@ def test_an_interrupted_film_leaves_nothing(
         ("--output film.webp --layers base", "renders no layer base"),
         ("--output film.webp --seconds 0", "--seconds"),
         ("--output film.webp --width 8192 --layers rgb rgb --seconds 0.1", "at most 16383 pixels a side, not 16384 x"),
-        ("--output film.gif --fps 60", "at most 50 pictures per second, not 60"),
+        ("--output film.gif --fps 60", "at most 50 frames per second, not 60"),
     ],
 )
 def test_what_makes_no_sense_is_refused_before_anything_is_rendered(
@@ -88,6 +88,6 @@ def test_a_link_to_nothing_is_in_the_way_of_a_film_until_it_is_forced(
     run, film = write_run(tmp_path / "run"), tmp_path / "film.gif"
     film.symlink_to(tmp_path / "elsewhere")
     assert main(["video", str(run), "--output", str(film), *SHORT]) == 2
-    assert "is already there; pass --force" in capsys.readouterr().err
+    assert "already exists; pass --force" in capsys.readouterr().err
     assert main(["video", str(run), "--output", str(film), *SHORT, "--force"]) == 0
     assert (tmp_path / "elsewhere").read_bytes()[:3] == b"GIF"

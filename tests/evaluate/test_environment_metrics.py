@@ -81,7 +81,7 @@ def test_what_is_no_panorama_is_refused(shape: tuple[int, ...]) -> None:
 
 
 def test_values_that_are_not_finite_are_refused() -> None:
-    with pytest.raises(ValueError, match="the learned environment holds values that are not finite"):
+    with pytest.raises(ValueError, match="the learned environment contains non-finite values"):
         environment_psnr(TRUTH / 0, TRUTH)
 
 

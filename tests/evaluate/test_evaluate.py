@@ -188,8 +188,8 @@ def test_surfaces_are_compared_with_what_lies_beside_the_photographs(tmp_path: P
 
 def test_without_true_surfaces_the_reason_is_said(case) -> None:
     results = evaluate(case.scene, case.renderer, case.dataset).results
-    assert results["normal_error_deg_reason"] == "no true normals lie next to the photograph"
-    assert results["strength_error_reason"] == "no true strength lies next to the photograph"
+    assert results["normal_error_deg_reason"] == "there are no true normals for the photograph"
+    assert results["strength_error_reason"] == "there is no true strength for the photograph"
 
 
 def test_no_gradients_are_recorded(case) -> None:
@@ -203,7 +203,7 @@ def test_no_gradients_are_recorded(case) -> None:
 def test_a_broken_render_is_named(case) -> None:
     frame = case.renderer.frames[41.0]
     case.renderer.frames[41.0] = replace(frame, rgb=frame.rgb / 0)
-    with pytest.raises(ValueError, match=r"render of b\.jpg holds values that are not finite"):
+    with pytest.raises(ValueError, match=r"render of b\.jpg contains non-finite values"):
         evaluate(case.scene, case.renderer, case.dataset)
 
 
@@ -281,7 +281,7 @@ def test_peak_memory_is_a_number_where_the_system_tells_it(monkeypatch: pytest.M
     peak = peak_memory_mib()
     assert isinstance(peak, float) and 50 < peak < 1e6
     monkeypatch.setitem(sys.modules, "resource", None)
-    assert peak_memory_mib() == f"{sys.platform} does not tell"
+    assert peak_memory_mib() == f"not available on {sys.platform}"
 
 
 def test_test_views_are_compared_as_their_neighbours_were_exposed(case) -> None:

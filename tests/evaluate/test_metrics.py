@@ -80,7 +80,7 @@ def test_bad_arguments_are_refused() -> None:
         psnr(IMAGE, OTHER[1:])
     with pytest.raises(ValueError, match="boolean region"):
         psnr(IMAGE, OTHER, torch.ones(20, 30))
-    with pytest.raises(ValueError, match="no pixel to compare"):
+    with pytest.raises(ValueError, match="no pixels to compare"):
         psnr(IMAGE, OTHER, torch.zeros(20, 30, dtype=torch.bool))
     with pytest.raises(ValueError, match="not finite"):
         quantize(torch.tensor([math.nan]))

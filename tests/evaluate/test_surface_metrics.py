@@ -14,7 +14,7 @@ COVERED[2:18, 5:25] = True
 STRENGTH = torch.where(torch.arange(WIDTH) < 15, 0.9, 0.2).expand(HEIGHT, WIDTH)
 TRUTH = TrueSurface(COVERED, NORMALS * COVERED[..., None], STRENGTH)
 PHOTO = torch.full((HEIGHT, WIDTH, 3), 255, dtype=torch.uint8)
-NOT_BESIDE = "no true strength lies next to the photograph"
+NOT_BESIDE = "there is no true strength for the photograph"
 
 
 def frame(**layers: torch.Tensor) -> Frame:
@@ -69,7 +69,7 @@ def test_what_is_missing_is_the_reason() -> None:
         "reflective_normal_error_deg": "the method renders no normals",
         "strength_error": "the method renders no strength",
     }
-    unknown = "no true normals lie next to the photograph"
+    unknown = "there are no true normals for the photograph"
     assert surface_metrics(frame(), PHOTO, None)["normal_error_deg"] == unknown
     assert surface_metrics(both, PHOTO, None) == {
         "reflective_psnr": NOT_BESIDE,

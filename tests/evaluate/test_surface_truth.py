@@ -98,7 +98,7 @@ def test_a_view_in_memory_has_no_files(view: View) -> None:
 
 def test_another_size_is_refused(view: View) -> None:
     Image.open(beside(view, "_normal")).resize((20, 20)).save(beside(view, "_normal"))
-    with pytest.raises(InputError, match=r"r_0_normal\.png is 20x20 pixels large, its photograph 40x40"):
+    with pytest.raises(InputError, match=r"r_0_normal\.png is 20x20 pixels, its photograph 40x40"):
         true_surface(view)
 
 

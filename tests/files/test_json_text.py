@@ -20,10 +20,10 @@ from glassplat.files.records import DEEPEST, _without_repeats, parse_json, read_
         (b"[" * (DEEPEST + 1) + b"]" * (DEEPEST + 1), f"nested more than {DEEPEST} levels deep"),
         (b'{"a":' * 100_000 + b"1" + b"}" * 100_000, f"nested more than {DEEPEST} levels deep"),
         (b'{"a": 1, "b": 2, "a": 3}', "the key 'a' occurs twice in one object"),
-        (b'{"name": "\xff\xfe"}', "is no text in UTF-8"),
-        ('{"name": "ü"}'.encode("utf-16"), "is no text in UTF-8"),
-        (b'{"name": "\\ud800.png"}', "is no valid Unicode"),
-        (b'{"\\udfff": 1}', "is no valid Unicode"),
+        (b'{"name": "\xff\xfe"}', "is not UTF-8 text"),
+        ('{"name": "ü"}'.encode("utf-16"), "is not UTF-8 text"),
+        (b'{"name": "\\ud800.png"}', "is not valid Unicode"),
+        (b'{"\\udfff": 1}', "is not valid Unicode"),
     ],
 )
 def test_damage_is_named_with_the_file(tmp_path: Path, content: bytes, message: str) -> None:
@@ -64,7 +64,7 @@ def test_numbers_of_any_length_are_numbers() -> None:
 
 
 def test_what_is_no_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"no file .*absent\.json"):
+    with pytest.raises(FileNotFoundError, match=r"absent\.json does not exist"):
         read_json(tmp_path / "absent.json")
     os.symlink(tmp_path / "loop.json", tmp_path / "loop.json")
     (tmp_path / "folder.json").mkdir()

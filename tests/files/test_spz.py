@@ -176,10 +176,10 @@ def streamed(count: int, table: list[tuple[int, int]], body: bytes = b"", offset
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        (b"", "no SPZ"),
-        (b"ply\n", "no SPZ"),
+        (b"", "not (an )?SPZ"),
+        (b"ply\n", "not (an )?SPZ"),
         (gzip.compress(b"short", mtime=0), "within its header"),
-        (gzip.compress(b"x" * 100, mtime=0), "no SPZ"),
+        (gzip.compress(b"x" * 100, mtime=0), "not (an )?SPZ"),
         (packed(3)[:20], "header|unpacked|cut off"),
         (packed(9), "version 9"),
         (packed(4), "version 4"),

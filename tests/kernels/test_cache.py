@@ -128,9 +128,8 @@ FunctionCache.save_overload = refuse
     script.write_text(refuse + SMALL_KERNEL)
     (tmp_path / "formula.py").write_text(FORMULA)
     lines = printed_by(script, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
-    assert [line for line in lines if "cannot keep" in line] == [
-        "cannot keep compiled kernels for the next time: no space left; set NUMBA_CACHE_DIR to a folder that can be "
-        "written and lasts"
+    assert [line for line in lines if "cannot cache" in line] == [
+        "cannot cache compiled kernels: no space left; set NUMBA_CACHE_DIR to a folder that is writable and permanent"
     ]
     assert lines[-1] == "[4.0, 4.0] compiled 1"
 

@@ -159,14 +159,14 @@ def test_a_temporary_folder_that_others_can_write_is_not_trusted(machine: Machin
         folder.symlink_to(machine.root / "elsewhere")
     compilations, (said,) = machine.run()
     assert compilations == 1
-    assert "cannot keep compiled kernels" in said
+    assert "cannot cache compiled kernels" in said
 
 
 def test_where_nothing_can_be_written_a_kernel_is_compiled_and_one_line_says_so(machine: Machine) -> None:
     machine.closed.append(machine.root)
     compilations, (said,) = machine.run()
     assert compilations == 1
-    assert said.startswith("cannot keep compiled kernels for the next time: ")
+    assert said.startswith("cannot cache compiled kernels: ")
     assert "set NUMBA_CACHE_DIR" in said
 
 
@@ -212,7 +212,7 @@ def test_a_damaged_file_is_compiled_again_and_replaced(machine: Machine, suffix:
         file.write_bytes({"empty": b"", "cut": content[: len(content) // 2], "text": b"not a kernel\n"}[damage])
     compilations, said = machine.run()
     assert compilations == 1
-    assert said and all("cannot be read" in line or "cannot keep" in line for line in said)
+    assert said and all("cannot be read" in line or "cannot cache" in line for line in said)
     if damage == "folder":
         shutil.rmtree(file)
         machine.run()

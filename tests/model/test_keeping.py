@@ -46,7 +46,7 @@ def test_nothing_is_written_over(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
     writer = FolderWriter(glassplat.load(run, device="cpu"), tmp_path)
     recipe = (run / "recipe.json").read_bytes()
-    with pytest.raises(FileExistsError, match="already there and not empty"):
+    with pytest.raises(FileExistsError, match="already exists and is not empty"):
         writer.write_scene(true_scene(), "run")
     (tmp_path / "mine").write_text("mine")
     (tmp_path / "nowhere").symlink_to(tmp_path / "gone")
@@ -63,9 +63,9 @@ def test_nothing_is_written_over(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["", "../out", "a/b", "/etc/x", ".hidden", "-option", "a\0b", "x" * 200, "..", "a\nb"])
 def test_no_name_leads_out_of_the_folder(name: str, tmp_path: Path) -> None:
     writer = FolderWriter(model(), tmp_path / "here")
-    with pytest.raises(InputError, match="cannot be a name"):
+    with pytest.raises(InputError, match="is not a valid name"):
         writer.write_scene(true_scene(), name)
-    with pytest.raises(InputError, match="cannot be a name"):
+    with pytest.raises(InputError, match="is not a valid name"):
         writer.write_keyframes(CAMERAS, name)
     assert not [*tmp_path.iterdir()]
 
@@ -85,7 +85,7 @@ def test_keyframes_are_what_a_film_is_made_of(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="at least two"):
         writer.write_keyframes(CAMERAS[:1], "my path")
     said = shlex.split(writer.write_keyframes(CAMERAS[:3], "my path").split("`")[1])
-    assert said[:3] == ["glassplat", "video", str(run)] and said[-2:] == ["--output", "film.mp4"]
+    assert said[:3] == ["glassplat", "video", str(run)] and said[-2:] == ["--output", "video.mp4"]
     film = ["--output", str(tmp_path / "film.webp"), "--seconds", "0.3", "--fps", "10", "--width", "64"]
     assert main([*said[1:-2], *film]) == 0
     assert (tmp_path / "film.webp").is_file()

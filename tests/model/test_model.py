@@ -79,7 +79,7 @@ def test_every_layer_is_an_image(tmp_path: Path) -> None:
         whole.render(3)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"planar renders no layer base; expected .*reflection"):
         whole.image("2.png", "base")
-    with pytest.raises(InputError, match=r"no camera is called 'nobody\.png'; expected one of .*0\.png"):
+    with pytest.raises(InputError, match=r"there is no camera 'nobody\.png'; expected one of .*0\.png"):
         whole.render("nobody.png")
 
 
@@ -192,7 +192,7 @@ def test_a_model_is_saved_in_several_formats_next_to_each_other(tmp_path: Path) 
     for name in ("a.ply", "a.spz", "a.glb"):
         whole.save(tmp_path / name)
     darker = whole.with_reflectance(LABEL, 0.01)
-    with pytest.raises(FileExistsError, match=r"planes\.json is already there; nothing was written"):
+    with pytest.raises(FileExistsError, match=r"planes\.json already exists; nothing was written"):
         darker.save(tmp_path / "b.ply")
     assert not (tmp_path / "b.ply").exists()
 
@@ -206,7 +206,7 @@ NO_PANES, PLAIN = {"planes": Planes.empty()}, PlanarRecipe(background=(0.0, 0.0,
     [
         ("a.ply", PLAIN, {}, None),
         ("a.glb", PLAIN, {}, None),
-        ("a.spz", PLAIN, {}, "how bright Gaussians are in panes"),
+        ("a.spz", PLAIN, {}, "the intensity of Gaussians in panes"),
         ("a.ply", PlanarRecipe.paper(), {}, "fresnel=schlick, blend=srgb, nearest=True"),
         ("a.ply", SplatRecipe(background=(0.0, 0.0, 0.0)), NO_PANES, None),
         ("a.ply", SplatRecipe(background=(1.0, 1.0, 1.0)), NO_PANES, "background=(1.0, 1.0, 1.0)"),
@@ -287,7 +287,7 @@ def test_an_environment_that_is_there_is_not_overwritten_unasked(name: str, tmp_
     whole = model()
     mirroring = whole.with_scene(dataclasses.replace(whole.scene, environment=Environment(torch.zeros(6, 4, 4, 3))))
     (tmp_path / name).write_text("somebody's")
-    with pytest.raises(FileExistsError, match=rf"{name} is already there; nothing was written"):
+    with pytest.raises(FileExistsError, match=rf"{name} already exists; nothing was written"):
         mirroring.save(tmp_path / "a.ply")
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [(name, "somebody's")]
     whole.save(tmp_path / "plain.ply")
@@ -304,7 +304,7 @@ def test_a_model_is_saved_as_a_page_and_as_nothing_unknown(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("name", ["none", "none.ply"])
 def test_what_is_not_there_is_named(name: str, tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=f"there is nothing at .*{name}; expected a run"):
+    with pytest.raises(FileNotFoundError, match=f"{name} does not exist; expected a run"):
         glassplat.load(tmp_path / name)
 
 

@@ -247,11 +247,11 @@ def test_a_disk_too_full_for_the_log_is_told(tmp_path: Path) -> None:
 
 def test_nothing_saved_is_nothing_to_go_on_from(tmp_path: Path) -> None:
     directory, heard = RunDirectory(tmp_path / "run"), list[Message]()
-    with pytest.raises(InputError, match=r"nothing was saved yet in .*; begin again without --resume"):
+    with pytest.raises(InputError, match=r"nothing was saved yet in .*; start again without --resume"):
         run(directory.path, resume=True)
     assert not directory.path.exists()
     directory.begin(RECIPE, SETTINGS, tiny_capture())
-    with pytest.raises(InputError, match="begin again without --resume"):
+    with pytest.raises(InputError, match="start again without --resume"):
         run(directory.path, resume=True)
     run(directory.path, heard=heard)
     assert RunBegun(0, 12, anew=True) in heard
@@ -286,19 +286,19 @@ def test_two_trainings_do_not_share_a_folder(tmp_path: Path) -> None:
                 refused.append(str(caught.value))
 
     Run(RECIPE, SETTINGS, RunDirectory(tmp_path), tiny_capture(), resume=False).to_the_end(listen)
-    assert len(refused) == 2 and all("another training is writing into" in text for text in refused)
+    assert len(refused) == 2 and all("another training is writing to" in text for text in refused)
 
 
 def test_a_run_too_short_for_its_stages_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     settings = replace(SETTINGS, iterations=6)
-    with pytest.raises(InputError, match=r"6 iterations leave no room for the stage '2 .*'; expected at least 8"):
+    with pytest.raises(InputError, match=r"6 iterations are too few for the stage '2 .*'; expected at least 8"):
         Run(PlanarRecipe(), settings, RunDirectory(tmp_path / "run"), tiny_capture(), resume=False).to_the_end(print)
     assert not (tmp_path / "run").exists()
 
 
 def test_a_scene_that_cannot_be_begun_leaves_no_folder(tmp_path: Path) -> None:
     bare = replace(tiny_capture(), pane_labels=())
-    with pytest.raises(PlaneFitError, match="needs to know where the panes are"):
+    with pytest.raises(PlaneFitError, match="needs to know the panes"):
         Run(PlanarRecipe(), SETTINGS, RunDirectory(tmp_path / "run"), bare, resume=False).to_the_end(print)
     assert not (tmp_path / "run").exists()
 
@@ -532,6 +532,6 @@ def test_a_capture_whose_poses_were_found_again_is_not_gone_on_with(tmp_path: Pa
         return replace(camera, cam_from_world=pose)
 
     other = replace(capture, train=tuple(view.with_camera(turned(view.camera)) for view in capture.train))
-    with pytest.raises(InputError, match=r"cameras of tiny are elsewhere than when .*: 1\.png.*prepared again\?"):
+    with pytest.raises(InputError, match=r"cameras of tiny have moved since .*: 1\.png.*prepared again\?"):
         Run(RECIPE, SETTINGS, RunDirectory(tmp_path), other, resume=True).to_the_end(print)
     assert RunDirectory(tmp_path).checkpoint.read_bytes() == before

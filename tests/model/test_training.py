@@ -35,7 +35,7 @@ def steps(training: Training) -> list[int]:
 def test_a_training_in_memory_can_be_watched_and_gone_on_with() -> None:
     training = Training(tiny_capture(), RECIPE, iterations=6, device="cpu")
     assert training.step == 0
-    with pytest.raises(RuntimeError, match="has not begun"):
+    with pytest.raises(RuntimeError, match="has not started"):
         _ = training.model
     images = []
     for message in training:
@@ -225,7 +225,7 @@ def twice(stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
 def test_what_cannot_be_trained_is_refused_at_once(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="dataset is 'captures/shop'; expected what"):
         Training("captures/shop", "splat")
-    with pytest.raises(InputError, match="no method is called 'nerf'; expected splat, planar"):
+    with pytest.raises(InputError, match="there is no method 'nerf'; expected splat, planar"):
         Training(tiny_capture(), "nerf")
     with pytest.raises(InputError, match="no training views"):
         Training(replace(tiny_capture(), train=()), "splat")
@@ -311,7 +311,7 @@ def test_a_run_of_a_recipe_of_ones_own_is_gone_on_with_and_loaded(
     trained = training(Weighted(sh_degree=1), resume=True).run()
     loaded = glassplat.load(tmp_path / "run", device="cpu")
     assert torch.equal(loaded.image("2.png"), trained.image("2.png")) and type(loaded.recipe) is SplatRecipe
-    assert "of a recipe of one's own, 'Weighted'; taken as SplatRecipe" in caplog.text
+    assert "of a custom recipe, 'Weighted'; read as SplatRecipe" in caplog.text
 
 
 def test_a_training_that_is_run_again_keeps_what_it_has_trained(tmp_path: Path) -> None:

@@ -130,7 +130,7 @@ def test_among_several_panes_one_may_be_done_without() -> None:
     annotations = scene_of([FRONT])
     camera, image = annotations[0]
     annotations[0] = camera, torch.where(image == 1, 2, image)
-    with pytest.raises(PlaneFitError, match=r"pane 2 is annotated in 1 view.* with label 2 erased from the masks"):
+    with pytest.raises(PlaneFitError, match=r"pane 2 is annotated in 1 view.* erase label 2 from the masks"):
         fit_planes(frame_and_clutter([FRONT]), annotations, extent=EXTENT, options=QUICK)
     with pytest.raises(PlaneFitError, match="pane 1 is annotated in 1 view") as one:
         fit_planes(frame_and_clutter([FRONT]), scene_of([FRONT])[:1], extent=EXTENT, options=QUICK)
@@ -156,7 +156,7 @@ def test_masks_of_different_things_are_refused() -> None:
         (camera, labels.roll(shift, dims=1))
         for (camera, labels), shift in zip(annotations, (0, 110, -110), strict=True)
     ]
-    with pytest.raises(PlaneFitError, match=r"pane 1.*label 1 means the same flat pane"):
+    with pytest.raises(PlaneFitError, match=r"pane 1.*label 1 is the same flat pane"):
         fit_planes(frame_and_clutter([FRONT], wall=20_000), shuffled, extent=EXTENT, options=QUICK)
 
 

@@ -74,7 +74,7 @@ def test_a_capture_that_misses_its_page_is_said_to_be_whole(
     monkeypatch.setattr(report_page, "write_page", interrupt)
     output = tmp_path / "my capture"
     told = interrupted(photographs, output, capsys)
-    assert f"the capture in {output} is whole; `glassplat info '{output}' --page '{output / PAGE}'` writes" in told
+    assert f"the capture in {output} is complete; `glassplat info '{output}' --page '{output / PAGE}'` writes" in told
 
 
 def test_an_earlier_capture_is_not_taken_for_this_one(
@@ -147,7 +147,7 @@ def test_work_that_does_not_name_its_photographs_is_not_gone_on_with(
     task = begun(photographs, tmp_path / "capture")
     settings = tmp_path / "capture.partial" / "settings.json"
     settings.write_text(json.dumps(task.record()))
-    with pytest.raises(InputError, match=r"capture\.partial does not say which photographs .* --force"):
+    with pytest.raises(InputError, match=r"capture\.partial does not record the photographs .* --force"):
         prepare(task, heard, resume=True)
 
 

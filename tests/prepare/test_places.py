@@ -42,7 +42,7 @@ def test_something_else_in_the_place_of_work_stays(
 
 def test_the_output_may_not_lie_among_the_photographs(photographs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for output in (photographs, photographs / "capture"):
-        assert "lies inside of the photographs' folder" in refused(photographs, output, capsys)
+        assert "is inside the photographs' folder" in refused(photographs, output, capsys)
     assert len(list(photographs.iterdir())) == 10
 
 
@@ -67,7 +67,7 @@ def test_too_little_texture_says_what_to_do(tmp_path: Path, capsys: pytest.Captu
     for shade in range(100, 105):
         Image.new("RGB", (320, 240), (shade, shade, shade)).save(tmp_path / "in" / f"{shade}.png")
     message = refused(tmp_path / "in", tmp_path / "capture", capsys)
-    assert "5 of 5 photographs show fewer than 50 places" in message
+    assert "5 of 5 photographs have fewer than 50 features" in message
     assert [path.name for path in tmp_path.iterdir()] == ["in"]
 
 
@@ -83,7 +83,7 @@ def test_a_link_to_itself_is_no_place_for_a_capture(
     photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    assert "expected a folder" in refused(photographs, tmp_path / "loop", capsys)
+    assert "expected an existing or new folder" in refused(photographs, tmp_path / "loop", capsys)
 
 
 def test_force_replaces_masks_that_were_prepared_and_no_others(tmp_path: Path) -> None:
@@ -93,7 +93,7 @@ def test_force_replaces_masks_that_were_prepared_and_no_others(tmp_path: Path) -
     (output / RECORD).write_text(json.dumps({"masks": [hashlib.sha256(mask.read_bytes()).hexdigest()]}))
     Workplace(output).begin({}, resume=False, force=True)
     mask.write_bytes(b"a passer-by, too")
-    with pytest.raises(InputError, match=r"capture holds ignore/left/1.png, which somebody made"):
+    with pytest.raises(InputError, match=r"capture holds ignore/left/1.png, which are not from `glassplat prepare`"):
         Workplace(output).begin({}, resume=False, force=True)
 
 
@@ -106,7 +106,10 @@ def test_force_removes_only_what_was_prepared(tmp_path: Path, name: str) -> None
         (output / made).parent.mkdir(parents=True, exist_ok=True)
         (output / made).write_text("{}")
     named = name if name.startswith("images/") else name.partition("/")[0]
-    with pytest.raises(InputError, match=rf"capture holds {named}, which somebody made and --force would remove"):
+    with pytest.raises(
+        InputError,
+        match=rf"capture holds {named}, which are not from `glassplat prepare` and would be removed by --force",
+    ):
         Workplace(output).begin({}, resume=False, force=True)
     (output / name).unlink()
     if named != name:
@@ -155,7 +158,7 @@ def test_a_capture_that_another_preparation_makes_is_left_to_it(
     with workplace.alone():
         workplace.begin({}, resume=False, force=False)
         assert main(["prepare", str(photographs), "--output", str(tmp_path / "capture"), option]) == 2
-        assert "another preparation is making" in " ".join(capsys.readouterr().err.split())
+        assert "another preparation is writing" in " ".join(capsys.readouterr().err.split())
         assert (workplace.folder / "settings.json").is_file()
         with Workplace(tmp_path / "other").alone():
             pass

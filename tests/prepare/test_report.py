@@ -83,7 +83,7 @@ def test_names_that_are_no_text_can_be_read_again(tmp_path: Path) -> None:
     (tmp_path / "record.json").write_text(json.dumps(record))
     found = read_json(tmp_path / "record.json")
     assert found["report"]["missing"] == [r"\xe9.jpg"] and found["input"].endswith(r"caf\xe9")
-    assert r"once more around \xe9.jpg" in found["report"]["advice"][0]
+    assert r"take more photographs around \xe9.jpg" in found["report"]["advice"][0]
 
 
 def test_a_good_preparation_needs_no_advice() -> None:
@@ -99,16 +99,16 @@ def test_photographs_that_were_placed_twice_are_no_second_group() -> None:
 def test_two_places_are_two_groups() -> None:
     found = report([FakeModel(range(6)), FakeModel(range(5, 10))])
     assert found.groups == (6, 4) and found.missing == ("6.jpg", "7.jpg", "8.jpg", "9.jpg")
-    assert any("2 groups that share nothing (6, 4 photographs)" in line for line in found.advice)
-    assert any("photograph once more around 6.jpg" in line for line in found.advice)
+    assert any("2 groups without matches between them (6, 4 photographs)" in line for line in found.advice)
+    assert any("take more photographs around 6.jpg" in line for line in found.advice)
 
 
 @pytest.mark.parametrize(
     ("model", "features", "expected"),
     [
-        ({"track": 2.2}, 3000, "with smaller steps"),
+        ({"track": 2.2}, 3000, "in smaller steps"),
         ({"error": 2.0}, 3000, "nothing large moves"),
-        ({"focal": 5000.0}, 3000, "focal length is unusual"),
+        ({"focal": 5000.0}, 3000, "focal length is implausible"),
         ({}, 200, "only 200 features"),
     ],
 )

@@ -34,7 +34,7 @@ RECORD: dict[str, Any] = {
         "cameras": ["200x150, focal length 166 pixels"],
         "attempt": "the usual settings",
         "attempts": 1,
-        "advice": ["photograph once more"],
+        "advice": ["take more photographs"],
     },
 }
 
@@ -69,7 +69,9 @@ def test_every_photograph_is_on_the_page_and_nothing_is_loaded(capture: Path) ->
     page = Parts(text)
     assert len(page.all("img")) == 64
     assert all(str(one["src"]).startswith("data:image/jpeg;base64,") for one in page.all("img"))
-    assert "no panes yet" in text and "&lt;b&gt;left &amp; out&lt;/b&gt;.jpg" in text and "photograph once more" in text
+    assert (
+        "no panes yet" in text and "&lt;b&gt;left &amp; out&lt;/b&gt;.jpg" in text and "take more photographs" in text
+    )
     assert not page.all("script") and not page.all("link") and len(text) < 2_000_000
 
 

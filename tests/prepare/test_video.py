@@ -76,7 +76,7 @@ def test_a_video_of_nothing_is_refused(still: bool, tmp_path: Path, heard: Heard
         film(path, np.zeros(40))
     else:
         path.write_bytes(b"this is no video")
-    expected = "shows 1 different places in 40 frames" if still else "holds no picture that OpenCV can read"
+    expected = "has 1 sufficiently different views in 40 frames" if still else "has no frame that OpenCV can read"
     with pytest.raises(InputError, match=expected):
         frames_of(path, tmp_path / "frames", 15, heard)
 

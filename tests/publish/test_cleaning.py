@@ -104,7 +104,7 @@ def test_a_box_that_takes_out_most_of_the_scene_is_warned_of(
     rules = ["--isolated", "0", "--oversized", "0", "--box", *box]
     assert main(["clean", str(run), "--output", str(tmp_path / "clean"), *rules]) == 0
     count = int((along > along.quantile(kept)).sum())
-    said = f"warning: --box takes out {count} Gaussians, more than half"
+    said = f"warning: --box removes {count} Gaussians, more than half"
     assert (said in " ".join(capsys.readouterr().out.split())) == warns
 
 
@@ -116,14 +116,14 @@ def test_the_command_writes_another_scene_in_metres(tmp_path: Path, capsys: pyte
         main(["clean", str(run), "--output", str(output), "--scale", *points, *["--isolated", "0", "--oversized", "0"]])
         == 0
     )
-    assert "one unit is a metre now; it was 0.5 m" in " ".join(capsys.readouterr().out.split())
+    assert "one unit is now a metre; it was 0.5 m" in " ".join(capsys.readouterr().out.split())
     old, new = glassplat.load(run), glassplat.load(output)
     torch.testing.assert_close(new.scene.planes.centers, old.scene.planes.centers / 2)
     torch.testing.assert_close(new.image("2.png"), old.image("2.png"), atol=2e-4, rtol=0)
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
     assert main(["clean", str(run), "--output", str(run)]) == 2
     assert main(["clean", str(run), "--output", str(tmp_path / "no"), "--scale", *"1231234"]) == 2
-    assert "expected two points" in " ".join(capsys.readouterr().err.split())
+    assert "expected two different points" in " ".join(capsys.readouterr().err.split())
     for metres in ("1e-12", "1e30"):
         assert main(["clean", str(run), "--output", str(tmp_path / "no"), "--scale", *"000001", metres]) == 2
         assert "expected 1e-06 to 1e+06" in " ".join(capsys.readouterr().err.split())

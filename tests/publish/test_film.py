@@ -70,13 +70,13 @@ def test_pictures_of_a_webp_do_not_stay_in_memory(tmp_path: Path, monkeypatch: p
 
 
 def test_what_is_no_film_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="avi is no name of a film"):
+    with pytest.raises(ValueError, match="avi is not a video name"):
         check_encoder(tmp_path / "film.avi", 10)
-    with pytest.raises(ValueError, match=r"at most 50 pictures per second, not 51; lower --fps"):
+    with pytest.raises(ValueError, match=r"at most 50 frames per second, not 51; lower --fps"):
         check_encoder(tmp_path / "film.gif", 51)
     check_encoder(tmp_path / "film.gif", 50)
     check_encoder(tmp_path / "film.webp", 120)
-    with pytest.raises(ValueError, match="needs a picture"):
+    with pytest.raises(ValueError, match="needs a frame"):
         write_film(tmp_path / "film.webp", iter([]), count=1, fps=10)
     with pytest.raises(OSError, match="VP9"):
         write_film(tmp_path / "none" / "film.mp4", iter(PICTURES), count=6, fps=10)

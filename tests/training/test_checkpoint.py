@@ -95,7 +95,7 @@ def test_surroundings_survive(tmp_path: Path) -> None:
 
 def test_a_full_disk_leaves_the_older_checkpoint(checkpoint: Path) -> None:
     before = checkpoint.read_bytes()
-    with no_file_beyond(4000), pytest.raises(OSError, match="whatever was there before is unchanged"):
+    with no_file_beyond(4000), pytest.raises(OSError, match="the previous contents are unchanged"):
         save_checkpoint(checkpoint, trained_state())
     assert checkpoint.read_bytes() == before
 

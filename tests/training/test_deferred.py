@@ -251,8 +251,8 @@ def test_propagation_ends_when_no_more_reflectors_are_found(
     ("share", "turns", "said"),
     [
         (0.4, 0.0, None),
-        (0.0, 0.12, "no more than 12 % of what is seen .* --region"),
-        (0.004, 0.3, "30 % of what is seen .* --iterations"),
+        (0.0, 0.12, "at most 12 % of the visible scene .* --region"),
+        (0.004, 0.3, "30 % of the visible scene .* --iterations"),
     ],
 )
 def test_where_nothing_reflects_the_rates_rise_and_the_log_says_so(
@@ -269,7 +269,7 @@ def test_where_nothing_reflects_the_rates_rise_and_the_log_says_so(
     if said is not None:
         assert re.search(rf"nothing reflective was found.*{said}", warnings[0])
     else:
-        assert "40 % of what is seen is reflection" in caplog.messages[-1]
+        assert "40 % of the visible scene is reflection" in caplog.messages[-1]
 
 
 def test_a_region_without_gaussians_is_named(caplog: pytest.LogCaptureFixture) -> None:
@@ -278,15 +278,15 @@ def test_a_region_without_gaussians_is_named(caplog: pytest.LogCaptureFixture) -
     state.scene = replace(state.scene, environment=environment)
     propagated(Search(), PropagationSchedule(patience=2), state=state)
     (warning,) = [record.getMessage() for record in caplog.records]
-    assert "learns as fast as splat" in warning
-    assert "no Gaussian lies in the sphere in which anything may reflect, of radius 2 around (50, 0, 0.5)" in warning
+    assert "uses the learning rates of splat" in warning
+    assert "no Gaussian lies in the sphere outside which nothing reflects, of radius 2 around (50, 0, 0.5)" in warning
 
 
 def test_rates_that_stay_are_not_said_to_rise(caplog: pytest.LogCaptureFixture) -> None:
     schedule, told = PropagationSchedule(end="fixed", stop=0.5), Told(reflects=(0.0,))
     action = Propagate(Every(0.1, stop=0.5), NormalPropagation(), schedule, Deferred(), search=told)
     action.apply(fresh_state(), tiny_capture(), Clock(50, 100, 5))
-    assert "little or nothing reflective" in caplog.text and "as fast as splat" not in caplog.text
+    assert "little or nothing reflective" in caplog.text and "the learning rates of splat" not in caplog.text
 
 
 @pytest.mark.parametrize("recipe", [DeferredRecipe(), TracedRecipe(), TracedRecipe(raise_rates_found=False)])

@@ -95,7 +95,7 @@ def test_a_rectangle_of_another_frame_is_refused(capture: Path) -> None:
 def test_a_rectangle_that_is_not_where_the_masks_show_the_pane_is_refused() -> None:
     dataset, aside = tiny_capture(), PANE.centers + 2 * PANE.half_sizes.max() * PANE.axes()[0]
     assert len(fitted_planes(replace(dataset, planes=PANE), None, PlaneFit())) == 1
-    with pytest.raises(PlaneFitError, match=r"put pane 1 into different places: \d+% of .* Mark it again"):
+    with pytest.raises(PlaneFitError, match=r"disagree about the position of pane 1: \d+% of .* Mark it again"):
         fitted_planes(replace(dataset, planes=replace(PANE, centers=aside)), None, PlaneFit())
     elsewhere = replace(PANE, centers=aside, labels=(2,))
     assert fitted_planes(replace(dataset, planes=elsewhere, pane_labels=()), None, PlaneFit()).labels == (2,)
@@ -126,5 +126,5 @@ def test_a_pane_that_only_a_test_photograph_shows_is_refused_by_name(tmp_path: P
     mask = np.array(Image.open(held_out))
     mask[:8, :8] = 2
     Image.fromarray(mask).save(held_out)
-    with pytest.raises(PlaneFitError, match=f"pane 2 is marked in {held_out.name} only, and test photographs"):
+    with pytest.raises(PlaneFitError, match=f"pane 2 is marked only in {held_out.name}, which are test photographs"):
         PlanarRecipe().initialise(load_dataset(root))

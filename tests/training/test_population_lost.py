@@ -109,6 +109,6 @@ def test_a_capture_that_shows_nothing_is_one_message(
     if code == 0:
         assert (run / "point_cloud" / "iteration_40" / "point_cloud.ply").is_file() and not message
     elif code == 1:
-        assert message.startswith("stopped:") and "Gaussian" in message and "did not foresee" not in message
+        assert message.startswith("stopped:") and "Gaussian" in message and "unexpected error" not in message
     else:
         assert message.startswith("error:")

@@ -172,7 +172,7 @@ def test_no_action_is_missed_where_steps_go_over_its_moment(count: int) -> None:
     """Whether an action that looks for something finds it may depend on the batch; that it looks may not."""
     alone, together = (Counter(actions_taken(trained("planar", Ranks(batch=batch), 60)[1])) for batch in (1, count))
     assert together == alone
-    assert alone["looking for Gaussians that no view needs"] == 3 and alone["grow SH"] == 1
+    assert alone["searching for unnecessary Gaussians"] == 3 and alone["grow SH"] == 1
 
 
 def test_ranks_compare_whatever_an_action_found(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -303,7 +303,7 @@ def test_a_rank_that_is_asked_to_end_does_not_wait_long_for_a_silent_one(capture
 
 def test_a_rank_that_falls_silent_is_given_up_and_what_was_trained_is_saved(capture: Path, tmp_path: Path) -> None:
     impatient = "tests.training.impatient_rank"
-    assert "does not answer" in last_word_before_a_silent_rank(impatient, capture, tmp_path / "run", asked=False)
+    assert "does not respond" in last_word_before_a_silent_rank(impatient, capture, tmp_path / "run", asked=False)
 
 
 @pytest.mark.parametrize(

@@ -66,7 +66,7 @@ def test_a_run_has_room_for_every_stage_from_the_length_that_is_asked_for(recipe
         if not missed_stages(stages, iterations):
             check_length(stages, iterations)
             continue
-        with pytest.raises(InputError, match=f"^{iterations} iterations leave no room") as caught:
+        with pytest.raises(InputError, match=f"^{iterations} iterations are too few") as caught:
             check_length(stages, iterations)
         least = int(str(caught.value).rpartition(" ")[2])
         check_length(stages, least)
@@ -85,7 +85,7 @@ def test_a_stage_without_a_share_is_missed_only_for_what_it_begins_with() -> Non
 
 def test_a_stage_with_hardly_any_share_is_not_looked_for_for_ever() -> None:
     stages: Any = tuple(SimpleNamespace(name=f"{share}", share=share, setup=None) for share in (0.5, 1e-12, 0.5))
-    with pytest.raises(InputError, match="no room for the stage '1e-12'; expected at least") as caught:
+    with pytest.raises(InputError, match="are too few for the stage '1e-12'; expected at least") as caught:
         check_length(stages, 1000)
     assert int(str(caught.value).rpartition(" ")[2]) > 1e11
 

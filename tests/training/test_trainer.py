@@ -235,5 +235,5 @@ def test_plane_entry_needs_annotated_views() -> None:
     dataset = tiny_capture()
     bare = replace(dataset, train=tuple(replace(view, read_pane_labels=None) for view in dataset.train))
     setup = PaneSetup(PlanarRecipe().plane_fit, 10, 0)
-    with pytest.raises(ValueError, match=r"pane 1 is marked in 0\.png only, and test photographs teach nothing"):
+    with pytest.raises(ValueError, match=r"pane 1 is marked only in 0\.png, which are test photographs"):
         finished(setup(TrainState(Scene(gaussians_from_points(dataset.points), dataset.extent), 0), bare))

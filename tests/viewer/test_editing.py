@@ -96,9 +96,9 @@ def test_a_person_moves_a_pane_sets_keyframes_and_saves_both(tmp_path: Path) -> 
         step = pane_is_dragged(client, browser)
         unfold(browser, "Edited scene", "Save as a run")
         click(browser, "Save as a run")
-        eventually(lambda: says(browser, "look at it with"))
+        eventually(lambda: says(browser, "view it with"))
         click(browser, "Save as a run")
-        eventually(lambda: says(browser, "already there and not empty"))
+        eventually(lambda: says(browser, "already exists and is not empty"))
         click(browser, "Put panes back")
         eventually(lambda: not client.request().moves)
         stood = keyframes_are_set_and_played(client, browser)
@@ -151,7 +151,7 @@ def keyframes_are_set_and_played(client: Client, browser: Browser) -> list[Camer
     eventually(lambda: says(browser, "2 keyframes"))
     press(browser, "Play or stop", lambda: client._nearest in (2, 3))
     eventually(lambda: client._nearest == 4)
-    press(browser, "Save keyframes", lambda: says(browser, "film them with"))
+    press(browser, "Save keyframes", lambda: says(browser, "render them with"))
     return stood
 
 

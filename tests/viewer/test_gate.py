@@ -278,7 +278,7 @@ def test_a_viser_that_cannot_be_guarded_is_not_served(monkeypatch: pytest.Monkey
 
     serve = gate.websockets_server.serve
     monkeypatch.setattr(gate.viser, "ViserServer", Elsewhere)
-    with pytest.raises(InputError, match="cannot guard"):
+    with pytest.raises(InputError, match="cannot protect"):
         Viewer(STATE, "127.0.0.1", free_port())
     assert stopped and gate.websockets_server.serve is serve
 

@@ -32,7 +32,7 @@ from glassplat.kernels.backend.devices import announced_compilation
 
 log = logging.getLogger("glassplat.kernels")
 
-REMEDY = "set NUMBA_CACHE_DIR to a folder that can be written and lasts"
+REMEDY = "set NUMBA_CACHE_DIR to a folder that is writable and permanent"
 
 
 class UserFolder(caching.UserWideCacheLocator):
@@ -116,7 +116,7 @@ class KernelFiles(caching.CompileResultCacheImpl):
 
     def not_kept(self, reason: Exception) -> None:
         """Says, once, that kernels will be compiled again in the next process."""
-        _warn_once("cannot keep compiled kernels for the next time: %s; %s", str(reason), REMEDY)
+        _warn_once("cannot cache compiled kernels: %s; %s", str(reason), REMEDY)
 
 
 @cache

@@ -396,7 +396,7 @@ def blocks_for(items: int, threads: int) -> int:
 def _numba_type(token: str, real: type) -> Any:
     match = TOKEN.fullmatch(token)
     if match is None:
-        raise ValueError(f"{token!r} is no argument type; expected something like real, int1 or bool3")
+        raise ValueError(f"{token!r} is not an argument type; expected something like real, int1 or bool3")
     scalar = types.float32 if real is np.float32 else types.float64
     element = scalar if match[1] == "real" else SCALARS[match[1]]
     return types.Array(element, int(match[2]), "C") if match[2] else element

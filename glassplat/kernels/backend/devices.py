@@ -103,7 +103,7 @@ def has_library(name: str) -> bool:
 
 def _other_compiler(major: int) -> str:
     if major not in EXTRAS:
-        return "take a machine with a newer one"
+        return "use a machine with a newer one"
     return f"run `pip install '{EXTRAS[major]}'` in a fresh environment with a PyTorch of CUDA {major}"
 
 

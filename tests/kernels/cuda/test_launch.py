@@ -224,7 +224,7 @@ def test_what_a_kernel_does_not_take_is_refused(gpu: Driver, tensor: torch.Tenso
 
 
 def test_a_wrong_argument_list_is_refused() -> None:
-    with pytest.raises(ValueError, match="'real7' is no argument type"):
+    with pytest.raises(ValueError, match="'real7' is not an argument type"):
         kernel("nothing", np.float32, "real7")(lambda values: None)
     made = kernel("nothing", np.float32, "real1 int")(lambda values, count: None)
     assert made.name == "nothing_float32"
