@@ -12,6 +12,7 @@ os.environ.setdefault("NUMBA_NUM_THREADS", "2")
 # Before PyTorch, as the package asks: it says how threads wait.
 import glassplat  # noqa: F401, I001
 
+import contextlib
 import random
 import signal
 from collections.abc import Iterator
@@ -22,6 +23,8 @@ import numpy as np
 import pytest
 import torch
 from _pytest.terminal import TerminalReporter
+
+from tools.browser import CHROMIUM, running_chromium
 
 # A shell lets what it starts in the background ignore Ctrl-C, and `nohup` the end of the terminal. The package leaves
 # ignored what it finds ignored; its tests want these signals heard, here and in the processes that they start.
@@ -42,6 +45,13 @@ def fixed_state() -> Iterator[None]:
     numba.set_num_threads(1)
     yield
     torch.set_default_dtype(torch.float32)
+
+
+@pytest.fixture(scope="module")
+def one_chromium() -> Iterator[None]:
+    """One Chromium, where there is one, for the pages of a module, in which no test may run an event loop."""
+    with running_chromium() if CHROMIUM else contextlib.nullcontext():
+        yield
 
 
 def pytest_terminal_summary(terminalreporter: TerminalReporter) -> None:

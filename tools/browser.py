@@ -28,6 +28,8 @@ OPTIONS = (
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 PATIENCE = 60.0
 """Seconds that anything on the page may take, on a machine that does much else."""
+LONGEST = 1000 * PATIENCE
+"""The same in Playwright's milliseconds."""
 KEYS = {"Right": "ArrowRight", "Left": "ArrowLeft", "Up": "ArrowUp", "Down": "ArrowDown"}
 
 
@@ -46,25 +48,34 @@ def wait_until(holds: Callable[[], Any], what: str) -> Any:
 
 
 @contextmanager
-def driver() -> Iterator[Any]:
-    """Playwright, which a thread can have only once: begun for the first who asks, ended with the last."""
+def running_chromium() -> Iterator[Any]:
+    """Chromium and Playwright, which a thread can have only once: begun for the first who asks, ended with the last."""
     from playwright.sync_api import sync_playwright
 
-    _drivers.append(_drivers[-1] if _drivers else sync_playwright().start())
+    if not _running:
+        driver = sync_playwright().start()
+        try:
+            _running.append((driver, driver.chromium.launch(executable_path=CHROMIUM, args=OPTIONS, timeout=LONGEST)))
+        except BaseException:
+            driver.stop()
+            raise
+    else:
+        _running.append(_running[-1])
     try:
-        yield _drivers[-1]
+        yield _running[-1][1]
     finally:
-        last = _drivers.pop()
-        if not _drivers:
-            last.stop()
+        driver, chromium = _running.pop()
+        if not _running:
+            chromium.close()
+            driver.stop()
 
 
-_drivers: list[Any] = []
-"""The same one, for each who uses it."""
+_running: list[tuple[Any, Any]] = []
+"""The same two, for each who uses them."""
 
 
 class Browser:
-    """One tab of one browser; use it in a `with` statement."""
+    """One tab, apart from all others; use it in a `with` statement."""
 
     def __init__(
         self, page: Path | str = "about:blank", width: int = 640, height: int = 480, *, query: str = "#still"
@@ -73,11 +84,10 @@ class Browser:
         self._requests: list[str] = []
         self._complaints: list[str] = []
         with ExitStack() as ending:
-            chromium = ending.enter_context(driver()).chromium
-            browser = chromium.launch(executable_path=CHROMIUM, args=OPTIONS, timeout=1000 * PATIENCE)
-            ending.callback(browser.close)
-            self._tab = browser.new_page(viewport={"width": width, "height": height})
-            self._tab.set_default_timeout(1000 * PATIENCE)
+            chromium = ending.enter_context(running_chromium())
+            self._tab = chromium.new_page(viewport={"width": width, "height": height})
+            ending.callback(self._tab.close)
+            self._tab.set_default_timeout(LONGEST)
             self._tab.on("request", lambda request: self._requests.append(request.url))
             self._tab.on("pageerror", lambda error: self._complaints.append(str(error)))
             self._tab.on("console", lambda said: said.type == "error" and self._complaints.append(said.text))

@@ -19,7 +19,7 @@ from tests.panes.pane_scene import FRONT
 from tools.browser import wait_until
 from tools.marking_page import MarkingPage, marking_page
 
-pytestmark = needs_browser
+pytestmark = [needs_browser, pytest.mark.usefixtures("one_chromium")]
 
 
 class Page(MarkingPage):

@@ -19,6 +19,8 @@ from tests.render.test_seen_panes import vitrine
 from tests.render.tiny_scene import in_single_precision, joined, pane, showcase
 from tools.browser import Browser
 
+pytestmark = pytest.mark.usefixtures("one_chromium")
+
 SPLATS_OF_MASKS = """glassplat.then(async ({ navigation, lensOf, ordersOf }) => {
   let orders = null;  // As it is where the page itself asks for another order meanwhile.
   while (!orders) orders = await ordersOf(navigation.pose(), lensOf());

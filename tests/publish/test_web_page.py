@@ -48,6 +48,8 @@ from tests.training.tiny_capture import tiny_capture, true_scene
 from tools.browser import Browser
 from tools.page_likeness import picture, pixels_of
 
+pytestmark = pytest.mark.usefixtures("one_chromium")
+
 CAMERAS = [(view.name, view.camera) for view in tiny_capture().train]
 LARGEST_SCRIPT = 72 * 1024
 
