@@ -98,23 +98,26 @@ def test_a_capture_is_replaced_only_by_force(prepared: Path, capsys: pytest.Capt
     assert (prepared / "sparse" / "0" / "images.bin").read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    "phase", ["looking for features", "matching photographs", "registering the photographs", "writing"]
-)
-def test_what_was_interrupted_goes_on(phase: str, photographs: Path, tmp_path: Path, heard: Heard) -> None:
+def test_what_was_interrupted_goes_on(photographs: Path, tmp_path: Path, heard: Heard) -> None:
+    """In each phase, one after the other: what goes on has to come as far as the next."""
     task = Preparation(photographs, tmp_path / "capture")
+    phases = ("looking for features", "matching photographs", "registering the photographs", "undistorting")
+    for number, phase in enumerate(phases):
 
-    def interrupt(message: Working | Note) -> None:
-        if isinstance(message, Working) and message.what.startswith(phase):
-            raise KeyboardInterrupt
+        def interrupt(message: Working | Note, phase: str = phase) -> None:
+            heard(message)
+            if isinstance(message, Working) and message.what.startswith(phase):
+                raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        prepare(task, interrupt)
-    assert not task.output.exists()
-    with pytest.raises(InputError, match="--resume"):
-        prepare(task, heard)
-    with pytest.raises(InputError, match="another max-size"):
-        prepare(Preparation(photographs, task.output, max_size=640), heard, resume=True)
+        heard.clear()
+        with pytest.raises(KeyboardInterrupt):
+            prepare(task, interrupt, resume=number > 0)
+        assert ("reading the photographs" in heard.whats()) == (number == 0)
+        assert not task.output.exists()
+        with pytest.raises(InputError, match="--resume"):
+            prepare(task, heard)
+        with pytest.raises(InputError, match="another max-size"):
+            prepare(Preparation(photographs, task.output, max_size=640), heard, resume=True)
     heard.clear()
     assert prepare(task, heard, resume=True).registered == len(CONNECTED)
     assert "reading the photographs" not in heard.whats()
