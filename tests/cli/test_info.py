@@ -60,11 +60,11 @@ def test_a_capture_without_masks_is_to_be_annotated(tmp_path: Path, capsys: pyte
 
 
 def test_estimated_normals_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    capture = shutil.copytree(SCENE, tmp_path / "capture", ignore=shutil.ignore_patterns("panes", "gt"))
+    capture = write_tiny_capture(tmp_path / "capture")
+    assert "normals" not in told(capture, capsys)["facts"]
     (capture / "normals").mkdir()
     for photograph in sorted((capture / "images").iterdir())[1:4]:
         (capture / "normals" / photograph.with_suffix(".npy").name).touch()
-    assert "normals" not in told(SCENE, capsys)["facts"]
     assert told(capture, capsys)["facts"]["normals"].startswith("estimated for 3 training photographs")
 
 
@@ -204,11 +204,12 @@ def test_an_interrupted_run_says_its_step_and_the_command_that_goes_on(
     assert told(tmp_path / "run", capsys)["facts"]["trained to"] == 12
 
 
-def test_what_is_for_programs_has_no_colours_and_no_line_of_the_log_in_it() -> None:
-    command = [sys.executable, "-m", "glassplat", "info", str(SCENE), "--json"]
+def test_what_is_for_programs_has_no_colours_and_no_line_of_the_log_in_it(tmp_path: Path) -> None:
+    capture = write_tiny_capture(tmp_path / "capture")
+    command = [sys.executable, "-m", "glassplat", "info", str(capture), "--json"]
     colourful = os.environ | {"FORCE_COLOR": "1", "COLUMNS": "40"}
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True, env=colourful)
-    assert json.loads(done.stdout)["path"] == str(SCENE) and "pane 1: " in done.stderr
+    assert json.loads(done.stdout)["path"] == str(capture) and "pane 1: " in done.stderr
 
 
 def test_a_run_is_described_and_misses_its_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
