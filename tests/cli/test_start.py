@@ -9,8 +9,10 @@ import platform
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -21,41 +23,56 @@ from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.recipe import recipe_to_json
 
 SLOW = ["torch", "numba", "scipy", "numpy", "PIL", "pycolmap", "OpenEXR", "safetensors"]
-IMPORTS = """
-import json, sys
-from glassplat.cli.main import main
-try:
-    code = main({arguments})
-except SystemExit as stop:
-    code = stop.code
-slow = [name for name in {slow} if name in sys.modules]
-print(json.dumps([code, slow, sorted(name for name in sys.modules if name.startswith("glassplat.cli."))]))
+LINES = """
+import contextlib, io, json, sys
+
+lines, watched = json.loads(sys.argv[1])
+found = []
+for words in lines:
+    with contextlib.redirect_stdout(io.StringIO()) as said, contextlib.redirect_stderr(io.StringIO()) as complained:
+        from glassplat.cli.main import main
+        try:
+            code = main(words)
+        except SystemExit as stop:
+            code = stop.code
+    slow = [name for name in watched if name in sys.modules]
+    commands = [name for name in sys.modules if name.startswith("glassplat.cli.")]
+    found.append((code, slow, commands, said.getvalue(), complained.getvalue()))
+print(json.dumps(found))
 """
+"""Runs command lines one after the other. What one of them imports counts for all that follow as well, so that a line
+that passes among others passes alone."""
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code"),
-    [
-        (["--help"], 0),
-        (["-h"], 0),
-        (["--version"], 0),
-        ([], 2),
-        (["trian"], 2),
-        (["--no-such-option"], 2),
-        (["--", "train"], 2),
-        (["Train"], 2),
-        ([""], 2),
-    ],
-)
-def test_the_list_of_commands_needs_none_of_the_libraries(arguments: list[str], code: int) -> None:
-    script = IMPORTS.format(arguments=arguments, slow=SLOW)
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    found, slow, commands = json.loads(done.stdout.splitlines()[-1])
-    assert found == code
-    assert slow == []
-    assert not {f"glassplat.cli.{listed.module}" for listed in COMMANDS.values()} & set(commands)
-    assert "Traceback" not in done.stderr
-    assert all(name in done.stdout + done.stderr for name in COMMANDS) or arguments == ["--version"]
+class Found(NamedTuple):
+    """Exit code of a command line, what it and those before it imported, and what it said."""
+
+    code: int
+    slow: list[str]
+    commands: set[str]
+    out: str
+    err: str
+
+
+def found_of(
+    lines: Sequence[Sequence[str]], watched: Sequence[str], folder: Path | None = None, before: str = ""
+) -> list[Found]:
+    """Command lines in one process of their own, which runs a script before, and looks for modules to be watched."""
+    command = [sys.executable, "-c", before + LINES, json.dumps((lines, watched))]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
+    assert (done.returncode, done.stderr) == (0, "")
+    return [Found(code, slow, set(commands), *said) for code, slow, commands, *said in json.loads(done.stdout)]
+
+
+def test_the_list_of_commands_needs_none_of_the_libraries() -> None:
+    right = [["--help"], ["-h"], ["--version"]]
+    wrong = [[], ["trian"], ["--no-such-option"], ["--", "train"], ["Train"], [""]]
+    for arguments, found in zip(right + wrong, found_of(right + wrong, SLOW), strict=True):
+        assert found.code == (0 if arguments in right else 2), arguments
+        assert found.slow == [], arguments
+        assert not {f"glassplat.cli.{listed.module}" for listed in COMMANDS.values()} & found.commands
+        assert "Traceback" not in found.err
+        assert all(name in found.out + found.err for name in COMMANDS) or arguments == ["--version"]
 
 
 def test_the_version_tells_what_a_report_of_a_bug_needs() -> None:
@@ -63,21 +80,30 @@ def test_the_version_tells_what_a_report_of_a_bug_needs() -> None:
     for name, version in (("glassplat", glassplat.__version__), ("PyTorch", metadata.version("torch"))):
         assert f"{name} {version}, " in done.stdout
     assert f"Python {platform.python_version()}, " in done.stdout
+    assert done.stdout.startswith(f"glassplat {glassplat.__version__}, Python ")
     assert "NVIDIA driver" in done.stdout or "CUDA" in done.stdout
 
 
-@pytest.mark.parametrize("name", ["prepare", "annotate", "train", "eval", "export", "view", "video", "info"])
-def test_a_command_does_not_wait_for_what_it_may_never_need(name: str) -> None:
-    late = ["scipy.spatial", "scipy.ndimage", "scipy.interpolate", "scipy.optimize", "viser", "cv2", "OpenEXR"]
-    late += [] if name in ("prepare", "annotate") else ["pycolmap"]
-    late += ["glassplat.evaluate.evaluate", "zstandard"] if name == "train" else []
-    done = subprocess.run(
-        [sys.executable, "-c", IMPORTS.format(arguments=[name, "--help"], slow=late)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert json.loads(done.stdout.splitlines()[-1])[:2] == [0, []]
+LATE = [
+    "torch", "numba", "scipy.spatial", "scipy.ndimage", "scipy.interpolate", "scipy.optimize", "viser", "cv2",
+    "OpenEXR", "pycolmap",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def explained() -> dict[str, Found]:
+    """What each command says of itself; those last that may import more than the others."""
+    names = sorted(COMMANDS, key=lambda name: (name in ("prepare", "annotate"), name != "train", name))
+    watched = [*LATE, "glassplat.evaluate.evaluate", "zstandard"]
+    return dict(zip(names, found_of([[name, "--help"] for name in names], watched), strict=True))
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_a_command_does_not_wait_for_what_it_may_never_need(name: str, explained: dict[str, Found]) -> None:
+    assert explained[name].code == 0
+    allowed = {"glassplat.evaluate.evaluate", "zstandard"} if name != "train" else set()
+    allowed |= {"pycolmap"} if name in ("prepare", "annotate") else set()
+    assert not set(explained[name].slow) - allowed
 
 
 REFUSED = {
@@ -128,19 +154,17 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.fixture(scope="module")
+def refused(places: Path) -> dict[str, Found]:
+    """What each command line is answered that can be refused at once."""
+    return dict(zip(REFUSED, found_of([line.split() for line in REFUSED], ["torch", "numba"], places), strict=True))
+
+
 @pytest.mark.parametrize("line", REFUSED)
-def test_what_can_be_refused_at_once_is_refused_without_pytorch(line: str, places: Path) -> None:
-    script = IMPORTS.format(arguments=line.split(), slow=["torch", "numba"])
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, cwd=places)
-    assert json.loads(done.stdout.splitlines()[-1])[:2] == [2, []]
-    assert REFUSED[line] in " ".join(done.stderr.split()) and done.stderr.startswith("error: ")
-
-
-@pytest.mark.parametrize("name", sorted(COMMANDS))
-def test_a_command_explains_itself_without_pytorch(name: str) -> None:
-    script = IMPORTS.format(arguments=[name, "--help"], slow=["torch", "numba"])
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert json.loads(done.stdout.splitlines()[-1])[:2] == [0, []]
+def test_what_can_be_refused_at_once_is_refused_without_pytorch(line: str, refused: dict[str, Found]) -> None:
+    found = refused[line]
+    assert (found.code, found.slow) == (2, [])
+    assert REFUSED[line] in " ".join(found.err.split()) and found.err.startswith("error: ")
 
 
 WITHOUT_PYTORCH = """
@@ -152,8 +176,6 @@ class Missing(importlib.abc.MetaPathFinder):
             raise OSError("PyTorch was imported")
 
 sys.meta_path.insert(0, Missing())
-from glassplat.cli.main import main
-sys.exit(main({arguments!r}))
 """
 FIRST_WORDS = {
     "train splat --data SCENE --output new": "a COLMAP capture of 64 photographs",
@@ -173,38 +195,38 @@ FIRST_WORDS = {
 """Command lines, and what each says before it needs PyTorch."""
 
 
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Found]:
+    """What each command line says until it needs PyTorch, which cannot be imported; each has an output of its own."""
+    folder = tmp_path_factory.mktemp("begun")
+    (folder / "splats.ply").write_bytes(b"")
+    (folder / "run").mkdir()
+    (folder / "run" / "recipe.json").write_text(recipe_to_json(PlanarRecipe()))
+    (folder / "run" / "settings.json").write_text(json.dumps({"data": "gone", "iterations": 3000}))
+    lines = [
+        line.replace("SCENE", str(SCENE)).replace("--output new", f"--output new{number}").split()
+        for number, line in enumerate(FIRST_WORDS)
+    ]
+    return dict(zip(FIRST_WORDS, found_of(lines, [], folder, WITHOUT_PYTORCH), strict=True))
+
+
 @pytest.mark.parametrize("line", FIRST_WORDS)
-def test_a_command_begins_before_pytorch_is_imported(line: str, tmp_path: Path) -> None:
-    (tmp_path / "splats.ply").write_bytes(b"")
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "recipe.json").write_text(recipe_to_json(PlanarRecipe()))
-    (tmp_path / "run" / "settings.json").write_text(json.dumps({"data": "gone", "iterations": 3000}))
-    script = WITHOUT_PYTORCH.format(arguments=line.replace("SCENE", str(SCENE)).split())
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, cwd=tmp_path)
-    assert FIRST_WORDS[line] in " ".join(done.stdout.split())
-    assert (done.returncode, done.stderr) == (1, "stopped: PyTorch was imported\n")
+def test_a_command_begins_before_pytorch_is_imported(line: str, begun: dict[str, Found]) -> None:
+    assert FIRST_WORDS[line] in " ".join(begun[line].out.split())
+    assert (begun[line].code, begun[line].err) == (1, "stopped: PyTorch was imported\n")
 
 
 def test_photographs_are_described_without_pytorch(places: Path) -> None:
-    script = IMPORTS.format(arguments=["info", "photographs"], slow=["torch", "numba"])
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, cwd=places)
-    assert json.loads(done.stdout.splitlines()[-1])[:2] == [0, []]
-    assert "photographs without poses" in done.stdout
-
-
-def test_the_package_runs_as_a_module() -> None:
-    done = subprocess.run([sys.executable, "-m", "glassplat", "--version"], capture_output=True, text=True, check=False)
-    assert done.returncode == 0
-    assert done.stdout.startswith(f"glassplat {glassplat.__version__}, Python ")
+    (found,) = found_of([["info", "photographs"]], ["torch", "numba"], places)
+    assert (found.code, found.slow) == (0, [])
+    assert "photographs without poses" in found.out
 
 
 def test_a_command_imports_no_other(tmp_path: Path) -> None:
-    script = IMPORTS.format(arguments=["eval", str(tmp_path)], slow=SLOW)
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    code, _, commands = json.loads(done.stdout.splitlines()[-1])
-    assert code == 2
-    assert "glassplat.cli.scene" in commands
-    assert not {"glassplat.cli.capture", "glassplat.cli.info", "glassplat.cli.train"} & set(commands)
+    (found,) = found_of([["eval", str(tmp_path)]], SLOW)
+    assert found.code == 2
+    assert "glassplat.cli.scene" in found.commands
+    assert not {"glassplat.cli.capture", "glassplat.cli.info", "glassplat.cli.train"} & found.commands
 
 
 @pytest.mark.parametrize("name", COMMANDS)
