@@ -1,14 +1,26 @@
-"""One of several processes that train the tiny capture together; `torchrun` starts it, and it writes what it has."""
+"""One of several processes that train the tiny capture together, which writes what it has; and how they are started.
+
+`torchrun` starts them as users do. Where a test is not about that, they are forked from a process that has imported
+everything, which takes longer than what most of them do.
+"""
 
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
+import runpy
+import socket
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 from glassplat.methods.recipe import RECIPES
+from glassplat.training import ranks
 from glassplat.training.checkpoint import save_checkpoint
 from glassplat.training.loop import train
 from glassplat.training.messages import Message, StepDone
@@ -18,6 +30,10 @@ from tests.training.test_trainer import planar_stages
 from tests.training.tiny_capture import tiny_capture
 
 ROOT = Path(__file__).parents[2]
+LONGEST = 240
+"""Seconds for what takes a few on an idle machine."""
+FORKS = multiprocessing.get_context("forkserver")
+FORKS.set_forkserver_preload(["tests.training.rank_process", "glassplat.cli.train", "torch.distributed"])
 ONE_THREAD = os.environ | {"NUMBA_NUM_THREADS": "1"}
 
 
@@ -40,7 +56,81 @@ def losses_of(messages: list[Message]) -> list[float]:
     return [message.loss for message in messages if isinstance(message, StepDone)]
 
 
-def torchrun(count: int, *arguments: str, timeout: float = 240) -> subprocess.CompletedProcess[str]:
+class ForkedRank:
+    """`python -m ARGUMENTS` in a process that is forked, with the interface of `Popen`; what it says goes to files."""
+
+    def __init__(
+        self, arguments: list[str], environment: dict[str, str], said: Path, shorter: dict[str, Any] | None = None
+    ) -> None:
+        self.args, self._said = arguments, said
+        self._process = FORKS.Process(target=_become, args=(arguments, environment, said, shorter or {}))
+        with pytest.MonkeyPatch.context() as patch:
+            # The process that all are forked from reads them once.
+            patch.setenv("NUMBA_NUM_THREADS", "1")
+            patch.setenv("OMP_NUM_THREADS", "1")
+            self._process.start()
+        self.kill = self._process.kill
+
+    @property
+    def returncode(self) -> int | None:
+        return self._process.exitcode
+
+    def poll(self) -> int | None:
+        return self._process.exitcode
+
+    def send_signal(self, number: int) -> None:
+        os.kill(self._process.pid, number)
+
+    def communicate(self, timeout: float) -> tuple[str, str]:
+        """What it said on its two outputs, once it has ended."""
+        self._process.join(timeout)
+        assert self.returncode is not None, f"{self.args} does not end"
+        return self._said.with_suffix(".out").read_text(), self._said.with_suffix(".err").read_text()
+
+
+def _become(arguments: list[str], environment: dict[str, str], said: Path, shorter: dict[str, Any]) -> None:
+    os.environ.update(environment)
+    vars(ranks).update(shorter)
+    for number, suffix in ((1, ".out"), (2, ".err")):
+        with said.with_suffix(suffix).open("wb") as file:
+            os.dup2(file.fileno(), number)
+    sys.argv = arguments
+    runpy.run_module(arguments[0], run_name="__main__", alter_sys=True)
+
+
+def start_apart(
+    arguments: list[str],
+    folder: Path,
+    *,
+    count: int = 2,
+    of_rank_1: Sequence[str] = (),
+    shorter: dict[str, Any] | None = None,
+) -> list[ForkedRank]:
+    """Ranks as so many machines would start them, the second one with further arguments.
+
+    Args:
+        arguments: a module and its arguments.
+        folder: takes what they say.
+        count: how many.
+        of_rank_1: further arguments.
+        shorter: waiting times of `glassplat.training.ranks` in place of its own.
+    """
+    with socket.socket() as found:
+        found.bind(("localhost", 0))
+        port = str(found.getsockname()[1])
+    where = {"MASTER_ADDR": "localhost", "MASTER_PORT": port, "TORCHELASTIC_RUN_ID": "test", "WORLD_SIZE": str(count)}
+    return [
+        ForkedRank(
+            [*arguments, *(of_rank_1 if rank == 1 else ())],
+            where | {"RANK": str(rank), "LOCAL_RANK": str(rank)},
+            folder / f"said_by_{rank}",
+            shorter,
+        )
+        for rank in range(count)
+    ]
+
+
+def torchrun(count: int, *arguments: str, timeout: float = LONGEST) -> subprocess.CompletedProcess[str]:
     """Runs `python -m ARGUMENTS` in so many processes."""
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}", "-m"]
     return subprocess.run(
