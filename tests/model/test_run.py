@@ -8,13 +8,14 @@ import math
 import os
 import resource
 import signal
-import subprocess
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any
 
@@ -24,6 +25,7 @@ import torch
 from glassplat.captures.dataset import load_dataset
 from glassplat.captures.view import Memory, View
 from glassplat.errors import InputError
+from glassplat.files import writing
 from glassplat.methods.glossy_recipes import DeferredRecipe
 from glassplat.methods.planar_recipe import PlanarRecipe, ReflectionWeights
 from glassplat.methods.recipe import recipe_from_json, recipe_to_json
@@ -38,6 +40,7 @@ from glassplat.training.checkpoint import load_checkpoint, recorded, save_checkp
 from glassplat.training.messages import CheckpointWritten, Message, RunBegun, StepDone, Working
 from glassplat.training.ranks import Ranks
 from glassplat.training.stage import Clock, TrainState
+from tests.training.rank_process import forked
 from tests.training.tiny_capture import tiny_capture, true_scene, write_tiny_capture
 
 SETTINGS = RunSettings("tiny", iterations=12)
@@ -63,28 +66,32 @@ def run(
     return begun.to_the_end(listen)
 
 
-KILLED_AT = """
-import os, signal, sys
-from pathlib import Path
-from glassplat.files import writing
-from tests.model.test_run import run
+@cache
+def whole() -> Scene:
+    """What a run learns that is not interrupted."""
+    with TemporaryDirectory() as folder:
+        return run(Path(folder) / "run").scene
 
-flush = writing._flush_to_disk
 
-def flushed(path):
-    if path.name.startswith(sys.argv[2]) and path.suffix == sys.argv[3]:
-        os.kill(os.getpid(), signal.SIGKILL)
-    flush(path)
+def killed_at(path: Path, stem: str, suffix: str) -> None:
+    """Runs, and is killed before a file is safely on the disk."""
+    flush = writing._flush_to_disk
 
-writing._flush_to_disk = flushed
-run(Path(sys.argv[1]), checkpoint_every=0)
-"""
+    def flushed(written: Path) -> None:
+        if written.name.startswith(stem) and written.suffix == suffix:
+            os.kill(os.getpid(), signal.SIGKILL)
+        flush(written)
+
+    writing._flush_to_disk = flushed
+    run(path, checkpoint_every=0)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no process is killed there")
 @pytest.mark.parametrize(("stem", "suffix"), [(".point_cloud.", ".ply"), (".scene.", ".json")])
 def test_what_a_killed_run_left_half_written_goes(tmp_path: Path, stem: str, suffix: str) -> None:
-    subprocess.run([sys.executable, "-c", KILLED_AT, str(tmp_path / "run"), stem, suffix], check=False)
+    process = forked(killed_at, tmp_path / "run", stem, suffix)
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
     scene = tmp_path / "run" / "point_cloud" / "iteration_12"
     assert any(path.name.startswith(stem) for path in scene.iterdir())
     (tmp_path / "run" / ".checkpoint.0123456789ab.tmp.safetensors").touch()
@@ -99,12 +106,11 @@ def test_what_a_killed_run_left_half_written_goes(tmp_path: Path, stem: str, suf
 @pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupted_run_resumes_to_the_same_scene(tmp_path: Path, by: signal.Signals) -> None:
     before = signal.getsignal(by)
-    whole = run(tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "stopped", interrupt_at=5, by=by)
     assert load_checkpoint(RunDirectory(tmp_path / "stopped").checkpoint).step == 5
     resumed = run(tmp_path / "stopped", resume=True)
-    assert_same(whole.scene, resumed.scene)
+    assert_same(whole(), resumed.scene)
     assert signal.getsignal(by) is before
 
 
@@ -144,7 +150,7 @@ def test_nothing_is_lost_when_nobody_is_there_to_hear_it(gone: BaseException, as
     with pytest.raises(KeyboardInterrupt if asked and isinstance(gone, OSError) else type(gone)):
         Run(RECIPE, SETTINGS, directory, tiny_capture(), resume=False).to_the_end(listen)
     assert load_checkpoint(directory.checkpoint).step == 7
-    assert_same(run(tmp_path, resume=True).scene, run(tmp_path / "whole").scene)
+    assert_same(run(tmp_path, resume=True).scene, whole())
 
 
 def test_checkpoints_come_by_time_and_are_told(tmp_path: Path) -> None:
@@ -237,7 +243,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(tmp_path: Path) -> None:
         run(tmp_path, resume=True)
     assert directory.checkpoint.read_bytes() == before
     assert not list(tmp_path.glob("*.tmp*"))
-    assert_same(run(tmp_path, resume=True).scene, run(tmp_path / "whole").scene)
+    assert_same(run(tmp_path, resume=True).scene, whole())
 
 
 def test_a_disk_too_full_for_the_log_is_told(tmp_path: Path) -> None:
@@ -402,7 +408,7 @@ def test_a_photograph_that_cannot_be_read_any_more_costs_nothing(
         Run(RECIPE, SETTINGS, directory, dataset, checkpoint_every=math.inf).to_the_end(listen)
     step = load_checkpoint(directory.checkpoint).step
     assert step >= 5 and (kind is not InputError or f"step {step} is saved" in str(caught.value))
-    assert_same(run(directory.path, resume=True).scene, run(tmp_path / "whole").scene)
+    assert_same(run(directory.path, resume=True).scene, whole())
 
 
 class Unreadable:

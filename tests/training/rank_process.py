@@ -13,7 +13,8 @@ import runpy
 import socket
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,17 @@ def losses_of(messages: list[Message]) -> list[float]:
     return [message.loss for message in messages if isinstance(message, StepDone)]
 
 
+def forked(target: Callable[..., None], *arguments: Any) -> BaseProcess:
+    """A function in a process of its own that has imported everything, and computes on one thread."""
+    process = FORKS.Process(target=target, args=arguments)
+    with pytest.MonkeyPatch.context() as patch:
+        # The process that all are forked from reads them once.
+        patch.setenv("NUMBA_NUM_THREADS", "1")
+        patch.setenv("OMP_NUM_THREADS", "1")
+        process.start()
+    return process
+
+
 class ForkedRank:
     """`python -m ARGUMENTS` in a process that is forked, with the interface of `Popen`; what it says goes to files."""
 
@@ -63,12 +75,7 @@ class ForkedRank:
         self, arguments: list[str], environment: dict[str, str], said: Path, shorter: dict[str, Any] | None = None
     ) -> None:
         self.args, self._said = arguments, said
-        self._process = FORKS.Process(target=_become, args=(arguments, environment, said, shorter or {}))
-        with pytest.MonkeyPatch.context() as patch:
-            # The process that all are forked from reads them once.
-            patch.setenv("NUMBA_NUM_THREADS", "1")
-            patch.setenv("OMP_NUM_THREADS", "1")
-            self._process.start()
+        self._process = forked(_become, arguments, environment, said, shorter or {})
         self.kill = self._process.kill
 
     @property
