@@ -1,5 +1,5 @@
-"""Captures: photographs, poses, masks and points, in the formats that others write.
+"""Readers of captures: photographs, poses, masks and points in the formats of other programs.
 
-What cannot be used of a capture is an InputError, whose message names the file and says what to do; a capture or file
-that is not there is a FileNotFoundError.
+Unusable data raise an InputError whose message names the file and the remedy. A missing capture or file raises a
+FileNotFoundError.
 """

@@ -1,4 +1,4 @@
-"""Evidence of the axes of camera poses; with the wrong ones the scene lies behind every camera."""
+"""Check of the axis convention of camera poses; with the wrong one the scene lies behind every camera."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from glassplat.scene.panes import in_image
 
 Item = TypeVar("Item")
 LEAST_SEEN = 0.05
-"""Largest share that counts as nothing seen; stray points lie in front of some camera whatever the axes."""
+"""Largest share that counts as nothing seen; some stray points lie in front of a camera with either axes."""
 MOST_SEEN = 0.5
 MOST_CAMERAS, MOST_POINTS, MOST_MASKS = 64, 2000, 24
 LEAST_SIGHTINGS = 3
 LEAST_CROSSING = 1e-3
-"""Smallest eigenvalue of the mean of I - d d^T for which rays towards a pane are taken to cross."""
+"""Smallest eigenvalue of the mean of I - d d^T for which rays towards a pane count as crossing."""
 BOX_MARGIN = 0.5
-"""How far outside the box of a mask the pane's middle may lie, in sizes of the box; photographs cut panes off."""
+"""Tolerance around a mask's box for the pane's centre, in sizes of the box; photographs may crop panes."""
 
 
 @dataclass(frozen=True)
 class AxesEvidence:
-    """Evidence in the data for the direction in which the cameras look.
+    """Evidence in the data for the viewing direction of the cameras.
 
     Attributes:
-        as_read: share of the points that some camera sees, or of the masks that contain the middle of their pane.
-        flipped: the same for cameras whose y and z axes are turned round.
+        as_read: share of the points that some camera sees, or of the masks that contain their pane's centre.
+        flipped: the same share with the y and z axes of the cameras negated.
         source: "points" or "masks".
     """
 
@@ -41,17 +41,17 @@ class AxesEvidence:
 
     @property
     def contradicts(self) -> bool:
-        """Return whether the axes are wrong and the other ones right."""
+        """Return whether the axes as read are wrong and the flipped ones right."""
         return self.as_read < LEAST_SEEN and self.flipped > MOST_SEEN
 
     @property
     def fits_neither(self) -> bool:
-        """Return whether the poses make no sense with either axes."""
+        """Return whether the poses contradict the data with either axes."""
         return self.as_read < LEAST_SEEN and self.flipped < LEAST_SEEN
 
 
 class _Sighting(NamedTuple):
-    """One pane in one view: the middle of its pixels [2] and its box, both corners [2, 2], in pixels."""
+    """One pane in one view: the mean of its pixels [2] and the two corners of its box [2, 2], in pixels."""
 
     camera: Camera
     middle: Tensor
@@ -59,13 +59,13 @@ class _Sighting(NamedTuple):
 
 
 def axes_evidence(views: Sequence[View], measured: Tensor | None) -> AxesEvidence | None:
-    """Judges axes by masks, or by points where the masks say nothing; None where neither does.
+    """Evaluates the axes by masks, or by points if the masks are inconclusive; None without evidence.
 
-    Masks come first: in a room photographed all around, cameras that look the wrong way see as many points.
+    Masks take precedence: in a room photographed all around, flipped cameras see as many points.
 
     Args:
         views: the training views.
-        measured: [P, 3] points that were triangulated; None for random ones.
+        measured: [P, 3] triangulated points; None if the points are random.
     """
     evidence = evidence_of_masks(views)
     if evidence is not None or measured is None or not len(measured):
@@ -74,7 +74,7 @@ def axes_evidence(views: Sequence[View], measured: Tensor | None) -> AxesEvidenc
 
 
 def evidence_of_points(cameras: Sequence[Camera], points: Tensor) -> AxesEvidence:
-    """Judges axes by measured points [P, 3]: every one of them was seen by a camera."""
+    """Evaluates the axes by measured points [P, 3], each of which was visible to some camera."""
     some_cameras = [_double(camera) for camera in _spread(cameras, MOST_CAMERAS)]
     some_points = points[_indices(len(points), MOST_POINTS)].double()
     return AxesEvidence(
@@ -85,10 +85,10 @@ def evidence_of_points(cameras: Sequence[Camera], points: Tensor) -> AxesEvidenc
 
 
 def evidence_of_masks(views: Sequence[View]) -> AxesEvidence | None:
-    """Judges axes by annotated views: the rays through the middles of one pane's masks meet in the pane.
+    """Evaluates the axes by annotated views: rays through the centres of a pane's masks meet in the pane.
 
-    None where the views say nothing: fewer than three show any one pane, or their rays are parallel. At most 24
-    of the views are looked at.
+    None if the views are inconclusive: no pane is visible in three of them, or the rays are parallel. At most 24 views
+    are read.
     """
     annotated = _spread([view for view in views if view.is_annotated], MOST_MASKS)
     shares = [
@@ -108,7 +108,7 @@ def evidence_of_masks(views: Sequence[View]) -> AxesEvidence | None:
 
 
 def flip_axes(camera: Camera) -> Camera:
-    """The same camera with y and z turned round: what OpenGL axes are to OpenCV axes, and back."""
+    """The same camera with y and z negated: converts between OpenGL and OpenCV axes."""
     turn = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=camera.cam_from_world.dtype))
     return replace(camera, cam_from_world=turn @ camera.cam_from_world)
 
@@ -118,7 +118,7 @@ def _double(camera: Camera) -> Camera:
 
 
 def _indices(count: int, most: int) -> Tensor:
-    """At most so many of the indices below a count, evenly spread."""
+    """Up to `most` evenly spread indices below `count`."""
     return torch.linspace(0, count - 1, min(count, most), dtype=torch.float32).round().long()
 
 
@@ -127,7 +127,7 @@ def _spread(items: Sequence[Item], most: int) -> list[Item]:
 
 
 def _share_of_points(cameras: Sequence[Camera], points: Tensor) -> float:
-    """Share of the points that lie in the image of at least one camera."""
+    """Share of the points that project into the image of at least one camera."""
     seen = torch.zeros(len(points), dtype=torch.bool)
     for camera in cameras:
         seen |= in_image(points, camera)
@@ -135,7 +135,7 @@ def _share_of_points(cameras: Sequence[Camera], points: Tensor) -> float:
 
 
 def _sightings(views: Sequence[View]) -> dict[int, list[_Sighting]]:
-    """Every pane of every view, by label."""
+    """Sightings of all panes in all views, by label."""
     found: dict[int, list[_Sighting]] = {}
     for view in views:
         labels = view.pane_labels
@@ -153,7 +153,7 @@ def _flip_sighting(sighting: _Sighting) -> _Sighting:
 
 
 def _share_of_masks(sightings: Sequence[_Sighting]) -> float | None:
-    """Share of the views in whose mask the pane's middle lies, in front of the camera; None if no rays cross."""
+    """Share of the views whose mask contains the pane's centre, in front of the camera; None if no rays cross."""
     middle = _meeting_point(sightings)
     if middle is None:
         return None
@@ -166,7 +166,7 @@ def _share_of_masks(sightings: Sequence[_Sighting]) -> float | None:
 
 
 def _meeting_point(sightings: Sequence[_Sighting]) -> Tensor | None:
-    """[3] the point closest to the rays through the middles, on the rays or behind the cameras."""
+    """[3] the least-squares intersection of the lines through the mask centres; it may lie behind the cameras."""
     projectors, targets = [], []
     for camera, middle, _ in sightings:
         intrinsics = camera.intrinsics

@@ -1,4 +1,4 @@
-"""Cameras of a capture: lenses, distorted or not, as pinholes, and poses checked to be rigid."""
+"""Cameras of a capture: lens models, their conversion to pinholes, and checks that poses are rigid."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from glassplat.files.images import resize_by_area
 from glassplat.files.records import LARGEST_COORDINATE
 
 ORTHOGONALITY_TOLERANCE = 1e-2
-"""Largest entry of R R^T - I that passes as rounding in the file."""
+"""Largest entry of R R^T - I that is accepted as rounding in the file."""
 
 
 def rigid_pose(matrix: NDArray[np.float64], name: str) -> NDArray[np.float64]:
-    """The pose [4, 4] with its rotation made exactly orthogonal, its camera centre or origin unchanged.
+    """The pose [4, 4] with its rotation made exactly orthogonal and its translation column unchanged.
 
     Args:
         matrix: [4, 4] or [3, 4] rigid transform as read from a file.
-        name: photograph, for the message.
+        name: of the photograph, for messages.
     """
     if matrix.shape not in ((3, 4), (4, 4)):
         raise InputError(f"the pose of {name} has shape {list(matrix.shape)}; expected a 4x4 or 3x4 matrix")
@@ -44,7 +44,7 @@ def rigid_pose(matrix: NDArray[np.float64], name: str) -> NDArray[np.float64]:
 
 
 def _nearest_rotation(linear: NDArray[np.float64], name: str) -> NDArray[np.float64]:
-    """The rotation closest to a matrix that is one up to rounding."""
+    """The closest rotation to a matrix that is a rotation up to rounding."""
     deviation = float(np.abs(linear @ linear.T - np.eye(3)).max())
     determinant = float(np.linalg.det(linear))
     if deviation > ORTHOGONALITY_TOLERANCE or determinant < 0:
@@ -60,7 +60,7 @@ Interpolation = Literal["BILINEAR", "NEAREST_NEIGHBOR"]
 
 
 class ParameterCounts(NamedTuple):
-    """Numbers of parameters of each kind in a camera model; two for the principal point lie between them."""
+    """Numbers of parameters of a camera model, stored as focal lengths, principal point, extra coefficients."""
 
     focal: int
     extra: int
@@ -68,7 +68,7 @@ class ParameterCounts(NamedTuple):
 
     @property
     def total(self) -> int:
-        """All of them."""
+        """Number of all parameters."""
         return self.focal + self.middle + self.extra
 
 
@@ -92,28 +92,28 @@ PARAMETER_COUNTS = {
     "EUCM": ParameterCounts(2, 2),
     "EQUIRECTANGULAR": ParameterCounts(0, 2, middle=0),
 }
-"""COLMAP's camera models, in the order of their numbers in binary files."""
+"""COLMAP's camera models, in the order of their ids in binary files."""
 MODEL_OF_ID = dict(enumerate(PARAMETER_COUNTS))
 
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 PERSPECTIVE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-"""Models that are a pinhole when all their distortion coefficients are zero; a fisheye never is."""
+"""Models that reduce to a pinhole when all distortion coefficients are zero; fisheye models never do."""
 LARGEST_SIDE = 2**17
-"""Of an image, in pixels; no format that is read holds more."""
+"""Largest side of an image, in pixels; no supported format exceeds it."""
 SHORTEST_FOCAL, LONGEST_FOCAL = 1e-3, 1e5
-"""In sizes of the image; beyond lies no lens, and float32 cannot resolve what such a camera shows."""
+"""Bounds of focal lengths in image sizes; no lens exceeds them, and float32 could not resolve the image."""
 FARTHEST_CENTER = 1e3
-"""Of the principal point from the image, in sizes of the image; cropped photographs have it outside."""
+"""Largest principal point, in image sizes; in cropped photographs it lies outside the image."""
 LARGEST_COEFFICIENT = 1e6
-"""Of distortion; those of a calibration are below 100."""
+"""Largest distortion coefficient; those of real calibrations are below 100."""
 LEAST_SIDE = 8
-"""Of a photograph, in pixels; smaller ones are what a failed download or export leaves."""
+"""Smallest side of a photograph, in pixels; smaller files come from failed downloads or exports."""
 LEAST_BLANK = 1e-3
-"""Share of an undistorted image outside the photograph; below, it is rounding along the border."""
+"""Share of an undistorted image outside the photograph, below which it is rounding along the border."""
 BLANK_SIDE = 128
-"""Of the image on which that is measured, in pixels; a whole photograph takes seconds."""
+"""Side of the image on which this share is measured, in pixels; full resolution would take seconds."""
 MOST_SKEW = 0.05
-"""Relative deviation of a photograph's side from a scaled copy's, however few pixels that is."""
+"""Largest relative deviation of a photograph's side from that of a scaled copy, even if it is one pixel."""
 
 
 @dataclass(frozen=True)
@@ -138,11 +138,11 @@ class Lens:
     height: int
 
     def focal_lengths(self) -> tuple[float, float]:
-        """Along x and y, pixels; of a panorama there are none."""
+        """Focal lengths along x and y, pixels; undefined for equirectangular panoramas."""
         return self.parameters[0], self.parameters[PARAMETER_COUNTS[self.model].focal - 1]
 
     def rescale(self, width: int, height: int) -> Lens:
-        """The lens of the same photograph at another size."""
+        """The lens of the same photograph resized."""
         scale_x, scale_y = width / self.width, height / self.height
         counts, scaled = PARAMETER_COUNTS[self.model], list(self.parameters)
         if counts.focal == 1:
@@ -162,15 +162,15 @@ class Lens:
 
 
 LEAST_SHARE = 1e-4
-"""Share of a pixel below which an area that covers it is rounding."""
+"""Covered share of a pixel below which the coverage is rounding."""
 
 
 @dataclass(frozen=True)
 class PixelMap:
-    """Turns a photograph, or its mask, into the pixel grid of its pinhole camera: undistorts, then reduces.
+    """Maps a photograph, or its mask, to the pixel grid of its pinhole camera: undistorts, then downscales.
 
     Attributes:
-        lens: that of the photograph, at the photograph's size; None when it is a pinhole already.
+        lens: lens of the photograph, at the photograph's size; None if it is a pinhole already.
         width, height: size of the result.
     """
 
@@ -179,43 +179,43 @@ class PixelMap:
     height: int
 
     def photo(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """[H, W, 3] of the file to [height, width, 3]; bilinear undistortion, area-averaging reduction."""
+        """Maps [H, W, 3] of the file to [height, width, 3]: bilinear undistortion, then area averaging."""
         if self.lens is not None:
             pixels = undistort(pixels, self.lens.as_colmap())
         return area_resize(pixels, self.width, self.height)
 
     def labels(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """[H, W] of the photograph's size to [height, width]; the nearest pixel's label, no label in between."""
+        """Maps [H, W] at the photograph's size to [height, width] by the nearest pixel; labels are not blended."""
         if self.lens is not None:
             labels = undistort(labels, self.lens.as_colmap(), "NEAREST_NEIGHBOR")
         return nearest_resize(labels, self.width, self.height)
 
     def ignored(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """[H, W] of the photograph's size to [height, width]; 1 where any pixel that is averaged has a label."""
+        """Maps [H, W] at the photograph's size to [height, width]; 1 where any averaged pixel has a label."""
         if self.lens is not None:
             labels = undistort(labels, self.lens.as_colmap(), "NEAREST_NEIGHBOR")
         return self.reduce_labels(labels)
 
     def blank(self) -> NDArray[np.uint8]:
-        """[height, width]; 1 where any pixel that is averaged lies outside the photograph of the lens."""
+        """[height, width], 1 where any averaged pixel lies outside the distorted photograph."""
         return _blank_in(self)
 
     def reduce_labels(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """[H, W] of the undistorted size to [height, width]; 1 where any pixel that is averaged has a label."""
+        """Maps [H, W] at the undistorted size to [height, width]; 1 where any averaged pixel has a label."""
         if labels.shape == (self.height, self.width):
             return labels
         return (resize_by_area(labels > 0, self.width, self.height) > LEAST_SHARE).astype(np.uint8)
 
 
 def area_resize(pixels: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
-    """[H, W, 3] averaged over the area of each new pixel; rounded once, so that no bias builds up."""
+    """[H, W, 3] averaged over the area of each new pixel; rounded once, so that no bias accumulates."""
     if pixels.shape[:2] == (height, width):
         return pixels
     return np.clip(np.round(resize_by_area(pixels, width, height)), 0, 255).astype(np.uint8)
 
 
 def nearest_resize(labels: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
-    """[H, W] labels on another grid over the same image, each pixel taking what lies under its centre."""
+    """[H, W] labels resampled to another grid; each pixel takes the label under its centre."""
     rows = ((np.arange(height) + 0.5) * labels.shape[0] / height).astype(np.int64)
     columns = ((np.arange(width) + 0.5) * labels.shape[1] / width).astype(np.int64)
     return np.ascontiguousarray(labels[rows[:, None], columns[None, :]])
@@ -242,7 +242,7 @@ def make_lens(model: str, parameters: list[float], size: tuple[int, int]) -> Len
 
 
 def _check_parameters(lens: Lens) -> None:
-    """Refuse what no lens has; comparisons with NaN are false."""
+    """Refuse implausible parameters, including NaN, for which comparisons are false."""
     size = lens.width, lens.height
     longer, counts = max(size), PARAMETER_COUNTS[lens.model]
     bounds = [
@@ -260,12 +260,12 @@ def _check_parameters(lens: Lens) -> None:
 
 
 def _size_text(size: tuple[int, int]) -> str:
-    """Sizes of thousands of digits, which a text file may hold, cannot be printed."""
+    """Size for messages; text files may hold sizes of thousands of digits, which cannot be printed."""
     return "x".join(str(side) if abs(side) < 10**9 else "huge" for side in size)
 
 
 def lens_for_image(lens: Lens, size: tuple[int, int], name: str) -> Lens:
-    """The lens at the size of the image file; images reduced after calibration rescale it."""
+    """The lens at the size of the image file; rescaled if the image was resized after calibration."""
     width, height = size
     if min(size) < LEAST_SIDE:
         raise InputError(f"{name} is {width}x{height} pixels; expected at least {LEAST_SIDE} pixels along each side")
@@ -283,14 +283,14 @@ def lens_for_image(lens: Lens, size: tuple[int, int], name: str) -> Lens:
 
 
 def _skew(expected: float, side: int, rounding: float) -> float:
-    """Relative deviation of a side of the photograph; infinite where it is more than rounding."""
+    """Relative deviation of a side of the photograph; infinite if it exceeds rounding."""
     deviation = abs(expected - side)
     return math.inf if deviation > rounding else deviation / side
 
 
 @lru_cache(maxsize=1024)
 def pinhole_of(lens: Lens) -> tuple[Pinhole, bool]:
-    """The pinhole camera that replaces a lens, and whether photographs have to be undistorted for it."""
+    """The pinhole camera that replaces a lens, and whether photographs must be undistorted for it."""
     if _is_pinhole(lens.model, lens.parameters):
         first = PARAMETER_COUNTS[lens.model].focal
         cx, cy = lens.parameters[first : first + 2]
@@ -309,9 +309,9 @@ def pinhole_of(lens: Lens) -> tuple[Pinhole, bool]:
 
 @lru_cache(maxsize=1024)
 def blank_share(lens: Lens) -> float:
-    """Share of the undistorted image that shows nothing of the photograph; 0 where that is rounding along its border.
+    """Share of the undistorted image outside the photograph; 0 if it is only rounding along the border.
 
-    Strong barrel lenses have such parts, since COLMAP enlarges no image to more than twice its size.
+    Strong barrel distortion leaves blank parts, because COLMAP enlarges an image to at most twice its size.
     """
     if not pinhole_of(lens)[1]:
         return 0.0
@@ -323,13 +323,13 @@ def blank_share(lens: Lens) -> float:
 
 @lru_cache(maxsize=8)
 def _blank_in(pixel_map: PixelMap) -> NDArray[np.uint8]:
-    """`PixelMap.blank`, which takes as long as undistorting a photograph and is the same for all of a lens."""
+    """Cached `PixelMap.blank`: as slow as undistorting a photograph, and the same for all photographs of a lens."""
     shape = (pixel_map.height, pixel_map.width)
     return pixel_map.reduce_labels(blank_pixels(pixel_map.lens)) if pixel_map.lens else np.zeros(shape, np.uint8)
 
 
 def blank_pixels(lens: Lens) -> NDArray[np.uint8]:
-    """[H, W] of the undistorted image, 1 where it shows nothing of the photograph."""
+    """[H, W] of the undistorted image, 1 at pixels outside the photograph."""
     return (undistort(np.full((lens.height, lens.width), 255, np.uint8), lens.as_colmap()) < 255).astype(np.uint8)
 
 
@@ -341,12 +341,12 @@ def _is_pinhole(model: str, parameters: tuple[float, ...]) -> bool:
 
 
 def undistort(pixels: NDArray[np.uint8], lens: Any, interpolation: Interpolation = "BILINEAR") -> NDArray[np.uint8]:
-    """A photograph as the pinhole camera of `pycolmap.undistort_camera` shows it, which may have another size.
+    """A photograph as seen by the pinhole camera of `pycolmap.undistort_camera`, whose size may differ.
 
     Args:
         pixels: [H, W, 3] of the photograph, or [H, W].
         lens: its `pycolmap.Camera`.
-        interpolation: between pixels; the nearest one for labels.
+        interpolation: between pixels; nearest neighbour for labels.
     """
     options = library.pycolmap.UndistortCameraOptions()
     kinds = type(options.warp_options.interpolation)  # pycolmap gives this enumeration no public name.

@@ -1,4 +1,4 @@
-"""Result of a loader, before photographs, masks and splits are looked at."""
+"""Result of a loader, before photographs and masks are read and test views are chosen."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ HIGHEST_COLOR = 255
 
 @dataclass(frozen=True)
 class RawPoints:
-    """Coloured points in world space, as the files have them.
+    """Coloured points in world space, as stored in the files.
 
     Attributes:
-        positions: [P, 3] float32, world units; infinite where they were beyond float32.
+        positions: [P, 3] float32, world units; infinite where the stored value exceeds float32.
         colors: [P, 3] uint8 sRGB.
     """
 
@@ -35,7 +35,7 @@ class RawPoints:
     def from_arrays(positions: NDArray[Any], colors: NDArray[Any]) -> RawPoints:
         """Points from arrays of any real type.
 
-        Positions beyond float32 become infinite.
+        Positions that exceed float32 become infinite.
         """
         colors = np.asarray(colors)
         outside = ~((colors >= 0) & (colors <= HIGHEST_COLOR))
@@ -48,12 +48,12 @@ class RawPoints:
 
 @dataclass(frozen=True)
 class Shot:
-    """One posed photograph as the data set describes it, distorted or not.
+    """One posed photograph with its lens, which may be distorted.
 
     Attributes:
         name: unique name with suffix, `/` between folders.
         image_path: the file.
-        lens: of any model.
+        lens: of any camera model.
         cam_from_world: [4, 4] float64, OpenCV axes.
     """
 
@@ -65,18 +65,18 @@ class Shot:
 
 @dataclass(frozen=True)
 class Capture:
-    """All that one data format says about a capture.
+    """Contents of a capture as one data format describes it.
 
     Attributes:
-        shots: every photograph, or those for training when the data set ships a split.
-        test_shots: the photographs for testing; None leaves the split to the reader.
-        points: sparse points, or None where the data set has none.
+        shots: all photographs, or the training photographs if the data set ships a split.
+        test_shots: test photographs; None lets `load_dataset` choose the split.
+        points: sparse points; None if the data set has none.
         format_name: for messages, such as "COLMAP".
         warnings: full sentences.
-        random_points: how to place points when `points` is None; None takes the default.
-        masks: masks of panes by name of the photograph where the format fixes them; None looks for them by name.
-        kept: masks whose black is left out, by name of the photograph, where the format names them.
-        cut_out: transparent pixels of photographs are left out; otherwise a background shows there.
+        random_points: generator of points if `points` is None; None uses the default.
+        masks: pane masks by name of the photograph if the format specifies them; None finds them by file name.
+        kept: masks whose black pixels are ignored, by name of the photograph, if the format names them.
+        cut_out: transparent pixels of photographs are ignored; otherwise they show a background.
     """
 
     shots: tuple[Shot, ...]
@@ -91,4 +91,4 @@ class Capture:
 
 
 Loader = Callable[[Path], Capture | None]
-"""Reads a folder: None when it is not in the loader's format; raises `InputError` when it is, but broken."""
+"""Reads a folder; returns None if it is in another format, and raises `InputError` if it is broken."""

@@ -1,9 +1,9 @@
 """COLMAP captures: a sparse model, binary or text, next to a folder of images.
 
-With label images `panes/<photograph's stem>.png` for the annotated photographs only, this is also the layout for
-captures of transparent panes such as RTR's, whose own files were never published.
+With label images `panes/<stem of the photograph>.png` for annotated photographs only, this layout also suits captures
+of transparent panes such as RTR's, whose own files were never published.
 
-Models are read here: on a truncated file COLMAP's own reader reads garbage or does not come back.
+Models are parsed here, because COLMAP's own reader returns garbage or hangs on truncated files.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from glassplat.files.records import reading
 from glassplat.options import short_repr
 
 UNIT_TOLERANCE = 1e-2
-"""How far the length of a quaternion may be from one, as rounding in a text file."""
+"""Largest deviation of a quaternion's length from one, as rounding in a text file."""
 
-_OBSERVATION_BYTES = 24  # x, y as double and the id of a point
+_OBSERVATION_BYTES = 24  # x, y as doubles and the id of a point
 _TRACK_BYTES = 8  # id of an image, index of an observation
 
 
@@ -47,7 +47,7 @@ class ModelImage:
 
 @dataclass(frozen=True)
 class Model:
-    """A sparse reconstruction; `lenses` belong to camera ids."""
+    """A sparse reconstruction; `lenses` are keyed by camera id."""
 
     lenses: dict[int, Lens]
     images: tuple[ModelImage, ...]
@@ -55,7 +55,7 @@ class Model:
 
 
 def model_suffix(folder: Path) -> str | None:
-    """`.bin` or `.txt` when the folder holds a model of that kind; binary wins, as in COLMAP."""
+    """`.bin` or `.txt` if the folder holds a model of that kind; binary takes precedence, as in COLMAP."""
     for suffix in (".bin", ".txt"):
         if all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
             return suffix
@@ -63,7 +63,7 @@ def model_suffix(folder: Path) -> str | None:
 
 
 def read_model(folder: Path) -> Model:
-    """Read cameras, images and points, which may be stored in the other way; a folder without points gives none."""
+    """Read cameras, images and points; points may be in the other format (binary or text), or missing."""
     suffix = model_suffix(folder)
     if suffix is None:
         raise InputError(f"no COLMAP model in {folder}; expected cameras and images as .bin or .txt")
@@ -103,7 +103,7 @@ def _by_id(records: list[tuple[int, Any]], path: Path) -> dict[int, Any]:
 
 
 def _records_of(path: Path) -> list[Any]:
-    """Everything in one file of a model, with errors that name the file."""
+    """All records in one file of a model; errors name the file."""
     binary, text = PARSERS[path.stem]
     try:
         with reading(path):
@@ -180,13 +180,13 @@ def _binary_points(data: _Bytes) -> Iterator[tuple[float, ...]]:
 
 
 def _records(stream: Iterator[str]) -> Iterator[str]:
-    """Lines that are neither empty nor a comment."""
+    """Lines that are neither empty nor comments."""
     stripped = (line.strip() for line in stream)
     return (line for line in stripped if line and not line.startswith("#"))
 
 
 def _at_least(count: int, fields: list[str]) -> list[str]:
-    """The fields of a line, if they are so many."""
+    """The fields of a line; checks their minimum number."""
     if len(fields) < count:
         line = " ".join(fields)
         raise ValueError(f"the line {short_repr(line)}; expected at least {count} values, separated by spaces")
@@ -209,9 +209,9 @@ def _text_images(stream: Iterator[str]) -> Iterator[ModelImage]:
 
 
 def _check_observations(line: str, name: str) -> None:
-    """Check that a line of x, y and point follows an image; it is empty where the image has none.
+    """Check the line after an image: x, y and point id of each observation; empty if there are none.
 
-    Without it the next image would pass for the list, and be lost.
+    If it were missing, the next image would be read as the list, and be lost.
     """
     words = line.split()
     if len(words) % 3 or not (not words or words[-1].lstrip("-").isdigit()):
@@ -237,7 +237,7 @@ LOOKED_FOR = "a COLMAP model (cameras and images as .bin or .txt in sparse/0, sp
 
 
 def load_colmap(root: Path) -> Capture | None:
-    """Read a COLMAP capture with photographs in `images/`; None when there is no model."""
+    """Read a COLMAP capture with photographs in `images/`; None if there is no model."""
     folder = next((root / name for name in MODEL_FOLDERS if model_suffix(root / name)), None)
     if folder is None:
         return None
@@ -254,7 +254,7 @@ def load_colmap(root: Path) -> Capture | None:
 
 
 def _shots(root: Path, model: Model) -> tuple[Shot, ...]:
-    """Every registered image, with an error that counts what is missing."""
+    """All registered images; the error for missing photographs counts them."""
     images = root / "images"
     if not images.is_dir():
         raise InputError(
@@ -279,7 +279,7 @@ def _shots(root: Path, model: Model) -> tuple[Shot, ...]:
 
 
 def _names_on_disk(images: Path, names: list[str]) -> list[str]:
-    """The names as the folder spells them, where masks follow it: some programs of Macs take accents for letters."""
+    """The names as spelled on disk, where masks follow them; some macOS programs decompose accented letters."""
     if all(isfile(images / name) for name in names):
         return names
     spelled = {normalize("NFC", name): name for name in (p.relative_to(images).as_posix() for p in files_below(images))}
@@ -287,7 +287,7 @@ def _names_on_disk(images: Path, names: list[str]) -> list[str]:
 
 
 def _other_models(root: Path, used: Path) -> tuple[str, ...]:
-    """COLMAP splits what it cannot connect into several models; only one can be trained at a time."""
+    """Warning of further models: COLMAP splits what it cannot connect, and only one can be trained at a time."""
     sparse = root / "sparse"
     others = (
         sorted(p.name for p in sparse.iterdir() if p != used and p.is_dir() and model_suffix(p))
@@ -300,7 +300,7 @@ def _other_models(root: Path, used: Path) -> tuple[str, ...]:
 
 
 def _unread_frames(root: Path) -> tuple[str, ...]:
-    """A warning where there is a `transforms.json` as well, which may name another split."""
+    """Warning if there is also a `transforms.json`, which may define another split."""
     unread = [name for name in (WHOLE, TRAIN) if (root / name).is_file()]
     if not unread:
         return ()

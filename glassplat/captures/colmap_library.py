@@ -1,9 +1,9 @@
-"""pycolmap, when it is first asked for, and without what importing it does to the process.
+"""Lazy import of pycolmap, without its side effects on the process.
 
-Only finding out where photographs were taken, and taking the distortion of a lens out of them, need it: it is an extra.
+Only pose estimation and undistortion need pycolmap, so it is an extra.
 
-It installs a handler that answers SIGTERM, with which job schedulers and shut-downs end a process, like a crash: with a
-stack of its C++ functions. Whatever answered before does so again.
+Importing it installs a SIGTERM handler that prints a C++ stack trace as after a crash, although job schedulers and
+shutdowns end processes by this signal. The previous handler is restored.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MISSING = (
 
 
 def __getattr__(name: str) -> Any:
-    """`pycolmap`, which takes a tenth of a second to import."""
+    """Imports `pycolmap` on first access, which takes a tenth of a second."""
     if name != "pycolmap":
         raise AttributeError(f"module {__name__} has no attribute {name}")
     before = signal.getsignal(signal.SIGTERM)
@@ -31,7 +31,7 @@ def __getattr__(name: str) -> Any:
     except ImportError as error:
         raise InputError(MISSING) from error
 
-    # Only the main thread may say how signals are answered; None stands for what Python cannot restore.
+    # Only the main thread may install signal handlers; None is a handler that Python cannot restore.
     if before is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, before)
     globals()[name] = pycolmap
@@ -39,6 +39,6 @@ def __getattr__(name: str) -> Any:
 
 
 def quiet_pycolmap() -> None:
-    """Keeps pycolmap from printing; what matters of it is said in this package's own words."""
+    """Silences pycolmap's log; this package reports what matters itself."""
     logging = __getattr__("pycolmap").logging
     logging.minloglevel = int(logging.FATAL)

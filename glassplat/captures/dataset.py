@@ -1,4 +1,4 @@
-"""Photographs, poses, masks and points of one capture, whatever format they came in."""
+"""Photographs, poses, masks and points of one capture, independent of its format."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
 
 SAMPLES = 9
-"""Points along each side of a rectangle that are looked for in the photographs."""
+"""Sample points along each side of a rectangle, for testing its visibility in the photographs."""
 
 
 def given_planes(root: Path, cameras: Sequence[Camera]) -> Planes | None:
-    """The rectangles in a capture's own frame; None where it gives none.
+    """The pane rectangles that a capture provides, in its own frame; None if there are none.
 
     Args:
         root: the capture's folder.
-        cameras: its training cameras, each pane in the sight of one at least.
+        cameras: its training cameras; each pane must be visible to at least one.
     """
     path = root / PLANES
     if not lexists(path):
@@ -67,7 +67,7 @@ def given_planes(root: Path, cameras: Sequence[Camera]) -> Planes | None:
 
 
 def rectangle_points(plane: Planes) -> torch.Tensor:
-    """[P, 3] points spread evenly over the rectangle of one plane, its corners among them."""
+    """[P, 3] points spread evenly over the rectangle of one plane, including its corners."""
     (tangent,), (bitangent,) = plane.axes()
     steps = torch.linspace(-1, 1, SAMPLES, dtype=torch.float32)
     u, v = torch.meshgrid(steps, steps, indexing="ij")
@@ -87,17 +87,17 @@ TEST_EVERY = 8
 EXTENT_MARGIN = 1.1
 FARTHEST_ORIGIN = 1e4
 SAME_PLACE = 1e-6
-"""Cameras closer together than this share of their distance from the origin differ by rounding only."""
+"""Share of the cameras' distance from the origin below which distances between them are rounding."""
 NERFSTUDIO_POINTS = "colmap/sparse/0/points3D.bin"
-"""Where nerfstudio keeps the model that its poses are from."""
+"""Path of the COLMAP model from which nerfstudio takes its poses."""
 MUCH_BLANK = 0.01
-"""Share of an undistorted photograph outside what its lens saw, above which that is said."""
+"""Share of an undistorted photograph outside the field of view of its lens, above which a warning is given."""
 FEW_MASKS = 4
-"""Photographs whose masks are looked at while a capture is loaded."""
+"""Photographs whose masks are decoded while a capture is loaded."""
 MUCH_LEFT_OUT = 0.7
-"""Share of photographs that masks leave out, above which that is said."""
+"""Ignored share of the photographs above which a warning is given."""
 LEAST_RADIUS = 1e-9
-"""World units. The square of a smaller one is lost in float32."""
+"""Smallest radius of the cameras, world units; the square of a smaller one is lost in float32."""
 
 
 @dataclass(frozen=True)
@@ -105,20 +105,20 @@ class Dataset:
     """One capture, split for training and testing.
 
     Attributes:
-        root: the folder.
-        train: views to learn from, by name; at least two.
-        test: views held out, by name; may be empty.
+        root: folder of the capture.
+        train: training views, sorted by name; at least two.
+        test: held-out views, sorted by name; may be empty.
         points: sparse points in the capture's own frame.
         extent: 1.1 x the largest distance of a training camera from their mean; world units.
-        pane_labels: every label that occurs in the masks, ascending.
-        truth: folder of known layers and planes for evaluation, where the capture has one.
-        warnings: what was assumed or left out, full sentences.
-        split: how the test views were chosen.
-        measured_points: False if `points` are random ones, which carry no geometry.
-        background: sRGB that is seen through transparent photographs; None where none is, or where that is left out.
-        planes: panes that the capture gives as rectangles; their masks, if any, only refine them.
-        downscale: by how much the photographs were reduced.
-        mask_polarity: which value of black-and-white masks is the pane, as the reader was told.
+        pane_labels: all labels in the masks, ascending.
+        truth: folder of ground-truth layers and planes for evaluation; None if the capture has none.
+        warnings: assumptions and ignored data, in full sentences.
+        split: rule by which the test views were chosen.
+        measured_points: False if `points` are random and carry no geometry.
+        background: sRGB behind transparent pixels; None if there are no such pixels, or if they are ignored.
+        planes: panes that the capture provides as rectangles; their masks, if any, only refine them.
+        downscale: factor by which the photographs were reduced.
+        mask_polarity: which value of binary masks marks the pane, as given to the reader.
     """
 
     root: Path
@@ -138,17 +138,17 @@ class Dataset:
 
     @property
     def memory(self) -> Memory:
-        """Pixels of its views that were read."""
+        """Cache of the pixels of its views."""
         return self.train[0].memory
 
     @property
     def photograph_pixels(self) -> int:
-        """Pixels of a training photograph of median size."""
+        """Number of pixels of a training photograph of median size."""
         return median_low(view.camera.width * view.camera.height for view in self.train)
 
     @property
     def photograph_bytes(self) -> int:
-        """Memory that all training photographs take."""
+        """Memory required by all training photographs, in bytes."""
         return sum(3 * view.camera.width * view.camera.height for view in self.train)
 
     def __repr__(self) -> str:
@@ -166,18 +166,18 @@ def load_dataset(
     mask_polarity: Polarity = "auto",
     memory: float | None = None,
 ) -> Dataset:
-    """Read a capture: COLMAP, Mirror-NeRF, or transforms.json in any of its dialects; photographs are read later.
+    """Read a capture: COLMAP, Mirror-NeRF, or transforms.json in any dialect; photographs are decoded later.
 
     Args:
         root: the capture's folder.
         downscale: photographs are reduced by this factor, at least 1.
-        background: sRGB in [0, 1], seen through transparent pixels; those of COLMAP captures are left out instead.
-        mask_polarity: which value of black-and-white masks is the pane.
-        memory: gigabytes of photographs that stay in memory; a quarter of what the machine has if not given.
+        background: sRGB in [0, 1] behind transparent pixels; COLMAP captures ignore these pixels instead.
+        mask_polarity: which value of binary masks marks the pane.
+        memory: gigabytes of photographs kept in memory; a quarter of the machine's memory if not given.
 
     Raises:
         FileNotFoundError: no such folder.
-        InputError: a format that is not known, or a capture that cannot be used; the message says why.
+        InputError: unknown format, or unusable capture; the message gives the reason.
     """
     check_downscale(downscale)
     files = read_capture(root, mask_polarity=mask_polarity)
@@ -185,13 +185,13 @@ def load_dataset(
 
 
 def check_dataset(dataset: Dataset) -> None:
-    """Refuse what is no data set, such as the path of one, with an InputError."""
+    """Raise an InputError for anything but a `Dataset`, such as a path."""
     if not isinstance(dataset, Dataset):
         raise InputError(f"dataset is {dataset!r}; expected what `glassplat.load_dataset` returns for a capture")
 
 
 def check_downscale(downscale: float) -> None:
-    """Refuse a factor that reduces nothing."""
+    """Raise an InputError for a factor below 1 or not finite."""
     if not math.isfinite(downscale) or downscale < 1:
         raise InputError(f"downscale is {downscale}; expected a number of at least 1")
 
@@ -199,7 +199,7 @@ def check_downscale(downscale: float) -> None:
 def dataset_of(
     files: CaptureFiles, *, downscale: float = 1.0, background: Rgb = WHITE, memory: float | None = None
 ) -> Dataset:
-    """Make a `Dataset`, as `load_dataset` does, of a capture whose folder was read."""
+    """Make a `Dataset`, as `load_dataset` does, from a capture that `read_capture` read."""
     check_downscale(downscale)
     root, capture, shots, masks = files.root, files.capture, files.shots, files.masks
     with input_checked():
@@ -253,14 +253,14 @@ def dataset_of(
 
 
 def _in_one_memory(views: list[View], gigabytes: float | None) -> list[View]:
-    """The views, which share a memory of a budget; the machine's share if none is given."""
+    """The views with one shared memory of the given budget; by default a share of the machine's memory."""
     largest = max((view.camera.width * view.camera.height for view in views), default=0)
     shared = Memory(None if gigabytes is None else gigabytes * GIGABYTE, largest=largest)
     return [replace(view, memory=shared) for view in views]
 
 
 def _check_axes(train: tuple[View, ...], points: PointCloud | None, format_name: str) -> None:
-    """Refuse poses with which everything lies behind the cameras, where turning them round would mend that."""
+    """Raise an InputError if the scene lies behind the cameras, but in front of them with flipped axes."""
     evidence = axes_evidence(train, None if points is None else points.positions)
     if evidence is not None and evidence.contradicts:
         raise InputError(
@@ -272,7 +272,7 @@ def _check_axes(train: tuple[View, ...], points: PointCloud | None, format_name:
 
 
 def _split_views(views: list[View], capture: Capture) -> tuple[tuple[View, ...], tuple[View, ...], str]:
-    """Training views, test views (both by name) and how they were chosen."""
+    """Training views, test views (both sorted by name) and a description of the split."""
     if capture.test_shots is None:
         held_out = {view.name for view in views[::TEST_EVERY]}
         split = f"every {TEST_EVERY}th image by name"
@@ -290,7 +290,7 @@ def _split_views(views: list[View], capture: Capture) -> tuple[tuple[View, ...],
 
 
 def _extent(train: tuple[View, ...]) -> float:
-    """1.1 x the radius of the training cameras about their mean; world units."""
+    """1.1 x the largest distance of a training camera from their mean; world units."""
     centers = torch.stack([view.camera.center.double() for view in train])
     radius = float((centers - centers.mean(0)).norm(dim=1).max())
     if radius <= max(SAME_PLACE * float(centers.norm(dim=1).max()), LEAST_RADIUS):
@@ -299,7 +299,7 @@ def _extent(train: tuple[View, ...]) -> float:
 
 
 def _far_off(train: tuple[View, ...], extent: float) -> tuple[str, ...]:
-    """A warning when coordinates are so large that float32 cannot resolve the scene."""
+    """Warning if coordinates are too large for float32 to resolve the scene."""
     distance = float(train[0].camera.center.norm())
     if distance <= FARTHEST_ORIGIN * extent:
         return ()
@@ -317,7 +317,7 @@ def _points(root: Path, capture: Capture, train: tuple[View, ...]) -> tuple[Poin
             f"The {capture.format_name} capture has no points; {len(points)} random points are used instead.{unread}"
         ]
     found = PointCloud.of(capture.points)
-    # Where a coordinate is NaN, the comparison is false.
+    # Comparisons with NaN are false.
     usable = (found.positions.abs() <= LARGEST_COORDINATE).all(dim=1)
     if usable.all():
         return found, []
@@ -328,7 +328,7 @@ def _points(root: Path, capture: Capture, train: tuple[View, ...]) -> tuple[Poin
 
 
 def _unread_points(path: Path) -> str:
-    """Sentence on the points of a COLMAP model that lies in a capture of nerfstudio, if it does."""
+    """Advice on the points of the COLMAP model in a nerfstudio capture; empty if there is no such model."""
     if not path.is_file():
         return ""
     folder = path.parents[2]
@@ -339,7 +339,7 @@ def _unread_points(path: Path) -> str:
 
 
 def _view_warnings(prepared: list[PreparedView], background: Rgb | None) -> list[str]:
-    """Assumptions about photographs, once for all of them."""
+    """Warnings of assumptions about photographs, one for all of them."""
     warnings = []
     rescaled = [p.view.name for p in prepared if p.rescaled]
     if rescaled:
@@ -353,7 +353,7 @@ def _view_warnings(prepared: list[PreparedView], background: Rgb | None) -> list
 
 
 def _blank_warnings(shots: Sequence[Shot]) -> list[str]:
-    """A warning when undistorted photographs have large parts outside what the lens saw."""
+    """Warning if large parts of undistorted photographs lie outside the field of view of the lens."""
     share = max(blank_share(shot.lens) for shot in shots)
     if share <= MUCH_BLANK:
         return []
@@ -364,7 +364,7 @@ def _blank_warnings(shots: Sequence[Shot]) -> list[str]:
 
 
 def _mask_warnings(files: CaptureFiles) -> list[str]:
-    """A warning when masks leave out most of the photographs; decodes only a few of them."""
+    """Warning if masks exclude most of the photographs; decodes only a few masks."""
     names = evenly(sorted(files.ignored), FEW_MASKS)
     shares = [left_out_share(files.ignored[name]) for name in names]
     share = sum(shares) / max(len(shares), 1) * len(files.ignored) / len(files.shots)
@@ -378,13 +378,13 @@ def _mask_warnings(files: CaptureFiles) -> list[str]:
 
 @torch.no_grad()
 def with_corrected_cameras(dataset: Dataset, scene: Scene) -> Dataset:
-    """The capture with the cameras of its photographs corrected as the scene says; itself where nothing is.
+    """The capture with the scene's pose corrections applied; the same object if there are none.
 
-    Nobody has looked where the cameras of test views are: they move as those of the photographs before and after them.
+    Test views have no corrections of their own: theirs are interpolated from the neighbouring photographs by name.
 
     Args:
         dataset: as it was read.
-        scene: whose `poses` were learned on it.
+        scene: its `poses` were optimised on this capture.
     """
     if not len(scene.poses):
         return dataset
@@ -397,20 +397,19 @@ def with_corrected_cameras(dataset: Dataset, scene: Scene) -> Dataset:
 
 
 def detached_camera(camera: Camera) -> Camera:
-    """The camera in memory, cut off from the autograd graph."""
+    """The camera on the CPU, detached from the autograd graph."""
     return replace(camera, cam_from_world=camera.cam_from_world.detach().cpu())
 
 
 @contextmanager
 def photographs_read(dataset: Dataset) -> Iterator[Callable[[], None]]:
-    """Reads photographs in a thread as long as the context lasts, one after the other.
+    """Read photographs in a background thread while the context lasts, one after the other.
 
-    Those for testing come first: nothing else would read them before training has ended. They are forgotten again;
-    training photographs are read as long as there is room in memory, where training wants them anyway. The others are
-    read ahead of their step.
+    Test photographs come first, to find unreadable ones before training ends, and are not kept. Training photographs
+    follow until memory is full, because training needs them there anyway. The rest is read ahead of its step.
 
     Yields:
-        A function that does nothing, or raises the InputError of a photograph that could not be read.
+        A function that raises the InputError of a photograph that could not be read, and otherwise does nothing.
     """
     stop = Event()
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="photographs") as pool:

@@ -1,4 +1,4 @@
-"""A capture's folder in any format, read without PyTorch, before any photograph is."""
+"""Reader of capture folders in any format, without PyTorch and without decoding photographs."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ LOADERS: tuple[tuple[Loader, str], ...] = (
     (mirror_nerf.load_mirror_nerf, mirror_nerf.LOOKED_FOR),
     (transforms.load_transforms, transforms.LOOKED_FOR),
 )
-"""Tried in this order; each with what it looks for, for the message when none fits."""
+"""Loaders in the order of trial, each with a description of its format for the message when none fits."""
 
 
 @dataclass(frozen=True)
 class CaptureFiles:
-    """A capture of which all is known but what its photographs show.
+    """A capture before its photographs are decoded.
 
     Attributes:
-        root: the folder.
-        capture: what its format says.
-        shots: all photographs, by name.
-        masks: where the panes are, by name of the photograph, and their labels.
-        ignored: masks of what is not to be learned, by name of the photograph; several for some.
-        mask_polarity: which value of black-and-white masks is the pane, as the reader was told.
+        root: folder of the capture.
+        capture: contents read by the loader of its format.
+        shots: all photographs, sorted by name.
+        masks: pane masks by name of the photograph, and their labels.
+        ignored: masks of pixels to ignore, by name of the photograph; some photographs have several.
+        mask_polarity: which value of binary masks marks the pane, as given to the reader.
     """
 
     root: Path
@@ -45,7 +45,7 @@ class CaptureFiles:
     mask_polarity: Polarity
 
     def __str__(self) -> str:
-        """One line about the capture."""
+        """One-line summary of the capture."""
         points = "no" if self.capture.points is None else len(self.capture.points)
         masks = len(self.masks.masks)
         return (
@@ -59,13 +59,13 @@ def read_capture(root: Path | str, *, mask_polarity: Polarity = "auto") -> Captu
 
     Args:
         root: the capture's folder.
-        mask_polarity: which value of black-and-white masks is the pane.
+        mask_polarity: which value of binary masks marks the pane.
     """
     return with_masks(read_poses(root), mask_polarity)
 
 
 def read_poses(root: Path | str) -> CaptureFiles:
-    """Read a capture as `read_capture` does, but look for no masks."""
+    """Read a capture as `read_capture` does, but without masks."""
     root = Path(root)
     if not is_encodable(whole := str(root.resolve())):  # Runs record it.
         raise InputError(f"the path {readable_name(whole)} is not valid UTF-8; rename the folders in it")
@@ -77,7 +77,7 @@ def read_poses(root: Path | str) -> CaptureFiles:
 
 
 def with_masks(files: CaptureFiles, mask_polarity: Polarity = "auto") -> CaptureFiles:
-    """A capture of which the poses were read, with its masks."""
+    """Add the masks to a capture whose poses were read."""
     photographs = {shot.name: shot.image_path for shot in files.shots}
     capture = files.capture
     found = find_masks(files.root, photographs, mask_polarity, panes=capture.masks, kept=capture.kept)
@@ -85,7 +85,7 @@ def with_masks(files: CaptureFiles, mask_polarity: Polarity = "auto") -> Capture
 
 
 def _load_capture(root: Path) -> Capture:
-    """The answer of the first loader that knows the format."""
+    """The capture from the first loader that recognises the format."""
     check_capture_folder(root)
     for load, _ in LOADERS:
         capture = load(root)

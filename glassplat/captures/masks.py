@@ -1,10 +1,10 @@
-"""Masks of panes (`panes/`) and of what is left out (`masks/`, `ignore/`): their files and what their values mean.
+"""Masks of panes (`panes/`) and of ignored pixels (`masks/`, `ignore/`): their files and the meaning of values.
 
-A mask of panes is either a label image (0 no pane, 1..K the pane) or binary (0 and 255, or one bit; one pane). Binary
-masks come in both polarities; which one is decided over the whole set, because one mask alone cannot tell.
+A pane mask is either a label image (0 no pane, 1..K the pane) or binary (0 and 255, or one bit; one pane). Binary masks
+come in both polarities; the polarity is decided from the whole set, because one mask alone is ambiguous.
 
-Masks in `masks/`, or `x_mask.png` next to a photograph `x.png`, mean what they mean in COLMAP, nerfstudio, Brush,
-3DGRUT and LichtFeld: what is black is left out. Earlier versions kept panes there; such captures are read as they were.
+Masks in `masks/`, or `x_mask.png` next to a photograph `x.png`, follow COLMAP, nerfstudio, Brush, 3DGRUT and LichtFeld:
+black pixels are ignored. Earlier versions stored pane masks there; such captures are still read that way.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files import images
 
 HIGHEST_LABEL = 64
-"""Grey values up to this one are labels when nothing brighter occurs; no one paints masks for the eye that dark."""
+"""Grey values up to this one are labels if none is brighter; masks painted for viewing are never that dark."""
 THRESHOLD = 128
 WHITE = 255
 SOFT_SHARE = 0.05
 """Largest share of grey pixels at the edges of a black-and-white mask."""
 FEW_SHADES = 4
-"""An antialiased edge has more shades of grey than this; fewer are labels somebody meant."""
+"""Minimum number of greys of an antialiased edge; fewer are intended labels."""
 LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
 LOSSY_NOISE = 24
 SIXTEEN_TO_EIGHT = 257
@@ -38,7 +38,7 @@ SIXTEEN_TO_EIGHT = 257
 
 @dataclass(frozen=True)
 class MaskValues:
-    """One understood mask.
+    """One interpreted mask.
 
     Attributes:
         kind: `labels` for pane labels, `binary` for black (0) and white (1), `empty` for all black.
@@ -62,7 +62,7 @@ def read_mask_values(path: Path) -> MaskValues:
 
 
 def read_mask_at_threshold(path: Path) -> MaskValues:
-    """Read one mask file of a format that is known to split its greys at one half; label images stay as they are."""
+    """Read one mask file of a format that thresholds greys at one half; label images are unchanged."""
     shades = _read_shades(path)
     if path.suffix.lower() not in LOSSY_SUFFIXES and not (shades > HIGHEST_LABEL).any():
         return MaskValues("labels" if shades.any() else "empty", shades)
@@ -71,7 +71,7 @@ def read_mask_at_threshold(path: Path) -> MaskValues:
 
 
 def _read_shades(path: Path) -> NDArray[np.uint8]:
-    """[H, W] grey values, or the indices of a palette that shows labels in colours; transparency goes before them."""
+    """[H, W] grey values, or palette indices of labels shown in colours; transparency takes precedence."""
     image = _open_mask(path)
     if image.mode in images.SHADES_16:
         return _in_eight_bits(np.array(image), path)
@@ -82,16 +82,16 @@ def _read_shades(path: Path) -> NDArray[np.uint8]:
 
 
 def _open_mask(path: Path) -> Image.Image:
-    """The mask; where any pixel is transparent, white on those that are opaque by half and black elsewhere."""
+    """The mask; if any pixel is transparent, its opacity thresholded at one half as white and black."""
     with input_checked():
         image = images.open_image(path)
         opaque = None if image.mode in images.SHADES_16 else images.opacity(image)
-    image.info.pop("transparency", None)  # Pillow warns of some ways to store it.
+    image.info.pop("transparency", None)  # Pillow warns about some encodings of it.
     return image if opaque is None else Image.fromarray(np.where(opaque < THRESHOLD, 0, WHITE).astype(np.uint8))
 
 
 def _in_eight_bits(values: NDArray[np.integer], path: Path) -> NDArray[np.uint8]:
-    """Labels as they are, and shades of sixteen bits as those of eight that they stand for."""
+    """Labels unchanged, and sixteen-bit greys converted to eight bits."""
     most = int(values.max())
     if most <= WHITE:
         return values.astype(np.uint8)
@@ -104,9 +104,9 @@ def _in_eight_bits(values: NDArray[np.integer], path: Path) -> NDArray[np.uint8]
 
 
 def _palette_shades(indices: NDArray[np.uint8], colors: NDArray[np.uint8], path: Path) -> NDArray[np.uint8]:
-    """Greys where all are; 0 and 255 for black and one colour, where 0 is not black; else the indices of a palette."""
+    """Greys of a grey palette; 0 and 255 for black and one colour, if index 0 is not black; else the indices."""
     if not np.ptp(colors, axis=2).any():
-        return colors[:, :, 0]  # Programs that shrink PNGs make such palettes, in which an index means nothing.
+        return colors[:, :, 0]  # PNG optimisers make such palettes, whose indices have no meaning.
     lit = colors.max(axis=2) > 0
     colored_zero = bool(lit[indices == 0].any())
     if (colored_zero or indices.all()) and not lit.all() and len(np.unique(indices)) == 2:
@@ -122,7 +122,7 @@ def _palette_shades(indices: NDArray[np.uint8], colors: NDArray[np.uint8], path:
 def _one_colour(pixels: NDArray[np.uint8], path: Path) -> NDArray[np.uint8]:
     """Grey values of an RGB mask: black against one colour."""
     bright = (pixels >= THRESHOLD).view(np.uint8)
-    mixtures = bright[..., 0] << 2 | bright[..., 1] << 1 | bright[..., 2]  # As bytes: a large mask takes gigabytes.
+    mixtures = bright[..., 0] << 2 | bright[..., 1] << 1 | bright[..., 2]  # As bytes: wider integers take gigabytes.
     if ((mixtures > 0) & (mixtures < mixtures.max())).any():
         raise InputError(
             f"{path} is painted in several colours; expected a label image (grey, 0 no pane, 1..K the pane)"
@@ -131,7 +131,7 @@ def _one_colour(pixels: NDArray[np.uint8], path: Path) -> NDArray[np.uint8]:
 
 
 def _check_black_and_white(counts: NDArray[np.int64], path: Path, lossy: bool) -> None:
-    """Refuse greys that could be labels or a photograph; `counts` holds the pixels of each value."""
+    """Refuse greys that could be labels or a photograph; `counts` is the histogram."""
     tolerance = LOSSY_NOISE if lossy else 0
     grey = counts[tolerance + 1 : WHITE - tolerance]
     few = not lossy and 0 < np.count_nonzero(grey) < FEW_SHADES
@@ -150,17 +150,17 @@ FRAMED_BY_PANE = 0.8
 MOSTLY_PANE = 0.5
 
 Polarity = Literal["auto", "bright", "dark"]
-"""Which value of binary masks is the pane; `auto` decides by what lies along the image borders."""
+"""Value of binary masks that marks the pane; `auto` decides by the values along the image borders."""
 
 
 @dataclass(frozen=True)
 class PaneMask:
-    """One mask file and how to read it.
+    """One mask file and its interpretation.
 
     Attributes:
         path: the file.
-        inverted: dark pixels are the pane.
-        read: what the stored values mean.
+        inverted: dark pixels mark the pane.
+        read: interprets the stored values.
     """
 
     path: Path
@@ -168,13 +168,13 @@ class PaneMask:
     read: Callable[[Path], MaskValues] = read_mask_values
 
     def labels(self) -> NDArray[np.uint8]:
-        """[H, W] pane label of every pixel of the file, 0 for no pane."""
+        """[H, W] pane label of each pixel of the file, 0 for no pane."""
         return _labels(self.read(self.path), self.inverted)
 
 
 @dataclass(frozen=True)
 class MaskSet:
-    """The masks of a capture by name of the photograph, all labels in them, and what the user should know."""
+    """The masks of a capture by name of the photograph, all their labels, and warnings for the user."""
 
     masks: Mapping[str, PaneMask]
     labels: tuple[int, ...] = ()
@@ -183,10 +183,10 @@ class MaskSet:
 
 @dataclass(frozen=True)
 class KeepMask:
-    """A mask file whose black pixels are left out: below one half, or zero where nothing is brighter than a label.
+    """A mask file whose black pixels are ignored: below one half, or zero if no value exceeds the highest label.
 
     Attributes:
-        path: the file; its transparency counts in place of its colours where any pixel is transparent.
+        path: the file; if any pixel is transparent, opacity is used in place of colour.
     """
 
     path: Path
@@ -199,7 +199,7 @@ class KeepMask:
 
 @dataclass(frozen=True)
 class CutOut:
-    """A photograph whose transparent pixels, those below one half, are left out.
+    """A photograph whose transparent pixels (opacity below one half) are ignored.
 
     Attributes:
         path: the photograph.
@@ -217,21 +217,21 @@ class CutOut:
 
 
 IgnoredMask = CutOut | KeepMask | PaneMask
-"""A mask whose `labels()` are above zero on what is not to be learned."""
+"""A mask whose `labels()` are above zero on pixels to ignore."""
 
 
 def left_out_share(masks: Sequence[IgnoredMask]) -> float:
-    """Share of a photograph that the one of its masks leaves out that leaves out most."""
+    """Largest share of a photograph that any one of its masks excludes."""
     return max(float((mask.labels() > 0).mean()) for mask in masks)
 
 
 @dataclass(frozen=True)
 class CaptureMasks:
-    """Panes and left-out pixels of a capture, by mask file.
+    """Masks of panes and of ignored pixels of a capture.
 
     Attributes:
-        panes: where the panes are.
-        ignored: what is not to be learned, by name of the photograph; a photograph may have two masks of it.
+        panes: masks of panes.
+        ignored: masks of pixels to ignore, by name of the photograph; a photograph may have two.
     """
 
     panes: MaskSet
@@ -246,24 +246,24 @@ def find_masks(
     panes: Mapping[str, Path] | None = None,
     kept: Mapping[str, Path] | None = None,
 ) -> CaptureMasks:
-    """Find and understand the masks of a capture.
+    """Find and interpret the masks of a capture.
 
-    Panes are in `panes/`; what is black in `masks/`, or above black in `ignore/`, is left out. In each folder is looked
-    for, for a photograph `a/x.jpg`: `a/x.png`, `a/x.jpg.png`, `a/x.jpg` and `a/x_mask.png`, each with any image suffix
-    and without the folder where that is unique; and for masks also `x_mask.png` next to the photograph, unless that is
-    a photograph of the capture. Where names are alike, `mask_paths` has one for each; and a name with its folder goes
-    before one without.
+    Panes are in `panes/`; pixels that are black in `masks/`, or above black in `ignore/`, are ignored. For a photograph
+    `a/x.jpg`, each folder is searched for `a/x.png`, `a/x.jpg.png`, `a/x.jpg` and `a/x_mask.png`, with any image
+    suffix, and without the folder `a/` if unambiguous. Masks may also be `x_mask.png` next to the photograph, unless
+    that is a photograph of the capture. If names collide, `mask_paths` gives a unique one; names with a folder take
+    precedence.
 
     Args:
         root: the capture's folder.
         photographs: path of every photograph by name.
-        polarity: which value of binary masks is the pane.
-        panes: masks of panes where the format says which they are, white on the pane; `masks/` is theirs then.
-        kept: masks of what is kept where the format names them; they go before those found by name.
+        polarity: which value of binary masks marks the pane.
+        panes: pane masks specified by the format, white on the pane; `masks/` then holds pane masks only.
+        kept: masks of pixels to keep named by the format; they take precedence over those found by name.
     """
     ignored = find_ignored(root, photographs)
     if panes is not None:
-        # Of a format that says which file belongs to which photograph; greys are split at one half.
+        # The format assigns files to photographs, and thresholds greys at one half.
         known = _understood(root, panes, "bright" if polarity == "auto" else polarity, read_mask_at_threshold)
         return CaptureMasks(known, _join_masks(kept or {}, ignored))
     paths = _match(root / PANE_FOLDER, photographs)
@@ -285,7 +285,7 @@ def find_masks(
 def _found_masks(
     root: Path, photographs: Mapping[str, Path], named: Set[str]
 ) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """Masks in `masks/` and next to the photographs but those that the format names; a warning if some are nobody's."""
+    """Masks in `masks/` and next to photographs, except those named by the format; a warning on unmatched ones."""
     unmatched: list[str] = []
     masks = _match(root / MASK_FOLDER, photographs, beside=_beside, unmatched=unmatched, named=named)
     if not unmatched:
@@ -299,7 +299,7 @@ def _found_masks(
 
 
 def _why_panes(root: Path, masks: Mapping[str, Path], *, marked: bool) -> str | None:
-    """Sentence on why masks in `masks/` are taken for panes; None where they are not."""
+    """Sentence on why masks in `masks/` are treated as pane masks; None if they are not."""
     highest = next((value for value in map(_highest_value, masks.values()) if value), 0)
     labels = 0 < highest <= HIGHEST_LABEL
     if marked:
@@ -317,7 +317,7 @@ def _why_panes(root: Path, masks: Mapping[str, Path], *, marked: bool) -> str | 
 
 
 def _highest_value(path: Path) -> int:
-    """The highest shade of a mask."""
+    """The highest grey value of a mask."""
     brightest = int(_brightness(path).max())
     if path.suffix.lower() in LOSSY_SUFFIXES:
         return int(brightest > LOSSY_NOISE) * WHITE
@@ -325,7 +325,7 @@ def _highest_value(path: Path) -> int:
 
 
 def _brightness(path: Path) -> NDArray[np.uint8]:
-    """[H, W] how bright a mask is, or how opaque where it has transparent pixels."""
+    """[H, W] brightness of a mask, or its thresholded opacity if it has transparent pixels."""
     image = _open_mask(path)
     if image.mode in images.SHADES_16:
         return _in_eight_bits(np.array(image), path)
@@ -333,7 +333,7 @@ def _brightness(path: Path) -> NDArray[np.uint8]:
 
 
 def _join_masks(kept: Mapping[str, Path], ignored: Mapping[str, PaneMask]) -> dict[str, tuple[IgnoredMask, ...]]:
-    """All masks of what is left out, by name of the photograph."""
+    """All masks of ignored pixels, by name of the photograph."""
     joined: dict[str, tuple[IgnoredMask, ...]] = {name: (KeepMask(path),) for name, path in kept.items()}
     for name, mask in ignored.items():
         joined[name] = (*joined.get(name, ()), mask)
@@ -343,7 +343,7 @@ def _join_masks(kept: Mapping[str, Path], ignored: Mapping[str, PaneMask]) -> di
 def find_ignored(root: Path, photographs: Mapping[str, Path]) -> Mapping[str, PaneMask]:
     """The masks in `ignore/`, by name of the photograph.
 
-    Every value above black is ignored; what that is, whether a passer-by or a car, does not matter.
+    Pixels of any value above black are ignored; the value itself, such as a class index, does not matter.
 
     Args:
         root: the capture's folder.
@@ -358,7 +358,7 @@ def find_ignored(root: Path, photographs: Mapping[str, Path]) -> Mapping[str, Pa
 def _understood(
     root: Path, paths: Mapping[str, Path], polarity: Polarity, read: Callable[[Path], MaskValues]
 ) -> MaskSet:
-    """Reads all masks once, for what only the whole set can tell."""
+    """Reads all masks once, to decide kind, polarity and labels from the whole set."""
     values = {name: read(path) for name, path in paths.items()}
     _check_same_kind(values, paths)
     inverted, warnings = _decide_polarity(list(values.values()), polarity)
@@ -381,7 +381,7 @@ def _labels(values: MaskValues, inverted: bool) -> NDArray[np.uint8]:
 
 
 def _present(labels: NDArray[np.uint8]) -> set[int]:
-    """The labels above zero that occur."""
+    """The labels above zero that are present."""
     return {int(label) for label in np.flatnonzero(np.bincount(labels.ravel())) if label > 0}
 
 
@@ -393,9 +393,9 @@ def _match(
     unmatched: list[str] | None = None,
     named: Set[str] = frozenset(),
 ) -> dict[str, Path]:
-    """Mask path by name of the photograph, in the order of the names; in the folder, or next to the photographs.
+    """Mask path by name of the photograph, sorted by name; in the folder, or next to the photographs.
 
-    What belongs to no photograph is appended to `unmatched`, or refused; files of the paths `named` are passed over.
+    Masks without a photograph are appended to `unmatched`, or else refused; the paths in `named` are skipped.
     """
     found: dict[str, list[Path]] = defaultdict(list)
     keys = _owners_by_key(photographs if folder.is_dir() else ())
@@ -435,7 +435,7 @@ def _no_photograph(folder: Path, unmatched: list[str], photographs: Mapping[str,
 
 
 def _image_files(folder: Path, hidden: Container[str]) -> Iterator[Path]:
-    """Image files below a folder, without hidden ones but those that are known by name, of hidden photographs."""
+    """Image files below a folder; hidden ones only if named in `hidden`, as masks of hidden photographs."""
     if not folder.is_dir():
         if lexists(folder):
             raise InputError(f"{folder} is not a readable folder; expected one of mask images, or none")
@@ -458,19 +458,19 @@ def _beside(photograph: Path) -> list[Path]:
 
 
 def mask_paths(photographs: Iterable[str]) -> dict[str, Path]:
-    """Path of a mask in its folder, for every photograph of a capture: no other photograph's is looked for there.
+    """Path of a mask in its folder, unique for every photograph of a capture.
 
-    Photographs in the capture choose first, and then those whose names lead out of it.
+    Names are assigned to photographs inside the capture first, then to those whose names lead out of it.
     """
     return images.picture_paths(sorted(photographs, key=lambda name: (images.leads_out(name), name)))
 
 
 Owners = Mapping[str, list[str]]
-"""Photographs by a name that their masks may have."""
+"""Names of photographs by a possible name of their masks."""
 
 
 def _owners_by_key(photographs: Iterable[str]) -> tuple[Owners, Owners, Owners]:
-    """Photographs by the names of `mask_paths`, their own, and those without the folder; with and without suffix."""
+    """Photographs by their `mask_paths`, their own names, and their names without folders; with and without suffix."""
     unique = {path.with_suffix("").as_posix(): [name] for name, path in mask_paths(photographs).items()}
     whole, bare = defaultdict[str, list[str]](list), defaultdict[str, list[str]](list)
     for name in photographs:
@@ -483,7 +483,7 @@ def _owners_by_key(photographs: Iterable[str]) -> tuple[Owners, Owners, Owners]:
 
 
 def _owners(relative: Path, keys: tuple[Owners, Owners, Owners]) -> list[str]:
-    """The photographs that a mask file may belong to by the most exact of its names."""
+    """The photographs to which a mask file may belong, by its most specific match."""
     unique, *others = keys
     plain = relative.with_suffix("").as_posix()
     if plain in unique:
@@ -493,7 +493,7 @@ def _owners(relative: Path, keys: tuple[Owners, Owners, Owners]) -> list[str]:
 
 
 def _check_same_kind(values: Mapping[str, MaskValues], paths: Mapping[str, Path]) -> None:
-    """Refuse a set in which some masks are label images and others binary."""
+    """Refuse a set that mixes label images and binary masks."""
     kinds = {kind: [str(paths[name]) for name, v in values.items() if v.kind == kind] for kind in ("labels", "binary")}
     if kinds["labels"] and kinds["binary"]:
         raise InputError(
@@ -503,7 +503,7 @@ def _check_same_kind(values: Mapping[str, MaskValues], paths: Mapping[str, Path]
 
 
 def _decide_polarity(values: list[MaskValues], polarity: Polarity) -> tuple[bool, list[str]]:
-    """Return whether dark pixels are the pane, and a warning where that was guessed."""
+    """Return whether dark pixels mark the pane, and a warning if that was guessed."""
     binary = [v for v in values if v.kind == "binary"]
     if polarity != "auto" or not binary:
         return polarity == "dark" and bool(binary), []

@@ -1,6 +1,6 @@
 """Mirror-NeRF captures: `transforms_train.json` and its siblings, with one mirror mask per photograph.
 
-Public readers agree on the layout, not on the axes:
+Public readers agree on the layout, but not on the axes:
 
 ```
 transforms_{train,val,test}.json   an explicit split; transforms.json with all frames may lie next to them
@@ -8,10 +8,10 @@ masks/<name of the photograph>     real scenes; white is the mirror, one half is
 masks/MirrorMask_0001.png          synthetic scenes, for the photograph Image_0001
 ```
 
-The matrices are camera-to-world. The authors' reader takes them in OpenGL axes, as `transforms.json` has them
-everywhere else; another takes them in OpenCV axes. OpenGL is assumed, the mirror's masks are asked whether that can be
-(the mirror has to lie in front of the cameras), and the other axes are taken where only they fit. Neither could be
-tried on the authors' own files.
+The matrices are camera-to-world. The authors' reader treats them as OpenGL axes, like all other `transforms.json`
+files; another reader treats them as OpenCV axes. OpenGL is assumed and checked against the mirror masks, because the
+mirror must lie in front of the cameras; OpenCV axes are used if only they fit. Neither could be tested on the authors'
+own files.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ if TYPE_CHECKING:
 LOOKED_FOR = f"a Mirror-NeRF scene ({transforms.TRAIN} and {MASK_FOLDER}/)"
 SYNTHETIC_MASK = "MirrorMask_"
 SAME_SIZE = 0.1
-"""Relative deviation up to which twice the principal point is the size of the photograph."""
+"""Relative deviation up to which twice the principal point counts as the size of the photograph."""
 
 
 def load_mirror_nerf(root: Path) -> Capture | None:
-    """Read a Mirror-NeRF scene; None when the folder is none.
+    """Read a Mirror-NeRF scene; None if the folder holds another format.
 
-    What tells it from other `transforms_train.json` captures, besides the folder of masks: these are called
-    `MirrorMask_*`; or intrinsics are spelled `fx` or as a matrix, and there is no folder of panes. Test views are
-    those of the test file, or else of the validation file; photographs that are in it and in the training file too
-    are only tested on.
+    It differs from other `transforms_train.json` captures by a folder of masks and one of two features. Either the
+    masks are named `MirrorMask_*`; or intrinsics are given as `fx` or as a matrix, and there is no folder of panes.
+    Test views come from the test file, or else the validation file; photographs listed for both are used for testing
+    only.
     """
     if not _is_mirror_nerf(root):
         return None
@@ -80,13 +80,13 @@ def _is_mirror_nerf(root: Path) -> bool:
 
 
 def _shots(root: Path, settings: transforms.Settings, file_name: str) -> tuple[Shot, ...]:
-    """The photographs of one part, with the intrinsics in the spelling that the lens knows."""
+    """The photographs of one split, with the intrinsics under the keys of `transforms.json`."""
     frames = [_plain_frame(root, settings, frame) for frame in settings["frames"]]
     return tuple(transforms.shots_of(root, {**settings, "frames": frames}, file_name).values())
 
 
 def _plain_frame(root: Path, settings: transforms.Settings, frame: transforms.Settings) -> dict[str, Any]:
-    """One frame with its photograph where it lies and with `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h` in its pixels."""
+    """One frame with the actual path of its photograph, and `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h` in its pixels."""
     path = transforms.image_path(root, frame)
     in_images = root / "images" / path.name
     if not path.is_file() and in_images.is_file():
@@ -99,7 +99,7 @@ def _plain_frame(root: Path, settings: transforms.Settings, frame: transforms.Se
 
 
 def _intrinsics(settings: transforms.Settings, name: str) -> tuple[float, float, float, float] | None:
-    """fx, fy, cx, cy as stored, of the frame's matrix or of the file; None where only opening angles are given."""
+    """fx, fy, cx, cy as stored, from `intrinsics` or `fx`; None if only opening angles are given."""
     try:
         if "intrinsics" in settings:
             matrix = np.array(settings["intrinsics"], dtype=np.float64)
@@ -118,8 +118,8 @@ def _intrinsics(settings: transforms.Settings, name: str) -> tuple[float, float,
 def _in_pixels_of(path: Path, intrinsics: tuple[float, float, float, float]) -> dict[str, float]:
     """Intrinsics in the pixels of a photograph that may have been reduced after calibration.
 
-    Nothing says at what size it was calibrated. The principal point lies near the middle, so twice its position is
-    that size; where this is about the photograph's own, the principal point is taken as measured.
+    The size at calibration is not stored. The principal point lies near the centre, so twice its position estimates
+    that size; if this is close to the photograph's size, the principal point is used as it is.
     """
     with input_checked():
         width, height = image_size(path)
@@ -135,7 +135,7 @@ def _in_pixels_of(path: Path, intrinsics: tuple[float, float, float, float]) -> 
 
 
 def _masks(root: Path, shots: tuple[Shot, ...]) -> dict[str, Path]:
-    """Mask path by name of the photograph, where there is one; those of photographs in no part are left alone."""
+    """Mask path by name of the photograph, if it has one; masks of photographs outside the split are skipped."""
     present = {path.name: path for path in sorted((root / MASK_FOLDER).iterdir()) if path.is_file()}
     found = {}
     for shot in shots:
@@ -152,15 +152,15 @@ def _masks(root: Path, shots: tuple[Shot, ...]) -> dict[str, Path]:
 
 
 def _mask_names(photograph: Path) -> list[str]:
-    """Possible names of a photograph's mask, the most explicit first."""
+    """Possible file names of a photograph's mask, the most specific first."""
     number = photograph.stem.rpartition("_")[2]
     stems = (photograph.stem, f"{SYNTHETIC_MASK}{number}")
     return [photograph.name, *(stem + suffix for stem in stems for suffix in IMAGE_SUFFIXES)]
 
 
 def _evidence(shots: tuple[Shot, ...], masks: Mapping[str, Path], points: RawPoints | None) -> AxesEvidence | None:
-    """Evidence of some masks, or else the points, for the axes of the poses."""
-    from glassplat.captures.axes import axes_evidence  # Takes PyTorch, which no other format needs to be read.
+    """Evidence for the axes of the poses, from some masks or else the points."""
+    from glassplat.captures.axes import axes_evidence  # Needs PyTorch, unlike the other formats.
     from glassplat.captures.view import PointCloud
 
     views = [_view(shot, masks.get(shot.name)) for shot in shots]
@@ -175,7 +175,7 @@ def _view(shot: Shot, mask: Path | None) -> View:
 
 
 def _with_fitting_axes(capture: Capture, evidence: AxesEvidence | None) -> Capture:
-    """The capture in the axes that the evidence leaves."""
+    """The capture in the axes that fit the evidence."""
     if evidence is None:
         unsure = "The axes of the poses cannot be determined; OpenGL is assumed, as in the authors' reader."
         return replace(capture, warnings=(*capture.warnings, unsure))
@@ -200,5 +200,5 @@ def _with_fitting_axes(capture: Capture, evidence: AxesEvidence | None) -> Captu
 
 
 def _flip_axes(shots: tuple[Shot, ...]) -> tuple[Shot, ...]:
-    """The photographs with the y and z axes of their cameras turned round."""
+    """The photographs with the y and z axes of their cameras negated."""
     return tuple(replace(shot, cam_from_world=transforms.OPENCV_FROM_OPENGL @ shot.cam_from_world) for shot in shots)

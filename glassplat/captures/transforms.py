@@ -1,6 +1,6 @@
 """`transforms.json` captures, as written by instant-ngp, nerfstudio and Blender scripts.
 
-Their poses are camera-to-world in OpenGL axes (+y up, -z forward); they are converted here and nowhere else.
+Their poses are camera-to-world in OpenGL axes (+y up, -z forward), and are converted only here.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ BOX_COUNT = 100_000
 BOX_HALF_SIZE = 1.3
 SEED = 0
 LEAST_CROSSING = 1e-2
-"""Smallest eigenvalue of the mean of I - d d^T for which optical axes are taken to cross (about 6 degrees apart)."""
+"""Smallest eigenvalue of the mean of I - d d^T for which optical axes count as crossing (about 6 degrees apart)."""
 MOST_CAMERAS = 0.8
-"""Share of the cameras that must see the crossing in front of them; fewer do in a room photographed from its middle."""
+"""Share of the cameras that must face the crossing; fewer do in a room photographed from its centre."""
 AHEAD = 3.0
-"""How far ahead points are placed otherwise, in radii of the camera path."""
+"""Distance ahead of the cameras at which points are placed otherwise, in radii of the camera path."""
 
 
 def points_in_box(count: int = BOX_COUNT) -> RawPoints:
-    """Uniform points in the cube about the origin that synthetic Blender scenes fit in."""
+    """Uniform points in the cube about the origin that contains synthetic Blender scenes."""
     positions = np.random.default_rng(SEED).uniform(-BOX_HALF_SIZE, BOX_HALF_SIZE, (count, 3))
     return RawPoints.from_arrays(positions, np.full((count, 3), GREY))
 
 
 def points_in_view(cameras: Sequence[Camera]) -> RawPoints:
-    """Uniform points in a ball about what the cameras look at, reaching as far as the cameras stand away."""
+    """Uniform points in a ball about the point that the cameras face; its radius is their median distance."""
     centers = np.stack([camera.center.double().numpy() for camera in cameras])
     forward = np.stack([camera.cam_from_world[2, :3].double().numpy() for camera in cameras])
     target, radius = _ball(centers, forward)
@@ -56,7 +56,7 @@ def points_in_view(cameras: Sequence[Camera]) -> RawPoints:
 
 
 def _ball(centers: NDArray[np.float64], forward: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Centre and radius: about the crossing of the optical axes, or ahead of cameras whose axes do not cross."""
+    """Centre and radius: at the crossing of the optical axes, or ahead of the cameras if the axes do not cross."""
     projectors = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     mean = projectors.mean(axis=0)
     if np.linalg.eigvalsh(mean)[0] > LEAST_CROSSING:
@@ -73,7 +73,7 @@ FISHEYE = "OPENCV_FISHEYE"
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 LISTED = ("k1", "k2", "k3", "k4", "p1", "p2")
-"""The order of `distortion_params`, as nerfstudio has it."""
+"""Order of `distortion_params`, as in nerfstudio."""
 LENS: dict[str, records.Field] = {
     "camera_model": records.Optional(records.Choice((*PERSPECTIVE, FISHEYE))),
     "is_fisheye": records.Optional(records.Flag(), default=False),
@@ -87,15 +87,15 @@ LENS: dict[str, records.Field] = {
 
 
 MOST_AS_SHARE = 2.0
-"""Of a focal length: a smaller one is a share of the image and no pixels."""
+"""Focal length up to which it is a share of the image size, not pixels."""
 
 
 def lens_from_settings(settings: Mapping[str, Any], image_path: Path, name: str) -> Lens:
     """The lens of one frame.
 
     Focal length: `fl_x`, `fl_y`, or the opening angles `camera_angle_x`, `camera_angle_y` in radians. Principal
-    point: `cx`, `cy`, or the middle. Size: `w`, `h`, or that of the image. Distortion: `k1` ... `k6`, `p1`, `p2`, as
-    in OpenCV; or `distortion_params`, a list of k1 to k4, p1 and p2, which goes before them.
+    point: `cx`, `cy`, or the image centre. Size: `w`, `h`, or that of the image. Distortion: `k1` ... `k6`, `p1`, `p2`,
+    as in OpenCV; or `distortion_params`, a list of k1 to k4, p1 and p2, which takes precedence.
     """
     with input_checked():
         found = records.check_fields(settings, LENS, f"the lens of {name}")
@@ -117,7 +117,7 @@ def lens_from_settings(settings: Mapping[str, Any], image_path: Path, name: str)
 
 
 def _lens(model: str, pinhole: list[float], coefficients: list[float], size: tuple[int, int]) -> Lens:
-    """The simplest of COLMAP's models that has all coefficients that are not zero."""
+    """The simplest of COLMAP's models that has all non-zero coefficients."""
     k1, k2, k3, k4, k5, k6, p1, p2 = coefficients
     if model == FISHEYE:
         return make_lens(FISHEYE, [*pinhole, k1, k2, k3, k4], size)
@@ -129,14 +129,14 @@ def _lens(model: str, pinhole: list[float], coefficients: list[float], size: tup
 
 
 def _size(found: Mapping[str, Any], image_path: Path) -> tuple[int, int]:
-    """Width and height the intrinsics refer to."""
+    """Width and height to which the intrinsics refer."""
     if found["w"] is None or found["h"] is None:
         return image_size(image_path)
     return round(found["w"]), round(found["h"])
 
 
 def _focal_lengths(found: Mapping[str, Any], width: int, height: int, name: str) -> tuple[float, float]:
-    """fx and fy in pixels; one stands for both where only one is given."""
+    """fx and fy in pixels; if only one is given, it is used for both."""
     along_x = _focal_length(found["fl_x"], found["camera_angle_x"], width)
     along_y = _focal_length(found["fl_y"], found["camera_angle_y"], height)
     fx, fy = along_x or along_y, along_y or along_x
@@ -148,7 +148,7 @@ def _focal_lengths(found: Mapping[str, Any], width: int, height: int, name: str)
 
 
 def _focal_length(length: float | None, angle_rad: float | None, size: int) -> float | None:
-    """From the length in pixels, or else from the opening angle."""
+    """Focal length from the length in pixels, or else from the opening angle."""
     if length is not None or angle_rad is None:
         return length
     return 0.5 * size / math.tan(0.5 * angle_rad)
@@ -169,11 +169,11 @@ FILE: dict[str, records.Field] = {
     "val_filenames": records.Optional(records.Items(records.Text())),
     "test_filenames": records.Optional(records.Items(records.Text())),
 }
-"""What is read besides the lens (`LENS`); more may be in the file."""
+"""Fields read in addition to the lens (`LENS`); other fields of the file are ignored."""
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """The contents of one file, with at least one frame; every frame names a photograph and has a matrix."""
+    """Contents of one file; checks that there are frames, each with a photograph and a matrix."""
     with input_checked():
         settings = records.read_json(path)
         frames = settings.get("frames") if isinstance(settings, dict) else None
@@ -186,7 +186,7 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 
 def shots_of(root: Path, settings: Settings, file_name: str) -> dict[str, Shot]:
-    """Every frame by its `file_path`, with an error that lists the photographs that are missing."""
+    """All frames by their `file_path`; the error for missing photographs lists them."""
     paths = [image_path(root, frame) for frame in settings["frames"]]
     missing = [path.name for path in paths if not isfile(path)]
     if missing:
@@ -204,21 +204,21 @@ def shots_of(root: Path, settings: Settings, file_name: str) -> dict[str, Shot]:
 
 
 def _of_frame(settings: Settings, frame: Settings) -> Settings:
-    """The settings of a frame: its own go before those of the file, and its opening angle before the file's length."""
+    """Settings of a frame: its own override the file's, and its opening angle overrides the file's focal length."""
     lengths, angles = {"fl_x", "fl_y"}, {"camera_angle_x", "camera_angle_y"}
     beaten = lengths | angles if angles & frame.keys() and not lengths & frame.keys() else set()
     return {**{key: value for key, value in settings.items() if key not in beaten}, **frame}
 
 
 def image_path(root: Path, frame: Settings) -> Path:
-    """The photograph of one frame; Blender leaves its suffix out."""
+    """Path of the photograph of one frame; Blender omits the suffix."""
     path = normpath(root / _plain_path(frame["file_path"]))
     candidates = [path, *(path + suffix for suffix in IMAGE_SUFFIXES)]
     return Path(next((candidate for candidate in candidates if isfile(candidate)), path))
 
 
 def _names(root: Path, paths: Sequence[Path]) -> list[str]:
-    """The photographs' names; where some elsewhere have the same, relative to the folder that holds them all."""
+    """Names of the photographs; if they are ambiguous, relative to the folder that contains all of them."""
     names = [_name(root, path) for path in paths]
     if len(set(names)) == len(set(paths)):
         return names
@@ -227,9 +227,9 @@ def _names(root: Path, paths: Sequence[Path]) -> list[str]:
 
 
 def _name(root: Path, path: Path) -> str:
-    """The photograph's name, relative to the folder of images, or to the capture, where it lies in there.
+    """Name of a photograph: its path relative to `images/` or the capture, or else its file name.
 
-    It does not matter how either is written: relative, whole, or by way of a link.
+    Both paths may be relative, absolute, or contain links.
     """
     for spelled in (normpath, abspath, realpath):
         folder, photograph = Path(spelled(root)), Path(spelled(path))
@@ -250,7 +250,7 @@ def _cam_from_world(frame: Settings, name: str) -> NDArray[np.float64]:
 
 
 def read_points(root: Path, settings: Settings) -> RawPoints | None:
-    """The points of the file that the settings name, or of one that usually holds them."""
+    """Points from the file named in the settings, or from one with a customary name; None if there is none."""
     named = settings.get("ply_file_path")
     if named is not None and not isfile(root / named):
         raise InputError(f"ply_file_path names {root / named}, which does not exist; copy it there or delete the entry")
@@ -281,7 +281,7 @@ LOOKED_FOR = f"{WHOLE}, or {TRAIN} with or without {TEST} or {VAL}"
 
 
 def load_transforms(root: Path) -> Capture | None:
-    """Read `transforms.json`, or the train and test files of a synthetic scene; None when there is neither."""
+    """Read `transforms.json`, or the train and test files of a synthetic scene; None if there is neither."""
     if (root / TRAIN).is_file():
         return _load_split(root)
     if (root / WHOLE).is_file():
@@ -290,7 +290,7 @@ def load_transforms(root: Path) -> Capture | None:
 
 
 def _load_whole(root: Path) -> Capture:
-    """One file for all photographs, which may name its own split."""
+    """Capture from one file for all photographs, which may define its own split."""
     settings = read_settings(root / WHOLE)
     shots = shots_of(root, settings, WHOLE)
     train, test, warnings = _own_split(shots, settings)
@@ -305,11 +305,11 @@ def _load_whole(root: Path) -> Capture:
 
 
 def _load_split(root: Path) -> Capture:
-    """Separate files for training and testing, or else validation, as synthetic scenes have them."""
+    """Capture from separate files for training and testing (or else validation), as in synthetic scenes."""
     tested = TEST if (root / TEST).is_file() else VAL
     files = {name: read_settings(root / name) for name in (TRAIN, tested) if (root / name).is_file()}
     if VAL in files and not all(image_path(root, frame).is_file() for frame in files[VAL]["frames"]):
-        del files[VAL]  # Its photographs are not there, as where nobody needs them.
+        del files[VAL]  # Its photographs are often left out of a copy.
     shots = {name: shots_of(root, settings, name) for name, settings in files.items()}
     kept: dict[str, Path] = {}
     for name, settings in files.items():
@@ -333,7 +333,7 @@ UNTESTED = (
 
 
 def _mask_paths(root: Path, file: str, settings: Settings, shots: Mapping[str, Shot]) -> dict[str, Path]:
-    """The masks that the frames of a file name, by name of the photograph."""
+    """Masks named by the frames of a file, by name of the photograph."""
     paths = {
         shots[frame["file_path"]].name: Path(normpath(root / _plain_path(frame["mask_path"])))
         for frame in settings["frames"]
@@ -352,26 +352,26 @@ PRIORS = {
     "depth_file_path": "depths are not used",
     "normal_file_path": "estimated normals are read from a folder normals/ next to the photographs",
 }
-"""What frames of nerfstudio and its kin name besides the photograph, and what becomes of it."""
+"""Further files that frames of nerfstudio and related programs name, and their treatment here."""
 
 
 def _unused_priors(settings: Settings) -> list[str]:
-    """Warnings about files that frames name and nobody reads."""
+    """Warnings about files that frames name and that are not read."""
     counts = {key: sum(bool(frame.get(key)) for frame in settings["frames"]) for key in PRIORS}
     return [f"{count} frames have a {key}, which is left out: {PRIORS[key]}." for key, count in counts.items() if count]
 
 
 def _is_blender(settings: Settings) -> bool:
-    """Blender scripts write the opening angle and nothing else about the lens."""
+    """Return whether a Blender script wrote the file: its lens has nothing but the opening angle."""
     return "camera_angle_x" in settings and "fl_x" not in settings and "w" not in settings
 
 
 def _own_split(
     shots: Mapping[str, Shot], settings: Settings
 ) -> tuple[tuple[Shot, ...], tuple[Shot, ...] | None, list[str]]:
-    """Training and test photographs as nerfstudio lists them in the file, or all and None; and warnings.
+    """Training and test photographs as listed by nerfstudio, or all and None without a list; and warnings.
 
-    Without training photographs, all others are; without test photographs, there are none.
+    Without a training list, all photographs outside the test list are used; without a test list, none are tested.
     """
     listed = settings.get("train_filenames"), settings.get("test_filenames") or settings.get("val_filenames")
     train_names, test_names = ([_plain_path(name) for name in names or ()] for names in listed)
@@ -388,5 +388,5 @@ def _own_split(
 
 
 def _plain_path(name: str) -> str:
-    """A path in one of its spellings, so that `./images/1.png` is `images/1.png`."""
+    """A normalised path: `./images/1.png` becomes `images/1.png`."""
     return normpath(name.replace("\\", "/"))

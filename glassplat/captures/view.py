@@ -1,12 +1,12 @@
-"""Photographs with their cameras, panes and estimated normals, read when first asked for; and coloured points.
+"""Photographs with cameras, panes and estimated normals, read lazily; and coloured points.
 
-Estimated normals are those that networks for single photographs write: x to the right, y up, z towards the camera; in a
-PNG of 8 or 16 bits (n + 1) / 2, in an NPY file [H, W, 3] of floats the vectors themselves.
+Estimated normals are the output of monocular networks: x to the right, y up, z towards the camera. A PNG of 8 or 16
+bits holds (n + 1) / 2, an NPY file [H, W, 3] of floats the vectors themselves.
 
-Pixels stay in memory up to a budget, and are read ahead of the step that needs them. What is read first stays as long
-as there is room: every pass over the views comes to each of them once, so that what was used last is not more likely to
-be used again. A small part of the budget holds what was read ahead for the next steps, and gives the oldest of it up.
-What was costly to undistort or to reduce is kept on disk as long as a training lasts.
+Pixels are cached in memory up to a budget, and are read ahead of the step that needs them. The pixels read first stay,
+as long as there is room: every epoch visits each view once, so recently used pixels are not more likely to be used
+again. A small part of the budget holds pixels read ahead for the next steps, and evicts the oldest. Pixels that were
+costly to undistort or to reduce are kept on disk during training.
 """
 
 from __future__ import annotations
@@ -41,43 +41,43 @@ from glassplat.options import WHITE, Rgb
 from glassplat.scene.camera import Camera, to_device
 
 LEAST_SIDE = 8
-"""Pixels along the side of a photograph that was reduced; below that are no edges to tell panes or details by."""
+"""Smallest side of a reduced photograph, in pixels; smaller ones show neither pane edges nor details."""
 
 GIGABYTE = 1e9
 SHARE = 0.25
-"""Share of the machine's memory that photographs take unless told otherwise."""
+"""Default share of the machine's memory for photographs."""
 UNKNOWN = 8 * GIGABYTE
-"""Memory of a machine that does not say how much it has."""
+"""Assumed memory of a machine that does not report it."""
 MOST_AHEAD = 8
-"""Views that are read ahead, at the most: a step is rarely as short as an eighth of what reading takes."""
+"""Maximum number of views read ahead: a step is rarely shorter than an eighth of the reading time."""
 AHEAD_SHARE = 0.25
-"""Share of the budget for what is read ahead, at the most, whatever the number of views."""
+"""Largest share of the budget for pixels read ahead, regardless of the number of views."""
 PIXEL_BYTES = 5
-"""Of a view: three of the photograph, one of the panes, one of what is left out."""
+"""Bytes per pixel of a view: three of the photograph, one of the pane labels, one of the ignore mask."""
 MOST_THREADS = 4
 DISK_RATE = 2e8
-"""Bytes that a slow disk reads in a second."""
+"""Bytes per second of a slow disk."""
 DISK_RESERVE = 5 * GIGABYTE
-"""Bytes of the disk that photographs leave free: the training writes there, too."""
+"""Bytes of disk space that photographs leave free, because training writes there, too."""
 MEMBERSHIP, GROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
-"""Where Linux says which groups this process belongs to, and where the limits of each are."""
+"""Linux files that list the control groups of this process, and the folder of their limits."""
 LIMITS = {"": "memory.max", "memory": "memory.limit_in_bytes"}
-"""Files of limits, by the controllers of a group: those of the second version have no name."""
+"""Names of the limit files by controller of a group: cgroup v2 has no controller name."""
 
 Item = TypeVar("Item")
 
 
 def evenly(items: Sequence[Item], most: int) -> list[Item]:
-    """No more than so many of the items, evenly among all of them."""
+    """At most `most` of the items, evenly spread."""
     count = min(most, len(items))
     return [items[len(items) * number // count] for number in range(count)]
 
 
 class Source:
-    """Pixels that can be read again: by whom, and what becomes of them; the same for the same reader.
+    """Pixels that can be read again; sources with the same reader are equal.
 
     Attributes:
-        is_mask: what is read counts where it is above zero.
+        is_mask: the values are converted to booleans: true above zero.
     """
 
     def __init__(self, reader: Callable[[], Tensor], *, is_mask: bool = False) -> None:
@@ -90,14 +90,14 @@ class Source:
         return id(self._reader)
 
     def read(self) -> Tensor:
-        """The pixels, from their file."""
+        """The pixels, read from their file."""
         return self._reader() > 0 if self.is_mask else self._reader()
 
 
 class Spool:
-    """Pixels on disk, undistorted and reduced, in a file without a name that ends with the process.
+    """Disk cache of undistorted and reduced pixels, in an unnamed file that disappears with the process.
 
-    Where the disk is full or cannot be written, it takes nothing more in, and photographs are read from their files.
+    If the disk is full or not writable, nothing more is stored, and photographs are read from their own files.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -108,7 +108,7 @@ class Spool:
         self._lock = Lock()
 
     def put(self, source: Source, pixels: Tensor) -> None:
-        """Keeps the pixels of a source if there is room."""
+        """Stores the pixels of a source if there is room."""
         values = pixels.numpy()
         with self._lock:
             if self._is_full or source in self._places:
@@ -122,12 +122,12 @@ class Spool:
                 self._file.write(values.tobytes())
                 self._file.flush()
             except OSError:
-                self._give_back()  # Under a quota, a checkpoint would not have the room that all this takes.
+                self._give_back()  # Under a quota, this space may be needed for a checkpoint.
                 return
             self._places[source] = place, values.shape, values.dtype
 
     def get(self, source: Source) -> Tensor | None:
-        """The pixels of a source; None where they are not here."""
+        """The pixels of a source; None if they are not stored."""
         with self._lock:
             if self._file is None or source not in self._places:
                 return None
@@ -141,7 +141,7 @@ class Spool:
         return torch.from_numpy(values) if is_whole else None
 
     def close(self) -> None:
-        """Gives the room on disk back."""
+        """Releases the disk space."""
         with self._lock:
             self._give_back()
 
@@ -150,23 +150,23 @@ class Spool:
         self._is_full = True
         file, self._file = self._file, None
         if file is not None:
-            with suppress(OSError):  # What could not be written is written again here.
+            with suppress(OSError):  # Closing flushes unwritten data again.
                 file.close()
 
 
 class Memory:
-    """Pixels that were read; may be asked by several threads at once.
+    """In-memory cache of pixels; thread-safe.
 
     Attributes:
-        budget: bytes, of all pixels together. What a single step needs is read even where it is more.
-        ahead: views that are worth reading ahead, besides that of the current step.
+        budget: bytes of all pixels together; the pixels of a single step are read even if they exceed it.
+        ahead: number of views worth reading ahead of the current step.
     """
 
     def __init__(self, budget: float | None = None, *, largest: int = 0) -> None:
-        """Holds nothing yet.
+        """Starts empty.
 
         Args:
-            budget: bytes; a share of the machine's memory if not given.
+            budget: bytes; by default a share of the machine's memory.
             largest: pixels of the largest view.
         """
         self.budget = default_budget() if budget is None else budget
@@ -183,16 +183,16 @@ class Memory:
         self._lock = Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Holds nothing in a copy or in another process, where pixels are read anew."""
+        """Copies, also in other processes, start empty and read pixels again."""
         return partial(Memory, self.budget, largest=self._largest), ()
 
     @property
     def is_full(self) -> bool:
-        """Return whether something had to be kept for a few steps only, because there is no more room."""
+        """Return whether some pixels had to be kept temporarily, because there is no more room."""
         return bool(self._passing)
 
     def get(self, source: Source) -> Tensor:
-        """The pixels of a source, read now unless they are there or on their way.
+        """The pixels of a source, read now unless they are cached or being read.
 
         Raises:
             InputError: they cannot be read.
@@ -207,7 +207,7 @@ class Memory:
         return future.result()
 
     def read_ahead(self, source: Source) -> None:
-        """Has a thread read what will be asked for soon; what fails is read again, and raised, when it is asked for."""
+        """Reads pixels in a background thread; after a failure, `get` reads them again and raises the error."""
         with self._lock:
             if source in self._pending or self._look_up(source) is not None:
                 return
@@ -216,7 +216,7 @@ class Memory:
 
     @contextmanager
     def spool_to(self, folder: Path) -> Iterator[None]:
-        """As long as the context lasts, what has no room and was costly to read is kept on disk in a folder."""
+        """Within the context, caches pixels on disk that were costly to read and do not fit in memory."""
         self._spool = spool = Spool(folder)
         try:
             yield
@@ -229,7 +229,7 @@ class Memory:
             self._passing.move_to_end(source)
         return self._resident.get(source, self._passing.get(source))
 
-    @torch.inference_mode(False)  # Who looks first may not need gradients; a later one may.
+    @torch.inference_mode(False)  # The first caller may not need gradients; a later one may.
     def _read(self, source: Source, future: Future[Tensor]) -> None:
         spool = self._spool
         try:
@@ -237,7 +237,7 @@ class Memory:
             begun = time.thread_time()
             pixels = source.read() if stored is None else stored
             is_costly = stored is None and time.thread_time() - begun > pixels.nbytes / DISK_RATE
-        except BaseException as error:  # noqa: BLE001 - Raised where the pixels are asked for.
+        except BaseException as error:  # noqa: BLE001 - Raised by `get`.
             with self._lock:
                 del self._pending[source]
             future.set_exception(error)
@@ -250,7 +250,7 @@ class Memory:
             spool.put(source, pixels)
 
     def _keep(self, source: Source, pixels: Tensor) -> bool:
-        """Keep pixels, and return whether they stay."""
+        """Cache pixels; returns whether they stay permanently."""
         size = pixels.numel() * pixels.element_size()
         if size <= self._room:
             self._room -= size
@@ -266,29 +266,29 @@ class Memory:
 
 @cache
 def reading_threads() -> ThreadPoolExecutor:
-    """The threads that read ahead, for all captures together; they sleep where nothing is to be read."""
+    """The threads that read ahead, shared by all captures; idle threads sleep."""
     return ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS), thread_name_prefix="photographs")
 
 
 def default_budget() -> float:
-    """Bytes for photographs: a share of the machine's memory, or of what a container may take, for each process."""
+    """Bytes for photographs per process: a share of the memory of the machine or its container."""
     return SHARE * machine_memory() / max(int(os.environ.get("LOCAL_WORLD_SIZE", "1")), 1)
 
 
 def machine_memory() -> float:
-    """Bytes of memory that the machine has, or that a container, a service or a scheduler's job may take of it."""
+    """Bytes of memory of the machine, or the limit of a container, a service or a scheduler's job."""
     try:
         whole = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    except (AttributeError, ValueError, OSError):  # Windows has no such question.
+    except (AttributeError, ValueError, OSError):  # Not available on Windows.
         whole = UNKNOWN
     for path in memory_limits():
-        with suppress(OSError, ValueError):  # No such file, or it says `max`.
+        with suppress(OSError, ValueError):  # No such file, or its limit is `max`.
             whole = min(whole, float(path.read_text()))
     return whole
 
 
 def memory_limits() -> Iterator[Path]:
-    """Files that may limit this process: of its group, and of those around it, which in a container end at the root."""
+    """Limit files of this process's control group and of its parents, which in a container end at the root."""
     lines = MEMBERSHIP.read_text(encoding="utf-8", errors="replace").splitlines() if MEMBERSHIP.is_file() else []
     for _, controllers, name in (line.split(":", 2) for line in lines):
         if controllers in LIMITS:
@@ -305,10 +305,10 @@ class View:
         camera: float32 pinhole camera of `photo`.
         image_path: the file.
         read_photo: returns `photo`.
-        read_pane_labels: returns `pane_labels`; None where the view is not annotated.
-        read_ignored: returns `ignored`; None where all pixels count.
-        read_normals: returns `normals`; None where nobody estimated any.
-        memory: holds what was read, for all views of a capture.
+        read_pane_labels: returns `pane_labels`; None if the view is not annotated.
+        read_ignored: returns `ignored`; None if all pixels are used.
+        read_normals: returns `normals`; None if there are no estimates.
+        memory: pixel cache shared by all views of a capture.
     """
 
     name: str
@@ -325,34 +325,34 @@ class View:
 
     @property
     def photo(self) -> Tensor:
-        """[H, W, 3] uint8 sRGB, undistorted and reduced; stays in memory once read, as long as there is room.
+        """[H, W, 3] uint8 sRGB, undistorted and reduced; cached in memory if there is room.
 
         Raises:
-            InputError: the file cannot be read; names it.
+            InputError: the file cannot be read; the message names it.
         """
         return self.memory.get(Source(self.read_photo))
 
     @property
     def pane_labels(self) -> Tensor | None:
-        """[H, W] uint8 pane label per pixel, 0 for no pane; None where the view is not annotated."""
+        """[H, W] uint8 pane label per pixel, 0 for no pane; None if the view is not annotated."""
         return None if self.read_pane_labels is None else self.memory.get(Source(self.read_pane_labels))
 
     @property
     def ignored(self) -> Tensor | None:
-        """[H, W] bool, the pixels that show what is not to be learned or measured; None where there are none."""
+        """[H, W] bool, the pixels excluded from training and evaluation; None if there are none."""
         return None if self.read_ignored is None else self.memory.get(Source(self.read_ignored, is_mask=True))
 
     @property
     def normals(self) -> Tensor | None:
-        """[H, W, 3] estimated unit normals in camera axes, zero where none is known; None where there is no file.
+        """[H, W, 3] estimated unit normals in camera axes, zero where unknown; None if there is no file.
 
         Raises:
-            InputError: the file cannot be read, or has not the proportions of the photograph.
+            InputError: the file cannot be read, or its aspect ratio differs from the photograph's.
         """
         return None if self.read_normals is None else self.memory.get(Source(self.read_normals))
 
     def read_ahead(self) -> None:
-        """Has threads read what training on the view will ask for."""
+        """Reads the pixels for training on this view in background threads."""
         self.memory.read_ahead(Source(self.read_photo))
         if self.read_pane_labels is not None:
             self.memory.read_ahead(Source(self.read_pane_labels))
@@ -361,21 +361,21 @@ class View:
 
     @property
     def is_annotated(self) -> bool:
-        """Return whether there is a mask; does not read it."""
+        """Return whether there is a pane mask, without reading it."""
         return self.read_pane_labels is not None
 
     def with_camera(self, camera: Camera) -> View:
-        """The same photograph from another camera; what was read of it stays read."""
+        """The same photograph with another camera; cached pixels stay valid."""
         other = copy(self)
         object.__setattr__(other, "camera", camera)
         return other
 
     @staticmethod
     def in_memory(name: str, camera: Camera, *, photo: Tensor, pane_labels: Tensor | None = None) -> View:
-        """A view of pixels at hand, such as a rendered one: a `photo` [H, W, 3] and `pane_labels` [H, W], of uint8.
+        """A view of pixels in memory, such as a rendered image: `photo` [H, W, 3] and `pane_labels` [H, W], uint8.
 
         Raises:
-            ValueError: they are no tensors of uint8, or of another size than the camera's.
+            ValueError: they are not uint8 tensors of the camera's size.
         """
         size = camera.height, camera.width
         for given, shape in ((photo, (*size, 3)), (pane_labels, size)):
@@ -392,9 +392,9 @@ def _at_hand(pixels: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class PhotoFile:
-    """Recipe for reading the pixels of one view; `background` is seen through transparent pixels.
+    """Reader of the pixels of one view; `background` is seen through transparent pixels.
 
-    Without one, their own colours are.
+    Without a background, transparent pixels show their own colours.
     """
 
     path: Path
@@ -410,7 +410,7 @@ class PhotoFile:
 
 @dataclass(frozen=True)
 class MaskFile:
-    """Recipe for reading the labels of one view; `size` is the photograph's, before undistortion."""
+    """Reader of the labels of one view; `size` is the photograph's, before undistortion."""
 
     mask: IgnoredMask
     size: tuple[int, int]
@@ -421,30 +421,30 @@ class MaskFile:
         return torch.from_numpy(self.pixel_map.labels(cameras.nearest_resize(self.mask.labels(), *self.size)))
 
     def ignored(self) -> Tensor:
-        """[H, W] uint8, above zero where a pixel of the view shows anything that has a label."""
+        """[H, W] uint8, above zero where a pixel of the view covers any labelled pixel."""
         return torch.from_numpy(self.pixel_map.ignored(cameras.nearest_resize(self.mask.labels(), *self.size)))
 
 
 @dataclass(frozen=True)
 class IgnoredFiles:
-    """Recipe for reading what any of several masks of one view leaves out, and what lies outside its photograph."""
+    """Reader of the pixels of one view that any of its masks excludes, or that lie outside the photograph."""
 
     masks: tuple[MaskFile, ...]
     blank: cameras.PixelMap | None = None
 
     def __call__(self) -> Tensor:
-        """[H, W] uint8, above zero where any mask is."""
+        """[H, W] uint8, above zero where any mask is, or outside the photograph."""
         blank = [] if self.blank is None else [torch.from_numpy(self.blank.blank())]
         return torch.stack([*blank, *(mask.ignored() for mask in self.masks)]).amax(dim=0)
 
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """Options for making views of photographs.
+    """Options for making views from photographs.
 
     Attributes:
         downscale: width and height are divided by it and rounded.
-        background: sRGB in [0, 1], seen through transparent pixels; None leaves them their own colours.
+        background: sRGB in [0, 1] behind transparent pixels; None keeps their own colours.
     """
 
     downscale: float = 1.0
@@ -453,7 +453,7 @@ class ViewOptions:
 
 @dataclass(frozen=True)
 class PreparedView:
-    """A view and what was noticed while its file header was looked at."""
+    """A view, and whether its intrinsics were rescaled to the size of the image file."""
 
     view: View
     rescaled: bool
@@ -467,17 +467,17 @@ def prepare_view(
     ignored: Sequence[IgnoredMask] = (),
     normals: Path | None = None,
 ) -> PreparedView:
-    """Check one photograph against its camera and set up how it is read; decodes no pixels of it.
+    """Check one photograph against its camera and set up its readers; decodes no pixels.
 
     Args:
         shot: the photograph.
         mask: of its panes.
-        options: how it is read.
-        ignored: masks of what is not to be learned.
+        options: of reading it.
+        ignored: masks of pixels to ignore.
         normals: file of its estimated normals.
 
     Raises:
-        InputError: unreadable file, sizes that disagree, a pose that is not rigid, a lens that cannot be undistorted.
+        InputError: unreadable file, inconsistent sizes, non-rigid pose, or lens that cannot be undistorted.
     """
     with input_checked():
         width, height = image_size(shot.image_path)
@@ -503,10 +503,10 @@ def prepare_view(
 
 
 def _reduced_size(pinhole: cameras.Pinhole, downscale: float, name: str) -> tuple[int, int]:
-    """Width and height of a photograph that is reduced by a factor.
+    """Width and height of a photograph reduced by a factor.
 
     Raises:
-        InputError: that makes it too small to learn from.
+        InputError: it would be too small for training.
     """
     width, height = (max(1, round(side / downscale)) for side in (pinhole.width, pinhole.height))
     if downscale > 1 and min(width, height) < LEAST_SIDE:
@@ -540,14 +540,14 @@ def _is_multiple(large: tuple[int, int], small: tuple[int, int]) -> bool:
 
 
 def _opaque(pixels: NDArray[np.uint8], background: Rgb | None) -> NDArray[np.uint8]:
-    """[H, W, 3] from grey, colour or colour with transparency, over the background if there is one."""
+    """[H, W, 3] from grey, RGB or RGBA, composited over the background if there is one."""
     if pixels.shape[2] == 1:
         return np.repeat(pixels, 3, axis=2)
     if pixels.shape[2] == 3 or background is None:
         return np.ascontiguousarray(pixels[:, :, :3])
     behind = np.asarray(background, dtype=np.float32) * 255
     opaque = np.empty((*pixels.shape[:2], 3), dtype=np.uint8)
-    for row, seen in enumerate(pixels):  # Row by row: as floats a photograph takes four times its memory.
+    for row, seen in enumerate(pixels):  # Row by row, because floats take four times the memory.
         alpha = seen[:, 3:].astype(np.float32) / 255
         opaque[row] = np.round(seen[:, :3] * alpha + behind * (1 - alpha))
     return opaque
@@ -556,13 +556,13 @@ def _opaque(pixels: NDArray[np.uint8], background: Rgb | None) -> NDArray[np.uin
 FOLDER = "normals"
 SUFFIXES = (".png", ".npy")
 CAMERA_FROM_PICTURE = (1.0, -1.0, -1.0)
-"""Turns y up and z towards the camera into y down and z forward."""
+"""Signs that convert y up and z towards the camera to y down and z forward."""
 LEAST_LENGTH = 0.5
-"""Shorter vectors, such as those of grey or black pixels, are no normals."""
+"""Shorter vectors, such as those of grey or black pixels, are not normals."""
 
 
 def estimated_normals(view: View) -> Tensor | None:
-    """[H, W, 3] unit normals of a view in world axes, zero where none is known; None where there is no file.
+    """[H, W, 3] unit normals of a view in world axes, zero where unknown; None if there is no file.
 
     Raises:
         InputError: as `View.normals`.
@@ -572,7 +572,7 @@ def estimated_normals(view: View) -> Tensor | None:
 
 
 def in_world(normals: Tensor, camera: Camera) -> Tensor:
-    """Vectors [..., 3] in camera axes, turned to world axes; differentiable in the camera's pose."""
+    """Vectors [..., 3] rotated from camera to world axes; differentiable in the camera's pose."""
     return normals @ camera.cam_from_world[:3, :3].to(normals)
 
 
@@ -582,12 +582,12 @@ def normals_reader(path: Path | None, camera: Camera) -> Callable[[], Tensor] | 
 
 
 def normals_in_file(path: Path, camera: Camera) -> Tensor:
-    """[H, W, 3] unit normals in camera axes at a camera's size, zero where none is known.
+    """[H, W, 3] unit normals in camera axes at a camera's size, zero where unknown.
 
-    They are of the photograph without its lens's distortion, as `View.photo` is.
+    The file belongs to the undistorted photograph, like `View.photo`.
 
     Raises:
-        InputError: a file cannot be read, or has not the camera's proportions.
+        InputError: the file cannot be read, or its aspect ratio differs from the camera's.
     """
     with input_checked():
         vectors = _vectors(path)
@@ -605,22 +605,22 @@ def normals_in_file(path: Path, camera: Camera) -> Tensor:
 
 
 def normals_paths(photographs: Mapping[str, Path]) -> dict[str, Path]:
-    """The files of estimated normals by name of the photograph; those without any are left out.
+    """Files of estimated normals by name of the photograph; photographs without one are left out.
 
-    Those of `left/3.jpg` are `left/3.png` in a folder `normals` among the photographs or next to their folder, or
-    `3.png` in a folder `normals` next to the photograph itself. If no other photograph is called 3, `3.png` among the
-    photographs or next to the folder `left` will do. Each may also be `3.npy`, `3.jpg.png` or `3.jpg.npy`.
+    The file of `left/3.jpg` is `left/3.png` in a folder `normals` inside or next to the folder of photographs, or
+    `3.png` in a folder `normals` next to the photograph. If the stem 3 is unique, `3.png` in a folder `normals` of the
+    photographs or next to `left` is found, too. Names may also be `3.npy`, `3.jpg.png` or `3.jpg.npy`.
 
     Args:
         photographs: path of every photograph of a capture by name.
     """
     stems = Counter(path.stem for path in photographs.values())
-    is_folder = cache(Path.is_dir)  # Most captures have none, and thousands of photographs ask.
+    is_folder = cache(Path.is_dir)  # Cached: most captures have none, and thousands of photographs are tested.
     found = {}
     for name, path in photographs.items():
         whole, alone = PurePosixPath(name), PurePosixPath(path.name)
         if whole.anchor or ".." in whole.parts or path.parts[-len(whole.parts) :] != whole.parts:
-            whole = alone  # Its folders lead elsewhere.
+            whole = alone  # The folders of the name are not those of the path.
         base = path.parents[len(whole.parts) - 1]
         places = [(base, whole), (base.parent, whole), (path.parent, alone)]
         if stems[path.stem] == 1:
@@ -635,7 +635,7 @@ def normals_paths(photographs: Mapping[str, Path]) -> dict[str, Path]:
 
 
 def _vectors(path: Path) -> NDArray[np.float32]:
-    """[H, W, 3] as stored, zero where not finite."""
+    """[H, W, 3] as stored, with non-finite values set to zero."""
     if path.suffix == ".png":
         pixels = read_image_float(path)
         if pixels.shape[2] < 3:
@@ -643,9 +643,9 @@ def _vectors(path: Path) -> NDArray[np.float32]:
         vectors = 2 * pixels[..., :3] - 1
         return vectors * (pixels[..., 3:] > LEAST_LENGTH) if pixels.shape[2] == 4 else vectors
     try:
-        with path.open("rb") as file:  # Not `load`, which opens archives of arrays, too.
+        with path.open("rb") as file:  # Not `numpy.load`, which opens archives, too.
             vectors = np.lib.format.read_array(file, allow_pickle=False)
-    except Exception as error:  # It evaluates the head of the file, and damaged ones raise what tokens do.
+    except Exception as error:  # NumPy evaluates the header, and damaged ones raise various errors.
         raise ValueError(f"{path} is not an array that NumPy can read ({error}); save it with numpy.save") from error
     if vectors.ndim != 3 or vectors.shape[2] != 3 or vectors.dtype.kind != "f" or 0 in vectors.shape:
         raise ValueError(f"{path} holds {vectors.dtype} of shape {list(vectors.shape)}; expected floats [H, W, 3]")
@@ -681,12 +681,12 @@ class PointCloud:
 
     @staticmethod
     def of(points: RawPoints) -> PointCloud:
-        """The points that were read; they share their memory."""
+        """Points that share the memory of those read."""
         return PointCloud(torch.from_numpy(points.positions), torch.from_numpy(points.colors))
 
 
 def with_ignored_right(image: Tensor, view: View) -> Tensor:
-    """An image [H, W, 3] that shows the photograph itself where the view ignores pixels: no error, no gradient."""
+    """An image [H, W, 3] with ignored pixels taken from the photograph: no error, no gradient."""
     if view.ignored is None:
         return image
     photo = to_device(view.photo, image.device).to(image.dtype) / 255
