@@ -192,7 +192,7 @@ class KeepMask:
     path: Path
 
     def labels(self) -> NDArray[np.uint8]:
-        """[H, W] 1 where a pixel is left out."""
+        """[H, W] 1 where a pixel is ignored."""
         shades = _brightness(self.path)
         return (shades < (THRESHOLD if shades.max() > HIGHEST_LABEL else 1)).astype(np.uint8)
 
@@ -208,7 +208,7 @@ class CutOut:
     path: Path
 
     def labels(self) -> NDArray[np.uint8]:
-        """[H, W] 1 where a pixel is left out."""
+        """[H, W] 1 where a pixel is ignored."""
         with input_checked():
             pixels = images.read_image(self.path)
         return (

@@ -1,5 +1,5 @@
-"""Files that others can read: splat PLY, planes, cameras, images.
+"""Readers and writers of exchange formats: splat files, planes, cameras, images.
 
-What reads a file raises FileNotFoundError where there is none and ValueError where it cannot be read, is damaged or of
-another kind; what writes one raises ValueError for what the format cannot hold. The message names the file.
+Readers raise FileNotFoundError for a missing file, and ValueError for one that is unreadable, damaged or of another
+kind. Writers raise ValueError for data that the format cannot store. The message names the file.
 """

@@ -1,9 +1,9 @@
 """Gaussians as binary glTF with KHR_gaussian_splatting, the extension that Khronos ratified in 2026.
 
-Splats are a primitive of points with attributes: rotation (`xyzw`), scale (not logarithmic), opacity (a share), and the
-coefficients of the harmonics, one attribute each. A glTF has x to the left and y up where a PLY has x to the right and
-y down; both directions of the way turn it. Channels, as the intensity with which a Gaussian is mirrored, are attributes
-of our own, which other programs leave alone.
+Splats are a primitive of points with attributes: rotation (`xyzw`), scale (linear), opacity (0 to 1), and the SH
+coefficients, one attribute each. A glTF has x to the left and y up where a PLY has x to the right and y down; reading
+and writing rotate the scene accordingly. Channels, such as a Gaussian's reflection intensity, are application
+attributes, which other programs ignore.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ DIRECTIONS = 64
 
 
 def turned_harmonics(sh: Tensor, rotation: Tensor) -> Tensor:
-    """Coefficients of the same colours, on things that were turned: the colour along d was that along R^T d.
+    """Rotated SH coefficients: the new colour along d is the old colour along R^T d.
 
-    Turning keeps each degree to itself, so a few directions determine the map between the coefficients exactly.
+    Rotations do not mix degrees, so a few directions determine the map between the coefficients exactly.
 
     Args:
         sh: [N, K, 3], K in {0, 1, 4, 9, 16}.
-        rotation: [3, 3] orthogonal R, also that of a mirror.
+        rotation: [3, 3] orthogonal R; may be a reflection.
     """
     count = sh.shape[1]
     generator = torch.Generator().manual_seed(0)
@@ -93,7 +93,7 @@ ASSET: dict[str, records.Field] = {"version": records.Text()}
 
 
 class GltfWriter:
-    """Collects arrays, and writes them with a document that refers to them by number."""
+    """Collects arrays, and writes them with a document that refers to them by index."""
 
     def __init__(self) -> None:
         self._accessors: list[dict[str, Any]] = []
@@ -102,11 +102,11 @@ class GltfWriter:
         self._size = 0
 
     def add(self, values: NDArray[np.float32], *, bounded: bool = False) -> int:
-        """Adds float32 rows [N] or [N, 2 to 4]; returns the number of their accessor.
+        """Adds float32 rows [N] or [N, 2 to 4]; returns the index of their accessor.
 
         Args:
             values: at least one row.
-            bounded: write the least and the greatest value of each column, as positions need them.
+            bounded: write the minimum and maximum of each column, as required for positions.
         """
         data = np.ascontiguousarray(values, dtype="<f4")
         kind = "SCALAR" if data.ndim == 1 else f"VEC{data.shape[1]}"
@@ -123,7 +123,7 @@ class GltfWriter:
         return len(self._accessors) - 1
 
     def file(self, document: Mapping[str, Any]) -> bytes:
-        """The GLB of a document, to which the arrays are added."""
+        """The GLB of a document together with the arrays."""
         whole = {**document, "accessors": self._accessors, "bufferViews": self._views}
         whole["buffers"] = [{"byteLength": self._size}]
         text = json.dumps(whole, separators=(",", ":"), allow_nan=False).encode()
@@ -136,7 +136,7 @@ class GltfWriter:
 
 
 class GltfReader:
-    """A GLB file whose buffer is inside; what it says is checked where it is used."""
+    """A GLB file with an embedded buffer; entries are validated when they are used."""
 
     def __init__(self, path: Path) -> None:
         """Reads the file."""
@@ -153,7 +153,7 @@ class GltfReader:
             raise ValueError(f"{path} is glTF of version {version}; expected 2.0: export it again")
 
     def list_of(self, kind: str) -> list[Any]:
-        """The list of that name in the document; empty where there is none."""
+        """The list of that name in the document; empty if there is none."""
         found = self.document.get(kind, [])
         if not isinstance(found, list):
             raise ValueError(f"{kind} of {self.path} is {short_repr(found)}; expected a list")
@@ -164,7 +164,7 @@ class GltfReader:
         return records.check_fields(self.raw(kind, index), fields, f"entry {index} of {kind} in {self.path}")
 
     def raw(self, kind: str, index: int) -> dict[str, Any]:
-        """One entry of a list as it is; its extensions are nobody else's to check."""
+        """One entry of a list, unchecked, including its extensions."""
         found = self.list_of(kind)
         if index >= len(found) or not isinstance(found[index], dict):
             raise ValueError(f"{self.path} refers to entry {index} of {kind}, which is not there; it is damaged")
@@ -176,7 +176,7 @@ class GltfReader:
         return int(self.entry("accessors", index, ACCESSOR)["count"])
 
     def array(self, index: int, width: int) -> NDArray[np.float32]:
-        """The rows [N, width] of an accessor as float32, dequantised where they are normalised."""
+        """The rows [N, width] of an accessor as float32, dequantised if they are normalised integers."""
         accessor = self.entry("accessors", index, ACCESSOR)
         view = self.entry("bufferViews", accessor["bufferView"], VIEW)
         if WIDTHS[accessor["type"]] != width or "sparse" in self.raw("accessors", index):
@@ -225,7 +225,7 @@ def _chunks(data: bytes, path: Path) -> tuple[str, bytes]:
 
 
 def _dequantise(rows: NDArray, *, normalized: bool) -> NDArray[np.float32]:
-    """Whole numbers as shares of the greatest, where they are normalised; at least -1 (glTF 2.0, Section 3.11)."""
+    """Normalised integers divided by their maximum and clamped at -1 (glTF 2.0, Section 3.11), or plain values."""
     values: NDArray[np.float32] = rows.astype(np.float32)
     if normalized and rows.dtype.kind in "iu":
         values = np.maximum(values / np.float32(np.iinfo(rows.dtype).max), np.float32(-1))
@@ -268,7 +268,7 @@ def placement_of(node: Mapping[str, Any], outer: Placement, where: str) -> Place
 
 
 def place_gaussians(gaussians: Gaussians, placement: Placement) -> Gaussians:
-    """The Gaussians where a placement puts them, their harmonics turned along; the identity changes no bit."""
+    """The Gaussians transformed by a placement, including their SH; the identity changes no bit."""
     if placement.scale == 1 and not bool(placement.shift.any()) and not bool(placement.quat[1:].any()):
         return gaussians
     rotation = rotation_from_quat(placement.quat)
@@ -320,21 +320,21 @@ SPLATS: dict[str, records.Field] = {
     "colorSpace": records.Optional(records.Choice(("srgb_rec709_display",)), "srgb_rec709_display"),
     "projection": records.Optional(records.Choice(("perspective",)), "perspective"),
 }
-"""What the renderers here can draw; how a viewer sorts is its own affair."""
+"""Properties that the renderers support; the sorting method is not checked."""
 HIGHEST_DEGREE = 3
 TURN = (-1.0, -1.0, 1.0)
-"""Signs of the coordinates after half a turn around z: to the frame of glTF, and back."""
+"""Signs of a half turn around z, which converts to the frame of glTF and back."""
 LEAST_SHARE, LEAST_SCALE = 1e-7, 1e-12
 PLAIN_COUNT, BYTES_PER_GAUSSIAN = 2**20, 8
-"""A file of B bytes may show B / 8 Gaussians, or a million: real ones take forty bytes, bombs show one often."""
+"""A file of B bytes may show B / 8 Gaussians, or a million; real ones take forty bytes, bombs repeat one often."""
 MOST_NODES, MOST_PARTS = 10_000, 2000
-"""Of a file, and of sets of splats that they show: to read so many takes seconds."""
+"""Maximum numbers of nodes and of splat sets shown; reading that many takes seconds."""
 
 
 def write_glb(path: Path | str, gaussians: Gaussians) -> None:
     """Writes shapes, opacities, colours and channels as GLB, atomically.
 
-    A viewer that does not know the extension shows the centres as coloured points.
+    Viewers without the extension show the centres as coloured points.
 
     Args:
         path: the file.
@@ -357,7 +357,7 @@ def write_glb(path: Path | str, gaussians: Gaussians) -> None:
 def read_glb(path: Path | str) -> Gaussians:
     """Reads the splats of a GLB, all of them as one set, in the frame of a PLY.
 
-    Memory stays in proportion to the size of the file, whatever it says.
+    Memory stays proportional to the file size, whatever the file declares.
     """
     file = GltfReader(Path(path))
     splats_of = functools.cache(functools.partial(_splat_primitives, file))
@@ -423,9 +423,9 @@ def _glb_bytes(gaussians: Gaussians) -> bytes:
 
 
 def _placed_meshes(file: GltfReader) -> list[tuple[int, Placement | ValueError]]:
-    """The meshes that the scene shows, each with where; a file without scenes shows all its nodes.
+    """The meshes that the scene shows, with their placements; a file without scenes shows all its nodes.
 
-    Meshes without splats may lie anywhere, so what cannot be placed comes with the reason, for who needs to.
+    Unsupported placements are returned as errors, because they matter only for meshes with splats.
     """
     if len(file.list_of("nodes")) > MOST_NODES:
         raise ValueError(f"{file.path} has more than {MOST_NODES} nodes; expected fewer: export its splats alone")
@@ -459,7 +459,7 @@ def _placed_meshes(file: GltfReader) -> list[tuple[int, Placement | ValueError]]
 
 
 def _splat_primitives(file: GltfReader, mesh: int) -> list[dict[str, int]]:
-    """The attributes of those primitives of a mesh that are splats."""
+    """Attributes of the splat primitives of a mesh."""
     where = f"mesh {mesh} of {file.path}"
     primitives = file.raw("meshes", mesh).get("primitives")
     if not isinstance(primitives, list):
@@ -514,7 +514,7 @@ def _read_primitive(file: GltfReader, attributes: dict[str, int], where: str) ->
 
 
 def _stored_degree(attributes: dict[str, int], where: str) -> int:
-    """The highest degree of harmonics of which there is any coefficient."""
+    """The highest SH degree with any coefficient."""
     prefix = f"{EXTENSION}:SH_DEGREE_"
     degrees = {name.removeprefix(prefix).partition("_")[0] for name in attributes if name.startswith(prefix)}
     if not degrees <= {str(degree) for degree in range(HIGHEST_DEGREE + 1)}:
@@ -523,13 +523,13 @@ def _stored_degree(attributes: dict[str, int], where: str) -> int:
 
 
 def _harmonic_names(count: int) -> list[str]:
-    """The attributes of that many coefficients: 1, 4, 9 or 16."""
+    """Attribute names of the given number of SH coefficients: 1, 4, 9 or 16."""
     degrees = range(round(count**0.5))
     return [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{n}" for degree in degrees for n in range(2 * degree + 1)]
 
 
 def _alike(part: Gaussians, coefficients: int, *, are_discs: bool) -> Gaussians:
-    """A set with so many coefficients, and the shape that all sets have."""
+    """A set padded to the given number of coefficients, and to three scales unless all sets are discs."""
     sh = torch.nn.functional.pad(part.sh, (0, 0, 0, coefficients - part.sh.shape[1]))
     log_scales = part.log_scales
     if part.are_discs and not are_discs:

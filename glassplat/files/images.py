@@ -1,4 +1,4 @@
-"""Image files, sRGB as stored or by their colour profile, and the picture files of named views."""
+"""Image files, with values as stored or converted to sRGB by their colour profile, and file names of views."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ if TYPE_CHECKING:
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 HEIF_SUFFIXES = (".heic", ".heif")
-"""Of telephones; read where pi-heif is installed."""
+"""Photographs of phones; read if pi-heif is installed."""
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF", "PPM", "TGA", "JPEG2000")
-"""What a photograph or a mask may be, whatever its suffix; not PostScript and others that start programs."""
+"""Accepted formats, whatever the suffix; not PostScript and other formats whose readers start programs."""
 MOST_PIXELS = 2**27
-"""Of one image; decoding takes about ten bytes a pixel."""
+"""Largest image, in pixels; decoding takes about ten bytes a pixel."""
 COMPRESSION = 4
-"""Of PNG files, of 9: half of the time of Pillow's 6 for a twentieth more bytes."""
+"""Compression level of PNG files, up to 9: half the time of Pillow's default 6 for 5 % more bytes."""
 SHADES_16 = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 _FULL_SCALE_16 = 65535
 
-# Damaged tags that do not matter end in warnings that name no file; those that do matter raise errors.
+# Harmless damaged tags cause warnings that name no file; harmful ones raise errors.
 warnings.filterwarnings("ignore", module=r"PIL\.")
-# `checked_image` sets the bound, and says which file is too large; Pillow warns and names none.
+# `checked_image` checks the limit and names the file; Pillow's warning names none.
 Image.MAX_IMAGE_PIXELS = None
 
 
 @cache
 def reads_heif() -> bool:
-    """Return whether HEIC photographs can be read, from now on by Pillow."""
+    """Return whether HEIC photographs can be read; registers the Pillow plugin."""
     try:
         from pi_heif import register_heif_opener
     except ImportError:
@@ -54,7 +54,7 @@ def reads_heif() -> bool:
 
 
 def open_image(path: Path) -> Image.Image:
-    """Open and fully decode an image, in the mode it is stored in; orientation tags are not applied."""
+    """Open and fully decode an image in its stored mode; orientation tags are not applied."""
     with checked_image(path) as image:
         image.load()
         _check_shades(image)
@@ -62,19 +62,19 @@ def open_image(path: Path) -> Image.Image:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height as stored; reads the header only, but of a TIFF with an orientation tag everything."""
+    """Width and height as stored; decodes only the header, except for TIFFs with an orientation tag."""
     with checked_image(path) as image:
         return image.width, image.height
 
 
 def is_transparent(path: Path) -> bool:
-    """Return whether any pixel lets through what is behind it; decodes only images that store transparency."""
+    """Return whether any pixel is transparent; decodes only images that store transparency."""
     with checked_image(path) as image:
         return opacity(image) is not None
 
 
 def opacity(image: Image.Image) -> NDArray[np.uint8] | None:
-    """[H, W] how opaque each pixel is; None where all are, whether the image stores that or not."""
+    """[H, W] alpha channel; None if all pixels are opaque, whether or not the image stores alpha."""
     if not image.has_transparency_data:
         return None
     with_alpha = image if "A" in image.getbands() else image.convert("RGBA")
@@ -85,14 +85,14 @@ def opacity(image: Image.Image) -> NDArray[np.uint8] | None:
 def read_image(path: Path | str) -> NDArray[np.uint8]:
     """Read an image as uint8 [H, W, C]: one channel for grey, three for colour, four with transparency.
 
-    Sixteen-bit grey is scaled to eight bits. Values are as stored: `read_colors` is for photographs.
+    Sixteen-bit grey is scaled to eight bits. Colours are not converted; use `read_colors` for photographs.
     """
     with checked_image(Path(path)) as image:
         return _pixels(_in_eight_bits(image))
 
 
 def read_colors(path: Path | str) -> NDArray[np.uint8]:
-    """Read a photograph as `read_image` does, its colours converted to sRGB by the embedded profile."""
+    """Read a photograph as `read_image` does, with colours converted to sRGB by the embedded profile."""
     with checked_image(Path(path)) as image:
         return _pixels(in_srgb(image))
 
@@ -126,7 +126,7 @@ def write_image(path: Path | str, image: Tensor | NDArray[np.generic]) -> None:
 
 @contextmanager
 def checked_image(path: Path) -> Iterator[Image.Image]:
-    """An image whose size is checked; all that Pillow raises about a bad file becomes one error that names it."""
+    """An open image of checked size; Pillow's errors about bad files become one error that names the file."""
     try:
         with Image.open(path, formats=(*FORMATS, "HEIF") if reads_heif() else FORMATS) as image:
             if image.width * image.height > MOST_PIXELS:
@@ -138,20 +138,20 @@ def checked_image(path: Path) -> Iterator[Image.Image]:
         raise FileNotFoundError(f"{path} does not exist; expected an image") from error
     except MemoryError:
         raise
-    except Exception as error:  # Its parsers raise whatever damaged bytes lead to, from KeyError to struct.error.
+    except Exception as error:  # Parsers raise anything for damaged bytes, from KeyError to struct.error.
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error) or type(error).__name__
         raise ValueError(f"cannot read {path} as an image ({reason}); replace the file or remove it") from error
 
 
 BACK = {2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}
-"""The EXIF orientation that undoes another."""
+"""The EXIF orientation that undoes each orientation."""
 
 
 def _turn_back(image: ImageFile.ImageFile) -> None:
-    """Pillow turns TIFFs, and no others, as their tag says, and removes it; here both become what the file holds."""
+    """Undo Pillow's automatic rotation of TIFFs, which it applies to no other format, and restore their tag."""
     orientation = image.getexif().get(ExifTags.Base.Orientation) if image.format == "TIFF" else None
     if orientation in BACK:
-        image.filename = ""  # By its name, Pillow would map a file of grey into memory, in the size that it has turned.
+        image.filename = ""  # With a name, Pillow would memory-map grey files in their rotated size.
         image.load()
         image.getexif()[ExifTags.Base.Orientation] = BACK[orientation]
         ImageOps.exif_transpose(image, in_place=True)
@@ -159,16 +159,16 @@ def _turn_back(image: ImageFile.ImageFile) -> None:
 
 
 SPACES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}
-"""Pillow's mode of the pixels that a profile describes, by its name of the colour space."""
+"""Pillow's pixel mode by the colour space of a profile."""
 NEARLY_SRGB = 1
-"""Of 255: a profile that changes no colour by more is one of the many of sRGB, whose pixels stay as they are."""
+"""Of 255: a profile that changes no colour by more is a variant of sRGB, and pixels stay unchanged."""
 
 
 def in_srgb(image: Image.Image) -> Image.Image:
-    """The image in eight bits, with the colours that its embedded profile says, in sRGB.
+    """The image in eight bits, converted from its embedded profile to sRGB.
 
-    Without a profile, cameras say by their tags alone that it is Adobe RGB. One that says nothing, has the profile of
-    sRGB, or one that is broken or for other pixels stays as it is.
+    Without a profile, EXIF tags may declare Adobe RGB. Images without either, with an sRGB profile, or with a profile
+    that is broken or for another pixel mode stay unchanged.
     """
     profile = image.info.get("icc_profile") or (adobe_rgb_profile() if _is_adobe_rgb(image) else None)
     image = _in_eight_bits(image)
@@ -184,10 +184,10 @@ def in_srgb(image: Image.Image) -> Image.Image:
 
 
 def _is_adobe_rgb(image: Image.Image) -> bool:
-    """Return whether the EXIF tags say so, in the way of DCF 2.0."""
+    """Return whether the EXIF tags declare Adobe RGB as in DCF 2.0."""
     try:
         return bool(image.getexif().get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex) == "R03")
-    except Exception:  # noqa: BLE001 - Damaged tags raise whatever they lead to, and are no reason to refuse a picture.
+    except Exception:  # noqa: BLE001 - Damaged tags raise anything, and are no reason to refuse an image.
         return False
 
 
@@ -197,12 +197,12 @@ ADOBE_PRIMARIES = {
     b"gXYZ": (0.20528, 0.62567, 0.06087),
     b"bXYZ": (0.14919, 0.06322, 0.74457),
 }
-"""Under D50, as the profile of Adobe RGB (1998) has them."""
+"""XYZ primaries under D50, as in the Adobe RGB (1998) profile."""
 
 
 @cache
 def adobe_rgb_profile() -> bytes:
-    """The profile of Adobe RGB (1998): that of sRGB with other primaries, and a power for its curve."""
+    """The profile of Adobe RGB (1998): the sRGB profile with other primaries and a power-law curve."""
     profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
     (count,) = struct.unpack_from(">I", profile, 128)
     for index in range(count):
@@ -216,7 +216,7 @@ def adobe_rgb_profile() -> bytes:
 
 @lru_cache(maxsize=8)
 def _to_srgb(profile: bytes) -> tuple[str, ImageCms.ImageCmsTransform] | None:
-    """Mode of the pixels that a profile describes, and their way to sRGB; None if it is broken, or leads nowhere."""
+    """Pixel mode of a profile and its transform to sRGB; None if it is broken, unsupported, or already sRGB."""
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         mode = SPACES[source.profile.xcolor_space.strip()]
@@ -233,7 +233,7 @@ def _to_srgb(profile: bytes) -> tuple[str, ImageCms.ImageCmsTransform] | None:
 
 
 def _in_eight_bits(image: Image.Image) -> Image.Image:
-    """The image, of grey in sixteen bits its shades in eight."""
+    """The image, with sixteen-bit grey scaled to eight bits."""
     if image.mode in SHADES_16:
         return Image.fromarray(np.round(_shades(image) * 255).astype(np.uint8))
     _check_shades(image)
@@ -241,14 +241,14 @@ def _in_eight_bits(image: Image.Image) -> Image.Image:
 
 
 def _pixels(image: Image.Image) -> NDArray[np.uint8]:
-    """[H, W, C] of an image in eight bits, in the mode that keeps what it shows."""
+    """[H, W, C] of an eight-bit image as grey, RGB or RGBA."""
     mode = "RGBA" if image.has_transparency_data else "L" if image.mode in ("1", "L") else "RGB"
     pixels = np.array(image if image.mode == mode else image.convert(mode))
     return pixels[:, :, None] if pixels.ndim == 2 else pixels
 
 
 def _check_shades(image: Image.Image) -> None:
-    """Raises ValueError for values of which nothing says what is white."""
+    """Raise ValueError for values without a defined white level."""
     if image.mode == "F":
         raise ValueError("it holds floating-point numbers; expected colours of 8 or 16 bits")
     if image.mode == "I":
@@ -264,18 +264,18 @@ def _shades(image: Image.Image) -> NDArray[np.float32]:
 
 
 def resize_by_area(pixels: NDArray[np.generic], width: int, height: int) -> NDArray[np.float32]:
-    """[H, W] or [H, W, C] as [height, width(, C)]: exact means over the area of each new pixel, whatever the factor."""
+    """[H, W] or [H, W, C] as [height, width(, C)]: exact means over the area of each new pixel, for any factor."""
     rows, columns = _shares_of_area(pixels.shape[0], height), _shares_of_area(pixels.shape[1], width)
     planes = pixels.reshape(*pixels.shape[:2], -1)
     means = np.empty((height, width, planes.shape[2]), dtype=np.float32)
-    for index in range(planes.shape[2]):  # One after the other: all as floats take more memory than the photograph.
+    for index in range(planes.shape[2]):  # One by one, because all as floats take more memory than the photograph.
         means[..., index] = (columns @ (rows @ planes[..., index].astype(np.float32)).T).T
     return means.reshape(height, width, *pixels.shape[2:])
 
 
 @lru_cache(maxsize=16)
 def _shares_of_area(old: int, new: int) -> Any:
-    """[new, old] sparse: what share of each new pixel along a side each of the old ones covers."""
+    """[new, old] sparse matrix: share of each new pixel that each old pixel covers, along one side."""
     from scipy import sparse
 
     edges = np.arange(new + 1) * old / new
@@ -288,7 +288,7 @@ def _shares_of_area(old: int, new: int) -> Any:
 
 
 def _to_uint8(pixels: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Eight-bit pixels in a shape that Pillow knows."""
+    """Eight-bit pixels in a shape that Pillow supports."""
     if pixels.ndim == 3 and pixels.shape[2] == 1:
         pixels = pixels[:, :, 0]
     if not (pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] in (3, 4))) or 0 in pixels.shape:
@@ -304,7 +304,7 @@ def _to_uint8(pixels: NDArray[np.generic]) -> NDArray[np.uint8]:
 
 
 def files_below(folder: Path) -> Iterator[Path]:
-    """The files below a folder, also in folders that are links, but for links to a folder that they lie in."""
+    """All files below a folder; linked folders are followed unless they contain the link itself."""
     around = {str(folder): frozenset[str]()}
     for where, folders, names in os.walk(folder, followlinks=True):
         inside = around.pop(where) | {os.path.realpath(where)}
@@ -314,7 +314,7 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 
 def is_hidden(relative: PurePath) -> bool:
-    """Return whether a file, by its path from a folder, is one that people do not see there: it or a folder of it."""
+    """Return whether a relative path is hidden: its name, or one of its folders, starts with a dot."""
     return any(part.startswith(".") for part in relative.parts)
 
 
@@ -322,31 +322,31 @@ Parts = tuple[str, ...]
 
 
 def picture_paths(names: Sequence[str]) -> dict[str, Path]:
-    """The PNG of each view, relative to a folder that it never leads out of: the photograph's name, as far as it goes.
+    """PNG path of each view, always inside the output folder, and close to the photograph's name.
 
-    Folders inside of the capture stay (`left/1.jpg` is `left/1.png`). A name that is an absolute path or climbs with
-    `..` keeps what sets it apart from the others of its kind (`/home/me/photos/left/1.jpg` is `left/1.png` too).
-    No two pictures share a file, nor does one lie where another needs a folder, also where case makes no difference.
+    Folders inside the capture are kept (`left/1.jpg` becomes `left/1.png`). Absolute paths and paths with `..` lose the
+    folders that all of them share (`/home/me/photos/left/1.jpg` becomes `left/1.png`, too). No two views share a file,
+    and no file has the path of another's folder, even on case-insensitive file systems.
 
     Args:
-        names: of all views of the capture, so that a picture's name does not depend on which of them are asked for.
+        names: of all views of the capture, so that a view's path does not depend on the selection.
     """
     return _distinct(_inside(names))
 
 
 def flat_picture_names(names: Sequence[str]) -> dict[str, str]:
-    """The same without folders, as names of files that lie side by side."""
+    """The same without folders: file names in a single folder."""
     flat = {name: ("_".join(parts),) for name, parts in _inside(names).items()}
     return {name: path.name for name, path in _distinct(flat).items()}
 
 
 def _distinct(parts: Mapping[str, Parts]) -> dict[str, Path]:
-    """A file for every name; who has a plain name to himself gets it before others look for one."""
+    """A unique file for every name; names without a clash are assigned first."""
     plain = {name: _key(_plain(own)) for name, own in parts.items()}
     times = Counter(plain.values())
     taken: set[str] = set()
     paths: dict[str, Path] = {}
-    # The deepest first, so that no file can stand where one of them needs a folder.
+    # The deepest first, so that no file takes the path of a folder.
     for name in sorted(parts, key=lambda name: (-len(parts[name]), times[plain[name]] > 1)):
         wanted = _candidates(parts[name], clash=times[plain[name]] > 1)
         path = next(path for path in wanted if not {_key(path), f"{_key(path)}/"} & taken)
@@ -356,7 +356,7 @@ def _distinct(parts: Mapping[str, Parts]) -> dict[str, Path]:
 
 
 def _inside(names: Sequence[str]) -> dict[str, Parts]:
-    """Folders and file of each name, without what leads out; backslashes divide, as on Windows."""
+    """Folders and file of each name, confined to the output folder; backslashes are separators, as on Windows."""
     parts = {name: _normal(name) for name in names}
     outside = [name for name in names if leads_out(name)]
     columns = zip(*(parts[name][:-1] for name in outside), strict=False)
@@ -365,7 +365,7 @@ def _inside(names: Sequence[str]) -> dict[str, Parts]:
 
 
 def leads_out(name: str) -> bool:
-    """Return whether a name is an absolute path, or climbs with `..`."""
+    """Return whether a name is an absolute path, or contains `..`."""
     path = PureWindowsPath(name)
     return bool(path.anchor) or ".." in path.parts
 
@@ -386,7 +386,7 @@ def _plain(parts: Parts) -> PurePosixPath:
 
 
 def _candidates(parts: Parts, *, clash: bool) -> Iterator[PurePosixPath]:
-    """Names in the order in which they are wanted; with the photograph's own suffix where the plain one would clash."""
+    """Names in order of preference; with the photograph's own suffix if the plain name would clash."""
     if not clash:
         yield _plain(parts)
     whole = PurePosixPath(*parts)
@@ -395,5 +395,5 @@ def _candidates(parts: Parts, *, clash: bool) -> Iterator[PurePosixPath]:
 
 
 def _key(path: PurePosixPath) -> str:
-    """Name that file systems without case take a path for."""
+    """Key of a path, equal for paths that a case-insensitive file system does not distinguish."""
     return unicodedata.normalize("NFC", str(path)).casefold()

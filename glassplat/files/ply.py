@@ -1,4 +1,4 @@
-"""Gaussians as PLY, plain as every splatting viewer and trainer reads it, and compressed."""
+"""Gaussians as PLY: the standard format of splat viewers and trainers, and the compressed one (reading only)."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ Floats = NDArray[np.float32]
 
 
 def is_compressed(table: PlyTable) -> bool:
-    """Return whether a PLY is of this kind."""
+    """Return whether a PLY is a compressed one of PlayCanvas/SuperSplat."""
     return set(PACKED) <= table.columns.keys()
 
 
-@np.errstate(over="ignore", invalid="ignore")  # What is out of range is told by the caller; here it must not warn.
+@np.errstate(over="ignore", invalid="ignore")  # The caller reports values out of range; NumPy must not warn.
 def read_compressed(path: Path, table: PlyTable) -> Gaussians:
-    """The Gaussians of a compressed PLY, whose `vertex` table has been read."""
+    """Reads the Gaussians of a compressed PLY whose `vertex` table has been read."""
     words = [table.columns[name] for name in PACKED]
     if any(word.dtype != np.uint32 for word in words):
         raise ValueError(f"{path} stores packed values in {[str(word.dtype) for word in words]}; expected uint")
@@ -58,7 +58,7 @@ def read_compressed(path: Path, table: PlyTable) -> Gaussians:
 
 
 def _bounds(path: Path, count: int) -> dict[str, Floats]:
-    """The bounds [N] of each Gaussian's chunk by name."""
+    """Bounds [N] of the chunk of each Gaussian, by name."""
     columns = read_table(path, "chunk").columns
     missing = [name for name in BOUNDS if name not in columns]
     chunks = len(next(iter(columns.values())))
@@ -78,13 +78,13 @@ def _between(shares: Floats, bounds: dict[str, Floats], names: tuple[str, ...]) 
 
 
 def _unit(words: NDArray[np.uint32], fields: tuple[tuple[int, int], ...]) -> Floats:
-    """Bit fields (shift, width) as shares [N, F] in [0, 1]."""
+    """Bit fields (shift, width) normalised to [0, 1], [N, F]."""
     parts = [((words >> np.uint32(shift)) & np.uint32(2**width - 1)) / (2**width - 1) for shift, width in fields]
     return np.stack(parts, axis=1).astype(np.float32)
 
 
 def _rotations(words: NDArray[np.uint32]) -> Floats:
-    """Quaternions [N, 4] `wxyz`: the largest component is left out, two bits say which."""
+    """Quaternions [N, 4] `wxyz`; two bits hold the index of the largest component, which is not stored."""
     three = (_unit(words, TENS) - np.float32(0.5)) * np.float32(np.sqrt(2))
     largest = np.sqrt((1 - (three**2).sum(axis=1)).clip(min=0))
     which = words >> np.uint32(30)
@@ -99,7 +99,7 @@ def _rotations(words: NDArray[np.uint32]) -> Floats:
 
 
 def _harmonics(path: Path, table: PlyTable, count: int) -> Floats:
-    """Coefficients [N, K, 3] beyond the constant one; a byte each, in a table of their own where there are any."""
+    """SH coefficients [N, K, 3] beyond degree 0: a byte each, in a separate table if there are any."""
     element = table.header.element("sh")
     if element is None:
         return np.zeros((count, 0, 3), dtype=np.float32)
@@ -125,23 +125,23 @@ SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 DISC_SCALE = SCALE[:DISC_SCALES]
 REQUIRED = (*POSITION, "opacity", *DISC_SCALE, *ROTATION)
-"""A file without the third scale holds discs, as those of 2DGS do."""
+"""A file without the third scale holds discs, as in 2DGS."""
 CHANNEL_PREFIXES = ("log_", "logit_", "raw_")
-"""Raw values are named after their activation, so these prefixes tell our channels from foreign properties."""
+"""Raw values are named after their activation; these prefixes distinguish channels from foreign properties."""
 SH_COEFFICIENTS = (1, 4, 9, 16)
 
 
 def is_channel(name: str) -> bool:
-    """Return whether a property is a channel: not one of a foreign program, nor the name of what all Gaussians have."""
+    """Return whether a property is a channel, not one of another program or a tensor that all Gaussians have."""
     return name.startswith(CHANNEL_PREFIXES) and name not in PER_GAUSSIAN
 
 
 def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
-    """Writes a set of Gaussians as a standard 3DGS or, of discs, 2DGS PLY: float32, binary little endian, atomically.
+    """Writes Gaussians as a standard 3DGS PLY, or discs as 2DGS PLY: float32, binary little endian, atomically.
 
     The properties are x y z, nx ny nz (zero), f_dc_*, f_rest_* (channel-major), opacity (logit),
-    scale_* (log; two of a disc), rot_* (`wxyz`), then one property per channel, which other readers skip.
-    Gaussians without colour (K = 0) have neither f_dc nor f_rest.
+    scale_* (log; two for discs), rot_* (`wxyz`), then one property per channel, which other readers skip. Gaussians
+    without colour (K = 0) have neither f_dc nor f_rest.
     """
     unreadable = [name for name in gaussians.channels if not is_channel(name)]
     if unreadable:
@@ -159,11 +159,11 @@ def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
 
 
 def read_gaussians(path: Path | str) -> Gaussians:
-    """Reads a 3DGS PLY, or one of 2DGS with two scales, as raw float32 tensors, bit for bit as stored.
+    """Reads a 3DGS PLY, or a 2DGS PLY with two scales, as raw float32 tensors, bit for bit as stored.
 
-    Properties may come in any order, in ascii or either byte order, with SH degree 0 to 3, with red, green and blue
-    in place of harmonics, or no colour at all. Properties that begin with `log_`, `logit_` or `raw_` become channels;
-    normals and other foreign properties are ignored. `active_sh_degree` is the highest degree stored.
+    Properties may be in any order, ascii or either byte order, with SH degree 0 to 3, with red, green and blue in place
+    of SH, or without colour. Properties whose names start with `log_`, `logit_` or `raw_` become channels; normals and
+    other foreign properties are ignored. `active_sh_degree` is the highest degree stored.
     """
     path = Path(path)
     table = read_table(path)
@@ -184,7 +184,7 @@ def read_gaussians(path: Path | str) -> Gaussians:
 
 
 def _color_columns(sh: Tensor) -> tuple[list[str], Tensor]:
-    """Names and values [N, 3 K] of the colour properties; the higher bands lie channel by channel."""
+    """Names and values [N, 3 K] of the colour properties; bands above 0 are stored channel by channel."""
     count = sh.shape[1]
     if count == 0:
         return [], sh.reshape(sh.shape[0], 0)
@@ -212,7 +212,7 @@ def _read_sh(columns: Mapping[str, Tensor], path: Path) -> Tensor:
 
 
 def _check_is_splat(table: PlyTable, path: Path) -> None:
-    """Raises with what the file seems to be, if it does not hold Gaussians."""
+    """Raises an error with the likely kind of file, if it does not hold Gaussians."""
     missing = [name for name in REQUIRED if name not in table.columns]
     if not missing:
         return
@@ -230,7 +230,7 @@ def _check_is_splat(table: PlyTable, path: Path) -> None:
 
 
 def _as_float32(values: NDArray) -> NDArray[np.float32]:
-    with np.errstate(over="ignore"):  # A double may be beyond float32; it becomes infinite.
+    with np.errstate(over="ignore"):  # Doubles that exceed float32 become infinite.
         return np.ascontiguousarray(values, dtype=np.float32)
 
 
@@ -239,10 +239,10 @@ def _stack_columns(columns: Mapping[str, Tensor], names: tuple[str, ...]) -> Ten
 
 
 def as_numpy(tensor: Tensor) -> NDArray[np.float32]:
-    """A tensor as an array of the CPU, in single precision."""
+    """A tensor as a float32 array on the CPU."""
     return tensor.detach().to("cpu", torch.float32).numpy()
 
 
 def as_tensor(values: NDArray) -> Tensor:
-    """An array as a tensor, in single precision."""
+    """An array as a float32 tensor."""
     return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))

@@ -1,4 +1,4 @@
-"""The PLY container: a header and one table of scalar columns per element. Knows nothing of Gaussians."""
+"""The PLY container: a header and one table of scalar columns per element, independent of Gaussians."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MOST_HEADER_LINES = 10_000
 
 @dataclass(frozen=True)
 class PlyElement:
-    """One table declared in a header; `None` as a type stands for a list property."""
+    """One table declared in a header; the type `None` marks a list property."""
 
     name: str
     count: int
@@ -35,11 +35,11 @@ class PlyElement:
 
     @property
     def has_lists(self) -> bool:
-        """Return whether rows differ in length, so that the table cannot be skipped or read at once."""
+        """Return whether rows may differ in length, so that the table cannot be skipped or read at once."""
         return any(kind is None for _, kind in self.properties)
 
     def row_type(self, byte_order: str) -> np.dtype:
-        """The packed row of a binary file."""
+        """Data type of a packed row in a binary file."""
         return np.dtype([(name, byte_order + str(kind)) for name, kind in self.properties])
 
 
@@ -68,7 +68,7 @@ def read_table(path: Path, name: str = "vertex") -> PlyTable:
 
     Args:
         path: the file.
-        name: which element to read; what comes after it in the file is not looked at.
+        name: element to read; later elements are ignored.
     """
     if not os.path.isfile(path):
         raise FileNotFoundError(f"no PLY file at {path}; check the path")
@@ -95,9 +95,9 @@ COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_bl
 
 
 def point_colors(columns: Mapping[str, NDArray]) -> NDArray | None:
-    """[N, 3] the columns red, green and blue, or as some programs call them, from 0 to 255; None where one is missing.
+    """[N, 3] the columns red, green and blue, or their other names, from 0 to 255; None if one is missing.
 
-    Fractions that are nowhere above one are shares of 255, as some programs write them.
+    Floats that never exceed one are multiplied by 255, because some programs write colours that way.
     """
     names = next((names for names in COLORS if columns.keys() >= set(names)), None)
     if names is None:
@@ -111,7 +111,7 @@ def write_table(path: Path, names: list[str], rows: NDArray[np.float32]) -> None
     """Writes one `vertex` table [N, P] of float properties, binary little endian, atomically.
 
     Args:
-        path: the file; replaced as a whole or not at all.
+        path: the file; replaced completely or not at all.
         names: the P property names in order.
         rows: the values.
     """
@@ -123,7 +123,7 @@ def write_table(path: Path, names: list[str], rows: NDArray[np.float32]) -> None
 
 
 def read_header(stream: BinaryIO, path: Path) -> PlyHeader:
-    """Parses the header and leaves the stream at the first byte of the data."""
+    """Parses the header; the stream ends up at the first byte of the data."""
     if stream.readline(LONGEST_HEADER_LINE).rstrip() != b"ply":
         raise ValueError(
             f"{path} is not a PLY file: expected its first line to be 'ply'. Give a Gaussian-splatting .ply file"
@@ -145,7 +145,7 @@ def read_header(stream: BinaryIO, path: Path) -> PlyHeader:
 
 
 def _header_lines(stream: BinaryIO, path: Path) -> list[list[str]]:
-    """The header's lines, split into words, up to `end_header`; comments are left out."""
+    """Header lines up to `end_header`, split into words, without comments."""
     lines: list[list[str]] = []
     while len(lines) < MOST_HEADER_LINES:
         line = stream.readline(LONGEST_HEADER_LINE)
@@ -217,7 +217,7 @@ def _read_ascii(
 
 
 def _in_declared_type(values: NDArray[np.float64], kind: str, name: str, path: Path) -> NDArray:
-    """A column of a text file; what is beyond a float becomes infinite, what is no such whole number is refused."""
+    """A column of a text file in its declared type; out of range, floats become infinite and integers are refused."""
     if not kind.startswith("f"):
         limits = np.iinfo(kind)
         inside = (values >= limits.min) & (values <= limits.max)

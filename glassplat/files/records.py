@@ -1,7 +1,7 @@
-"""JSON records from files that anybody may have written: parsing, limits, and tables of fields.
+"""JSON records from untrusted files: parsing, limits, and tables of fields.
 
-Nothing that is read is deeper than `DEEPEST`, no text in it is unprintable in UTF-8, no whole number has more than
-`MOST_DIGITS` digits (a longer one becomes a float, which may be infinite), and no key of an object comes twice.
+Values are nested at most `DEEPEST` levels, all text is valid UTF-8, and no key of an object occurs twice. Integers have
+at most `MOST_DIGITS` digits; longer ones become floats, which may be infinite.
 
 A table of fields checks a JSON object:
 
@@ -24,12 +24,12 @@ from typing import Any
 from glassplat.options import is_finite, short_repr
 
 LARGEST_TEXT = 2**28
-"""Bytes of a text file; a list of a hundred thousand photographs with their poses has a quarter of it."""
+"""Maximum bytes of a text file; a list of a hundred thousand photographs with poses takes a quarter of it."""
 
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turns what opening or reading a file raises into errors that say what is wrong with which file."""
+    """Turns exceptions from opening or reading a file into errors that name the file and the cause."""
     try:
         if not stat.S_ISREG(os.stat(path).st_mode):
             raise ValueError(f"{path} cannot be read (it is a folder, a pipe or a device); expected a file")
@@ -58,7 +58,7 @@ def read_text(path: Path) -> str:
 
 DEEPEST = 32
 MOST_DIGITS = 20
-"""Enough for every number of 64 bits."""
+"""Enough for every 64-bit integer."""
 
 
 def read_json(path: Path) -> Any:
@@ -67,7 +67,7 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(text: str, where: str) -> Any:
-    """The value that a text in JSON stands for; `where` names the text in messages."""
+    """The value of a JSON text; `where` names the text in messages."""
     try:
         value = json.loads(text, parse_int=_whole, object_pairs_hook=_without_repeats)
     except RecursionError as error:
@@ -91,7 +91,7 @@ def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _check_nesting_and_text(value: Any, where: str) -> None:
-    """Level by level, without recursion of its own."""
+    """Checks depth and text level by level, without recursion."""
     level = [value]
     for _ in range(DEEPEST):
         unprintable = next((text for text in level if isinstance(text, str) and not is_encodable(text)), None)
@@ -110,12 +110,12 @@ def _inside(value: Any) -> list[Any]:
 
 
 def is_encodable(text: str) -> bool:
-    """Half of a surrogate pair can be written in JSON, but in no file name and on no screen."""
+    """Return whether a text has no lone surrogates, which JSON allows, but file names and terminals do not."""
     return text.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
 def readable_name(path: Path | str) -> str:
-    """A path as text that JSON may hold; bytes that are none stand there as hexadecimal numbers."""
+    """A path as text for JSON; undecodable bytes are written in hexadecimal."""
     return os.fsencode(path).decode("utf-8", "backslashreplace")
 
 
@@ -125,16 +125,16 @@ def _too_deep(where: str) -> str:
 
 LEAST_WHOLE, MOST_WHOLE = -(2**63), 2**63 - 1
 LARGEST_COORDINATE = 1e12
-"""World units. The square of a greater one, and what is summed up of them, does not fit float32."""
+"""World units; squares of larger values, and sums of these, may exceed float32."""
 
 
 class Field:
-    """Requirement of one value; `expected` is for messages, as in "expected a number"."""
+    """Requirement for one value; `expected` is for messages, as in "expected a number"."""
 
     expected = "any value"
 
     def read(self, value: Any, where: str) -> Any:
-        """The value, in the type that the program uses."""
+        """Checks a value and converts it to the type that the program uses."""
         if not self._fits(value):
             raise ValueError(f"{where} is {short_repr(value)}; expected {self.expected}")
         return self._converted(value, where)
@@ -147,7 +147,7 @@ class Field:
 
 
 class Number(Field):
-    """A finite number, from `least` to `most`, or above `above`; no text nor truth value; read as float."""
+    """A finite number, from `least` to `most`, or above `above`; not a string or boolean; read as float."""
 
     def __init__(self, least: float = -math.inf, most: float = math.inf, above: float = -math.inf) -> None:
         self._least, self._most, self._above = least, most, above
@@ -162,7 +162,7 @@ class Number(Field):
 
 
 class Whole(Field):
-    """A whole number from `least` to `most`, not 2.0 nor true."""
+    """An integer from `least` to `most`; 2.0 and true are refused."""
 
     def __init__(self, least: int = LEAST_WHOLE, most: int = MOST_WHOLE) -> None:
         self._least, self._most = least, most
@@ -173,7 +173,7 @@ class Whole(Field):
 
 
 class Flag(Field):
-    """True or false, not 0 nor 1."""
+    """A boolean; 0 and 1 are refused."""
 
     expected = "true or false"
 
@@ -182,7 +182,7 @@ class Flag(Field):
 
 
 class Text(Field):
-    """A text that is not empty."""
+    """A non-empty string."""
 
     expected = "a text that is not empty"
 
@@ -191,7 +191,7 @@ class Text(Field):
 
 
 class Choice(Field):
-    """One of a few values; 1 is not true here."""
+    """One of a few values; types must match, so that 1 is not true."""
 
     def __init__(self, choices: tuple[Any, ...]) -> None:
         self._choices = choices
@@ -202,7 +202,7 @@ class Choice(Field):
 
 
 class Items(Field):
-    """A list of values of one kind, of `count` of them if that is given; read as a tuple."""
+    """A list of values of one kind, with `count` entries if given; read as a tuple."""
 
     def __init__(self, item: Field, count: int | None = None) -> None:
         self._item, self._count = item, count
@@ -249,11 +249,11 @@ class Optional(Field):
 
 
 def check_fields(value: Any, fields: Mapping[str, Field], where: str) -> dict[str, Any]:
-    """The fields of an object, each as its entry of the table says; keys that the table does not know are left out.
+    """The fields of an object, checked and converted by a table; keys outside the table are left out.
 
     Args:
-        value: what was read.
-        fields: what has to be under each key; one that is `Optional` may be missing.
+        value: the parsed JSON value.
+        fields: requirement by key; `Optional` fields may be missing.
         where: names the object in messages.
     """
     if not isinstance(value, dict):
@@ -270,7 +270,7 @@ def check_fields(value: Any, fields: Mapping[str, Field], where: str) -> dict[st
 
 
 def _range_text(least: float, most: float, above: float = -math.inf) -> str:
-    """The range of a number, for messages; the ends of 64 bits go without saying."""
+    """The range of a number, for messages; 64-bit limits are omitted."""
     is_above, has_least, has_most = above > -math.inf, least > LEAST_WHOLE, most < MOST_WHOLE
     if has_least and has_most:
         return f" from {least:g} to {most:g}"

@@ -1,4 +1,4 @@
-"""Scenes as folders, and splat files of any format; SOG and KSPLAT by way of gaussforge, an extra."""
+"""Scenes as folders, and splat files of any format; SOG and KSPLAT require gaussforge, an extra."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ PHOTOGRAPHER, POSES = "photographer.ply", "poses.json"
 FILES = (PRIMARY, GLASS, PLANES, ENVIRONMENT, SURROUNDINGS, EXPOSURES, PHOTOGRAPHER, POSES)
 LARGEST_COLOR = 1e6
 LARGEST_LOG = 40.0
-"""Of a logarithm: its exponential, squared, fits float32."""
+"""Largest logarithm; the square of its exponential fits float32."""
 EXTENT = records.Number(above=1 / records.LARGEST_COORDINATE, most=4 * records.LARGEST_COORDINATE)
-"""World units; the squares of smaller ones do not fit float32 either."""
+"""World units; squares of smaller values may underflow float32."""
 SH_DEGREE = records.Whole(0, 3)
 DIRECTION = records.Nullable(records.Items(records.Number(-1.001, 1.001), 3))
 UNIT_TOLERANCE = 1e-3
@@ -45,19 +45,18 @@ HEADER: dict[str, records.Field] = {
     "up": records.Optional(DIRECTION),
     "files": records.Optional(records.Items(records.Choice(FILES))),
 }
-"""`files` is what the scene consists of, so that one that is lost is missed, and one of an earlier scene is not read;
-folders of earlier versions lack it."""
+"""`files` lists the parts of the scene, so that a lost file is detected and one of an earlier scene is ignored; folders
+of earlier versions lack it."""
 
 
 def write_scene(folder: Path, scene: Scene) -> None:
-    """Writes a scene so that `read_scene` returns it exactly.
+    """Writes a scene; `read_scene` returns it exactly.
 
-    `point_cloud.ply` holds the primary Gaussians, which any splat viewer shows without the reflections;
-    `glass.ply` and `planes.json` hold what a viewer that knows panes needs on top, `environment.safetensors` the raw
-    texels of the environment's cube map, `surroundings.ply` the Gaussians that reflections show, `exposures.json` how
-    the photographs were exposed, `photographer.ply` whom the panes show in them, in a frame that goes along with the
-    camera, `poses.json` how far their cameras are from where they were said to be. Each is there only where the scene
-    has it.
+    `point_cloud.ply` holds the primary Gaussians, which any splat viewer shows without reflections. `glass.ply` and
+    `planes.json` are for viewers that support panes. `environment.safetensors` holds the raw texels of the
+    environment's cube map, `surroundings.ply` the Gaussians seen in reflections. `exposures.json` holds the exposures
+    of the photographs, `poses.json` the corrections of their camera poses. `photographer.ply` holds the reflection of
+    the photographer, in a frame that moves with the camera. Parts that the scene lacks are not written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = [PRIMARY]
@@ -85,7 +84,7 @@ def write_scene(folder: Path, scene: Scene) -> None:
 
 
 def read_scene(folder: Path) -> Scene:
-    """Reads what `write_scene` wrote."""
+    """Reads a scene that `write_scene` wrote."""
     header = records.check_fields(records.read_json(folder / SCENE), HEADER, str(folder / SCENE))
     for name in header["files"] or ():
         if not os.path.isfile(folder / name):
@@ -112,7 +111,7 @@ def read_scene(folder: Path) -> Scene:
 
 
 def direction(up: Sequence[float] | None, where: str) -> Direction | None:
-    """The direction that a header holds, if any."""
+    """The unit direction in a header, if any."""
     if up is None:
         return None
     x, y, z = up
@@ -122,7 +121,7 @@ def direction(up: Sequence[float] | None, where: str) -> Direction | None:
 
 
 def _colored(folder: Path, name: str, active_sh_degree: int | None) -> Gaussians:
-    """Gaussians with the degree that the scene's header names; without one, with the highest that is stored."""
+    """Gaussians with the SH degree from the scene's header, or else the highest degree stored."""
     gaussians = _drawable(folder / name)
     if active_sh_degree is None:
         return gaussians
@@ -133,7 +132,7 @@ def _colored(folder: Path, name: str, active_sh_degree: int | None) -> Gaussians
 
 
 def _glass(path: Path) -> Gaussians:
-    """Glass with its marks, without which nothing tells where it reflects."""
+    """Glass with its marks, which determine where it reflects."""
     glass = _ellipsoids(_drawable(path), path)
     if "logit_mark" not in glass.channels:
         raise ValueError(f"{path} has no property logit_mark; expected glass as `planar` exports it")
@@ -141,21 +140,21 @@ def _glass(path: Path) -> Gaussians:
 
 
 def _ellipsoids(gaussians: Gaussians, path: Path) -> Gaussians:
-    """Gaussians that are composited with others of three scales."""
+    """Checks that Gaussians have three scales, as compositing them with others requires."""
     if gaussians.are_discs:
         raise ValueError(f"{path} has two scales, scale_0 and scale_1; expected three, as `planar` exports it")
     return gaussians
 
 
 def _drawable(path: Path) -> Gaussians:
-    """Gaussians whose colours and channels leave images finite; what cannot be drawn, the renderers leave out."""
+    """Reads Gaussians and refuses colours and channels that make images non-finite; renderers skip undrawable ones."""
     gaussians = read_gaussians(path)
     bounds = {"sh": LARGEST_COLOR} | {
         name: LARGEST_LOG if name.startswith("log_") else LARGEST_COLOR for name in gaussians.channels
     }
     for name, most in bounds.items():
         values = gaussians.tensors()[name]
-        broken = ~(values.abs() <= most)  # NaN is not.
+        broken = ~(values.abs() <= most)  # Also true for NaN.
         if bool(broken.any()):
             raise ValueError(f"{path} holds the value {values[broken][0]:g} of {name}; expected at most {most:g}")
     return gaussians
@@ -166,9 +165,9 @@ LEAST_SCALE = 1e-12
 
 
 def read_splats(path: Path | str) -> Gaussians:
-    """Reads the Gaussians of a file in the frame of a PLY (y down, z forward), as they are stored.
+    """Reads the Gaussians of a file in the frame of a PLY (y down, z forward), without filtering.
 
-    What kind of file it is, its first bytes say; a .splat, .sog or .ksplat its name.
+    The format is detected by the first bytes, or by the suffix for .splat, .sog and .ksplat.
     """
     path = Path(path)
     with records.reading(path), path.open("rb") as stream:
@@ -188,7 +187,7 @@ def read_splats(path: Path | str) -> Gaussians:
 
 
 def drawable(gaussians: Gaussians, path: Path | str) -> tuple[Gaussians, int]:
-    """Those that can be drawn, and how many cannot: values not finite or absurd, rotations without direction."""
+    """The drawable Gaussians, and the number of others: non-finite or extreme values, or zero quaternions."""
     bounds = {
         "means": records.LARGEST_COORDINATE,
         "log_scales": LARGEST_LOG,
@@ -198,7 +197,7 @@ def drawable(gaussians: Gaussians, path: Path | str) -> tuple[Gaussians, int]:
     good = ~torch.isnan(gaussians.logit_opacities) & (gaussians.quats.square().sum(1) > 0)
     for name, most in bounds.items():
         values = gaussians.tensors()[name].flatten(1)
-        # A scale may be as small as it likes.
+        # Scales may be arbitrarily small.
         good &= ((values if name == "log_scales" else values.abs()) <= most).all(dim=1) & ~values.isnan().any(dim=1)
     for name, values in gaussians.channels.items():
         good &= values.abs() <= (LARGEST_LOG if name.startswith("log_") else LARGEST_COLOR)
@@ -216,7 +215,7 @@ def drawable(gaussians: Gaussians, path: Path | str) -> tuple[Gaussians, int]:
 
 
 def _read_rows(path: Path) -> Gaussians:
-    """A .splat: 32 bytes per Gaussian, colour and opacity as seen, scales not logarithmic."""
+    """A .splat: 32 bytes per Gaussian, with activated colours and opacities, and linear scales."""
     size = os.stat(path).st_size
     if size == 0 or size % SPLAT_ROW.itemsize:
         raise ValueError(
@@ -236,7 +235,7 @@ def _read_rows(path: Path) -> Gaussians:
 
 
 def read_forged(path: Path) -> Gaussians:
-    """Reads a .sog (PlayCanvas) or .ksplat (GaussianSplats3D), which are lossy, in the frame of a PLY."""
+    """Reads a .sog (PlayCanvas) or .ksplat (GaussianSplats3D), both lossy, in the frame of a PLY."""
     forge, kind = _forge(path), path.suffix.lower()[1:]
     with records.reading(path):
         data = path.read_bytes()
@@ -250,7 +249,7 @@ def read_forged(path: Path) -> Gaussians:
 
 
 def write_forged(path: Path, gaussians: Gaussians) -> None:
-    """Writes a .sog or .ksplat; discs become as flat as SPZ can say.
+    """Writes a .sog or .ksplat; discs get the smallest third scale of SPZ.
 
     Raises:
         ValueError: gaussforge is not installed, or cannot write these Gaussians; or there are none.
@@ -259,7 +258,7 @@ def write_forged(path: Path, gaussians: Gaussians) -> None:
     forge = _forge(path)
     if not len(gaussians):
         raise ValueError(f"there are no Gaussians to write as {path}; expected one at least")
-    # SOG leaves out the largest component of a rotation, which its length of one tells.
+    # SOG omits the largest component of a quaternion, which follows from unit length.
     quats = torch.nn.functional.normalize(gaussians.quats, dim=1)
     gaussians = replace(gaussians, quats=quats, log_scales=three_log_scales(gaussians))
     with tempfile.TemporaryDirectory() as folder:

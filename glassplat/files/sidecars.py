@@ -1,4 +1,4 @@
-"""Sidecar files of a PLY: panes, cameras, corrections of photographs, environments."""
+"""Sidecar files of a PLY: panes, cameras, per-photograph corrections, environments and panoramas."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ LONGEST_REASON = 200
 
 
 class TensorsFile(NamedTuple):
-    """An open file: its header, and what its tensors are read from."""
+    """An open file: its header, and the library's object for reading tensors."""
 
     header: dict[str, Any]
     file: Any
 
     def tensors(self) -> dict[str, Tensor]:
-        """All tensors by name, in memory: those of the library stay in the file, which Windows then never replaces."""
+        """All tensors by name, copied: memory-mapped ones would keep Windows from replacing the file."""
         return {name: self.file.get_tensor(name).clone() for name in self.file.keys()}  # noqa: SIM118
 
 
@@ -50,24 +50,24 @@ def write_tensors(path: Path | str, tensors: Mapping[str, Tensor], header: Mappi
     """Writes tensors and a header atomically.
 
     Raises:
-        OSError: the disk is full or not writable; an older file at `path` stays as it was.
+        OSError: the disk is full or not writable; an older file at `path` is unchanged.
     """
     owned = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     with atomic_write(path) as temporary:
         temporary.touch()
-        usual_mode = temporary.stat().st_mode  # The library's own is for the owner alone, whatever the umask.
+        usual_mode = temporary.stat().st_mode  # The library restricts files to the owner, whatever the umask.
         try:
             save_file(owned, temporary, metadata={HEADER_KEY: json.dumps(header)})
-        except SafetensorError as error:  # What the system says reaches Python in this disguise.
+        except SafetensorError as error:  # The library wraps errors of the operating system.
             raise system_error(str(error)) from error
         temporary.chmod(usual_mode)
 
 
 def system_error(text: str) -> OSError:
-    """The error of the operating system that a library tells in words, with the number that says what helps."""
+    """The operating system's error with its errno, recovered from the text of a library's error."""
     if match := re.search(
         r"\(os error (\d+)\)", text
-    ):  # As libraries in Rust have it, on Windows with its own numbers.
+    ):  # As written by libraries in Rust; on Windows with its own numbers.
         return OSError(int(match[1]), text, None, int(match[1]))
     number = next((number for number in errno.errorcode if os.strerror(number) in text), None)
     return OSError(text) if number is None else OSError(number, text)
@@ -75,12 +75,12 @@ def system_error(text: str) -> OSError:
 
 @contextmanager
 def opened_tensors(path: Path, file_format: str, what: str) -> Iterator[TensorsFile]:
-    """A file that `write_tensors` wrote, its header checked to be of a format.
+    """Opens a file of `write_tensors`, and checks the format in its header.
 
     Args:
         path: the file.
-        file_format: what the header says under `format`.
-        what: what the file is, for messages, such as "an environment".
+        file_format: expected `format` in the header.
+        what: kind of the file for messages, such as "an environment".
     """
     try:
         with records.reading(path), _unicode_name(path) as name, _open_table(name) as file:
@@ -90,13 +90,13 @@ def opened_tensors(path: Path, file_format: str, what: str) -> Iterator[TensorsF
                 raise ValueError(f"{path} has format {found!r}; expected {file_format!r}, as glassplat writes it")
             yield TensorsFile(header, file)
     except SafetensorError as error:
-        reason = str(error)[:LONGEST_REASON]  # It may repeat all of the header.
+        reason = str(error)[:LONGEST_REASON]  # It may contain the whole header.
         raise ValueError(f"{path} is truncated or not {what} ({reason}); expected a complete file") from error
 
 
 @contextmanager
 def _open_table(path: Path) -> Iterator[Any]:
-    """The library's view of one file; it opens a path twice, and another file may be written there in between."""
+    """Opens a file with the library; retries if the file was replaced, because the library opens the path twice."""
     while True:
         before = _file_identity(path)
         try:
@@ -118,7 +118,7 @@ def _file_identity(path: Path) -> tuple[int, int]:
 
 @contextmanager
 def _unicode_name(path: Path) -> Iterator[Path]:
-    """A name that the library opens: of a path with bytes that are no text, which it refuses, a link to it."""
+    """A path that the library accepts: a temporary link if the name is not valid text."""
     if records.is_encodable(str(path)):
         yield path
         return
@@ -129,11 +129,11 @@ def _unicode_name(path: Path) -> Iterator[Path]:
 
 
 EDIT_TOLERANCE = 1e-5
-"""Above this difference the readable value has been edited by hand, and wins over the raw one."""
+"""Difference above which the readable value was edited by hand, and takes precedence over the raw one."""
 REFLECTANCE_MARGIN = 1e-6
 LEAST_LENGTH = 1e-6
 LEAST_ANGLE = 1e-3
-"""Between tangent and normal, in radians: below it the rectangle's sides have no direction."""
+"""Smallest angle between tangent and normal, radians; below, the rectangle's sides are undefined."""
 LEAST_HALF_SIZE = 1e-9
 LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE = 1e-6, 1.0
 VECTOR = records.Items(records.COORDINATE, 3)
@@ -154,7 +154,7 @@ PLANE: dict[str, records.Field] = {
 
 
 def write_planes(path: Path | str, planes: Planes) -> None:
-    """Writes `planes_json`, atomically; `read_planes` gives back the same float32 bits.
+    """Writes `planes_json`, atomically; `read_planes` returns the same float32 bits.
 
     Raises:
         ValueError: a plane holds a value that is not finite.
@@ -165,10 +165,9 @@ def write_planes(path: Path | str, planes: Planes) -> None:
 def planes_json(planes: Planes) -> str:
     """Planes as a JSON list.
 
-    Each entry has label, mirror, center, normal (unit), tangent, half_sizes and base_reflectance for people
-    and other programs (world units, the capture's frame), and the raw values raw_normal and
-    logit_reflectance that training continues from; where glass may be tinted also transmittance, of red, green and
-    blue, and its raw log_transmittance (see `Planes`).
+    Each entry has label, mirror, center, normal (unit), tangent, half_sizes and base_reflectance for people and other
+    programs (world units, the capture's frame), and the raw values raw_normal and logit_reflectance for continued
+    training. If glass may be tinted, it also has the RGB transmittance and its raw log_transmittance (see `Planes`).
     """
     entries = [_pane_entry(planes, index) for index in range(len(planes))]
     for entry in entries:
@@ -183,12 +182,12 @@ def planes_json(planes: Planes) -> str:
 def read_planes(path: Path | str) -> Planes:
     """Reads planes as float32 tensors.
 
-    A file edited by hand works as expected: where `normal`, `base_reflectance` or `transmittance` no longer agrees
-    with its raw value, or the raw value is missing, the readable one is taken.
+    Files may be edited by hand: if `normal`, `base_reflectance` or `transmittance` no longer agrees with its raw value,
+    or the raw value is missing, the readable one is used.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: not a list of planes, a missing or malformed value, or a label that appears twice.
+        ValueError: not a list of planes, a missing or malformed value, or a repeated label.
     """
     path = Path(path)
     entries = [_checked_entry(entry, index, path) for index, entry in enumerate(_load_entries(path), start=1)]
@@ -210,7 +209,7 @@ def read_planes(path: Path | str) -> Planes:
 
 
 def _pane_entry(planes: Planes, index: int) -> dict[str, Any]:
-    """One plane as plain numbers; a float32 survives the way through a decimal double unchanged."""
+    """One plane as plain numbers; float32 values survive the round trip through decimal doubles."""
     return {
         "label": int(planes.labels[index]),
         "mirror": planes.labels[index] in planes.mirrors,
@@ -225,7 +224,7 @@ def _pane_entry(planes: Planes, index: int) -> dict[str, Any]:
 
 
 def _glass(planes: Planes) -> dict[str, Tensor]:
-    """Further values of panes whose glass may be tinted, a row for each."""
+    """Additional values of panes whose glass may be tinted, one row per pane."""
     glass = {}
     if planes.transmittances is not None and planes.log_transmittances is not None:
         glass["transmittance"] = planes.transmittances.clamp(LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE)
@@ -247,7 +246,7 @@ def _load_entries(path: Path) -> list[Any]:
 
 
 def _checked_entry(entry: Any, index: int, path: Path) -> dict[str, Any]:
-    """One plane whose rectangle has a direction and an area."""
+    """One plane; checks its fields, and that its rectangle is not degenerate."""
     where = f"plane {index} in {path}"
     plane = records.check_fields(entry, PLANE, where)
     normal, tangent = (torch.tensor(plane[key], dtype=torch.float64) for key in ("normal", "tangent"))
@@ -282,7 +281,7 @@ def _logit_reflectance(entry: Mapping[str, Any]) -> Tensor:
 
 
 def _log_transmittances(entries: list[dict[str, Any]]) -> Tensor | None:
-    """[K, 3], zeros for panes that say nothing of it; None if none does."""
+    """[K, 3], zeros for panes without transmittance; None if all lack it."""
     if all(entry["transmittance"] is None for entry in entries):
         return None
     return torch.stack([_log_transmittance(entry) for entry in entries])
@@ -311,7 +310,7 @@ CAMERA: dict[str, records.Field] = {
     "cy": records.Optional(records.COORDINATE),
 }
 LARGEST_SHEAR = 1e-3
-"""Of a rotation: how far its rows may be from unit vectors at right angles."""
+"""Largest entry of R R^T - I that is accepted for a rotation."""
 
 
 def write_cameras(path: Path | str, cameras: Iterable[tuple[str, Camera]]) -> None:
@@ -322,14 +321,14 @@ def write_cameras(path: Path | str, cameras: Iterable[tuple[str, Camera]]) -> No
 
     Args:
         path: the file.
-        cameras: image name and camera, in the order in which ids are given.
+        cameras: image name and camera, in the order of ids.
     """
     entries = [_camera_entry(index, name, camera) for index, (name, camera) in enumerate(cameras)]
     write_text(path, json.dumps(entries, indent=1, allow_nan=False) + "\n")
 
 
 def read_cameras(path: Path | str) -> list[tuple[str, Camera]]:
-    """Reads what `write_cameras`, or another program in that layout, wrote: names and float32 cameras in order."""
+    """Reads names and float32 cameras, in order, from a file of `write_cameras` or another 3DGS program."""
     path = Path(path)
     entries = records.read_json(path)
     if not isinstance(entries, list):
@@ -372,11 +371,11 @@ LARGEST_TWIST = 1e2
 TWIST = records.Items(records.Number(-LARGEST_TWIST, LARGEST_TWIST), 6)
 Correction = TypeVar("Correction", bound=ByPhotograph)
 ENTRIES: dict[type[ByPhotograph], records.Field] = {Exposures: TRANSFORM, PoseCorrections: TWIST}
-"""What the values of a photograph have to be, by kind of correction."""
+"""Required values of a photograph, by kind of correction."""
 
 
 def write_corrections(path: Path, corrections: ByPhotograph) -> None:
-    """Writes the values by photograph; `read_corrections` returns them exactly."""
+    """Writes the values of each photograph; `read_corrections` returns them exactly."""
     entries = dict(zip(corrections.names, corrections.values.detach().cpu().tolist(), strict=True))
     write_text(path, json.dumps(entries, indent=1) + "\n")
 
@@ -394,7 +393,7 @@ def write_colmap(
     """Writes `cameras.txt`, `images.txt` and `points3D.txt`; points have no tracks.
 
     Args:
-        folder: of the model, such as `sparse/0`; made where it is missing.
+        folder: of the model, such as `sparse/0`; created if missing.
         cameras: image name and pinhole camera.
         positions: [P, 3] of the points, world units.
         colors: [P, 3] of the points, sRGB.
@@ -418,11 +417,11 @@ def write_colmap(
 
 FORMAT = "glassplat-environment-1"
 REGION = records.Nullable(records.Items(records.COORDINATE, 4))
-"""Centre and radius of the sphere that holds all that mirrors the environment."""
+"""Centre and radius of the sphere that contains everything that reflects the environment."""
 
 
 def write_environment(path: Path | str, environment: Environment) -> None:
-    """Writes an environment, atomically; `read_environment` gives back the same bits.
+    """Writes an environment, atomically; `read_environment` returns the same bits.
 
     Raises:
         OSError: the file cannot be written; an older one is unchanged.
@@ -431,7 +430,7 @@ def write_environment(path: Path | str, environment: Environment) -> None:
 
 
 def read_environment(path: Path | str) -> Environment:
-    """Reads what `write_environment` wrote."""
+    """Reads an environment that `write_environment` wrote."""
     path = Path(path)
     if not os.path.isfile(path):
         raise FileNotFoundError(f"no environment at {path}; expected the environment.safetensors of a run")
@@ -450,14 +449,14 @@ def read_environment(path: Path | str) -> Environment:
 
 EXR, PNG = ".exr", ".png"
 MOST_PIXELS = 2**25
-"""Of a panorama, 8192 x 4096: as floats it takes ten times the memory of a photograph, and no environment is finer."""
+"""Largest panorama, 8192 x 4096: as floats it takes ten photographs' memory, and no environment is finer."""
 
 
 def read_equirect(path: Path | str) -> Tensor:
     """Reads a panorama, equirectangular with z up, as [H, 2H, 3] float32 sRGB in [0, 1].
 
-    An EXR file holds linear radiance with Rec. 709 primaries, of which what is brighter than white is clipped; a PNG
-    file holds sRGB. Where directions lie is said in docs/conventions.md.
+    An EXR file holds linear radiance with Rec. 709 primaries, clipped at white; a PNG file holds sRGB. The directions
+    of pixels are defined in docs/conventions.md.
     """
     path = Path(path)
     _check_suffix(path)
@@ -477,7 +476,7 @@ def write_equirect(path: Path | str, image: Tensor) -> None:
     """Writes a panorama [H, 2H, 3], sRGB in [0, 1], atomically: linear float32 radiance as EXR, sRGB in 8 bits as PNG.
 
     Raises:
-        ValueError: another format, a wrong shape, or a value that is not finite.
+        ValueError: unknown format, wrong shape, or a non-finite value.
         OSError: the file cannot be written; an older one is unchanged.
     """
     path = Path(path)
@@ -489,7 +488,7 @@ def write_equirect(path: Path | str, image: Tensor) -> None:
     if path.suffix.lower() == PNG:
         write_image(path, image)
         return
-    import OpenEXR  # Only where there are such files.
+    import OpenEXR  # Imported only for such files.
 
     radiance = linear_from_srgb(image.detach().cpu().double()).float().contiguous().numpy()
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -506,7 +505,7 @@ def _check_suffix(path: Path) -> None:
 
 
 def _check_size(path: Path, width: int, height: int) -> None:
-    """Refuse the size in a header before room is made for pixels: that of an EXR file may be anything."""
+    """Checks the size in a header before pixels are allocated, because an EXR file may declare any size."""
     if width != 2 * height or width * height > MOST_PIXELS:
         raise ValueError(
             f"{path} is {width} x {height} pixels; expected an equirectangular image, twice as wide as high, of at "
@@ -527,7 +526,7 @@ def _read_exr(path: Path) -> NDArray[np.float32]:
 
 
 def _in_exr(path: Path, look: Callable[[Any], Any], **options: bool) -> Any:
-    """Look into an EXR file; what the library raises becomes an error that names it."""
+    """Reads from an EXR file; errors of the library become one that names the file."""
     import OpenEXR  # As above.
 
     try:
@@ -538,7 +537,7 @@ def _in_exr(path: Path, look: Callable[[Any], Any], **options: bool) -> Any:
 
 
 def _color(pixels: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
-    """Pixels without transparency."""
+    """RGB of an image, without transparency."""
     if pixels.shape[2] < 3:
         raise ValueError(f"{path} is grey; expected a panorama in colour")
     return np.ascontiguousarray(pixels[:, :, :3])

@@ -1,10 +1,10 @@
 """Gaussians as SPZ, Niantic's compressed format.
 
-Up to version 3 the whole file is one gzip stream: header and sections. Version 4 has a plain header, a table of the
-sections' sizes, and each section as a stream of its own, compressed with Zstandard.
+Up to version 3 the whole file, header and sections, is one gzip stream. Version 4 has an uncompressed header, a table
+of section sizes, and one Zstandard stream per section.
 
-The frame of an SPZ file has y up and z backwards where a PLY's has y down and z forward; both directions of the way
-turn it.
+An SPZ file has y up and z backwards where a PLY has y down and z forward; reading and writing rotate the scene
+accordingly.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ log = logging.getLogger(__name__)
 Bytes = NDArray[np.uint8]
 
 FLIP = (1.0, -1.0, -1.0)
-"""Signs of the coordinates after half a turn around x: to the frame of SPZ and of the web page, and back."""
+"""Signs of a half turn around x, which converts to the frame of SPZ and the web page, and back."""
 HARMONICS = (0, 3, 8, 15, 24)
-"""Coefficients beyond the constant one, by degree; those of the fourth degree are read over."""
+"""Number of SH coefficients beyond degree 0, by degree; those of degree 4 are skipped."""
 MOST_HARMONICS = HARMONICS[3]
 COLOR_SCALE = 0.15
 LOWEST_LOG_SCALE, STEPS_PER_LOG = -10.0, 16.0
 LARGEST_POSITION = 2**23 - 1
 MOST_FRACTIONAL_BITS = 20
 QUAT_STEPS = 511
-"""Of the three smallest components of a quaternion, either side of zero."""
+"""Quantisation steps of the three smallest quaternion components, on either side of zero."""
 
 
 class Layout(NamedTuple):
     """Sections of the file as the header describes them.
 
     Attributes:
-        version: of the format; 1 stores half-precision positions, 3 and later four bytes per rotation.
+        version: of the format; 1 has half-precision positions, 3 and later have four bytes per rotation.
         number: of Gaussians.
-        degree: of the harmonics, up to 4.
+        degree: SH degree, up to 4.
         fractional_bits: of the fixed-point positions.
     """
 
@@ -68,7 +68,7 @@ class Layout(NamedTuple):
 
 
 def fractional_bits_for(means: Tensor) -> int:
-    """As many bits behind the point as the largest coordinate leaves room for."""
+    """Number of fractional bits for which the largest coordinate still fits."""
     largest = float(means.abs().max()) if means.numel() else 0.0
     bits = MOST_FRACTIONAL_BITS
     while bits > 0 and largest * 2**bits > LARGEST_POSITION:
@@ -77,7 +77,7 @@ def fractional_bits_for(means: Tensor) -> int:
 
 
 def packed_sections(gaussians: Gaussians, layout: Layout) -> list[Bytes]:
-    """The six sections of a set in the capture's frame, whose layout is of version 3 or 4."""
+    """The six sections of Gaussians in the capture's frame, for a layout of version 3 or 4."""
     gaussians = half_turned(gaussians, FLIP)
     opacities = torch.sigmoid(gaussians.logit_opacities)
     return [
@@ -91,14 +91,14 @@ def packed_sections(gaussians: Gaussians, layout: Layout) -> list[Bytes]:
 
 
 def three_log_scales(gaussians: Gaussians) -> Tensor:
-    """[N, 3] log scales; the format knows no discs, which become as flat as it can say."""
+    """[N, 3] log scales; discs, which the format does not support, get its smallest third scale."""
     if not gaussians.are_discs:
         return gaussians.log_scales
     return torch.nn.functional.pad(gaussians.log_scales, (0, 1), value=LOWEST_LOG_SCALE)
 
 
 def unpack_gaussians(sections: list[Bytes], layout: Layout) -> Gaussians:
-    """The Gaussians of six sections, in the frame of a PLY; harmonics of the fourth degree are left out."""
+    """The Gaussians of six sections, in the frame of a PLY; SH of degree 4 are dropped."""
     positions, opacities, colors, scales, rotations, harmonics = sections
     count, kept = layout.number, min(HARMONICS[layout.degree], MOST_HARMONICS)
     rest = harmonics.reshape(count, HARMONICS[layout.degree], 3)[:, :kept].astype(np.float32) / 128 - 1
@@ -122,17 +122,17 @@ def _packed_positions(means: NDArray[np.float32], bits: int) -> Bytes:
 def _unpacked_positions(section: Bytes, layout: Layout) -> NDArray[np.float32]:
     if layout.version == 1:
         halves = section.view("<f2").reshape(layout.number, 3)
-        # Of a signalling NaN NumPy warns in any arithmetic; who draws leaves out what is no number.
+        # NumPy warns about arithmetic with signalling NaNs; renderers skip NaNs.
         return np.where(np.isnan(halves), np.float32(np.nan), halves.astype(np.float32))
     padded = np.zeros((3 * layout.number, 4), dtype=np.uint8)
     padded[:, 1:] = section.reshape(-1, 3)
-    # Three bytes at the top of four carry their sign with them on the way down.
+    # The shift extends the sign of the 24-bit values.
     fixed = padded.view("<i4").reshape(layout.number, 3) >> 8
     return fixed.astype(np.float32) / np.float32(2**layout.fractional_bits)
 
 
 def _packed_rotations(quats: NDArray[np.float32]) -> Bytes:
-    """The three smallest components of (x, y, z, w) with ten bits each, below two that say which one is left out."""
+    """The three smallest components of (x, y, z, w), ten bits each; the top two bits index the omitted one."""
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     unit = np.roll(np.divide(quats, norms, out=np.zeros_like(quats), where=norms > 0), -1, axis=1)
     largest = np.abs(unit).argmax(axis=1)
@@ -178,13 +178,13 @@ STREAM = struct.Struct("<QQ")
 VERSIONS = (1, 2, 3, 4)
 GZIP_WINDOW = 31
 PLAIN_COUNT, GAUSSIANS_PER_BYTE = 2**20, 2
-"""A file of B bytes may announce 2 B Gaussians, or a million: real scenes take ten bytes each, bombs a hundredth."""
+"""A file of B bytes may declare 2 B Gaussians, or a million; real ones take ten bytes, bombs 0.01."""
 
 
 def write_spz(path: Path | str, gaussians: Gaussians, version: int = 3) -> None:
-    """Writes the Gaussians' shapes, opacities and colours as SPZ, atomically; channels have no place in it.
+    """Writes shapes, opacities and colours of Gaussians as SPZ, atomically; channels are not stored.
 
-    Positions keep as many bits behind the point as the scene's size leaves; everything else has 8 bits, rotations 10.
+    Positions have as many fractional bits as the scene's size permits; rotations have 10 bits, all else 8.
 
     Args:
         path: the file.
@@ -229,13 +229,13 @@ def spz_bytes(gaussians: Gaussians, version: int = 3) -> bytes:
 
 
 MOST_CLIPPED = 0.001
-"""Share of the Gaussians whose sizes may be clipped without a warning."""
+"""Share of Gaussians whose scales may be clipped without a warning."""
 THIN = 3.0
-"""A Gaussian whose length is e to this times its thickness, or more, looks as if it had none."""
+"""Log ratio of length to thickness above which the thickness of a Gaussian is invisible."""
 
 
 def _warn_of_sizes(log_scales: Tensor) -> None:
-    """Warns where many Gaussians are larger than SPZ can say, or so small that being thicker changes their look."""
+    """Warns if many Gaussians are too large for SPZ, or so small that clipping visibly thickens them."""
     lowest, highest, within = LOWEST_LOG_SCALE, LOWEST_LOG_SCALE + 255 / STEPS_PER_LOG, 0.5 / STEPS_PER_LOG
     largest, smallest = log_scales.amax(dim=1), log_scales.amin(dim=1)
     small = (smallest < lowest - within) & (largest < lowest + THIN)
@@ -251,9 +251,9 @@ def _warn_of_sizes(log_scales: Tensor) -> None:
 
 
 def read_spz(path: Path | str) -> Gaussians:
-    """Reads an SPZ file of versions 1 to 4 into the frame of a PLY; harmonics of the fourth degree are left out.
+    """Reads an SPZ file of version 1 to 4 into the frame of a PLY; SH of degree 4 are dropped.
 
-    Memory stays in proportion to what the header may claim for a file of this size, whatever is compressed in it.
+    Memory is bounded by the largest count accepted for a file of this size, whatever is compressed in it.
     """
     path = Path(path)
     with reading(path):
@@ -268,7 +268,7 @@ def read_spz(path: Path | str) -> Gaussians:
 
 
 def _streamed(head: tuple[int, ...], sections: list[bytes]) -> bytes:
-    """Header, table of sizes, and the sections that are not empty."""
+    """Header, table of sizes, and the non-empty sections."""
     stored = [section for section in sections if section]
     packed = [zstandard.ZstdCompressor(level=12).compress(section) for section in stored]
     table = b"".join(STREAM.pack(len(p), len(s)) for p, s in zip(packed, stored, strict=True))
@@ -285,7 +285,7 @@ def _read_gzip(data: bytes, path: Path) -> tuple[Layout, list[Bytes]]:
                 f"{path} says that it is SPZ of version 4, which is not compressed as a whole; it is damaged"
             )
         size = sum(layout.sizes())
-        # One byte more than expected shows that there are more; nothing beyond is ever unpacked.
+        # One extra byte reveals a longer stream; nothing beyond is unpacked.
         body = unpacker.decompress(unpacker.unconsumed_tail, size + 1)
     except zlib.error as error:
         raise ValueError(
@@ -342,7 +342,7 @@ def _unpacked_stream(packed: bytes, size: int, index: int, path: Path) -> Bytes:
 
 
 def _layout(header: bytes, file_size: int, path: Path) -> Layout:
-    """Layout in the header, checked for plausibility."""
+    """Layout from the header, checked for plausibility."""
     if len(header) < HEADER.size:
         raise ValueError(f"{path} ends within its header; the file is cut off: copy or export it again")
     magic, version, count, degree, bits, *_ = HEADER.unpack(header)

@@ -1,4 +1,4 @@
-"""Files written completely or not at all, the folders for them, and the formats of splats."""
+"""Atomic file writing, output folders, and the formats of splats."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from uuid import uuid4
 from glassplat.errors import InputError
 
 FORGED_SUFFIXES = (".sog", ".ksplat")
-"""Formats that an extra reads and writes."""
+"""Formats that need an extra to be read and written."""
 SPLAT_SUFFIXES = (".ply", ".spz", ".glb", ".splat", *FORGED_SUFFIXES)
-"""Of files of Gaussians that are read."""
+"""Suffixes of readable files of Gaussians."""
 LOADED = f"a run, a folder of an export, or a splat file ({', '.join(SPLAT_SUFFIXES)})"
-"""What can be opened as a scene."""
+"""Paths that can be opened as a scene."""
 SPLAT_WRITERS = {
     "ply": "glassplat.files.ply:write_gaussians",
     "spz": "glassplat.files.spz:write_spz",
@@ -29,30 +29,29 @@ SPLAT_WRITERS = {
     "sog": "glassplat.files.scene_folder:write_forged",
     "ksplat": "glassplat.files.scene_folder:write_forged",
 }
-"""Formats that Gaussians are written in, by suffix: the function `(path, gaussians)` of each, imported when needed."""
+"""Output formats of Gaussians by suffix: the function `(path, gaussians)` of each, imported when needed."""
 WRITTEN = (*SPLAT_WRITERS, "html")
-"""All formats of `export` and `Model.save`; the page is written of a whole model."""
+"""All formats of `export` and `Model.save`; `html` is the page of a whole model."""
 
 
 def write_splats(kind: str, path: Path, gaussians: Any, **options: Any) -> None:
-    """Writes Gaussians in a format of `SPLAT_WRITERS`, with the harmonics that are active."""
+    """Write Gaussians in a format of `SPLAT_WRITERS`, with the active SH degree."""
     module, _, name = SPLAT_WRITERS[kind].partition(":")
     shown = replace(gaussians, sh=gaussians.sh[:, : (gaussians.active_sh_degree + 1) ** 2])
     getattr(importlib.import_module(module), name)(path, shown, **options)
 
 
 UNFINISHED = re.compile(r"\..{0,32}\.[0-9a-f]{12}\.tmp(\..{1,31})?")
-"""Name of a file that `atomic_write` has not put in its place yet."""
+"""Name of a temporary file of `atomic_write`."""
 
 
 @contextmanager
 def atomic_write(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path next to `path`; on success it replaces `path` in one step.
 
-    The temporary file has the suffix of `path`, which may be a link to a file without it, so writers that pick a format
-    by suffix work unchanged. When the body raises (a
-    full disk, Ctrl-C), the temporary file is removed and an older file at `path` keeps its contents. Missing parent
-    folders are created.
+    The temporary file has the suffix of `path`, even if that is a link to a file without it, so writers that choose the
+    format by suffix work unchanged. If the body raises (a full disk, Ctrl-C), the temporary file is removed and an
+    older file at `path` keeps its contents. Missing parent folders are created.
 
     Example:
         with atomic_write(run / "results.json") as temporary:
@@ -62,7 +61,7 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
         OSError: the target cannot be written; the message names it. Keeps the subclass, such as PermissionError.
     """
     target = Path(os.path.realpath(path))
-    # Shortened, because a name that is as long as names may be leaves no room for more.
+    # Shortened, because a name of maximum length leaves no room for additions.
     temporary = target.with_name(f".{target.stem[:32]}.{uuid4().hex[:12]}.tmp{Path(path).suffix[:32]}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -74,28 +73,28 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
         message = f"could not write {path} ({reason}); the previous contents are unchanged"
         raise (OSError(message) if error.errno is None else OSError(error.errno, message)) from error
     finally:
-        with suppress(OSError):  # never hide the error above behind one from the clean-up
+        with suppress(OSError):  # A clean-up error must not hide the one above.
             temporary.unlink()
 
 
 def write_bytes(path: Path | str, data: bytes) -> None:
-    """Writes a file atomically."""
+    """Write a file atomically."""
     with atomic_write(path) as temporary:
         temporary.write_bytes(data)
 
 
 def write_text(path: Path | str, text: str) -> None:
-    """Writes a text file in UTF-8 atomically; lines end as in the text, on every system."""
+    """Write a text file in UTF-8 atomically; line endings are kept on every system."""
     write_bytes(path, text.encode("utf-8"))
 
 
 def file_digest(path: Path) -> str:
-    """Digest of a file's contents; empty where there is no file."""
+    """SHA-256 of a file's contents; empty if there is no file."""
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
 
 def remove_unfinished(folder: Path, suffixes: Sequence[str]) -> None:
-    """Removes what was left in a folder by writers that were killed; nobody may be writing such files there now."""
+    """Remove temporary files of killed writers from a folder; no writer of such files may be running there."""
     for path in folder.glob(".*"):
         if UNFINISHED.fullmatch(path.name) and path.suffix in suffixes:
             with suppress(OSError):
@@ -103,8 +102,8 @@ def remove_unfinished(folder: Path, suffixes: Sequence[str]) -> None:
 
 
 def _flush_to_disk(path: Path) -> None:
-    """Force the contents out, so that a crash cannot leave the new name on an empty file."""
-    descriptor = os.open(path, os.O_RDWR)  # Windows flushes only what may be written.
+    """Flush the contents to disk, so that a crash cannot leave an empty file under the new name."""
+    descriptor = os.open(path, os.O_RDWR)  # Windows flushes only writable files.
     try:
         os.fsync(descriptor)
     finally:
@@ -112,16 +111,16 @@ def _flush_to_disk(path: Path) -> None:
 
 
 SCENE = "scene.json"
-"""The file by which a folder is known to hold a scene that was exported."""
+"""The file that marks a folder as an exported scene."""
 IN_THE_WAY = (errno.EEXIST, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
 
 
 def check_folder(path: Path) -> None:
-    """Look whether a folder is there or can be made, without making it.
+    """Check that a folder exists or can be created, without creating it.
 
     Raises:
-        NotADirectoryError: it is a file, or its path goes through one.
-        PermissionError: nothing may be written there.
+        NotADirectoryError: it is a file, or its path contains one.
+        PermissionError: the folder is not writable.
     """
     whole = Path(os.path.abspath(path))
     found = next(folder for folder in (whole, *whole.parents) if os.path.lexists(folder))
@@ -136,17 +135,17 @@ def check_folder(path: Path) -> None:
 
 
 def check_capture_folder(path: Path) -> None:
-    """Look whether a folder is there that may be a capture."""
+    """Check that the folder of a capture exists."""
     if not os.path.isdir(path):
         raise FileNotFoundError(f"no folder {path}; expected the folder of a capture")
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder, with those above it, where there is none; where that fails, none of them is left.
+    """Create a folder and its missing parents; after a failure, none of them is left.
 
     Raises:
-        NotADirectoryError: something that is no folder is in the way, or it cannot have that name.
-        PermissionError: nothing may be written there.
+        NotADirectoryError: a file is in the way, or the name is not allowed.
+        PermissionError: the folder is not writable.
         OSError: the disk is full, or fails.
     """
     check_folder(path)
@@ -163,29 +162,29 @@ def make_folder(path: Path) -> None:
 
 
 def missing_folders(path: Path) -> list[Path]:
-    """A folder and those above it, as far as they are not there, the innermost first."""
+    """A folder and its parents, as far as they are missing, the innermost first."""
     return [folder for folder in (path, *path.parents) if not os.path.lexists(folder)]
 
 
 def remove_empty(folders: Sequence[Path]) -> None:
-    """Removes those folders that hold nothing, the first one first."""
+    """Remove those of the folders that are empty, in order."""
     for folder in folders:
         with suppress(OSError):
             folder.rmdir()
 
 
 def real_path(path: Path) -> Path:
-    """Path after following links; one that goes round in circles stays as it is, unlike in `Path.resolve`."""
+    """Path after following links; circular links are kept, unlike in `Path.resolve`."""
     return Path(os.path.realpath(path))
 
 
 def check_links(folder: Path, names: Sequence[str]) -> None:
-    """Refuses links that lead out of a folder where files and folders of these names are to be written.
+    """Refuse links that lead out of a folder in which files and folders of these names will be written.
 
-    Who has filled the folder, as with a run or a capture of somebody else, could have any file replaced by them.
+    In a folder from another person, such as a run or a capture, links could make any file be overwritten.
 
     Raises:
-        InputError: names the link; nothing has been written.
+        InputError: there is such a link; nothing has been written.
     """
     inside = real_path(folder)
     for path in (path for name in names for path in (folder / name, *(folder / name).rglob("*"))):
@@ -197,7 +196,7 @@ def check_links(folder: Path, names: Sequence[str]) -> None:
 
 
 def scene_source(path: Path) -> Path:
-    """The splats in a folder that `glassplat export` wrote, the most exact of its files; any other path as it is."""
+    """The most exact splat file in a folder of `glassplat export`; any other path unchanged."""
     if (path / "recipe.json").is_file():
         return path
     kinds = dict.fromkeys(("ply", "glb", *SPLAT_WRITERS))
