@@ -189,7 +189,7 @@ def _with_fitting_axes(capture: Capture, evidence: AxesEvidence | None) -> Captu
         return capture
     turned = (
         f"The poses are read in OpenCV axes: with OpenGL axes {evidence.as_read:.0%} of the {evidence.source} lie in "
-        f"front of the cameras, so {evidence.flipped:.0%}."
+        f"front of the cameras, with OpenCV axes {evidence.flipped:.0%}."
     )
     return replace(
         capture,

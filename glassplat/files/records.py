@@ -120,7 +120,7 @@ def readable_name(path: Path | str) -> str:
 
 
 def _too_deep(where: str) -> str:
-    return f"{where} is nested more than {DEEPEST} levels deep; expected a file that such a program wrote"
+    return f"{where} is nested more than {DEEPEST} levels deep; expected a file written by a splatting program"
 
 
 LEAST_WHOLE, MOST_WHOLE = -(2**63), 2**63 - 1

@@ -341,7 +341,7 @@ def _camera(entry: Any, where: str) -> tuple[str, Camera]:
     rotation = torch.tensor(values["rotation"], dtype=torch.float64).T
     shear = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
     if float(shear) > LARGEST_SHEAR or float(torch.linalg.det(rotation)) < 0:
-        raise ValueError(f"rotation of {where} is none; expected three unit vectors at right angles, right-handed")
+        raise ValueError(f"rotation of {where} is not a rotation; expected three orthogonal unit vectors, right-handed")
     cam_from_world = torch.eye(4, dtype=torch.float64)
     cam_from_world[:3, :3] = rotation
     cam_from_world[:3, 3] = -rotation @ torch.tensor(values["position"], dtype=torch.float64)
