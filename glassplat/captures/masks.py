@@ -358,7 +358,7 @@ def find_ignored(root: Path, photographs: Mapping[str, Path]) -> Mapping[str, Pa
 def _understood(
     root: Path, paths: Mapping[str, Path], polarity: Polarity, read: Callable[[Path], MaskValues]
 ) -> MaskSet:
-    """Reads all masks once, to decide kind, polarity and labels from the whole set."""
+    """Read all masks once, to decide kind, polarity and labels from the whole set."""
     values = {name: read(path) for name, path in paths.items()}
     _check_same_kind(values, paths)
     inverted, warnings = _decide_polarity(list(values.values()), polarity)

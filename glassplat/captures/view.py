@@ -250,7 +250,7 @@ class Memory:
             spool.put(source, pixels)
 
     def _keep(self, source: Source, pixels: Tensor) -> bool:
-        """Cache pixels; returns whether they stay permanently."""
+        """Caches pixels; returns whether they stay permanently."""
         size = pixels.numel() * pixels.element_size()
         if size <= self._room:
             self._room -= size
@@ -467,7 +467,7 @@ def prepare_view(
     ignored: Sequence[IgnoredMask] = (),
     normals: Path | None = None,
 ) -> PreparedView:
-    """Check one photograph against its camera and set up its readers; decodes no pixels.
+    """Checks one photograph against its camera and sets up its readers; decodes no pixels.
 
     Args:
         shot: the photograph.
