@@ -1,1 +1,1 @@
-"""Looking at a scene in the browser while this program renders it."""
+"""Viewer in the browser: this program renders the scene, the browser shows the images and controls."""

@@ -1,4 +1,4 @@
-"""Controls in the browser: panes, keyframes of a film, photographs."""
+"""Controls in the browser: panes, cleaning, measuring, keyframes of a video, photographs."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ logger = logging.getLogger(__name__)
 
 
 def log_errors(callback: Callable[..., Any]) -> Callable[..., None]:
-    """The callback, whose errors end with it: viser's threads print tracebacks, and a training would end with them."""
+    """Wraps a callback to log its errors, which would print tracebacks in viser's threads and stop a training run."""
 
     @wraps(callback)
     def call(*given: Any) -> None:
         try:
             callback(*given)
-        except Exception as error:  # noqa: BLE001 - Whatever a client did, the others and the server go on.
+        except Exception as error:  # noqa: BLE001 - A client must not stop the server or the other clients.
             logger.warning("a request of a browser failed: %s: %s", type(error).__name__, error)
 
     return call
@@ -39,22 +39,22 @@ def log_errors(callback: Callable[..., Any]) -> Callable[..., None]:
 
 NO_PANE = "none"
 HANDLE_SHARE = 0.7
-"""Length of a gizmo's arrows, of the mean half side of its pane."""
+"""Length of a gizmo's arrows, as a share of the mean half side of its pane."""
 OUTLINE_PIXELS = 2.0
 MOST_OPEN = 4
-"""Panes whose sliders are shown at once; those of more are folded away."""
+"""Maximum number of panes whose sliders are unfolded initially."""
 
 
 class PaneGizmo:
-    """Arrows and arcs on one pane that move and turn it, with its outline; hidden until it is shown."""
+    """Arrows and arcs that move and rotate one pane, with its outline; hidden until `show` is called."""
 
     def __init__(self, scene: Any, planes: Planes, row: int) -> None:
-        """Puts it where the pane is.
+        """Adds the gizmo at the position of the pane.
 
         Args:
-            scene: a client's.
-            planes: of the scene that is looked at.
-            row: which of them.
+            scene: viser's scene of a client.
+            planes: of the displayed scene.
+            row: index of the pane.
         """
         self.label, self._name = planes.labels[row], f"/panes/{planes.labels[row]}"
         axes = torch.stack([*(axis[row] for axis in planes.axes()), planes.normals[row]], dim=1)
@@ -79,19 +79,19 @@ class PaneGizmo:
         )
 
     def listen(self, changed: Callable[[], None]) -> None:
-        """From now on `changed` is called whenever it is moved."""
+        """Calls `changed` whenever the pane is moved."""
         self._handle.on_update(log_errors(lambda _: changed()))
 
     def show(self, visible: bool) -> None:
-        """Shows or hides it; where it stands counts in either case."""
+        """Shows or hides the gizmo; its position applies in both cases."""
         self._handle.visible = visible
 
     def put_back(self) -> None:
-        """Back to where the pane is in the scene."""
+        """Resets the gizmo to the pane's original pose."""
         self._handle.wxyz, self._handle.position = self._start, self._center
 
     def remove(self) -> None:
-        """Takes it and its outline off the view."""
+        """Removes the gizmo and its outline from the view."""
         self._handle.remove()
 
     def move(self) -> PaneMove | None:
@@ -106,14 +106,14 @@ class PaneGizmo:
 
 
 class PaneControls:
-    """A folder of controls of the glass; to be made only for scenes that have panes."""
+    """A folder of controls for the panes; only for scenes with at least one."""
 
     def __init__(self, handle: Any, planes: Planes) -> None:
-        """Lays them out; they do nothing yet.
+        """Lays out the controls; `listen` activates them.
 
         Args:
             handle: of the client.
-            planes: of the scene that is looked at; at least one.
+            planes: of the displayed scene; at least one.
         """
         gui = handle.gui
         self._own = dict(zip(planes.labels, planes.base_reflectances.tolist(), strict=True))
@@ -127,10 +127,10 @@ class PaneControls:
                 }
             self._gain = gui.add_slider("Gain", LEAST_GAIN, MOST_GAIN, 0.05, 1.0)
             self._chosen = gui.add_dropdown("Move pane", (NO_PANE, *map(str, planes.labels)))
-            self._back = gui.add_button("Put panes back")
+            self._back = gui.add_button("Reset panes")
 
     def listen(self, changed: Callable[[], None]) -> None:
-        """From now on `changed` is called whenever something else is asked for, and arrows show as they are chosen."""
+        """Calls `changed` whenever the request changes, and shows the gizmo of the selected pane."""
         for control in (self._glass, *self._reflectances.values(), self._gain):
             control.on_update(log_errors(lambda _: changed()))
         for gizmo in self._gizmos:
@@ -139,7 +139,7 @@ class PaneControls:
         self._back.on_click(log_errors(lambda _: self._put_back(changed)))
 
     def apply(self, request: ViewRequest) -> ViewRequest:
-        """The request, with the panes as the controls say."""
+        """The request, with the edits of panes from the controls."""
         sliders = {label: within(slider.value, 0.0, 1.0) for label, slider in self._reflectances.items()}
         changed = [(label, value) for label, value in sliders.items() if value != round(self._own[label], 3)]
         moves = [move for gizmo in self._gizmos if (move := gizmo.move()) is not None]
@@ -152,7 +152,7 @@ class PaneControls:
         )
 
     def remove(self) -> None:
-        """Takes the gizmos off the view; the controls go with their layout."""
+        """Removes the gizmos from the view; the controls are removed with their layout."""
         for gizmo in self._gizmos:
             gizmo.remove()
 
@@ -167,7 +167,7 @@ class PaneControls:
 
 
 def within(value: float, least: float, most: float) -> float:
-    """The value within a range, which a client need not keep to; the least where it is no number."""
+    """The value of a client clamped to a range; NaN becomes the minimum."""
     return min(max(value, least), most) if value == value else least
 
 
@@ -176,31 +176,31 @@ BOX_HINT = "x y z x y z"
 
 
 class CleanControls:
-    """A folder of controls that take floaters out, as `glassplat clean` does."""
+    """A folder of controls that remove floaters, like `glassplat clean`."""
 
     def __init__(self, gui: Any, state: ViewerState) -> None:
-        """Lays them out; they do nothing yet.
+        """Lays out the controls; `listen` activates them.
 
         Args:
             gui: of the client.
-            state: what is looked at.
+            state: the displayed scene.
         """
         self._state, usual = state, Cleaning()
         self._floaters: Floaters | None = None
         with gui.add_folder("Clean", expand_by_default=False):
-            self._on = gui.add_checkbox("Take floaters out", False)
+            self._on = gui.add_checkbox("Remove floaters", False)
             self._isolated = gui.add_slider("Isolated", 0.0, MOST_ISOLATED, 0.5, usual.isolated)
             self._oversized = gui.add_slider("Oversized", 0.0, MOST_OVERSIZED, 0.05, usual.oversized)
             self._box = gui.add_text("Box", "", hint=BOX_HINT)
             self._told = gui.add_markdown("")
 
     def listen(self, changed: Callable[[], None]) -> None:
-        """From now on `changed` is called whenever something else is asked for."""
+        """Calls `changed` whenever the request changes."""
         for control in (self._on, self._isolated, self._oversized, self._box):
             control.on_update(log_errors(lambda _: changed()))
 
     def apply(self, request: ViewRequest) -> ViewRequest:
-        """The request, with what the controls leave of the scene."""
+        """The request, with the mask of Gaussians that the controls keep."""
         if not self._on.value:
             self._told.content = ""
             return request
@@ -213,12 +213,12 @@ class CleanControls:
             within(self._oversized.value, 0.0, MOST_OVERSIZED),
         )
         kept = ~torch.stack(list(self._floaters.masks(cleaning).values())).any(dim=0)
-        self._told.content = f"{int(kept.sum())} of {len(primary)} Gaussians stay"
+        self._told.content = f"{int(kept.sum())} of {len(primary)} Gaussians kept"
         return replace(request, kept=kept) if bool(kept.any()) else request
 
 
 def box_of(text: str) -> tuple[float, float, float, float, float, float] | None:
-    """Two corners of a box that somebody typed; None where they are not six numbers."""
+    """Two corners of a box, parsed from text; None unless it consists of six finite numbers."""
     try:
         x, y, z, u, v, w = (float(number) for number in text.replace(",", " ").split())
     except ValueError:
@@ -230,23 +230,23 @@ MEASURE_COLOR = (86, 180, 233)
 
 
 class MeasureControls:
-    """A checkbox, and the distance between the last two points that were clicked while it was on."""
+    """A checkbox, and the distance between the last two points clicked while it is checked."""
 
     def __init__(self, handle: Any) -> None:
-        """Has no points yet, and no controls before `lay_out`."""
+        """Starts without points; `lay_out` adds the controls."""
         self._handle = handle
         self._points: list[np.ndarray] = []
         self._is_listening = False
 
     def lay_out(self, clicked: Callable[[np.ndarray], None]) -> None:
-        """Puts the controls there; `clicked` is called with the direction [3] of a click."""
+        """Adds the controls; `clicked` is called with the direction [3] of each click."""
         with self._handle.gui.add_folder("Measure", expand_by_default=False):
             self._on = self._handle.gui.add_checkbox("Click two points", False)
             self._told = self._handle.gui.add_markdown(self._distance())
         self._on.on_update(log_errors(lambda _: self._listen(clicked)))
 
     def take(self, point: np.ndarray) -> None:
-        """One more point [3]; a third begins anew."""
+        """Adds a point [3]; a third one starts a new measurement."""
         self._points = [*self._points, point] if len(self._points) < 2 else [point]
         self._told.content = self._distance()
         ends = np.stack([self._points[0], self._points[-1]]).astype(np.float32)
@@ -255,7 +255,7 @@ class MeasureControls:
         )
 
     def _listen(self, clicked: Callable[[np.ndarray], None]) -> None:
-        """Hears clicks from the first time that it is on; pages look otherwise once they are to report clicks."""
+        """Listens to clicks once the checkbox is first checked, because pages that report clicks look different."""
         if not self._on.value or self._is_listening:
             return
         self._is_listening = True
@@ -264,7 +264,7 @@ class MeasureControls:
 
     def _distance(self) -> str:
         if len(self._points) < 2:
-            return f"{len(self._points)} of two points"
+            return f"{len(self._points)} of 2 points"
         ends = " ".join(f"{value:.4g}" for point in self._points for value in point)
         return (
             f"{np.linalg.norm(self._points[1] - self._points[0]):.4g} units; in metres with "
@@ -274,49 +274,49 @@ class MeasureControls:
 
 MOST_KEYFRAMES = 200
 FRUSTUM_SHARE = 0.06
-"""Size of a keyframe in the view, of the scene's extent."""
+"""Size of a keyframe's frustum, as a share of the scene's extent."""
 PLAYED_PER_SECOND, SECONDS_BETWEEN = 8, 2
 KEYFRAME_COLOR = (249, 140, 10)
 
 
 class KeyframeControls:
-    """A folder of controls, and the keyframes as small cameras in the view. They outlive a new layout."""
+    """A folder of controls, and the keyframes, shown as frusta in the view. They survive a new layout."""
 
     def __init__(self, handle: Any, extent: float, camera: Callable[[], Camera | None]) -> None:
-        """Has no keyframe yet, and no controls before `lay_out`.
+        """Starts without keyframes; `lay_out` adds the controls.
 
         Args:
             handle: of the client.
             extent: of the scene, world units.
-            camera: where the client stands now, None while that is not known.
+            camera: returns the client's current camera, None while unknown.
         """
         self._handle, self._extent, self._camera = handle, extent, camera
         self._frusta: list[Any] = []
         self.keyframes: tuple[Camera, ...] = ()
         self._playing: threading.Event | None = None
-        # viser's threads call at once what is clicked in quick succession.
+        # viser calls the callbacks of quick successive clicks concurrently.
         self._lock = threading.Lock()
         self._step = threading.Lock()
 
     def lay_out(self, go: Callable[[Camera], None], save: Callable[[str], None] | None) -> None:
-        """Puts the controls there.
+        """Adds the controls.
 
         Args:
             go: moves the client's camera.
-            save: keeps the keyframes under a name; None where nothing may be written.
+            save: writes the keyframes under a name; None if writing is not allowed.
         """
         gui = self._handle.gui
         with gui.add_folder("Keyframes", expand_by_default=False):
             self._count = gui.add_markdown(self._count_text())
             gui.add_button("Add this view").on_click(log_errors(lambda _: self.add()))
-            gui.add_button("Remove the last").on_click(log_errors(lambda _: self.remove()))
+            gui.add_button("Remove last").on_click(log_errors(lambda _: self.remove()))
             gui.add_button("Play or stop").on_click(log_errors(lambda _: self.play(go)))
             if save is not None:
                 name = gui.add_text("Name", "keyframes")
                 gui.add_button("Save keyframes").on_click(log_errors(lambda _: save(name.value)))
 
     def add(self) -> None:
-        """One more keyframe, where the client stands."""
+        """Adds a keyframe at the client's camera."""
         camera = self._camera()
         with self._lock:
             if camera is None or len(self._frusta) == MOST_KEYFRAMES:
@@ -337,7 +337,7 @@ class KeyframeControls:
             self._count.content = self._count_text()
 
     def remove(self) -> None:
-        """The last keyframe goes."""
+        """Removes the last keyframe."""
         with self._lock:
             if self._frusta:
                 self._frusta.pop().remove()
@@ -345,7 +345,7 @@ class KeyframeControls:
                 self._count.content = self._count_text()
 
     def play(self, go: Callable[[Camera], None]) -> None:
-        """Begins to move the client along the path as the film will, or stops that."""
+        """Starts or stops moving the client along the path of the video."""
         keyframes = self.keyframes
         with self._lock:
             was_playing = self._playing is not None and not self._playing.is_set()
@@ -354,23 +354,23 @@ class KeyframeControls:
                 return
             ended = self._playing = threading.Event()
         frames = (len(keyframes) - 1) * SECONDS_BETWEEN * PLAYED_PER_SECOND + 1
-        # A thread of its own: viser has few, and all clients share them.
+        # A separate thread, because viser has few, and all clients share them.
         path = interpolate_cameras(keyframes, frames)
         threading.Thread(target=_play, args=(path, go, ended, self._step), daemon=True).start()
 
     def stop(self) -> None:
-        """Ends the playing, as when the client leaves or stands elsewhere; nothing moves it afterwards."""
+        """Stops playback, for example when the client leaves; the camera does not move after this returns."""
         with self._step:
             if self._playing is not None:
                 self._playing.set()
 
     def _count_text(self) -> str:
         count = len(self.keyframes)
-        return f"{count} {'keyframe' if count == 1 else 'keyframes'}" + (", a film needs two" if count < 2 else "")
+        return f"{count} {'keyframe' if count == 1 else 'keyframes'}" + (", a video needs two" if count < 2 else "")
 
 
 def _play(path: list[Camera], go: Callable[[Camera], None], ended: threading.Event, step: threading.Lock) -> None:
-    """Moves along a path until it or the playing ends; `step` is held while it moves."""
+    """Moves along a path until its end or until playback stops; `step` is held during each move."""
     for camera in path:
         with step:
             if ended.is_set():
@@ -386,27 +386,27 @@ NO_PHOTOGRAPH = np.zeros((2, 3, 3), dtype=np.uint8)
 
 
 class PhotographControls:
-    """A folder of controls: a list of photographs to stand at, and the picture of the nearest one."""
+    """A folder of controls: a list of photographs whose cameras can be selected, and the nearest photograph."""
 
     def __init__(self, gui: Any, state: ViewerState, at: int) -> None:
-        """Lays them out; they do nothing yet.
+        """Lays out the controls; `listen` activates them.
 
         Args:
             gui: of the client.
-            state: what is looked at.
-            at: the photograph to begin with.
+            state: the displayed scene.
+            at: index of the initial photograph.
         """
         self._state, self._at, self._on_screen = state, at, -1
         self._names = tuple(name for name, _ in state.cameras)
         with gui.add_folder("Photographs"):
-            self._name = gui.add_dropdown("Stand at", self._names, initial_value=self._names[at])
+            self._name = gui.add_dropdown("Go to", self._names, initial_value=self._names[at])
             self._steps = gui.add_button_group("Step", ("previous", "next"))
             self._photo = None
             if state.photographs:
                 self._photo = gui.add_image(NO_PHOTOGRAPH, label="Nearest photograph")
 
     def listen(self, stand_at: Callable[[int], None]) -> None:
-        """From now on they move the camera to where a photograph was taken, with `stand_at`."""
+        """Calls `stand_at` with the index of the selected photograph, which moves the camera there."""
         names, steps = self._names, self._steps
         self._name.on_update(
             log_errors(lambda event: stand_at(names.index(self._name.value)) if event.client is not None else None)
@@ -414,15 +414,15 @@ class PhotographControls:
         steps.on_click(log_errors(lambda _: stand_at((self._at + (1 if steps.value == "next" else -1)) % len(names))))
 
     def stands_at(self, index: int) -> None:
-        """The camera is where a photograph was taken."""
+        """Marks a photograph as the one at whose pose the camera is."""
         self._at = index
         self._name.value = self._state.cameras[index][0]
 
     def show_nearest(self, index: int) -> None:
-        """Shows a photograph, unless it is there already; where it is gone or broken, says so in its place."""
+        """Shows a photograph unless it is displayed already; the label reports unreadable ones."""
         cameras = self._state.cameras
         if torch.equal(cameras[index][1].cam_from_world, cameras[self._at][1].cam_from_world):
-            index = self._at  # Of those that were taken from one place, the one that was chosen.
+            index = self._at  # Of photographs with equal poses, the selected one.
         name = cameras[index][0]
         if self._photo is None or index == self._on_screen or name not in self._state.photographs:
             return

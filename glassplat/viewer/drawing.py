@@ -1,4 +1,4 @@
-"""Requests of those who look at a scene, and the pictures of them."""
+"""Render requests of viewers, and the images rendered for them."""
 
 from __future__ import annotations
 
@@ -34,30 +34,30 @@ Photograph = Callable[[], Tensor]
 
 
 class Writer(Protocol):
-    """Writes what was made in the browser, each under a new name, and says where it is.
+    """Writes edits made in the browser, each under a new name, and returns a message with the location.
 
-    Both raise InputError or OSError, with nothing overwritten, where that cannot be.
+    Both raise InputError or OSError on failure; nothing is overwritten.
     """
 
     def write_scene(self, scene: Scene, name: str) -> str:
         """Writes an edited scene."""
 
     def write_keyframes(self, cameras: Sequence[Camera], name: str) -> str:
-        """Writes the cameras of a film."""
+        """Writes the keyframes of a video."""
 
 
 @dataclass(frozen=True)
 class ViewerState:
-    """Scene on show, with its cameras.
+    """Displayed scene, with its cameras.
 
     Attributes:
         title: of the page.
         scene: on the renderer's device.
         renderer: of its frames.
-        layers: names of the layers, the first one first shown.
+        layers: names of the layers; the first one is shown initially.
         cameras: of the photographs, by name; at least one.
-        photographs: [H, W, 3] uint8 by name, read when asked for; may be empty.
-        writer: writes what is made in the browser; None where nothing may be written.
+        photographs: [H, W, 3] uint8 by name, read on demand; may be empty.
+        writer: writes edits made in the browser; None if writing is not allowed.
     """
 
     title: str
@@ -70,21 +70,21 @@ class ViewerState:
 
 
 class Viewpoints:
-    """Places and directions of all photographs, to find the one that is nearest to a view."""
+    """Positions and directions of all photographs, to find the one nearest to a view."""
 
     def __init__(self, cameras: Sequence[Camera], extent: float) -> None:
-        """Keeps where the cameras are.
+        """Stores the poses.
 
         Args:
             cameras: at least one.
-            extent: of the scene: that far away counts as much as a radian aside.
+            extent: of the scene; this distance counts as much as an angle of one radian.
         """
         self._centers = np.stack([camera.center.double().cpu().numpy() for camera in cameras])
         self._forwards = np.stack([camera.cam_from_world[2, :3].double().cpu().numpy() for camera in cameras])
         self._extent = extent
 
     def nearest(self, center: NDArray[np.float64], forward: NDArray[np.float64]) -> int:
-        """The camera whose place and direction are nearest to those of a view; both [3]."""
+        """Index of the camera whose position and direction are nearest to those of a view; both [3]."""
         away = np.linalg.norm(self._centers - center, axis=1) / self._extent
         aside = np.arccos(np.clip(self._forwards @ forward, -1, 1))
         return int(np.argmin(away + aside))
@@ -95,24 +95,24 @@ LEAST_GAIN, MOST_GAIN = 0.1, 10.0
 ERROR = "error"
 """The layer that compares with a photograph."""
 MEASURED_ROWS, SURFACE_COVERAGE = 480, 0.5
-"""Of the picture in which points are measured, and below which it shows no surface."""
+"""Rows of the image in which points are measured, and the alpha below which a pixel shows no surface."""
 
 
 @dataclass(frozen=True)
 class ViewRequest:
-    """A view that a client asks for.
+    """A view requested by a client.
 
     Attributes:
         cam_from_world: [4, 4] rigid.
         fov_rad: vertical field of view.
         aspect: width over height.
         layer: `rgb`, a layer of the renderer's frames, or `error`.
-        glass: what becomes of the panes.
-        reflectances: R0 of each pane by label, where it is not the scene's own.
-        gain: factor on what the panes mirror.
-        moves: panes that are elsewhere than in the scene.
-        against: position of the photograph that the layer `error` compares with; None for the other layers.
-        kept: [N] bool, the primary Gaussians that stay; None where nothing is cleaned.
+        glass: panes as in the scene, as mirrors, or removed.
+        reflectances: R0 by label of the panes for which it differs from the scene.
+        gain: factor on the light reflected by panes.
+        moves: movements of panes, relative to the scene.
+        against: index of the photograph that the layer `error` compares with; None for the other layers.
+        kept: [N] bool, the primary Gaussians to keep; None keeps all.
     """
 
     cam_from_world: Tensor
@@ -127,14 +127,14 @@ class ViewRequest:
     kept: Tensor | None = None
 
     def camera(self, height: int) -> Camera:
-        """The camera of a picture with that many rows."""
+        """The camera of an image with the given number of rows."""
         focal = height / 2 / float(np.tan(self.fov_rad / 2))
         width = max(1, round(self.aspect * height))
         return Camera(self.cam_from_world, focal, focal, width / 2, height / 2, width, height)
 
 
 def edit_scene(scene: Scene, request: ViewRequest) -> Scene:
-    """The scene with the panes as they are asked for and cleaned; what is not asked for keeps every bit."""
+    """The scene with the requested edits of panes and cleaning; everything else keeps every bit."""
     if request.kept is not None and len(request.kept) == len(scene.primary):
         scene = replace(scene, primary=scene.primary.select(request.kept.to(scene.primary.means.device)))
     if not len(scene.planes) or request.glass == "none":
@@ -153,7 +153,7 @@ def edit_scene(scene: Scene, request: ViewRequest) -> Scene:
 
 @torch.no_grad()
 def draw_picture(scene: Scene, renderer: Renderer, request: ViewRequest, height: int) -> NDArray[np.uint8]:
-    """The picture [H, W, 3] of a request; a layer that the scene does not have shows as the image itself."""
+    """The image [H, W, 3] of a request; `rgb` replaces a layer that the frame does not have."""
     frame = renderer.with_layers([request.layer])(edit_scene(scene, request), request.camera(height))
     return _picture(layer_image(frame, request.layer if request.layer in (*frame.layers, PHOTOGRAPHED) else "rgb"))
 
@@ -162,16 +162,16 @@ def draw_picture(scene: Scene, renderer: Renderer, request: ViewRequest, height:
 def error_drawn(
     scene: Scene, renderer: Renderer, request: ViewRequest, height: int, camera: Camera, photo: Tensor, *, name: str
 ) -> NDArray[np.uint8]:
-    """Error of the edited scene against a photograph, in its colours and from its camera: [H, W, 3], W by the aspect.
+    """Error map [H, W, 3] of the edited scene against a photograph, with its exposure and camera; W follows the aspect.
 
-    The photograph fills the height, is black beyond its edges and cut off where the picture is narrower. Both are
-    compared pixel by pixel, so that the picture has no more rows than the photograph.
+    The photograph fills the height; it is padded with black, or cropped if the image is narrower. The comparison is per
+    pixel, so that the image has at most as many rows as the photograph.
 
     Args:
         scene: what is shown.
         renderer: of its frames.
-        request: whose edits and aspect count; not its camera.
-        height: rows of the picture, at most.
+        request: its edits and aspect are used, its camera is not.
+        height: maximum number of rows of the image.
         camera: of the photograph.
         photo: [H, W, 3] uint8.
         name: of the photograph.
@@ -193,7 +193,7 @@ def error_drawn(
 def point_along(
     scene: Scene, renderer: Renderer, request: ViewRequest, direction: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """[3] the point that a picture of a request shows in a direction [3], world axes."""
+    """[3] the surface point visible in a direction [3] (world axes) from the camera of a request."""
     camera = request.camera(MEASURED_ROWS)
     x, y, z = (camera.cam_from_world[:3, :3].double().numpy() @ direction).tolist()
     if z <= 0:
@@ -202,7 +202,7 @@ def point_along(
     frame = renderer.with_layers(["depth"])(edit_scene(scene, request), camera)
     is_inside = 0 <= row < camera.height and 0 <= column < camera.width
     if not is_inside or float(frame.layers["alpha"][row, column]) < SURFACE_COVERAGE:
-        raise ValueError("nothing is there")
+        raise ValueError("there is no surface")
     depth = float(frame.layers["depth"][row, column])
     point: NDArray[np.float64] = camera.center.double().numpy() + depth / z * direction
     return point

@@ -1,9 +1,9 @@
-"""Gate between viser and whoever connects to it.
+"""Access control and message validation in front of viser.
 
-viser accepts any websocket connection and believes every message. It makes its server by
-`websockets.asyncio.server.serve(handler, host, port, ...)`; while it does, that name stands for one that adds three
-documented parameters: `process_request`, so that nobody is let in who may not be; `create_connection`, so that messages
-are checked before viser sees them; and a smaller `max_size`. A viser that begins otherwise is stopped at once.
+viser accepts any websocket connection and trusts every message. It creates its server by
+`websockets.asyncio.server.serve(handler, host, port, ...)`. During this call, that name is replaced by a function that
+adds three documented parameters: `process_request` rejects unauthorised requests, `create_connection` checks messages
+before viser receives them, and `max_size` is smaller. A viser that creates its server otherwise is stopped.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ from glassplat.errors import InputError
 from glassplat.files.records import COORDINATE, ByName, Choice, Field, Items, Number, Optional, Whole, check_fields
 
 LARGEST_MESSAGE = 64 * 1024
-"""Bytes; a page sends cameras and what is typed into controls."""
+"""Bytes; a page sends cameras and values of controls."""
 LONGEST_TEXT = 1000
 LARGEST_WINDOW = 16_384
-"""Pixels of a side of the browser's window."""
+"""Maximum width and height of the browser's window, pixels."""
 LEAST_TURN, MOST_TURN = 1e-3, 1e3
-"""Length of a quaternion."""
+"""Bounds of the length of a quaternion."""
 POSITION, TURN = Items(COORDINATE, 3), Items(Number(-MOST_TURN, MOST_TURN), 4)
 PAGE_PATH = re.compile(r"/|(/[\w@+-][\w@+.,-]{0,199}){1,8}", re.ASCII)
-"""Path of a file of viser's page: no part begins with a dot, and nothing is escaped."""
+"""Path of a file of viser's page: no component starts with a dot, and no character is percent-encoded."""
 HEADERS = {"X-Frame-Options": "DENY", "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
 TURNS_TO_ANNOUNCE = 4
-"""Turns of asyncio's loop from accepting a connection until its handler runs."""
+"""Iterations of asyncio's loop from accepting a connection until its handler runs."""
 _SERVE = threading.Lock()
 logger = logging.getLogger(__name__)
 
 
 class ShortText(Field):
-    """A text of a name or of what somebody typed; may be empty."""
+    """A name or a typed text; may be empty."""
 
     expected = f"a text of at most {LONGEST_TEXT} characters"
 
@@ -57,7 +57,7 @@ class ShortText(Field):
 
 
 class ControlValue(Field):
-    """Possible value of a control."""
+    """Value of a control."""
 
     expected = "a number, true, false or a short text"
 
@@ -92,14 +92,14 @@ MESSAGES: dict[str, dict[str, Field]] = {
         "modifier": Choice((None,)),
     },
 }
-"""What browsers may say, by viser's names, and within which bounds; nothing else is heard.
+"""Accepted messages of browsers, by viser's names, with bounds of their fields; all others are ignored.
 
-Among what is not heard: that the scene be shared through a public server, uploads, and pictures of other views.
+Ignored messages include requests to share the scene through a public server, uploads, and renderings sent by clients.
 """
 
 
 def understood(data: str | bytes) -> bytes | None:
-    """A message with nothing in it but what `MESSAGES` names; None for one that is not to be heard."""
+    """A message reduced to the fields listed in `MESSAGES`; None if it is to be ignored."""
     try:
         message = msgspec.msgpack.decode(data if isinstance(data, bytes) else b"")
         kind = message["type"]
@@ -113,26 +113,26 @@ def understood(data: str | bytes) -> bytes | None:
 
 
 class GuardedConnection(ServerConnection):
-    """A connection on which only messages arrive that are understood."""
+    """A connection that drops messages other than those in `MESSAGES`."""
 
     async def recv(self, decode: bool | None = None) -> Any:
-        """The next message that is."""
+        """The next accepted message."""
         while (message := understood(await super().recv(decode))) is None:
             pass
         return message
 
 
 class GuardedServe(serve):
-    """A server that ends when every connection it has accepted is closed."""
+    """A server whose shutdown closes every accepted connection."""
 
     async def __aexit__(self, *raised: Any) -> None:
-        """Accepts nothing more, drops what has asked for nothing yet, and closes the rest.
+        """Stops accepting connections, aborts those without a request, and closes the others.
 
-        asyncio announces a connection some turns of its loop after it accepted it. If the server closes in between,
-        the socket is left to the garbage collector, which warns of it.
+        asyncio starts the handler of a connection some iterations of its loop after accepting it. If the server closes
+        in between, the socket is left to the garbage collector, which prints a warning.
         """
         loop = asyncio.get_running_loop()
-        with suppress(NotImplementedError):  # Windows has no readers to remove.
+        with suppress(NotImplementedError):  # The event loop of Windows has no readers.
             for listening in self.server.sockets:
                 loop.remove_reader(listening.fileno())
         for _ in range(TURNS_TO_ANNOUNCE):
@@ -146,7 +146,7 @@ class GuardedServe(serve):
 
 
 def admission(access: Access, page: Callable[..., Any] | None) -> Callable[[ServerConnection, Request], Any]:
-    """A function for `process_request` that answers with `page` whoever may come in, and refuses others."""
+    """A function for `process_request` that passes authorised requests to `page`, and rejects others."""
 
     def answer(connection: ServerConnection, request: Request) -> Any:
         try:
@@ -167,10 +167,10 @@ def admission(access: Access, page: Callable[..., Any] | None) -> Callable[[Serv
 
 
 def check_request(access: Access, request: Request) -> Mapping[str, str] | None:
-    """None if a request may be answered; for one that brings the key, the headers of the answer.
+    """None if a request is authorised; for a request with the key, the headers of the response.
 
     Raises:
-        RefusedError: it may not.
+        RefusedError: the request is not authorised.
     """
     hosts, origins, upgrades = (request.headers.get_all(name) for name in ("Host", "Origin", "Upgrade"))
     if len(hosts) != 1 or len(origins) > 1:
@@ -185,16 +185,16 @@ def check_request(access: Access, request: Request) -> Mapping[str, str] | None:
 
 
 def reply_with(status: HTTPStatus, headers: Mapping[str, str], text: str = "") -> Response:
-    """An answer with nothing of viser in it."""
+    """A response that viser does not handle."""
     body = text.encode()
     length = {"Content-Length": str(len(body)), "Cache-Control": "no-store", "Connection": "close"}
     return Response(status, status.phrase, Headers({**HEADERS, **length, **headers}), body)
 
 
 def guarded_server(access: Access, *, host: str, port: int, title: str) -> viser.ViserServer:
-    """A server of viser that serves only whom `access` lets in, and hears only what it understands."""
+    """A viser server that serves only requests authorised by `access`, and ignores unknown messages."""
     made: list[str] = []
-    with _SERVE, redirect_stdout(io.StringIO()):  # viser prints a table of addresses; the commands say them.
+    with _SERVE, redirect_stdout(io.StringIO()):  # Commands print the address themselves, not viser's table.
         usual: Any = websockets_server.serve
 
         def guarded(handler: Callable[..., Any], *where: Any, **options: Any) -> Any:
@@ -221,5 +221,5 @@ def guarded_server(access: Access, *, host: str, port: int, title: str) -> viser
 
 
 def _log_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Note an error of one message in place of printing its traceback."""
+    """Logs the error of a message instead of printing its traceback."""
     logger.debug("a message of a browser was rejected: %s", context.get("exception") or context.get("message"))

@@ -1,9 +1,9 @@
-"""Pictures for all clients, one at a time: coarse at once, sharp when nobody asks for anything else.
+"""Rendering for all clients, one image at a time: coarse at once, full resolution when no other request waits.
 
-A request has a generation. When a picture is done whose client has meanwhile asked for another view, it is dropped.
+Each request has a generation. An image is dropped if its client has requested another view since.
 
-One thread draws, since kernels are not entered twice at a time: a `RenderThread`, or one that has other work to do and
-keeps what it spends on pictures to a share of its time, a `DrawingShare`.
+Only one thread renders, because kernels are not reentrant: a `RenderThread`, or a thread with other work that limits
+the share of its time spent on rendering by a `DrawingShare`.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ FIRST_PORT, MOST_PORTS = 8080, 100
 
 
 def vacant_port(host: str) -> int:
-    """The first port from 8080 on that can be used."""
+    """The first usable port, starting at 8080."""
     for port in range(FIRST_PORT, FIRST_PORT + MOST_PORTS):
         try:
             check_port(host, port)
         except InputError:
             continue
         return port
-    raise InputError(f"no port from {FIRST_PORT} on can be used; stop the programs that use them")
+    raise InputError(f"none of the {MOST_PORTS} ports from {FIRST_PORT} can be used; close programs that use them")
 
 
 def check_port(host: str, port: int) -> int:
-    """Refuses a port that is taken, or an address that is not this machine's, before anything is served.
+    """Refuses a port in use, or an address that is not one of this machine, before the server starts.
 
     Returns:
-        The port; one that is free in place of 0.
+        The port; a free one instead of 0.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family) as probe:
@@ -63,13 +63,13 @@ Picture = NDArray[np.uint8]
 
 LEAST_WIDTH = 320
 LONGEST_WAIT = 0.5
-"""Seconds after which a thread that has nothing to draw looks whether it should end."""
+"""Seconds after which an idle thread checks if it should end."""
 MOST_SHARE = 0.15
-"""Of its time, what a program spends on pictures that has other work to do."""
+"""Maximum share of its time that a program with other work spends on rendering."""
 MOST_SAVED = 2.0
-"""Seconds of drawing that may be saved up while nobody looks."""
+"""Maximum rendering time, in seconds, that accumulates while there are no requests."""
 COARSE_SECONDS = 0.08
-"""What the first picture after a move may take; its size follows from how long the last ones took."""
+"""Target time of the first image after a move; its size follows from the time of previous images."""
 SMOOTHING = 0.3
 logger = logging.getLogger(__name__)
 
@@ -79,10 +79,10 @@ class Request(Generic[Wanted]):
     """The newest request of a client.
 
     Attributes:
-        view: what to draw.
-        size: width and height of the sharp picture, pixels.
+        view: the view to render.
+        size: width and height of the full-resolution image, pixels.
         generation: counts the requests of all clients.
-        is_coarse_shown: whether the coarse picture is there.
+        is_coarse_shown: the client has the coarse image.
     """
 
     view: Wanted
@@ -92,7 +92,7 @@ class Request(Generic[Wanted]):
 
 
 class RenderLoop(Generic[Wanted]):
-    """Knows the newest request of each client, and draws the next picture when it is told to."""
+    """Newest request of each client; `serve` renders the next image."""
 
     def __init__(
         self,
@@ -100,12 +100,12 @@ class RenderLoop(Generic[Wanted]):
         show: Callable[[int, Picture, bool], None],
         fail: Callable[[int, str], None] = lambda client, reason: None,
     ) -> None:
-        """Begins to wait for requests.
+        """Starts without requests.
 
         Args:
-            draw: the picture of a view with so many rows; called by `serve` only.
-            show: sends a picture to a client, and says whether it is the sharp one.
-            fail: tells a client why its picture could not be drawn.
+            draw: renders a view with the given number of rows; called by `serve` only.
+            show: sends an image to a client; the flag is true at full resolution.
+            fail: notifies a client of the reason why rendering failed.
         """
         self._draw, self._show, self._fail = draw, show, fail
         self._requests: dict[int, Request[Wanted]] = {}
@@ -116,25 +116,25 @@ class RenderLoop(Generic[Wanted]):
         self._complaint = ""
 
     def ask(self, client: int, view: Wanted, size: tuple[int, int]) -> None:
-        """Replaces what a client wants to see."""
+        """Replaces the request of a client."""
         with self._changed:
             self._generation += 1
             self._requests[client] = Request(view, size, self._generation)
             self._changed.notify()
 
     def forget(self, client: int) -> None:
-        """A client has gone."""
+        """Drops the request of a client that has disconnected."""
         with self._changed:
             self._requests.pop(client, None)
 
     def call(self, work: Callable[[], None]) -> None:
-        """Has something done by the thread that draws, before the next picture."""
+        """Schedules a call on the rendering thread, before the next image."""
         with self._changed:
             self._calls.append(work)
             self._changed.notify()
 
     def serve(self) -> bool:
-        """Draws a picture or does what was called for, if there is any, and returns whether; for one thread only."""
+        """Renders an image or runs a scheduled call; returns false if there is neither. For one thread only."""
         with self._changed:
             call = self._calls.pop(0) if self._calls else None
             if call is None and not self._requests:
@@ -145,18 +145,18 @@ class RenderLoop(Generic[Wanted]):
                 self._serve(*waiting)
             elif call is not None:
                 call()
-        except Exception as error:  # noqa: BLE001 - Of one client or picture; the thread, maybe a training, goes on.
+        except Exception as error:  # noqa: BLE001 - The thread, which may be training, continues.
             self._complain(error)
         return True
 
     def wait(self, seconds: float) -> None:
-        """Waits until somebody asks for something, or for so long."""
+        """Waits for a request, for at most this long."""
         with self._changed:
             if not self._requests and not self._calls:
                 self._changed.wait(seconds)
 
     def expected_seconds(self) -> float | None:
-        """Expected seconds of the next picture, which is called for nothing; None if nobody waits."""
+        """Expected seconds of the next image, 0 for a scheduled call; None if there is no request."""
         with self._changed:
             if self._calls:
                 return 0.0
@@ -170,13 +170,13 @@ class RenderLoop(Generic[Wanted]):
         return self._seconds_per_pixel * width * rows * rows / height
 
     def coarse_height(self, size: tuple[int, int]) -> int:
-        """Rows of a picture that can be drawn in `COARSE_SECONDS`; no narrower than `LEAST_WIDTH`."""
+        """Rows of an image that can be rendered in `COARSE_SECONDS`, but at least `LEAST_WIDTH` wide."""
         width, height = size
         share = (COARSE_SECONDS / (self._seconds_per_pixel * width * height)) ** 0.5
         return max(1, round(height * min(1.0, max(share, LEAST_WIDTH / width))))
 
     def _next(self) -> tuple[int, Request[Wanted]]:
-        """Clients that see nothing of their view yet come first, in turn."""
+        """The next client and its request, in turn; clients without a coarse image come first."""
         waiting = [client for client, request in self._requests.items() if not request.is_coarse_shown]
         clients = sorted(waiting or self._requests)
         client = next((one for one in clients if one > self._turn), clients[0])
@@ -201,11 +201,11 @@ class RenderLoop(Generic[Wanted]):
             self._show(client, picture, is_sharp)
 
     def _draw_timed(self, client: int, view: Wanted, rows: int) -> Picture | None:
-        """A picture; what goes wrong with one must not end the others."""
+        """The rendered image; None on failure, which must not affect other clients."""
         begun = time.perf_counter()
         try:
             picture = self._draw(view, rows)
-        except Exception as error:  # noqa: BLE001 - A photograph that is gone, no memory: whatever it was.
+        except Exception as error:  # noqa: BLE001 - Any failure, such as a missing photograph or no memory.
             self._fail(client, self._complain(error))
             return None
         seconds = (time.perf_counter() - begun) / (picture.shape[0] * picture.shape[1])
@@ -213,7 +213,7 @@ class RenderLoop(Generic[Wanted]):
         return picture
 
     def _complain(self, error: Exception) -> str:
-        """The error as text, which is logged unless the last one was the same."""
+        """The error as text; it is logged unless it repeats the previous one."""
         text = str(error) or type(error).__name__
         if text != self._complaint:
             logger.warning("a view could not be drawn: %s", text)
@@ -222,16 +222,16 @@ class RenderLoop(Generic[Wanted]):
 
 
 class RenderThread:
-    """A thread that does nothing but draw."""
+    """A thread dedicated to rendering."""
 
     def __init__(self, loop: RenderLoop[Any]) -> None:
-        """Begins to draw."""
+        """Starts the thread."""
         self._loop, self._stopped = loop, False
         self._thread = threading.Thread(target=self._run, name="render", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """Ends the thread, after the picture that it is drawing."""
+        """Ends the thread after the current image."""
         self._stopped = True
         self._thread.join()
 
@@ -242,15 +242,15 @@ class RenderThread:
 
 
 class DrawingShare:
-    """Keeps the drawing of a program that has other work to a share of its time, and to nothing while nobody looks."""
+    """Limits rendering in a program with other work to a share of its time; without requests it takes none."""
 
     def __init__(self, loop: RenderLoop[Any], clock: Callable[[], float] = time.perf_counter) -> None:
-        """Counts from now on; a picture may be drawn at once."""
+        """Starts with enough saved time to render at once."""
         self._loop, self._clock = loop, clock
         self._saved, self._since = MOST_SAVED, clock()
 
     def draw(self) -> None:
-        """To be called between two pieces of work: draws what there is time for."""
+        """Renders as much as there is time for; to be called between two pieces of work."""
         worked = self._clock() - self._since
         self._saved = min(self._saved + MOST_SHARE * worked, MOST_SAVED)
         while (expected := self._loop.expected_seconds()) is not None and self._saved >= min(expected, MOST_SAVED):

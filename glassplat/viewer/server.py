@@ -1,6 +1,6 @@
 """The viewer in the browser: viser shows the controls and moves the camera, this package renders.
 
-viser's own splats know nothing of panes, so that what it shows is a picture behind an empty scene.
+viser's own splats do not support panes, so the rendered image is the background of an empty scene.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from glassplat.viewer.render_loop import RenderLoop, RenderThread, check_port
 LARGEST_HEIGHT, MOST_PIXELS = 1080, 4_000_000
 SHARP_QUALITY, COARSE_QUALITY = 90, 60
 LEAST_AHEAD = 0.1
-"""Of the extent: how far before the camera the point is, at least, that the mouse turns it about."""
-WAITING = ("Drawing", "The first picture may take a minute or two: kernels are compiled once for each machine.")
-"""Title and text of what stands there until there is a picture."""
+"""Minimum distance from the camera to the point it orbits, as a share of the extent."""
+WAITING = ("Rendering", "The first image may take a minute or two: kernels are compiled once per machine.")
+"""Title and text of the notification shown until the first image."""
 
 
 class Client:
     """One browser."""
 
     def __init__(self, handle: Any, viewer: Viewer) -> None:
-        """Lays out the controls and goes to the first view; `ask` is for who has made it."""
+        """Lays out the controls and moves to the first view; the caller then calls `ask`."""
         self._handle, self._viewer = handle, viewer
         self._status, self._nearest = "", viewer.first
         self._layer: Any = None
@@ -57,7 +57,7 @@ class Client:
         handle.camera.on_update(controls.log_errors(lambda _: self.ask()))
 
     def show(self, picture: NDArray[np.uint8], is_sharp: bool) -> None:
-        """Puts a picture on the screen, and with a sharp one the photograph that is nearest to it."""
+        """Displays an image; at full resolution also the nearest photograph."""
         quality = SHARP_QUALITY if is_sharp else COARSE_QUALITY
         self._handle.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
         self._stop_waiting()
@@ -66,11 +66,11 @@ class Client:
             self._photographs.show_nearest(self._nearest)
 
     def say_failed(self, reason: str) -> None:
-        """Says why there is no picture, once until there is one again."""
+        """Notifies of the reason why rendering failed, once for repeated failures."""
         self._stop_waiting()
         if reason != self._failure:
             self._failure = reason
-            self._notify("No picture", reason, "red")
+            self._notify("No image", reason, "red")
 
     def tell(self, status: str) -> None:
         """Shows a line above the controls."""
@@ -79,11 +79,11 @@ class Client:
             self._told.content = plain(status)
 
     def leave(self) -> None:
-        """The browser has gone."""
+        """Stops playback, because the browser has disconnected."""
         self.keyframes.stop()
 
     def ask(self) -> None:
-        """Asks for what the controls and the camera say."""
+        """Requests the view given by the controls and the camera."""
         request = self.request()
         if request is None:
             return
@@ -97,7 +97,7 @@ class Client:
         try:
             wxyz, position = np.asarray(camera.wxyz), np.asarray(camera.position)
             fov_rad, aspect = float(camera.fov), float(camera.aspect)
-        except AssertionError:  # viser has not heard of this camera yet; it will say so.
+        except AssertionError:  # The browser has not sent its camera yet.
             return None
         self._nearest = self._viewer.viewpoints.nearest(position, drawing.matrix_of(wxyz)[:, 2])
         against = self._nearest if self._layer.value == drawing.ERROR else None
@@ -107,12 +107,12 @@ class Client:
         return request if self._panes is None else self._panes.apply(request)
 
     def camera(self) -> Camera | None:
-        """Camera of the browser, with as many rows as its window has."""
+        """Camera of the browser, with the rows of its window."""
         request = self.request()
         return None if request is None else request.camera(max(1, int(self._handle.camera.image_height)))
 
     def stand_at(self, index: int) -> None:
-        """Moves the camera to where a photograph was taken, and shows that; keyframes play no further."""
+        """Moves the camera to the pose of a photograph and shows it; playback of keyframes stops."""
         self.keyframes.stop()
         self._photographs.stands_at(index)
         self._photographs.show_nearest(index)
@@ -131,7 +131,7 @@ class Client:
             self._handle.camera.fov = 2 * float(np.arctan(camera.height / 2 / camera.fy))
 
     def lay_out(self) -> None:
-        """Puts the controls there, anew where there were some."""
+        """Lays out the controls, replacing existing ones."""
         gui, state = self._handle.gui, self._viewer.state
         layers = tuple(state.layers)
         chosen = layers[0] if self._layer is None else self._layer.value
@@ -145,11 +145,11 @@ class Client:
         if self._panes is not None:
             self._panes.remove()
         self._panes = controls.PaneControls(self._handle, panes) if len(panes) else None
-        # A scene that is trained changes from step to step.
+        # A scene in training changes at every step.
         self._clean = None if self._viewer.buttons else controls.CleanControls(gui, state)
         self._measure.lay_out(self.measure)
         self._photographs = controls.PhotographControls(gui, state, self._nearest)
-        # Now that all are there: a control may be used as soon as it listens.
+        # After all are created, because a control may fire as soon as it listens.
         if self._panes is not None:
             self._panes.listen(self.ask)
         if self._clean is not None:
@@ -160,9 +160,9 @@ class Client:
             self._add_saving(f"{state.title}-edited")
 
     def measure(self, direction: NDArray[np.float64]) -> None:
-        """Takes the point that is seen in a direction [3], world axes, as an end of what is measured.
+        """Adds the surface point visible in a direction [3] (world axes) to the measurement.
 
-        It is seen from where the camera is now: the thread that draws may take long to come to it.
+        The current camera is used, because the rendering thread may run this much later.
         """
         request = self.request()
         if request is None:
@@ -179,13 +179,13 @@ class Client:
         self._viewer.loop.call(controls.log_errors(work))
 
     def save_scene(self, name: str) -> None:
-        """Saves the scene as it is edited here, under a new name; says how that went."""
+        """Saves the edited scene under a new name; a notification reports the result."""
         writer, request = self._viewer.state.writer, self.request()
         if writer is not None and request is not None:
             self._save(lambda: writer.write_scene(drawing.edit_scene(self._viewer.state.scene, request), name))
 
     def save_keyframes(self, name: str) -> None:
-        """Saves the keyframes under a new name; says how that went."""
+        """Saves the keyframes under a new name; a notification reports the result."""
         writer, keyframes = self._viewer.state.writer, self.keyframes.keyframes
         if writer is not None:
             self._save(lambda: writer.write_keyframes(keyframes, name))
@@ -197,7 +197,7 @@ class Client:
             gui.add_button("Save as a run").on_click(controls.log_errors(lambda _: self.save_scene(text.value)))
 
     def _save(self, write: Callable[[], str]) -> None:
-        """Writes in the thread that draws: what is written may need kernels."""
+        """Writes in the rendering thread, because writing may run kernels."""
 
         def work() -> None:
             try:
@@ -217,7 +217,7 @@ class Client:
 
 
 def plain(text: str) -> str:
-    """Markdown of a text that the page is to show as it is: names in it may look like HTML."""
+    """Text escaped for Markdown, so that the page shows it verbatim: names may look like HTML."""
     return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", text)
 
 
@@ -230,18 +230,18 @@ def cam_from_world(wxyz: NDArray[np.float64], position: NDArray[np.float64]) -> 
 
 
 class Viewer:
-    """Serves a scene to any number of browsers until it is stopped; who made it draws, or `start` does."""
+    """Serves a scene to any number of browsers until it is stopped; the caller renders, or `start` does."""
 
     def __init__(
         self, state: drawing.ViewerState, host: str, port: int, buttons: Mapping[str, Callable[[], None]] | None = None
     ) -> None:
-        """Begins to serve.
+        """Starts the server.
 
         Args:
-            state: what there is to look at.
-            host: who may look, with the key of the address; 127.0.0.1 is this machine alone.
-            port: where the browser finds it; 0 takes any that is free.
-            buttons: further ones by what is written on them, and what they do; called from other threads.
+            state: the scene, its cameras and its photographs.
+            host: address to listen on; 127.0.0.1 serves this machine only. Clients need the key in the address.
+            port: to listen on; 0 picks a free one.
+            buttons: additional buttons, by label, with their callbacks; called from other threads.
         """
         port = check_port(host, port)
         try:
@@ -256,7 +256,7 @@ class Viewer:
         self._thread: RenderThread | None = None
         self._clients: dict[int, Client] = {}
         logging.getLogger("websockets").setLevel(logging.CRITICAL)
-        # A browser that leaves in the middle of something is nothing that anybody needs to know.
+        # A browser may disconnect at any time; users need no warning.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         self.access = Access(host)
         self._server = guarded_server(self.access, host=host, port=port, title=state.title)
@@ -266,7 +266,7 @@ class Viewer:
         self.focus = survey.focus.numpy()
         self.first = best_view(state.scene.planes, cameras)
         self.viewpoints = drawing.Viewpoints(cameras, state.scene.extent)
-        # The error layer asks for the same one with every edit.
+        # The error layer reads the same photograph for every edit.
         self._photograph = lru_cache(maxsize=2)(self._read_photograph)
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._server.on_client_connect(controls.log_errors(self._on_connect))
@@ -277,15 +277,15 @@ class Viewer:
 
     @property
     def port(self) -> int:
-        """Port of the server; another one than was asked for if that was taken."""
+        """Port of the server, which may differ from the requested one."""
         return int(self._server.get_port())
 
     @property
     def address(self) -> str:
-        """Address to open in the browser: with the key, without which there is no answer."""
+        """Address to open in the browser, including the key; requests without it are rejected."""
         everywhere = self.host in ("0.0.0.0", "::")
         name = "localhost" if is_local(self.host) else socket.gethostname() if everywhere else self.host
-        name = f"[{name}]" if ":" in name else name  # The port of an IPv6 address begins after the bracket.
+        name = f"[{name}]" if ":" in name else name  # Separates an IPv6 address from the port.
         return f"http://{name}:{self.port}/?key={self.access.key}"
 
     @property
@@ -294,18 +294,18 @@ class Viewer:
         return bool(self._clients)
 
     def start(self) -> None:
-        """Begins to draw, in a thread of its own."""
+        """Starts rendering in a separate thread."""
         self._thread = RenderThread(self.loop)
 
     def stop(self) -> None:
-        """Ends the drawing, then the server."""
+        """Stops rendering, then the server."""
         if self._thread is not None:
             self._thread.stop()
         with redirect_stdout(io.StringIO()):
             self._server.stop()
 
     def change(self, scene: Scene, renderer: Renderer) -> None:
-        """Shows another scene from now on; to be called by the thread that draws. `refresh` draws it anew."""
+        """Replaces the displayed scene; to be called by the rendering thread. `refresh` renders it."""
         had = self.state.scene.planes.labels
         self.state = replace(self.state, scene=scene, renderer=renderer)
         if scene.planes.labels != had:
@@ -313,7 +313,7 @@ class Viewer:
                 controls.log_errors(client.lay_out)()
 
     def refresh(self, status: str = "") -> None:
-        """Asks for everybody's picture again, and tells them something."""
+        """Requests the views of all clients again, and shows them a status line."""
         for client in list(self._clients.values()):
             controls.log_errors(client.tell)(status)
             controls.log_errors(client.ask)()
@@ -321,7 +321,7 @@ class Viewer:
     def _on_connect(self, handle: Any) -> None:
         client = self._clients[handle.client_id] = Client(handle, self)
         client.ask()
-        if handle.client_id not in self._server.get_clients():  # It left before it was known here.
+        if handle.client_id not in self._server.get_clients():  # It disconnected before it was registered here.
             self._on_disconnect(handle)
 
     def _on_disconnect(self, handle: Any) -> None:
@@ -342,7 +342,7 @@ class Viewer:
         """[H, W, 3] uint8.
 
         Raises:
-            ValueError, OSError: the photograph is not there, or cannot be read.
+            ValueError, OSError: the photograph does not exist, or cannot be read.
         """
         name = self.state.cameras[index][0]
         if name not in self.state.photographs:

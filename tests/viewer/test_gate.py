@@ -248,7 +248,7 @@ def test_a_photograph_that_is_gone_ends_nobody_s_drawing(capfd: pytest.CaptureFi
     async def work(client: ViewerClient) -> None:
         nonlocal gone
         gone = True
-        await client.set("Stand at", state.cameras[2][0])
+        await client.set("Go to", state.cameras[2][0])
         await client.picture()
         await client.set("Layer", "error")
         async with asyncio.timeout(60):
