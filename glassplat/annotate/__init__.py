@@ -1,1 +1,1 @@
-"""Panes marked by hand: corners in a few photographs become planes, masks and a page in the browser to do it in."""
+"""Manual marking of panes in the browser: corners in a few photographs become planes and masks."""

@@ -1,4 +1,4 @@
-"""Marks on a capture: one JSON document, the same in the browser and on disk, and outlines as masks."""
+"""Marks on a capture: a JSON document, shared by browser and disk, and the rasterisation of outlines to masks."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ Material = Literal["glass", "mirror", "screen"]
 
 ANNOTATIONS = "annotations.json"
 LOCK = "annotations.lock"
-"""Stays behind, empty, where folders cannot be locked."""
+"""An empty file that remains on systems that cannot lock folders."""
 MOST_PANES, MOST_CORNERS, MOST_STROKES, MOST_PLACES = 64, 32, 500, 20_000
-"""Of one document: more than anybody marks, and few enough to work with."""
+"""Limits of one document: more than users mark, and small enough to process."""
 FARTHEST = 1e6
 PLACE = Items(Number(-FARTHEST, FARTHEST), 2)
 
@@ -67,11 +67,11 @@ DOCUMENT: dict[str, Field] = {"version": Choice((1,)), "panes": Items(PANE)}
 
 @dataclass(frozen=True)
 class Stroke:
-    """A part of one photograph that is, or is not, covered by what stands in front of the pane.
+    """A region of one photograph that occluders of the pane cover, or do not cover.
 
     Attributes:
-        kind: a filled polygon, or a line as wide as a brush.
-        effect: cut takes the part out of the mask, keep puts it back.
+        kind: a filled polygon, or a brush line.
+        effect: cut removes the region from the mask, keep restores it.
         radius: of the brush, in pixels of the photograph.
         points: [P, 2] pixels.
     """
@@ -84,7 +84,7 @@ class Stroke:
 
 @dataclass(frozen=True)
 class MarkedPane:
-    """One pane as somebody marked it; views go by the names of their photographs."""
+    """The marks of one pane; views are identified by the names of their photographs."""
 
     label: int
     material: Material
@@ -94,13 +94,13 @@ class MarkedPane:
     strokes: Mapping[str, Sequence[Stroke]]
 
     def marks(self, numbers: Mapping[str, int]) -> Marks:
-        """Its corners and edges by the numbers of views; those in photographs that are gone are left out."""
+        """Corners and edges by index of the view; marks in photographs that no longer exist are left out."""
         corners = [_number_places(places, numbers) for places in self.corners]
         edges = [_number_places(places, numbers) for places in self.edges[: len(corners)]]
         return Marks(corners, edges)
 
     def views(self) -> set[str]:
-        """Photographs with any mark of it."""
+        """Names of the photographs with any mark of the pane."""
         marked = {name for places in (*self.corners, *self.edges) for name in places}
         return marked | {name for name, strokes in self.strokes.items() if strokes}
 
@@ -134,7 +134,7 @@ def _pane(entry: Mapping[str, Any]) -> MarkedPane:
 
 
 def read_document(folder: Path) -> Any:
-    """The document of a capture as JSON; an empty one where nothing was marked yet."""
+    """The document of a capture as JSON; an empty one if nothing is marked yet."""
     path = folder / ANNOTATIONS
     if not path.exists():
         return {"version": 1, "panes": []}
@@ -144,13 +144,13 @@ def read_document(folder: Path) -> Any:
 
 
 def version_of(value: Any) -> str:
-    """Digest of all that is in a document."""
+    """Digest of the contents of a document."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:24]
 
 
 @contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
-    """Keeps other programs from saving marks of a capture meanwhile, where its file system has locks."""
+    """Keeps other programs from saving marks of a capture within the context, if its file system supports locks."""
     try:
         import fcntl
     except ImportError:  # Windows, where folders cannot be locked.
@@ -167,7 +167,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
 
 
 def write_document(folder: Path, value: Any) -> None:
-    """Writes a document that was checked."""
+    """Writes a checked document."""
     write_text(folder / ANNOTATIONS, json.dumps(value, ensure_ascii=False, indent=1) + "\n")
 
 
@@ -175,21 +175,21 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 NEAR = 1e-3
-"""Camera z before which an outline is cut off, as a share of its largest distance."""
+"""Near plane at which an outline is clipped, as a share of its largest coordinate."""
 FARTHEST_OUTSIDE = 1e5
-"""Pixels beyond which a point of a stroke is as good as at infinity."""
+"""Range in pixels to which the points of brush strokes are clamped."""
 
 
 def seen_outline(camera: NumpyCamera, corners: Array) -> Array:
-    """[P, 2] the outline of a polygon [K, 3] in a view, cut off where it passes the camera; empty if it is behind.
+    """[P, 2] the projected outline of a polygon [K, 3], clipped at the near plane; empty if it is behind the camera.
 
-    It reaches far outside the photograph there, which keeps its edges straight: 1 / `NEAR` focal lengths at most.
+    Clipped ends lie far outside the photograph, at most 1 / `NEAR` focal lengths, which keeps edges straight.
     """
     return camera.pixels(_before_camera(camera.in_camera(corners)))
 
 
 def _before_camera(points: Array) -> Array:
-    """[P, 3] a polygon's part with z of at least a little (Sutherland and Hodgman's way to cut)."""
+    """[P, 3] a polygon clipped at the near plane (Sutherland and Hodgman's algorithm)."""
     near = NEAR * float(np.abs(points).max())
     kept: list[Array] = []
     for here, after in zip(points, np.roll(points, -1, axis=0), strict=True):
@@ -201,12 +201,12 @@ def _before_camera(points: Array) -> Array:
 
 
 def fill_polygon(outline: Array, size: tuple[int, int]) -> Mask:
-    """[H, W] the pixels whose centres a polygon [P, 2] winds round, as on the page; `size` is width and height."""
+    """[H, W] the pixels with centres inside a polygon [P, 2] (non-zero rule, as on the page); `size` is (W, H)."""
     width, height = size
     if len(outline) < 3:
         return np.zeros((height, width), dtype=bool)
     y, x = np.arange(height) + 0.5, np.arange(width) + 0.5
-    turns = np.zeros((height, width + 1), dtype=np.int16)  # First where each row is crossed, then summed up.
+    turns = np.zeros((height, width + 1), dtype=np.int16)  # Winding numbers: crossings per row, then summed along it.
     for one, other in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         low, high = sorted((one[1], other[1]))
         rows = np.flatnonzero((y >= low) & (y < high))
@@ -219,7 +219,7 @@ def fill_polygon(outline: Array, size: tuple[int, int]) -> Mask:
 
 
 def depths(camera: NumpyCamera, corners: Array, rows: slice, columns: slice) -> Array:
-    """Camera z at which the ray of each pixel in a window meets the plane of a polygon; infinite where it does not."""
+    """Camera z at which each pixel's ray in a window intersects the plane of a polygon; infinite if it does not."""
     center = corners.mean(axis=0)
     normal = np.linalg.svd(corners - center)[2][2]
     x, y = np.meshgrid(np.arange(columns.start, columns.stop) + 0.5, np.arange(rows.start, rows.stop) + 0.5)
@@ -230,7 +230,7 @@ def depths(camera: NumpyCamera, corners: Array, rows: slice, columns: slice) -> 
 
 
 def with_strokes(mask: Mask, strokes: Sequence[Stroke]) -> Mask:
-    """A mask after its strokes: cut takes pixels out, keep brings back those that the mask had at first."""
+    """A mask after its strokes: cut removes pixels, keep restores those of the original mask."""
     found = mask.copy()
     for stroke in strokes:
         covered = rasterise_stroke(stroke, (mask.shape[1], mask.shape[0]))
@@ -239,7 +239,7 @@ def with_strokes(mask: Mask, strokes: Sequence[Stroke]) -> Mask:
 
 
 def rasterise_stroke(stroke: Stroke, size: tuple[int, int]) -> Mask:
-    """[H, W] what a stroke covers."""
+    """[H, W] the pixels that a stroke covers."""
     places = np.array(stroke.points, dtype=np.float64).reshape(-1, 2)
     if stroke.kind == "polygon":
         return fill_polygon(places, size)

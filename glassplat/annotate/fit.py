@@ -15,21 +15,21 @@ from glassplat.scene.camera import NumpyCamera
 Array = NDArray[np.float64]
 
 RECTANGLE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-"""Corners in half sides, one after the other round it."""
+"""Corners in units of half sides, in order around the rectangle."""
 
 
 @dataclass(frozen=True)
 class RectanglePane:
-    """A rectangle: tilt, turn, centre and two half sides."""
+    """A rectangle: orientation, centre and two half sides."""
 
     axes: Array
-    """[3, 3] rows: along the first side, along the second, and the normal."""
+    """[3, 3] rows: directions of the first and the second side, and the normal."""
     center: Array
     half_sizes: Array
 
     @property
     def freedom(self) -> int:
-        """Three to turn it, three to shift it, two for its sides."""
+        """Three for rotation, three for translation, two for the sides."""
         return 8
 
     def corners(self) -> Array:
@@ -37,7 +37,7 @@ class RectanglePane:
         return np.asarray(self.center + (RECTANGLE * self.half_sizes) @ self.axes[:2])
 
     def apply_step(self, step: Array) -> RectanglePane:
-        """Shifts are in units of the longer half side, sides grow by factors."""
+        """The shape after a step: translation in units of the longer half side, logarithmic factors of the sides."""
         return RectanglePane(
             axes=_turn_axes(self.axes, step[:3]),
             center=self.center + self.half_sizes.max() * step[3:6] @ self.axes,
@@ -47,17 +47,17 @@ class RectanglePane:
 
 @dataclass(frozen=True)
 class PolygonPane:
-    """Corners anywhere in a plane."""
+    """A planar polygon."""
 
     axes: Array
-    """[3, 3] rows: two in the plane, and its normal."""
+    """[3, 3] rows: two directions in the plane, and its normal."""
     center: Array
     places: Array
     """[K, 2] corners along the first two axes, from the centre."""
 
     @property
     def freedom(self) -> int:
-        """Two to tilt it, one along its normal, two for each corner."""
+        """Two for the tilt, one for translation along the normal, two for each corner."""
         return 3 + 2 * len(self.places)
 
     def corners(self) -> Array:
@@ -65,7 +65,7 @@ class PolygonPane:
         return np.asarray(self.center + self.places @ self.axes[:2])
 
     def apply_step(self, step: Array) -> PolygonPane:
-        """Lengths are in units of the polygon's reach."""
+        """The shape after a step; lengths are in units of the largest distance of a corner from the centre."""
         reach = float(np.linalg.norm(self.places, axis=1).max())
         return replace(
             self,
@@ -76,11 +76,11 @@ class PolygonPane:
 
 
 PaneShape = RectanglePane | PolygonPane
-"""Corners in one plane; the first two parameters of a step tilt it, in radians."""
+"""A planar shape; the first two parameters of a step tilt its plane, in radians."""
 
 
 def polygon_pane(corners: Array) -> PolygonPane:
-    """The polygon in the plane that lies closest to points [K, 3]."""
+    """The polygon of points [K, 3], projected onto their least-squares plane."""
     center = corners.mean(axis=0)
     _, sizes, axes = np.linalg.svd(corners - center)
     if sizes[1] <= 1e-6 * sizes[0]:
@@ -90,10 +90,10 @@ def polygon_pane(corners: Array) -> PolygonPane:
 
 
 def rectangle_pane(polygon: PolygonPane) -> RectanglePane:
-    """The rectangle closest to a polygon of four corners, which may be far from one."""
+    """A rectangle fitted to a polygon of four corners, which may be far from rectangular."""
     a, b, c, d = polygon.places
     along, across = (b - a + c - d) / 2, (d - a + c - b) / 2
-    # The direction on which both pairs of sides agree best, the second pair turned back by a right angle.
+    # The direction that best fits both pairs of sides, with the second pair rotated back by 90 degrees.
     turn = 1.0 if along[0] * across[1] - along[1] * across[0] > 0 else -1.0
     direction = along + turn * np.array([across[1], -across[0]])
     first = direction / np.linalg.norm(direction)
@@ -104,7 +104,7 @@ def rectangle_pane(polygon: PolygonPane) -> RectanglePane:
 
 
 def _turn_axes(axes: Array, angles: Array) -> Array:
-    """Axes turned about themselves by small angles, radians."""
+    """Axes rotated about themselves by a rotation vector, in radians."""
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_rotvec(angles).as_matrix().T @ axes)
@@ -113,25 +113,25 @@ def _turn_axes(axes: Array, angles: Array) -> Array:
 Shape = Literal["rectangle", "polygon"]
 
 ACCURACY = 1.0 / 1000
-"""Of a mark, in image diagonals: how exactly somebody clicks, at best."""
+"""Best accuracy of a mark, in image diagonals."""
 OUTLIER = 4.0
-"""Accuracies from which on a mark counts less and less."""
+"""Residual, in accuracies, above which marks are down-weighted."""
 LEAST_PARALLAX = np.radians(0.5)
-"""Between two sight lines on a corner; with less its distance is a guess."""
+"""Minimum angle between two sight lines for triangulation; below it, depth is unreliable."""
 DERIVATIVE_STEP = 1e-5
 
 
 class TooFewMarksError(ValueError):
-    """The marks leave the plane open; the message says which are missing."""
+    """Raised when the marks do not determine the plane; the message names the missing ones."""
 
 
 @dataclass(frozen=True)
 class Marks:
-    """Marks of one pane; views are numbered.
+    """Marks of one pane; views are identified by index.
 
     Attributes:
-        corners: for each corner, in order round the outline, its pixel (x, y) in every view that shows it.
-        edges: for each edge, the one after the corner of its number, two pixels on it in every view that shows it.
+        corners: for each corner, in order around the outline, its pixel (x, y) in every view with a mark.
+        edges: for each edge, which starts at the corner of the same index, two pixels on it in every view with a mark.
     """
 
     corners: Sequence[Mapping[int, Array]]
@@ -144,13 +144,13 @@ class Marks:
 
 @dataclass(frozen=True)
 class PaneFit:
-    """A pane as the marks have it.
+    """A pane fitted to marks.
 
     Attributes:
         shape: the outline in the world.
         error: root mean square distance of marks from it, in pixels.
         errors: the largest distance of a mark in each view, in pixels.
-        information: [F, F] of the parameters of the shape, those of `apply_step`: inverse of their covariance.
+        information: [F, F] inverse covariance of the shape's parameters, those of `apply_step`.
     """
 
     shape: PaneShape
@@ -160,29 +160,29 @@ class PaneFit:
 
     @property
     def uncertainty(self) -> float:
-        """Degrees by which the plane may be tilted, one standard deviation along its least certain axis."""
+        """Standard deviation of the plane's tilt along its least certain axis, degrees."""
         return tilt_deviation(self.information)
 
 
 def tilt_deviation(information: Array) -> float:
-    """Degrees, of the tilt that is least certain; 90 where nothing holds the plane."""
+    """Standard deviation of the least certain tilt, degrees; 90 if the marks do not constrain it."""
     tilt, mixed, rest = information[:2, :2], information[:2, 2:], information[2:, 2:]
-    # What is left of the tilt's information when everything else is free; how far edges go may be open.
+    # The tilt's information with all other parameters marginalised out; the extent of edges may be undetermined.
     alone = tilt - mixed @ np.linalg.pinv(rest, rcond=1e-10, hermitian=True) @ mixed.T
     least = float(np.linalg.eigvalsh(alone)[0])
     return 90.0 if least <= np.degrees(1) ** -2 * 1e-4 else min(float(np.degrees(1 / np.sqrt(least))), 90.0)
 
 
 def fit_pane(marks: Marks, cameras: Sequence[NumpyCamera], shape: Shape) -> PaneFit:
-    """The outline that lies closest to all marks; single marks that are far off count little.
+    """The outline that best fits all marks, by a robust loss that gives outliers little weight.
 
     Args:
-        marks: corners and edges, in numbered views.
+        marks: corners and edges by index of the view.
         cameras: the cameras of all views.
         shape: a rectangle (of four corners), or any polygon.
 
     Raises:
-        TooFewMarksError: a corner of too few is known from two places; the message says what to mark.
+        TooFewMarksError: too few corners are known from two positions; the message names the missing marks.
     """
     fits = [_fit_from(marks, cameras, start) for start in _starts(marks, cameras, shape)]
     _, fitted = min(fits, key=lambda fit: fit[0])
@@ -196,27 +196,27 @@ def fit_pane(marks: Marks, cameras: Sequence[NumpyCamera], shape: Shape) -> Pane
 
 
 def _fit_from(marks: Marks, cameras: Sequence[NumpyCamera], begun: PaneShape) -> tuple[float, PaneShape]:
-    """Fit a shape to marks from where it begins; also return the residuals."""
+    """The robust cost and the shape of a fit that starts at the given shape."""
     from scipy.optimize import least_squares
 
     def residuals(step: Array) -> Array:
         return mark_residuals(marks, cameras, begun.apply_step(step))
 
     step, cost = np.zeros(begun.freedom), np.inf
-    for loss in ("soft_l1", "cauchy"):  # The second lets go of what is far off, and would stay there if it came first.
+    for loss in ("soft_l1", "cauchy"):  # Cauchy first would stay at a poor start, where all marks are outliers.
         found = least_squares(residuals, step, loss=loss, f_scale=OUTLIER, x_scale="jac", max_nfev=100)
         step, cost = found.x, float(found.cost)
     return cost, begun.apply_step(step)
 
 
 def mark_residuals(marks: Marks, cameras: Sequence[NumpyCamera], shape: PaneShape) -> Array:
-    """[R] distances of all marks from the shape, in accuracies; two for a corner, one for each pixel on an edge."""
+    """[R] residuals of all marks, in accuracies: two for a corner, one for each pixel on an edge."""
     parts = [away / (ACCURACY * cameras[view].diagonal) for view, away in _distances(marks, cameras, shape)]
     return np.concatenate(parts)
 
 
 def corner_information(camera: NumpyCamera, shape: PaneShape) -> Array:
-    """[F, F] what marking every corner that a view holds would add to a fit's information."""
+    """[F, F] information that a fit would gain if all corners visible in a view were marked."""
     held = camera.holds(shape.corners())
     marks = Marks(
         [{0: pixel} if seen else {} for pixel, seen in zip(camera.project(shape.corners()), held, strict=True)]
@@ -239,7 +239,7 @@ def _jacobian(marks: Marks, cameras: Sequence[NumpyCamera], shape: PaneShape) ->
 
 
 def _distances(marks: Marks, cameras: Sequence[NumpyCamera], shape: PaneShape) -> list[tuple[int, Array]]:
-    """The view and the distances, in pixels, of each mark: [2] of a corner, [2] across an edge."""
+    """The view and the residual of each mark, in pixels: [2] of a corner, [2] perpendicular to an edge."""
     corners = shape.corners()
     found = []
     for number, places in enumerate(marks.corners):
@@ -259,13 +259,13 @@ def _across(line: Array, places: Array) -> Array:
 
 
 def _starts(marks: Marks, cameras: Sequence[NumpyCamera], shape: Shape) -> list[PaneShape]:
-    """Outlines to begin with, one at least.
+    """Initial outlines, at least one.
 
-    An edge or a corner of one view only says nothing about the plane, but how far a pane goes: other starts are the
-    pane that all other marks give, cut off by such edges, and stretched to such corners.
+    An edge or a corner marked in one view only does not constrain the plane, only the extent of the pane. Therefore,
+    additional starts are the fit to all other marks, clipped by such edges, or stretched to such corners.
 
     Raises:
-        TooFewMarksError: the marks leave the plane open.
+        TooFewMarksError: the marks do not determine the plane.
     """
     starts = [polygon_pane(_first_corners(marks, cameras))]
     firm, loose = _seen_again(marks.edges)
@@ -274,22 +274,22 @@ def _starts(marks: Marks, cameras: Sequence[NumpyCamera], shape: Shape) -> list[
         starts.append(polygon_pane(_cut_by_edges(marks, cameras, pane, loose)))
     firm, loose = _seen_again(marks.corners)
     if loose:
-        with suppress(ValueError):  # Without these corners, or stretched to a wrong one, it may be no pane.
+        with suppress(ValueError):  # Without these corners, or with a wrong one, the fit may be degenerate.
             pane = fit_pane(replace(marks, corners=firm), cameras, shape).shape
             starts.append(polygon_pane(_stretched_to_corners(marks, cameras, pane, loose)))
     return [rectangle_pane(start) if shape == "rectangle" and len(marks.corners) == 4 else start for start in starts]
 
 
 def _seen_again(marks: Sequence[Mapping[int, Array]]) -> tuple[list[Mapping[int, Array]], list[int]]:
-    """Marks of corners or edges, none where one view only has any, and the numbers of those."""
+    """Marks of corners or edges, without those marked in one view only, and the indices of the latter."""
     loose = [number for number, places in enumerate(marks) if len(places) == 1]
     return [{} if number in loose else places for number, places in enumerate(marks)], loose
 
 
 def _stretched_to_corners(marks: Marks, cameras: Sequence[NumpyCamera], pane: PaneShape, loose: Sequence[int]) -> Array:
-    """[K, 3] the corners of a pane, some of which are moved to where one view shows them.
+    """[K, 3] the corners of a pane, some of them moved to their marks in a single view.
 
-    Of four corners the one that lies across stays, and those between keep the directions of their sides.
+    Of four corners, the opposite one is fixed, and the adjacent ones keep the directions of their sides.
     """
     corners = pane.corners()
     for number in loose:
@@ -306,7 +306,7 @@ def _stretched_to_corners(marks: Marks, cameras: Sequence[NumpyCamera], pane: Pa
 
 
 def _cut_by_edges(marks: Marks, cameras: Sequence[NumpyCamera], pane: PaneShape, loose: Sequence[int]) -> Array:
-    """[K, 3] the corners of a pane, some edges of which are moved to where one view shows them."""
+    """[K, 3] the corners of a pane, some edges of which are moved to their marks in a single view."""
     corners = pane.corners()
     for number in loose:
         corners = _cut_at(corners, number, _line_on_plane(marks.edges[number], cameras, pane))
@@ -314,7 +314,7 @@ def _cut_by_edges(marks: Marks, cameras: Sequence[NumpyCamera], pane: PaneShape,
 
 
 def _cut_at(corners: Array, edge: int, line: tuple[Array, Array] | None) -> Array:
-    """[K, 3] an outline, one edge of which is moved to a line in its plane."""
+    """[K, 3] an outline with one edge moved to a line in its plane."""
     around = [corners[(edge + step) % len(corners)] for step in (-1, 0, 1, 2)]
     first, second = (_meeting(line, (around[before], around[before + 1])) for before in (0, 2))
     found = corners.copy()
@@ -337,10 +337,10 @@ def _line_on_plane(
 
 
 def _first_corners(marks: Marks, cameras: Sequence[NumpyCamera]) -> Array:
-    """[K, 3] every corner: triangulated, where two edges meet, on the plane of the others, or completing them.
+    """[K, 3] all corners: triangulated, intersected from two edges or with the plane of the others, or completed.
 
     Raises:
-        TooFewMarksError: fewer than three are known from two places.
+        TooFewMarksError: fewer than three are known from two positions.
     """
     lines = [_edge_line(places, cameras) for places in marks.edges] + [None] * (len(marks.corners) - len(marks.edges))
     known = [
@@ -371,7 +371,7 @@ def _missing(marks: Marks, known: int) -> str:
 
 
 def _triangulate(places: Mapping[int, Array], cameras: Sequence[NumpyCamera]) -> Array | None:
-    """[3] the point nearest to all sight lines; None where they are too parallel."""
+    """[3] the point nearest to all sight lines; None if they are too close to parallel."""
     centers = np.stack([cameras[view].center for view in places])
     rays = np.stack([cameras[view].rays(np.asarray(place)) for view, place in places.items()])
     if np.arccos(np.clip((rays @ rays.T).min(), -1, 1)) < LEAST_PARALLAX:
@@ -381,7 +381,7 @@ def _triangulate(places: Mapping[int, Array], cameras: Sequence[NumpyCamera]) ->
 
 
 def _edge_line(places: Mapping[int, Array], cameras: Sequence[NumpyCamera]) -> tuple[Array, Array] | None:
-    """Two points of an edge in space, where the planes of sight through it meet, as far out as the marks lie."""
+    """Two points on the intersection of an edge's planes of sight, at the marks of the first view, or None."""
     if len(places) < 2:
         return None
     rays = {view: cameras[view].rays(np.asarray(place)) for view, place in places.items()}
@@ -405,7 +405,7 @@ def _nearest_on_line(point: Array, direction: Array, center: Array, ray: Array) 
 
 
 def _meeting(before: tuple[Array, Array] | None, after: tuple[Array, Array] | None) -> Array | None:
-    """[3] half-way between two lines where they are closest; None where one is missing or they are parallel."""
+    """[3] the midpoint between the closest points of two lines; None if one is missing or they are parallel."""
     if before is None or after is None:
         return None
     one, other = (line[1] - line[0] for line in (before, after))
@@ -418,7 +418,7 @@ def _meeting(before: tuple[Array, Array] | None, after: tuple[Array, Array] | No
 
 
 def _on_plane(marks: Marks, number: int, cameras: Sequence[NumpyCamera], center: Array, normal: Array) -> Array | None:
-    """[3] where the one sight line on a corner meets the plane of the others; None where nothing was marked."""
+    """[3] intersection of a corner's first usable sight line with the plane of the others; None if there is none."""
     for view, place in marks.corners[number].items():
         ray = cameras[view].rays(np.asarray(place))
         slope = ray @ normal
@@ -428,10 +428,10 @@ def _on_plane(marks: Marks, number: int, cameras: Sequence[NumpyCamera], center:
 
 
 def _with_line_ends(corners: list[Array | None], lines: Sequence) -> list[Array]:
-    """All corners: those that nothing tells are ends of a marked edge, or the fourth of a parallelogram.
+    """All corners; unknown ones become ends of a marked edge, or the fourth corner of a parallelogram.
 
     Raises:
-        TooFewMarksError: some corners are told by nothing.
+        TooFewMarksError: some corners remain unknown.
     """
     count = len(corners)
     for number in range(count):

@@ -1,4 +1,4 @@
-"""Masks and planes of marked panes, written into the capture, and foregrounds cut out by GrabCut."""
+"""Masks and planes of marked panes, written into the capture, and occluders segmented by GrabCut."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ from glassplat.scene.panes import Planes
 Array = NDArray[np.float64]
 
 LONGEST = 480
-"""Pixels of the part of the photograph that is looked at: more takes seconds."""
+"""Maximum width and height, in pixels, of the segmented part of a photograph; more takes seconds."""
 MARGIN = 0.25
-"""Of the outline's size: how much next to it is looked at, to learn what the background is like."""
+"""Margin around an outline from which the background is learned, as a share of the outline's size."""
 ROUNDS = 5
 SMALLEST = 0.01
-"""Of the outline's area: smaller pieces are specks."""
+"""Minimum area of a piece, as a share of the outline's area."""
 
 
 def grab_outlines(photo: NDArray[np.uint8], outline: Array) -> list[Array]:
-    """Outlines of the thing within a rough one.
+    """Outlines of the object inside a rough outline.
 
     Args:
         photo: [H, W, 3].
-        outline: [P, 2] pixels round the thing, with a little of what is next to it.
+        outline: [P, 2] pixels around the object, with a little of its surroundings.
 
     Returns:
-        [Q, 2] pixels of each piece; the rough outline itself where nothing in it differs from what is around it.
+        [Q, 2] pixels of each piece; the rough outline itself if its inside does not differ from its surroundings.
     """
     cv2 = _opencv()
     low, high = _window(outline, photo.shape[1], photo.shape[0])
@@ -59,7 +59,7 @@ def grab_outlines(photo: NDArray[np.uint8], outline: Array) -> list[Array]:
     factor = np.array([small.shape[1], small.shape[0]]) / (high - low)
     inside = fill_polygon((outline - low) * factor, (small.shape[1], small.shape[0]))
     if not inside.any():
-        raise InputError("the outline lies outside the photograph; draw it round what stands in front of the pane")
+        raise InputError("the outline lies outside the photograph; draw it around an object in front of the pane")
     if inside.all():
         return [outline]
     found = _foreground(cv2, np.ascontiguousarray(small[:, :, ::-1]), inside)
@@ -67,7 +67,7 @@ def grab_outlines(photo: NDArray[np.uint8], outline: Array) -> list[Array]:
 
 
 def _window(outline: Array, width: int, height: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """[2] the first pixel and the one after the last, of the part around an outline."""
+    """[2] first (inclusive) and last (exclusive) pixel of the window around an outline."""
     low, high = outline.min(axis=0), outline.max(axis=0)
     room = MARGIN * (high - low) + 4
     size = np.array([width, height])
@@ -76,8 +76,8 @@ def _window(outline: Array, width: int, height: int) -> tuple[NDArray[np.int64],
 
 
 def _foreground(cv2: Any, colors: NDArray[np.uint8], inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """[H, W] 1 where a pixel within the outline is unlike those next to it."""
-    cv2.setRNGSeed(0)  # The same outline gives the same answer.
+    """[H, W] 1 for pixels inside the outline that GrabCut labels as foreground."""
+    cv2.setRNGSeed(0)  # Makes the result deterministic.
     mask = np.where(inside, cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8)
     models = np.zeros((1, 65)), np.zeros((1, 65))
     cv2.grabCut(colors, mask, None, *models, ROUNDS, cv2.GC_INIT_WITH_MASK)
@@ -85,7 +85,7 @@ def _foreground(cv2: Any, colors: NDArray[np.uint8], inside: NDArray[np.bool_]) 
 
 
 def _pieces(cv2: Any, found: NDArray[np.uint8], least: float) -> list[Array]:
-    """The outlines of what was found, along the pixels' outer edges, without specks."""
+    """Outlines of the found pixels, along their outer edges; pieces smaller than `least` pixels are dropped."""
     doubled = np.kron(found, np.ones((2, 2), dtype=np.uint8))
     outlines, _ = cv2.findContours(doubled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     smooth = [cv2.approxPolyDP(outline, 1.0, True).reshape(-1, 2) for outline in outlines]
@@ -103,14 +103,14 @@ Labels = NDArray[np.uint8]
 Solved = Sequence[tuple[MarkedPane, PaneFit]]
 
 RECORD = "annotated.json"
-"""In the folder of masks: which of them, and which planes, were made here, and may be replaced."""
+"""Record in the folder of masks of the masks and planes written here, which may be replaced."""
 MIRROR_REFLECTANCE = 0.999
 
 
 def write_results(root: Path, views: Sequence[View], cameras: Sequence[NumpyCamera], panes: Solved) -> list[str]:
     """Writes a mask for every photograph with a mark, and all planes; returns the masks' names.
 
-    A mask tells of every pane what of it a photograph shows, also of panes that were not marked in this one.
+    A mask shows the visible part of every pane, including panes not marked in its photograph.
     """
     folder = root / PANE_FOLDER
     earlier = earlier_masks(root)
@@ -120,7 +120,7 @@ def write_results(root: Path, views: Sequence[View], cameras: Sequence[NumpyCame
     paths = mask_paths(view.name for view in views)
     shown = [(view, camera) for view, camera in zip(views, cameras, strict=True) if view.name in marked]
     new = {paths[view.name].as_posix() for view, _ in shown}
-    # First: after an interrupt, all that is there is known to be ours.
+    # Written first: after an interrupt, all files are known to be ours.
     _write_record(
         folder, earlier | new, [*_made_here(folder)[1], hashlib.sha256(planes_json(planes).encode()).hexdigest()]
     )
@@ -134,7 +134,7 @@ def write_results(root: Path, views: Sequence[View], cameras: Sequence[NumpyCame
 
 
 def _check_planes(root: Path) -> None:
-    """Refuse to replace planes that somebody else wrote; earlier versions did not record which were theirs."""
+    """Refuse to replace planes not written here; earlier versions did not record theirs."""
     masks, digests = _made_here(root / PANE_FOLDER)
     written = file_digest(root / PLANES)
     if written and written not in digests and (digests or not masks):
@@ -145,7 +145,7 @@ def _check_planes(root: Path) -> None:
 
 
 def remove_results(root: Path) -> list[str]:
-    """Removes the masks and planes that were made here, and nothing else; returns their names in the capture."""
+    """Removes only the masks and planes written here; returns their names in the capture."""
     folder = root / PANE_FOLDER
     masks, digests = [folder / name for name in sorted(earlier_masks(root))], _made_here(folder)[1]
     ours = [*([root / PLANES] if file_digest(root / PLANES) in digests else ()), *masks]
@@ -160,12 +160,12 @@ def remove_results(root: Path) -> list[str]:
 
 
 def _write_record(folder: Path, masks: Set[str], digests: Sequence[str]) -> None:
-    """Notes which masks of a folder were made here, and the digests of the planes that were, or are about to be."""
+    """Records the masks of a folder that were written here, and digests of planes written or about to be written."""
     write_text(folder / RECORD, json.dumps({"masks": sorted(masks), "planes": " ".join(digests)}, indent=1))
 
 
 def _made_here(folder: Path) -> tuple[set[str], list[str]]:
-    """Masks of a folder and digests of planes, as recorded; a list of masks alone where an earlier version did it."""
+    """Recorded masks of a folder and digests of planes; earlier versions recorded only a list of masks."""
     try:
         record = read_json(folder / RECORD)
         masks, planes = (record["masks"], record["planes"]) if isinstance(record, dict) else (record, "")
@@ -175,9 +175,9 @@ def _made_here(folder: Path) -> tuple[set[str], list[str]]:
 
 
 def capture_to_mark(root: Path) -> Dataset:
-    """A capture whose panes are marked here, or nowhere.
+    """Loads a capture whose panes are unmarked or marked here.
 
-    Masks that were made here are not read: after an interrupt, or if they show no pane, they would be in the way.
+    Masks written here are not read, because they may be incomplete after an interrupt, or show no pane.
     """
     earlier_masks(root)
     files = read_poses(root)
@@ -192,7 +192,7 @@ def capture_to_mark(root: Path) -> Dataset:
 
 
 def earlier_masks(root: Path) -> set[str]:
-    """Names in their folder of the masks of a capture's panes that were made here before."""
+    """Names, relative to their folder, of the masks written here before."""
     folder = root / PANE_FOLDER
     if not folder.is_dir():
         return set()
@@ -210,7 +210,7 @@ def earlier_masks(root: Path) -> set[str]:
 
 
 def pane_labels(name: str, camera: NumpyCamera, panes: Solved) -> Labels:
-    """[H, W] label of the nearest pane at each pixel of a view, without what stands in front of it."""
+    """[H, W] label of the nearest pane at each pixel of a view, without marked occluders."""
     width, height = int(camera.size[0]), int(camera.size[1])
     labels, nearest = np.zeros((height, width), dtype=np.uint8), np.full((height, width), np.inf)
     for pane, fit in panes:
@@ -230,7 +230,7 @@ def pane_labels(name: str, camera: NumpyCamera, panes: Solved) -> Labels:
 
 
 def in_photograph(view: View, labels: Labels) -> Labels:
-    """[H, W] of the view's pixels to those of its photograph's file, which a lens may have bent."""
+    """[H, W] labels resampled from the view to the pixels of its photograph's file, which may have lens distortion."""
     reader = view.read_photo
     if not isinstance(reader, PhotoFile):
         return labels
@@ -252,7 +252,7 @@ def in_photograph(view: View, labels: Labels) -> Labels:
 
 
 def planes_of(panes: Solved, cameras: Sequence[NumpyCamera]) -> Planes:
-    """A rectangle around each outline, its normal towards most cameras."""
+    """The minimum-area rectangle around each outline, with the normal towards most cameras."""
     rows = [_rectangle(fit, cameras) for _, fit in panes]
     centers, normals, tangents, half_sizes = (
         torch.tensor(np.stack(column), dtype=torch.float32) for column in zip(*rows, strict=True)

@@ -1,7 +1,7 @@
-"""The page for marking panes, served to browsers on this computer only.
+"""Server of the page for marking panes, for browsers on this computer only.
 
-Nothing but numbers of views and one document comes from the page; no path does. Who does not know the key, which is
-part of the address that the command prints, gets nothing: other users of the computer, and pages of other sites.
+The page sends only indices of views, outlines and one document, never a path. Other users of the computer and pages of
+other sites are rejected, because they do not know the key, which is part of the address that the command prints.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ POLICY = "default-src 'self'; img-src 'self' blob: data:; frame-ancestors 'none'
 
 
 class AnnotationServer(ThreadingHTTPServer):
-    """Serves one session until it is told to stop.
+    """Serves one session until it is stopped.
 
     Attributes:
         session: the capture that is marked.
-        access: who may come in.
-        is_finished: whether the page asked for the end.
+        access: access control of requests.
+        is_finished: the page has requested to stop the server.
     """
 
     daemon_threads = True
 
     def __init__(self, session: Session, port: int) -> None:
-        """Listens; `port` 0 takes any that is free."""
+        """Starts to listen; `port` 0 picks a free one."""
         self.session = session
         self.access = Access()
         self.is_finished = False
@@ -60,15 +60,15 @@ class AnnotationServer(ThreadingHTTPServer):
         return f"http://{LOCAL}:{self.server_address[1]}/?key={self.access.key}"
 
     def finish(self) -> None:
-        """Stops serving; from any thread."""
+        """Stops serving; may be called from any thread."""
         Thread(target=self.shutdown, daemon=True).start()
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Nothing: a browser that goes away in the middle of an answer is none of our business."""
+        """Ignores errors of connections that browsers close during a response."""
 
 
 class PageHandler(BaseHTTPRequestHandler):
-    """Answers one browser."""
+    """Handler of one connection."""
 
     server: AnnotationServer
     server_version = "glassplat"
@@ -77,19 +77,19 @@ class PageHandler(BaseHTTPRequestHandler):
     timeout = 60
 
     def do_GET(self) -> None:
-        """The page, its parts, photographs, and the capture."""
+        """Sends the page, its files, photographs, and the description of the capture."""
         self._answer(self._get)
 
     def do_POST(self) -> None:
-        """A changed document, and what to do with it."""
+        """Handles a changed document, a rough outline, and the requests to write results and to stop."""
         self._answer(self._post)
 
     def log_message(self, format: str, *values: Any) -> None:
-        """Nothing: requests interest nobody."""
+        """Suppresses request logs."""
 
     def _answer(self, work: Callable[[], None]) -> None:
         try:
-            self.__dict__.pop("_path", None)  # A connection is used for more than one request.
+            self.__dict__.pop("_path", None)  # A connection may serve several requests.
             self.server.access.check_host(self._host)
             work()
         except RefusedError as refused:
@@ -131,7 +131,7 @@ class PageHandler(BaseHTTPRequestHandler):
             self._send_json(session.finish())
         elif path == "/close":
             self.server.is_finished = True
-            self._send_json({})  # Before the end: nobody waits for this thread.
+            self._send_json({})  # Sent before the shutdown, which does not wait for this thread.
             self.server.finish()
         else:
             raise RefusedError(HTTPStatus.NOT_FOUND, "there is no such page")

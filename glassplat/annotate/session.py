@@ -1,4 +1,4 @@
-"""A capture while its panes are being marked, and which photograph to mark next."""
+"""Session of marking the panes of a capture, with suggestions of photographs to mark next."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ from glassplat.scene.camera import NumpyCamera
 Array = NDArray[np.float64]
 
 WANTED_ANGLE = np.radians(25)
-"""Between the sight lines of two photographs on a pane, from which on more adds little, and corners look different."""
+"""Angle between sight lines of two photographs on a pane; a larger one adds little and changes the look of corners."""
 MARGIN = 0.1
 LEAST_CORNERS = 3
 OFFERED = 3
 
 
 def settling_views(fit: PaneFit, cameras: Sequence[NumpyCamera], marked: Collection[int]) -> list[tuple[int, float]]:
-    """Views that would make a plane surest if their corners were marked, with the uncertainty in degrees after that."""
+    """Views whose corners, if marked, would make a plane most certain, with the resulting uncertainty in degrees."""
     corners = fit.shape.corners()
     found = []
     for number, camera in enumerate(cameras):
@@ -58,9 +58,9 @@ def settling_views(fit: PaneFit, cameras: Sequence[NumpyCamera], marked: Collect
 
 
 def second_views(outline: Array, view: int, cameras: Sequence[NumpyCamera], points: Array) -> list[int]:
-    """Views that show what one view shows inside of an outline [K, 2], from another place; the best first.
+    """Views that show the contents of an outline [K, 2] in one view from another position; the best first.
 
-    The measured points [P, 3] inside of the outline tell, wherever they lie.
+    They are ranked by the measured points [P, 3] that project into the outline, at any depth.
     """
     camera = cameras[view]
     inside = fill_polygon(outline, (int(camera.size[0]), int(camera.size[1])))
@@ -77,12 +77,12 @@ def second_views(outline: Array, view: int, cameras: Sequence[NumpyCamera], poin
 
 
 def first_view(cameras: Sequence[NumpyCamera], points: Array) -> int:
-    """The view that shows most of what was measured."""
+    """The view that shows the most measured points."""
     return int(np.argmax([camera.holds(points).sum() for camera in cameras])) if len(points) else 0
 
 
 def _worth(points: Array, camera: NumpyCamera, other: NumpyCamera) -> float:
-    """Share of the points that another view holds, times how different its sight of them is."""
+    """Share of the points inside another view, times the median angle between sight lines, capped at `WANTED_ANGLE`."""
     one, two = (points - one.center for one in (camera, other))
     cosine = (one * two).sum(1) / (np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1))
     angle = float(np.median(np.arccos(np.clip(cosine, -1, 1))))
@@ -93,12 +93,12 @@ Panes = Mapping[int, Any]
 
 
 class Merged(NamedTuple):
-    """A document with the changes of both sides.
+    """A document with the changes of both programs.
 
     Attributes:
         document: as JSON.
-        changes: what the others have changed, in words.
-        renamed: new labels of our panes by the ones that they had.
+        changes: the other program's changes, in words.
+        renamed: new labels of our panes, by their old labels.
     """
 
     document: Any
@@ -107,15 +107,15 @@ class Merged(NamedTuple):
 
 
 def merge_documents(base: Any, theirs: Any, ours: Any) -> Merged:
-    """Puts together what two sides have made of one document.
+    """Merges two versions of one document.
 
-    A pane that one side has changed or added is as that side has it. One that both have changed stays as they
-    have it, and ours is added under a label that is free; so is one that they have removed and we have changed.
+    A pane changed or added on one side is taken from that side. If both sides changed it, theirs is kept, and ours is
+    added under a free label. Ours is also added if they removed the pane and we changed it.
 
     Args:
-        base: the document that both began with.
-        theirs: what is saved.
-        ours: what was to be saved.
+        base: the common ancestor of both.
+        theirs: the saved document.
+        ours: the document to save.
     """
     before, there, here = ({pane["label"]: pane for pane in document["panes"]} for document in (base, theirs, ours))
     kept, renamed = dict(there), dict[int, int]()
@@ -147,36 +147,36 @@ def _changes(before: Panes, after: Panes) -> list[str]:
         if before.get(label) != after.get(label):
             how = "added" if label not in before else "removed" if label not in after else "changed"
             words.append(f"pane {label} {how}")
-    return words or ["nothing of the panes"]
+    return words or ["no pane changed"]
 
 
 THUMBNAIL = 160
 SHOWN = 2400
-"""Pixels of the longer side of a photograph as it is sent to the page."""
+"""Pixels of the longer side of photographs sent to the page."""
 QUALITY = 90
 KEPT_BYTES = 200_000_000
-"""Of encoded photographs in memory."""
+"""Maximum memory of encoded photographs."""
 POOR_RECTANGLE = 1.5
-"""Factor by which a free outline may fit better before a rectangle is called into question."""
+"""Ratio of the errors of rectangle and free polygon above which a warning is shown."""
 POINTS_USED = 20_000
 MOST_GRABBED = 2000
-"""Points of an outline that is drawn by hand."""
+"""Maximum number of points of a hand-drawn outline."""
 KNOWN_VERSIONS = 200
-"""Of the document, that a page may still have when it saves."""
+"""Number of remembered versions of the document on which a page may base its changes."""
 GRABBED: dict[str, Field] = {"view": Whole(0, 10**9), "points": Items(PLACE)}
 
 
 class ChangedElsewhereError(ValueError):
-    """A page saves what it began with an older document than the one that is there; `answer` is for the page."""
+    """Raised when a page saves changes to an outdated document; `answer` is the response to the page."""
 
     def __init__(self, both: Merged, version: str) -> None:
-        super().__init__(f"the marks were changed elsewhere ({', '.join(both.changes)}); both are kept")
+        super().__init__(f"the marks were changed elsewhere ({', '.join(both.changes)}); both versions are kept")
         self.answer = {"document": both.document, "renamed": both.renamed, "version": version}
 
 
 @dataclass(frozen=True)
 class SolvedPane:
-    """A pane with its fit, or why there is none."""
+    """A pane with its fit, or the reason why there is none."""
 
     pane: MarkedPane
     fit: PaneFit | None
@@ -184,7 +184,7 @@ class SolvedPane:
 
 
 class Session:
-    """A capture, what was marked in it, and what follows.
+    """A capture, its marks, and the fits to them.
 
     Attributes:
         root: the capture's folder.
@@ -213,7 +213,7 @@ class Session:
         return self._document
 
     def describe(self) -> dict[str, Any]:
-        """The capture for the page."""
+        """Description of the capture for the page."""
         return {
             "name": self.root.resolve().name,
             "views": [
@@ -224,10 +224,10 @@ class Session:
         }
 
     def picture(self, number: int, longest: int) -> bytes:
-        """A photograph as JPEG, without distortion, reduced to `longest` pixels.
+        """A photograph as JPEG, undistorted, reduced to at most `longest` pixels a side.
 
         Raises:
-            IndexError: there is no such view.
+            IndexError: the view does not exist.
         """
         view = self.views[number]
         with self._lock:
@@ -245,15 +245,15 @@ class Session:
         return encoded.getvalue()
 
     def save(self, asked: Any) -> dict[str, Any]:
-        """Takes a changed document over, saves it, and says what follows from it.
+        """Saves a changed document; returns the fits of its panes and its version.
 
         Args:
-            asked: `document`, and `version`, that of the document in which the page has made its changes.
+            asked: `document`, and `version` of the document that the page changed.
 
         Raises:
-            ChangedElsewhereError: another page, or program, has saved since; nothing is written.
-            ValueError: it is no document.
-            OSError: it cannot be saved.
+            ChangedElsewhereError: another page or program has saved since; nothing is written.
+            ValueError: it is not a valid document.
+            OSError: the document cannot be saved.
         """
         fields = check_fields(asked, {"version": Text()}, "what the page saves")
         document = asked.get("document")
@@ -269,20 +269,20 @@ class Session:
         return {"panes": [self._answer(pane) for pane in panes], "version": version_of(document)}
 
     def _current(self) -> dict[str, Any]:
-        """The document on disk and its version: what another program has saved counts."""
+        """The document on disk, which another program may have saved, and its version."""
         with self._lock:
             self._remember(read_document(self.root))
             return {"document": self._document, "version": version_of(self._document)}
 
     def _remember(self, document: Any) -> None:
-        """Remember the state on disk."""
+        """Store the document on disk and its version."""
         self._document = self._versions[version_of(document)] = document
         self._versions.move_to_end(version_of(document))
         while len(self._versions) > KNOWN_VERSIONS:
             self._versions.popitem(last=False)
 
     def grab(self, asked: Any) -> dict[str, Any]:
-        """The outlines of what stands within a rough outline in a photograph."""
+        """Outlines of the object inside a rough outline in a photograph."""
         fields = check_fields(asked, GRABBED, "the outline of the page")
         if fields["view"] >= len(self.views) or not 3 <= len(fields["points"]) <= MOST_GRABBED:
             raise ValueError(f"expected 3 to {MOST_GRABBED} points in one of {len(self.views)} views")
@@ -303,9 +303,9 @@ class Session:
             return SolvedPane(pane, None, f"{error}; check the order of the corners")
 
     def finish(self) -> dict[str, Any]:
-        """Writes masks and planes of everything that is marked, here or by another program; says what was written.
+        """Writes masks and planes of all marked panes, including those of another program; returns a summary.
 
-        Where nothing is marked any more, what was written before is removed.
+        If no pane is marked any more, earlier output is removed.
         """
         panes = parsed_document(self._current()["document"], "the document")
         solved = [(one.pane, one.fit) for one in map(self.solve, panes) if one.fit is not None]
@@ -324,7 +324,7 @@ class Session:
         }
 
     def _answer(self, pane: MarkedPane) -> dict[str, Any]:
-        """Record of a pane for the page; the last one where its corners, edges and shape are still the same."""
+        """Record of a pane for the page; the cached one if its corners, edges and shape are unchanged."""
         marked, known = repr((pane.corners, pane.edges, pane.shape)), self._answers.get(pane.label)
         if known is None or known[0] != marked:
             known = self._answers[pane.label] = marked, self._record(self.solve(pane))
@@ -357,22 +357,22 @@ class Session:
         }
 
     def _crossing(self, marks: Marks) -> str:
-        """A warning about the first photograph in which the sides of the outline cross, or nothing."""
+        """A warning about the first photograph in which sides of the outline cross, or an empty string."""
         for view in marks.views():
             outline = [places[view] for places in marks.corners if view in places]
             if len(outline) == len(marks.corners) and _crosses_itself(np.array(outline)):
-                return f"the sides cross in {self.views[view].name}: click the corners in order round the pane"
+                return f"the sides cross in {self.views[view].name}: click the corners in order around the pane"
         return ""
 
     def _judgement(self, pane: MarkedPane, fit: PaneFit, marks: Marks) -> str:
-        """A warning about a fit, or nothing."""
+        """A warning about a poor fit, or an empty string."""
         worst = max(fit.errors, key=fit.errors.__getitem__)
         if pane.shape == "rectangle" and len(marks.corners) == 4 and fit.error > 2:
             free = fit_pane(marks, self.cameras, "polygon")
             if fit.error > POOR_RECTANGLE * max(free.error, 1.0):
                 return (
-                    f"the corners do not form a rectangle ({fit.error:.1f} pixels off, {free.error:.1f} without that "
-                    "demand): check them and their order, or choose polygon"
+                    f"the corners do not form a rectangle ({fit.error:.1f} pixels off, as a polygon {free.error:.1f}): "
+                    "check them and their order, or choose polygon"
                 )
         if fit.errors[worst] > 0.01 * self.cameras[worst].diagonal:
             name = self.views[worst].name
@@ -388,7 +388,7 @@ class Session:
         return [number for number in found if number not in views[1:]]
 
     def _sight_lines(self, marks: Marks) -> list[list[Any]]:
-        """For each corner that is marked in one view only: where it may lie in each view, a segment, or None."""
+        """For each corner marked in one view only, its sight line as a segment in each other view, or None."""
         lines = []
         for places in marks.corners:
             segments: list[Any] = [None] * len(self.cameras)
@@ -402,7 +402,7 @@ class Session:
         return lines
 
     def _sight_line(self, view: int, place: Array, camera: NumpyCamera) -> list[list[float]] | None:
-        """The part of a sight line, from near to far, as another view sees it."""
+        """The visible segment of a sight line in another view, from near to far."""
         source = self.cameras[view]
         far = self._reach()
         ends = source.center + source.rays(place) * np.geomspace(0.01 * far, 10 * far, 60)[:, None]
@@ -422,18 +422,18 @@ def _crosses_itself(outline: Array) -> bool:
     """Return whether two sides of an outline [K, 2] cross."""
     along, away = np.roll(outline, -1, axis=0) - outline, outline[None] - outline[:, None]
     starts = along[:, None, 0] * away[..., 1] - along[:, None, 1] * away[..., 0]
-    is_apart = starts * np.roll(starts, -1, axis=1) < 0  # Ends of the other side lie on both sides of this one.
+    is_apart = starts * np.roll(starts, -1, axis=1) < 0  # The ends of one side lie on opposite sides of the other.
     return bool((is_apart & is_apart.T).any())
 
 
 def _places(camera: NumpyCamera, corners: Array) -> list[list[float] | None]:
-    """The pixels of corners; None for those behind the camera."""
+    """Pixels of corners; None for those behind the camera."""
     places = np.round(camera.project(corners), 2).tolist()
     return [place if depth > 0 else None for place, depth in zip(places, camera.in_camera(corners)[:, 2], strict=True)]
 
 
 def opened_session(root: Path) -> Session:
-    """The session of a capture.
+    """Opens the session of a capture.
 
     Args:
         root: folder of the capture.

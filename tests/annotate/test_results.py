@@ -399,4 +399,4 @@ def test_sides_that_cross_are_told_of(shape: str, room: Path) -> None:
         swapped = [{**corners[one], **{view: corners[other][view] for view in crossing}} for one, other in CROSSED]
         for marks in (swapped, [{NAMES[0]: places[NAMES[0]]} for places in swapped]):
             answer = saved(session, marked_document(shape=shape, corners=marks))["panes"][0]
-            assert answer["message"] == "the sides cross in 0.png: click the corners in order round the pane"
+            assert answer["message"] == "the sides cross in 0.png: click the corners in order around the pane"
