@@ -1,7 +1,7 @@
-"""COLMAP's features, pairs and structure from motion, called so that they can be interrupted.
+"""Interruptible calls of COLMAP: features, pairs to match, and structure from motion.
 
-In the database of an attempt photographs go by numbers, whatever they are called. What is in it stays: a call that was
-interrupted goes on.
+In the database of an attempt, photographs are named by their index. Its contents persist, so that a repeated call
+continues an interrupted one.
 """
 
 from __future__ import annotations
@@ -30,32 +30,32 @@ from glassplat.training.messages import Working
 Result = TypeVar("Result")
 
 LOOK_EVERY = 0.25
-"""Seconds between two looks at how far a call is."""
+"""Seconds between two checks of the progress."""
 PAIRS_AT_ONCE = 50
-"""Pairs of photographs matched between two looks at whether to end early; COLMAP's own 1225 are many minutes' work."""
+"""Pairs of photographs matched between two checks for cancellation; COLMAP's default of 1225 takes many minutes."""
 
 
 def interruptible(work: Callable[[Any], Result], meanwhile: Callable[[], None] = lambda: None) -> Result:
-    """Runs work in a thread, so that signals reach the main thread, which has the work end early.
+    """Runs work in a thread, so that signals reach the main thread, which then cancels the work.
 
     Args:
-        work: is given the `pycolmap.CancellationToken` to hand on; what knows none runs to its end.
-        meanwhile: called a few times a second while the work goes on.
+        work: receives a `pycolmap.CancellationToken`; calls that do not take one run to their end.
+        meanwhile: called a few times a second while the work runs.
 
     Raises:
-        Exception: what the work raised.
-        KeyboardInterrupt: somebody asked for the end, and the work has ended.
+        Exception: raised by the work.
+        KeyboardInterrupt: the command was interrupted; the work has ended.
     """
     token = library.pycolmap.CancellationToken()
     results: list[Result] = []
     errors: list[BaseException] = []
-    # Not `join`: one that a signal interrupts takes the thread for ended, and the next one returns at once.
+    # Not `join`: if a signal interrupts it, it treats the thread as ended, and the next call returns at once.
     ended = threading.Event()
 
     def run() -> None:
         try:
             results.append(work(token))
-        except BaseException as error:  # noqa: BLE001 - Raised again where somebody waits.
+        except BaseException as error:  # noqa: BLE001 - Raised again in the calling thread.
             errors.append(error)
         finally:
             ended.set()
@@ -66,7 +66,7 @@ def interruptible(work: Callable[[Any], Result], meanwhile: Callable[[], None] =
             meanwhile()
     except BaseException:
         token.cancel()
-        ended.wait()  # It writes into the database: whoever goes on from here finds it whole.
+        ended.wait()  # Waits for writes to the database, so that it is consistent.
         raise
     if errors:
         raise errors[0]
@@ -75,13 +75,13 @@ def interruptible(work: Callable[[Any], Result], meanwhile: Callable[[], None] =
 
 Item = TypeVar("Item")
 LensName = Literal["simple_pinhole", "simple_radial", "radial", "opencv", "opencv_fisheye"]
-"""COLMAP's camera models, the simplest first: two fish-eyes aside, each next one bends lines in more ways."""
+"""COLMAP's camera models, the simplest first: except for the fisheye, each one adds distortion parameters."""
 
 USUAL_FOCAL = 1.2
-"""Focal length in longer image sides, where a photograph does not tell: roughly a telephone's main lens."""
+"""Default focal length, in longer image sides, of photographs without EXIF: roughly a phone's main lens."""
 SEED = 0
 OF_DATABASE = ("SQLite", "database", "basic_string")
-"""In what COLMAP says where its database fails; the last where a text is missing in it."""
+"""Parts of COLMAP's messages if its database fails; the last one if a text is missing in it."""
 
 
 @dataclass(frozen=True)
@@ -89,9 +89,9 @@ class Features:
     """Options for finding and matching features.
 
     Attributes:
-        most: features of one photograph.
-        least_contrast: of a feature, as COLMAP's peak threshold.
-        guided: match a second time along the lines that the first matches lead to.
+        most: maximum number of features of one photograph.
+        least_contrast: minimum contrast of a feature, COLMAP's peak threshold.
+        guided: match a second time along the epipolar lines of the first matches.
     """
 
     most: int
@@ -105,8 +105,8 @@ class FeatureDatabase:
 
     Attributes:
         path: of the file.
-        pictures: folder of the grey pictures that features are found in.
-        photographs: in the order of their numbers.
+        pictures: folder of the greyscale images from which features are extracted.
+        photographs: in the order of their indices.
     """
 
     path: Path
@@ -123,7 +123,7 @@ class FeatureDatabase:
         return f"{index:06d}.png"
 
     def create(self, lens: LensName) -> None:
-        """Writes cameras and photographs, if they are not there yet."""
+        """Writes cameras and photographs unless they exist."""
         with self._open() as database:
             if database.num_images() == len(self.photographs):
                 return
@@ -134,7 +134,7 @@ class FeatureDatabase:
                 _add_image(database, self.picture_name(index), *rigs[_camera_key(photograph)])
 
     def write_pictures(self, listen: Listener) -> None:
-        """Writes the grey pictures that are missing: upright, reduced."""
+        """Writes missing greyscale images: upright, reduced."""
         self.pictures.mkdir(parents=True, exist_ok=True)
         targets = [self.pictures / name for name in self.picture_names]
         missing = [index for index, target in enumerate(targets) if not target.is_file()]
@@ -145,28 +145,28 @@ class FeatureDatabase:
                 Image.fromarray(pixels).convert("L").save(temporary, compress_level=1)
 
     def extract(self, features: Features, listen: Listener) -> None:
-        """Finds the features of the photographs that have none yet."""
+        """Extracts features of the photographs without any."""
         options = library.pycolmap.FeatureExtractionOptions(use_gpu=False)
         options.sift.max_num_features = features.most
         options.sift.peak_threshold = features.least_contrast
-        options.sift.first_octave = -1  # Twice the size, in which the smallest are found.
+        options.sift.first_octave = -1  # Twice the image size, at which the smallest features are found.
 
         def work(token: Any) -> None:
             library.pycolmap.extract_features(
                 self.path,
                 self.pictures,
-                image_names=self.picture_names,  # A command that was killed may have left half a picture there.
+                image_names=self.picture_names,  # A killed command may have left a partial file there.
                 extraction_options=options,
                 device=library.pycolmap.Device.cpu,
                 cancellation_token=token,
             )
 
         with self._open() as database:
-            watched = _Watched("looking for features", _image_ids(database), database.exists_keypoints, listen)
+            watched = _Watched("extracting features", _image_ids(database), database.exists_keypoints, listen)
             interruptible(work, watched.look)
 
     def match(self, pairs: Sequence[tuple[int, int]], features: Features, listen: Listener) -> None:
-        """Matches pairs of photographs, by number, that are not matched yet."""
+        """Matches pairs of photographs, by index, that are not matched yet."""
         listed = self.path.with_suffix(".pairs.txt")
         names = [(self.picture_name(one), self.picture_name(other)) for one, other in pairs]
         listed.write_text("".join(f"{one} {other}\n" for one, other in names), encoding="utf-8")
@@ -196,37 +196,37 @@ class FeatureDatabase:
             interruptible(work, watched.look)
 
     def feature_counts(self) -> NDArray[np.int64]:
-        """[P] features of each photograph."""
+        """[P] number of features of each photograph."""
         with self._open() as database:
             return np.array([database.num_keypoints_for_image(one) for one in _image_ids(database)], dtype=np.int64)
 
     def descriptors(self) -> list[NDArray[np.uint8]]:
-        """[F, 128] of each photograph, the order of the features as found."""
+        """[F, 128] of each photograph, in the order of its features."""
         with self._open() as database:
             return [np.asarray(database.read_descriptors(one).data) for one in _image_ids(database)]
 
     @contextmanager
     def _open(self) -> Iterator[Any]:
-        """The file as COLMAP's database."""
+        """Opens the file as COLMAP's database."""
         with check_database(self.path):
             database = library.pycolmap.Database.open(self.path)
             try:
                 with closing(database):
                     yield database
             except RuntimeError:
-                # Where closing failed, as on a full disk, so does the destructor, and ends the process: it never runs.
+                # After a failed close, as on a full disk, the destructor would abort the process: it must never run.
                 ctypes.pythonapi.Py_IncRef(ctypes.py_object(database))
                 raise
 
     def _focal(self, key: tuple[str, int, int]) -> float | None:
-        """Median focal length in the photographs of one camera; None if none has one."""
+        """Median EXIF focal length of the photographs of one camera, in pixels; None if unknown."""
         focals = [one.focal for one in self.photographs if _camera_key(one) == key and one.focal is not None]
         return float(np.median(focals)) if focals else None
 
 
 @contextmanager
 def check_database(path: Path) -> Iterator[None]:
-    """Says in words what is wrong with a database that COLMAP cannot work with."""
+    """Turns COLMAP's errors about its database into InputError, or OSError if the disk is full."""
     try:
         yield
     except InputError:
@@ -243,10 +243,10 @@ def check_database(path: Path) -> Iterator[None]:
 
 
 class _Watched(Generic[Item]):
-    """Tells of how many items a database has what COLMAP finds, while COLMAP is at it.
+    """Progress of COLMAP: counts the items with results in the database while COLMAP runs.
 
-    It is read by COLMAP's SQLite. Python's is another copy in this process: closing a file in one drops the locks of
-    the other, which then dies of a bus error (sqlite.org/howtocorrupt.html, 2.2.1).
+    The database is read by COLMAP's SQLite. Python's is another copy in this process: closing a file in one drops the
+    locks of the other, which then crashes with a bus error (sqlite.org/howtocorrupt.html, 2.2.1).
     """
 
     def __init__(self, what: str, items: Sequence[Item], exists: Callable[[Item], bool], listen: Listener) -> None:
@@ -254,13 +254,13 @@ class _Watched(Generic[Item]):
         self._missing, self._exists, self._listen = items, exists, listen
 
     def look(self) -> None:
-        """Looks for what was missing the last time, and tells."""
+        """Checks the items missing at the last call, and reports progress."""
         self._missing = [item for item in self._missing if not self._exists(item)]
         self._listen(Working(self._what, self._total - len(self._missing), self._total))
 
 
 def _image_ids(database: Any) -> list[int]:
-    """The database's ids of the photographs, in their order."""
+    """The database's ids of the photographs, in the order of their indices."""
     return [image.image_id for image in sorted(database.read_all_images(), key=lambda image: str(image.name))]
 
 
@@ -269,7 +269,7 @@ def _camera_key(photograph: Photograph) -> tuple[str, int, int]:
 
 
 def _new_rig(database: Any, lens: LensName, key: tuple[str, int, int], focal: float | None) -> tuple[int, int]:
-    """Adds the camera of a device, alone on its rig; the ids of both."""
+    """Adds the camera of a device and a rig with only this camera; returns their ids."""
     _, width, height = key
     model = getattr(library.pycolmap.CameraModelId, lens.upper())
     camera = library.pycolmap.Camera.create_from_model_id(
@@ -294,12 +294,12 @@ def _add_image(database: Any, name: str, camera_id: int, rig_id: int) -> None:
 Pairs = list[tuple[int, int]]
 
 MOST_EXHAUSTIVE = 80
-"""Photographs of which all pairs are compared; they are 3160."""
+"""Maximum number of photographs of which all pairs are matched; these are 3160."""
 NEIGHBOURS = 10
 ALIKE = 10
-"""Of each photograph: those that it is compared with wherever they were taken, which closes loops."""
+"""Number of similar photographs, taken anywhere, with which each one is matched; this closes loops."""
 WORDS, SAMPLED = 64, 20_000
-"""Of the visual vocabulary, and descriptors that it is learned from."""
+"""Number of visual words, and of descriptors from which they are learned."""
 
 
 def all_pairs(count: int) -> Pairs:
@@ -308,16 +308,16 @@ def all_pairs(count: int) -> Pairs:
 
 
 def neighbouring_pairs(count: int) -> Pairs:
-    """The next `NEIGHBOURS` of each photograph in the order they were taken in, and those 16, 32, ... farther."""
+    """Pairs of each photograph with the next `NEIGHBOURS` in order, and with those 16, 32, ... 512 further on."""
     steps = [*range(1, NEIGHBOURS + 1), *(2**power for power in range(4, 10))]
     return [(index + step, index) for index in range(count) for step in steps if index + step < count]
 
 
 def alike_pairs(descriptors: Sequence[NDArray[np.uint8]]) -> Pairs:
-    """The `ALIKE` photographs that look most like each one, by the words of a vocabulary learned from all of them.
+    """Pairs of each photograph with the `ALIKE` most similar ones, by a visual vocabulary learned from all of them.
 
-    A photograph is described by how its features differ from their nearest words, summed for each word (VLAD, Jégou et
-    al. 2010), with signed square roots. No vocabulary learned elsewhere is needed.
+    The descriptor of a photograph is the sum of differences between its features and their nearest words, for each word
+    (VLAD, Jégou et al. 2010), with signed square roots. No pretrained vocabulary is needed.
 
     Args:
         descriptors: [F, 128] of each photograph.
@@ -331,7 +331,7 @@ def alike_pairs(descriptors: Sequence[NDArray[np.uint8]]) -> Pairs:
 
 
 def chosen_pairs(descriptors: Sequence[NDArray[np.uint8]]) -> Pairs:
-    """The pairs to compare of photographs with these descriptors."""
+    """The pairs to match, of photographs with these descriptors."""
     count = len(descriptors)
     if count <= MOST_EXHAUSTIVE:
         return all_pairs(count)
@@ -340,7 +340,7 @@ def chosen_pairs(descriptors: Sequence[NDArray[np.uint8]]) -> Pairs:
 
 def _signatures(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
     """[P, WORDS * 128] unit vectors; zeros where a photograph has no features."""
-    from scipy.cluster.vq import kmeans2  # Slow to import, and only many photographs need it.
+    from scipy.cluster.vq import kmeans2  # Slow to import, and needed for many photographs only.
 
     everything = np.concatenate(descriptors)
     rng = np.random.default_rng(SEED)
@@ -368,8 +368,8 @@ class Mapping:
     """Options for registering photographs.
 
     Attributes:
-        first_angle: degrees between the sight lines of the first two photographs.
-        least_matches: on known points, with which a photograph is registered.
+        first_angle: minimum triangulation angle of the first two photographs, degrees.
+        least_matches: minimum number of inliers among matches to known points for registering a photograph.
     """
 
     first_angle: float = 16.0
@@ -382,14 +382,14 @@ REGISTERING = "registering the photographs"
 def register_photographs(
     database: Path, mapper: Mapper, options: Mapping, *, count: int, listen: Listener
 ) -> list[Any]:
-    """The connected groups of photographs that were registered, each a `pycolmap.Reconstruction`, the largest first.
+    """Registers photographs; returns their connected groups as `pycolmap.Reconstruction`, the largest first.
 
     Args:
-        database: the matches.
-        mapper: one photograph after the other, or all at once.
-        options: how.
-        count: of the photographs, for the progress.
-        listen: is told how far it is.
+        database: file with the matches.
+        mapper: incremental or global structure from motion.
+        options: thresholds of the incremental mapper.
+        count: number of photographs, for the progress.
+        listen: receives the progress.
     """
     output = database.with_suffix(".models")
     output.mkdir(exist_ok=True)
@@ -407,7 +407,7 @@ def _incremental(database: Path, output: Path, options: Any, count: int, listen:
     group = registered_now = 0
 
     def tell() -> None:
-        # Each group is work of its own: its time left is not that of the whole.
+        # Progress is per group, because the remaining time of one is not that of all.
         what = REGISTERING if group <= 1 else f"{REGISTERING}, group {group}"
         listen(Working(what, registered_now, count))
 

@@ -1,4 +1,4 @@
-"""Photographs as cameras and telephones leave them, and photographs from a video."""
+"""Photographs of cameras and phones, and frames extracted from a video."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from glassplat.training.messages import Working
 
 @dataclass(frozen=True)
 class Note:
-    """Something that the user should know now, a full sentence."""
+    """A message to show to the user at once, a full sentence."""
 
     text: str
 
@@ -35,14 +35,14 @@ Listener = Callable[[Working | Note], None]
 UNREADABLE = (".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
 """Photographs that Pillow cannot read."""
 HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
-"""In bytes 8 to 12 of such a file, whatever its name: telephones and chats call some of them `.jpg`."""
+"""Bytes 8 to 12 of HEIF files, whatever their suffix: phones and messengers name some of them `.jpg`."""
 LEAST_SIDE = 64
-"""Pixels of the shorter side; a smaller picture holds too few places to recognise."""
+"""Minimum shorter side in pixels; smaller images have too few features."""
 FEWEST = 3
 FILM_DIAGONAL = math.hypot(36, 24)
-"""Millimetres, of the film that focal lengths are converted to."""
+"""Diagonal of 35 mm film in millimetres, to which focal lengths are converted."""
 SIDEWAYS = (5, 6, 7, 8)
-"""Values of the EXIF orientation that turn a photograph by a quarter."""
+"""Values of the EXIF orientation that rotate a photograph by 90 degrees."""
 
 
 @dataclass(frozen=True)
@@ -52,10 +52,10 @@ class Photograph:
     Attributes:
         path: the file.
         name: in the capture, with `/` between folders.
-        width, height: upright and reduced, as it is used.
-        device: what took it; photographs of one device and size share a lens.
-        focal: in pixels of the reduced photograph; None where the file does not tell.
-        transparent: whether parts of it are, which are read as black.
+        width, height: in pixels after rotation and reduction.
+        device: camera and lens; photographs of one device and size share intrinsics.
+        focal: in pixels of the reduced photograph; None if unknown.
+        transparent: the photograph has transparent parts, which are read as black.
     """
 
     path: Path
@@ -68,7 +68,7 @@ class Photograph:
 
 
 PICTURE_SUFFIX = ".jpg"
-"""Of photographs as they are written into a capture."""
+"""Suffix of photographs written into a capture."""
 CAPTURE_FOLDERS = ("sparse", "panes", "gt", "ignore")
 MASK_FOLDERS = (PANE_FOLDER, MASK_FOLDER, IGNORE_FOLDER)
 NOT_CARRIED = (
@@ -78,7 +78,7 @@ NOT_CARRIED = (
 
 
 def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photograph]:
-    """The photographs below a folder in the order in which they were numbered; each is decoded once, to check it."""
+    """The photographs below a folder in the order of the numbers in their names; each is decoded once as a check."""
     if (folder / "images").is_dir() and any((folder / name).is_dir() for name in CAPTURE_FOLDERS):
         raise InputError(f"{folder} is a capture; expected a folder of photographs, such as {folder / 'images'}")
     paths = _photograph_paths(folder)
@@ -86,7 +86,7 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
     if masks:
         listen(
             Note(
-                f"Masks by their names or folders, which are no photographs: {_names_below(folder, sorted(masks))}. "
+                f"Skipped masks, recognised by their names or folders: {_names_below(folder, sorted(masks))}. "
                 f"{NOT_CARRIED}"
             )
         )
@@ -104,7 +104,7 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
             continue
         kept, twin = found.get(contents, photograph), photograph
         if len(kept.name) > len(photograph.name):
-            kept, twin = photograph, kept  # `IMG 9 copy.jpg` goes before `IMG 9.jpg`.
+            kept, twin = photograph, kept  # `IMG 9 copy.jpg` sorts before `IMG 9.jpg`; keep the latter.
         found[contents] = kept
         if twin is not kept:
             same.append((twin.path, contents))
@@ -118,7 +118,7 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
             "more, taken a step apart"
         )
     if twins:
-        listen(Note(f"Duplicates, left out: {first_names(twins)}."))
+        listen(Note(f"Skipped duplicates: {first_names(twins)}."))
     cut_out = [one.path for one in found.values() if one.transparent]
     if cut_out:
         listen(
@@ -131,7 +131,7 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
 
 
 def file_states(source: Path) -> dict[str, list[int]]:
-    """Size and time of the last change of a video, or of every photograph below a folder, by name."""
+    """Size and modification time of a video, or of every photograph below a folder, by name."""
     folder, paths = (source.parent, [source]) if source.is_file() else (source, _photograph_paths(source))
     found = {}
     for path in paths:
@@ -141,18 +141,18 @@ def file_states(source: Path) -> dict[str, list[int]]:
 
 
 def _refusal(broken: Mapping[str, InputError], count: int) -> InputError:
-    """Reason for refusing some of so many photographs, by their names."""
+    """Error that names the unusable ones of `count` photographs."""
     first = next(iter(broken.values()))
     if len(broken) == 1:
         return first
     return InputError(
         f"{len(broken)} of {count} photographs cannot be used ({first_names(list(broken))}); replace or remove them. "
-        f"Of the first: {first}"
+        f"The first: {first}"
     )
 
 
 def broken_photographs(paths: Sequence[Path], least_side: int) -> list[str]:
-    """Names of those that cannot be read, or have fewer pixels along a side; each is decoded at a small size."""
+    """Names of files that cannot be read, or whose shorter side is below `least_side`; decoded at a small size."""
     broken = []
     for path in paths:
         try:
@@ -165,11 +165,11 @@ def broken_photographs(paths: Sequence[Path], least_side: int) -> list[str]:
 def capture_names(paths: Sequence[Path], folder: Path) -> dict[Path, str]:
     """Name of each photograph in the capture: its own name below the folder, as a JPEG.
 
-    All differ without suffix, too, as masks need it. Names that are no text, or have line breaks, are made readable.
+    Names are unique even without suffix, which masks require. Undecodable bytes and line breaks are replaced.
     """
     unreadable = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
     spoken = {path: unreadable.sub("_", path.relative_to(folder).as_posix()) for path in paths}
-    # Two files may become one name, as when both held bytes that are no text.
+    # Names may collide, for example after replacing undecodable bytes.
     counts: Counter[str] = Counter()
     for path, name in spoken.items():
         counts[name] += 1
@@ -180,14 +180,14 @@ def capture_names(paths: Sequence[Path], folder: Path) -> dict[Path, str]:
 
 
 def masks_among(paths: Sequence[Path]) -> list[Path]:
-    """Files that are named as the mask of another one next to them: `x_mask.png` of `x.jpg`."""
+    """Files named as the mask of another file in their folder: `x_mask.png` of `x.jpg`."""
     plain = {path.with_suffix("") for path in paths}
     named = [path for path in paths if path.stem.endswith(MASK_MARK)]
     return [path for path in named if path.with_name(path.stem.removesuffix(MASK_MARK)) in plain]
 
 
 def masks_below(folder: Path, paths: Sequence[Path]) -> set[Path]:
-    """Files below a folder that are masks by their names, or by the folders that they lie in."""
+    """Files below a folder that are masks by their names or by the names of their folders."""
     inside = [path for path in paths if not {*MASK_FOLDERS}.isdisjoint(path.relative_to(folder).parts[:-1])]
     return {*masks_among(paths), *inside}
 
@@ -208,7 +208,7 @@ def read_photograph(photograph: Photograph) -> NDArray[np.uint8]:
 
 
 def _upright(path: Path) -> Image.Image:
-    """The picture as eight-bit sRGB over black, turned as its EXIF tag says."""
+    """The image as 8-bit sRGB over black, rotated by its EXIF orientation."""
     with images.checked_image(path) as image:
         orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
         shown = images.in_srgb(image)
@@ -221,7 +221,7 @@ def _upright(path: Path) -> Image.Image:
 
 
 def _photograph_paths(folder: Path) -> list[Path]:
-    """Image files below a folder by their numbers: 2.jpg before 10.jpg."""
+    """Image files below a folder in natural order: 2.jpg before 10.jpg."""
     if not folder.is_dir():
         raise InputError(f"no folder or video {folder}; expected a folder of photographs, or a video file")
     below = images.files_below(folder)
@@ -232,7 +232,7 @@ def _photograph_paths(folder: Path) -> list[Path]:
         raise InputError(
             f"{len(unreadable)} photographs in {folder} are {kinds} files, which cannot be read "
             f"({first_names(list(unreadable))}); save them as JPEG and remove these (a phone does so if its "
-            "camera is set to 'most compatible'). to read HEIC: pip install 'glassplat[heic]'"
+            "camera is set to 'most compatible'). To read HEIC: pip install 'glassplat[heic]'"
         )
     suffixes = (*images.IMAGE_SUFFIXES, *(images.HEIF_SUFFIXES if images.reads_heif() else ()))
     paths = [path for path in files if path.suffix.lower() in suffixes]
@@ -243,7 +243,7 @@ def _photograph_paths(folder: Path) -> list[Path]:
 
 
 def _unreadable_kind(path: Path) -> str | None:
-    """Kind of a photograph that Pillow cannot read, by its name or first bytes; None for all others."""
+    """Format of a photograph that Pillow cannot read, by its suffix or first bytes; None for all others."""
     suffix = path.suffix.lower()
     if suffix in UNREADABLE or (suffix in images.HEIF_SUFFIXES and not images.reads_heif()):
         return suffix[1:].upper()
@@ -253,18 +253,18 @@ def _unreadable_kind(path: Path) -> str | None:
         with reading(path), path.open("rb") as file:
             start = file.read(12)
     except (ValueError, FileNotFoundError):
-        return None  # Which is said when it is decoded.
+        return None  # Reported when it is decoded.
     return "HEIC" if start[4:8] == b"ftyp" and start[8:] in HEIF_BRANDS else None
 
 
 def _numbers_as_such(name: str) -> tuple[tuple[int, int, str], ...]:
-    """A key that sorts the numbers in a name by their value."""
+    """Sorting key for natural order: numbers in a name by their value."""
     parts = re.findall(r"\d+|\D+", name)
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts)
 
 
 def _examine(path: Path, name: str, max_size: int, least_side: int = LEAST_SIDE) -> tuple[Photograph, bytes]:
-    """A photograph and a fingerprint of its file; decoded at a small size, which finds files that are cut off."""
+    """A photograph and the hash of its file, which is decoded at a small size to detect truncation."""
     try:
         size = images.image_size(path)
         with images.checked_image(path) as image:
@@ -291,14 +291,14 @@ def _examine(path: Path, name: str, max_size: int, least_side: int = LEAST_SIDE)
 
 
 def _device(tags: dict) -> str:
-    """Maker, model, lens and zoom, as far as the file tells; digital zoom shows only in the length on 35 mm film."""
+    """Maker, model, lens and zoom from EXIF; digital zoom appears only in the 35 mm equivalent focal length."""
     lens = (ExifTags.Base.LensModel, ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
     kinds = (ExifTags.Base.Make, ExifTags.Base.Model, *lens)
     return " ".join(str(tags[kind]).strip("\0 ") for kind in kinds if tags.get(kind))
 
 
 def _focal(tags: dict, width: int, height: int) -> float | None:
-    """The focal length in pixels of the reduced photograph, from that converted to 35 mm film."""
+    """Focal length in pixels of the reduced photograph, from the 35 mm equivalent."""
     try:
         focal = float(tags.get(ExifTags.Base.FocalLengthIn35mmFilm) or 0)
     except (TypeError, ValueError):
@@ -308,9 +308,9 @@ def _focal(tags: dict, width: int, height: int) -> float | None:
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".3gp")
 SMALL_SIDE = 320
-"""Pixels of the longer side at which motion and sharpness are measured."""
+"""Longer side, in pixels, of the frames in which motion and sharpness are measured."""
 LEAST_SPACING = 0.02
-"""Of the image's longer side, between two photographs that are kept: a picture that hardly moved shows nothing new."""
+"""Minimum motion between two selected frames, as a share of the longer side; smaller motion shows nothing new."""
 FEWEST_FRAMES = 8
 CORNERS = {"maxCorners": 200, "qualityLevel": 0.01, "minDistance": 7}
 FEWEST_CORNERS = 10
@@ -318,11 +318,11 @@ FEWEST_CORNERS = 10
 
 @dataclass(frozen=True)
 class Footage:
-    """Measurements of a first look at a video, for each frame.
+    """Measurements for each frame of a video, from a first pass.
 
     Attributes:
-        travelled: [F] how far the picture has moved since the first frame, in image sides.
-        sharpness: [F] variance of the Laplacian at a small size.
+        travelled: [F] cumulative image motion since the first frame, in longer image sides.
+        sharpness: [F] variance of the Laplacian of the reduced frame.
     """
 
     travelled: NDArray[np.float64]
@@ -330,13 +330,13 @@ class Footage:
 
 
 def frames_of(video: Path, folder: Path, most: int, listen: Listener) -> list[Path]:
-    """Writes the chosen frames of a video as PNG files into a folder, named by their number in the video.
+    """Writes selected frames of a video as PNG files into a folder, named by their index in the video.
 
     Args:
         video: the file.
-        folder: where to; frames that are there already are kept, so that an interrupted choice goes on.
-        most: number of frames wanted; a video that moves little has fewer.
-        listen: is told how far it is.
+        folder: output; existing frames are kept, so that an interrupted extraction continues.
+        most: maximum number of frames; a video with little motion yields fewer.
+        listen: receives the progress.
     """
     cv2 = _opencv()
     footage = _measure_motion(cv2, video, listen)
@@ -357,10 +357,10 @@ def frames_of(video: Path, folder: Path, most: int, listen: Listener) -> list[Pa
 
 
 def chosen_frames(footage: Footage, most: int) -> NDArray[np.int64]:
-    """The sharpest frame of every stretch of equal motion; stretches are at least `LEAST_SPACING` long."""
+    """Indices of the sharpest frame in each interval of equal motion, which is at least `LEAST_SPACING`."""
     path = footage.travelled
     spacing = max(float(path[-1] - path[0]) / most, LEAST_SPACING)
-    # The last frame ends the last stretch and begins none.
+    # The last frame belongs to the last interval.
     stretch = np.minimum(np.floor((path - path[0]) / spacing).astype(np.int64), most - 1)
     order = np.lexsort((-footage.sharpness, stretch))
     firsts = np.unique(stretch[order], return_index=True)[1]
@@ -368,12 +368,12 @@ def chosen_frames(footage: Footage, most: int) -> NDArray[np.int64]:
 
 
 class NoOpenCVError(InputError):
-    """A video was to be read, and OpenCV is not installed; the message says what to do."""
+    """Raised when a video is to be read and OpenCV is not installed; the message says what to do."""
 
 
 @dataclass(frozen=True)
 class VideoFacts:
-    """Facts of a video: the number of its frames, and their width and height in pixels."""
+    """Number of frames of a video, and their width and height in pixels."""
 
     frames: int
     width: int
@@ -381,7 +381,7 @@ class VideoFacts:
 
 
 def video_facts(video: Path) -> VideoFacts | None:
-    """Facts of a video; None if OpenCV can read no picture of it.
+    """Size and length of a video; None if OpenCV cannot read a frame.
 
     Raises:
         NoOpenCVError: OpenCV is not installed.
@@ -427,7 +427,7 @@ def _length(cv2: Any, video: Path) -> int:
 
 
 def _frames(cv2: Any, video: Path) -> Iterator[NDArray[np.uint8]]:
-    """Frames [H, W, 3], BGR, turned as the video says."""
+    """Frames [H, W, 3], BGR, rotated by the metadata of the video."""
     capture = cv2.VideoCapture(str(video))
     try:
         while True:
@@ -446,7 +446,7 @@ def _small_grey(cv2: Any, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _motion(cv2: Any, before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
-    """The median way of corners from one frame to the next, in image sides; 0 where there are hardly any."""
+    """Median motion of corners from one frame to the next, in longer image sides; 0 if there are too few."""
     corners = cv2.goodFeaturesToTrack(before, **CORNERS)
     if corners is None or len(corners) < FEWEST_CORNERS:
         return 0.0

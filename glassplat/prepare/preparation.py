@@ -46,23 +46,23 @@ from glassplat.prepare.reconstruction import (
 log = logging.getLogger(__name__)
 
 RECORD = "prepare.json"
-"""In the capture: that it was prepared here, and the report."""
+"""Record in the capture: inputs of the preparation, and its report."""
 PAGE = "prepare.html"
-"""In the capture: the same for people."""
+"""The report in the capture, for people."""
 PHOTOGRAPHS = "photographs"
-"""In the settings of an interrupted preparation: the states of the files that it was begun with."""
+"""Key of the settings of an interrupted preparation: states of the input files."""
 MASKS = "masks"
-"""In the record: digests of the masks of what a wide lens did not see."""
+"""Key of the record: digests of the masks of regions outside the view of a wide lens."""
 MADE = ("images", "sparse", RECORD, PAGE)
-"""In a capture: all that comes from here; whatever else is there, somebody spent time on."""
+"""Everything in a capture that `prepare` writes; other files are the user's work."""
 
 
 @dataclass(frozen=True)
 class Workplace:
-    """The folder in which a capture is made.
+    """The temporary folder in which a capture is made.
 
     Attributes:
-        output: where the capture will be; of a link, the folder that it leads to.
+        output: folder of the finished capture; links are resolved.
     """
 
     output: Path
@@ -72,7 +72,7 @@ class Workplace:
 
     @property
     def folder(self) -> Path:
-        """Next to the output, so that the finished capture is moved in one step."""
+        """The temporary folder, next to the output, so that the finished capture is moved atomically."""
         return self.output.with_name(f"{self.output.name}.partial")
 
     @property
@@ -82,7 +82,7 @@ class Workplace:
 
     @contextmanager
     def alone(self) -> Iterator[None]:
-        """Holds the output against other preparations on this machine, where it knows locks."""
+        """Locks the output against other preparations on this machine, if it supports locks."""
         user = os.getuid() if hasattr(os, "getuid") else ""
         name = hashlib.sha256(os.fsencode(self.output)).hexdigest()[:16]
         lock = FileLock(Path(tempfile.gettempdir()) / f"glassplat-prepare-{user}-{name}.lock", blocking=False)
@@ -100,12 +100,12 @@ class Workplace:
             lock.release()
 
     def begin(self, settings: Mapping[str, Any], *, resume: bool, force: bool) -> bool:
-        """Makes the folder, or finds the one of an interrupted preparation; returns whether it is a new one.
+        """Creates the folder, or reuses that of an interrupted preparation; returns true for a new one.
 
         Args:
-            settings: what the work depends on; an interrupted one goes on with the same only.
-            resume: go on with what was interrupted.
-            force: begin again, and replace a capture that was prepared before.
+            settings: inputs of the work; an interrupted preparation continues only with equal ones.
+            resume: continue an interrupted preparation.
+            force: start again, and replace a capture that was prepared before.
         """
         self._check_output(force)
         known = self._known_settings()
@@ -139,7 +139,7 @@ class Workplace:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _check_unchanged(self, known: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
-        """Refuse to go on with other settings or photographs: their poses and features are kept by number."""
+        """Refuse to continue with other settings or photographs, because poses and features are stored by index."""
         changed = sorted(key for key in {*known, *settings} if known.get(key) != settings.get(key))
         if set(changed) - {PHOTOGRAPHS}:
             raise InputError(
@@ -193,7 +193,7 @@ class Workplace:
             )
 
     def _known_settings(self) -> dict[str, Any] | None:
-        """Those of an interrupted preparation; None where there is none."""
+        """Settings of an interrupted preparation, or None."""
         if not self.folder.exists() or not any(self.folder.iterdir()):
             return None
         try:
@@ -211,26 +211,26 @@ FEW_FEATURES = 500
 SHORT_TRACK = 3.0
 LARGE_ERROR = 1.5
 USUAL_FOCALS = (0.4, 3.0)
-"""In longer image sides."""
+"""Range of plausible focal lengths, in longer image sides."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """A preparation in figures.
+    """Statistics of a preparation.
 
     Attributes:
-        photographs: how many there were.
-        registered: how many have a pose, all connected with each other.
-        missing: names of the files that were not.
-        groups: sizes of the groups of photographs that were registered, each by itself; each photograph counts once.
-        points: measured places in the scene.
-        reprojection_error: mean distance of a point from where photographs show it, in pixels.
-        track_length: mean number of photographs that a point was measured in.
-        features: of the middle photograph.
-        cameras: each lens in words.
-        attempt: the settings that this came from.
-        attempts: how many were made.
-        advice: what would make it better, full sentences.
+        photographs: number of photographs.
+        registered: number of photographs with a pose in the largest connected group.
+        missing: names of the other files.
+        groups: sizes of the separately registered groups; each photograph counts once.
+        points: number of triangulated points.
+        reprojection_error: mean, in pixels.
+        track_length: mean number of photographs per point.
+        features: median number per photograph.
+        cameras: description of each lens.
+        attempt: name of the settings of the best attempt.
+        attempts: number of attempts.
+        advice: suggestions for improvement.
     """
 
     photographs: int
@@ -248,23 +248,23 @@ class Report:
 
     @property
     def share(self) -> float:
-        """Of the photographs, those that were registered."""
+        """Share of the photographs that were registered."""
         return self.registered / self.photographs
 
     def lines(self) -> list[str]:
-        """The report for people."""
+        """Lines of the report for people."""
         missing = f" (not: {first_names(list(self.missing), 8)})" if self.missing else ""
         return [
             f"{self.registered} of {self.photographs} photographs registered{missing}, with {self.attempt}",
             f"{self.points} points, each in {self.track_length:.1f} photographs on average, "
-            f"{self.reprojection_error:.2f} pixels off",
+            f"mean reprojection error {self.reprojection_error:.2f} pixels",
             *(f"camera: {camera}" for camera in self.cameras),
             *(f"advice: {line}" for line in self.advice),
         ]
 
 
 def report_of(solution: Solution) -> Report:
-    """The figures of a solution; one without any model has zeros."""
+    """The report of a solution; zeros if it has no model."""
     photographs = solution.database.photographs
     missing = [readable_name(one.path.name) for one in solution.missing()]
     model = solution.models[0] if solution.models else None
@@ -287,7 +287,7 @@ def report_of(solution: Solution) -> Report:
 
 
 def _groups(solution: Solution) -> tuple[int, ...]:
-    """Number of photographs that each model adds to the larger ones; part of a group may be registered twice."""
+    """Number of photographs that each model adds to the larger ones, because some may be in several models."""
     known: set[int] = set()
     sizes = []
     for model in solution.models:
@@ -299,7 +299,7 @@ def _groups(solution: Solution) -> tuple[int, ...]:
 
 
 def _describe_lenses(model: Any) -> list[str]:
-    """Each lens that took a registered photograph."""
+    """Descriptions of the lenses of registered photographs."""
     used = {image.camera_id for image in model.images.values() if image.has_pose}
     return [
         f"{camera.width}x{camera.height}, focal length {camera.mean_focal_length():.0f} pixels"
@@ -313,7 +313,7 @@ def _advice(figures: Report, missing: list[str], solution: Solution) -> list[str
     if missing:
         advice.append(
             f"take more photographs around {first_names(missing, 3)}: in steps of half a metre, with two thirds "
-            f"overlap, and some that show what is next to the glass"
+            f"overlap, and some that show the surroundings of the glass"
         )
     if len(figures.groups) > 1:
         advice.append(
@@ -323,7 +323,7 @@ def _advice(figures: Report, missing: list[str], solution: Solution) -> list[str
         )
     if figures.features < FEW_FEATURES:
         advice.append(
-            f"photographs have only {figures.features} features on average: use more light, a steadier camera, "
+            f"photographs have only {figures.features} features (median): use more light, a steadier camera, "
             f"or a larger --max-size"
         )
     if figures.points and figures.track_length < SHORT_TRACK:
@@ -341,15 +341,15 @@ def _advice(figures: Report, missing: list[str], solution: Solution) -> list[str
 
 @dataclass(frozen=True)
 class Preparation:
-    """Options of a preparation, and its photographs.
+    """Input, output and options of a preparation.
 
     Attributes:
         source: folder of photographs, or a video.
-        output: the capture.
-        max_size: pixels of the longer side to which photographs are reduced.
-        frames: photographs taken from a video, at most.
-        least_registered: share of the photographs that have to be registered.
-        settings: how they are registered.
+        output: folder of the capture.
+        max_size: maximum longer side in pixels; larger photographs are reduced.
+        frames: maximum number of frames extracted from a video.
+        least_registered: minimum share of registered photographs.
+        settings: options for registering photographs.
     """
 
     source: Path
@@ -360,20 +360,20 @@ class Preparation:
     settings: Settings = field(default_factory=Settings)
 
     def record(self) -> dict[str, Any]:
-        """Inputs on which the work depends: an interrupted one goes on with the same only."""
+        """Inputs of the work; an interrupted preparation continues only with equal ones."""
         options = {"lens": self.settings.lens, "mapper": self.settings.mapper}
         source = readable_name(writing.real_path(self.source))
         return {"input": source, "max-size": self.max_size, "frames": self.frames, **options}
 
 
 def prepare(task: Preparation, listen: Listener, *, resume: bool = False, force: bool = False) -> Report:
-    """Makes the capture; returns what became of the photographs.
+    """Makes the capture and returns its report.
 
     Args:
-        task: what to make of what.
-        listen: is told how far it is.
-        resume: go on where an earlier call was interrupted.
-        force: replace a capture that was prepared before, or begin an interrupted one again.
+        task: input, output and options.
+        listen: receives the progress.
+        resume: continue an interrupted call.
+        force: replace a capture that was prepared before, or restart an interrupted preparation.
     """
     check_places(task)
     quiet_pycolmap()
@@ -393,7 +393,7 @@ def _prepare(task: Preparation, workplace: Workplace, listen: Listener, *, resum
         report = report_of(solution)
         _check_enough(report, task)
     except InputError as error:
-        # What an earlier call left is worth more than these photographs, which may be away for a moment.
+        # Keep the results of an earlier call, because the photographs may only be unavailable at the moment.
         if begun or isinstance(error, TooLittleShownError):
             workplace.discard()
             writing.remove_empty(missing)
@@ -411,7 +411,7 @@ def is_video(source: Path) -> bool:
 
 
 def check_places(task: Preparation) -> None:
-    """Refuse an input that is no photographs, and an output among them."""
+    """Refuse an input other than a folder or a video, and an output inside the input."""
     source, output = writing.real_path(task.source), writing.real_path(task.output)
     if source.is_file() and not is_video(source):
         known = ", ".join(VIDEO_SUFFIXES)
@@ -427,7 +427,7 @@ def check_places(task: Preparation) -> None:
 
 
 def _photographs(task: Preparation, workplace: Workplace, listen: Listener) -> list[Photograph]:
-    """Those of the folder or the video."""
+    """Photographs of the folder or the video."""
     if not is_video(task.source):
         return photographs_in(task.source, task.max_size, listen)
     frames = workplace.folder / "frames"
@@ -436,7 +436,7 @@ def _photographs(task: Preparation, workplace: Workplace, listen: Listener) -> l
 
 
 def _check_enough(report: Report, task: Preparation) -> None:
-    """Refuse a capture of which too much is missing, or in which no photograph was registered."""
+    """Refuse a capture with too few registered photographs."""
     if report.registered >= FEWEST and report.share >= task.least_registered:
         return
     lines = "\n".join(report.lines())

@@ -1,4 +1,4 @@
-"""The best reconstruction that a few attempts give, and the capture written from it."""
+"""The best reconstruction of a few attempts, and the capture written from it."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from glassplat.prepare.photographs import Listener, Note, Photograph, read_photo
 from glassplat.training.messages import Working
 
 FEWEST_FEATURES = 50
-"""Of the middle photograph; with fewer nothing can be matched."""
+"""Minimum number of features of at least half of the photographs; fewer cannot be matched."""
 ENOUGH = 0.95
-"""Share of the photographs with which no further attempt is made that takes no longer."""
+"""Share of registered photographs above which no further attempt of equal cost is made."""
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """Settings of one attempt; `name` ends "trying again with"."""
+    """Settings of one attempt; `name` follows "trying again with"."""
 
     name: str
     features: Features
@@ -54,13 +54,13 @@ ATTEMPTS = (
 
 @dataclass(frozen=True)
 class Solution:
-    """The groups that one attempt registered.
+    """The registered groups of one attempt.
 
     Attributes:
         database: of the attempt.
-        models: `pycolmap.Reconstruction`, the largest first; photographs in different ones share nothing.
+        models: `pycolmap.Reconstruction`, the largest first; they are not connected with each other.
         attempt: its name.
-        tried: how many attempts were made.
+        tried: number of attempts made.
     """
 
     database: FeatureDatabase
@@ -70,7 +70,7 @@ class Solution:
 
     @property
     def registered(self) -> int:
-        """Photographs in the largest group."""
+        """Number of photographs in the largest group."""
         return int(self.models[0].num_reg_images()) if self.models else 0
 
     def missing(self) -> list[Photograph]:
@@ -85,7 +85,7 @@ class Settings:
 
     Attributes:
         lens: COLMAP's camera model.
-        mapper: one photograph after the other, or all at once.
+        mapper: incremental or global structure from motion.
     """
 
     lens: LensName = "simple_radial"
@@ -93,16 +93,16 @@ class Settings:
 
 
 def image_numbers(model: Any) -> dict[int, Any]:
-    """The registered images of a model by the number of their photograph."""
+    """The registered images of a model by the index of their photograph."""
     return {int(Path(image.name).stem): image for image in model.images.values() if image.has_pose}
 
 
 def best_solution(
     photographs: Sequence[Photograph], work: Path, settings: Settings, least: float, listen: Listener
 ) -> Solution:
-    """Places photographs, with as many attempts as it takes; what lies in `work` from before is used.
+    """Registers photographs in several attempts until enough are registered; earlier results in `work` are reused.
 
-    More features take many times as long, so they are tried only where less than the share `least` was registered.
+    More features take many times as long, so they are tried only if less than the share `least` is registered.
     """
     best: Solution | None = None
     tried = 0
@@ -130,7 +130,7 @@ def best_solution(
 def _match_features(
     photographs: Sequence[Photograph], work: Path, features: Features, settings: Settings, listen: Listener
 ) -> FeatureDatabase:
-    """The database of these features, with every pair matched that is worth it."""
+    """The database of these features, with the pairs selected by `chosen_pairs` matched."""
     database = FeatureDatabase(work / f"features-{features.most}.db", work / "grey", photographs)
     database.write_pictures(listen)
     database.create(settings.lens)
@@ -141,7 +141,7 @@ def _match_features(
 
 
 class TooLittleShownError(InputError):
-    """No option gives these photographs poses, so nothing that was done so far is of use."""
+    """Raised when no option can register these photographs, so that partial results are useless."""
 
 
 def _check_texture(database: FeatureDatabase) -> None:
@@ -159,9 +159,9 @@ JPEG_QUALITY = 95
 
 
 def write_capture(solution: Solution, folder: Path, listen: Listener) -> None:
-    """Writes `images/` and `sparse/0` of the largest group; the solution's model is changed on the way.
+    """Writes `images/` and `sparse/0` of the largest group; modifies the solution's model.
 
-    What a wide lens did not see of its undistorted photographs is left out by masks in `ignore/`.
+    Regions of undistorted photographs outside the view of a wide lens are excluded by masks in `ignore/`.
     """
     model = solution.models[0]
     lenses = {key: library.pycolmap.Camera(camera.todict()) for key, camera in model.cameras.items()}
@@ -188,7 +188,7 @@ def write_capture(solution: Solution, folder: Path, listen: Listener) -> None:
 
 
 def _wide_lenses(cameras: dict[int, Any]) -> dict[int, Lens]:
-    """The lenses that did not see all of their undistorted photographs."""
+    """The lenses whose undistorted photographs have regions without pixels."""
     lenses = {
         key: make_lens(camera.model_name, list(camera.params), (camera.width, camera.height))
         for key, camera in cameras.items()
@@ -197,7 +197,7 @@ def _wide_lenses(cameras: dict[int, Any]) -> dict[int, Lens]:
 
 
 def _straighten(model: Any) -> None:
-    """Gives a model pinhole cameras, and its observations the places that these show them at."""
+    """Replaces the cameras of a model by pinhole cameras, and undistorts its observations."""
     options = library.pycolmap.UndistortCameraOptions()
     pinholes = {key: library.pycolmap.undistort_camera(options, camera) for key, camera in model.cameras.items()}
     for image in image_numbers(model).values():

@@ -1,4 +1,4 @@
-"""The report on a preparation as a page: how well photographs fit each other, and the capture seen from above."""
+"""The report of a preparation as a page: reprojection errors, tracks, thumbnails, and a plan of the capture."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ Array = NDArray[np.float64]
 SIZE = (640, 440)
 MARGIN = 14
 MOST_POINTS = 4000
-"""Drawn; of more every second or third is."""
+"""Maximum number of points drawn; more are subsampled evenly."""
 OUTLIERS = 4.0
-"""Points are shown up to this share, in percent, at each end: a few lie anywhere."""
+"""Percentage of points at each end that may lie outside the plan, because some are outliers."""
 RECTANGLE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 HEADING = 11.0
-"""Pixels of a camera's stroke, which points where it looks."""
+"""Length, in pixels, of a camera's line along its viewing direction."""
 
 
 def plan(views: Sequence[View], points: PointCloud, behind: NDArray[np.bool_], planes: Planes | None) -> str:
-    """The SVG.
+    """The plan as SVG.
 
     Args:
-        views: cameras, in the order in which they are joined by a line.
-        points: measured places.
-        behind: [N] which of them lie behind panes.
+        views: cameras, in the order of the line that joins them.
+        points: triangulated points.
+        behind: [N] mask of those behind panes.
         planes: panes, if any are known.
     """
     cameras = [NumpyCamera.of(view.camera) for view in views]
@@ -68,19 +68,19 @@ def plan(views: Sequence[View], points: PointCloud, behind: NDArray[np.bool_], p
 
 
 def _from_above(cameras: Sequence[NumpyCamera]) -> Array:
-    """[2, 3] to the right and down in the plan, of world points; up is where cameras look on average."""
+    """[2, 3] axes of the plan, right and down, in world space; the mean viewing direction is up in the plan."""
     up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
     up /= max(float(np.linalg.norm(up)), 1e-9)
     ahead = np.mean([camera.rotation[2] for camera in cameras], axis=0)
     ahead -= up * (ahead @ up)
-    if np.linalg.norm(ahead) < 1e-3:  # They look all around.
+    if np.linalg.norm(ahead) < 1e-3:  # The cameras face all directions.
         ahead = np.cross(up, cameras[0].rotation[0])
     ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
     return np.stack([np.cross(ahead, up), -ahead])
 
 
 def _corners(planes: Planes) -> list[Array]:
-    """[4, 3] of each pane, one after the other round it."""
+    """[4, 3] of each pane, in order around it."""
     centers, sizes = (one.detach().cpu().double().numpy() for one in (planes.centers, planes.half_sizes))
     tangents, bitangents = (axis.detach().cpu().double().numpy() for axis in planes.axes())
     sides = np.stack([tangents * sizes[:, :1], bitangents * sizes[:, 1:]], axis=1)
@@ -88,7 +88,7 @@ def _corners(planes: Planes) -> list[Array]:
 
 
 def _fitting(places: Array, always: Array) -> Callable[[Array], Array]:
-    """From places in the plan to pixels."""
+    """The map from plan coordinates to pixels."""
     reach = np.percentile(places, [OUTLIERS, 100 - OUTLIERS], axis=0) if len(places) else always[:0].reshape(0, 2)
     all_of_it = np.concatenate([reach, always])
     low, high = all_of_it.min(axis=0), all_of_it.max(axis=0)
@@ -130,12 +130,12 @@ def _headings(cameras: Sequence[NumpyCamera], axes: Array, on_page: Callable[[Ar
 
 THUMBNAIL = (160, 120)
 MOST_THUMBNAILS = 200
-"""Of more photographs only every second or third is shown: the page stays below 2 MB."""
+"""Maximum number of thumbnails, which keeps the page below 2 MB; more are subsampled evenly."""
 TRACKS = (2, 3, 4, 5, 7, 10, 15, 1 << 30)
-"""Numbers of photographs that points are counted by: from one up to the next."""
+"""Edges of the bins by number of photographs per point; the upper edge is exclusive."""
 ERRORS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, np.inf)
 FEW_POINTS = 50
-"""A photograph that shows fewer is badly held."""
+"""A photograph with fewer points is poorly constrained."""
 
 PAGE_STYLE = """
 section { display: inline-block; vertical-align: top; margin: 0 36px 20px 0 }
@@ -164,17 +164,17 @@ REPORT: dict[str, Field] = {
     "attempts": COUNT,
     "advice": NAMES,
 }
-"""What the page shows of a preparation's report."""
+"""Fields of a preparation's report that the page shows."""
 
 
 @dataclass(frozen=True)
 class Shown:
-    """Record of one photograph in the model.
+    """Statistics of one photograph in the model.
 
     Attributes:
         view: the photograph.
-        points: measured places that it shows.
-        error: mean distance of these from where it shows them, in pixels.
+        points: number of its triangulated points.
+        error: mean reprojection error of these points, in pixels.
     """
 
     view: View
@@ -183,16 +183,16 @@ class Shown:
 
 
 def write_page(capture: Path, target: Path, planes: Planes | None = None) -> None:
-    """Writes the page of a capture that `glassplat prepare` made; it refers to nothing outside of itself.
+    """Writes the page of a capture made by `glassplat prepare`; the page is self-contained.
 
     Args:
         capture: the folder.
         target: the file to write.
-        planes: of panes that are marked in it; points behind them are counted and shown.
+        planes: of its marked panes; points behind them are counted and shown.
     """
     report = _read_report(capture / RECORD)
     dataset = load_dataset(capture)
-    from glassplat.captures.colmap_library import pycolmap  # `info` names this page, and need not wait for it.
+    from glassplat.captures.colmap_library import pycolmap  # Slow to import; `info` only needs the name of this page.
 
     model = pycolmap.Reconstruction(capture / "sparse" / "0")
     write_text(target, _page(report, dataset, model, planes, capture.resolve().name))
@@ -213,15 +213,15 @@ def _page(report: Mapping[str, Any], dataset: Dataset, model: Any, planes: Plane
     points = list(model.points3D.values())
     tracks = np.array([point.track.length() for point in points])
     errors = np.array([point.error for point in points])
-    legend = "cameras blue, in the order of their names joined by a line; points in their colours"
-    legend += "" if planes is None else ", those behind panes magenta; panes yellow"
+    legend = "cameras in blue, joined in the order of their names; points in their colours"
+    legend += "" if planes is None else ", those behind panes in magenta; panes in yellow"
     body = [
         f"<h1>{html.escape(title)}</h1>",
         f'<div class="cards">{"".join(_cards(report, behind, planes))}</div>',
         *(f'<p class="advice">{html.escape(str(line))}</p>' for line in report["advice"]),
-        f"<section><h2>From above</h2>{plan(views, dataset.points, behind, planes)}<p>{legend}</p></section>",
-        f"<section>{_bars('Points by the photographs that show them', tracks, TRACKS)}"
-        f"{_bars('Points by how far off they are, in pixels', errors, ERRORS)}</section>",
+        f"<section><h2>Plan</h2>{plan(views, dataset.points, behind, planes)}<p>{legend}</p></section>",
+        f"<section>{_bars('Points by number of photographs', tracks, TRACKS)}"
+        f"{_bars('Points by reprojection error, in pixels', errors, ERRORS)}</section>",
         "<h2>Photographs</h2>",
         f'<div class="photographs">{"".join(_photographs(_shown(views, model)))}</div>',
         *_missing(report["missing"]),
@@ -231,7 +231,7 @@ def _page(report: Mapping[str, Any], dataset: Dataset, model: Any, planes: Plane
 
 
 def _behind(dataset: Dataset, planes: Planes | None) -> NDArray[np.bool_]:
-    """[N] which points most photographs show through a pane."""
+    """[N] mask of points that most photographs show through a pane."""
     if planes is None:
         return np.zeros(len(dataset.points), dtype=bool)
     cameras = [view.camera for view in dataset.train]
@@ -244,11 +244,11 @@ def _cards(report: Mapping[str, Any], behind: NDArray[np.bool_], planes: Planes 
     facts = {
         "photographs registered": f"{report['registered']} of {report['photographs']}",
         "points": f"{report['points']:,}",
-        "pixels off, on average": f"{report['reprojection_error']:.2f}",
+        "mean reprojection error, in pixels": f"{report['reprojection_error']:.2f}",
         "photographs per point": f"{report['track_length']:.1f}",
-        "features of a photograph": f"{report['features']:,}",
+        "features per photograph": f"{report['features']:,}",
         "points behind panes": "no panes yet" if planes is None else f"{behind.sum():,} ({share:.0%})",
-        "attempt": f"{report['attempt']} ({report['attempts']} made)",
+        "settings": f"{report['attempt']} (of {report['attempts']} tried)",
     }
     facts |= {f"camera {number}": camera for number, camera in enumerate(report["cameras"], start=1)}
     return [f"<div><b>{html.escape(str(value))}</b><span>{name}</span></div>" for name, value in facts.items()]
@@ -274,7 +274,7 @@ def _bin(low: float, high: float) -> str:
 
 
 def _shown(views: Sequence[View], model: Any) -> list[Shown]:
-    # A file may spell an accent in another way than the model does.
+    # Accents may be encoded in another way in file names than in the model.
     images = {normalize("NFC", image.name): image for image in model.images.values()}
     found = []
     for view in views:
@@ -294,12 +294,12 @@ def _photograph(shown: Shown) -> str:
     name = html.escape(shown.view.name)
     return (
         f'<figure{weak}><img src="{_thumbnail(shown.view)}" alt="{name}">{name}<br>{shown.points} points, '
-        f"{shown.error:.2f} pixels off</figure>"
+        f"error {shown.error:.2f} pixels</figure>"
     )
 
 
 def _thumbnail(view: View) -> str:
-    """A data address of a small JPEG."""
+    """Data URL of a small JPEG."""
     small = Image.fromarray(view.photo.cpu().numpy()).convert("RGB")
     small.thumbnail(THUMBNAIL)
     buffer = io.BytesIO()

@@ -177,7 +177,7 @@ def test_masks_next_to_photographs_are_no_photographs(tmp_path: Path, heard: Hea
     assert sorted(found(folder, heard)) == ["0.png", "1.png", "2.png", "wall_mask.png"]
     (note,) = notes_of(heard)
     names = "1_mask.jpg, 2_mask.png, left/ignore/0.png, masks/0.png, panes/1.png"
-    assert note.startswith(f"Masks by their names or folders, which are no photographs: {names}. They are not copied")
+    assert note.startswith(f"Skipped masks, recognised by their names or folders: {names}. They are not copied")
 
 
 def test_folders_of_the_input_itself_are_not_asked(tmp_path: Path, heard: Heard) -> None:
@@ -212,7 +212,7 @@ def test_the_same_photograph_counts_once(tmp_path: Path, heard: Heard) -> None:
     folder = three(tmp_path / "in")
     (folder / "copy.png").write_bytes((folder / "1.png").read_bytes())
     assert sorted(found(folder, heard)) == ["0.png", "1.png", "2.png"]
-    assert notes_of(heard) == ["Duplicates, left out: copy.png (as 1.png)."]
+    assert notes_of(heard) == ["Skipped duplicates: copy.png (as 1.png)."]
 
 
 def test_of_the_same_photographs_the_one_with_the_shorter_name_stays(tmp_path: Path, heard: Heard) -> None:
@@ -222,7 +222,7 @@ def test_of_the_same_photographs_the_one_with_the_shorter_name_stays(tmp_path: P
     names = list(found(folder, heard))
     assert names == ["0.png", "1.png", "2.png", "IMG 8.png", "IMG 9.png"]
     twins = "IMG 9 copy 2.png (as IMG 9.png), IMG 9 copy.png (as IMG 9.png)"
-    assert notes_of(heard) == [f"Duplicates, left out: {twins}."]
+    assert notes_of(heard) == [f"Skipped duplicates: {twins}."]
 
 
 def broken(folder: Path) -> None:
@@ -277,7 +277,7 @@ def a_capture(folder: Path) -> None:
     [
         (a_capture, r"in is a capture; expected a folder of photographs, such as .*images"),
         (broken, r"cannot read .*1\.png as an image"),
-        (several, r"2 of 3 photographs cannot be used \(1\.png, 2\.png\).*Of the first: cannot read .*1\.png as"),
+        (several, r"2 of 3 photographs cannot be used \(1\.png, 2\.png\).*The first: cannot read .*1\.png as"),
         (no_picture, r"cannot read .*1\.png as an image"),
         (tiny, r"thumbnail\.png is 30x20 pixels; expected at least 64"),
         (heic, r"1 photographs in .* are HEIC files.*IMG_1\.HEIC.*save them as JPEG.*pip install 'glassplat\[heic\]'"),

@@ -101,7 +101,7 @@ def test_a_capture_is_replaced_only_by_force(prepared: Path, capsys: pytest.Capt
 def test_what_was_interrupted_goes_on(photographs: Path, tmp_path: Path, heard: Heard) -> None:
     """In each phase, one after the other: what goes on has to come as far as the next."""
     task = Preparation(photographs, tmp_path / "capture")
-    phases = ("looking for features", "matching photographs", "registering the photographs", "undistorting")
+    phases = ("extracting features", "matching photographs", "registering the photographs", "undistorting")
     for number, phase in enumerate(phases):
 
         def interrupt(message: Working | Note, phase: str = phase) -> None:
@@ -134,7 +134,7 @@ def test_only_one_sqlite_has_the_database_open_and_progress_is_read_from_it(
     monkeypatch.setattr(sqlite3, "connect", refuse)
     monkeypatch.setattr(colmap, "LOOK_EVERY", 0.001)
     assert prepare(Preparation(photographs, tmp_path / "capture"), heard).registered == len(CONNECTED)
-    for phase in ("looking for features", "matching photographs"):
+    for phase in ("extracting features", "matching photographs"):
         told = [message.done for message in heard if isinstance(message, Working) and message.what == phase]
         total = next(m.total for m in heard if isinstance(m, Working) and m.what == phase)
         assert told == sorted(told) and len(set(told)) > 2 and told[-1] >= 0.9 * total
