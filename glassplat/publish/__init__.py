@@ -1,1 +1,1 @@
-"""Publishing: pages and films of a scene."""
+"""Publishing: web pages and videos of a scene, camera paths, and removal of floaters."""

@@ -1,4 +1,4 @@
-"""Paths of a camera through a scene: around what the photographs show, or along where they were taken."""
+"""Camera paths: an orbit around the subject, or a smooth path through the cameras of photographs."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from glassplat.publish.web_page import least_along, survey_capture
 from glassplat.scene.camera import Camera, look_at
 
 MOST_KEYFRAMES = 12
-"""Photographs that a path goes through; more of them make it shake as the hand did that took them."""
+"""Maximum number of photographs on a path; more would reproduce the shake of a hand-held camera."""
 ALL_AROUND = 0.4
-"""Length of the mean direction from which photographs were taken, below which they were taken from all sides."""
+"""Length of the mean of unit directions to the photographs, below which they are taken to surround the subject."""
 SHARE_OF_SPREAD = 1.2
 LEAST_LOOP = 0.08
-"""Of the distance: a loop in front of the scene, or over it, is no smaller."""
+"""Minimum radius of a loop, as a share of the distance to the subject."""
 
 
 def orbit(cameras: Sequence[Camera], extent: float, frames: int) -> list[Camera]:
-    """Once around what the cameras look at, or, where they all stand on one side, in a loop before it; closed.
+    """A closed path once around the subject of the cameras, or a loop in front of it if all are on one side.
 
     Args:
-        cameras: of the photographs; the first one gives the lens.
+        cameras: of the photographs; the first one defines the intrinsics.
         extent: of the scene.
         frames: how many cameras to return.
     """
@@ -56,11 +56,11 @@ def orbit(cameras: Sequence[Camera], extent: float, frames: int) -> list[Camera]
 
 
 def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """A smooth way through the cameras, at an even pace from one to the next; the first and the last one are on it.
+    """A smooth path from the first camera through all others to the last, with equal time between neighbours.
 
     Args:
-        cameras: at least two; lenses change on the way as poses do, the size is that of the first one, which others
-            are scaled and cut to.
+        cameras: at least two; intrinsics are interpolated, too. The size is that of the first one, to which the others
+            are scaled and cropped.
         frames: how many cameras to return.
 
     Raises:
@@ -87,19 +87,19 @@ def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 
 def keyframes_of(cameras: Sequence[Camera]) -> list[Camera]:
-    """A few of the cameras, evenly, the first and the last one among them."""
+    """At most `MOST_KEYFRAMES` of the cameras, evenly spaced, including the first and the last one."""
     count = min(len(cameras), MOST_KEYFRAMES)
     return [cameras[round(index * (len(cameras) - 1) / max(count - 1, 1))] for index in range(count)]
 
 
 def fit_to_width(camera: Camera, width: int) -> Camera:
-    """The camera with pictures of this width, and of the even height that fits best; encoders want both sides even."""
+    """The camera resized to this width, and to the nearest even height; encoders require even sizes."""
     height = max(2, 2 * round(width * camera.height / camera.width / 2))
     return camera.resize(width, height)
 
 
 def _lens(camera: Camera, width: int, height: int) -> tuple[float, float, float, float]:
-    """(fx, fy, cx, cy) of a camera in pictures of another size, which the middle of its own fills."""
+    """(fx, fy, cx, cy) of a camera for another image size, filled by the centre of its own image."""
     scale = max(width / camera.width, height / camera.height)
     cx, cy = width / 2 + scale * (camera.cx - camera.width / 2), height / 2 + scale * (camera.cy - camera.height / 2)
     return scale * camera.fx, scale * camera.fy, cx, cy

@@ -1,4 +1,4 @@
-"""Floaters: Gaussians outside a box, far from all others, or large for how near they are to a camera."""
+"""Floaters: Gaussians outside a box, far from all others, or large relative to their distance from a camera."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 
 NEIGHBOURS = 4
-"""Floaters come in twos and threes."""
+"""Neighbour whose distance is measured; the first ones are too near, because floaters come in twos and threes."""
 
 
 class Floaters:
-    """Sizes and distances of a scene's Gaussians, measured once, so that rules can be tried one after the other."""
+    """Sizes and distances of a scene's Gaussians, measured once for trying several rules."""
 
     def __init__(self, gaussians: Gaussians, cameras: Tensor) -> None:
-        """Measures.
+        """Measures sizes and distances.
 
         Args:
             gaussians: N of them.
@@ -31,7 +31,7 @@ class Floaters:
         """
         if not len(gaussians):
             raise InputError("a scene without Gaussians cannot be cleaned; expected at least one")
-        from scipy.spatial import cKDTree  # Takes long to import, and most commands never need it.
+        from scipy.spatial import cKDTree  # Slow to import, and rarely needed.
 
         self._gaussians = gaussians
         means = gaussians.means.detach().double().cpu().numpy()
@@ -42,7 +42,7 @@ class Floaters:
         self._longest = gaussians.log_scales.detach().double().cpu().amax(dim=1).exp()
 
     def masks(self, cleaning: Cleaning) -> dict[str, Tensor]:
-        """[N] bool for each rule: which Gaussians it takes out."""
+        """[N] bool for each rule: the Gaussians it removes."""
         everywhere = torch.zeros(len(self._longest), dtype=torch.bool)
         found = {"outside": everywhere, "isolated": everywhere, "oversized": everywhere}
         if cleaning.box is not None:
@@ -57,15 +57,15 @@ class Floaters:
 
 
 def clean_scene(scene: Scene, floaters: Floaters, cleaning: Cleaning) -> tuple[Scene, dict[str, int]]:
-    """The scene without what the rules take out, and how many Gaussians each of them found.
+    """The scene without the Gaussians selected by the rules, and their number for each rule.
 
     Args:
-        scene: to be cleaned; it is left as it is.
+        scene: to be cleaned; it is not modified.
         floaters: of its primary Gaussians.
         cleaning: the rules.
 
     Raises:
-        InputError: nothing would be left.
+        InputError: no Gaussian would be left.
     """
     found = floaters.masks(cleaning)
     kept = ~torch.stack(list(found.values())).any(dim=0)

@@ -1,7 +1,7 @@
-"""Films: pictures one after the other.
+"""Writing of videos and animations.
 
-`.mp4` is VP9, which browsers play: OpenCV's wheels bring libvpx (BSD) and FFmpeg without its GPL parts.
-`.webp` and `.gif` need nothing beyond Pillow.
+`.mp4` is VP9, which browsers play: OpenCV's wheels include libvpx (BSD) and FFmpeg without its GPL parts. `.webp` and
+`.gif` only need Pillow.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ ANIMATIONS = (".webp", ".gif")
 SUFFIXES = (*CODECS, *ANIMATIONS)
 WEBP_QUALITY, LARGEST_WEBP = 80, 16383
 MOST_IN_GIF = 50
-"""Pictures per second: a GIF counts in hundredths, and browsers show one hundredth as ten."""
+"""Maximum frames per second: a GIF counts in hundredths of a second, and browsers play one hundredth as ten."""
 
 
 def write_film(path: Path, pictures: Iterable[Picture], *, count: int, fps: int) -> None:
-    """Writes a film.
+    """Writes a video.
 
     Args:
-        path: the file, new; its suffix is one of `SUFFIXES`.
-        pictures: [H, W, 3] each, of one size with even sides; taken one at a time.
-        count: how many pictures there are.
-        fps: pictures per second.
+        path: a new file; its suffix is one of `SUFFIXES`.
+        pictures: frames [H, W, 3] of equal, even size; read one at a time.
+        count: number of frames.
+        fps: frames per second.
 
     Raises:
         ImportError: OpenCV is needed and not installed.
-        OSError: the film cannot be written, as on a full disk.
-        ValueError: there is no picture, or the suffix is another one.
+        OSError: the video cannot be written, as on a full disk.
+        ValueError: there is no frame, or the suffix is not supported.
     """
     stream = iter(pictures)
     first = next(stream, None)
@@ -50,11 +50,11 @@ def write_film(path: Path, pictures: Iterable[Picture], *, count: int, fps: int)
 
 
 def check_encoder(path: Path, fps: int) -> None:
-    """Looks whether a film of this name can be written here, before anything is rendered.
+    """Checks that a video of this name can be written, before anything is rendered.
 
     Raises:
         ImportError: OpenCV is needed and not installed.
-        ValueError: the suffix is none of `SUFFIXES`, or a GIF cannot show so many pictures per second.
+        ValueError: the suffix is not one of `SUFFIXES`, or a GIF does not support this frame rate.
     """
     if path.suffix not in SUFFIXES:
         raise ValueError(f"{path.name} is not a video name; expected one that ends in one of {', '.join(SUFFIXES)}")
@@ -67,10 +67,10 @@ def check_encoder(path: Path, fps: int) -> None:
 
 
 def check_size(path: Path, width: int, height: int) -> None:
-    """Looks whether the format of a film has room for its pictures, before anything is rendered.
+    """Checks that the format of a video supports the size of its frames, before anything is rendered.
 
     Raises:
-        ValueError: a WebP cannot be so large.
+        ValueError: the size is too large for a WebP.
     """
     if path.suffix == ".webp" and max(width, height) > LARGEST_WEBP:
         raise ValueError(
@@ -80,12 +80,12 @@ def check_size(path: Path, width: int, height: int) -> None:
 
 
 def side_by_side(pictures: list[Picture]) -> Picture:
-    """Pictures of one size next to each other."""
+    """Images of one size, concatenated horizontally."""
     return np.concatenate(pictures, axis=1)
 
 
 def wipe_pictures(left: Picture, right: Picture, share: float) -> Picture:
-    """The left picture up to a share of the width, a bright line, and then the right one."""
+    """A split image: the left one up to a share of the width, a white line, and the right one."""
     column = round(share * left.shape[1])
     picture = np.concatenate([left[:, :column], right[:, column:]], axis=1)
     picture[:, max(column - 1, 0) : column + 1] = 255
@@ -93,14 +93,14 @@ def wipe_pictures(left: Picture, right: Picture, share: float) -> Picture:
 
 
 def _durations(path: Path, count: int, fps: int) -> list[int]:
-    """Milliseconds of each picture, rounded in sum, so that the film takes as long as it should."""
+    """Milliseconds of each frame; cumulative times are rounded, so that the total duration is exact."""
     step = 10 if path.suffix == ".gif" else 1
     ends = [step * round(1000 * k / fps / step) for k in range(count + 1)]
     return [after - before for before, after in pairwise(ends)]
 
 
 class _LaterPictures:
-    """All pictures but the first, as one image of many frames: of several images, Pillow would keep all in memory."""
+    """All frames but the first, as one multi-frame image; Pillow would keep a list of images in memory."""
 
     def __init__(self, pictures: Iterator[Picture], count: int) -> None:
         self.n_frames = count
@@ -108,7 +108,7 @@ class _LaterPictures:
         self._image: Image.Image | None = None
 
     def seek(self, frame: int) -> None:
-        """Goes on to the next picture; Pillow asks for them in order."""
+        """Reads the next frame; Pillow requests them in order."""
         if frame >= self.n_frames:
             raise EOFError
         self._image = Image.fromarray(next(self._pictures))
@@ -119,7 +119,7 @@ class _LaterPictures:
 
 def _write_animation(path: Path, first: Picture, rest: Iterator[Picture], durations: list[int]) -> None:
     later = _LaterPictures(rest, len(durations) - 1)
-    with path.open("wb") as file:  # Pillow leaves a file open that it opens itself, where Ctrl-C ends it.
+    with path.open("wb") as file:  # After Ctrl-C, Pillow would leave a file open that it opened.
         kind = path.suffix.removeprefix(".").upper()
         options = {"duration": durations, "loop": 0, "quality": WEBP_QUALITY}
         Image.fromarray(first).save(file, kind, save_all=True, append_images=[later], **options)
@@ -139,7 +139,7 @@ def _write_video(path: Path, first: Picture, rest: Iterator[Picture], fps: int) 
             count += 1
     finally:
         writer.release()
-    # The encoder says nothing of a disk that is full.
+    # The encoder does not report a full disk.
     if _pictures_in(path) != count:
         raise OSError(f"the video could not be written completely to {path}; is the disk full?")
 

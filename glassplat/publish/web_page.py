@@ -1,7 +1,7 @@
-"""A scene as one HTML file that shows it with live panes: no server, nothing loaded from anywhere.
+"""Export of a scene as a self-contained HTML file with interactive panes, which needs no server.
 
-The page's world is that of the SPZ file in it, y and z turned round. Its script and shaders lie in `web_page/` and are
-written into the page as they are.
+The page's world is that of its embedded SPZ file, with y and z negated. Script and shaders are in `web_page/` and are
+embedded verbatim.
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ COUNT = 24
 WIDTH, HEIGHT = 960, 640
 FOV_RAD = math.radians(50)
 ELEVATION = 0.25
-"""Tangent of the angle from which the cameras look down."""
+"""Height of the cameras above the middle, as a share of the radius of their circle."""
 INNER_SHARE = 0.96
-"""Part of the Gaussians, the middle ones, that the pictures should hold."""
+"""Share of the Gaussians, the inner ones, that the images should contain."""
 MOST_SAMPLED = 200_000
 CLOSE = 1.15
 
 
 def cameras_around(gaussians: Gaussians, up: Tensor) -> list[tuple[str, Camera]]:
-    """Named cameras on a circle, which look at the middle of the scene.
+    """Named cameras on a circle, facing the middle of the scene.
 
     Args:
-        gaussians: at least one, all finite; on any device, the cameras are on the CPU.
+        gaussians: at least one, all finite; on any device. The cameras are on the CPU.
         up: [3] away from the ground.
     """
     middle, radius = bounding_ball(gaussians)
@@ -73,7 +73,7 @@ def cameras_around(gaussians: Gaussians, up: Tensor) -> list[tuple[str, Camera]]
 
 
 def bounding_ball(gaussians: Gaussians) -> tuple[Tensor, float]:
-    """Middle [3] and radius of a ball around the inner Gaussians; those that are hardly visible do not count.
+    """Centre [3] and radius of a ball around the inner Gaussians, without those of opacity below 0.5 if any is above.
 
     Raises:
         InputError: there are no Gaussians.
@@ -91,26 +91,26 @@ def bounding_ball(gaussians: Gaussians) -> tuple[Tensor, float]:
 
 
 def least_along(up: Tensor) -> Tensor:
-    """The coordinate axis that is furthest from a direction."""
+    """The coordinate axis with the largest angle to a direction."""
     return torch.eye(3, dtype=up.dtype)[int(up.abs().argmin())]
 
 
 TOWARDS_MIDDLE = 0.02
-"""Weight of a point before the cameras against where they look: parallel lines of sight meet nowhere."""
+"""Weight of a point in front of the cameras when intersecting their sight lines, which may be parallel."""
 SPACINGS, SHARE_OF_DISTANCE = 2.5, 0.12
-"""How far from a photograph one may go: in distances between neighbours, or of the distance to what they show."""
+"""Reach around photographs: the larger of a multiple of their spacing and a share of the distance to the focus."""
 FULL_SHARE = 0.55
-"""Part of the picture that a pane should fill in the first view."""
+"""Share of the image that panes should fill in the first view."""
 
 
 class Surveyed(NamedTuple):
-    """Places of a capture's cameras, and what they look at.
+    """Geometry of a capture's cameras.
 
     Attributes:
-        focus: [3] the point that the cameras look at.
+        focus: [3] the point nearest to the sight lines of all cameras.
         up: [3] unit vector, away from the ground, as `upward` finds it.
-        distance: of the cameras from the focus, the median; world units.
-        reach: how far from the nearest photograph the scene is still known, world units.
+        distance: median distance of the cameras from the focus, world units.
+        reach: distance from the nearest photograph up to which the scene is known, world units.
     """
 
     focus: Tensor
@@ -120,11 +120,11 @@ class Surveyed(NamedTuple):
 
 
 def survey_capture(cameras: Sequence[Camera], extent: float) -> Surveyed:
-    """Looks at the poses of a capture.
+    """Estimates focus, up direction, distance and reach from the poses of a capture.
 
     Args:
         cameras: at least one.
-        extent: of the scene, for captures whose cameras all look the same way.
+        extent: of the scene, for captures whose cameras all face the same way.
     """
     poses = torch.stack([camera.cam_from_world for camera in cameras]).double().cpu()
     centers, forward = -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0], poses[:, 2, :3]
@@ -146,14 +146,14 @@ def survey_capture(cameras: Sequence[Camera], extent: float) -> Surveyed:
 
 @torch.no_grad()
 def best_view(planes: Planes, cameras: Sequence[Camera]) -> int:
-    """The camera to begin with: panes fill about half of its picture, in the middle; without panes the middle one."""
+    """Index of the initial camera, where panes fill about half of the image, centred; without panes the middle one."""
     if not len(planes):
         return len(cameras) // 2
     return min(range(len(cameras)), key=lambda k: _composition(planes, cameras[k]))
 
 
 def _composition(planes: Planes, camera: Camera) -> float:
-    """Distance of a picture from one that shows panes well: by their share of it, and by how far off its middle."""
+    """Score of a view of the panes, lower is better: by their share of the image and their distance from its centre."""
     small = camera.resize(64, max(1, round(64 * camera.height / camera.width)))
     rows, columns = (nearest_hits(panes_in_camera(planes, small), small).pane >= 0).nonzero(as_tuple=True)
     if not len(rows):
@@ -168,32 +168,32 @@ SCRIPTS = (
 )  # fmt: skip
 SHADERS = ("texels.glsl", "screen.vert", "project.frag", "splat.vert", "splat.frag", "compose.frag", "copy.frag")
 CUBE_SIZE = 128
-"""Texels along a side of what glossy things mirror."""
+"""Maximum texels along a side of the environment map of glossy objects."""
 MOST_VIEWS = 400
 MOST_PANES = 24
-"""Each takes eight of the 224 vectors that WebGL 2 grants a shader."""
+"""Each takes eight of the 224 uniform vectors that WebGL 2 guarantees."""
 MOST_GAUSSIANS = 1_000_000
-"""76 MB to load. Textures of 4096 rows, which every device has, hold 1.4 million of SH degree 3."""
+"""76 MB to load. Textures of 4096 rows, which every device supports, hold 1.4 million of SH degree 3."""
 RANKING_VIEWS, RANKING_WIDTH = 64, 480
 """Views by which Gaussians are ranked, and their width in pixels."""
 POSTER_WIDTH, POSTER_QUALITY = 640, 70
 LEAST_OPACITY = 1 / 255
 DESCRIPTION = "Look around, remove the reflections from the glass, or turn it into a mirror."
 DESCRIPTIONS = ("Look around a scene of Gaussians.", "Look around, and remove reflections from glossy objects.")
-"""Of scenes without panes: matte ones, and those with glossy things."""
+"""Descriptions of scenes without panes: matte ones, and those with glossy objects."""
 PREVIEW = "preview.jpg"
 PREVIEW_WIDTH, PREVIEW_HEIGHT = 1200, 630
-"""What the programs that preview links ask for, pixels."""
+"""Size that link previews request, pixels."""
 DIVIDER = 3
-"""Half the width of the line between the halves of a preview, pixels."""
+"""Half the width of the dividing line of a preview, pixels."""
 
 
 class Sharing(NamedTuple):
-    """Credit and address of a page, for it and for links to it.
+    """Credit and address of a page, for its text and link previews.
 
     Attributes:
-        credit: who made the scene, and its licence; plain text.
-        url: the page's address; a picture next to it, `PREVIEW`, shows up in previews of links. None without them.
+        credit: author and licence of the scene; plain text.
+        url: the page's address; link previews show the image `PREVIEW` next to it. None disables them.
     """
 
     credit: str = ""
@@ -205,7 +205,7 @@ PRIVATE = Sharing()
 
 @torch.no_grad()
 def write_preview(path: Path | str, scene: Scene, renderer: Renderer, cameras: Sequence[tuple[str, Camera]]) -> None:
-    """Writes the picture for previews of links, atomically: the first view, on its right half without its panes.
+    """Writes the image for link previews, atomically: the first view, with panes removed in the right half.
 
     Args:
         path: the JPEG file.
@@ -242,18 +242,18 @@ def write_page(
         path: the HTML file.
         scene: what to show.
         renderer: how.
-        cameras: of the photographs, by name; at least one. People may look round near them.
+        cameras: of the photographs, by name; at least one. Users can move near them.
         title: of the page.
-        sharing: what it says of its origin and address.
+        sharing: credit and address of the page.
 
     Raises:
-        ValueError: no camera, more panes than a page can show, or values that are not finite.
+        ValueError: no camera, more panes than a page can show, or non-finite values.
     """
     write_text(path, page_text(scene, renderer, cameras, title, sharing=sharing))
 
 
 def check_panes(scene: Scene) -> None:
-    """Raises ValueError where a page cannot show all panes of a scene."""
+    """Raises ValueError if a scene has more panes than a page can show."""
     if len(scene.planes) > MOST_PANES:
         raise ValueError(
             f"the scene has {len(scene.planes)} panes, and a page shows at most {MOST_PANES}; export it without panes "
@@ -265,7 +265,7 @@ def check_panes(scene: Scene) -> None:
 def page_text(
     scene: Scene, renderer: Renderer, cameras: Sequence[tuple[str, Camera]], title: str, *, sharing: Sharing = PRIVATE
 ) -> str:
-    """Text of the page."""
+    """The HTML text of the page."""
     settings = renderer.page_settings()
     if not cameras:
         raise ValueError("there are no cameras; expected at least one")
@@ -284,7 +284,7 @@ def page_text(
     count = len(scene.planes)
     kept = f"{len(scene.primary):,}" + (f" of {drawable:,}" if len(scene.primary) < drawable else "")
     subtitle = f"{kept} Gaussians" + (f" · {count} pane{'s' if count > 1 else ''}" if count else "")
-    # Glass has no colour; a constant one makes an SPZ file of it.
+    # Glass has no colour, but the SPZ format needs one, so a constant is used.
     glass = replace(
         scene.glass, sh=torch.zeros(len(scene.glass), 1, 3, dtype=torch.float32), channels={}, active_sh_degree=0
     )
@@ -310,7 +310,7 @@ def page_text(
 
 
 def preview_tags(url: str | None) -> str:
-    """Tags for previews of links to an address, which may be of the page or of its folder; none without an address."""
+    """HTML tags for link previews; the address may be that of the page or of its folder. Empty without an address."""
     if url is None:
         return ""
     address = urlsplit(url)
@@ -321,12 +321,12 @@ def preview_tags(url: str | None) -> str:
 
 
 def asset(name: str) -> str:
-    """A file of the page's sources."""
+    """Text of a source file of the page."""
     return (files("glassplat") / "web_page" / name).read_text(encoding="utf-8")
 
 
 def fill_template(template: str, values: dict[str, str]) -> str:
-    """The template with each {{name}} replaced; what is put in is not looked at again."""
+    """The template with each {{name}} replaced; inserted values are not expanded."""
     parts = template.split("{{")
     text = [parts[0]]
     for part in parts[1:]:
@@ -336,27 +336,27 @@ def fill_template(template: str, values: dict[str, str]) -> str:
 
 
 def in_script(value: Any) -> str:
-    """JSON that may stand inside a script: nothing in it ends one."""
+    """JSON escaped so that it cannot close the surrounding script element."""
     return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def in_base64(data: bytes) -> str:
-    """Bytes as text."""
+    """Bytes as base64 text."""
     return base64.b64encode(data).decode("ascii")
 
 
 def visible_gaussians(gaussians: Gaussians) -> Gaussians:
-    """Those that can be seen at all."""
+    """Gaussians with an opacity above `LEAST_OPACITY`."""
     return gaussians.select(torch.sigmoid(gaussians.logit_opacities) > LEAST_OPACITY)
 
 
 def fits(scene: Scene) -> bool:
-    """Return whether a page can show all Gaussians that can be seen."""
+    """Return whether a page can show all visible Gaussians."""
     return len(visible_gaussians(scene.primary)) + len(visible_gaussians(scene.glass)) <= MOST_GAUSSIANS
 
 
 def fitting(scene: Scene, cameras: Sequence[Camera]) -> Scene:
-    """The scene with as many primary Gaussians as a page can show: those that cover most of some photograph."""
+    """The scene with as many primary Gaussians as a page can show: those that contribute most to any photograph."""
     room = max(MOST_GAUSSIANS - len(scene.glass), 0)
     if len(scene.primary) <= room:
         return scene
@@ -371,7 +371,7 @@ def fitting(scene: Scene, cameras: Sequence[Camera]) -> Scene:
 
 
 def poster_camera(camera: Camera) -> Camera:
-    """The camera, small enough for the picture that is shown while the scene is unpacked."""
+    """The camera of the poster, the small image shown while the scene is decoded."""
     share = min(1.0, POSTER_WIDTH / camera.width)
     return camera.resize(max(1, round(share * camera.width)), max(1, round(share * camera.height)))
 
@@ -385,7 +385,7 @@ def jpeg(image: Tensor, quality: int = POSTER_QUALITY) -> bytes:
 
 
 def channel_bytes(scene: Scene) -> tuple[bytes, list[float]]:
-    """Intensities of the primary Gaussians, marks of the glass and the pane that it is part of; and lowest and step."""
+    """Intensities of the primary Gaussians, marks and pane indices of the glass; and [minimum, step] of intensities."""
     logs = scene.primary.channels.get("log_intensity", torch.zeros(len(scene.primary), dtype=torch.float32))
     low, high = (float(logs.min()), float(logs.max())) if len(logs) else (0.0, 0.0)
     step = (high - low) / 255
@@ -401,15 +401,15 @@ def channel_bytes(scene: Scene) -> tuple[bytes, list[float]]:
 
 
 def strength_bytes(scene: Scene) -> bytes:
-    """The strength of the reflection of each Gaussian, one byte each."""
+    """The reflection strength of each Gaussian, one byte each."""
     strengths = torch.round(255 * torch.sigmoid(scene.primary.channels["logit_strength"]))
     return strengths.to(torch.uint8).numpy().tobytes()
 
 
 def cube_bytes(scene: Scene, settings: Mapping[str, Any]) -> bytes:
-    """The light that glossy things mirror: six faces [S, S, 3] sRGB in the order and the axes of WebGL's cube maps.
+    """Environment map of glossy objects: six faces [S, S, 3] sRGB in the order and the axes of WebGL's cube maps.
 
-    Near surroundings are those that the middle of the glossy things sees.
+    Near surroundings are rendered from the centre of the glossy objects.
     """
     near, environment = settings["mirrored"] == "near", scene.environment
     size = CUBE_SIZE if near else min(environment.size, CUBE_SIZE)

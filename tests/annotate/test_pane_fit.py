@@ -192,8 +192,8 @@ def test_edges_of_five_corners_are_fitted_too() -> None:
 @pytest.mark.parametrize(
     ("kept", "expected"),
     [
-        ({0: 4}, "a second photograph, taken from another place"),
-        ({0: 4, 1: 1}, "1 corner is known from two places"),
+        ({0: 4}, "a second photograph, taken from another position"),
+        ({0: 4, 1: 1}, "1 corner is known from two positions"),
         ({0: 4, 1: 2}, "2 corners are known from two positions, expected at least 3"),
     ],
 )
