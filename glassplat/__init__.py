@@ -105,11 +105,11 @@ HOMES = {
     "training.messages": ("ActionDone", "CheckpointWritten", "RunBegun", "StageEntered", "StepDone", "Working"),
     "training.stage": ("Stage",),
 }
-"""Where each public name lives; its module is imported, and PyTorch with it, when the name is first used."""
+"""Modules of the public names; they are imported, with PyTorch, on first use."""
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, imported now."""
+    """A public name, imported on first use."""
     home = next((module for module, names in HOMES.items() if name in names), None)
     if home is None:
         raise AttributeError(f"module 'glassplat' has no attribute {name!r}; it has {', '.join(__all__)}")

@@ -38,7 +38,7 @@ BETWEEN_SAMPLES = 5.0
 LAST_PICTURE = 300.0
 """Seconds in which every client that rests has to get a picture."""
 MOST_TOLD = 20
-COMPLAINTS = ("Traceback", "Error", "could not be drawn")
+COMPLAINTS = ("Traceback", "Error", "could not be rendered")
 
 
 @dataclass

@@ -446,5 +446,5 @@ def _with_line_ends(corners: list[Array | None], lines: Sequence) -> list[Array]
                 corners[number] = a + c - b
     missing = [str(number + 1) for number, corner in enumerate(corners) if corner is None]
     if missing:
-        raise TooFewMarksError(f"mark corner {', '.join(missing)} too, in one photograph at least")
+        raise TooFewMarksError(f"mark corner {', '.join(missing)} too, in at least one photograph")
     return [corner for corner in corners if corner is not None]

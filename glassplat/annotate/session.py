@@ -255,7 +255,7 @@ class Session:
             ValueError: it is not a valid document.
             OSError: the document cannot be saved.
         """
-        fields = check_fields(asked, {"version": Text()}, "what the page saves")
+        fields = check_fields(asked, {"version": Text()}, "the request of the page")
         document = asked.get("document")
         panes = parsed_document(document, "the document of the page")
         with self._lock, lock_folder(self.root):

@@ -124,7 +124,7 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
         listen(
             Note(
                 f"Transparent parts of {len(cut_out)} of {len(found)} photographs become black "
-                f"({_names_below(folder, cut_out)}); leave them out by masks in the capture's ignore/."
+                f"({_names_below(folder, cut_out)}); exclude them by masks in the capture's ignore/."
             )
         )
     return list(found.values())
@@ -280,8 +280,8 @@ def _examine(path: Path, name: str, max_size: int, least_side: int = LEAST_SIDE)
         raise InputError(str(error)) from error
     if min(size) < least_side:
         raise InputError(
-            f"{path} is {size[0]}x{size[1]} pixels; expected a photograph, {least_side} pixels at least along "
-            "each side: remove it"
+            f"{path} is {size[0]}x{size[1]} pixels; expected a photograph of at least {least_side} pixels "
+            "along each side: remove it"
         )
     width, height = size[::-1] if sideways else size
     scale = min(1.0, max_size / max(size))

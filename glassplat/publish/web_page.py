@@ -79,7 +79,7 @@ def bounding_ball(gaussians: Gaussians) -> tuple[Tensor, float]:
         InputError: there are no Gaussians.
     """
     if not len(gaussians):
-        raise InputError("the scene has no Gaussians to look at; expected at least one, or cameras of the capture")
+        raise InputError("the scene has no Gaussians; expected at least one, or cameras of the capture")
     means = gaussians.means.double()
     seen = gaussians.logit_opacities > 0
     means = means[seen] if bool(seen.any()) else means
@@ -209,8 +209,8 @@ def write_preview(path: Path | str, scene: Scene, renderer: Renderer, cameras: S
 
     Args:
         path: the JPEG file.
-        scene: what to show.
-        renderer: how.
+        scene: to be shown.
+        renderer: of its images.
         cameras: as of `write_page`.
     """
     view = cameras[best_view(scene.planes, [camera for _, camera in cameras])][1]
@@ -240,8 +240,8 @@ def write_page(
 
     Args:
         path: the HTML file.
-        scene: what to show.
-        renderer: how.
+        scene: to be shown.
+        renderer: of its images.
         cameras: of the photographs, by name; at least one. Users can move near them.
         title: of the page.
         sharing: credit and address of the page.

@@ -267,7 +267,7 @@ class MeasureControls:
             return f"{len(self._points)} of 2 points"
         ends = " ".join(f"{value:.4g}" for point in self._points for value in point)
         return (
-            f"{np.linalg.norm(self._points[1] - self._points[0]):.4g} units; in metres with "
+            f"{np.linalg.norm(self._points[1] - self._points[0]):.4g} units; to convert to metres: "
             f"`glassplat clean ... --scale {ends} METRES`"
         )
 

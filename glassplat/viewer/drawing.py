@@ -168,7 +168,7 @@ def error_drawn(
     pixel, so that the image has at most as many rows as the photograph.
 
     Args:
-        scene: what is shown.
+        scene: the displayed scene.
         renderer: of its frames.
         request: its edits and aspect are used, its camera is not.
         height: maximum number of rows of the image.

@@ -216,7 +216,7 @@ class RenderLoop(Generic[Wanted]):
         """The error as text; it is logged unless it repeats the previous one."""
         text = str(error) or type(error).__name__
         if text != self._complaint:
-            logger.warning("a view could not be drawn: %s", text)
+            logger.warning("a view could not be rendered: %s", text)
         self._complaint = text
         return text
 

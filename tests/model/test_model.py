@@ -254,7 +254,7 @@ def test_a_model_of_nothing_says_so() -> None:
     nothing = model().with_scene(Scene(Gaussians.empty(1, channels=("log_intensity",)), 1.0))
     with pytest.raises(InputError, match="cannot be cleaned; expected at least one"):
         nothing.clean()
-    with pytest.raises(InputError, match="no Gaussians to look at"):
+    with pytest.raises(InputError, match="the scene has no Gaussians; expected"):
         _ = dataclasses.replace(nothing, cameras={}).viewpoints
 
 
