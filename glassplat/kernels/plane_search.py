@@ -1,8 +1,8 @@
-"""The inner loops of the search for a pane's plane: masks followed to other views, points mirrored onto others.
+"""Inner loops of the search for a pane's plane: mask edges transferred to other views, and points mirrored in planes.
 
-A search tries thousands of planes on some hundred rays or points. For each plane and ray there are a few products
-and one look into an image: little enough to be done as it comes, without arrays in between. All is in double
-precision, on the CPU.
+A search tests thousands of planes on a few hundred rays or points. Each pair of plane and ray takes a few products and
+one image lookup, so all is computed in one pass without intermediate arrays. Everything runs in double precision on the
+CPU.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ Array = NDArray[np.float64]
 Image = NDArray[np.bool_]
 
 PARALLEL = 1e-9
-"""Slope of a ray against a plane from which on it is taken to run along the plane."""
+"""Dot product of a ray and a plane's normal below which the ray is treated as parallel to the plane."""
 SMALLEST = 1e-100
-"""Below it heights and sizes of pixels are taken for this; its square is a number still."""
+"""Lower bound of heights and pixel sizes; its square does not underflow."""
 STEEPEST = 8.0
-"""How far beyond an edge a camera may stand and be told apart, in its heights over the plane: farther out it looks
-along the pane."""
+"""Upper bound of a camera's offset beyond an edge, in multiples of its height over the plane. Cameras farther out see
+the pane at grazing angles."""
 
 
 class Cameras(NamedTuple):
@@ -41,10 +41,10 @@ class Cameras(NamedTuple):
 
 
 class Edges(NamedTuple):
-    """P points of the masks' edges as their cameras see them.
+    """P points of mask edges, as seen by their cameras.
 
-    sources [P]: the view of each; rays [P, 3]: directions to them, along which the camera's z grows by 1; limits
-    [P, 3]: unit normals, off the pane, of the planes through camera and edge.
+    sources [P]: the view of each; rays [P, 3]: directions to them, with a camera z of 1; limits [P, 3]: unit normals of
+    the planes through camera and edge, pointing away from the pane.
     """
 
     sources: NDArray[np.int64]
@@ -53,8 +53,8 @@ class Edges(NamedTuple):
 
 
 class Rays(NamedTuple):
-    """P rays through pixels: sources [P], the view of each; rays [P, 3] as of `Edges`; on_pane [P]: whether the mask is
-    at the pane there.
+    """P rays through pixels: sources [P], the view of each; rays [P, 3] as in `Edges`; on_pane [P]: true where the mask
+    marks the pane.
     """
 
     sources: NDArray[np.int64]
@@ -63,8 +63,8 @@ class Rays(NamedTuple):
 
 
 class Followed(NamedTuple):
-    """Edges on H planes, and where they land in V views: distances, shifts [H, V, P], outward [H, P, 3], compared
-    [H, V, P]; `EdgeMatches` says what they are.
+    """Edges on H planes, and their positions in V views: distances, shifts [H, V, P], outward [H, P, 3], compared
+    [H, V, P]; `EdgeMatches` describes them.
     """
 
     distances: Array
@@ -74,8 +74,8 @@ class Followed(NamedTuple):
 
 
 class Field(NamedTuple):
-    """Values [X, Y, Z] (float32) of the cells of a box, the place of its corner [3], and the size of a cell, in world
-    units; 0 outside of the box.
+    """Values [X, Y, Z] (float32) of the cells of a box, the position of its corner [3], and the size of a cell, in
+    world units; 0 outside of the box.
     """
 
     values: NDArray[np.float32]
@@ -84,20 +84,19 @@ class Field(NamedTuple):
 
 
 def follow_edges(normals: Array, offsets: Array, cameras: Cameras, edges: Edges, fields: list[Array]) -> Followed:
-    """Follows edges of masks over planes to all views.
+    """Transfers mask edges to all views over each plane.
 
     Args:
         normals: [H, 3] unit normals of the planes.
-        offsets: [H] where they are: normal . x = offset.
+        offsets: [H] of the planes: normal . x = offset.
         cameras: of V views.
         edges: P points.
-        fields: an image for each view, distances from a pixel's centre to the edge of its mask, positive
-            on the pane.
+        fields: one image for each view: signed distances from pixel centres to the mask's edge, positive on the pane.
     """
     planes, views, points = len(offsets), len(fields), len(edges.sources)
     distances, shifts = np.empty((2, planes, views, points))
     outward, compared = np.empty((planes, points, 3)), np.empty((planes, views, points), np.bool_)
-    fields = [np.ascontiguousarray(field, np.float64) for field in fields]  # Held until the kernel has returned.
+    fields = [np.ascontiguousarray(field, np.float64) for field in fields]  # Kept alive until the kernel has returned.
     addresses = np.array([field.ctypes.data for field in fields], np.int64)
     follow_edges_kernel()(normals, offsets, *cameras, *edges, addresses, distances, shifts, outward, compared)
     return Followed(distances, shifts, outward, compared)
@@ -107,16 +106,16 @@ def overlaps(
     normals: Array, offsets: Array, cameras: Cameras, rays: Rays, masks: list[Image], hidden: list[Image],
     unknown_weight: float,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Rays that meet the pane in two views, and in either of them; [H, V, V] each, from and to.
+    """Counts of rays on the pane in both of two views, and in at least one; [H, V, V] each, from and to.
 
     Args:
         normals: [H, 3] unit normals of the planes.
-        offsets: [H] where they are: normal . x = offset.
+        offsets: [H] of the planes: normal . x = offset.
         cameras: of V views.
         rays: P rays.
-        masks: an image for each view, true on the pane.
-        hidden: an image for each view, true where nothing is known.
-        unknown_weight: what a ray on the pane counts that no other view tells anything of.
+        masks: one image for each view, true on the pane.
+        hidden: one image for each view, true where the mask is unknown.
+        unknown_weight: weight of a ray on the pane that is outside the other view or hidden in it.
     """
     both, either = np.zeros((2, len(offsets), len(masks), len(masks)))
     images = [np.ascontiguousarray(image, np.bool_) for image in (*masks, *hidden)]
@@ -126,7 +125,7 @@ def overlaps(
 
 
 def sum_mirrored(normals: Array, offsets: Array, points: Array, field: Field) -> Array:
-    """[H] the field, summed over the mirror images of points [N, 3] in each of H planes normal . x = offset."""
+    """Sums [H] of the field over the mirror images of points [N, 3] in each of H planes normal . x = offset."""
     sums = np.empty(len(offsets))
     sum_mirrored_kernel()(normals, offsets, points, *field, sums)
     return sums
@@ -143,7 +142,7 @@ def along_ray(normal, offset, center, ray):  # type: ignore[no-untyped-def]
 
 @inlined
 def seen_at(pose, lens, size, x, y, z):  # type: ignore[no-untyped-def]
-    """Column and row of a place in an image, in pixels, its depth, and whether the image holds it."""
+    """Column and row of a point in an image, in pixels, its depth, and whether it is inside the image."""
     depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
     if not depth > 0.0:
         return 0.0, 0.0, depth, False
@@ -155,7 +154,7 @@ def seen_at(pose, lens, size, x, y, z):  # type: ignore[no-untyped-def]
 
 @inlined
 def interpolated(field, size, column, row):  # type: ignore[no-untyped-def]
-    """The value of an image at a place that it holds, between the centres of four pixels."""
+    """Bilinearly interpolated value of an image at a position inside it."""
     x, y = min(max(column - 0.5, 0.0), size[1] - 1.0), min(max(row - 0.5, 0.0), size[0] - 1.0)
     left, top = min(int(x), max(size[1] - 2, 0)), min(int(y), max(size[0] - 2, 0))
     right, low = min(left + 1, size[1] - 1), min(top + 1, size[0] - 1)
@@ -167,7 +166,7 @@ def interpolated(field, size, column, row):  # type: ignore[no-untyped-def]
 
 @functools.cache
 def follow_edges_kernel() -> Kernel:
-    """Fills what `follow_edges` returns, plane by plane."""
+    """Fills the results of `follow_edges`, plane by plane."""
     at = array_at(np.float64)
 
     @kernel("follow_edges", np.float64)
@@ -182,7 +181,7 @@ def follow_edges_kernel() -> Kernel:
             diagonals[v] = 1.0 / math.sqrt(float(sizes[v, 0] * sizes[v, 0] + sizes[v, 1] * sizes[v, 1]))
         for h in prange(offsets.size):
             normal, offset = normals[h], offsets[h]
-            # How steeply a camera looks at an edge: how far it stands beyond it, over its height.
+            # Inverse heights: a camera's offset beyond an edge, times this, is the tangent of its viewing angle.
             heights = np.empty(views)
             for v in range(views):
                 n, c = normal, centers[v]
@@ -204,7 +203,7 @@ def follow_edges_kernel() -> Kernel:
 
                 passing = out_x * x + out_y * y + out_z * z
                 steep = (out_x * own[0] + out_y * own[1] + out_z * own[2] - passing) * heights[source]
-                # Of its own camera's z, by which a ray grows in ones.
+                # `along` is the depth in the source camera, because rays have a camera z of 1.
                 own_pixel = max(along * math.sqrt(1.0 + steep * steep) * pixels[source], SMALLEST)
                 own_hidden = min(max(steep, 0.0), STEEPEST)
                 for v in range(views):
@@ -218,7 +217,8 @@ def follow_edges_kernel() -> Kernel:
                     steep = (out_x * c[0] + out_y * c[1] + out_z * c[2] - passing) * heights[v]
                     pixel = max(depth * math.sqrt(1.0 + steep * steep) * pixels[v], SMALLEST)
                     hidden = min(max(steep, 0.0), STEEPEST)
-                    # A doubt of one pixel in both views, on the plane; here one of this view is as large as `pixel`.
+                    # Inverse of a one-pixel uncertainty in both views, on the plane; this view's pixel is `pixel`
+                    # large.
                     doubt = diagonals[v] / math.sqrt(0.5 * (pixel * pixel + own_pixel * own_pixel))
                     field = at(addresses[v], 0, size[0] * size[1])
                     distances[h, v, p] = interpolated(field, size, column, row) * pixel * doubt
@@ -229,7 +229,7 @@ def follow_edges_kernel() -> Kernel:
 
 @functools.cache
 def overlaps_kernel() -> Kernel:
-    """Adds up what `overlaps` returns, plane by plane."""
+    """Accumulates the results of `overlaps`, plane by plane."""
     at = array_at(np.bool_)
 
     @kernel("mask_overlaps", np.float64, parallel=False)
@@ -265,7 +265,7 @@ def overlaps_kernel() -> Kernel:
 
 @functools.cache
 def sum_mirrored_kernel() -> Kernel:
-    """Fills what `sum_mirrored` returns, plane by plane."""
+    """Fills the results of `sum_mirrored`, plane by plane."""
 
     @kernel("sum_mirrored", np.float64, parallel=False)
     def add(normals, offsets, points, values, corner, cell, sums):  # type: ignore[no-untyped-def]

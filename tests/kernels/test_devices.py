@@ -98,12 +98,12 @@ def test_a_compiler_newer_than_the_driver_is_explained(
 ) -> None:
     gpu.setattr(torch.version, "cuda", "12.8")
     gpu.setattr(devices, "driver_version", lambda: 12040)
-    with pytest.raises(CudaUnavailableError, match=r"knows CUDA 12\.4, but the kernels' compiler is that of CUDA 13"):
+    with pytest.raises(CudaUnavailableError, match=r"supports CUDA 12\.4, but the kernels' compiler is for CUDA 13"):
         chosen_device("cuda")
     assert "pip install 'glassplat[cuda12]'" in str(cuda_problem())
     with caplog.at_level(logging.INFO):
         assert chosen_device("auto") == torch.device("cpu")
-    assert "the NVIDIA driver knows CUDA 12.4" in caplog.text
+    assert "the NVIDIA driver supports CUDA 12.4" in caplog.text
     gpu.setattr(devices, "bindings_major", lambda: 12)
     assert cuda_problem() is None
 

@@ -14,7 +14,7 @@ from glassplat.kernels.records import check_tensors
 
 
 class Update(NamedTuple):
-    """A parameter, what moves it and how far.
+    """A parameter with its gradient, moments and step size.
 
     Attributes:
         parameter: [N, ...] float32 or float64, contiguous; changed in place.
@@ -23,10 +23,10 @@ class Update(NamedTuple):
         second_moment: running mean of the squared gradient, as `parameter`, contiguous; changed in place.
         lr: learning rate, or one for each element of a row of the parameter, [columns] with columns the product of
             all dimensions after the first.
-        step: number of this step, from 1; the bias correction depends on it. A fraction where steps before it had other
+        step: number of this step, starting at 1, for the bias correction. It is fractional if earlier steps had other
             betas.
-        decay: [columns] by what the parameter is multiplied and added to its gradient, which is that of an L2 penalty
-            of half as much; None adds nothing.
+        decay: [columns] factors by which the parameter is added to its gradient, as of an L2 penalty of half the
+            weight; None adds none.
     """
 
     parameter: Tensor
@@ -50,7 +50,7 @@ CHANGED = ("parameter", "first_moment", "second_moment")
 def adam(updates: Sequence[Update], *, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15) -> None:
     """Takes one Adam step with bias correction, as `torch.optim.Adam` does; changes all but the gradients in place.
 
-    So is `decay` that optimiser's `weight_decay`: part of the gradient, and not taken off the parameter as by AdamW.
+    `decay` acts as that optimiser's `weight_decay`, through the gradient; AdamW instead shrinks the parameter itself.
 
     Args:
         updates: the parameters, all of one floating-point type and on one device, no two of them in the same memory.
@@ -80,7 +80,7 @@ def _check(update: Update, like: Tensor) -> None:
 
 
 def _flat(update: Update) -> Update:
-    """The same update of one row of elements each."""
+    """The same update with flattened tensors."""
     parameter, gradient, first, second, lr, step, decay = update
     return Update(
         parameter.view(-1), gradient.contiguous().view(-1), first.view(-1), second.view(-1), lr, step, decay

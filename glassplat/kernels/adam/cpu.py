@@ -1,4 +1,4 @@
-"""Adam on the CPU: one pass over parameters, gradients and moments, whatever their number."""
+"""Adam on the CPU: one parallel pass over all parameters, gradients and moments."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from glassplat.kernels.backend.cpu import Kernel, array_at, kernel
 from glassplat.kernels.records import REAL_OF
 
 BLOCK = 4096
-"""Elements per task, about: whole rows of a tensor whose columns have rates of their own."""
+"""Approximate number of elements per task: whole rows of a tensor whose columns have their own rates."""
 
 # Columns of the table of updates: addresses of the four tensors, their size, and the number of their step sizes.
 PARAMETER, GRADIENT, FIRST, SECOND, SIZE, COLUMNS = range(6)
 
 
 def adam(flat: Sequence[Update], betas: tuple[float, float], eps: float) -> None:
-    """Takes the updates, whose tensors are flat."""
+    """Performs the updates, whose tensors are flat."""
     real = REAL_OF[flat[0].parameter.dtype]
     table, step_sizes, roots = [], [], []
     weight_decays: list[float] = []
@@ -34,7 +34,7 @@ def adam(flat: Sequence[Update], betas: tuple[float, float], eps: float) -> None
         step_sizes += [rate * step_correction for rate in rates]
         weight_decays += [0.0] * len(rates) if update.decay is None else update.decay.tolist()
         roots.append(root)
-    # 1 - 0.999 loses half of its digits in single precision, so the gains are rounded from the double.
+    # 1 - 0.999 loses half of its digits in single precision, so the gains are computed in double and then rounded.
     decays, gains = tuple(real(b) for b in betas), tuple(real(1 - b) for b in betas)
     columns_of = np.array([step_sizes, weight_decays]).astype(real)
     adam_step(real)(np.array(table), columns_of, np.array(roots, real), decays, gains, real(eps))
@@ -42,12 +42,12 @@ def adam(flat: Sequence[Update], betas: tuple[float, float], eps: float) -> None
 
 @cache
 def adam_step(real: type) -> Kernel:
-    """Updates flat arrays in place; `columns` are step sizes and decays of those of each, which follow one another."""
+    """Updates flat arrays in place; `columns` holds the step sizes and decays of all tensors, concatenated."""
     at = array_at(real)
 
     @kernel("adam", real)
     def step(table, columns, roots, betas, gains, eps):
-        # What a task needs of its tensor: which tasks are before it, and step size and decay of each of its elements.
+        # Per tensor: the number of tasks before it, and step size and decay of each element of a task.
         count, known = table.shape[0], 0
         tasks, begins = np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64)
         for k in range(count):

@@ -1,4 +1,4 @@
-"""Adam on the GPU: one thread for each element, of several parameters at once, as many are small."""
+"""Adam on the GPU: one thread per element; a launch covers several parameters, because many are small."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from glassplat.kernels.records import REAL_OF
 
 THREADS = 256
 AT_ONCE = 5
-"""Parameters of one launch."""
+"""Parameters per launch."""
 NOTHING = (None, None, None, None, None, None, 0.0, 0.0)
-"""Stands for a parameter where there are fewer."""
+"""Arguments of an absent parameter, in a launch with fewer."""
 
 
 def adam(flat: Sequence[Update], betas: tuple[float, float], eps: float) -> None:
@@ -34,7 +34,7 @@ def adam(flat: Sequence[Update], betas: tuple[float, float], eps: float) -> None
 
 
 def _arguments(update: Update, betas: tuple[float, float]) -> tuple[Any, ...]:
-    """A parameter as the kernel takes it, in as few small operations as can be: each costs more than a small step."""
+    """Kernel arguments of a parameter, with as few tensor operations as possible: each costs more than a small step."""
     parameter, lr, decays, (rate, root) = update.parameter, update.lr, update.decay, update.corrections(betas)
     rates = None
     if isinstance(lr, Tensor):
@@ -48,9 +48,9 @@ def _arguments(update: Update, betas: tuple[float, float]) -> tuple[Any, ...]:
 
 @cache
 def adam_step(real: type) -> Kernel:
-    """Updates flat arrays in place; each begins with a block of its own, so that the threads of one agree.
+    """Updates flat arrays in place; each starts at a new block, so that all threads of a block take the same branch.
 
-    `rate` is the step size, times that of the column in `rates`.
+    The step size is `rate`, multiplied by the column's entry in `rates` if there are any.
     """
     one = "real1 real1 real1 real1 real1 real1 real real "
 

@@ -1,18 +1,18 @@
-"""Compilation and running of CPU kernels: the compiler's flags, the threads, the memory between steps.
+"""Compilation and execution of CPU kernels: compiler flags, threads, and memory kept between steps.
 
-Threads are OpenMP's where there are some, else those of Numba's own work queue. Left alone, Numba takes TBB wherever it
-finds one. TBB's waiting threads take the cores from PyTorch's pool, which makes training about twice as long, and when
-the process ends they may wait for each other forever. So TBB comes last, behind the work queue that is always there.
-Set NUMBA_THREADING_LAYER or NUMBA_THREADING_LAYER_PRIORITY to choose.
+Threads are OpenMP's if available, else those of Numba's own work queue. By default Numba prefers TBB. TBB's waiting
+threads take cores from PyTorch's pool, which makes training take about twice as long, and they may deadlock when the
+process exits. TBB therefore comes last, after the work queue, which is always available. Set NUMBA_THREADING_LAYER or
+NUMBA_THREADING_LAYER_PRIORITY to choose.
 
-What is freed stays at hand, up to a bound, where the C library can be told so. Images, packed splats and gradient rows
-are made anew in every step. glibc gives what is freed back to the system as soon as it is more than twice the largest
-of them, and the next step fetches it again page by page, 4 KiB at a time. Set MALLOC_TRIM_THRESHOLD_,
-MALLOC_MMAP_THRESHOLD_ or GLIBC_TUNABLES to choose.
+Freed memory is kept by the process, up to a bound, if the C library supports that. Images, packed splats and gradient
+rows are allocated again in every step. glibc returns freed memory to the system as soon as it exceeds twice the largest
+of them, and the next step faults it in again in pages of 4 KiB. Set MALLOC_TRIM_THRESHOLD_, MALLOC_MMAP_THRESHOLD_ or
+GLIBC_TUNABLES to choose.
 
 A `prange` gives each thread one contiguous run of tasks. Neighbouring Gaussians and tiles are alike (behind the camera,
-empty, crowded), so one thread would get most of the work. Taken with a stride that visits every task once
-(`even_stride`), any run of tasks is a sample of all of them. Which thread does a task never shows in the result.
+empty, crowded), so one thread would get most of the work. With a stride that visits every task once (`even_stride`),
+any run of tasks is a sample of all of them. Results do not depend on the thread that runs a task.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ from glassplat.kernels.backend.cpu_cache import KernelCache
 
 CHOSEN_BY_USER = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES")
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
-"""Numbers of the two parameters of glibc's `mallopt`."""
+"""Codes of two parameters of glibc's `mallopt`."""
 KEPT = 128 << 20
-"""Bytes of freed memory that a process keeps at the most."""
+"""Maximum of freed memory that a process keeps, in bytes."""
 LARGEST_RECYCLED = 32 << 20
-"""Bytes of the largest arrays that are taken from it, the most that glibc allows; larger ones go back when freed."""
+"""Maximum size of recycled arrays in bytes, as large as glibc allows; larger ones are returned when freed."""
 
 
 def keep_freed_memory() -> bool:
-    """Lets this process keep freed memory; False where the user decides, or the C library has no such choice."""
+    """Lets this process keep freed memory; False if the user has set it otherwise, or the C library cannot."""
     if any(name in os.environ for name in CHOSEN_BY_USER):
         return False
     try:
         mallopt = ctypes.CDLL(None).mallopt
-    except (OSError, AttributeError, TypeError):  # Not glibc, or not a system with one C library for all.
+    except (OSError, AttributeError, TypeError):  # Not glibc, or a system without one global C library.
         return False
     return bool(mallopt(TRIM_THRESHOLD, KEPT)) and bool(mallopt(MMAP_THRESHOLD, LARGEST_RECYCLED))
 
@@ -63,15 +63,15 @@ _alone = threading.Lock()
 
 
 def prefer_openmp() -> None:
-    """Puts TBB last, unless the user has said what comes first; before Numba starts its threads."""
+    """Puts TBB last, unless the user has set a priority; must run before Numba starts its threads."""
     if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
         numba.config.THREADING_LAYER_PRIORITY = PRIORITY
 
 
 @cache
 def threading_layer() -> str:
-    """Numba's threading layer, `omp`, `workqueue` or `tbb`; starts its threads, and says which, at the first call."""
-    prefer_openmp()  # Again: Numba reads its variables anew when the environment has changed.
+    """Numba's threading layer, `omp`, `workqueue` or `tbb`; the first call starts and logs its threads."""
+    prefer_openmp()  # Again: Numba re-reads its variables when the environment has changed.
     threads = numba.get_num_threads()
     layer = str(numba.threading_layer())
     log.info("kernels run on %d thread%s of %s", threads, "" if threads == 1 else "s", NAMES.get(layer, layer))
@@ -79,7 +79,7 @@ def threading_layer() -> str:
 
 
 def entrance(compiled: Callable[..., Any]) -> Callable[..., Any]:
-    """A parallel kernel as any thread may call it: the work queue ends the process when two threads are in it."""
+    """Wrapper of a parallel kernel that any thread may call: the work queue aborts if two threads enter it."""
     if threading_layer() != "workqueue":
         return compiled
 
@@ -95,14 +95,14 @@ prefer_openmp()
 keep_freed_memory()
 
 HOW = "".join(Path(__file__).with_name(name).read_text() for name in ("cpu.py", "cpu_vector.py"))
-"""This file and what operators on vectors mean, which no kernel names: with its own code, they decide whether the cache
-still holds."""
+"""Source of this file and of the vector operators, which kernels do not reference by name. It is part of the cache key,
+along with a kernel's own code."""
 
 # `nnan` and `ninf` stay out: with them a comparison with NaN is undefined, and culling bad Gaussians relies on it.
 FAST_MATH = frozenset({"contract", "reassoc", "nsz", "arcp", "afn"})
 
-# Forced, because the compiler balks at functions of many arrays, where a call costs more than the body. Without
-# reference counting too: one atomic increment per array and call, of counters that all threads share.
+# Inlining is forced, because the compiler declines functions of many arrays, whose call costs more than the body.
+# Reference counting is off: it costs an atomic increment per array and call, of counters that all threads share.
 inlined = register_jitable(
     forceinline=True, _nrt=False, no_cfunc_wrapper=True, fastmath=set(FAST_MATH), error_model="numpy"
 )
@@ -118,11 +118,11 @@ class Kernel:
         self._run: Callable[..., Any] = self._first_run if parallel else dispatcher
 
     def __call__(self, *arguments: Any) -> Any:
-        """Runs the kernel, compiled at the first call unless the disk has it."""
+        """Runs the kernel; the first call compiles it unless it is cached on disk."""
         return self._run(*arguments)
 
     def _first_run(self, *arguments: Any) -> Any:
-        """Starts the threads: only then it is known which they are, and how a parallel kernel may be entered."""
+        """Starts the threads, which determines the threading layer and how a parallel kernel may be entered."""
         self._run = entrance(self.dispatcher)
         return self._run(*arguments)
 
@@ -140,7 +140,7 @@ def kernel(name: str, real: type, *, parallel: bool = True) -> Callable[[Callabl
     Args:
         name: the operation and direction, such as `composite_forward`.
         real: `np.float32` or `np.float64`, part of the cached file's name.
-        parallel: whether the function holds a `prange`.
+        parallel: whether the function contains a `prange`.
     """
 
     def decorate(function: Callable[..., Any]) -> Kernel:
@@ -160,7 +160,7 @@ GOLDEN = 0.6180339887498949
 
 @inlined
 def even_stride(count):
-    """A stride near the golden section of `count` and coprime to it: task `t` does piece `t * stride % count`."""
+    """A stride near the golden section of `count` and coprime to it: task `t` processes item `t * stride % count`."""
     stride = max(1, int(count * GOLDEN))
     while True:
         a, b = count, stride
@@ -172,11 +172,10 @@ def even_stride(count):
 
 
 def array_at(real: type) -> Callable[..., Any]:
-    """The function that makes an array of type `real` of the `count` elements from `first` on behind an address.
+    """Builds `at(address, first, count)`: an array of `count` elements of type `real`, starting at index `first`.
 
-    `real` may be `np.bool_`, too.
-
-    Nothing keeps what lies there: the caller holds the tensors until the kernel has returned.
+    `real` may also be `np.bool_`. The array does not own its memory: the caller holds the tensors until the kernel has
+    returned.
     """
     kind = types.Array(numba.from_dtype(np.dtype(real)), 1, "C")
 

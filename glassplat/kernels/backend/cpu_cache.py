@@ -1,8 +1,8 @@
-"""The on-disk cache of compiled kernels: what makes a kernel the same as in an earlier process, and where it lies.
+"""On-disk cache of compiled kernels: keys that are stable across processes, and the folders that are used.
 
-Kernels are kept in the first of four folders that can be written: NUMBA_CACHE_DIR where it is set, `__pycache__` beside
-the kernel's source, the user's cache folder, and one in the folder for temporary files. What lies ready in one of them
-is used also where nothing can be written, as in a container whose kernels were compiled when it was built.
+Kernels are stored in the first writable one of four folders: NUMBA_CACHE_DIR if set, `__pycache__` next to the kernel's
+source, the user's cache folder, and one among the temporary files. Stored kernels are used even if no folder is
+writable, as in a container whose kernels were compiled when it was built.
 """
 
 from __future__ import annotations
@@ -40,25 +40,25 @@ class UserFolder(caching.UserWideCacheLocator):
 
     @classmethod
     def from_function(cls, py_func: Callable[..., Any], py_file: str) -> Any:
-        """The folder for a kernel; None where it cannot be written, or where a user without a home has none."""
-        # Without a home, `~` stays as it is, and a folder of that name would appear wherever the command runs.
+        """The folder for a kernel; None if it is not writable, or the user has no home directory."""
+        # Without a home directory `~` is not expanded, and a folder of that name would appear in the current one.
         return (
             super().from_function(py_func, py_file) if os.path.isabs(cls(py_func, py_file).get_cache_path()) else None
         )
 
 
 class TemporaryFolder(caching.InTreeCacheLocator):
-    """A folder among the temporary files that nobody else can write to, since what is in it will be executed."""
+    """A temporary folder that no other user can write to, because its contents are executed."""
 
     def get_cache_path(self) -> str:
         """The folder for the kernel's module."""
         return os.path.join(_temporary_root(), self.get_suitable_cache_subpath(self._py_file))
 
     def ensure_cache_path(self) -> None:
-        """Makes the folder.
+        """Creates the folder.
 
         Raises:
-            OSError: it cannot be written, or belongs to somebody else.
+            OSError: it is not writable, or belongs to another user.
         """
         root = Path(_temporary_root())
         root.mkdir(mode=0o700, exist_ok=True)
@@ -69,14 +69,14 @@ class TemporaryFolder(caching.InTreeCacheLocator):
 
 
 class Nowhere(caching.InTreeCacheLocator):
-    """The folder next to the source when none can be written: kernels are read from it, and saving fails."""
+    """The folder next to the source, if none is writable: kernels are read from it, and saving fails."""
 
     def ensure_cache_path(self) -> None:
-        """Leaves everything as it is; whether something can be saved shows when it is."""
+        """Does nothing; saving fails later if the folder is not writable."""
 
 
 class KernelFiles(caching.CompileResultCacheImpl):
-    """Files of compiled kernels, in the first folder that can be written."""
+    """Files of compiled kernels, in the first writable folder."""
 
     _locator_classes = (
         caching.UserProvidedCacheLocator,
@@ -87,9 +87,9 @@ class KernelFiles(caching.CompileResultCacheImpl):
     )
 
     def files(self, function: Callable[..., Any]) -> list[caching.IndexDataCacheFile]:
-        """The kernel's file in every folder, first the one that is written to."""
+        """The kernel's file in every folder; the first one is written to."""
         folders = [self.locator.get_cache_path()]
-        if not numba.config.CACHE_LOCATOR_CLASSES:  # Numba's own way to ask for one folder and no other.
+        if not numba.config.CACHE_LOCATOR_CLASSES:  # Numba's own setting for a single folder.
             kinds = [caching.InTreeCacheLocator, UserFolder]
             if numba.config.CACHE_DIR:
                 kinds.insert(0, caching.UserProvidedCacheLocator)
@@ -98,7 +98,7 @@ class KernelFiles(caching.CompileResultCacheImpl):
         return [caching.IndexDataCacheFile(folder, self.filename_base, stamp) for folder in dict.fromkeys(folders)]
 
     def remark(self) -> None:
-        """Says, once, when kernels are not kept where the user may expect them."""
+        """Logs once if kernels are not stored where the user may expect them."""
         folder = os.path.dirname(self.locator.get_cache_path())
         if isinstance(self.locator, TemporaryFolder):
             _warn_once(
@@ -115,7 +115,7 @@ class KernelFiles(caching.CompileResultCacheImpl):
             )
 
     def not_kept(self, reason: Exception) -> None:
-        """Says, once, that kernels will be compiled again in the next process."""
+        """Logs once that kernels will be compiled again in the next process."""
         _warn_once("cannot cache compiled kernels: %s; %s", str(reason), REMEDY)
 
 
@@ -129,29 +129,29 @@ def _temporary_root() -> str:
 
 
 def _user() -> int | None:
-    """The user's number; None where users have none."""
+    """The user's ID; None on systems without user IDs."""
     return os.getuid() if hasattr(os, "getuid") else None
 
 
 PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
 NAMED = (ModuleType, type, BuiltinFunctionType, np.ufunc)
 SPELLED = (types.Type, ir.Type)
-"""Types whose text says all about them."""
+"""Types that are fully described by their text."""
 LIBRARIES = ("numba", "numpy", "llvmlite")
 INTRINSIC = type(intrinsic(lambda typing: None))
 DAMAGE = (EOFError, pickle.UnpicklingError, AttributeError, ImportError, LookupError, TypeError, ValueError)
-"""What reading a file ends with that was cut short, or is another program's."""
+"""Exceptions on reading a file that is truncated, or was written by another program."""
 
 
 def fingerprint(function: Callable[..., Any], flags: str) -> str:
-    """Digest of everything a compiled function is made from.
+    """Digest of everything that a compiled function depends on.
 
-    That is its bytecode and constants, what it closes over, the globals that it reads, and the same of every function
-    among those. Equal sources give equal digests in every process.
+    That is its bytecode and constants, its closure, the globals that it reads, and the same for every function among
+    those. Equal sources give equal digests in every process.
 
     Args:
         function: a Python function, before compilation.
-        flags: the compiler options, written out.
+        flags: the compiler options as text.
 
     Raises:
         TypeError: the function uses a value that has no stable description.
@@ -163,7 +163,7 @@ def fingerprint(function: Callable[..., Any], flags: str) -> str:
 
 
 def _describe(value: Any, seen: set[int]) -> Iterator[str]:
-    """The value as text, part by part; functions are entered once."""
+    """The value as text, part by part; each function is described once."""
     if isinstance(value, PLAIN):
         yield f"{type(value).__name__} {value!r}"
     elif isinstance(value, tuple | frozenset):
@@ -186,7 +186,7 @@ def _describe(value: Any, seen: set[int]) -> Iterator[str]:
             seen.add(id(value))
             yield from _described_function(value, seen)
     elif type(value).__name__ == "_Intrinsic":
-        # What a kernel says to the compiler in its own words, in a function that Numba wraps.
+        # A Numba intrinsic, which is described by its definition.
         yield from _describe(value._defn, seen)
     else:
         raise TypeError(
@@ -215,12 +215,12 @@ def _globals_read(code: CodeType) -> set[str]:
 
 
 def kept_data(files: Iterable[caching.IndexDataCacheFile], key: Any) -> Any:
-    """Data kept under a key, from the first folder that has it; None where none has. Damaged files count as none."""
+    """Data stored under a key, from the first folder that has it; None if no folder has. Damaged files are skipped."""
     for file in files:
         try:
             data = file.load(key)
         except OSError:
-            continue  # A folder that is none, or that this user may not look into.
+            continue  # Not a folder, or not readable by this user.
         except DAMAGE as error:
             log.warning("%s cannot be read (%s); compiling again", file._index_path, error)
             continue
@@ -230,10 +230,10 @@ def kept_data(files: Iterable[caching.IndexDataCacheFile], key: Any) -> Any:
 
 
 def keep_data(file: caching.IndexDataCacheFile, key: Any, data: Any) -> None:
-    """Keeps something under a key; a damaged index, which cannot be added to, is begun anew.
+    """Stores data under a key; a damaged index, which cannot be extended, is replaced by a new one.
 
     Raises:
-        OSError: the folder cannot be written.
+        OSError: the folder is not writable.
     """
     try:
         file.save(key, data)
@@ -244,20 +244,20 @@ def keep_data(file: caching.IndexDataCacheFile, key: Any, data: Any) -> None:
 
 @cache
 def loading_context() -> CPUContext:
-    """Context for loading kernels that this process compiled, apart from the compiler's own."""
+    """Context for loading kernels that this process compiled, separate from the compiler's."""
     return CPUContext(cpu_target.typing_context, "cpu")
 
 
 class KernelCache(caching.FunctionCache):
-    """Numba's on-disk cache, under keys that hold across processes, with an announcement of each compilation, and with
-    the same kernel in the process that compiles it as in all others.
+    """Numba's on-disk cache, with keys that are stable across processes, and an announcement of each compilation. The
+    process that compiles a kernel runs the same machine code as all others.
 
-    Numba's own key pickles what a function closes over. Those bytes depend on which strings happen to be one object
-    in memory, so that another program that imports in another order compiles everything again.
+    Numba's own key pickles a function's closure. Those bytes depend on which strings happen to be the same object in
+    memory, so that a program with another import order would compile everything again.
 
-    The compiler optimises the body of a `prange` twice: by itself, and again as a part of the kernel. The process that
-    compiles would run the first result, those that load the kernel the second, and the two may round differently. So
-    what has been compiled is loaded from the disk like everything else.
+    The compiler optimises the body of a `prange` twice: by itself, and again as a part of the kernel. The compiling
+    process would run the first result, and processes that load the kernel the second; the two may round differently.
+    Compiled kernels are therefore always loaded from the disk.
     """
 
     _impl_class = KernelFiles
@@ -271,7 +271,7 @@ class KernelCache(caching.FunctionCache):
         self.compilations = 0
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The kernel for a signature from the first folder that has it; a damaged file counts as none."""
+        """The kernel for a signature from the first folder that has it; damaged files are skipped."""
         data = kept_data(self._files, self._index_key(sig, target_context.codegen()))
         return None if data is None else self._impl.rebuild(target_context, data)
 
@@ -279,16 +279,16 @@ class KernelCache(caching.FunctionCache):
         return sig, codegen.magic_tuple(), self._fingerprint
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The kernel for a signature; where the disk does not have it, the compiler runs first, which is announced."""
+        """The kernel for a signature; compiles it first, with an announcement, if it is not on disk."""
         found = super().load_overload(sig, target_context)
         if found is None:
             made = self._compile(sig)
-            # Without a place on the disk, what the compiler left has to do, but for its notes on time taken.
+            # If it could not be stored, the compiler's own result is used, without its timing metadata.
             found = super().load_overload(sig, loading_context()) or made._replace(metadata=None)
         return found
 
     def _compile(self, sig: Any) -> Any:
-        """Compiles the kernel and keeps it; goes on without when the disk refuses."""
+        """Compiles and stores the kernel; continues if it cannot be stored."""
         with announced_compilation(self._name_shown, "this machine"):
             dispatcher = self._compiled(self._function)
             dispatcher.compile(sig)
@@ -298,7 +298,7 @@ class KernelCache(caching.FunctionCache):
         return made
 
     def _keep(self, sig: Any, made: Any) -> None:
-        """Writes a compiled kernel to the disk; a damaged index, which cannot be added to, is begun anew."""
+        """Stores a compiled kernel on disk; a damaged index, which cannot be extended, is replaced by a new one."""
         try:
             try:
                 self.save_overload(sig, made)

@@ -1,8 +1,8 @@
-"""Vectors in CPU kernels: several numbers that one instruction computes with.
+"""SIMD vectors in CPU kernels: several numbers processed by one instruction.
 
-A kernel that uses them says itself what lies in one vector, where a loop leaves that to the compiler, and keeps sums in
-registers from one loop to the next. Vectors have one element type and a number of lanes, a power of two; LLVM splits
-what is wider than the machine's registers, so that a kernel means the same everywhere.
+A kernel that uses them chooses itself what a vector holds, instead of leaving that to the compiler's vectoriser, and
+keeps sums in registers across loops. Vectors have one element type and a power-of-two number of lanes. LLVM splits
+those wider than the machine's registers, so that a kernel means the same everywhere.
 
     full, load = vector_kind(np.float32, 8)
 
@@ -11,13 +11,13 @@ what is wider than the machine's registers, so that a kernel means the same ever
         for at in range(0, values.size, 8):
             store(values, at, load(values, at) * factor)
 
-Vectors take `+ - * /`, comparisons, which give masks, and unary minus; masks take `&` and `|`. The other operand of
-arithmetic may be a scalar of the same element type and of no other: a bare literal, which would be float64, does not
-compile. Sums and products may be fused, as everywhere in kernels. A comparison with NaN is false.
+Vectors support `+ - * /`, comparisons, which return masks, and unary minus; masks support `&` and `|`. The other
+operand of arithmetic may be a scalar of exactly the element type: a bare literal is float64 and does not compile with
+float32 vectors. Sums and products may be fused, as everywhere in kernels. A comparison with NaN is false.
 
 A row of four pixels with four channels is a vector of 16 lanes; with three channels it is 12 numbers, in vectors of 8
-and 4 lanes. What belongs to one thing lies next to each other in memory, the three coordinates of a place or its many
-coefficients; a vector holds one of these of several things.
+and 4 lanes. Memory holds all values of an item next to each other, such as the three coordinates of a point or its
+coefficients; a vector holds the same value of several items.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class MaskType(types.Type):
 
 
 def llvm_type(kind: VectorType) -> ir.VectorType:
-    """LLVM type of such vectors."""
+    """LLVM type of the vectors."""
     return ir.VectorType(ir.DoubleType() if kind.element == types.float64 else ir.FloatType(), kind.lanes)
 
 
@@ -80,7 +80,7 @@ class VectorKind(NamedTuple):
 
     Attributes:
         full: a scalar in every lane.
-        load: consecutive elements of a contiguous one-dimensional array, from an index on.
+        load: consecutive elements of a contiguous one-dimensional array, starting at an index.
     """
 
     full: Intrinsic
@@ -110,7 +110,7 @@ def vector_kind(real: type, lanes: int) -> VectorKind:
 
 
 def constant(real: type, values: tuple[float, ...]) -> Intrinsic:
-    """The function without arguments that gives a vector of these values."""
+    """Builds a function without arguments that returns a vector of these values."""
     kind = VectorType(types.float64 if real is np.float64 else types.float32, len(values))
 
     @intrinsic
@@ -122,9 +122,9 @@ def constant(real: type, values: tuple[float, ...]) -> Intrinsic:
 
 @intrinsic
 def item(typing, array, at):
-    """One element of a contiguous one-dimensional array, at an index that the caller knows not to be negative.
+    """One element of a contiguous one-dimensional array, at an index that must not be negative.
 
-    Between vectors, the arithmetic with which an ordinary index minds its sign is a good part of a loop.
+    Among vector operations, the sign check of an ordinary index takes a good part of a loop's time.
     """
 
     def generate(context, builder, sig, arguments):
@@ -137,7 +137,7 @@ def item(typing, array, at):
 
 @intrinsic
 def store(typing, array, at, value):
-    """Puts a vector into consecutive elements of a contiguous one-dimensional array, from index `at` on."""
+    """Stores a vector in consecutive elements of a contiguous one-dimensional array, starting at index `at`."""
 
     def generate(context, builder, sig, arguments):
         done = builder.store(arguments[2], _pointer(context, builder, sig, arguments, value))
@@ -150,7 +150,7 @@ def store(typing, array, at, value):
 
 @intrinsic
 def select(typing, mask, chosen, other):
-    """`chosen` where the mask holds, `other` elsewhere."""
+    """`chosen` where the mask is set, `other` elsewhere."""
     if isinstance(mask, MaskType) and isinstance(chosen, VectorType) and chosen == other:
         return plain(chosen, (mask, chosen, other), lambda builder, *arguments: builder.select(*arguments))
 
@@ -182,12 +182,12 @@ def _called(name: str) -> Intrinsic:
 absolute = _called("fabs")
 square_root = _called("sqrt")
 exp = _called("exp")
-"""e^x; a call for each lane, exact and slow."""
+"""e^x; one library call per lane, accurate and slow."""
 
 
 @intrinsic
 def fraction(typing, value):
-    """Fractional parts of numbers; undefined from 2^31 on."""
+    """Fractional parts of numbers; undefined for magnitudes of 2^31 and more."""
 
     def build(builder, x):
         whole = builder.fptosi(x, ir.VectorType(ir.IntType(32), value.lanes))
@@ -199,7 +199,7 @@ def fraction(typing, value):
 
 @intrinsic
 def times_power_of_2(typing, value, exponent):
-    """`value` times 2^n, where n is the exponent cut towards 0; undefined where the result is not a normal number."""
+    """`value` times 2^n, where n is the truncated exponent; undefined where the result is not a normal number."""
     if isinstance(value, VectorType) and value == exponent:
         return plain(value, (value, exponent), lambda builder, x, y: _times_power_of_2(builder, x, y, value))
 
@@ -225,7 +225,7 @@ def lowest_bit(typing, bits):
 
 @intrinsic
 def sums_of(typing, vectors):
-    """The vector of the sums over the lanes of as many vectors as it has lanes, in an order of adding that is fixed."""
+    """Sums over the lanes of n vectors of n lanes, as one vector; the order of addition is fixed."""
 
     def build(builder, packed):
         parts = [builder.extract_value(packed, i) for i in range(vectors.count)]
@@ -240,12 +240,12 @@ def sums_of(typing, vectors):
 
 
 def shuffle(builder: Any, a: Any, b: Any, order: Any) -> Any:
-    """Lanes of two vectors in a row, in some order, as one vector."""
+    """Lanes of two concatenated vectors, in a given order, as one vector."""
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(order)), list(order)))
 
 
 def _halve(builder: Any, a: Any, b: Any, groups: int) -> Any:
-    """Halves the lanes that hold each of the sums begun in two vectors, `groups` sums in either."""
+    """Halves the lanes of each partial sum in two vectors of `groups` sums each, and joins the two."""
     lanes = a.type.count
     width = lanes // groups
     near = [g * width + i for g in range(2 * groups) for i in range(width // 2)]
@@ -263,7 +263,7 @@ def _times_power_of_2(builder: Any, x: Any, exponent: Any, kind: VectorType) -> 
 
 
 def plain(result: Any, arguments: tuple[Any, ...], build: Callable[..., Any]) -> tuple[Any, Callable[..., Any]]:
-    """Result of an intrinsic that needs only the values of its arguments."""
+    """Signature and code generator of an intrinsic that needs only the values of its arguments."""
     return result(*arguments), lambda context, builder, sig, values: build(builder, *values)
 
 
@@ -363,7 +363,7 @@ ROW = 16
 
 @intrinsic
 def interleave(typing, vectors):
-    """Four vectors taken apart lane by lane: the first lanes of all four, then their second lanes, and so on.
+    """Interleaves four vectors: the first lanes of all four, then their second lanes, and so on.
 
     The result is four vectors again; `sorted_apart` undoes it.
     """
@@ -380,7 +380,7 @@ def interleave(typing, vectors):
 
 @intrinsic
 def sorted_apart(typing, vectors):
-    """Four vectors of which every fourth lane belongs together; undoes `interleave`."""
+    """Collects every fourth lane of four vectors; undoes `interleave`."""
 
     def build(builder, packed):
         rows = [builder.extract_value(packed, i) for i in range(4)]
@@ -400,7 +400,7 @@ def zip_lanes(builder: Any, a: Any, b: Any) -> tuple[Any, Any]:
 
 
 def _unzip_lanes(builder: Any, a: Any, b: Any) -> tuple[Any, Any]:
-    """The even lanes of two vectors in a row, and the odd ones."""
+    """Even and odd lanes of two concatenated vectors."""
     lanes = a.type.count
     return shuffle(builder, a, b, range(0, 2 * lanes, 2)), shuffle(builder, a, b, range(1, 2 * lanes, 2))
 
@@ -419,7 +419,7 @@ def without_fourths(typing, row):
 
 @intrinsic
 def with_fourths(typing, eight, four):
-    """A row of four pixels of which three channels are given, as `without_fourths` gives them; the fourth is zero."""
+    """A row of four pixels from three channels, as `without_fourths` returns them; the fourth is zero."""
 
     def build(builder, x, y):
         padded = shuffle(builder, y, y, [*range(4), *range(4)])
@@ -434,14 +434,14 @@ def with_fourths(typing, eight, four):
 
 @intrinsic
 def thirds(typing, first, second, third):
-    """Three vectors in a row that hold triples: their first numbers, their second and their third ones."""
+    """Splits triples, stored in three consecutive vectors, into their first, second and third numbers."""
 
     def build(builder, a, b, c):
         lanes = a.type.count
         columns = []
         for k in range(3):
             places = [3 * i + k for i in range(lanes)]
-            # From the first two vectors, 0 for what is in the third; then that from there.
+            # First the lanes from the first two vectors, with 0 as a placeholder; then those from the third.
             early = shuffle(builder, a, b, [place if place < 2 * lanes else 0 for place in places])
             late = [i if place < 2 * lanes else place - lanes for i, place in enumerate(places)]
             columns.append(shuffle(builder, early, c, late))
@@ -453,10 +453,7 @@ def thirds(typing, first, second, third):
 
 @intrinsic
 def triples(typing, first, second, third):
-    """Three vectors in a row that hold the triples of whose numbers these are the first, the second and the third ones.
-
-    Undoes `thirds`.
-    """
+    """Joins first, second and third numbers to triples in three consecutive vectors; undoes `thirds`."""
 
     def build(builder, a, b, c):
         lanes, rows = a.type.count, []
@@ -473,7 +470,7 @@ def triples(typing, first, second, third):
 
 @intrinsic
 def transpose(typing, rows):
-    """As many vectors as each has lanes, lane i of vector k being lane k of vector i."""
+    """Transposes n vectors of n lanes: lane i of vector k becomes lane k of vector i."""
 
     def build(builder, packed):
         parts = [builder.extract_value(packed, i) for i in range(rows.count)]
@@ -488,7 +485,7 @@ def transpose(typing, rows):
 
 
 def row_loader(real: type, lanes: int) -> Callable[..., Any]:
-    """The function that loads `lanes` vectors of an array, which begin `at` elements after as many positions in it."""
+    """Builds a function that loads `lanes` vectors of an array, each starting `at` elements after a given position."""
     kind = VectorType(types.float64 if real is np.float64 else types.float32, lanes)
     index = ir.IntType(64)
 
@@ -513,7 +510,7 @@ def row_loader(real: type, lanes: int) -> Callable[..., Any]:
 
 @intrinsic
 def store_all(typing, array, at, vectors):
-    """Puts vectors one after the other into a contiguous one-dimensional array, from index `at` on."""
+    """Stores vectors one after the other in a contiguous one-dimensional array, starting at index `at`."""
 
     def generate(context, builder, sig, arguments):
         data = context.make_array(sig.args[0])(context, builder, arguments[0]).data

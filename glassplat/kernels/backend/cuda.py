@@ -1,7 +1,7 @@
-"""Declaration, compilation and launch of CUDA kernels: one place for the flags and for what torch and Numba share.
+"""Declaration, compilation and launch of CUDA kernels: compiler flags, and the interface of torch and Numba.
 
-Memory, sorting and scans belong to torch; a kernel gets views of its tensors and runs on its current stream. Numba's
-own launch looks at each array for microseconds; here the arguments are written out as its calling convention wants.
+torch does memory, sorting and scans; a kernel gets views of its tensors and runs on its current stream. Numba's own
+launch spends microseconds on each array; here the arguments are packed directly in its calling convention.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ COMPILERS = (
     "nvidia-cuda-nvcc-cu12",
     "nvidia-nvjitlink-cu12",
 )
-"""Distributions that decide what the compiler makes."""
+"""Distributions whose versions affect the compiled code."""
 
 
 class MachineCode(NamedTuple):
@@ -94,9 +94,9 @@ log = logging.getLogger("glassplat.kernels")
 
 
 class ImageCache:
-    """The machine code of one kernel: from the disk, or from the compiler, which is announced.
+    """Machine code of one kernel: from the disk, or from the compiler, with an announcement.
 
-    It lies where compiled CPU kernels do (`cpu_cache`).
+    It is stored in the same folders as compiled CPU kernels (`cpu_cache`).
 
     Attributes:
         name: of the kernel.
@@ -108,7 +108,7 @@ class ImageCache:
         self._signature = signature
 
     def machine_code(self, capability: tuple[int, int]) -> MachineCode:
-        """The kernel for a compute capability (major, minor), compiled unless the disk has it."""
+        """The kernel for a compute capability (major, minor), compiled unless it is on disk."""
         folders, key = KernelFiles(self._function), self.key(capability)
         files = folders.files(self._function)
         found = kept_data(files, key)
@@ -127,12 +127,12 @@ class ImageCache:
         return made
 
     def key(self, capability: tuple[int, int]) -> str:
-        """Digest of the kernel's code and that of all functions it uses, its types, and whatever compiles it."""
+        """Digest of the code of the kernel and all functions it uses, its argument types, and the compiler versions."""
         return fingerprint(self._function, f"{self._signature} {capability} {compiler_versions()}")
 
 
 SLOT = 8
-"""Bytes that each argument has to itself."""
+"""Bytes reserved for each argument."""
 
 
 class LoadedKernel:
@@ -148,7 +148,7 @@ class LoadedKernel:
         Args:
             code: for the GPU.
             name: of the kernel.
-            index: of the GPU, as torch counts.
+            index: of the GPU, in torch's numbering.
             expected: the arguments.
         """
         self.name = name
@@ -156,7 +156,7 @@ class LoadedKernel:
             self._context = int(check_driver("cuCtxGetCurrent", driver.cuCtxGetCurrent()))
             self._library = ObjectCode.from_cubin(code.cubin, name=name)
             self._function = driver.CUfunction(int(self._library.get_kernel(code.entry).handle))
-        # Addresses and numbers lie in front, then a zero, then what is known of the shapes, which seldom change.
+        # Addresses and numbers come first, then a zero, then sizes and strides of the arrays, which seldom change.
         self._front = struct.Struct("<" + "".join(one.layout for one in expected))
         zero, behind = len(expected), len(expected) + 1
         places: list[int] = []
@@ -166,7 +166,7 @@ class LoadedKernel:
                 places.append(place)
                 continue
             count, each, *others = range(behind, behind + 2 + 2 * ndim)
-            # Two pointers that only host memory uses come first.
+            # The first two pointers are used for host memory only.
             places += (zero, zero, count, each, place, *others)
             self._sizes.append((struct.Struct(f"<{2 + 2 * ndim}q"), behind * SLOT, size))
             behind += 2 + 2 * ndim
@@ -175,7 +175,7 @@ class LoadedKernel:
         first = ctypes.addressof(self._memory)
         self._slots = (ctypes.c_void_p * len(places))(*(first + place * SLOT for place in places))
         self._address = ctypes.addressof(self._slots)
-        # The threads of a backward pass launch too, and the driver reads the arguments while others may run.
+        # Threads of a backward pass launch too, and the driver reads the arguments while other threads may run.
         self._lock = threading.Lock()
 
     def launch(
@@ -184,17 +184,17 @@ class LoadedKernel:
         """Queues the kernel.
 
         Args:
-            blocks: how many of them.
+            blocks: number of blocks.
             threads: in each block.
             stream: the address of a stream of the GPU's primary context.
-            values: each argument, of an array its address.
-            shapes: of the arrays; None for one that is not there.
+            values: the arguments; for an array, its address.
+            shapes: of the arrays; None for an absent one.
         """
         with self._lock:
             self._front.pack_into(self._memory, 0, *values)
             if shapes != self._shapes:
                 self._keep(shapes)
-            # A thread that has not used the GPU yet has no context, and one may be busy with another GPU.
+            # A thread that has not used the GPU yet has no context, and another may have that of another GPU.
             current = check_driver("cuCtxGetCurrent", driver.cuCtxGetCurrent())
             elsewhere = int(current) != self._context
             if elsewhere:
@@ -209,7 +209,7 @@ class LoadedKernel:
             check_driver(self.name, done)
 
     def _keep(self, shapes: Sequence[tuple[int, ...] | None]) -> None:
-        """Writes what has changed of the arrays: number and bytes of the elements, shape, strides."""
+        """Writes the fields of arrays with a new shape: number and bytes of the elements, shape, strides."""
         for shape, known, (layout, offset, size) in zip(shapes, self._shapes, self._sizes, strict=True):
             if shape == known:
                 continue
@@ -227,7 +227,7 @@ def _strides(shape: tuple[int, ...], size: int) -> tuple[int, ...]:
 
 
 def current_gpu(index: int) -> Any:
-    """A block in which a GPU's primary context, the one that torch uses too, is the current one."""
+    """Context manager that makes a GPU's primary context, which torch uses too, the current one."""
     return cuda.gpus[index]
 
 
@@ -255,7 +255,7 @@ SCALARS = {
     "double": types.float64,
 }
 FORMATS = {"bool": "?", "uint8": "B", "int16": "h", "int32": "i", "int64": "q", "float32": "f", "float64": "d"}
-"""How numbers are written to memory."""
+"""`struct` formats of the number types."""
 TOKEN = re.compile(r"([a-z]+)([1-4]?)")
 
 
@@ -278,10 +278,10 @@ class Kernel:
         self._simulated = cuda.jit(function) if SIMULATED else None
 
     def __call__(self, blocks: int, threads: int, *arguments: Any) -> None:
-        """Launches on torch's current stream of the tensors' device; does nothing for no blocks.
+        """Launches on torch's current stream of the tensors' device; does nothing for zero blocks.
 
         Args:
-            blocks: how many of them.
+            blocks: number of blocks.
             threads: in each block.
             arguments: contiguous tensors of one device, at least one, and numbers, in the order of the signature. None
                 stands for an array without elements.
@@ -294,7 +294,7 @@ class Kernel:
             own = (e.simulate(argument) for e, argument in zip(self._expected, arguments, strict=True))
             self._simulated[blocks, threads](*own)
             return
-        # Python takes longer over the arguments than the driver does for the launch: nothing is called without need.
+        # Python takes longer for the arguments than the driver for the launch, so function calls are kept to a minimum.
         values: list[Any] = []
         shapes: list[tuple[int, ...] | None] = []
         for argument, (type_, dtype, ndim, _) in zip(arguments, self._expected, strict=True):
@@ -312,13 +312,13 @@ class Kernel:
                 tensor = argument
         index = tensor.get_device()
         loaded = self._loaded.get(index) or self._on_device(index)
-        # The number that `torch.cuda.current_stream` makes an object of.
+        # The raw stream handle, which `torch.cuda.current_stream` would wrap in an object.
         loaded.launch(blocks, threads, torch._C._cuda_getCurrentRawStream(index), values, shapes)
 
     def _on_device(self, index: int) -> LoadedKernel:
         """The kernel on a GPU, loaded at first use."""
         if index not in self._loaded:
-            # Numba asks the current GPU about itself while it compiles, and torch's threads may have none.
+            # Numba queries the current GPU while it compiles, and torch's threads may have none.
             with current_gpu(index):
                 code = self._images.machine_code(torch.cuda.get_device_capability(index))
                 self._loaded[index] = LoadedKernel(code, self.name, index, self._expected)
@@ -342,7 +342,7 @@ class Expected(NamedTuple):
 
     @classmethod
     def of(cls, type_: Any) -> Expected:
-        """The argument of a Numba type."""
+        """The expected argument for a Numba type."""
         is_array = isinstance(type_, types.Array)
         element = str(type_.dtype if is_array else type_)
         dtype: torch.dtype = torch.bool if element == "bool" else getattr(torch, element)
@@ -365,7 +365,7 @@ class Expected(NamedTuple):
 
 
 def refusal(argument: Tensor, type_: Any) -> TypeError:
-    """The error for a tensor that is not the array which a kernel takes."""
+    """Error for a tensor whose type, rank or layout is not the one that a kernel expects."""
     return TypeError(f"got {argument.dtype} of shape {tuple(argument.shape)}, expected contiguous {type_}")
 
 
@@ -376,7 +376,7 @@ def kernel(name: str, real: type, arguments: str) -> Callable[[Callable[..., Non
         name: the operation and direction, such as `composite_forward`.
         real: `np.float32` or `np.float64`.
         arguments: the type of each argument: `bool`, `byte`, `short`, `int`, `long`, `float`, `double` or `real`, with
-            a digit for a C-contiguous array of so many dimensions: `"real2 int1 real"`.
+            a digit for a C-contiguous array of that number of dimensions: `"real2 int1 real"`.
     """
     full_name = f"{name}_{np.dtype(real).name}"
 
@@ -389,7 +389,7 @@ def kernel(name: str, real: type, arguments: str) -> Callable[[Callable[..., Non
 
 
 def blocks_for(items: int, threads: int) -> int:
-    """Blocks of so many threads that have a thread for each item."""
+    """Number of blocks of the given size that provide one thread per item."""
     return -(-items // threads)
 
 

@@ -1,4 +1,4 @@
-"""Devices: which one to use, and which kernels belong to the one that holds a tensor."""
+"""Devices: the choice of one, and the kernel modules for a tensor's device."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 
 COMPILER_LIBRARIES = ("nvvm", "nvrtc")
-"""Libraries without which Numba compiles nothing: the compiler, and the one that it asks for the known GPUs."""
+"""Libraries that Numba needs to compile: the compiler, and the one that lists the supported GPUs."""
 
 EXTRAS = {12: "glassplat[cuda12]", 13: "glassplat[cuda]"}
-"""What to install for each major version of CUDA."""
+"""Package to install for each major version of CUDA."""
 
 
 log = logging.getLogger("glassplat.kernels")
@@ -30,13 +30,13 @@ _compile_times: list[float] = []
 
 
 def compile_seconds() -> float:
-    """Seconds that this process has spent compiling kernels, which no later one will."""
+    """Seconds that this process has spent compiling kernels; later processes load them from the cache."""
     return sum(_compile_times)
 
 
 @contextmanager
 def announced_compilation(name: str, where: str) -> Iterator[None]:
-    """Says that a kernel is being compiled, and how long it took."""
+    """Logs that a kernel is being compiled, and how long it took."""
     log.info("compiling %s for %s (first use only, then cached on disk) ...", name, where)
     started = time.perf_counter()
     yield
@@ -45,12 +45,12 @@ def announced_compilation(name: str, where: str) -> Iterator[None]:
 
 
 def has_numba_cuda() -> bool:
-    """Return whether the package is there that all CUDA kernels need."""
+    """Return whether numba-cuda, which all CUDA kernels need, is installed."""
     return importlib.util.find_spec("numba_cuda") is not None
 
 
 def install_hint() -> str:
-    """Hint how to install numba-cuda."""
+    """Hint on installing numba-cuda."""
     return "the CUDA kernels need numba-cuda; run `pip install 'glassplat[cuda]'` or use --device cpu"
 
 
@@ -60,13 +60,13 @@ def toolchain_problem() -> str | None:
         return install_hint()
     major = bindings_major()
     if major is None:
-        return "numba-cuda is there, but not cuda-bindings; run `pip install 'glassplat[cuda]'` or use --device cpu"
+        return "numba-cuda is installed, but not cuda-bindings; run `pip install 'glassplat[cuda]'` or use --device cpu"
     driver = driver_version()
     # Machine code of one major version of CUDA runs on every driver of that version and of later ones, on no other.
     if driver // 1000 < major:
         return (
-            f"the NVIDIA driver knows CUDA {driver // 1000}.{driver % 1000 // 10}, but the kernels' compiler is that "
-            f"of CUDA {major}; update the driver, or {_other_compiler(driver // 1000)}, or use --device cpu"
+            f"the NVIDIA driver supports CUDA {driver // 1000}.{driver % 1000 // 10}, but the kernels' compiler is for "
+            f"CUDA {major}; update the driver, or {_other_compiler(driver // 1000)}, or use --device cpu"
         )
     missing = [f"lib{name}" for name in COMPILER_LIBRARIES if not has_library(name)]
     if missing:
@@ -76,7 +76,7 @@ def toolchain_problem() -> str | None:
 
 
 def bindings_major() -> int | None:
-    """The version of CUDA that cuda-bindings, and with it the compiler, is made for; None where it is missing."""
+    """The major version of CUDA that cuda-bindings and the compiler are built for; None if not installed."""
     try:
         return int(version("cuda-bindings").partition(".")[0])
     except PackageNotFoundError:
@@ -84,7 +84,7 @@ def bindings_major() -> int | None:
 
 
 def driver_version() -> int:
-    """The newest CUDA that the NVIDIA driver knows, as 1000 times the major plus 10 times the minor version."""
+    """The newest CUDA that the NVIDIA driver supports, as 1000 times the major plus 10 times the minor version."""
     from cuda.bindings import driver
 
     return int(driver.cuDriverGetVersion()[1])
@@ -114,7 +114,7 @@ SIMULATED = os.environ.get("NUMBA_ENABLE_CUDASIM", "0") not in ("", "0")
 
 
 class CudaUnavailableError(RuntimeError):
-    """An NVIDIA GPU was asked for, and something that it needs is missing; the message says what to do."""
+    """An NVIDIA GPU was requested, but something that it needs is missing; the message gives the remedy."""
 
 
 def kernels_for(operation: str, device: torch.device) -> Any:
@@ -122,7 +122,7 @@ def kernels_for(operation: str, device: torch.device) -> Any:
 
     Args:
         operation: name of the operation's folder in `kernels/`, which holds `cpu.py` and `cuda.py`.
-        device: where the operation's tensors are, the CPU or an NVIDIA GPU.
+        device: device of the operation's tensors, the CPU or an NVIDIA GPU.
 
     Raises:
         CudaUnavailableError: the tensors are on a GPU, and its kernels cannot be used.
@@ -138,11 +138,11 @@ def _module(operation: str, folder: str) -> Any:
 
 
 def chosen_device(name: DeviceName | torch.device) -> torch.device:
-    """The device for a name of the command line; `auto` is the GPU where it can be used. Says which in the log.
+    """The device for a name from the command line; `auto` is the GPU if it can be used. Logs the choice.
 
     Raises:
-        CudaUnavailableError: `cuda` was asked for and cannot be used.
-        ValueError: the name is none of these.
+        CudaUnavailableError: `cuda` was requested but cannot be used.
+        ValueError: the name is not one of these.
     """
     import torch
 
