@@ -1,4 +1,4 @@
-"""Scalar maths of blending: how much a splat covers a pixel, and which rows of an image it can reach.
+"""Scalar maths of blending: the coverage of a pixel by a splat, and the image rows that a splat can reach.
 
 Every function is pure and typed by its factory, so that one source compiles for the CPU and for CUDA.
 """
@@ -16,9 +16,9 @@ from glassplat.kernels.backend.cpu import inlined
 ALPHA_MIN = 1.0 / 255.0
 """Coverage below this is ignored."""
 ALPHA_MAX = 0.99
-"""Coverage is clamped here, so that one splat never takes all the light."""
+"""Upper bound of coverage, so that no single splat blocks all light."""
 TRANSMITTANCE_MIN = 1e-4
-"""A pixel stops before the splat that would take its transmittance below this."""
+"""Blending of a pixel stops before the splat that would reduce its transmittance below this."""
 
 # Minimax polynomial of 2^f for f in [-1, 0] with 2^0 = 1 exactly; relative error 2.4e-7 in float32.
 EXP2_COEFFICIENTS = (1.0, 0.693143721, 0.240180143, 0.0552973572, 0.00920579680, 0.000944903083)
@@ -32,8 +32,8 @@ class BlendMaths(NamedTuple):
     Attributes:
         exp2: 2^t for t <= 0. NaN and anything below -80 give 2^-80, which is far below `ALPHA_MIN`.
         screen_form: a conic scaled so that a Gaussian falls off as 2^(quadratic form of the offset).
-        vertical_reach: distance in rows from its centre at which a splat's coverage sinks to `ALPHA_MIN`;
-            negative where it reaches nothing.
+        vertical_reach: distance in rows from its centre at which a splat's coverage drops to `ALPHA_MIN`; negative if
+            it reaches no pixel.
         row_range: first and one-past-last of the rows 0 .. count - 1 that a splat reaches.
     """
 
@@ -55,7 +55,7 @@ def _fast_exp2(real: type) -> Scalar:
 
     @inlined
     def exp2(t):  # type: ignore[no-untyped-def]
-        # This order of the comparison sends NaN to the lowest value too.
+        # This order of the comparison maps NaN to the lowest value too.
         t = t if t > lowest else lowest
         # Truncation towards zero is one vector instruction; math.floor would widen to 64 bits.
         whole = np.int32(t)
@@ -99,7 +99,7 @@ def _vertical_reach(real: type) -> Scalar:
         xx, xy = np.float64(conic_xx), np.float64(conic_xy)
         determinant = xx * np.float64(conic_yy) - xy * xy
         visible = inverse_alpha_min * opacity
-        # Written so that NaN anywhere ends in "reaches nothing".
+        # Written so that any NaN results in "reaches nothing".
         if not (determinant > 0.0 and conic_xx > zero and one < visible < endless):
             return nothing
         return real(math.sqrt(two * math.log(visible) * real(xx / determinant))) + slack

@@ -1,8 +1,8 @@
-"""Scalar maths of a cube map: which face a direction meets, where on it, which texels meet at an edge, and mirroring.
+"""Scalar maths of a cube map: face and position of a direction, neighbouring texels across edges, and mirroring.
 
-Every function is pure and compiles for the CPU and for CUDA, typed by its factory where it needs that. Face 2 a + s is
-the one of axis a, on the negative side for s = 1; its columns run along axis a + 1 and its rows along a + 2 (mod 3).
-Cells are texels of faces that are padded by a ring of their neighbours' texels: texel i is cell i + 1.
+Every function is pure and compiles for the CPU and for CUDA, typed by its factory where needed. Face 2 a + s belongs to
+axis a, on the negative side for s = 1; its columns run along axis a + 1 and its rows along a + 2 (mod 3). Cells are
+texels of faces padded by a ring of their neighbours' texels: texel i is cell i + 1.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ class CubeMaths(NamedTuple):
 
     Attributes:
         on_face: (axis, face, u, v, 1 / |largest coordinate|) of a direction x, y, z; u and v in [-1, 1].
-        from_face: gradient of x, y, z from those of u and v, given what `on_face` returned.
-        cell: first of the two cells that u or v lies between, and its fraction of the way to the second one. The cell
-            exists whatever the value; the fraction is NaN where the value is.
-        between: value of the bilinear filter between two cells of a row and the two below them, at the fractions along
-            the row and down.
+        from_face: gradient of x, y, z from those of u and v, given the result of `on_face`.
+        cell: first of the two cells around u or v, and the fraction of the way to the second one. The cell is valid for
+            every value; the fraction of NaN is NaN.
+        between: bilinear interpolation of two cells of a row and the two below them, at the fractions along the row and
+            down.
         slopes: its derivatives with respect to these fractions.
         logistic: 1 / (1 + exp(-x)).
     """
@@ -114,7 +114,7 @@ def _logistic(real: type) -> Scalar:
     def logistic(x):  # type: ignore[no-untyped-def]
         small = exp2(-abs(x) * bits)
         value = (one if x >= zero else small) / (one + small)
-        # `exp2` takes NaN for a very small number.
+        # `exp2` treats NaN as a very small number.
         return value if x == x else x
 
     return logistic
@@ -163,7 +163,7 @@ def lookup_maths(real: type) -> tuple[Scalar, Scalar]:
 
 
 TWO = np.float32(2.0)
-"""In single precision, which holds it exactly, so that it widens nothing."""
+"""In single precision, where it is exact, so that it does not promote float32."""
 
 
 @inlined
@@ -191,5 +191,5 @@ def over_column(face, side, row, size):  # type: ignore[no-untyped-def]
 
 @inlined
 def over_row(face, side, column, size):  # type: ignore[no-untyped-def]
-    """The same next to `column`, beyond the last or before the first row."""
+    """The same for the texel next to `column`, after the last or before the first row."""
     return 2 * ((face // 2 + 2) % 3) + side, column, (1 - face % 2) * (size - 1)

@@ -1,11 +1,12 @@
-"""Scalar maths of discs on screen (2DGS): where a pixel's ray meets a disc, the region it covers, and the adjoints.
+"""Scalar maths of discs on screen (2DGS): intersection with a pixel's ray, the covered region, and the adjoints.
 
-A disc is its centre m and two tangents p, q of unit length in camera space, with the deviations s_u, s_v along them.
-The ray through the pixel at offset (dx, dy) from the centre's own pixel meets its plane at m + u s_u p + v s_v q with
+A disc has a centre m and two unit tangents p, q in camera space, with the standard deviations s_u, s_v along them. The
+ray through the pixel at offset (dx, dy) from the projected centre meets its plane at m + u s_u p + v s_v q with
 
     u = (u_x dx + u_y dy) / e,   v = (v_x dx + v_y dy) / e,   e = 1 + w_x dx + w_y dy,   depth = m_z / e
 
-Measured from the centre, none of these cancels, however small the disc. The six numbers are its *map*.
+Relative to the centre, none of these suffers from cancellation, however small the disc. The six numbers u_x, u_y, v_x,
+v_y, w_x, w_y are its *map*.
 
 Every function is pure and, if it has constants, typed by its factory: one source compiles for the CPU and for CUDA.
 """
@@ -22,11 +23,11 @@ from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
 from glassplat.kernels.maths.projection import along, blend, cross, dot, scaled_sum
 
 EDGE_ON = 1e-3
-"""Cosine between ray and normal below which a disc is seen from its edge and not met."""
+"""Cosine between ray and normal below which a disc is seen edge-on and not intersected."""
 MOST_LOG_SCALE = 40.0
-"""Beyond, squares of deviations and of their inverses leave the range of float32."""
+"""Maximum magnitude of a log scale: beyond it, squared deviations or their inverses leave the range of float32."""
 MOST_DEVIATIONS = 3.0
-"""Distance from its centre, in standard deviations, at which a Gaussian ends (EnvGS, Section 4.2)."""
+"""Distance from its centre, in standard deviations, at which a Gaussian is cut off (EnvGS, Section 4.2)."""
 
 
 class RayHitMaths(NamedTuple):
@@ -90,10 +91,10 @@ def _ellipsoid(real: type) -> RayHitMaths:
 
     @inlined
     def across(q, f, length):  # type: ignore[no-untyped-def]
-        """Part of q at right angles to the ray: all of it, apart from rounding.
+        """Component of q perpendicular to the ray: all of q, apart from rounding.
 
-        Across a thin ellipsoid q is a difference of numbers as large as the inverse of its thickness, and gradients
-        multiply what rounding leaves of it by as much again.
+        Across a thin ellipsoid q is a difference of numbers as large as the inverse of its thickness. Gradients
+        multiply its rounding error by the same factor again.
         """
         return blend(one, q, -dot(q, f) / length, f)
 
@@ -111,9 +112,9 @@ def _ellipsoid(real: type) -> RayHitMaths:
     def meet_gradient(offset, d, frame, t, q, v_t, v_squared):  # type: ignore[no-untyped-def]
         e, f = along(offset, frame[0], frame[1], frame[2]), along(d, frame[0], frame[1], frame[2])
         length = dot(f, f)
-        # The first time leaves what is rounded of the rest itself.
+        # Repeated, because the first projection leaves a rounding error of its own.
         q = across(q, f, length)
-        # |q| does not change with t, which is where it is least.
+        # The derivative of |q| with respect to t is zero, because t minimises |q|.
         by_t = v_t / length
         v_e = blend(-two * v_squared, q, by_t, f)
         v_f = blend(two * v_squared * t, q, by_t, (e[0] - two * t * f[0], e[1] - two * t * f[1], e[2] - two * t * f[2]))
@@ -126,11 +127,11 @@ def _ellipsoid(real: type) -> RayHitMaths:
 
 
 LOW_PASS = math.sqrt(0.5)
-"""Standard deviation in pixels of the falloff around its centre on screen that a disc has at least (2DGS, Eq. 11)."""
+"""Standard deviation in pixels of the screen-space low-pass filter around a disc's centre (2DGS, Eq. 11)."""
 MAP = 6
-"""Numbers of a map: u_x, u_y, v_x, v_y, w_x, w_y."""
+"""Number of values in a map: u_x, u_y, v_x, v_y, w_x, w_y."""
 SLACK = 1.002
-"""By how much an outline is wider than what it encloses, so that no pixel is lost to rounding."""
+"""Factor by which an outline is wider than the region it encloses, so that no pixel is lost to rounding."""
 
 
 class DiscMaths(NamedTuple):
@@ -138,7 +139,7 @@ class DiscMaths(NamedTuple):
 
     Attributes:
         crossed: (q x m, m x p, p x q) from tangents and centre.
-        faces: whether a disc is seen from anywhere but its edge, from p x q and the centre.
+        faces: whether a disc is not seen edge-on, from p x q and the centre.
         map_of: the map from crossed vectors, centre, inverse deviations and focal lengths.
         map_gradient: gradients of tangents, centre and the logarithms of the deviations from those of the map.
     """
@@ -214,7 +215,7 @@ def _map_gradient(real: type) -> Scalar:
 
 @inlined
 def reach(opacity):  # type: ignore[no-untyped-def]
-    """Squared deviations up to which a disc of some opacity is met; negative where nowhere."""
+    """Squared distance, in standard deviations, up to which a disc of this opacity is visible; negative for none."""
     visible = np.float64(opacity) / ALPHA_MIN
     if not visible > 1.0:
         return -1.0
@@ -223,7 +224,7 @@ def reach(opacity):  # type: ignore[no-untyped-def]
 
 @inlined
 def _clamped_ellipse(xx, xy, yy, least):  # type: ignore[no-untyped-def]
-    """An ellipse {d : d^T S^-1 d <= 1}, none of its half axes shorter than the root of `least`, and a little wider."""
+    """An ellipse {d : d^T S^-1 d <= 1}, with half axes of at least the root of `least`, widened by `SLACK`."""
     middle, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
     apart = math.sqrt(half * half + xy * xy)
     large, small = max(middle + apart, least), max(middle - apart, least)
@@ -237,11 +238,11 @@ def _clamped_ellipse(xx, xy, yy, least):  # type: ignore[no-untyped-def]
 
 @inlined
 def outline(found, opacity, nearest, near, width, height):  # type: ignore[no-untyped-def]
-    """An ellipse that encloses what the disc covers: (dx, dy, xx, xy, yy, half width, half height).
+    """An ellipse that encloses the region covered by the disc: (dx, dy, xx, xy, yy, half width, half height).
 
-    Its centre is an offset from the disc's, and its conic such that opacity exp(-q / 2) falls to 1/255 on it. A conic
-    of zeros is the whole image: the disc crosses the near plane. `nearest` is the smallest depth of what the disc
-    covers.
+    Its centre is an offset from the disc's, and its conic is scaled such that opacity exp(-q / 2) is 1/255 on it. A
+    conic of zeros means the whole image, for a disc that crosses the near plane. `nearest` is the smallest depth in the
+    region.
     """
     squared = reach(opacity)
     u_x, u_y, v_x, v_y = np.float64(found[0]), np.float64(found[1]), np.float64(found[2]), np.float64(found[3])
@@ -264,13 +265,13 @@ def outline(found, opacity, nearest, near, width, height):  # type: ignore[no-un
 
 @inlined
 def box(m, p, q, deviations, squared, near, fx, fy):  # type: ignore[no-untyped-def]
-    """(left, right, top, bottom), pixels from the principal point, of what a disc covers that crosses the near plane.
+    """Bounds (left, right, top, bottom) of a disc that crosses the near plane, in pixels from the principal point.
 
-    These are the corners of a rectangle in the disc's plane, one side of it along the depth, cut off at the near plane.
+    They enclose a rectangle in the disc's plane, with one side along the depth gradient, clipped at the near plane.
     """
     a, b = np.float64(p[2] * deviations[0]), np.float64(q[2] * deviations[1])
     steepness, depth, reach = math.sqrt(a * a + b * b), np.float64(m[2]), math.sqrt(squared)
-    # However near the plane, what lies on it does not project.
+    # However close the near plane, points at depth zero do not project.
     first, last = -reach, reach
     if steepness > 0.0:
         first = max(-reach, (max(near, 1e-6 * depth) - depth) / steepness)
@@ -308,6 +309,6 @@ def meet_maths(real: type) -> Scalar:
 
 @inlined
 def meet_slopes(found, g_u, g_v, g_e):  # type: ignore[no-untyped-def]
-    """The gradient of the offset from those of what `meet` gives."""
+    """The gradient of the offset from those of the results of `meet`."""
     u_x, u_y, v_x, v_y, w_x, w_y = found
     return g_u * u_x + g_v * v_x + g_e * w_x, g_u * u_y + g_v * v_y + g_e * w_y

@@ -1,6 +1,6 @@
-"""Scalar maths that a GPU has instructions for. The simulator, which has none of them, takes the plain form.
+"""Scalar maths with dedicated GPU instructions. The simulator, which lacks them, uses the plain formulas.
 
-Two are a little less exact than the plain form, and replace it in float32 only.
+Two are slightly less accurate than the plain formula, and replace it in float32 only.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def fused_maths() -> Scalar:
 
 
 def exp2_maths(real: type) -> Scalar:
-    """Builds 2^t. In float32 within two units in the last place; 0 where that is below the smallest normal number."""
+    """Builds 2^t. In float32 within two units in the last place; 0 for results below the smallest normal number."""
     if SIMULATED or real is not np.float32:
         return blend_maths(real).exp2
     return _instruction("ex2.approx.ftz.f32")
@@ -51,8 +51,8 @@ def reciprocal_maths(real: type) -> Scalar:
 
 
 def _instruction(name: str) -> Scalar:
-    """One instruction of PTX that takes a float32 and gives one."""
-    # The simulator has neither.
+    """A PTX instruction from float32 to float32."""
+    # Unavailable in the simulator.
     from llvmlite import ir
     from numba.cuda.extending import intrinsic
 

@@ -29,7 +29,7 @@ SH_CONSTANTS = (
 
 
 def check_sh_degree(sh_degree: int, coefficients: int) -> None:
-    """Raises ValueError where a degree is out of range, or needs more coefficients than there are; none are fine."""
+    """Raises ValueError if a degree is out of range or needs more coefficients than given; 0 coefficients are fine."""
     if not 0 <= sh_degree <= MAX_DEGREE or (coefficients and coefficients < (sh_degree + 1) ** 2):
         raise ValueError(
             f"sh_degree is {sh_degree}, but degrees go from 0 to {MAX_DEGREE} and sh holds {coefficients} coefficients"
@@ -56,7 +56,7 @@ def color_maths(real: type) -> ColorMaths:
 
 
 def harmonic_basis(real: type) -> Callable[..., Any]:
-    """The function of a unit direction (x, y, z) that gives all 16 harmonics."""
+    """Builds the function that returns all 16 harmonics of a unit direction (x, y, z)."""
     c0, c1, c_xy, c_zz, c_xx, c_yxx, c_xyz, c_yzz, c_zzz, c_zxx = (real(c) for c in SH_CONSTANTS)
     two, three, four = real(2.0), real(3.0), real(4.0)
 
@@ -86,9 +86,9 @@ def harmonic_basis(real: type) -> Callable[..., Any]:
 
 
 def channel_with(take: Callable[..., Any]) -> Callable[..., Any]:
-    """One of three colours from harmonics, of numbers or of vectors.
+    """Builds the function that evaluates one colour channel from harmonics, for scalars or vectors.
 
-    `take(sh, n, k, c)` reads colour c of coefficient k.
+    `take(sh, n, k, c)` reads channel c of coefficient k.
     """
 
     # Tuples are indexed by constants only: a variable index compiles to a switch.
@@ -110,10 +110,10 @@ def channel_with(take: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def color_gradient_with(real: type, put: Callable[..., Any], v_basis: Callable[..., Any]) -> Callable[..., Any]:
-    """The adjoint of three colours, of numbers or of vectors; it returns the gradient of the direction.
+    """Builds the adjoint of three colour channels, for scalars or vectors; it returns the gradient of the direction.
 
-    `put(g_sh, at, k, b, g)` takes the gradient of coefficient k, whose harmonic is b, for gradients g of the colours;
-    `v_basis(sh, n, k, g)` is the gradient of that harmonic.
+    `put(g_sh, at, k, b, g)` stores or adds the gradient of coefficient k, from its harmonic b and the gradients g of
+    the channels; `v_basis(sh, n, k, g)` returns the gradient of that harmonic.
     """
     first, second, third = _direction_gradients(real)
 

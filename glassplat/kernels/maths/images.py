@@ -1,4 +1,4 @@
-"""Maths of images: sRGB as photographed and linear radiance, and the sums of SSIM."""
+"""Maths of images: conversion between sRGB and linear radiance, and the sums of SSIM."""
 
 from __future__ import annotations
 
@@ -121,8 +121,8 @@ class SsimMaths(NamedTuple):
 
     Attributes:
         blur: weighted sum of 11 values of an array, `step` apart, the first of them at `at`.
-        compare: similarity of two pixels a and b (Wang et al. 2004, Eq. 13), and its slopes by the blurred a, by the
-            blurred sum of squares a^2 + b^2 and by the blurred product a b, from those and the blurred b.
+        compare: similarity of two pixels a and b (Wang et al. 2004, Eq. 13), and its derivatives with respect to the
+            blurred a, the blurred sum of squares a^2 + b^2 and the blurred product a b, from these and the blurred b.
     """
 
     blur: Scalar

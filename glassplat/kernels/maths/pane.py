@@ -1,4 +1,4 @@
-"""Scalar maths of a flat pane: where rays meet it, and how strongly it reflects.
+"""Scalar maths of a flat pane: its reflectance, and the blending of transmission and reflection.
 
 Rays are (x, y, 1) in the camera frame. Every function is pure and typed by its factory, so that one source compiles for
 the CPU and for CUDA.
@@ -15,16 +15,16 @@ from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.images import color_space_maths
 
 LAWS: tuple[Fresnel, ...] = get_args(Fresnel)
-"""Kernels are given a law as its position here."""
+"""Kernels receive a law as its index in this tuple."""
 PANE, SCHLICK = LAWS.index("pane"), LAWS.index("schlick")
 
 LEAST_COSINE = 1e-6
-"""Two surfaces are not asked for more grazing rays: a pane that reflects nothing would divide 0 by 0."""
+"""Lower bound of the cosine for two surfaces: below it, a pane that reflects nothing would divide 0 by 0."""
 
 DARKEST = 0.05
-"""sRGB value from which on the slope of linear light is taken to grow as the value, as of a gamma of 2."""
+"""sRGB value above which the derivative of linear light is treated as proportional to it, as for a gamma of 2."""
 MOST_HELD = 2.0
-"""Times what a pane adds, up to which a transmission may hold the edges of a reflection."""
+"""Largest ratio s of `kernels.panes.gradient_conflict` with full weight; the weight falls to 0 at twice the ratio."""
 
 
 class PaneMaths(NamedTuple):
@@ -71,12 +71,12 @@ def pane_maths(real: type) -> PaneMaths:
 
 
 def counting(real: type) -> Scalar:
-    """The weight of a cell of shared edges; `kernels.panes.gradient_conflict` gives the reason."""
+    """Builds the weighting of a cell of shared edges; `kernels.panes.gradient_conflict` explains it."""
     zero, one, two, most = real(0.0), real(1.0), real(2.0), real(MOST_HELD)
 
     @inlined
     def counted(edges, held, full, is_told):  # type: ignore[no-untyped-def]
-        """The cell's part of the sum, and its derivative by the edges; the weight of the cell is constant."""
+        """The cell's contribution to the sum, and its derivative by the edges; the weight counts as constant."""
         weight = one
         if is_told and held != zero:
             weight = min(max(two - abs(held) / (most * full), zero), one)
@@ -87,17 +87,17 @@ def counting(real: type) -> Scalar:
 
 
 def mixing(real: type) -> tuple[Scalar, Scalar]:
-    """Blending of one channel of a pixel, sRGB, with what a pane mirrors there; and its adjoint.
+    """Builds the blending of one sRGB channel of a pixel with the pane's reflection, and its adjoint.
 
-    `share` is how strongly the pane reflects, `gain` the intensity of the reflection, and `linear` says whether light
-    is blended rather than sRGB values.
+    `share` is the pane's reflectance and `gain` the intensity of the reflection; `linear` blends linear light instead
+    of sRGB values.
     """
     linear_of, linear_slope, encoded, encoded_slope = color_space_maths(real)
     one = real(1.0)
 
     @inlined
     def mix(behind, mirrored, gain, share, linear):  # type: ignore[no-untyped-def]
-        """The blended channel, and the reflection with its intensity."""
+        """The blended channel, and the reflection times its intensity."""
         if linear:
             lit, bright = linear_of(behind), linear_of(mirrored) * gain
             return encoded(lit + share * (bright - lit)), encoded(bright)
@@ -106,7 +106,7 @@ def mixing(real: type) -> tuple[Scalar, Scalar]:
 
     @inlined
     def unmix(behind, mirrored, gain, share, linear, v_mixed, v_bright):  # type: ignore[no-untyped-def]
-        """Gradients of the first four, given those of what `mix` returns."""
+        """Gradients of the first four arguments, given those of the results of `mix`."""
         if linear:
             lit, shone = linear_of(behind), linear_of(mirrored)
             bright = shone * gain
@@ -123,7 +123,7 @@ def mixing(real: type) -> tuple[Scalar, Scalar]:
 
 
 def _schlick(real: type) -> tuple[Scalar, Scalar]:
-    """R0 + (1 - R0) (1 - c)^5 (TR-Gaussians, Eq. 6), and its slopes."""
+    """R0 + (1 - R0) (1 - c)^5 (TR-Gaussians, Eq. 6), and its derivatives."""
     zero, one, five = real(0.0), real(1.0), real(5.0)
 
     @inlined
@@ -143,13 +143,13 @@ def _schlick(real: type) -> tuple[Scalar, Scalar]:
 
 
 def _two_surfaces(real: type) -> tuple[Scalar, Scalar]:
-    """Fresnel's laws at both surfaces of a pane, with all that goes to and fro between them; and the slopes.
+    """Fresnel reflectance of a pane's two surfaces, including multiple reflections between them, and its derivatives.
 
-    A surface of relative index n takes the cosine c to c_t inside. With q = 1 / n^2, one polarisation's Fresnel
-    coefficient is (a - b) / (a + b) for (a, b) = (c_t, c / n), the other's for (c, c_t / n), and two surfaces reflect
-    2 r / (1 + r) = (a - b)^2 / (a^2 + b^2). With t = 1 - R0 and w = sqrt(1 - t^2) = (1 - q) / (1 + q), everything
-    below is rational in t, w, c and c_t. a - b is (a^2 - b^2) / (a + b), whose numerator has no difference of nearly
-    equal numbers left: values and slopes keep their digits from glass that reflects nothing to a perfect mirror.
+    A surface of relative index n refracts the cosine c to c_t. With q = 1 / n^2, one polarisation's Fresnel coefficient
+    is (a - b) / (a + b) for (a, b) = (c_t, c / n), the other's for (c, c_t / n), and two surfaces reflect 2 r / (1 + r)
+    = (a - b)^2 / (a^2 + b^2). With t = 1 - R0 and w = sqrt(1 - t^2) = (1 - q) / (1 + q), everything below is rational
+    in t, w, c and c_t. a - b is (a^2 - b^2) / (a + b), whose numerator has no difference of nearly equal numbers left.
+    Values and derivatives are therefore accurate for any pane, from one that reflects nothing to a perfect mirror.
     """
     zero, half, one, least = real(0.0), real(0.5), real(1.0), real(LEAST_COSINE)
 
@@ -169,7 +169,7 @@ def _two_surfaces(real: type) -> tuple[Scalar, Scalar]:
     @inlined
     def two_surfaces(base, cosine):  # type: ignore[no-untyped-def]
         across, along, w, rest, inside, c = terms(base, cosine)
-        # In the same proportion: 2 a b, and the second a^2 - b^2, which is 0 at Brewster's angle; the first is w.
+        # Scaled in the same way: 2 a b, and the second a^2 - b^2, which is 0 at Brewster's angle; the first is w.
         product, difference = (one - base) * c * inside, w * (c * c + c * c - rest)
         first = w * w / (across * (across + product))
         return half * (first + difference * difference / (along * (along + product * (one + w))))

@@ -17,7 +17,7 @@ from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
 LOW_PASS = 0.3
 """Variance in px^2 added to every splat, so that none falls between pixel centres (3DGS)."""
 TANGENT_MARGIN = 0.3
-"""How far beyond the image, in half image sizes, the Jacobian of the projection still follows the centre (3DGS)."""
+"""Margin around the image, in half image sizes, within which the Jacobian is taken at the centre (3DGS)."""
 
 
 # Functions of 3-vectors, which are tuples (x, y, z) of numbers or of vectors of numbers.
@@ -66,7 +66,7 @@ def cross_squared(a, b):
 
 @inlined
 def tangential(s, v, u):
-    """The part of a vector v across a unit vector u, scaled: s (v - (v . u) u)."""
+    """The component of a vector v perpendicular to a unit vector u, scaled: s (v - (v . u) u)."""
     radial = dot(v, u)
     return s * (v[0] - radial * u[0]), s * (v[1] - radial * u[1]), s * (v[2] - radial * u[2])
 
@@ -77,8 +77,8 @@ class ShapeMaths(NamedTuple):
     Attributes:
         sigmoid: 1 / (1 + exp(-x)).
         is_finite: whether a value is neither NaN nor infinite.
-        unit_quat: the quaternion `wxyz` over its norm, and the inverse norm; the latter is not finite or zero where
-            the quaternion has no direction.
+        unit_quat: the normalised quaternion `wxyz`, and the inverse norm, which is not finite or is zero if the
+            quaternion has no direction.
         rotation: columns of the rotation matrix of a unit quaternion.
         unit_quat_gradient: gradient to the raw quaternion from the gradients of the three columns.
     """
@@ -143,9 +143,9 @@ class ScreenMaths(NamedTuple):
     Attributes:
         tangent_limits: (lowest x, highest x, lowest y, highest y) of the tangents for which the Jacobian is taken.
         screen_covariance: (xx, xy, yy, determinant), low-pass included, from the axes seen along w_x and w_y.
-        half_extents: pixels from the centre to where the coverage sinks to `ALPHA_MIN`, along x and y; (0, 0)
-            where it never rises above.
-        covariance_gradient: gradients of what `screen_covariance` gives, from those (xx, xy, yy) of its inverse.
+        half_extents: distances from the centre along x and y, in pixels, at which the coverage drops to `ALPHA_MIN`;
+            (0, 0) if it is never above.
+        covariance_gradient: gradients of the results of `screen_covariance`, from those (xx, xy, yy) of its inverse.
         footprint_gradient: gradients of w_x and w_y from these, and of the three axes.
     """
 
@@ -163,7 +163,7 @@ def screen_maths(real: type) -> ScreenMaths:
 
 @inlined
 def clamp(x, lowest, highest):
-    """A value held between two limits."""
+    """A value clamped to two limits."""
     return min(max(x, lowest), highest)
 
 
@@ -217,8 +217,8 @@ def _screen_gradients(real: type) -> tuple[Scalar, Scalar]:
 
     @inlined
     def covariance_gradient(covariance, g_xx, g_xy, g_yy):
-        # The inverse is (yy, -xy, xx) over the determinant. In products of two inverses the terms of needles cancel, as
-        # they would in the determinant if it were taken from the covariance.
+        # The inverse is (yy, -xy, xx) over the determinant. Products of two inverses would cancel for needles, and so
+        # would the determinant if it were taken from the covariance.
         xx, xy, yy, determinant = covariance
         inverse = one / determinant
         g_determinant = -(g_xx * (yy * inverse) - g_xy * (xy * inverse) + g_yy * (xx * inverse)) * inverse
@@ -249,22 +249,22 @@ def _screen_gradients(real: type) -> tuple[Scalar, Scalar]:
 
 @inlined
 def half_height(xx, xy, yy, opacity):
-    """Largest |dy| in the ellipse; negative where there is none, infinite where the conic is degenerate."""
+    """Largest |dy| in the ellipse; negative if it is empty, infinite if the conic is degenerate."""
     xx, xy, yy, visible = np.float64(xx), np.float64(xy), np.float64(yy), np.float64(opacity) / ALPHA_MIN
     if not visible >= 1.0:
         return -1.0
     determinant = xx * yy - xy * xy
     if not (determinant > 0.0 and xx > 0.0):
         return np.inf
-    # Compositing evaluates the quadratic form in single precision, where its terms cancel the more the longer the
-    # needle: the bound is widened by that error, so that no pixel is lost to rounding.
+    # Compositing evaluates the quadratic form in single precision, where its terms cancel more for longer needles. The
+    # bound is widened by that error, so that no pixel is lost to rounding.
     bound = 2.0 * math.log(visible) * (1.0 + 1e-6 * xx * yy / determinant) + 2e-3
     return math.sqrt(bound * xx / determinant)
 
 
 @inlined
 def outline(xx, xy, yy, height):
-    """The ellipse as `band` takes it: (slope, widening, half height, dy of the rightmost point)."""
+    """The ellipse in the form that `band` expects: (slope, widening, half height, dy of the rightmost point)."""
     xx, xy, yy = np.float64(xx), np.float64(xy), np.float64(yy)
     if not height < np.inf:
         return 0.0, np.inf, height, 0.0
@@ -275,7 +275,7 @@ def outline(xx, xy, yy, height):
 
 @inlined
 def band(shape, low, high):
-    """Lowest and highest dx of the ellipse over dy in [low, high], which must overlap it."""
+    """Smallest and largest dx of the ellipse over dy in [low, high], which must overlap it."""
     slope, widening, height, rightmost = shape
     if not height < np.inf:
         return -np.inf, np.inf

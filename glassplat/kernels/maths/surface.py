@@ -14,11 +14,11 @@ from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS
 
 
 class SurfaceMaths(NamedTuple):
-    """Steps for Gaussian `i`, which is seen.
+    """Steps for Gaussian `i`, which must be visible.
 
     Attributes:
-        describe: writes its channels, with a normal of zeros where its quaternion has no direction.
-        describe_gradient: writes the gradients, given the channels that `describe` has written.
+        describe: writes its channels, with a normal of zeros if its quaternion has no direction.
+        describe_gradient: writes the gradients, given the channels written by `describe`.
     """
 
     describe: Scalar
@@ -27,7 +27,7 @@ class SurfaceMaths(NamedTuple):
 
 @inlined
 def shortest_axis(x, y, z):  # type: ignore[no-untyped-def]
-    """Position of the smallest of three values, the first among equals."""
+    """Index of the smallest of three values, the first among equals."""
     if y < x:
         return 2 if z < y else 1
     return 2 if z < x else 0
@@ -42,7 +42,7 @@ def _facing(real: type) -> tuple[Scalar, Scalar]:
 
     @inlined
     def chosen(which, a, b, c):  # type: ignore[no-untyped-def]
-        # Sums, because a processor cannot foresee which one it is.
+        # Weighted sums, because a branch would be unpredictable.
         first, second = real(which == 0), real(which == 1)
         third = one - first - second
         return (
