@@ -1,4 +1,4 @@
-"""Surfaces that mirror an environment: their channels, lookups in cube maps, and deferred shading."""
+"""Reflective surfaces: their channels, cube-map lookups, and deferred shading with an environment map."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ def surface_channels(
     camera_center: Tensor,
     extra: Tensor | None = None,
 ) -> Tensor:
-    """Colour, normal and reflection strength of each Gaussian, side by side (3DGS-DR, Section 3.1).
+    """Colour, normal and reflection strength of each Gaussian, concatenated (3DGS-DR, Section 3.1).
 
-    The normal is the Gaussian's shortest axis, the first of equally short ones, turned towards the camera. Which axis
-    is and on which side count as constants. It is 0 where a quaternion is 0 or not finite.
+    The normal is the Gaussian's shortest axis, the first of equally short ones, oriented towards the camera. The choice
+    of axis and orientation counts as constant. The normal is 0 if the quaternion is 0 or not finite.
 
     Differentiable in `colors`, `quats`, `logit_strengths` and `extra`; the length of a quaternion has no effect, and
     its gradient is 0.
 
     Args:
         colors: [N, 3] of the projected Gaussians, sRGB.
-        radii: [N, 2] half extents on screen; a Gaussian with 0 is not seen: its channels and gradients are 0.
+        radii: [N, 2] half extents on screen; a Gaussian with 0 is invisible: its channels and gradients are 0.
         quats: [N, 4] orientations `wxyz` of any length.
         log_scales: [N, 3] logarithm of the standard deviation along each axis.
         means: [N, 3] centres, world units.
         logit_strengths: [N] logit of the reflection strength.
         camera_center: [3] camera centre in the world.
-        extra: [N, E] more channels.
+        extra: [N, E] additional channels.
 
     Returns:
         [N, 7 + E]: colour, unit normal in world axes and strength, as `shade_environment` reads them, then `extra`.
@@ -86,10 +86,10 @@ class _SurfaceChannels(torch.autograd.Function):
 
 
 def cube_lookup(texels: Tensor, directions: Tensor) -> Tensor:
-    """Look up a cube map in directions, by a bilinear filter without seams.
+    """Look up a cube map in given directions, with seamless bilinear filtering.
 
-    Faces are +x, -x, +y, -y, +z, -z. On a face of axis a (x, y, z = 0, 1, 2), on either side, columns run along axis
-    a + 1 and rows along a + 2, counted round:
+    Faces are +x, -x, +y, -y, +z, -z. On both faces of axis a (x, y, z = 0, 1, 2), columns run along axis a + 1 and rows
+    along a + 2, modulo 3:
 
         faces       columns towards    rows towards
         +x, -x      +y                 +z
@@ -97,16 +97,16 @@ def cube_lookup(texels: Tensor, directions: Tensor) -> Tensor:
         +z, -z      +x                 +y
 
     A direction d meets the face of its largest coordinate at u = d[a + 1] / |d[a]|, v = d[a + 2] / |d[a]| in [-1, 1];
-    texel i has its centre at (2 i + 1) / S - 1. The filter blends the four nearest texels. Across an edge these are
-    the neighbouring face's; at a corner of the cube, where only three meet, their mean stands for the fourth. So the
-    result is continuous everywhere, and equal for both faces at an edge.
+    texel i has its centre at (2 i + 1) / S - 1. The filter blends the four nearest texels. Across an edge they include
+    the neighbouring face's. At a corner of the cube, where only three meet, their mean replaces the fourth. The result
+    is continuous everywhere, and equal for both faces at an edge.
 
     Differentiable in `texels` and `directions`; the gradient of a direction is orthogonal to it.
 
     Args:
         texels: [6, S, S, D] faces, rows, columns; S of at least 1.
-        directions: [..., 3] in the cube's axes, of any positive length. Where a direction is 0, NaN or infinite, so
-            that there is nothing to look up, the result is NaN.
+        directions: [..., 3] in the cube's axes, of any positive length. The result is NaN for a direction that is 0,
+            NaN or infinite.
 
     Returns:
         [..., D] blended texels.
@@ -151,7 +151,7 @@ def shade_environment(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     least_strength: float = 0.0,
 ) -> Shaded:
-    """Lays blended surfaces over a background and adds what they mirror of the environment (3DGS-DR, Eq. 3).
+    """Composites blended surfaces over a background and adds their reflection of the environment (3DGS-DR, Eq. 3).
 
         C = blended color + (1 - alpha) background
         r = 2 (v . n) n - v,    n = N / |N|,    v from the surface to the camera
@@ -159,20 +159,20 @@ def shade_environment(
         C' = (1 - R) C + R E
 
     Where N is shorter than `NORMAL_MIN`, as on an empty background, or |R| is below `least_strength`, the image is the
-    base C, bit for bit, the reflection is 0, and nothing but the base gets a gradient. Where else the strength is 0 the
-    image is the base, bit for bit, too, but the strength has its gradient. A normal that is not finite gives NaN.
+    base C, bit for bit, the reflection is 0, and only the base gets a gradient. At other pixels with a strength of 0
+    the image is also the base, bit for bit, but the strength gets its gradient. A non-finite normal gives NaN.
 
     Differentiable in `blended`, `alpha`, `texels` and `world_from_cam`.
 
     Args:
-        blended: [H, W, D] with D >= 7: color, sRGB; normal N, world axes, of any length, whose sign does not matter;
-            strength R; what follows is not used.
+        blended: [H, W, D] with D >= 7: color, sRGB; normal N, world axes, of any length and either sign; strength R;
+            further channels are not used.
         alpha: [H, W] coverage.
         texels: [6, S, S, 3] logits of the environment's sRGB colour, faces as in `cube_lookup`.
         intrinsics: [4] fx, fy, cx, cy in pixels.
         world_from_cam: [3, 3] rotation from camera to world axes; may be mirrored.
-        background: what is seen behind the surfaces, sRGB.
-        least_strength: pixels that reflect less are left as they are, which saves their lookup.
+        background: colour behind the surfaces, sRGB.
+        least_strength: pixels with a smaller strength are not shaded, which saves their lookup.
     """
     check_cube(texels)
     height, width = alpha.shape
@@ -198,7 +198,7 @@ def shade_environment(
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)
 def _color(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """The numbers as a tensor, the same one at every call; filled on the device, as copying them makes it wait."""
+    """The numbers as a cached tensor, filled on the device, because copying from the host would stall it."""
     color = torch.empty(len(values), dtype=dtype, device=device)
     for part, value in zip(color, values, strict=True):
         part.fill_(value)
@@ -226,9 +226,9 @@ class _ShadeEnvironment(torch.autograd.Function):
 
 
 def _gradient_of_turn(inputs: list[Tensor], least_strength: float, cotangents: list[Tensor]) -> Tensor:
-    """[3, 3] gradient of the camera's rotation, which turns the rays that are mirrored.
+    """Gradient [3, 3] of the camera's rotation, which rotates the reflected rays.
 
-    Only cameras that are refined ask for it, so that it has no kernel of its own.
+    Only the refinement of cameras needs it, so it has no kernel of its own.
     """
     blended, alpha, texels, intrinsics, world_from_cam, _ = inputs
     normals, strength = blended[..., NORMAL_AT:STRENGTH_AT], blended[..., STRENGTH_AT]

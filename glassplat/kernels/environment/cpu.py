@@ -1,13 +1,13 @@
-"""Surfaces that mirror an environment, on the CPU: channels, cube maps, deferred shading.
+"""Reflective surfaces on the CPU: channels, cube maps, deferred shading.
 
 Channels are filled one Gaussian at a time, and cube maps read one direction at a time. Gradients of texels are summed
-in an order that no thread count changes: lookups are sorted by the row of cells that they begin in. Each row is then
-one task, which adds up what those lookups give to the row and to the next one, in the order of their numbers and in
+in an order that does not depend on the number of threads: lookups are sorted by the row of their first cell. Each row
+is then one task, which sums the contributions of those lookups to the row and to the next one, in index order and in
 memory of its own.
 
-Deferred shading takes runs of pixels of one row that have a normal and reflect. A run is kept in *planes* of one flat
-buffer, one plane per quantity, at offsets known to the compiler; that is what lets it turn the lookup and the sigmoid
-into vector instructions.
+Deferred shading processes runs of pixels of one image row that have a normal and reflect. A run is stored in *planes*
+of one flat buffer, one plane per quantity. Their offsets are known to the compiler, so that it can vectorise the lookup
+and the sigmoid.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from glassplat.kernels.records import NORMAL_AT, NORMAL_MIN, REAL_OF, STRENGTH_A
 
 
 def surface_channels(inputs: Sequence[Tensor]) -> Tensor:
-    """As the operation; inputs in its order."""
+    """See `glassplat.kernels.environment.surface_channels`; inputs in its order."""
     colors, extra = inputs[0], inputs[-1]
     channels = colors.new_empty(colors.shape[0], SURFACE_CHANNELS + extra.shape[1])
     surface_channels_forward(REAL_OF[colors.dtype])(*(tensor.numpy() for tensor in (*inputs, channels)))
@@ -47,7 +47,7 @@ def surface_channels_gradients(saved: Sequence[Tensor], v_channels: Tensor) -> t
 
 
 def gradients_like(v_channels: Tensor) -> tuple[Tensor, ...]:
-    """Room for the gradients of colors, quats, logit strengths and extra."""
+    """Uninitialised tensors for the gradients of colors, quats, logit strengths and extra."""
     count, width = v_channels.shape
     shapes = (count, 3), (count, 4), (count,), (count, width - SURFACE_CHANNELS)
     return tuple(torch.empty(shape, dtype=v_channels.dtype, device=v_channels.device) for shape in shapes)
@@ -91,11 +91,11 @@ def surface_channels_backward(real: type) -> Kernel:
 
 
 NO_LOOKUP = np.int32(-1)
-"""Stands for the first cell where nothing was looked up."""
+"""First cell of a pixel without a lookup."""
 
 
 def padded_faces(texels: Tensor) -> Tensor:
-    """Faces [6, S + 2, S + 2, D] with a ring of their neighbours' texels, as the twin's."""
+    """Faces [6, S + 2, S + 2, D] with a ring of their neighbours' texels, as in the reference."""
     size, depth = texels.shape[1], texels.shape[3]
     padded = texels.new_empty(6, size + 2, size + 2, depth)
     pad_faces(REAL_OF[texels.dtype])(texels.numpy(), padded.numpy())
@@ -145,7 +145,7 @@ def pad_faces(real: type) -> Kernel:
                     for d in range(depth):
                         target[column + 1, d] = texels[f, r, c, d]
             else:
-                # All but the ring is copied, in long runs.
+                # Everything but the ring is copied in long runs.
                 copied, to = rows[face, row], padded_rows[face, row + 1, depth : (size + 1) * depth]
                 for i in range(to.size):
                     to[i] = copied[i]
@@ -164,7 +164,7 @@ def pad_faces(real: type) -> Kernel:
 
 @cache
 def sort_lookups(real: type) -> Kernel:
-    """Fills the order of the lookups, without those of nothing, and where each row of cells begins in it."""
+    """Fills the order of the lookups, without empty ones, and the start of each row of cells in it."""
 
     @kernel("cube_sort_lookups", real, parallel=False)
     def sort(first_cells, starts, order):
@@ -189,7 +189,7 @@ def sort_lookups(real: type) -> Kernel:
 
 @cache
 def sum_lookups(real: type) -> Kernel:
-    """Fills rows of cells [R, 2, floats] with what the lookups that begin in a row add to it and to the next one."""
+    """Fills rows of cells [R, 2, floats] with the sums that lookups starting in a row add to it and to the next one."""
     zero, one = real(0.0), real(1.0)
 
     @kernel("cube_sum_lookups", real)
@@ -221,7 +221,7 @@ def fold_faces(real: type) -> Kernel:
 
     @inlined
     def cell(sums, face, row, column, d):
-        """The gradient of a cell, which lookups that begin in the row before add to as well."""
+        """The gradient of a cell, including lookups that start in the row before."""
         found = sums[face, row, 0, column, d]
         return found + sums[face, row - 1, 1, column, d] if row > 0 else found
 
@@ -275,7 +275,7 @@ def cube_lookup_gradients(texels: Tensor, directions: Tensor, cotangents: Tensor
 
 @cache
 def cube_lookup_forward(real: type) -> Kernel:
-    """Fills what padded faces show."""
+    """Fills the lookups in padded faces."""
     look_up, _ = lookup_maths(real)
 
     @kernel("cube_lookup_forward", real)
@@ -288,7 +288,7 @@ def cube_lookup_forward(real: type) -> Kernel:
 
 @cache
 def cube_lookup_backward(real: type) -> Kernel:
-    """Fills the gradients of the directions, and which cells each lookup blends at which fractions."""
+    """Fills the gradients of the directions, and the cells and fractions of each lookup."""
     _, look_up_gradient = lookup_maths(real)
 
     @kernel("cube_lookup_backward", real)
@@ -304,7 +304,7 @@ def cube_lookup_backward(real: type) -> Kernel:
 RUN = 32
 """Pixels of a run."""
 
-# Planes of a run: real numbers, and whole ones. What a run does not fill is left from another one and not read.
+# Planes of a run: floats, then integers. Entries that a run does not fill are stale and not read.
 NORMAL, RAY, PLACE, ALONG, DOWN, SEEN = (plane * RUN for plane in (0, 3, 6, 9, 10, 11))
 FORWARD_PLANES = 14
 V_RAW, BY_COLUMN, BY_ROW = (plane * RUN for plane in (14, 17, 18))
@@ -314,7 +314,7 @@ WHOLE_PLANES = 6
 
 
 def shade_environment(inputs: Sequence[Tensor], least_strength: float) -> Shaded:
-    """As the operation; inputs in the order of the kernel."""
+    """See `glassplat.kernels.environment.shade_environment`; inputs in the order of the kernel."""
     blended, alpha, texels, *rest = inputs
     real = REAL_OF[blended.dtype]
     shaded = Shaded(*(alpha.new_empty(*alpha.shape, 3) for _ in range(3)))
@@ -326,7 +326,7 @@ def shade_environment(inputs: Sequence[Tensor], least_strength: float) -> Shaded
 def shade_environment_gradients(
     inputs: Sequence[Tensor], least_strength: float, found: Sequence[Tensor], cotangents: Sequence[Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients of blended, alpha and texels, given the base and the reflection that the kernel found."""
+    """Gradients of blended, alpha and texels, given base and reflection of the forward pass."""
     blended, alpha, texels, *rest = inputs
     real = REAL_OF[blended.dtype]
     v_blended, v_alpha = torch.empty_like(blended), torch.empty_like(alpha)
@@ -352,7 +352,7 @@ def _place(real: type) -> Scalar:
 
     @inlined
     def place(run, whole, row, side, intrinsics, rotation):
-        """Place on the cube that the pixels of a run mirror."""
+        """Positions on the cube that the pixels of a run reflect."""
         inverse_f, start = one / intrinsics[0], half - intrinsics[2]
         y = (real(np.int32(row)) + half - intrinsics[3]) / intrinsics[1]
         across_x, across_y, across_z = rotation[0, 0], rotation[1, 0], rotation[2, 0]
@@ -389,7 +389,7 @@ def shade_environment_forward(real: type) -> Kernel:
 
     @inlined
     def look(run, whole, flat, below):
-        """The colour that each pixel of a run mirrors; `below` is the distance of the next row of cells."""
+        """The colour that each pixel of a run reflects; `below` is the offset of the next row of cells."""
         for d in range(3):
             for i in range(RUN):
                 at, along, down = whole[FIRST + i] + d, run[ALONG + i], run[DOWN + i]
@@ -443,7 +443,7 @@ def _slopes(real: type) -> Scalar:
 
     @inlined
     def slopes_of_run(run, whole, flat, below):
-        """Gradients of each pixel's place among the cells, from those of what it looks up."""
+        """Gradients of each pixel's position among the cells, from those of its lookup."""
         for i in range(RUN):
             run[BY_COLUMN + i], run[BY_ROW + i] = zero, zero
         for d in range(3):
@@ -465,7 +465,7 @@ def _turn(real: type) -> Scalar:
 
     @inlined
     def turn(run, whole, side):
-        """Gradients of the normals, in place of the normals."""
+        """Replaces the normals by their gradients."""
         cells_per_u = half * real(side - np.int32(2))
         for i in range(RUN):
             place = whole[AXIS + i], whole[FACE + i], run[PLACE + i], run[PLACE + RUN + i], run[PLACE + 2 * RUN + i]
@@ -480,7 +480,7 @@ def _turn(real: type) -> Scalar:
 
 @cache
 def shade_environment_backward(real: type) -> Kernel:
-    """Fills the gradients of blended, alpha and of what was looked up, and which cells each pixel blends."""
+    """Fills the gradients of blended, alpha and the lookups, and the cells and fractions of each pixel."""
     place, slopes, turn = _place(real), _slopes(real), _turn(real)
     shortest = real(NORMAL_MIN**2)
     zero, one = real(0.0), real(1.0)

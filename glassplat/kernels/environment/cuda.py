@@ -1,10 +1,9 @@
-"""Surfaces that mirror an environment, on the GPU: a thread for each Gaussian, direction or pixel.
+"""Reflective surfaces on the GPU: one thread per Gaussian, direction or pixel.
 
-Gradients of texels are summed without atomics. Lookups are sorted by the cell that they begin in. One warp adds up
-those of a cell, each thread every 32nd of them, and joins its sums in a tree; then one thread for each texel gathers
-from the cells that show it. The order of every sum follows from the lookups alone, so that the bits are the same in
-every run. The sort costs less than it would cost to let many lookups wait for one texel, as happens where surfaces
-magnify the environment.
+Gradients of texels are summed without atomics. Lookups are sorted by their first cell. One warp sums those of a cell,
+each thread every 32nd of them, and reduces its sums in a tree; then one thread per texel gathers from the cells that
+contain it. The order of every sum depends on the lookups only, so that results are bit-identical in every run. The sort
+costs less than the contention of many lookups for one texel, which occurs where surfaces magnify the environment.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ THREADS = 128
 
 
 def surface_channels(inputs: Sequence[Tensor]) -> Tensor:
-    """As the operation; inputs in its order."""
+    """See `glassplat.kernels.environment.surface_channels`; inputs in its order."""
     colors, extra = inputs[0], inputs[-1]
     count = colors.shape[0]
     channels = colors.new_zeros(count, SURFACE_CHANNELS + extra.shape[1])
@@ -49,7 +48,7 @@ def surface_channels_gradients(saved: Sequence[Tensor], v_channels: Tensor) -> t
 
 @cache
 def surface_channels_forward(real: type) -> Kernel:
-    """Fills the channels of what is seen."""
+    """Fills the channels of visible Gaussians."""
     describe, zero = surface_maths(real).describe, real(0.0)
 
     @kernel("surface_channels_forward", real, "real2 real2 real2 real2 real2 real1 real1 real2 real2")
@@ -63,7 +62,7 @@ def surface_channels_forward(real: type) -> Kernel:
 
 @cache
 def surface_channels_backward(real: type) -> Kernel:
-    """Fills the gradients of what is seen."""
+    """Fills the gradients of visible Gaussians."""
     describe_gradient, zero = surface_maths(real).describe_gradient, real(0.0)
 
     @kernel("surface_channels_backward", real, "real2 real2 real2 real2 real2 real2 real2 real1 real2")
@@ -81,7 +80,7 @@ WARP = 32
 
 
 def padded_faces(texels: Tensor) -> Tensor:
-    """Faces [6, S + 2, S + 2, D] with a ring of their neighbours' texels, as the twin's."""
+    """Faces [6, S + 2, S + 2, D] with a ring of their neighbours' texels, as in the reference."""
     size, depth = texels.shape[1], texels.shape[3]
     padded = texels.new_empty(6, size + 2, size + 2, depth)
     pad_faces(REAL_OF[texels.dtype])(blocks_for(padded.numel(), THREADS), THREADS, texels, padded)
@@ -93,7 +92,7 @@ def texel_gradients(first_cells: Tensor, fractions: Tensor, gradients: Tensor, s
 
     Args:
         first_cells: [P] int32 flat index, among padded texels, of the first of the four cells that each lookup blends;
-            6 (S + 2)^2 where there was none.
+            6 (S + 2)^2 if there was none.
         fractions: [P, 2] of the way to the next column and to the next row.
         gradients: [P, D] gradient of each lookup's result.
         size: texels along the side of a face, S.
@@ -111,7 +110,7 @@ def texel_gradients(first_cells: Tensor, fractions: Tensor, gradients: Tensor, s
 
 @cache
 def pad_faces(real: type) -> Kernel:
-    """Fills padded faces from texels, one thread for each number."""
+    """Fills padded faces from texels, one thread per number."""
     third = real(1.0 / 3.0)
 
     @kernel("cube_pad_faces", real, "real4 real4")
@@ -138,7 +137,7 @@ def pad_faces(real: type) -> Kernel:
 
 @cache
 def sum_lookups(real: type) -> Kernel:
-    """Fills what the lookups that begin in a cell give to it, the next column, the next row and both [cells, 4, D]."""
+    """Fills the sums [cells, 4, D] of lookups starting in a cell, for it, the next column, the next row and both."""
     zero, one = real(0.0), real(1.0)
 
     @kernel("cube_sum_lookups", real, "real2 real2 long1 long1 real3")
@@ -169,7 +168,7 @@ def sum_lookups(real: type) -> Kernel:
             if t == 0:
                 for corner in range(4):
                     sums[cell, corner, d] = shared[corner, 0]
-            # The others go on to the next channel, and into what has just been read, only now.
+            # Only now may the other threads continue with the next channel, and overwrite the values just read.
             cuda.syncthreads()
 
     return add
@@ -182,7 +181,7 @@ def fold_faces(real: type) -> Kernel:
 
     @inlined
     def cell(sums, face, row, column, d):
-        """The gradient of a padded texel, from the lookups that begin in it, next to it, above it and above beside."""
+        """The gradient of a padded texel, from lookups that start in it, left of it, above it, and above left."""
         depth = sums.shape[3] // 4
         found = sums[face, row, column, d]
         if column > 0:
@@ -206,8 +205,8 @@ def fold_faces(real: type) -> Kernel:
         d, column, row, face = i % depth, i // depth % size, i // depth // size % size, i // depth // size // size
         axis, outer = face // 2, (1 - face % 2) * (size + 1)
         found = cell(sums, face, row + 1, column + 1, d)
-        # Where this face goes on beyond an edge: the inverse of `over_column` for the first loop, of `over_row` for
-        # the second one. A corner's mean is shown by all three faces that meet there.
+        # Neighbouring faces across an edge: the inverse of `over_column` in the first loop, and of `over_row` in the
+        # second one. A corner's mean appears in all three faces that meet there.
         for side in range(2):
             if is_end(row, side, size):
                 beside = 2 * ((axis + 2) % 3) + side
@@ -252,7 +251,7 @@ def cube_lookup_gradients(texels: Tensor, directions: Tensor, cotangents: Tensor
 
 @cache
 def cube_lookup_forward(real: type) -> Kernel:
-    """Fills what padded faces show."""
+    """Fills the lookups in padded faces."""
     look_up, _ = lookup_maths(real)
 
     @kernel("cube_lookup_forward", real, "real4 real2 real2")
@@ -266,7 +265,7 @@ def cube_lookup_forward(real: type) -> Kernel:
 
 @cache
 def cube_lookup_backward(real: type) -> Kernel:
-    """Fills the gradients of the directions, and which cells each lookup blends at which fractions."""
+    """Fills the gradients of the directions, and the cells and fractions of each lookup."""
     _, look_up_gradient = lookup_maths(real)
 
     @kernel("cube_lookup_backward", real, "real4 real2 real2 real2 int1 real2")
@@ -311,7 +310,7 @@ def _place(real: type) -> Scalar:
 
     @inlined
     def place(row, column, normal, intrinsics, rotation, size):
-        """The ray of a pixel, where on the cube it is mirrored to, and the cells and fractions there."""
+        """The ray of a pixel, the position on the cube that it is reflected to, and the cells and fractions there."""
         x = (real(np.int32(column)) + half - intrinsics[2]) * (one / intrinsics[0])
         y = (real(np.int32(row)) + half - intrinsics[3]) / intrinsics[1]
         ray = (
@@ -362,7 +361,7 @@ def shade_environment_forward(real: type) -> Kernel:
 
 @cache
 def shade_environment_backward(real: type) -> Kernel:
-    """Fills the gradients of blended, alpha and of what was looked up, and which cells each pixel blends."""
+    """Fills the gradients of blended, alpha and the lookups, and the cells and fractions of each pixel."""
     maths, place = cube_maths(real), _place(real)
     from_face, slopes = maths.from_face, maths.slopes
     shortest, zero, half, one = real(NORMAL_MIN**2), real(0.0), real(0.5), real(1.0)

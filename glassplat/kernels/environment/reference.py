@@ -50,7 +50,7 @@ def cube_lookup(texels: Tensor, directions: Tensor) -> Tensor:
 
 
 def face_positions(directions: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Face, and (column, row) among its padded texels, whose centres lie at whole numbers, of directions [..., 3]."""
+    """Face and (column, row) of directions [..., 3] among padded texels, whose centres are at whole numbers."""
     x, y, z = directions.abs().unbind(-1)
     axis = torch.where((x >= y) & (x >= z), 0, torch.where(y >= z, 1, 2))
     order = (axis[..., None] + torch.arange(3, device=axis.device)) % 3
@@ -60,7 +60,7 @@ def face_positions(directions: Tensor, size: int) -> tuple[Tensor, Tensor, Tenso
 
 
 def padded_faces(texels: Tensor) -> Tensor:
-    """Faces [6, S + 2, S + 2, D] with a ring of their neighbours' texels; at a corner, the mean of the three there."""
+    """Faces [6, S + 2, S + 2, D] with a ring of their neighbours' texels; a corner is the mean of three."""
     size = texels.shape[1]
     first, second, third = (texels.flatten(0, 2)[index] for index in neighbours(size, texels.device))
     in_ring = torch.arange(size + 2, device=texels.device) % (size + 1) == 0
@@ -70,11 +70,11 @@ def padded_faces(texels: Tensor) -> Tensor:
 
 @functools.lru_cache(maxsize=8)
 def neighbours(size: int, device: torch.device) -> Tensor:
-    """Flat texel indices [3, 6, S + 2, S + 2] of what padded texels show: three at a corner, elsewhere one, thrice.
+    """Flat indices [3, 6, S + 2, S + 2] of the sources of padded texels: three at a corner, elsewhere one, repeated.
 
-    Face 2 a + s looks along axis a, to the negative side for s = 1; its columns run along axis a + 1, its rows along
-    a + 2 (mod 3). Beyond its edge towards axis a + 1, it continues on that axis' face, whose columns run along axis
-    a + 2 and whose rows along a: the same row here is the same column there, in the row at the edge that is shared.
+    Face 2 a + s belongs to axis a, on the negative side for s = 1; its columns run along axis a + 1, its rows along
+    a + 2 (mod 3). Beyond its edge towards axis a + 1, it continues on that axis' face, whose columns run along axis a +
+    2 and whose rows along a: a row here becomes the column of the same index there, in the row at the shared edge.
     """
     sequence = torch.arange(-1, size + 1, device=device)
     outside = ((sequence < 0) | (sequence == size)).long()
@@ -108,9 +108,9 @@ def shade_environment(
     base = blended[..., :NORMAL_AT] + (1 - alpha)[..., None] * blended.new_tensor(background)
     rays = ray_grid(intrinsics.detach(), width, height) @ world_from_cam.T
     bare = (normals.square().sum(-1, keepdim=True) <= NORMAL_MIN**2) | (strength.abs() < least_strength)[..., None]
-    # Where there is no normal, a harmless one stands in: a NaN masked afterwards would still reach the gradients.
+    # The ray replaces a missing normal: a NaN that is masked afterwards would still reach the gradients.
     safe = torch.where(bare, rays, normals)
-    # The lookup takes a direction of any length, so that neither the ray nor the normal needs to be of length 1.
+    # The lookup accepts directions of any length, so that neither the ray nor the normal must be normalised.
     mirrored = safe.square().sum(-1, keepdim=True) * rays - 2 * (rays * safe).sum(-1, keepdim=True) * safe
     reflection = torch.where(bare, 0, torch.sigmoid(cube_lookup(texels, mirrored)))
     return Shaded(torch.where(bare, base, base + strength[..., None] * (reflection - base)), base, reflection)

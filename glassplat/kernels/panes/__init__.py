@@ -1,4 +1,4 @@
-"""Flat panes: where the camera sees them, how they blend transmission and reflection, and edges that both share."""
+"""Flat panes: hits of camera rays, blending of transmission and reflection, and edges shared by both."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class MirroredViews(NamedTuple):
 
 
 def mirrored_views(centers: Tensor, raw_normals: Tensor, cam_from_world: Tensor) -> MirroredViews:
-    """A camera on a GPU mirrored about planes, in one kernel; `glassplat.render.panes.mirrored_views` says how.
+    """A camera on a GPU mirrored about planes, in one kernel; see `glassplat.render.panes.mirrored_views`.
 
     Differentiable in all three; the half spaces have no gradient.
 
@@ -93,17 +93,17 @@ def pane_hits(
 ) -> PaneHits:
     """Finds the nearest pane along the ray of every pixel centre (H_k of TR-Gaussians, Section III-A2).
 
-    Not differentiable: piecewise constant in everything.
+    Not differentiable; the choice of the pane is piecewise constant.
 
     Args:
         panes: rectangles in the camera frame, seen from either side.
         intrinsics: [4] fx, fy, cx, cy in pixels.
         width: of the image, pixels.
         height: of the image, pixels.
-        mask: [H, W] visibility of the panes; where it is 0, `tiles` and `windows` leave the pixel out.
-        beyond: hits with the same panes and camera; the nearest pane after them is sought, and none where they have
-            none. Called with its own results, this finds all surfaces along a ray, one after another; panes in one
-            plane are one.
+        mask: [H, W] visibility of the panes; where it is 0, `tiles` and `windows` exclude the pixel.
+        beyond: hits with the same panes and camera; the nearest pane behind them is searched for, and none where they
+            have none. Called again with its own results, this finds all surfaces along a ray, one after another;
+            coplanar panes count as one.
     """
     count = panes.centers.shape[0]
     expected = {
@@ -137,37 +137,38 @@ def blend_panes(
         C_r = C_raw A                                (Eq. 13)
         C = (1 - R) C_t + R C_r                      (Eq. 1)
 
-    f is what a real pane reflects of unpolarised light (`fresnel="pane"`): with r0 = R0 / (2 - R0) for one of its
+    f is the reflectance of a real pane for unpolarised light (`fresnel="pane"`). With r0 = R0 / (2 - R0) for one of its
     surfaces and the index n = (1 + sqrt r0) / (1 - sqrt r0), Snell's and Fresnel's laws at one surface are
 
         c_t = sqrt(1 - (1 - c^2) / n^2)
         r_s = ((c - n c_t) / (c + n c_t))^2,  r_p = ((n c - c_t) / (n c + c_t))^2
 
-    and two surfaces, with all the light that goes to and fro between them, reflect
+    and two surfaces, including multiple reflections between them, reflect
 
         f = r_s / (1 + r_s) + r_p / (1 + r_p),       which is R0 at c = 1.
 
     A mirror is a pane whose R0 is near 1.
 
-    Where no pane is shown or the mask is 0, the image is the transmission, bit for bit, and strength and reflection
-    are 0; also the image where the strength is 0.
+    Where no pane is shown or the mask is 0, the image is the transmission, bit for bit, and strength and reflection are
+    0. The image is also the transmission where the strength is 0.
 
     Differentiable in `transmission`, `mask`, `reflections`, `normals` and `base_reflectances`. The last two get no
-    gradient where A is `DAZZLING`: a lamp's reflection says how bright the lamp is, and nothing of the pane.
+    gradient where A exceeds `DAZZLING`: a lamp's reflection depends on its brightness, and carries no information on
+    the pane.
 
     Args:
         transmission: [H, W, 3] C_t, sRGB.
         mask: [H, W] M, visibility of the panes.
-        reflections: [K, H, W, 4] what each pane mirrors, C_raw in sRGB and A - 1, by how much the intensity departs
-            from 1: 0 where nothing was blended.
-        pane: [H, W] int32 position of each pixel's pane, -1 for none, as `pane_hits` gives it.
+        reflections: [K, H, W, 4] the reflection of each pane: C_raw in sRGB and A - 1, the deviation of the intensity
+            from 1, which is 0 where nothing was blended.
+        pane: [H, W] int32 index of each pixel's pane, -1 for none, as returned by `pane_hits`.
         normals: [K, 3] unit normals in the camera frame; the sign does not matter.
         base_reflectances: [K] R0 in [0, 1].
         intrinsics: [4] fx, fy, cx, cy in pixels; no gradient.
-        fresnel: "pane" is the f above; "schlick" the paper's, f = R0 + (1 - R0) (1 - c)^5 (Eq. 6), which is one
-            surface's; "none" is f = R0 for every angle.
+        fresnel: "pane" is the f above; "schlick" the paper's, f = R0 + (1 - R0) (1 - c)^5 (Eq. 6), of a single surface;
+            "none" is f = R0 for every angle.
         intensity: multiply by A; False sets C_r = C_raw.
-        linear: blend and multiply linear radiance; False does so with sRGB values, as the paper does.
+        linear: blend and multiply linear radiance; False uses sRGB values, as the paper does.
     """
     height, width, count = *mask.shape, normals.shape[0]
     check_tensors(
@@ -212,11 +213,11 @@ class _BlendPanes(torch.autograd.Function):
 def inside_panes(pane: Tensor, strength: Tensor) -> Tensor:
     """1 where a pixel and its eight neighbours show the same pane, 0 elsewhere. Not differentiable.
 
-    It is 0 where nothing reflects: on the rim of a pane, and where it is hit and no glass is there. Pixels beyond the
-    border of the image count as those next to them.
+    It is also 0 where nothing reflects: on the rim of a pane, and where its rectangle is hit but has no glass.
+    Neighbours outside the image are ignored.
 
     Args:
-        pane: [H, W] int32, which pane is nearest, -1 for none.
+        pane: [H, W] int32 index of the nearest pane, -1 for none.
         strength: [H, W] of the reflection.
 
     Returns:
@@ -234,10 +235,10 @@ def inside_panes(pane: Tensor, strength: Tensor) -> Tensor:
 def layer_slopes(
     strength: Tensor, transmission: Tensor, reflection: Tensor, where: Tensor, *, linear: bool
 ) -> tuple[Tensor, Tensor]:
-    """The derivatives of Eq. 1 of TR-Gaussians by the transmission and by the reflection, of grey.
+    """Derivatives of Eq. 1 of TR-Gaussians by the transmission and by the reflection, for grey layers.
 
-    Grey is as bright as the mean of a layer's channels. In linear radiance the derivatives are not 1 - R and R: a weak
-    reflection stands out from a dark transmission, and takes contrast from it. Not differentiable.
+    Each layer is replaced by the mean of its channels. In linear radiance the derivatives are not 1 - R and R: a weak
+    reflection stands out from a dark transmission, and reduces its contrast. Not differentiable.
 
     Args:
         strength: [H, W] R.
@@ -265,12 +266,12 @@ def layer_slopes(
 
 @torch.no_grad()
 def slopes_at(slopes: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
-    """Values of an image of slopes at the centres of splats, 1 where they lie before a surface. Not differentiable.
+    """Values of an image of derivatives at the centres of splats, 1 in front of a surface. Not differentiable.
 
     Args:
-        slopes: [H, W], by the transmission.
+        slopes: [H, W] derivatives by the transmission.
         near: [H, W] depth of the surface, infinite where there is none.
-        means2d: [C, N, 2] centres in pixels; those beyond the image, and NaN, count as at its border.
+        means2d: [C, N, 2] centres in pixels; those outside the image, and NaN, are clamped to its border.
         depths: [C, N] of the centres.
 
     Returns:
@@ -289,22 +290,21 @@ def gradient_conflict(
 ) -> Tensor:
     """Edges that transmission and reflection share, per colour channel and inner pixel (after TR-Gaussians, Eq. 15).
 
-    In cells of a single pixel, and without a strength, that is Eq. 15: the mean of hit |grad C_t . grad C_r|. In larger
-    cells it is their |sum of hit grad C_t . grad C_r|, which is small where edges only happen to meet.
-    With a strength R, a cell counts by how much of the reflection the transmission seems to hold, in units of what a
-    pane of that strength adds: s, the sum of grad C_t . grad C_r over that of R |grad C_r|^2, in linear light. What is
-    left of a reflection has an s of 1, or of 2 where the reflection has found half of its contrast. From there to twice
-    as much, cells count less and less: that is an edge of the transmission itself.
+    With cells of one pixel, and without a strength, this is Eq. 15: the mean of hit |grad C_t . grad C_r|. Larger cells
+    use |sum of hit grad C_t . grad C_r|, which is small where edges coincide by chance. With a strength R, a cell's
+    weight depends on s, the sum of grad C_t . grad C_r over that of R |grad C_r|^2 in linear light: the part of the
+    reflection in the transmission, relative to the light that the pane adds. A residual reflection has s = 1, or 2 if
+    the reflection layer has half of its contrast. From s = 2 to 4 the weight falls from 1 to 0, because such an edge
+    belongs to the transmission itself.
 
-    Gradients are Sobel's; pixels on the image border are left out.
-    Differentiable in `transmission` only, for which what cells count is constant: an edge of the reflection should not
-    appear in the transmission, and the reflection is not to give way.
+    Gradients are Sobel's; pixels on the image border are left out. Differentiable in `transmission` only, with constant
+    weights: edges of the reflection should not appear in the transmission, but the reflection should not adapt to it.
 
     Args:
         transmission: [H, W, 3] C_t, with H and W of at least 3.
         reflection: [H, W, 3] C_r.
-        hit: [H, W] weight of each pixel, 1 where a pane is.
-        strength: [H, W] R, the share of the light that is reflected; None counts all cells alike.
+        hit: [H, W] weight of each pixel, 1 on a pane.
+        strength: [H, W] R, the share of the light that is reflected; None weights all cells equally.
         cell: side of the cells, in pixels.
     """
     height, width = hit.shape

@@ -1,9 +1,9 @@
-"""Panes on the CPU: which one each pixel shows, their blending, how much of each layer is left, edges that they share.
+"""Panes on the CPU: ray hits, blending, derivatives of the blend by its layers, and edges shared by the layers.
 
-Rays meet rectangles row by row: everything but one division is affine along a row. Blending takes runs of pixels of one
-row and one pane. A run is first copied into *planes* of one flat buffer, one plane per quantity, at offsets known to
-the compiler; that is what lets it turn the curves of the colour space into vector instructions. Of slopes, greys come
-first, for the same reason.
+Rays are intersected with rectangles row by row, where everything but one division is affine. Blending processes runs of
+pixels of one row and one pane. A run is first copied into *planes* of one flat buffer, one plane per quantity. Their
+offsets are known to the compiler, so that it can vectorise the colour-space curves. `layer_slopes` computes the greys
+of a row first, for the same reason.
 """
 
 from __future__ import annotations
@@ -113,10 +113,10 @@ def pane_hits_forward(real: type) -> Kernel:
 
 LANES = 16
 RUN = 32
-"""Pixels of a run, whole vectors."""
+"""Pixels of a run, a multiple of the lanes."""
 
 ALL = (1 << LANES) - 1
-"""Bits of a whole vector."""
+"""Mask bits of a whole vector."""
 
 # Planes of a run. MASK is 0 where the run's pane is not shown; GAIN is the intensity.
 MASK, GAIN, RAW, SHARE, ALONG, LENGTH = (plane * RUN for plane in range(6))
@@ -164,7 +164,7 @@ def _load(real: type) -> Scalar:
 
     @inlined
     def load(run, transmission, mask, reflections, pane, intensity, row, k, first, count):
-        """Copies the pixels of a run; what lies beyond its end is not shown. Images of colours are flat."""
+        """Copies the pixels of a run; entries beyond its end count as not shown. Colour images are flat."""
         height, width = mask.shape
         pixel = row * width + first
         mirrored = k * height * width + pixel
@@ -200,7 +200,7 @@ def _load(real: type) -> Scalar:
 
 
 def _copies(real: type) -> tuple[Scalar, Scalar]:
-    """Between colours of `LANES` pixels, which lie in a row in a flat image, and three planes of a run."""
+    """Builds the copies between colours of `LANES` consecutive pixels of a flat image and three planes of a run."""
     load_lanes = vector_kind(real, LANES).load
 
     @inlined
@@ -313,7 +313,7 @@ def _unmix(real: type) -> Scalar:
 
     @inlined
     def unmix(run, d, linear):
-        """Gradients of channel d; those of BEHIND and MIRRORED replace V_RGB and V_BRIGHT, the others add up."""
+        """Gradients of channel d; those of BEHIND and MIRRORED replace V_RGB and V_BRIGHT, the others accumulate."""
         at = d * RUN
         for i in range(RUN):
             share = run[SHARE + i]
@@ -334,7 +334,7 @@ def _dim(real: type) -> Scalar:
 
     @inlined
     def dim(run, base, first, intrinsics, law):
-        """From the gradient of SHARE to sums over the run for the normal (x, 1) and the base reflectance."""
+        """Sums over the run, from SHARE's gradient: for the normal, weighted by x and 1, and the base reflectance."""
         inverse_f = one / intrinsics[0]
         start = real(np.int32(first)) + half - intrinsics[2]
         sum_x, sum_1, sum_base = zero, zero, zero
@@ -438,7 +438,7 @@ def blend_panes_backward(real: type) -> Kernel:
 def layer_slopes(
     strength: Tensor, transmission: Tensor, reflection: Tensor, where: Tensor, *, linear: bool
 ) -> tuple[Tensor, Tensor]:
-    """The slopes by the transmission and by the reflection [H, W]; see `glassplat.kernels.panes.layer_slopes`."""
+    """The derivatives by transmission and reflection [H, W]; see `glassplat.kernels.panes.layer_slopes`."""
     through, mirrored = torch.empty_like(strength), torch.empty_like(strength)
     layers = (tensor.numpy() for tensor in (strength, transmission, reflection, where))
     layer_slopes_kernel(REAL_OF[strength.dtype])(*layers, linear, through.numpy(), mirrored.numpy())
@@ -479,7 +479,7 @@ def layer_slopes_kernel(real: type) -> Kernel:
 def slopes_at(slopes: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
     """As `glassplat.kernels.panes.slopes_at`, of contiguous tensors."""
     height, width = slopes.shape
-    # Held within the image before the conversion, which infinities and NaN would leave to chance; fmax takes 0 for NaN.
+    # Clamped to the image before the conversion, which is undefined for infinities and NaN; fmax maps NaN to 0.
     zero = means2d.new_zeros(())
     columns, rows = (
         torch.fmax(axis, zero).clamp_(max=size - 1).int()
@@ -497,7 +497,7 @@ def inside_panes(pane: Tensor, strength: Tensor) -> Tensor:
     along, above = shown[:, 1:] == shown[:, :-1], shown[1:] == shown[:-1]
     inside[:, 1:] &= along
     inside[:, :-1] &= along
-    # Two rows of which each pixel shows what those next to it and the one above it show.
+    # Pairs of rows in which a pixel shows the same pane as its neighbours and the one above.
     pairs = (inside[1:] & inside[:-1]).logical_and_(above)
     inside[1:] &= pairs
     inside[:-1] &= pairs
@@ -510,17 +510,17 @@ CHANNELS = 3
 def gradient_conflict(
     transmission: Tensor, reflection: Tensor, hit: Tensor, strength: Tensor | None, cell: int
 ) -> tuple[Tensor, Tensor]:
-    """The mean of the edges that are counted, and slopes for its gradient (`kernels.panes.gradient_conflict`).
+    """The mean of the weighted edges, and slopes for its gradient (`kernels.panes.gradient_conflict`).
 
     Args:
-        transmission: [H, W, 3], as all of these contiguous.
+        transmission: [H, W, 3], contiguous like all of these.
         reflection: [H, W, 3].
         hit: [H, W].
         strength: [H, W], or None.
         cell: side of the cells in pixels.
     """
     height, width = hit.shape
-    # A ring of zeros around the derivatives spares the backward pass all questions about the border.
+    # A ring of zeros around the derivatives saves the border checks of the backward pass.
     slopes = transmission.new_zeros(2, height + 2, CHANNELS * (width + 2))
     sums = torch.zeros(-(-(height - 2) // cell), dtype=torch.float64)
     images = (transmission, reflection, hit, hit if strength is None else strength)
@@ -539,15 +539,15 @@ def gradient_conflict_gradient(slopes: Tensor, v_mean: Tensor) -> Tensor:
 
 
 def conflict_count(height: int, width: int) -> int:
-    """Number of derivatives of an image along one axis, of all channels; those on its border are left out."""
+    """Number of derivatives of an image along one axis, over all channels and without its border."""
     return CHANNELS * (height - 2) * (width - 2)
 
 
 @cache
 def conflict_forward(real: type) -> Kernel:
-    """Fills the sum of each row of cells, and slopes [2, H + 2, 3 (W + 2)], the derivatives by both of Sobel's images.
+    """Fills the sum of each row of cells, and slopes [2, H + 2, 3 (W + 2)], the derivatives by both Sobel images.
 
-    Columns are added up first, and then cells, so that the loops over pixels are of one piece.
+    Columns are summed first, and then cells, so that the loops over pixels are contiguous.
     """
     zero, one, two, darkest, counted = real(0.0), real(1.0), real(2.0), real(DARKEST), counting(real)
 
@@ -614,7 +614,7 @@ def conflict_forward(real: type) -> Kernel:
 
 @cache
 def conflict_backward(real: type) -> Kernel:
-    """Fills the gradient of the transmission [H, W, 3], the transposed Sobel operators of the slopes."""
+    """Fills the gradient of the transmission [H, W, 3], by the transposed Sobel operators on the slopes."""
     two = real(2.0)
 
     @kernel("gradient_conflict_backward", real)

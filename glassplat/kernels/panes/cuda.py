@@ -1,6 +1,6 @@
-"""Panes on the GPU: which one a pixel shows, their blending, and edges that layers share.
+"""Panes on the GPU: ray hits, blending, derivatives of the blend by its layers, and edges shared by the layers.
 
-Shared edges are added up by a block for each cell and channel.
+Shared edges are summed by one block per cell and channel.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from glassplat.kernels.records import DAZZLING, REAL_OF, TILE, PaneHits
 
 PIXELS = TILE * TILE
 SHORTEST = 1e-12
-"""Length below which a vector is not made unit, as by PyTorch."""
+"""Lower bound of a vector's length in its normalisation, as in PyTorch."""
 
 
 def pane_hits(
@@ -74,7 +74,7 @@ def mirrored_views_gradients(
 
 
 def vectors(real: type) -> tuple[Scalar, Scalar]:
-    """A row made unit, with its inverse length; and a vector turned by the rotation of a pose."""
+    """Builds the normalisation of a vector, with its inverse length, and the rotation of a vector by a pose."""
     least, one = real(SHORTEST), real(1.0)
 
     @inlined
@@ -95,7 +95,7 @@ def vectors(real: type) -> tuple[Scalar, Scalar]:
 
 @cache
 def rectangles_in_camera(real: type) -> Kernel:
-    """Fills all rectangles, of which there are few, in one thread."""
+    """Fills all rectangles in one thread, because there are few."""
     unit, turned = vectors(real)
 
     @kernel("panes_in_camera", real, "real2 real2 real2 real2 real2 real2 real3")
@@ -119,7 +119,7 @@ def rectangles_in_camera(real: type) -> Kernel:
 def mirrored_views_forward(real: type) -> Kernel:
     """Fills poses, normals and half spaces of all planes in one thread.
 
-    With m = R n the pose about a plane has the rotation R - 2 m n^T and the translation t + 2 (c . n) m.
+    With m = R n the pose mirrored about a plane has the rotation R - 2 m n^T and the translation t + 2 (c . n) m.
     """
     unit, turned = vectors(real)
     zero, one, two = real(0.0), real(1.0), real(2.0)
@@ -189,9 +189,10 @@ def mirrored_views_backward(real: type) -> Kernel:
 
 @cache
 def pane_hits_forward(real: type) -> Kernel:
-    """Fills the index and the depth, and marks the tiles in which a pane is shown and how far that reaches.
+    """Fills the index and the depth, and marks the tiles in which a pane is shown and its extents in the image.
 
-    A pane reaches so many pixels from the image's right, lower, left and upper border; 0 where it is not shown.
+    Extents reach from the image's right, lower, left and upper border to the pane's opposite edge, in pixels; 0 if not
+    shown.
     """
     half, one, zero, far = real(0.5), real(1.0), real(0.0), real(np.inf)
 
@@ -226,7 +227,7 @@ def pane_hits_forward(real: type) -> Kernel:
         index[row, column] = hit
         depth_of[row, column] = nearest
         if hit >= 0 and (mask.size == 0 or mask[row, column] > zero):
-            # Many threads may write here, all of them the same.
+            # Many threads may write here, all of them the same value.
             tiles[hit, tile_row, tile_column] = True
             cuda.atomic.max(reaches, (hit, 0), np.int32(width - column))
             cuda.atomic.max(reaches, (hit, 1), np.int32(height - row))
@@ -241,7 +242,7 @@ THREADS = 128
 
 @cache
 def windows_of(real: type) -> Kernel:
-    """Left, top, right and bottom edge of what each pane shows; all 0 where that is nothing."""
+    """Fills the left, top, right and bottom edge of the pixels that show each pane; all 0 if there are none."""
 
     @kernel("pane_windows", real, "int2 int int real2")
     def fill(reaches, width, height, windows):
@@ -276,7 +277,7 @@ def blend_panes_gradients(
     shares = mask.new_zeros(*mask.shape, 4)
     kernel_of = blend_panes_backward(REAL_OF[mask.dtype])
     kernel_of(blocks_for(mask.numel(), THREADS), THREADS, *inputs, *switches, *cotangents, *found, shares)
-    # A sum of its own for each pane, in an order that does not change from run to run.
+    # A separate sum for each pane, in an order that does not change from run to run.
     panes = torch.arange(normals.shape[0], device=mask.device)[:, None]
     sums = (pane.flatten() == panes).to(mask.dtype) @ shares.view(-1, 4)
     return (*found, sums[:, :3].contiguous(), sums[:, 3].contiguous())
@@ -333,8 +334,8 @@ def blend_panes_forward(real: type) -> Kernel:
 
 @cache
 def blend_panes_backward(real: type) -> Kernel:
-    """Fills the gradients of transmission, mask and reflections, and each pixel's share [H, W, 4] of those of its
-    pane's normal and base reflectance; all but the first start at zero.
+    """Fills the gradients of transmission, mask and reflections, and each pixel's contribution [H, W, 4] to those of
+    its pane's normal and base reflectance; all but the first start at zero.
     """
     shine, strength_slopes, (_, unmix) = _shine(real), pane_maths(real).strength_slopes, mixing(real)
     zero, one, dazzling = real(0.0), real(1.0), real(DAZZLING)
@@ -394,7 +395,7 @@ def layer_slopes(
 
 @cache
 def layer_slopes_kernel(real: type) -> Kernel:
-    """Fills both images [H, W], a pixel for each thread."""
+    """Fills both images [H, W], one thread per pixel."""
     linear_of, linear_slope, encoded, encoded_slope = color_space_maths(real)
     zero, one, third = real(0.0), real(1.0), real(1.0 / 3.0)
 
@@ -433,7 +434,7 @@ def slopes_at(slopes: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> 
 
 @cache
 def slopes_under(real: type) -> Kernel:
-    """Fills the slope at each centre, 1 before the surface; a splat for each thread."""
+    """Fills the derivative at each centre, 1 in front of the surface; one thread per splat."""
     zero, one = real(0.0), real(1.0)
 
     @kernel("slopes_at", real, "real2 real2 real2 real1 real1")
@@ -459,7 +460,7 @@ def inside_panes(pane: Tensor, strength: Tensor) -> Tensor:
 
 @cache
 def inside_of(real: type) -> Kernel:
-    """Fills 1 where a pixel and its neighbours show the same pane, and 0 elsewhere; a pixel for each thread."""
+    """Fills 1 where a pixel and its neighbours show the same pane, and 0 elsewhere; one thread per pixel."""
     zero, one = real(0.0), real(1.0)
 
     @kernel("inside_panes", real, "int2 real2 real2")
@@ -517,7 +518,7 @@ def sobel_at(image, y, x, d):
 
 @cache
 def conflict_forward(real: type) -> Kernel:
-    """Fills the sum of each cell and channel, and slopes [2, H - 2, W - 2, 3], its derivatives by Sobel's images."""
+    """Fills the sum of each cell and channel, and slopes [2, H - 2, W - 2, 3], its derivatives by the Sobel images."""
     zero, one, darkest, counted = real(0.0), real(1.0), real(DARKEST), counting(real)
 
     @kernel("gradient_conflict_forward", real, "real3 real3 real2 real2 int real4 real1")
@@ -566,7 +567,7 @@ def conflict_forward(real: type) -> Kernel:
 
 @cache
 def conflict_backward(real: type) -> Kernel:
-    """Fills the gradient of the transmission [H, W, 3], the transposed Sobel operators of the slopes."""
+    """Fills the gradient of the transmission [H, W, 3], by the transposed Sobel operators on the slopes."""
     zero, one, two, count = real(0.0), real(1.0), real(2.0), real(CHANNELS)
 
     @kernel("gradient_conflict_backward", real, "real4 real1 real3")

@@ -33,7 +33,7 @@ def pane_hits(
         offset = along - (panes.centers * panes.axes[:, axis]).sum(-1)[:, None, None]
         inside &= offset.abs() <= panes.half_sizes[:, axis, None, None]
     if beyond is not None:
-        # A pane is not behind itself, nor behind another of the same plane, however depths are rounded.
+        # A pane is not behind itself or a coplanar one, however depths are rounded.
         own = beyond.pane == torch.arange(count, device=beyond.pane.device)[:, None, None]
         inside &= (depth > beyond.depth * BEHIND) & ~own
     far = torch.full((1, height, width), torch.inf, dtype=rays.dtype)
@@ -65,7 +65,7 @@ def pixel_rays(intrinsics: Tensor, columns: Tensor, rows: Tensor) -> Tensor:
 
 
 def two_surfaces(base: Tensor, cosine: Tensor) -> Tensor:
-    """Snell's and Fresnel's laws at a surface, for both polarisations, and light going to and fro between two."""
+    """Snell's and Fresnel's laws at a surface, for both polarisations, with multiple reflections between two."""
     one_surface = torch.sqrt(base / (2 - base))
     inverse_index = (1 - one_surface) / (1 + one_surface)
     inside = torch.sqrt(1 - inverse_index**2 * (1 - cosine**2))
@@ -111,13 +111,13 @@ def blend_panes(
 
 
 GREY = 0.5
-"""Any strength and light at which the derivatives are finite, in place of what is left out."""
+"""Placeholder for strength and light of pixels that are left out; any value with finite derivatives works."""
 
 
 def layer_slopes(
     strength: Tensor, transmission: Tensor, reflection: Tensor, where: Tensor, *, linear: bool
 ) -> tuple[Tensor, Tensor]:
-    """See `glassplat.kernels.panes.layer_slopes`; left-out pixels are computed too, as no GPU is asked which."""
+    """See `glassplat.kernels.panes.layer_slopes`; left-out pixels are computed too, to avoid a GPU synchronisation."""
     layers = (strength, transmission.mean(dim=-1), reflection.mean(dim=-1))
     share, *greys = (torch.where(where, layer.detach(), GREY) for layer in layers)
     with torch.enable_grad():
@@ -134,7 +134,7 @@ def layer_slopes(
 def gradient_conflict(
     transmission: Tensor, reflection: Tensor, hit: Tensor, strength: Tensor | None = None, *, cell: int = 1
 ) -> Tensor:
-    """See `glassplat.kernels.panes.gradient_conflict`: products of Sobel derivatives, added up in cells."""
+    """See `glassplat.kernels.panes.gradient_conflict`: products of Sobel derivatives, summed in cells."""
     reflection, weight = reflection.detach(), hit[1:-1, 1:-1, None]
     of_transmission, of_reflection = sobel(transmission), sobel(reflection)
     products = weight * (of_transmission[0] * of_reflection[0] + of_transmission[1] * of_reflection[1])
@@ -151,7 +151,7 @@ def gradient_conflict(
 
 
 def in_cells(values: Tensor, cell: int) -> Tensor:
-    """Sums of values [H, W, C] over square cells of so many pixels; the last ones of a row or column may be smaller."""
+    """Sums of values [H, W, C] over square cells of `cell` pixels a side; the last ones of an axis may be smaller."""
     sums = torch.nn.functional.avg_pool2d(values.permute(2, 0, 1), cell, ceil_mode=True, divisor_override=1)
     return sums.permute(1, 2, 0)
 

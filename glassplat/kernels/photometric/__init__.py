@@ -1,4 +1,4 @@
-"""Difference of an image from a photograph: L1 and structural similarity (Wang et al. 2004), as in 3DGS."""
+"""Difference between an image and a photograph: L1 and structural similarity (Wang et al. 2004), as in 3DGS."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ class Photometric(NamedTuple):
 
 
 def photometric(image: Tensor, target: Tensor) -> Photometric:
-    """Mean absolute difference and mean structural similarity of an image and a photograph, in one traversal.
+    """Mean absolute difference and mean structural similarity of an image and a photograph, in one pass.
 
-    Similarity has a window of 11 x 11 with a Gaussian of sigma 1.5, zero beyond the border, C1 = 0.01^2,
-    C2 = 0.03^2. Differentiable in `image` only; the slope of |x - y| is 0 where they are equal.
+    Similarity uses an 11 x 11 Gaussian window with sigma 1.5, zero padding, C1 = 0.01^2 and C2 = 0.03^2. Differentiable
+    in `image` only; the derivative of |x - y| is 0 where they are equal.
 
     Args:
         image: [H, W, 3] in [0, 1], float32 or float64.
-        target: [H, W, 3] uint8, the photograph as it is stored; 255 is 1.
+        target: [H, W, 3] uint8, the photograph as stored; 255 represents 1.
     """
     _check_images(image, target)
     return Photometric(*_Photometric.apply(image, target))

@@ -1,10 +1,10 @@
-"""L1 and structural similarity on the CPU in one traversal, with the gradient of the similarity where it is asked for.
+"""L1 and structural similarity on the CPU in one pass, with the gradient of the similarity if requested.
 
-A tile is a run of columns of a strip of rows. Rows enter it from above in groups: they are blurred along the row, then
-down the columns, compared, and the slopes of the similarity are blurred in the same two steps, so that all that lies
-between photograph and gradient stays in the cache. An image row is taken as one run of interleaved channels: a
-horizontal tap is three floats away and every loop runs over contiguous memory. Squares need no blur of their own per
-image: similarity depends on their sum only.
+A tile is a range of columns in a strip of rows. Rows enter it from above in groups. They are blurred along the row,
+then down the columns, and compared; the derivatives of the similarity are blurred in the same two steps. All
+intermediate results thus stay in the cache. An image row is treated as one array of interleaved channels: horizontal
+taps are three floats apart, and every loop runs over contiguous memory. The squares of both images share one blur,
+because similarity depends on their sum only.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ MARGIN = RADIUS * CHANNELS
 ROWS = 76
 """Rows of a tile; with two margins above and below they fill six groups."""
 COLUMNS = 256
-"""Columns of a tile; like all columns here, floats and not pixels."""
+"""Columns of a tile; all columns here count floats, not pixels."""
 WIDE = COLUMNS + 2 * 16
 """Columns with one margin on either side, rounded up to whole vectors."""
 STRIDE = WIDE + 2 * 16
 GROUP = 16
 """Rows that enter a tile at once; ten rows before them are still needed."""
 TOGETHER = 4
-"""Rows that are blurred vertically at once, because they share most of what they read."""
+"""Rows that are blurred vertically at once, because they share most of their inputs."""
 
-# One flat buffer with offsets known to the compiler lets it see that its parts never overlap, so that loops become
-# vector code. A plane holds the rows that are needed at a time; it has 32, so that a mask can bound their number.
+# With one flat buffer and constant offsets the compiler sees that its parts never overlap, and vectorises the loops. A
+# plane holds the rows that are needed at a time; it has 32, so that a mask can bound the row's index.
 PLANE = 32 * STRIDE
 ENTERED = 0  # One row of image, photograph, sum of squares and product,
 BLURRED = ENTERED + 4 * STRIDE  # a plane of each after the blur along the row,
@@ -50,7 +50,7 @@ SCRATCH = BLURRED_SLOPES + 3 * PLANE
 
 
 def photometric(image: Tensor, target: Tensor, *, with_gradient: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean L1, mean similarity, and the gradient [H, W, 3] of the similarity's sum (empty unless asked for)."""
+    """Mean L1, mean similarity, and the gradient [H, W, 3] of the similarity's sum (empty unless requested)."""
     height, width, _ = image.shape
     ssim_gradient = image.new_empty(image.shape if with_gradient else (0, 0, CHANNELS))
     sums = np.zeros((-(-height // ROWS) * -(-width * CHANNELS // COLUMNS), 2), np.float64)
@@ -60,7 +60,7 @@ def photometric(image: Tensor, target: Tensor, *, with_gradient: bool) -> tuple[
 
 
 def photometric_gradient(image: Tensor, target: Tensor, ssim_gradient: Tensor, v_l1: Tensor, v_ssim: Tensor) -> Tensor:
-    """Gradient of the image, given what the forward pass found."""
+    """Gradient of the image, given the results of the forward pass."""
     real, v_image = REAL_OF[image.dtype], torch.empty_like(image)
     weights = (real(v.item() / image.numel()) for v in (v_l1, v_ssim))
     _backward(real)(_rows(image), _rows(target), _rows(ssim_gradient), *weights, _rows(v_image))
@@ -76,7 +76,7 @@ def _brightness(real: type) -> Scalar:
 
     @inlined
     def brightness(byte):
-        """A byte in [0, 1]; in double precision, so that it is the number nearest to the quotient."""
+        """A byte scaled to [0, 1]; in double precision, so that it is the number nearest to the quotient."""
         return real(np.float64(byte) * per_step)
 
     return brightness
@@ -132,7 +132,7 @@ def _compare_row(real: type) -> Scalar:
 
     @inlined
     def compare_row(scratch, row):
-        """Similarity of one of the four rows at `RESULTS`, and its slopes."""
+        """Similarity of one of the four rows at `RESULTS`, and its derivatives."""
         at = RESULTS + (row & 3) * STRIDE
         for j in range(WIDE):
             value, by_mean, by_squares, by_product = compare(
@@ -154,7 +154,7 @@ def _spread_slopes(real: type) -> Scalar:
 
     @inlined
     def spread_slopes(scratch, inside, left, rest, row):
-        """Blurs the row of slopes into row `row` of the planes; beyond the image, `rest` columns on, there are none."""
+        """Blurs the row of slopes into row `row` of the planes; beyond the image, after `rest` columns, they are 0."""
         for plane in range(3):
             at, to = SLOPES + (plane & 3) * STRIDE, BLURRED_SLOPES + (plane & 3) * PLANE + (row & 31) * STRIDE
             if inside:
@@ -188,7 +188,7 @@ def _ssim_gradient_row(real: type) -> Scalar:
 
 @inlined
 def _scroll(scratch, first, planes):
-    """Moves the last ten rows of each plane to its top, in one loop: row by row, LLVM takes a minute to compile it."""
+    """Moves the last ten rows of each plane to its top, in one loop: a loop per row takes LLVM a minute to compile."""
     for plane in range(planes):
         to = first + (plane & 7) * PLANE
         for j in range(2 * RADIUS * STRIDE):

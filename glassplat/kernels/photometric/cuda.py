@@ -1,7 +1,7 @@
 """L1 and structural similarity on the GPU: separable blurs of tiles in shared memory.
 
-There is one block for each tile and channel. The forward pass leaves the slopes of each pixel's similarity, which the
-backward pass blurs; to recompute them in its larger margin would cost more than to read them.
+There is one block per tile and channel. The forward pass stores the derivatives of each pixel's similarity, which the
+backward pass blurs; recomputing them in its larger margin would cost more than reading them.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from glassplat.kernels.records import REAL_OF, TILE
 CHANNELS = 3
 PIXELS = TILE * TILE
 WIDE = TILE + 2 * RADIUS
-"""Edge of a tile with its margin."""
+"""Side of a tile with its margin."""
 AREA, STRIP = WIDE * WIDE, WIDE * TILE
 
 
 def photometric(image: Tensor, target: Tensor, *, with_gradient: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean L1, mean similarity, and the similarity's slopes [3, H, W, 3] (empty unless asked for).
+    """Mean L1, mean similarity, and the similarity's slopes [3, H, W, 3] (empty unless requested).
 
     Slopes are the derivatives of each pixel's similarity by the blurred image, squares and product.
     """
@@ -38,7 +38,7 @@ def photometric(image: Tensor, target: Tensor, *, with_gradient: bool) -> tuple[
 
 
 def photometric_gradient(image: Tensor, target: Tensor, slopes: Tensor, v_l1: Tensor, v_ssim: Tensor) -> Tensor:
-    """Gradient of the image, given what the forward pass found."""
+    """Gradient of the image, given the results of the forward pass."""
     v_image = torch.empty_like(image)
     weights = torch.stack([v_l1, v_ssim]) / image.numel()
     photometric_backward(REAL_OF[image.dtype])(_blocks(image), PIXELS, image, target, slopes, weights, v_image)
@@ -109,7 +109,7 @@ def photometric_forward(real: type) -> Kernel:
                 slopes[0, y, x, channel] = by_mean
                 slopes[1, y, x, channel] = by_squares
                 slopes[2, y, x, channel] = by_product
-        # Nobody reads the sums of squares and the products any more; a tree adds up in an order that never changes.
+        # Squares and products are not needed any more; their memory serves a tree reduction, whose order is fixed.
         squares[t], products[t] = difference, similarity
         step = PIXELS // 2
         while step > 0:
