@@ -1,7 +1,7 @@
-"""Operations on tensors: most are differentiable, and most have a plain-PyTorch twin of the same name.
+"""Tensor operations: most are differentiable, and most have a plain-PyTorch twin of the same name.
 
-All of them raise ValueError where shapes disagree or a value is out of range, and TypeError where tensors are of
-different or unsupported types, or not on one device that has kernels.
+All of them raise ValueError if shapes disagree or a value is out of range, and TypeError if tensors have different or
+unsupported types, or are not on one device with kernels.
 """
 
 from __future__ import annotations
@@ -9,4 +9,4 @@ from __future__ import annotations
 from typing import Literal
 
 Fresnel = Literal["pane", "schlick", "none"]
-"""How reflectance follows the angle: as that of a pane with two surfaces, by Schlick's curve of one, or not at all."""
+"""Angular dependence of reflectance: that of a pane with two surfaces, Schlick's curve of one surface, or none."""

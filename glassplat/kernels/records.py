@@ -1,7 +1,7 @@
-"""Records that the kernel operations hand to each other, and what every operation asks of its tensors.
+"""Records passed between kernel operations, and checks of their tensors.
 
-`C` cameras, `N` Gaussians, `G >= N` splats per camera. Dense layout: what a camera does not see has `radii == 0`, a
-disc `opacities == 0` too.
+`C` cameras, `N` Gaussians, `G >= N` splats per camera. Dense layout: Gaussians that a camera does not see have
+`radii == 0`, discs `opacities == 0` too.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def check_tensors(expected: dict[str, tuple[Tensor, tuple[int, ...]]]) -> None:
 
 
 def check_device(name: str, tensor: Tensor, other_name: str, other: Tensor) -> None:
-    """Raises unless a tensor is where another one is, on a device that has kernels."""
+    """Raises unless a tensor is on the device of another one, and that device has kernels."""
     if tensor.device.type not in DEVICES:
         raise TypeError(
             f"{name} is on {tensor.device}, but only the CPU and NVIDIA GPUs have kernels; move it there with .cpu()"
@@ -56,7 +56,7 @@ class CameraBatch(NamedTuple):
     """Cameras of one image size: cam_from_world [C, 4, 4], intrinsics [C, 4] as (fx, fy, cx, cy), pixels.
 
     `clip_planes` [C, 4] are world planes (n, d): a Gaussian is kept where n . mean + d > 0.
-    `windows` [C, 4] are left, top, right and bottom edge, in pixels, of the part of each image that is wanted.
+    `windows` [C, 4] are left, top, right and bottom edge, in pixels, of the region of each image to be rendered.
     """
 
     cam_from_world: Tensor
@@ -94,30 +94,30 @@ class Splats(NamedTuple):
 
 
 MOST_CHANNELS = 32
-"""Channels of a splat that can be blended at once."""
+"""Maximum number of channels that are blended at once."""
 
 TILE = 16
 """Edge of a tile in pixels."""
 BEHIND = 1 + 1e-5
-"""By what factor farther along a ray a pane has to be to be another surface: panes of one front share their plane up to
+"""Ratio of ray distances beyond which two panes are separate surfaces: panes of one shop front share their plane up to
 rounding, and their rectangles may overlap."""
 DAZZLING = 1.5
-"""Intensity of a reflection beyond which it is that of a lamp."""
+"""Reflected intensity beyond which a reflection is treated as that of a lamp."""
 
 MOST_PAIRS = 2**31 - 1
-"""(tile, splat) pairs that their index type can count."""
+"""Maximum number of (tile, splat) pairs; limited by the index type."""
 
 LEAST_ALPHA = 1e-6
-"""Coverage up to which a pixel holds nothing, and the mean of its channels is taken for 0."""
+"""Coverage up to which a pixel counts as empty, and the mean of its channels as 0."""
 ON_MEAN = 8
-"""Rounding steps of a mean within which values lie on it: whoever covers a pixel alone deviates by rounding only."""
+"""Values within this many rounding steps of a mean equal it: a splat alone in its pixel deviates only by rounding."""
 
 
 class Deviation(NamedTuple):
     """A request for the spread of one channel along each pixel's ray.
 
-    channel: which one. where [C, H, W]: factor on the result; tiles in which it is 0 throughout cost nothing.
-    through_mean: let the gradient pass through the mean too.
+    channel: index of the channel. where [C, H, W]: factor on the result; tiles in which it is 0 throughout are skipped.
+    through_mean: propagate the gradient through the mean too.
     """
 
     channel: int
@@ -129,7 +129,7 @@ class TileBins(NamedTuple):
     """Splats per 16 x 16 tile, front to back.
 
     pair_splats [P] int32: splat of each (tile, splat) pair, an index into the flattened [C * G].
-    tile_offsets [C * T + 1] int64: where each tile's pairs begin.
+    tile_offsets [C * T + 1] int64: start of each tile's pairs.
     pair_slots [P] int32, splat_offsets [C * G + 1] int64: `pair_slots[splat_offsets[s] : splat_offsets[s + 1]]`
     are the positions of splat s in `pair_splats`.
     active [A] int32: tiles (camera * T + tile) to traverse.
@@ -146,7 +146,7 @@ class TileBins(NamedTuple):
 
 
 def check_pair_count(count: int) -> None:
-    """Raises ValueError where there are more (tile, splat) pairs than can be indexed."""
+    """Raises ValueError if there are more (tile, splat) pairs than can be indexed."""
     if count > MOST_PAIRS:
         raise ValueError(
             f"{count} (tile, splat) pairs are more than the {MOST_PAIRS} that can be indexed; render fewer cameras at "
@@ -155,17 +155,17 @@ def check_pair_count(count: int) -> None:
 
 
 FLAT, SOLID = 2, 3
-"""Scales of a disc and of an ellipsoid."""
+"""Number of scales of a disc and of an ellipsoid."""
 
 
 class ProjectedDiscs(NamedTuple):
     """Discs on screen.
 
-    means2d [C, N, 2] pixels. maps [C, N, 6]: where a pixel's ray meets the disc (`maths/disc.py`). depths [C, N] of the
-    centres, camera z; opacities [C, N] in (0, 1); colors [C, N, 3]; normals [C, N, 3] unit, world axes, towards the
-    camera. outline_centers [C, N, 2], outline_conics [C, N, 3]: an ellipse around what a disc covers with at least
-    1/255, for `bin_tiles`; conics of zeros for one that crosses the near plane. radii [C, N, 2] half extents of that
-    ellipse in pixels, 0 where culled.
+    means2d [C, N, 2] pixels. maps [C, N, 6]: map from pixels to the points where their rays meet the disc
+    (`maths/disc.py`). depths [C, N] of the centres, camera z; opacities [C, N] in (0, 1); colors [C, N, 3]; normals
+    [C, N, 3] unit, world axes, towards the camera. outline_centers [C, N, 2], outline_conics [C, N, 3]: an ellipse
+    around the region where a disc covers at least 1/255, for `bin_tiles`; zero conics if it crosses the near plane.
+    radii [C, N, 2] half extents of that ellipse in pixels, 0 where culled.
     """
 
     means2d: Tensor
@@ -180,7 +180,7 @@ class ProjectedDiscs(NamedTuple):
 
     @property
     def outlines(self) -> Splats:
-        """Splats of these discs for `bin_tiles`."""
+        """Outlines of these discs as splats for `bin_tiles`."""
         return Splats(self.outline_centers, self.outline_conics, self.opacities, self.depths, self.radii)
 
 
@@ -207,12 +207,12 @@ class Panes(NamedTuple):
 
 
 class PaneHits(NamedTuple):
-    """Pane that each pixel shows.
+    """The pane visible in each pixel.
 
     pane [H, W] int32: the nearest pane that the pixel's ray meets, -1 where there is none.
-    depth [H, W]: where it does, infinite where there is none.
-    tiles [K, rows, columns] bool: tiles in which a pixel shows the pane.
-    windows [K, 4]: left, top, right and bottom edge, in pixels, of the pixels that show it; all 0 where none does.
+    depth [H, W]: depth of the intersection, infinite where there is none.
+    tiles [K, rows, columns] bool: tiles with a pixel that shows the pane.
+    windows [K, 4]: left, top, right and bottom edge, in pixels, of the pixels that show it; all 0 if none does.
     """
 
     pane: Tensor
@@ -230,7 +230,7 @@ class BlendedPanes(NamedTuple):
 
 
 NORMAL_MIN = 1e-6
-"""A blended normal that is shorter has no direction."""
+"""Shortest blended normal that still defines a direction."""
 
 
 NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS = 3, 6, 7
@@ -238,7 +238,7 @@ NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS = 3, 6, 7
 
 
 class Shaded(NamedTuple):
-    """An image, what it shows without reflection, and what it mirrors: rgb, base and reflection [H, W, 3] sRGB."""
+    """An image, its base without reflection, and its reflection: rgb, base and reflection [H, W, 3] sRGB."""
 
     rgb: Tensor
     base: Tensor
@@ -246,14 +246,14 @@ class Shaded(NamedTuple):
 
 
 class Rays(NamedTuple):
-    """Origins [R, 3] and directions [R, 3], world units; a direction may have any length but zero."""
+    """Origins [R, 3] and directions [R, 3], world units; directions may have any non-zero length."""
 
     origins: Tensor
     directions: Tensor
 
 
 class Shapes(NamedTuple):
-    """Activated Gaussians as rays meet them: means [N, 3], frames [N, 3, 3] (rows, see `maths/disc.py`),
+    """Activated Gaussians for ray intersection: means [N, 3], frames [N, 3, 3] (rows, see `maths/disc.py`),
     opacities [N], sh [N, K, 3].
     """
 
@@ -264,12 +264,12 @@ class Shapes(NamedTuple):
 
 
 class Bvh(NamedTuple):
-    """A bounding volume hierarchy of eight children a node, over Gaussians in an order of their own.
+    """A bounding volume hierarchy with eight children per node, over reordered Gaussians.
 
-    order [N] int32: Gaussian at each place; a node of the lowest level holds eight places in a row, one of the next
-    level eight such nodes in a row, and so on.
-    boxes [nodes, 6, 8]: lowest x, y, z and highest x, y, z of each node's children, the lowest level first.
-    level_offsets [levels + 1] int64: where each level's nodes begin.
+    order [N] int32: Gaussian at each position; a leaf holds eight consecutive positions, a node of the next level eight
+    consecutive leaves, and so on.
+    boxes [nodes, 6, 8]: minimum x, y, z and maximum x, y, z of each node's children, leaves first.
+    level_offsets [levels + 1] int64: start of each level's nodes.
     """
 
     order: Tensor
@@ -281,9 +281,10 @@ class Traced(NamedTuple):
     """Results of tracing rays.
 
     colors [R, 3]: blended front to back (EnvGS, Eq. 2), over black.
-    alphas [R]: share of the light that Gaussians take.
-    depths [R]: distance from the origin to each hit, blended as colours are; divide by `alphas` for its mean.
-    hits [R] int32: how many Gaussians were blended.
+    alphas [R]: accumulated opacity, 1 - T.
+    depths [R]: distance from the origin to each hit, blended like colours; divide by `alphas` for the expected
+    distance.
+    hits [R] int32: number of Gaussians blended.
     """
 
     colors: Tensor

@@ -1,4 +1,4 @@
-"""Statistics of the views of a step for each Gaussian, added up for densification."""
+"""Per-Gaussian statistics over the views of a step, accumulated for densification."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ CHUNK = 1024
 
 
 class Sums(NamedTuple):
-    """Sums for each of N Gaussians, in two rows: over all views, and over those that see it directly.
+    """Sums for each of N Gaussians, in two rows: over all views, and over direct (not mirrored) views.
 
-    gradient_sum [2, N]: norms of the gradient of the centre; absgrad_sum [2, N]: of its absolute gradient; view_count
-    [2, N]: how many views.
+    gradient_sum [2, N]: norms of the gradient of the centre; absgrad_sum [2, N]: norms of its absolute gradient;
+    view_count [2, N]: number of views.
     """
 
     gradient_sum: Tensor
@@ -34,9 +34,9 @@ class Sums(NamedTuple):
 class Views(NamedTuple):
     """Views of one image size, and the gradients of a loss in them.
 
-    v_means2d, v_absgrad, radii [C, N, 2]: gradients of centres, absolute ones, and half extents, in pixels, 0 where a
-    view does not see the Gaussian. weight: what a view counts, a scalar for all or [C, N] for each Gaussian.
-    direct: whether the views see the Gaussians themselves, and not their mirror images.
+    v_means2d, v_absgrad, radii [C, N, 2]: gradients of centres, absolute gradients, and half extents in pixels, 0 where
+    a view does not see the Gaussian. weight: weight of a view in the counts, a scalar for all or [C, N] for each
+    Gaussian. direct: True if the views see the Gaussians themselves, False for their mirror images.
     """
 
     v_means2d: Tensor
@@ -52,11 +52,11 @@ class Views(NamedTuple):
 def add_views(sums: Sums, views: Views) -> None:
     """Adds the views of one step to the sums, in place.
 
-    Gradients are taken to normalised device coordinates, in which the image spans [-1, 1] both ways: a shift by one
-    pixel is 2 / width there, so gradients per pixel are multiplied by width / 2 and height / 2.
+    Gradients are converted to normalised device coordinates, in which the image spans [-1, 1] in both directions. A
+    shift by one pixel is 2 / width there, so gradients per pixel are multiplied by width / 2 and height / 2.
 
     Args:
-        sums: the record so far; contiguous float32 or float64.
+        sums: sums of earlier steps; contiguous float32 or float64.
         views: of the same floating-point type.
     """
     cameras, count, _ = views.radii.shape
@@ -82,7 +82,7 @@ def add_views(sums: Sums, views: Views) -> None:
 
 @functools.cache
 def add_views_kernel(real: type) -> Kernel:
-    """Adds to the first `rows` rows of the sums; `weight` is [C, N], or [1, 1] where it is the same for all."""
+    """Adds to the first `rows` rows of the sums; `weight` is [C, N], or [1, 1] for one weight for all."""
     half, zero = real(0.5), real(0.0)
 
     @kernel("screen_statistics", real)

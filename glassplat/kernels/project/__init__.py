@@ -1,4 +1,4 @@
-"""Projects Gaussians onto the screens of a batch of cameras: ellipsoids, and discs (2DGS)."""
+"""Projects Gaussians into a batch of cameras: ellipsoids (3DGS), and discs (2DGS)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def projection_inputs(
     Args:
         gaussians: raw tensors, float32 or float64.
         cameras: of the same floating-point type.
-        scales: how many a Gaussian has.
+        scales: number of scales per Gaussian.
         sh_degree: highest degree of the spherical harmonics to evaluate.
         near: smallest depth.
     """
@@ -43,14 +43,14 @@ def projection_inputs(
 
 
 def _degree(gaussians: RawGaussians, sh_degree: int) -> int:
-    """The degree as kernels take it: -1 for no colour."""
+    """SH degree for the kernels: -1 without coefficients."""
     return sh_degree if gaussians.sh.shape[1] else -1
 
 
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)
 def _whole_images(count: int, width: int, height: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Windows of all pixels, the same tensor at every call; filled on the device, as copying numbers makes it wait."""
+    """Windows of whole images, in a cached tensor; filled on the device, because copying from the host synchronises."""
     windows = torch.zeros(count, 4, dtype=dtype, device=device)
     windows[:, 2].fill_(width)
     windows[:, 3].fill_(height)
@@ -78,16 +78,16 @@ def _check(gaussians: RawGaussians, cameras: CameraBatch, scales: int) -> None:
 
 @dataclass
 class GradientSum:
-    """Common tensors in which projections of the same Gaussians add up their gradients.
+    """Shared tensors in which projections of the same Gaussians accumulate their gradients.
 
-    Most of a gradient is zeros, of what a camera does not see; filling and adding them costs more than the rest. Each
-    projection hands the next one a token, so that autograd asks for their gradients from the last to the first, which
-    alone returns the sum.
+    Most of a gradient is zeros, for Gaussians that a camera does not see; filling and adding them costs more than the
+    rest. Each projection passes a token to the next one, so that autograd visits them from the last to the first, and
+    only the first returns the sum.
 
     Attributes:
-        token: of the projection before.
-        found: what the projections after it have found, where they have been asked; empty otherwise. Nodes of the graph
-            hold this list and not the record, whose token holds them.
+        token: token of the previous projection.
+        found: sum of later projections, if their backward pass has run; empty otherwise. Graph nodes hold this list and
+            not the record, because its token refers back to them.
     """
 
     token: Tensor | None = None
@@ -99,14 +99,14 @@ def project(
 ) -> Projected:
     """Projects Gaussians into cameras: activation, EWA splatting, bounds, culling and view-dependent colour.
 
-    A Gaussian is culled in a camera when its depth is at most `near`, its centre is not on the kept side of
-    the camera's clip plane, its coverage reaches 1/255 nowhere in the camera's window, or a parameter is not
-    finite. Then its radii and all its other values are zero and it gets no gradient from that camera.
+    A Gaussian is culled in a camera if its depth is at most `near`, its centre is not on the kept side of the camera's
+    clip plane, its coverage stays below 1/255 throughout the camera's window, or a parameter is not finite. Then its
+    radii and all its other outputs are zero and it gets no gradient from that camera.
 
-    A splat's covariance is J A Sigma A^T J^T plus 0.3 px^2 on the diagonal, A the upper 3x3 block of
-    `cam_from_world` and J the Jacobian of the projection; beyond 1.3 times the image, J stays that of the border.
-    Colours are seen along the direction from the camera centre, defined as -A^T t, to the mean, offset by 0.5 and
-    clamped at 0. A mirrored, left-handed A is as good as any.
+    A splat's covariance is J A Sigma A^T J^T plus 0.3 px^2 on the diagonal, with A the upper 3x3 block of
+    `cam_from_world` and J the Jacobian of the projection; beyond 1.3 times the image, J is that of the border. Colours
+    are evaluated along the direction from the camera centre, defined as -A^T t, to the mean, offset by 0.5 and clamped
+    at 0. A may be a mirrored, left-handed pose.
 
     Differentiable in all tensors of `gaussians` and in `cam_from_world`; `radii` carry no gradient.
 
@@ -116,7 +116,7 @@ def project(
         sh_degree: highest degree of the spherical harmonics to evaluate; `gaussians.sh` may hold more, or
             none at all, which makes all colours zero.
         near: smallest depth (camera z, world units), at least 0.
-        total: the same for all projections of these very tensors whose gradients are to be added up.
+        total: shared by all projections of these same tensors whose gradients are to be summed.
     """
     inputs = projection_inputs(gaussians, cameras, scales=SOLID, sh_degree=sh_degree, near=near)
     total = GradientSum() if total is None else total
@@ -145,7 +145,7 @@ class _Project(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         *inputs, radii = ctx.saved_tensors
-        # Only a projection that was asked in this very pass has handed back its token.
+        # A gradient of the token means that the next projection has run in this backward pass.
         known = None if gradients[6] is None else list(ctx.shared)
         ctx.shared.clear()
         found, cameras = kernels_for("project", radii.device).project_gradients(
@@ -168,7 +168,7 @@ def _pose_gradient(cameras: Tensor, cam_from_world: Tensor) -> Tensor:
 
 
 def _cotangents(gradients: Sequence[Tensor | None], radii: Tensor) -> list[Tensor]:
-    """Gradients of means2d, conics, depths, opacities and colors; zeros for those that nothing comes from."""
+    """Gradients of means2d, conics, depths, opacities and colors; zeros where autograd passes None."""
     return [
         radii.new_zeros(*radii.shape[:2], *rest) if gradient is None else gradient.contiguous()
         for gradient, rest in zip(gradients[:5], ((2,), (3,), (), (), (3,)), strict=True)
@@ -176,24 +176,24 @@ def _cotangents(gradients: Sequence[Tensor | None], radii: Tensor) -> list[Tenso
 
 
 SMOOTH = 6
-"""Outputs with a gradient; they come first."""
+"""Number of differentiable outputs; they come first."""
 
 
 def project_discs(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, near: float) -> ProjectedDiscs:
     """Projects discs into cameras: activation, the map from pixels to the disc, outlines, culling and colour.
 
-    A disc lies in the plane of the first two axes of its rotation and falls off with two deviations; the third axis is
-    its normal. It ends at three deviations, or before that where its coverage falls to 1/255.
+    A disc lies in the plane of the first two axes of its rotation and falls off with two standard deviations; the third
+    axis is its normal. It is cut off at three deviations, or earlier if its coverage falls to 1/255.
 
-    A disc is culled in a camera when the depth of its centre is at most `near`, its centre is not on the kept side of
-    the camera's clip plane, it is seen from its edge (the cosine between its normal and the ray to its centre is at
-    most 1e-3), its outline lies outside the camera's window, its opacity is at most 1/255, it has no size (a log scale
-    beyond -40 or 40), or a parameter or its map is not finite. Then its radii and all its other values are zero and it
-    gets no gradient from that camera. A disc that reaches through the near plane is kept where what lies behind
-    that plane may be seen: then its outline is the whole image, and `composite_discs` leaves out what lies before it.
+    A disc is culled in a camera if the depth of its centre is at most `near`, its centre is not on the kept side of the
+    camera's clip plane, it is seen edge-on (the cosine between its normal and the ray to its centre is at most 1e-3),
+    its outline lies outside the camera's window, its opacity is at most 1/255, a log scale is beyond -40 or 40, or a
+    parameter or its map is not finite. Then its radii and all its other outputs are zero and it gets no gradient from
+    that camera. A disc that crosses the near plane is kept if its part beyond that plane may be visible. Then its
+    outline is the whole image, and `composite_discs` omits the part in front of the plane.
 
-    Colours are those of `project`: along the direction from the camera centre, -A^T t, to the mean. A mirrored,
-    left-handed A is as good as any.
+    Colours are those of `project`: along the direction from the camera centre, -A^T t, to the mean. A may be a
+    mirrored, left-handed pose.
 
     Differentiable in all tensors of `gaussians` and in `cam_from_world`; outlines and radii carry no gradient.
 

@@ -1,9 +1,9 @@
-"""Projection on the CPU: chunks of Gaussians, in every camera of the batch.
+"""Projection on the CPU: chunks of Gaussians into every camera of the batch.
 
-Chunks have a fixed size, whatever the number of threads. Of a chunk the Gaussians that may show are listed first, then
-those that do, each time sixteen at once; colours come last, as coefficients are most of a Gaussian's memory. The
-adjoint goes over the same chunks. Gradients that many Gaussians share (those of the cameras) are summed per chunk and
-then over chunks in order, so that results do not depend on the number of threads.
+Chunks have a fixed size, independent of the number of threads. In each chunk, the Gaussians that may be visible are
+listed first, then those that are, sixteen at once in SIMD lanes. Colours come last, because coefficients are most of a
+Gaussian's memory. The backward pass uses the same chunks. Gradients of the cameras are summed per chunk and then over
+chunks in order, so that results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ WIDTHS = ((2,), (MAP,), (), (), (3,), (3,), (2,), (3,), (2,))
 
 
 def project_discs(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, near: float) -> tuple[Tensor, ...]:
-    """Fields of `ProjectedDiscs` from raw discs, poses, intrinsics, clip planes and windows; degree -1 is no colour."""
+    """Fields of `ProjectedDiscs` from raw discs, poses, intrinsics, clip planes, windows; degree -1 skips colours."""
     means, cam_from_world = inputs[0], inputs[5]
     real, leading = REAL_OF[means.dtype], (cam_from_world.shape[0], means.shape[0])
     outputs = tuple(means.new_empty(*leading, *rest) for rest in WIDTHS)
@@ -114,7 +114,7 @@ def project_discs_forward(real: type) -> Kernel:
 
 
 def _disc_backward(real: type) -> Scalar:
-    """One disc in all cameras: fills its gradients, which are zero beforehand."""
+    """Fills the gradients, initially zero, of one disc from all cameras."""
     footprint, zero = discs(real), real(0.0)
     shape, finish, project_back = footprint.shape, footprint.finish, projecting_back(real, footprint)
 
@@ -175,7 +175,7 @@ def project_discs_backward(real: type) -> Kernel:
 __all__ = ["project", "project_discs", "project_discs_gradients", "project_gradients"]
 
 OWN, SHARED = 11, 12
-"""Gradients of a Gaussian without its coefficients, and what it adds to those of a camera."""
+"""Number of gradients of a Gaussian without its coefficients, and of its contributions to a camera's gradient."""
 
 
 def _place_backward(real: type) -> Callable[..., Any]:
@@ -187,7 +187,7 @@ def _place_backward(real: type) -> Callable[..., Any]:
         g_means2d, g_conics, g_depths, g_opacities, needs_camera, total,
         g_means, g_quats, g_log_scales, g_logit_opacities,
     ):  # fmt: skip
-        """Adds to all gradients but that of the colour, of those listed; `columns` is scratch."""
+        """Adds the gradients, other than those of colours, of the listed Gaussians; `columns` is scratch."""
         for first in range(0, shown, LANES):
             last = min(first + LANES, shown) - 1
             gather_shapes(columns, listed, first, last, means, quats, log_scales, logit_opacities)
@@ -220,7 +220,7 @@ def _add_coefficients(real: type) -> Callable[..., Any]:
 
     @inlined
     def add_coefficients(listed, first, last, table, positions, terms, g_sh, row_size):
-        """Adds the second half of the table, a column for each of the first coefficients; `g_sh` is flat."""
+        """Adds the second half of the table, one column per coefficient, to `g_sh`, which is flat."""
         if row_size != COLUMNS:
             for i in range(last + 1 - first):
                 for k in range(3 * terms):
@@ -249,11 +249,11 @@ def _color_backward(real: type) -> Callable[..., Any]:
         listed, shown, columns, table, positions, c, degree, means, sh, row_size, cam_from_world, lens,
         g_colors, needs_camera, total, g_means, g_sh,
     ):  # fmt: skip
-        """Adds what comes from the colours of those listed; `sh` and `g_sh` are flat, the list is used up."""
+        """Adds the gradients of the listed Gaussians' colours; `sh` and `g_sh` are flat; the list is overwritten."""
         touched = 0
         for at in range(shown):
             n = listed[at]
-            # A Gaussian that no pixel saw, as behind others, has nothing to pass on.
+            # Gaussians without a colour gradient, such as occluded ones, are skipped.
             if not (g_colors[c, n, 0] == zero and g_colors[c, n, 1] == zero and g_colors[c, n, 2] == zero):
                 listed[touched] = n
                 touched += 1
@@ -284,9 +284,9 @@ def _color_backward(real: type) -> Callable[..., Any]:
 
 @cache
 def project_backward(real: type) -> Kernel:
-    """Adds to the gradients of the Gaussians, or fills them where they are `fresh`, and adds to those of the cameras.
+    """Adds to the gradients of the Gaussians, or fills them if they are `fresh`, and adds to those of the cameras.
 
-    These are [C, 12], rows of (3x3 block, translation).
+    The latter are [C, 12], rows of (3x3 block, translation).
     """
     fill_lenses = view_steps(real).fill_lenses
     color_backward, place_backward = _color_backward(real), _place_backward(real)
@@ -337,7 +337,7 @@ def project_backward(real: type) -> Kernel:
 
 
 def project(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, near: float) -> tuple[Tensor, ...]:
-    """Fields of `Projected` from raw Gaussians, poses, intrinsics, clip planes and windows; degree -1 is no colour."""
+    """Fields of `Projected` from raw Gaussians, poses, intrinsics, clip planes and windows; degree -1 skips colours."""
     means, cam_from_world = inputs[0], inputs[5]
     real, leading = REAL_OF[means.dtype], (cam_from_world.shape[0], means.shape[0])
     outputs = tuple(means.new_empty(*leading, *rest) for rest in ((2,), (3,), (), (), (3,), (2,)))
@@ -355,7 +355,7 @@ def project_gradients(
 ) -> tuple[list[Tensor], Tensor]:  # fmt: skip
     """Gradients of raw Gaussians and of each camera [C, 12]; `radii` are those of the forward pass.
 
-    Those of the Gaussians are added to what is `known`, in place.
+    Gradients of the Gaussians are added to those in `known`, in place.
     """
     real = REAL_OF[inputs[0].dtype]
     found = [torch.empty_like(tensor) for tensor in inputs[:5]] if known is None else known
@@ -369,7 +369,7 @@ def project_gradients(
 
 
 def listing(real: type) -> Callable[..., Any]:
-    """The step that lists the Gaussians of a chunk that may show in a camera."""
+    """Builds the step that lists the Gaussians of a chunk that may be visible in a camera."""
     load_triples, may_show = load_triples_of(real), may_show_of(real)
 
     @inlined
@@ -377,7 +377,7 @@ def listing(real: type) -> Callable[..., Any]:
         listed, means, log_scales, ends, begin, end, c, cam_from_world, intrinsics, lens, near, clip_planes, clips,
         windows,
     ):  # fmt: skip
-        """Returns how many there are; means and log scales are flat, `ends` is scratch."""
+        """Returns the number of candidates; means and log scales are flat, `ends` is scratch."""
         found, count = 0, means.size // 3
         for n in range(begin, end, LANES):
             if n + LANES <= count:
@@ -401,7 +401,7 @@ def listing(real: type) -> Callable[..., Any]:
 
 
 def placing_listed(real: type) -> Callable[..., Any]:
-    """The step that fills everything but the colours of those listed that are visible."""
+    """Builds the step that fills all outputs but the colours, for the visible ones of the listed Gaussians."""
     place, half_extents = place_of(real), screen_maths(real).half_extents
     zero = real(0.0)
     U, V, XX, XY, YY, DEPTH, OPACITY, WIDE, HIGH = (field * LANES for field in range(9))
@@ -411,7 +411,7 @@ def placing_listed(real: type) -> Callable[..., Any]:
         listed, found, columns, c, means, quats, log_scales, logit_opacities, cam_from_world, intrinsics, lens, windows,
         means2d, conics, depths, opacities, radii,
     ):  # fmt: skip
-        """Returns how many there are, which the list holds then; `columns` is scratch."""
+        """Returns the number of visible Gaussians and keeps them in the list; `columns` is scratch."""
         shown = 0
         for first in range(0, found, LANES):
             last = min(first + LANES, found) - 1
@@ -442,7 +442,7 @@ def placing_listed(real: type) -> Callable[..., Any]:
 
 
 def coloring(real: type) -> Callable[..., Any]:
-    """The step that fills the colours of those listed; whoever has none that is finite is culled."""
+    """Builds the step that fills the colours of listed Gaussians; those with a non-finite colour are culled."""
     tabulate, color = color_steps(real)
     cull, full = culling(real)[0], vector_kind(real, LANES).full
     zero, half, largest = real(0.0), real(0.5), real(np.finfo(real).max)

@@ -1,6 +1,6 @@
-"""Projection of Gaussians for one camera, sixteen at once, and the gradients, in vectors.
+"""Projection of Gaussians into one camera, sixteen at once in SIMD lanes, and its gradients.
 
-The same maths as for one of them (`steps`), which takes vectors as it takes numbers, but for roots and limits.
+The maths of single Gaussians (`steps`) accepts vectors too, except for roots and limits.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from glassplat.kernels.project.steps import MOST_SQUARED_DEVIATIONS, place_gradi
 
 LANES = 16
 COLUMNS = 48
-"""Coefficients of a Gaussian at most."""
+"""Maximum number of coefficients of a Gaussian."""
 
 Step = Callable[..., Any]
 
 
 @inlined
 def gather(columns, at, listed, first, last, array):
-    """Puts triples of the Gaussians listed from `first` on into three columns; the one at `last` stands in for more."""
+    """Copies triples of the Gaussians listed from `first` to `last` to three columns; the last one pads the lanes."""
     for i in range(LANES):
         n = listed[min(first + i, last)]
         for k in range(3):
@@ -51,7 +51,7 @@ def gather(columns, at, listed, first, last, array):
 
 @inlined
 def gather_shapes(columns, listed, first, last, means, quats, log_scales, logit_opacities):
-    """Puts all raw parameters but coefficients into columns, as `place` takes them."""
+    """Copies all raw parameters but coefficients to columns, in the order expected by `place`."""
     for i in range(LANES):
         n = listed[min(first + i, last)]
         for k in range(3):
@@ -62,7 +62,7 @@ def gather_shapes(columns, listed, first, last, means, quats, log_scales, logit_
 
 
 def load_triples_of(real: type) -> Step:
-    """The step that gives three vectors from an array of triples, of the Gaussians from one on."""
+    """Builds the step that loads three vectors from an array of triples, starting at Gaussian n."""
     load = vector_kind(real, LANES).load
 
     @inlined
@@ -74,7 +74,7 @@ def load_triples_of(real: type) -> Step:
 
 
 def _exponential(real: type) -> Step:
-    """e^x; in single precision held within the normal numbers, relative error below 3e-7."""
+    """Builds e^x; in single precision clamped to normal numbers, with a relative error below 3e-7."""
     full = vector_kind(real, LANES).full
     # Taylor series of 2^f for f in [-1/2, 1/2].
     e0, e1, e2, e3, e4, e5, e6, e7 = (real(math.log(2.0) ** k / math.factorial(k)) for k in range(8))
@@ -91,7 +91,7 @@ def _exponential(real: type) -> Step:
 
 
 def may_show_of(real: type) -> Step:
-    """The step that gives bits of those on the kept sides of a camera that come near its window: safe, not exact."""
+    """Builds a conservative culling test: bits of Gaussians on the kept sides that may reach a camera's window."""
     exponential = _exponential(real)
     zero, one, low_pass, most_squared = real(0.0), real(1.0), real(LOW_PASS), real(MOST_SQUARED_DEVIATIONS)
 
@@ -109,7 +109,7 @@ def may_show_of(real: type) -> Step:
         past_y = maximum(windows[c, 1] - v, v - windows[c, 3])
         size = exponential(maximum(maximum(log_scales[0], log_scales[1]), log_scales[2])) * inverse_depth
         wide, high = size * (intrinsics[c, 0] * lens[c, 7]), size * (intrinsics[c, 1] * lens[c, 8])
-        # NaN is beside nothing, which leaves the decision to the exact test.
+        # NaN is never culled here, which leaves the decision to the exact test.
         beside_x = (past_x > zero) & (past_x * past_x > (wide * wide + low_pass) * most_squared)
         beside_y = (past_y > zero) & (past_y * past_y > (high * high + low_pass) * most_squared)
         return bits_of(kept) & ~bits_of(beside_x | beside_y)
@@ -118,9 +118,9 @@ def may_show_of(real: type) -> Step:
 
 
 def shapes(real: type) -> Step:
-    """The step that takes columns of quaternions, log scales and logits, after three others.
+    """Builds the step that activates columns of quaternions, log scales and logits, which follow the three of means.
 
-    It gives unit quaternions, their inverse norms, scales, axes, opacities, and the sum of the raw magnitudes.
+    It returns unit quaternions, their inverse norms, scales, axes, opacities, and the sum of the raw magnitudes.
     """
     rotation, exponential, load, one = (
         shape_maths(real).rotation,
@@ -151,7 +151,7 @@ def shapes(real: type) -> Step:
 
 
 def views(real: type) -> Step:
-    """As `ViewSteps.view`, of vectors."""
+    """`ViewSteps.view` for vectors."""
     full = vector_kind(real, LANES).full
 
     @inlined
@@ -162,9 +162,9 @@ def views(real: type) -> Step:
 
 
 def place_of(real: type) -> Step:
-    """The step that places Gaussians on screen, from columns of means (3), quaternions (4), log scales (3) and logits.
+    """Builds the step that projects Gaussians, from columns of means (3), quaternions (4), log scales (3) and logits.
 
-    It gives (mean x and y, conic xx, xy and yy, depth, opacity, covariance xx and yy), and bits of who has finite ones.
+    It returns (mean x and y, conic xx, xy and yy, depth, opacity, covariance xx and yy), and bits of the finite ones.
     """
     shape, view, load = shapes(real), views(real), vector_kind(real, LANES).load
     zero, one, largest = real(0.0), real(1.0), real(np.finfo(real).max)
@@ -191,7 +191,7 @@ def place_of(real: type) -> Step:
 
 
 def channel_of(real: type) -> Step:
-    """The step that gives one colour from harmonics and a table, whose columns begin at an index."""
+    """Builds the step that evaluates one colour channel from harmonics and table columns starting at an index."""
     load = vector_kind(real, LANES).load
 
     @inlined
@@ -202,16 +202,16 @@ def channel_of(real: type) -> Step:
 
 
 def color_steps(real: type) -> tuple[Step, Step]:
-    """The steps that tabulate coefficients, and that give colours from such a table."""
+    """Builds the steps that tabulate coefficients, and that evaluate colours from such a table."""
     load_rows, load, basis = row_loader(real, LANES), vector_kind(real, LANES).load, harmonic_basis(real)
     channel, one, whole = channel_of(real), real(1.0), COLUMNS * LANES
 
     @inlined
     def tabulate(table, listed, first, last, terms, sh, row_size, positions):
-        """Puts the first `terms` coefficients of listed Gaussians, three numbers each, in columns into a table's first
+        """Copies the first `terms` coefficients of listed Gaussians, three numbers each, to columns of a table's first
         half; `sh` is flat, with rows of `row_size`.
 
-        The second half of the table is scratch, for rows so near the end of `sh` that whole vectors would reach beyond.
+        The second half of the table is scratch, for rows near the end of `sh`, where vector loads would overrun.
         """
         inside = listed[last] * row_size + (3 * terms + LANES - 1) // LANES * LANES <= sh.size
         for i in range(LANES):
@@ -227,7 +227,7 @@ def color_steps(real: type) -> tuple[Step, Step]:
 
     @inlined
     def color(table, means, at, degree, lens, c):
-        """(Red, green, blue) of such columns, before offset and clamp, for columns of means."""
+        """(Red, green, blue) before offset and clamp, from table columns and columns of means."""
         x = load(means, 0) - lens[c, 4]
         y, z = load(means, LANES) - lens[c, 5], load(means, 2 * LANES) - lens[c, 6]
         inverse_length = one / square_root(x * x + y * y + z * z)
@@ -238,10 +238,10 @@ def color_steps(real: type) -> tuple[Step, Step]:
 
 
 def place_gradient_of(real: type) -> Step:
-    """The adjoint of placing, from the same columns, followed by the gradients of means on screen (2), conics (3),
+    """Builds the adjoint of `place`, from the same columns, followed by the gradients of 2D means (2), conics (3),
     depths and opacities.
 
-    It gives the gradients of the first columns (11), and what each Gaussian adds to that of the camera (12).
+    It returns the gradients of the first columns (11), and each Gaussian's contribution to that of the camera (12).
     """
     unit_quat_gradient, (full, load) = shape_maths(real).unit_quat_gradient, vector_kind(real, LANES)
     shape, view, zero, one = shapes(real), views(real), real(0.0), real(1.0)
@@ -289,10 +289,10 @@ def place_gradient_of(real: type) -> Step:
 
 
 def color_gradient_of(real: type) -> Step:
-    """The adjoint of `color`, from a table of coefficients and columns of means and of the gradients of the colours.
+    """Builds the adjoint of `color`, from a table of coefficients and columns of means and of gradients of colours.
 
-    It puts the gradients of the coefficients into the table from an index on, and gives those of the vector from the
-    camera to the mean.
+    It writes the gradients of the coefficients to the table, starting at an index, and returns those of the vector from
+    the camera to the mean.
     """
     (full, load), basis, channel = vector_kind(real, LANES), harmonic_basis(real), channel_of(real)
     zero, half, one = real(0.0), real(0.5), real(1.0)

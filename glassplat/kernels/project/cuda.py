@@ -1,6 +1,6 @@
-"""Projection on the GPU: one thread for each Gaussian, which looks at it through every camera of the batch.
+"""Projection on the GPU: one thread per Gaussian, which projects it into every camera of the batch.
 
-Ellipsoids and discs differ by their footprint alone: their kernels hand the arrays over to the same steps.
+Ellipsoids and discs differ only in their footprint: their kernels pass the arrays to the same steps.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from glassplat.kernels.screen_statistics import Sums, Views
 
 THREADS = 128
 POSE = 12
-"""Entries of a camera's gradient: rows of (3x3 block, translation)."""
+"""Number of entries of a camera's gradient: rows of (3x3 block, translation)."""
 
 
 def project(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, near: float) -> tuple[Tensor, ...]:
@@ -77,7 +77,7 @@ def project_discs_gradients(
 
 
 def _zeros_like(tensors: Sequence[Tensor]) -> list[Tensor]:
-    """Zeros of these shapes, all filled at once."""
+    """Zeros of these shapes, all filled by one launch."""
     parts = tensors[0].new_zeros(sum(tensor.numel() for tensor in tensors)).split([t.numel() for t in tensors])
     return [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)]
 
@@ -91,7 +91,7 @@ def _gradients(
     backward: Any, inputs: Sequence[Tensor], lens: Tensor, degree: int, given: Sequence[Tensor], needs_camera: bool,
     found: list[Tensor],
 ) -> tuple[list[Tensor], Tensor]:  # fmt: skip
-    """Gradients of raw Gaussians, added to what is `found`, and of each camera [C, 12], as sums over blocks."""
+    """Gradients of raw Gaussians, added to `found` in place, and of each camera [C, 12], summed over blocks."""
     means, num_cameras = inputs[0], inputs[5].shape[0]
     blocks = blocks_for(means.shape[0], THREADS)
     shape = (blocks, num_cameras, POSE) if needs_camera else (0, 0, 0)
@@ -111,7 +111,7 @@ def _lenses(cam_from_world: Tensor, intrinsics: Tensor, width: int, height: int)
 
 @cache
 def camera_lenses(real: type) -> Kernel:
-    """Fills the lenses of all cameras, of which there are few, in one thread."""
+    """Fills the lenses of all cameras in one thread, because there are few."""
     fill_lenses = view_steps(real).fill_lenses
 
     @kernel("camera_lenses", real, "real2 real3 real2 real real")
@@ -171,7 +171,7 @@ def project_discs_forward(real: type) -> Kernel:
 
 
 def _back(real: type, footprint: Footprint) -> Scalar:
-    """The body of a backward kernel: adds up a Gaussian's gradients over cameras, and each camera's over the block."""
+    """Builds the body of a backward kernel: sums Gaussians' gradients over cameras, and cameras' over a block."""
     zero, threads, pose = real(0.0), THREADS, POSE
     shape, finish, project_back = footprint.shape, footprint.finish, projecting_back(real, footprint)
 
@@ -185,7 +185,7 @@ def _back(real: type, footprint: Footprint) -> Scalar:
         g_means, g_quats, g_log_scales, g_logit_opacities, g_sh = found
         n, t = cuda.grid(1), cuda.threadIdx.x
         inside = n < means.shape[0]
-        # Threads beyond the last Gaussian stay for the sums of the block.
+        # Threads beyond the last Gaussian keep running, because the block sums need them.
         n = n if inside else means.shape[0] - 1
         mean, touched, none = vec3(means, n), False, (zero, zero, zero)
         shaped = shape(means, quats, log_scales, logit_opacities, n)
@@ -216,7 +216,7 @@ def _back(real: type, footprint: Footprint) -> Scalar:
 
 @cache
 def project_backward(real: type) -> Kernel:
-    """Adds to the gradients of ellipsoids, and fills of each camera the sum over each block [blocks, C, 12]."""
+    """Adds to the gradients of ellipsoids, and fills each block's sums for each camera [blocks, C, 12]."""
     back = _back(real, ellipsoids(real))
 
     @kernel(
@@ -241,7 +241,7 @@ def project_backward(real: type) -> Kernel:
 
 @cache
 def project_discs_backward(real: type) -> Kernel:
-    """Fills the gradients of discs, zero beforehand, and of each camera the sum over each block [blocks, C, 12]."""
+    """Fills the gradients, initially zero, of discs, and each block's sums for each camera [blocks, C, 12]."""
     back = _back(real, discs(real))
 
     @kernel(
@@ -265,10 +265,10 @@ def project_discs_backward(real: type) -> Kernel:
 
 
 def add_views(sums: Sums, views: Views) -> None:
-    """As `glassplat.kernels.screen_statistics.add_views`, of tensors that are checked."""
+    """As `glassplat.kernels.screen_statistics.add_views`, for checked tensors."""
     count, weight, factor = sums.view_count.shape[1], None, 1.0
     if isinstance(views.weight, Tensor):
-        # A scalar stays on the GPU: who asks for it waits.
+        # A scalar stays on the GPU, because reading it would synchronise.
         weight = views.weight.contiguous() if views.weight.dim() else views.weight.reshape(1, 1)
     else:
         factor = views.weight
@@ -280,7 +280,7 @@ def add_views(sums: Sums, views: Views) -> None:
 
 @cache
 def add_views_kernel(real: type) -> Kernel:
-    """Adds to the first `rows` rows of the sums, a Gaussian for each thread."""
+    """Adds to the first `rows` rows of the sums, with one thread per Gaussian."""
     half, zero = real(0.5), real(0.0)
 
     @kernel("screen_statistics", real, "real2 real2 real2 real3 real3 real3 real2 real real real int")

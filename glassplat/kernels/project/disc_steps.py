@@ -1,4 +1,4 @@
-"""Projection of one disc for one camera, shared by the kernels of the CPU and of a GPU."""
+"""Projection of one disc into one camera, shared by the kernels for CPU and GPU."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from glassplat.kernels.project.steps import Footprint, pose
 
 
 def discs(real: type) -> Footprint:
-    """The footprint of discs, whose shape ends with two deviations, on the CPU and on a GPU."""
+    """Builds the footprint of discs for CPU or GPU; their `shape` returns two deviations as its last entry."""
     return Footprint(_shape(real), cull, _place(real), _place_gradient(real), _finish(real))
 
 
@@ -57,12 +57,12 @@ def tangents(rows, offset, mean, axes):  # type: ignore[no-untyped-def]
 
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
-"""In single precision, which holds them exactly, so that they widen nothing."""
+"""Exact in single precision, so that expressions are not promoted to double."""
 
 
 @inlined
 def towards(axis, mean, lens, c):  # type: ignore[no-untyped-def]
-    """1 where a disc's axis points to the camera, else -1."""
+    """1 if a disc's axis points to the camera, else -1."""
     back = lens[c, 4] - mean[0], lens[c, 5] - mean[1], lens[c, 6] - mean[2]
     return -ONE if dot(back, axis) < ZERO else ONE
 

@@ -1,4 +1,4 @@
-"""The definition of the projection of ellipsoids and discs, in PyTorch."""
+"""Reference projection of ellipsoids and discs in PyTorch, which defines the result."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from glassplat.kernels.records import CameraBatch, Projected, ProjectedDiscs, Ra
 
 
 class _Ellipses(NamedTuple):
-    """Screen covariances [C, N] (xx, xy, yy), low-pass included, and their determinant."""
+    """Screen-space covariances [C, N] (xx, xy, yy), low-pass included, and their determinant."""
 
     xx: Tensor
     xy: Tensor
@@ -33,7 +33,7 @@ def project(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, ne
 
 
 def _harmless(gaussians: RawGaussians, visible: Tensor) -> RawGaussians:
-    """Ones for Gaussians that nothing shows: a NaN masked afterwards would still reach gradients, as NaN times zero."""
+    """Ones for invisible Gaussians: a NaN masked afterwards would still reach gradients, as NaN times zero."""
     seen = visible.any(dim=0)
     return RawGaussians(*(_where(seen, tensor, torch.ones_like(tensor)) for tensor in gaussians))
 
@@ -46,7 +46,7 @@ def _where(mask: Tensor, value: Tensor, other: Tensor) -> Tensor:
 def _project_all(
     gaussians: RawGaussians, cameras: CameraBatch, sh_degree: int, near: float, visible: Tensor | None = None
 ) -> tuple[Projected, Tensor]:
-    """Everything projected, culled or not, and what is visible [C, N]."""
+    """Projections of all Gaussians, culled or not, and the mask of visible ones [C, N]."""
     linear, offset = cameras.cam_from_world[:, :3, :3], cameras.cam_from_world[:, :3, 3]
     in_camera = gaussians.means @ linear.mT + offset[:, None]
     depths = in_camera[..., 2]
@@ -70,7 +70,7 @@ def _project_all(
 
 
 def _ellipses(gaussians: RawGaussians, cameras: CameraBatch, tangents: Tensor, depths: Tensor) -> _Ellipses:
-    """EWA projection: J A Sigma A^T J^T with the Jacobian J at the tangents held near the image, plus the low-pass."""
+    """EWA projection: J A Sigma A^T J^T with the Jacobian J at tangents clamped near the image, plus the low-pass."""
     focal, center = cameras.intrinsics[:, None, :2], cameras.intrinsics[:, None, 2:]
     size = torch.tensor([cameras.width, cameras.height], dtype=focal.dtype)
     margin = TANGENT_MARGIN * size / 2
@@ -129,7 +129,7 @@ def sh_basis(directions: Tensor) -> Tensor:
 
 
 def _visible(projected: Projected, gaussians: RawGaussians, cameras: CameraBatch, near: float) -> Tensor:
-    """Mask [C, N] of what is in front of the near plane, on the kept side of the clip plane and in the window."""
+    """Mask [C, N] of Gaussians beyond the near plane, on the kept side of the clip plane and in the window."""
     raw = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities[:, None])
     norm = gaussians.quats.square().sum(-1)
     usable = torch.cat(raw, dim=-1).isfinite().all(dim=-1) & norm.isfinite() & (norm > 0)
@@ -139,7 +139,7 @@ def _visible(projected: Projected, gaussians: RawGaussians, cameras: CameraBatch
 
 
 def _wanted(low: Tensor, high: Tensor, gaussians: RawGaussians, cameras: CameraBatch) -> Tensor:
-    """Mask [C, N] of boxes that reach into the window, of Gaussians on the kept side of the clip plane."""
+    """Mask [C, N] of Gaussians on the kept side of the clip plane with boxes that overlap the window."""
     windows = cameras.windows
     if windows is None:
         windows = torch.tensor([[0, 0, cameras.width, cameras.height]], dtype=low.dtype)
@@ -164,7 +164,7 @@ def project_discs(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: i
 def _project_all_discs(
     gaussians: RawGaussians, cameras: CameraBatch, sh_degree: int, near: float, visible: Tensor | None = None
 ) -> ProjectedDiscs:
-    """Everything projected, culled or not."""
+    """Projections of all discs, culled or not."""
     linear, offset = cameras.cam_from_world[:, :3, :3], cameras.cam_from_world[:, :3, 3]
     focal, middle = cameras.intrinsics[:, None, :2], cameras.intrinsics[:, None, 2:]
     centers = gaussians.means @ linear.mT + offset[:, None]
@@ -203,7 +203,7 @@ def _project_all_discs(
 
 
 def _squared_reach(opacities: Tensor) -> Tensor:
-    """Squared deviations up to which discs are met; zero where nowhere."""
+    """Squared standard deviations up to which rays hit discs; zero for invisible discs."""
     return (2 * torch.log(opacities / ALPHA_MIN)).clamp(min=0, max=MOST_DEVIATIONS**2)
 
 
@@ -234,7 +234,7 @@ def _outlines(maps: Tensor, opacities: Tensor, whole: Tensor, width: int, height
 
 
 def _visible_discs(projected: ProjectedDiscs, gaussians: RawGaussians, cameras: CameraBatch, near: float) -> Tensor:
-    """Mask [C, N] of what is in front of the near plane, not seen from its edge, on the kept side and in the window."""
+    """Mask [C, N] of discs beyond the near plane, not edge-on, on the kept side and in the window."""
     raw = torch.cat([*gaussians[:3], gaussians.logit_opacities[:, None]], dim=-1)
     norm = gaussians.quats.square().sum(-1)
     usable = raw.isfinite().all(dim=-1) & norm.isfinite() & (norm > 0)
@@ -253,9 +253,9 @@ def _visible_discs(projected: ProjectedDiscs, gaussians: RawGaussians, cameras: 
 def _crossing_boxes(
     gaussians: RawGaussians, cameras: CameraBatch, opacities: Tensor, near: float
 ) -> tuple[Tensor, Tensor]:
-    """Lowest and highest pixel coordinates [C, N, 2] of what discs cover behind the near plane.
+    """Minimum and maximum pixel coordinates [C, N, 2] covered by the parts of discs beyond the near plane.
 
-    Those of a rectangle around each disc, with one side along the depth, cut off at the plane, and of the low-pass.
+    They bound the low-pass and a rectangle around each disc, with one side along the depth, cut off at the plane.
     """
     poses, lenses = cameras.cam_from_world.double(), cameras.intrinsics.double()
     linear, offset = poses[:, :3, :3], poses[:, :3, 3]
@@ -279,7 +279,7 @@ def _crossing_boxes(
 
 
 def _faces(gaussians: RawGaussians, cameras: CameraBatch) -> Tensor:
-    """Return whether discs are seen from anywhere but their edge [C, N]."""
+    """Mask [C, N] of discs that are not seen edge-on."""
     linear, offset = cameras.cam_from_world[:, :3, :3], cameras.cam_from_world[:, :3, 3]
     centers = gaussians.means @ linear.mT + offset[:, None]
     turned = rotations(gaussians.quats)

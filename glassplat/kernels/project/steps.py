@@ -1,4 +1,4 @@
-"""Projection of one Gaussian for one camera, with its gradients, shared by the kernels."""
+"""Projection of one Gaussian into one camera, with its gradients, shared by the kernels."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from glassplat.kernels.maths.projection import (
 )
 
 CHUNK = 512
-"""Gaussians per task; part of the result's rounding, so not to be tuned per machine."""
+"""Gaussians per task; affects the rounding of results, so do not tune it per machine."""
 LENS_VALUES = 9
-"""Tangent limits (4), camera centre (3), and how much longer than a sphere its footprint may get along x and y (2)."""
+"""Tangent limits (4), camera centre (3), and maximum stretch of a sphere's footprint along x and y (2)."""
 
 
 @inlined
@@ -45,11 +45,11 @@ def pose(cam_from_world, c):
 
 
 class ViewSteps(NamedTuple):
-    """Parts of the kernels, which read the arrays that the scalar maths does not know.
+    """Steps of the kernels that read arrays and pass their values to the scalar maths.
 
     Attributes:
         shape: (usable, opacity, unit quaternion, inverse norm, axes) of a Gaussian.
-        view: what a camera sees of a Gaussian before its colour.
+        view: projection of a Gaussian into a camera, without its colour.
         fill_lenses: writes `LENS_VALUES` numbers per camera.
         direction: unit vector from a camera's centre to a mean, and its inverse length.
     """
@@ -92,7 +92,7 @@ def _lenses(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
     @inlined
     def skewed(row, row_z, tangent):
-        """Length of a footprint in multiples of focal length over depth."""
+        """Length of a unit sphere's footprint in multiples of focal length over depth."""
         w = blend(one, row, -tangent, row_z)
         return math.sqrt(dot(w, w))
 
@@ -104,7 +104,7 @@ def _lenses(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
                 intrinsics[c, 0], intrinsics[c, 1], intrinsics[c, 2], intrinsics[c, 3], width, height
             )
             lens[c, 0], lens[c, 1], lens[c, 2], lens[c, 3] = limits
-            # A footprint's length is convex in the tangent, so it is greatest at one of the limits.
+            # A footprint's length is convex in the tangent, so its maximum is at one of the limits.
             row_x, row_y, row_z, _ = pose(cam_from_world, c)
             lens[c, 7] = max(skewed(row_x, row_z, limits[0]), skewed(row_x, row_z, limits[1]))
             lens[c, 8] = max(skewed(row_y, row_z, limits[2]), skewed(row_y, row_z, limits[3]))
@@ -125,12 +125,12 @@ def _lenses(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
 
 def view_with(real: type, clamped: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a record of a camera, of numbers or of vectors, with the function that clamps them."""
+    """Builds `view` for scalars or vectors, given the function that clamps them."""
     screen_covariance, one = screen_maths(real).screen_covariance, real(1.0)
 
     @inlined
     def view(rows, position, axes, intrinsics, lens, c):
-        """Tangents, their clamped values, the footprint, the axes on screen and the covariance there."""
+        """Tangents, their clamped values, the footprint, and the axes and covariance in screen space."""
         inverse_depth = one / position[2]
         tangent_x, tangent_y = position[0] * inverse_depth, position[1] * inverse_depth
         held_x, held_y = clamped(tangent_x, lens[c, 0], lens[c, 1]), clamped(tangent_y, lens[c, 2], lens[c, 3])
@@ -143,11 +143,11 @@ def view_with(real: type, clamped: Callable[..., Any]) -> Callable[..., Any]:
 
 
 MOST_SQUARED_DEVIATIONS = 1.01 * 2.0 * math.log(1.0 / ALPHA_MIN)
-"""Squared number of standard deviations within which any coverage sinks to `ALPHA_MIN`; a percent is slack."""
+"""Squared number of standard deviations at which even full opacity falls to `ALPHA_MIN`, plus one percent."""
 
 
 def placing(real: type) -> Callable[..., Any]:
-    """One ellipsoid in one camera: fills everything but the colour, where it is visible."""
+    """Builds `place` for ellipsoids: if one is visible in a camera, fills all its outputs but the colour."""
     view = view_steps(real).view
     half_extents = screen_maths(real).half_extents
     is_finite = shape_maths(real).is_finite
@@ -179,7 +179,7 @@ def placing(real: type) -> Callable[..., Any]:
 
 
 def culling(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Writing zeros for one ellipsoid in one camera, and whether a Gaussian is on the kept sides."""
+    """Builds `cull`, which zeroes one ellipsoid in one camera, and `in_front`, a test of near and clip planes."""
     zero = real(0.0)
 
     @inlined
@@ -200,9 +200,9 @@ def culling(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
 
 def place_gradients(real: type, free: Callable[..., Any] | None = None) -> Callable[..., Any]:
-    """One Gaussian in one camera, without its colour; or vectors of them.
+    """Builds the gradient of one Gaussian in one camera, without its colour, for scalars or vectors.
 
-    Of vectors, `free(x, held, tangent)` is x where a tangent is not held at a limit, and 0 elsewhere.
+    For vectors, `free(x, held, tangent)` is x where a tangent is not clamped to a limit, and 0 elsewhere.
     """
     *_, covariance_gradient, footprint_gradient = screen_maths(real)
     zero, one = real(0.0), real(1.0)
@@ -221,7 +221,7 @@ def place_gradients(real: type, free: Callable[..., Any] | None = None) -> Calla
         scale_x, scale_y = fx * inverse_depth, fy * inverse_depth
         g_covariance = covariance_gradient(covariance, g_conic[0], g_conic[1], g_conic[2])
         gw_x, gw_y, g_axes = footprint_gradient(w_x, w_y, v_x, v_y, axes, g_covariance)
-        # w_x = (fx / z) (row_x - held_x row_z); where the tangent is held at its limit it passes no gradient.
+        # w_x = (fx / z) (row_x - held_x row_z); a tangent clamped to its limit passes no gradient.
         g_held_x = free(-scale_x * dot(gw_x, rows[2]), held[0], tangent[0])
         g_held_y = free(-scale_y * dot(gw_y, rows[2]), held[1], tangent[1])
         g_tangent_x, g_tangent_y = fx * g_mean2d[0] + g_held_x, fy * g_mean2d[1] + g_held_y
@@ -235,7 +235,7 @@ def place_gradients(real: type, free: Callable[..., Any] | None = None) -> Calla
 
 
 def camera_sums(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Adding to a camera's gradient [12], rows of (3x3 block, translation), in double precision."""
+    """Builds steps that add to a camera's gradient [12], rows of (3x3 block, translation), in double precision."""
     one = real(1.0)
 
     @inlined
@@ -264,7 +264,7 @@ def camera_sums(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
 
 def view_gradients(real: type) -> Callable[..., Any]:
-    """The colour of one Gaussian in one camera."""
+    """Builds the gradient of the colour of one Gaussian in one camera."""
     direction, (color, color_gradient) = view_steps(real).direction, color_maths(real)
     zero, half = real(0.0), real(0.5)
 
@@ -284,19 +284,19 @@ def view_gradients(real: type) -> Callable[..., Any]:
 
 
 class Footprint(NamedTuple):
-    """Parts in which the projections of ellipsoids and discs differ.
+    """The steps in which the projections of ellipsoids and discs differ.
 
-    Inputs are raw Gaussians, poses, intrinsics, clip planes and windows. Of outputs and cotangents the first five are
-    centres, conics or maps, depths, opacities and colours; the last output are the radii.
+    Inputs are raw Gaussians, poses, intrinsics, clip planes and windows. The first five outputs and cotangents are
+    centres, conics or maps, depths, opacities and colours; the last output is the radii.
 
     Attributes:
         shape: (usable, opacity, unit quaternion, inverse norm, axes, ...) of a Gaussian.
         cull: writes zeros for one Gaussian in one camera.
-        place: fills everything but the colour, where the Gaussian is visible; its radii say whether it is.
+        place: fills all outputs but the colour if the Gaussian is visible; otherwise its radii stay zero.
         place_gradient: gradients of (the centre in camera space, the rows of the pose without the centre's part, the
-            three axes, two log scales besides).
-        finish: writes the gradients of a Gaussian but that of its coefficients, from (the mean's, the opacity's, the
-            axes', the two log scales').
+            three axes, two log scales).
+        finish: writes the gradients of a Gaussian, except those of its coefficients, given those of (mean, opacity,
+            axes, two log scales).
     """
 
     shape: Callable[..., Any]
@@ -307,7 +307,7 @@ class Footprint(NamedTuple):
 
 
 def ellipsoids(real: type) -> Footprint:
-    """The footprint of ellipsoids, one at a time."""
+    """Builds the footprint of ellipsoids, for one at a time."""
     culled = culling(real)[0]
 
     @inlined
@@ -371,7 +371,7 @@ def _finish_ellipsoid(real: type) -> Callable[..., Any]:
 
 
 def projecting(real: type, kind: Footprint) -> Callable[..., Any]:
-    """One Gaussian in all cameras: fills its outputs, zeros where it is culled."""
+    """Builds the step that fills the outputs of one Gaussian in all cameras, zeros where it is culled."""
     direction, in_front = view_steps(real).direction, culling(real)[1]
     shape, cull, place, *_ = kind
     is_finite, color = shape_maths(real).is_finite, color_maths(real).color
@@ -407,13 +407,13 @@ def projecting(real: type, kind: Footprint) -> Callable[..., Any]:
 
 
 def projecting_back(real: type, kind: Footprint) -> Callable[..., Any]:
-    """One Gaussian in one camera that sees it: adds to the sums that `finish` takes, and to the camera's gradient."""
+    """Builds the step that adds one visible Gaussian's gradients to the inputs of `finish`, and to its camera's."""
     place_gradient, view_gradient, (add_place, add_view) = kind.place_gradient, view_gradients(real), camera_sums(real)
     zero, one = real(0.0), real(1.0)
 
     @inlined
     def project_back(c, n, mean, shaped, inputs, lens, degree, maps, cotangents, needs_camera, total, sums, g_sh):
-        """`inputs` are coefficients, poses and intrinsics; `maps` are those of discs, or None."""
+        """Inputs are coefficients, poses and intrinsics; `maps` are those of discs, or None."""
         sh, cam_from_world, intrinsics = inputs
         g_opacities, g_colors = cotangents[3], cotangents[4]
         g_mean, g_opacity, (ga_x, ga_y, ga_z), (g_u, g_v) = sums
