@@ -23,7 +23,7 @@ from glassplat.kernels.records import (
 
 
 def check_bins(channels: Tensor, bins: TileBins, cameras: int, count: int, these: str) -> None:
-    """Raises where channels or bins are not of these splats or discs, or where no kernel exists for them."""
+    """Raises unless bins match the splats or discs, and kernels support the number of channels and the device."""
     check_device("channels", channels, "bins", bins.pair_splats)
     if channels.ndim != 3 or not 1 <= channels.shape[2] <= MOST_CHANNELS:
         raise ValueError(f"channels has shape {list(channels.shape)}, expected [C, G, D] with D in 1..{MOST_CHANNELS}")
@@ -35,7 +35,7 @@ def check_bins(channels: Tensor, bins: TileBins, cameras: int, count: int, these
 
 
 def primary_count(num_primary: int | None, splats: Splats) -> int:
-    """The number of primary splats; all of them where none is given."""
+    """The number of primary splats, by default all."""
     count = splats.opacities.shape[1]
     if num_primary is None:
         return count
@@ -45,14 +45,14 @@ def primary_count(num_primary: int | None, splats: Splats) -> int:
 
 
 ABSGRAD = 7
-"""Which argument of the operation `absgrad` is."""
+"""Index of `absgrad` among the operation's arguments."""
 
 
 class Composite(NamedTuple):
     """Blended images.
 
     image [C, H, W, D]: sum of channels. alpha [C, H, W]: coverage by primary splats, 1 - T.
-    mask [C, H, W]: visible marks of glass splats. deviation [C, H, W]: empty unless asked for.
+    mask [C, H, W]: visible marks of glass splats. deviation [C, H, W]: empty unless requested.
     """
 
     image: Tensor
@@ -75,8 +75,8 @@ def composite(
 
     T_i is the product of (1 - alpha) over the primary splats in front, T_glass_j the same over the glass splats in
     front; their product is the transmittance over both together. A pixel stops before the primary splat that would
-    take T below 1e-4; its mask also before the glass splat that would take T_glass there. Pixels of tiles that are
-    not active are zero everywhere. No background is added.
+    reduce T below 1e-4; its mask also stops before the glass splat that would do so to T_glass. All outputs are zero in
+    inactive tiles. No background is added.
 
     Differentiable in `means2d`, `conics`, `opacities`, `channels` and `marks`; the order of depths is constant.
     A non-finite channel makes pixels non-finite only in the tiles that its splat reaches; a splat with non-finite
@@ -86,12 +86,12 @@ def composite(
         splats: [C, G] splats; those with index >= `num_primary` are glass, and appear in the mask only.
         channels: [C, G, D] values to blend, 1 to 32 of them; those of glass splats are not used.
         bins: the same splats sorted into tiles, from `bin_tiles`.
-        marks: [C, G - num_primary] what a glass splat adds to the mask, in [0, 1]; needed where there is glass.
-        num_primary: how many splats are primary; all of them by default.
-        deviation: the channel z whose deviation to compute, and where; the mean is a constant unless it says so.
-        absgrad: [C, G, 2], any values; they change nothing. Its gradient is the absolute gradient of the centres: |v_x|
-            and |v_y|, summed over the pixels, of which the gradient of `means2d` is the sum with signs (AbsGS,
-            arXiv 2404.10484, Eq. 8). Pixels that disagree cancel there and show here.
+        marks: [C, G - num_primary] value of each glass splat in the mask, in [0, 1]; required if there is glass.
+        num_primary: number of primary splats; all of them by default.
+        deviation: the channel z whose deviation to compute, and where; the mean is constant without `through_mean`.
+        absgrad: [C, G, 2], values are ignored. Its gradient is the absolute gradient of the centres: |v_x| and |v_y|
+            summed over pixels, where the gradient of `means2d` is the signed sum (AbsGS, arXiv 2404.10484, Eq. 8).
+            Pixels of opposite sign cancel in the latter but not here.
     """
     cameras, count = splats.opacities.shape
     check_bins(channels, bins, cameras, count, "these very splats")
@@ -122,7 +122,7 @@ def composite(
 
 
 def needs_gradients(*tensors: Tensor | None) -> bool:
-    """Return whether a gradient of any of these will be asked for."""
+    """Return whether autograd needs the gradient of any of these tensors."""
     return torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors)
 
 
@@ -157,9 +157,8 @@ class BlendedDiscs(NamedTuple):
     """Blended images.
 
     image [C, H, W, D]: sum of channels. alpha [C, H, W]: coverage, 1 - T. depth [C, H, W]: sum of the depths at which
-    the pixel's ray meets the discs; over alpha, the expected depth. median [C, H, W]: depth of the last disc before
-    which more than half of the light is left, 0 where nothing is. distortion [C, H, W]: how far apart along the ray
-    lies what the pixel shows.
+    the pixel's ray meets the discs; over alpha, the expected depth. median [C, H, W]: depth of the last disc in front
+    of which T is above 1/2, 0 in empty pixels. distortion [C, H, W]: spread of the blended discs along the ray.
     """
 
     image: Tensor
@@ -173,30 +172,30 @@ def composite_discs(
     discs: Discs, channels: Tensor, bins: TileBins,
     *, near: float, low_pass: float = LOW_PASS, absgrad: Tensor | None = None,
 ) -> BlendedDiscs:  # fmt: skip
-    """Blends discs over each pixel, in the order of their centres' depths (2DGS, Eqs. 8 to 13).
+    """Blends discs over each pixel, ordered by the depths of their centres (2DGS, Eqs. 8 to 13).
 
         alpha_i = min(0.99, opacity_i exp(-q_i / 2)),  q_i = min(u_i^2 + v_i^2, |d|^2 / low_pass^2)
         image   = sum over i of channels_i alpha_i T_i,  depth = sum over i of z_i alpha_i T_i
         distortion = sum over i < j of w_i w_j (1 / z_i - 1 / z_j)^2,  w_i = alpha_i T_i
 
-    (u, v) is where the pixel's ray meets the disc, in deviations, and z the depth there; d is the offset of the pixel
-    from the disc's centre. Where the falloff around the centre is the larger one, as of a disc far away or seen from
-    its edge, z is the depth of the centre. A disc ends where q reaches 9 or alpha 1/255, and where z is at most `near`.
-    A pixel stops before the disc that would take T below 1e-4. Depths in NDC, of which 2DGS takes the distortion, are
-    1 / z times a constant and plus one.
+    (u, v) is the intersection of the pixel's ray with the disc, in standard deviations, and z its depth; d is the
+    offset of the pixel from the disc's centre. If the falloff around the centre is larger, as for a distant or edge-on
+    disc, z is the depth of the centre. A disc is cut off where q reaches 9, alpha falls to 1/255, or z is at most
+    `near`. A pixel stops before the disc that would reduce T below 1e-4. 2DGS uses NDC depths in the distortion: a
+    constant times 1 / z, plus one.
 
-    Pixels of tiles that are not active are zero everywhere. No background is added. Differentiable in `means2d`,
-    `maps`, `opacities`, `depths` and `channels`; the order of depths is constant. A non-finite channel makes pixels
-    non-finite only in the tiles that its disc reaches; a disc with non-finite geometry is not drawn.
+    All outputs are zero in inactive tiles. No background is added. Differentiable in `means2d`, `maps`, `opacities`,
+    `depths` and `channels`; the order of depths is constant. A non-finite channel makes pixels non-finite only in the
+    tiles that its disc reaches; a disc with non-finite geometry is not drawn.
 
     Args:
         discs: [C, G] discs, from `project_discs`.
         channels: [C, G, D] values to blend, 1 to 32 of them.
         bins: the outlines of the same discs sorted into tiles, from `bin_tiles`.
-        near: of `project_discs`.
-        low_pass: standard deviation in pixels of the falloff around the centre; 0 leaves it out.
-        absgrad: [C, G, 2], any values, as in `composite`; its gradient is that of `means2d` with the parts of single
-            pixels added up without their signs.
+        near: as for `project_discs`.
+        low_pass: standard deviation in pixels of the falloff around the centre; 0 disables it.
+        absgrad: [C, G, 2], values are ignored; as in `composite`, its gradient is the absolute gradient of `means2d`,
+            summed over pixels.
     """
     _check(discs, channels, bins, absgrad)
     if not near >= 0 or not low_pass >= 0:
@@ -252,5 +251,5 @@ class _CompositeDiscs(torch.autograd.Function):
 
 
 def mean_depth(depth_sum: Tensor, alpha: Tensor) -> Tensor:
-    """Blended depth (TR-Gaussians, Eq. 4): weighted depth sum over total weight; 0 where nothing is."""
+    """Blended depth (TR-Gaussians, Eq. 4): weighted depth sum over total weight; 0 in empty pixels."""
     return torch.where(alpha > LEAST_ALPHA, depth_sum / alpha.clamp(min=LEAST_ALPHA), 0)

@@ -1,6 +1,6 @@
-"""Blending of sorted splats: the operation on the CPU.
+"""Blending of sorted splats on the CPU.
 
-For each pixel this is a short loop over the splats of its tile, from front to back:
+Each pixel runs a short loop over the splats of its tile, from front to back:
 
     for splat in tile:
         alpha = min(0.99, 2^exponent(offset))              # 0 below 1/255
@@ -13,15 +13,15 @@ For each pixel this is a short loop over the splats of its tile, from front to b
             image   += channels alpha t
             t       *= 1 - alpha
 
-It is run for sixteen pixels at a time:
+The loop runs for sixteen pixels at once:
 
     image   tiles of 16 x 16 pixels, a few for each task                               composite_forward
     tile    16 blocks, and its splats in chunks of 128, packed side by side (`fetch`)
     block   4 x 4 pixels, the lanes of one vector, and the splats that reach it        blend_block
             (`list_block`; glass as ~k)
 
-Four channels are blended along with alpha; `blend_more` adds the others from the weights that were kept. A pixel that
-has stopped keeps its transmittance with the sign turned, so that one comparison tells which lanes still run.
+Four channels are blended along with alpha; `blend_more` adds the others from stored weights. A stopped pixel keeps its
+transmittance with a negative sign, so that one comparison finds the running lanes.
 """
 
 from __future__ import annotations
@@ -67,12 +67,12 @@ from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE
 from glassplat.kernels.records import LEAST_ALPHA, ON_MEAN, REAL_OF, Deviation, Splats, TileBins
 
 # Planes of a tile's results; SUMS has one per channel. T_AGAIN, CENTER, DEVIATION and LEAN belong to the second
-# traversal, which sums distances from the mean that the first one has found.
+# traversal, which sums distances from the mean of the first.
 MASK, T_AGAIN, CENTER, DEVIATION, LEAN, SUMS = (plane * tile.PIXELS for plane in range(6))
 
 
 def _blend_block(real: type, with_glass: bool) -> Scalar:
-    """Builds the loop over the splats of a block, of which some may be glass."""
+    """Builds the loop over the splats of a block, with or without glass splats."""
     full, load = vector_kind(real, tile.LANES)
     x_centers, y_centers = tile.pixel_centers(real)
     exp2 = tile.exp2_of(real)
@@ -83,7 +83,7 @@ def _blend_block(real: type, with_glass: bool) -> Scalar:
 
     @inlined
     def blend_block(state, at_state, planes, at, batch, width, entries, count, x, y, weights, keep):
-        """Blends the first four channels; returns how many splats it took, and whether any pixel still runs."""
+        """Blends the first four channels; returns the number of splats processed, and whether any pixel still runs."""
         xs, ys = x_centers() + x, y_centers() + y
         none, most = full(zero), full(alpha_max)
         t, last = load(state, at_state + T), load(state, at_state + LAST)
@@ -146,7 +146,7 @@ def _blend_more(real: type) -> Scalar:
 
     @inlined
     def blend_more(planes, at, batch, width, entries, count, column, weights):
-        """Adds four more channels, the first of which is a splat's `column`, with the weights that are kept."""
+        """Blends four more channels, starting at `column` of a splat, with the stored weights."""
         at += SUMS + (column - VALUES) * PIXELS
         s0, s1 = load(planes, at), load(planes, at + PIXELS)
         s2, s3 = load(planes, at + 2 * PIXELS), load(planes, at + 3 * PIXELS)
@@ -176,7 +176,7 @@ def _deviate_block(real: type) -> Scalar:
 
     @inlined
     def deviate_block(state, at_state, planes, at, batch, width, entries, count, x, y, column):
-        """Adds up how far a splat's `column` lies from CENTER, over splats that `blend_block` has taken."""
+        """Sums the weighted distances of `column` from CENTER, over splats that `blend_block` has blended."""
         xs, ys = x_centers() + x, y_centers() + y
         none, most = full(zero), full(alpha_max)
         t, last, center = load(planes, at + T_AGAIN), load(state, at_state + LAST), load(planes, at + CENTER)
@@ -204,7 +204,7 @@ def _clear(real: type) -> Scalar:
 
     @inlined
     def clear(planes, groups):
-        """No mask and no sums yet."""
+        """Sets mask and sums to zero."""
         for i in range(0, PIXELS, LANES):
             store(planes, MASK + i, full(zero))
         for i in range(SUMS, SUMS + groups * 4 * PIXELS, LANES):
@@ -214,14 +214,14 @@ def _clear(real: type) -> Scalar:
 
 
 def _write_tile(real: type) -> Scalar:
-    """Builds the function that puts a tile into the images, which are flat."""
+    """Builds the function that writes a tile to the flat images."""
     one = real(1.0)
     load, load_row = vector_kind(real, tile.LANES).load, vector_kind(real, tile.BLOCK).load
     BLOCK, ACROSS, LANES, PIXELS, T = tile.BLOCK, tile.ACROSS, tile.LANES, tile.PIXELS, tile.T
 
     @inlined
     def write_whole_block(state, at, planes, i, image, alpha, first, width, channels):
-        """A block of three or four channels that lies within the image; `first` is its first pixel."""
+        """Writes a block of three or four channels that lies within the image; `first` is its first pixel."""
         s0, s1 = load(planes, SUMS + i), load(planes, SUMS + PIXELS + i)
         s2, s3 = load(planes, SUMS + 2 * PIXELS + i), load(planes, SUMS + 3 * PIXELS + i)
         rows = interleave((s0, s1, s2, s3))
@@ -258,7 +258,7 @@ def _write_tile(real: type) -> Scalar:
 
 @inlined
 def write_mask(planes, mask, first, width, columns, rows):
-    """Puts a tile into the mask, which is flat."""
+    """Writes a tile to the flat mask."""
     for y in range(rows):
         for x in range(columns):
             mask[first + y * width + x] = planes[MASK + lane_of(x, y)]
@@ -266,7 +266,7 @@ def write_mask(planes, mask, first, width, columns, rows):
 
 @inlined
 def write_deviation(planes, where, deviation, first, width, columns, rows):
-    """Puts a tile into the deviation, which is flat like the factor `where` on it."""
+    """Writes a tile to the deviation, which is flat like its factor `where`."""
     for y in range(rows):
         for x in range(columns):
             pixel = first + y * width + x
@@ -279,7 +279,7 @@ def _begin_deviation(real: type) -> Scalar:
 
     @inlined
     def begin_deviation(state, at, planes, channel, where, first, width, columns, rows):
-        """Starts the second traversal of a tile; False where nobody asks for it."""
+        """Prepares the second traversal of a tile; returns False if `where` is zero throughout."""
         wanted = False
         for y in range(rows):
             for x in range(columns):
@@ -375,7 +375,7 @@ def composite_forward(real: type) -> Kernel:
                             blend_more(planes, i, batch, width, entries, taken, VALUES + 4 * group, weights)
                         if not runs:
                             running &= ~(np.int64(1) << b)
-                            # What the block was not asked about any more does not reach it in the backward pass either.
+                            # Splats that the stopped block has skipped must not reach it in the backward pass.
                             for e in range(taken, count):
                                 k = entries[e]
                                 pairs[first + (~k if k < 0 else k)] &= ~(np.int32(1) << b)
@@ -417,9 +417,9 @@ __all__ = ["composite", "composite_discs", "composite_discs_gradients", "composi
 class Saved(NamedTuple):
     """Flat results of the forward pass for the backward pass.
 
-    Packed splats, what each pair reaches (`cpu_tile.GLASS`), each active tile's final state, and where a deviation was
-    asked for, each active tile's mean of the channel and its lean: the weight of what lies above the mean minus that of
-    what lies below.
+    Packed splats, blocks reached by each pair (`cpu_tile.GLASS`), and final states of active tiles. If a deviation is
+    requested, also the channel's mean in each pixel of active tiles, and its lean: the weight of splats above the mean
+    minus that of splats below.
     """
 
     packed: NDArray[Any]
@@ -432,18 +432,18 @@ def composite(
     splats: Splats, channels: Tensor, bins: TileBins,
     *, marks: Tensor, num_primary: int, deviation: Deviation | None, needs_gradients: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Saved]:  # fmt: skip
-    """Image [C, H, W, D], alpha, mask and deviation [C, H, W], and what `composite_gradients` starts from.
+    """Image [C, H, W, D], alpha, mask and deviation [C, H, W], and the state for `composite_gradients`.
 
-    That is little here, and kept whether gradients are needed or not.
+    The state is small on the CPU, and returned even if no gradients are needed.
     """
     cameras, count, num_channels = channels.shape
     shape = (bins.num_cameras, bins.height, bins.width)
     dtype, tiles = channels.dtype, len(bins.active)
-    # Of NumPy, whose zeros of many panes take no memory where nothing is drawn.
+    # Zeros of NumPy, because untouched pages of many panes take no memory.
     sizes = (*shape, num_channels), shape, shape
     image, alpha, mask = (torch.from_numpy(np.zeros(size, REAL_OF[dtype])) for size in sizes)
     deviated = torch.zeros(shape if deviation else (0, 0, 0), dtype=dtype)
-    # Of PyTorch, because its arrays begin with a cache line, and a packed splat is one.
+    # Arrays of PyTorch, because they are aligned to cache lines, and a packed splat fills one.
     lengths = cameras * count * tile.packed_width(num_channels), tiles * tile.STATE
     packed, state = (torch.empty(length, dtype=dtype).numpy() for length in lengths)
     spread = torch.zeros(tiles * 2 * tile.PIXELS if deviation else 0, dtype=dtype).numpy()
@@ -465,7 +465,7 @@ def composite_gradients(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]:  # fmt: skip
     """Gradients of means2d, conics, opacities, channels and marks, given those of image, alpha, mask and deviation.
 
-    Last that of `absgrad`, where `with_absgrad`.
+    The last is that of `absgrad`, None without `with_absgrad`.
     """
     real = REAL_OF[channels.dtype]
     cameras, count, num_channels = channels.shape

@@ -1,8 +1,8 @@
 """Gradients of blending, tile by tile and back to front.
 
-A splat is taken off the blocks that it reached, with the sums over its pixels in registers. One row of sums is written
-per (tile, splat) pair; the rows of each splat are summed afterwards in a fixed order, so that the result has the same
-bits for any number of threads. Transmittances come back by division from their final values.
+A splat is removed from the blocks that it reached, with the sums over its pixels in registers. One row of sums is
+written per (tile, splat) pair; the rows of each splat are summed afterwards in a fixed order, so that the result has
+the same bits for any number of threads. Transmittances are recovered by division from their final values.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, Scalar
 from glassplat.kernels.records import LEAST_ALPHA, ON_MEAN
 
 # Planes of the backward pass; V_IMAGE has one per channel. T and T_GLASS are transmittances in front of the current
-# splat, BEHIND and BEHIND_GLASS what lies behind it, weighted by the incoming gradients, WEIGHT how much of it shows.
+# splat, BEHIND and BEHIND_GLASS the gradient-weighted sums behind it, WEIGHT its blending weight.
 T, T_GLASS, BEHIND, BEHIND_GLASS, V_MASK, V_DEVIATION, CENTER, WEIGHT, V_IMAGE = (
     plane * tile.PIXELS for plane in range(9)
 )
 
 
 LEAN = PAIR_VALUES + tile.GROUP
-"""Column of a pair's row that is free where there are no more than four channels."""
+"""Column of a pair's row that is unused with up to four channels."""
 
 
 def _unblend(real: type, with_absgrad: bool, of_glass: bool) -> Scalar:
@@ -57,10 +57,10 @@ def _unblend(real: type, with_absgrad: bool, of_glass: bool) -> Scalar:
 
     @inlined
     def unblend(planes, state, at, batch, splat, blocks, groups, deviating, row, row_at):
-        """Takes a splat off the pixels of its blocks and writes its sums, of channels beyond the first four zero.
+        """Removes a splat from the pixels of its blocks and writes its sums, zero beyond the first four channels.
 
-        With no more than four channels the one after them is the gradient of a deviation by its channel. Of glass the
-        first is the gradient of its mark, and the others are zero.
+        With up to four channels, the next column is the gradient of the deviation with respect to its channel. For
+        glass, the first is the gradient of the mark, and the others are zero.
         """
         none, most = full(zero), full(alpha_max)
         g, g_x, g_y, g_xx, g_xy, g_yy = none, none, none, none, none, none
@@ -121,7 +121,7 @@ def _sided(real: type) -> Scalar:
 
     @inlined
     def sided(difference, center, slope):
-        """A slope with the sign of the difference from the mean, none for who lies on it."""
+        """A gradient with the sign of the difference from the mean, zero for values equal to it up to rounding."""
         slack = on_mean * absolute(center)
         return select(difference > slack, slope, select(difference < -slack, -slope, full(zero)))
 
@@ -134,7 +134,7 @@ def _dot_more(real: type) -> Scalar:
 
     @inlined
     def dot_more(dot, planes, i, batch, splat, groups, deviating):
-        """Adds channels beyond the first four, and the deviation of one of them."""
+        """Adds channels beyond the first four to the dot product, and the deviation of one channel."""
         for d in range(4, groups * 4, 4):
             v, value = V_IMAGE + d * PIXELS + i, splat + VALUES + d
             dot = dot + (load(planes, v) * item(batch, value) + load(planes, v + PIXELS) * item(batch, value + 1))
@@ -155,7 +155,7 @@ def _sum_more(real: type) -> Scalar:
 
     @inlined
     def sum_more(planes, batch, splat, blocks, groups, deviating, rows, row, sums):
-        """Adds to a row of sums what `unblend` leaves out, with the weights it kept; `sums` is scratch."""
+        """Adds the channels that `unblend` omits to a row of sums, with the stored weights; `sums` is scratch."""
         sum_channels(planes, blocks, 1, groups, rows, row, sums)
         if deviating >= 0:
             none, left = full(zero), blocks
@@ -186,7 +186,7 @@ def _load_gradients(real: type) -> Scalar:
 
     @inlined
     def load_whole_block(planes, i, v_image, v_alpha, first, width, channels):
-        """A block of three or four channels that lies within the image; `first` is its first pixel."""
+        """Loads a block of three or four channels that lies within the image; `first` is its first pixel."""
         r0, r1 = load_row_of_four(v_image, first, channels), load_row_of_four(v_image, first + width, channels)
         r2 = load_row_of_four(v_image, first + 2 * width, channels)
         r3 = load_row_of_four(v_image, first + 3 * width, channels)
@@ -200,7 +200,7 @@ def _load_gradients(real: type) -> Scalar:
 
     @inlined
     def load_gradients(planes, v_image, v_alpha, first, width, columns, rows, channels):
-        """Fills V_IMAGE and BEHIND, elsewhere zero."""
+        """Fills V_IMAGE and BEHIND; pixels outside the image stay zero."""
         for b in range(tile.BLOCKS):
             x0, y0 = b % ACROSS * BLOCK, b // ACROSS * BLOCK
             corner = first + y0 * width + x0
@@ -213,7 +213,7 @@ def _load_gradients(real: type) -> Scalar:
                     planes[BEHIND + i] = v_alpha[pixel]
                     for d in range(channels):
                         planes[V_IMAGE + d * PIXELS + i] = v_image[pixel * channels + d]
-        # alpha = 1 - T: its gradient acts like something behind every splat.
+        # alpha = 1 - T: its gradient acts like that of a background.
         for i in range(0, PIXELS, LANES):
             store(planes, BEHIND + i, -load(planes, BEHIND + i) * load(planes, T + i))
 
@@ -226,7 +226,7 @@ def _load_deviation(real: type) -> Scalar:
 
     @inlined
     def load_deviation(planes, spread, n, channel, through_mean, v_deviation, first, width, columns, rows):
-        """Fills V_DEVIATION and CENTER, after the other gradients; False where the tile has no such gradient."""
+        """Fills V_DEVIATION and CENTER, after the other gradients; returns False if the tile has no such gradient."""
         wanted, keep = False, n * 2 * PIXELS
         for y in range(rows):
             for x in range(columns):
@@ -251,7 +251,7 @@ def _begin(real: type) -> Scalar:
 
     @inlined
     def begin(planes, state, at, v_mask, first, width, columns, rows, with_glass):
-        """Transmittances behind everything; returns how many pairs of the tile any pixel has looked at."""
+        """Loads final transmittances; returns the number of pairs up to the last one evaluated by a pixel."""
         for i in range(0, planes.size, LANES):
             store(planes, i, full(zero))
         for i in range(0, PIXELS, LANES):
@@ -265,7 +265,7 @@ def _begin(real: type) -> Scalar:
         for i in range(0, PIXELS, LANES):
             of_both = maximum(load(state, at + tile.LAST + i), load(state, at + tile.LAST_GLASS + i))
             latest = maximum(latest, of_both)
-        # WEIGHT is written before it is read, and free until then.
+        # WEIGHT serves as scratch here, because it is written again before it is read.
         store(planes, WEIGHT, latest)
         most = planes[WEIGHT]
         for i in range(1, LANES):

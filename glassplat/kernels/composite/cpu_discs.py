@@ -1,9 +1,9 @@
-"""Blending of sorted discs on the CPU, tile by tile and block by block: forwards, and the gradients.
+"""Blending of sorted discs on the CPU, tile by tile and block by block, and its gradients.
 
-Tiles, blocks and outlines are those of `cpu_tile`: which blocks a disc may reach is decided by its outline, and what it
-covers by its map. Forwards, discs are blended front to back. Backwards, a disc is taken off the blocks that it reached,
-one row of sums is written per (tile, disc) pair, and the rows of each disc are summed afterwards in a fixed order. Of
-the distortion a disc needs to know only the sums over all discs of a pixel, and none over those in front of it.
+Tiles, blocks and outlines are those of `cpu_tile`: the outline of a disc determines the blocks that it may reach, its
+map the coverage. The forward pass blends discs front to back. The backward pass removes a disc from the blocks that it
+reached and writes one row of sums per (tile, disc) pair; the rows of each disc are summed afterwards in a fixed order.
+The gradient of the distortion needs only sums over all discs of a pixel, none over those in front of a disc.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE
 from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, meet_maths, meet_slopes
 from glassplat.kernels.records import REAL_OF, Discs, TileBins
 
-# Columns of a packed disc: first its outline as a packed splat, of which ORDER is reused once blocks are known.
+# Columns of a packed disc: first its outline as a packed splat, whose ORDER column is reused once blocks are known.
 CENTER_X, CENTER_Y, U_X, U_Y, V_X, V_Y, W_X, W_Y, BITS, Z, INVERSE_Z, VALUES = range(tile.VALUES, tile.VALUES + 12)
 ORDER = tile.ORDER
 
-# Planes of a tile's state, which the backward pass starts from: transmittance, position in the tile's list of the last
-# disc that a pixel blended and of the one whose depth is the median, and of the inverse depths the one that others are
-# measured from, the weighted sum and the weighted sum of squares. T is negative where a pixel has stopped.
+# Planes of a tile's state, which the backward pass starts from: transmittance; position in the tile's list of the last
+# disc that a pixel blended and of its median disc; and, for inverse depths, their origin and the weighted sums of
+# offsets from it and of their squares. T is negative if a pixel has stopped.
 T, LAST, MEDIAN, FIRST, TOTAL, SQUARES = (plane * tile.PIXELS for plane in range(6))
 STATE = 6 * tile.PIXELS
 
 
 def packed_width(num_values: int) -> int:
-    """Columns of a packed disc that carries `num_values` channels in whole groups: whole vectors."""
+    """Columns of a packed disc with `num_values` channels, rounded up to whole groups and vectors."""
     return tile.LANES * ((VALUES + tile.GROUP * tile.groups_of(num_values) + tile.LANES - 1) // tile.LANES)
 
 
@@ -60,10 +60,10 @@ def _pack(real: type) -> Scalar:
 
     @inlined
     def pack(packed, at, center, map_of, opacity, depth, outline_center, conic):
-        """Copies one disc's geometry into its packed row."""
+        """Copies one disc's geometry to its packed row."""
         pack_outline(packed, at, outline_center, conic, opacity)
         if conic[0] == zero and conic[1] == zero and conic[2] == zero:
-            # It crosses the near plane and may reach any block.
+            # The disc crosses the near plane and may reach any block.
             for column in range(tile.FORM_XX, tile.VALUES):
                 packed[at + column] = zero
         total = center[0] + center[1] + depth
@@ -85,7 +85,7 @@ def _fetch(real: type) -> Scalar:
 
     @inlined
     def fetch(batch, packed, pair_splats, first, last, width, x0, y0):
-        """Copies the packed discs of consecutive pairs next to each other, their centres relative to the tile."""
+        """Copies the packed discs of consecutive pairs to a contiguous batch, with centres relative to the tile."""
         fetch_splats(batch, packed, pair_splats, first, last, width, x0, y0)
         for k in range(last - first):
             batch[k * width + CENTER_X] -= real(x0)
@@ -105,9 +105,9 @@ def _cover(real: type) -> Scalar:
     def cover(batch, at, x, y, near, sharpness):
         """Coverage of a fetched disc over the block whose corner is (x, y).
 
-        The offset (dx, dy) of the pixels; (u, v, 1 / e) and e where their rays meet the disc, (0, 0, 1) and 1 where the
-        falloff around its centre is the larger one; the coverage before it is clamped, 0 where it is not drawn; and
-        which pixels show the disc and not that falloff. `sharpness` is one over the variance of the low-pass.
+        Returns the offsets (dx, dy) of the pixels; (u, v, 1 / e) and e at the intersections, or (0, 0, 1) and 1 where
+        the falloff around the centre is larger; the coverage before clamping, 0 where not drawn; and a mask of pixels
+        that show the disc rather than that falloff. `sharpness` is one over the variance of the low-pass.
         """
         dx = x_centers() + (x - item(batch, at + CENTER_X))
         dy = y_centers() + (y - item(batch, at + CENTER_Y))
@@ -121,7 +121,7 @@ def _cover(real: type) -> Scalar:
         u, v = up * inverse, vp * inverse
         solid = u * u + v * v
         around = (dx * dx + dy * dy) * sharpness
-        # Comparisons with NaN are false, and so no falloff that is NaN is chosen.
+        # Comparisons with NaN are false, so a NaN falloff is never chosen.
         within = (e > zero) & (full(item(batch, at + Z)) > e * near) & (solid <= farthest)
         solid = select(within, solid, full(far))
         nearer = around < solid
@@ -148,7 +148,7 @@ def _blend_block(real: type) -> Scalar:
 
     @inlined
     def blend_block(state, at_state, planes, at, batch, width, entries, count, x, y, near, sharpness, weights):
-        """Fills the weights; returns how many discs it took, and whether any pixel still runs."""
+        """Fills the weights; returns the number of discs processed, and whether any pixel still runs."""
         none, most = full(zero), full(alpha_max)
         t, last, middle_at = load(state, at_state + T), load(state, at_state + LAST), load(state, at_state + MEDIAN)
         first, total = load(state, at_state + FIRST), load(state, at_state + TOTAL)
@@ -165,7 +165,7 @@ def _blend_block(real: type) -> Scalar:
             weight = select(alive, weight, none)
             z, position = met[2] * item(batch, splat + Z), full(item(batch, splat + ORDER))
             inverse = nearness * item(batch, splat + INVERSE_Z)
-            # Measured from the first one that a pixel shows: squares of what is alike would cancel.
+            # Relative to the first disc of the pixel: squares of nearly equal inverse depths would cancel.
             first = select(t >= one, inverse, first)
             apart = inverse - first
             part = (apart * apart) * (one - t) - (apart * total) * (one + one) + squares
@@ -200,12 +200,12 @@ def _blend_channels(real: type) -> Scalar:
 
     @inlined
     def blend_channels(planes, at, batch, width, entries, count, column, weights):
-        """Adds four channels, the first of which is a disc's `column`."""
+        """Blends four channels, starting at `column` of a disc."""
         s0, s1 = load(planes, at), load(planes, at + PIXELS)
         s2, s3 = load(planes, at + 2 * PIXELS), load(planes, at + 3 * PIXELS)
         for e in range(count):
             weight, value = load(weights, e * LANES), item(entries, e) * width + column
-            # What no pixel of the block shows may hold anything.
+            # Channels of discs that no pixel of the block shows may not be finite.
             if bits_of(weight > zero) != 0:
                 s0 = s0 + weight * item(batch, value)
                 s1 = s1 + weight * item(batch, value + 1)
@@ -224,7 +224,7 @@ def _write_tile(real: type) -> Scalar:
 
     @inlined
     def write_tile(state, at, planes, images, first, width, columns, rows, channels):
-        """Puts a tile into the images, which are flat, and takes off the signs that tell which pixels have stopped."""
+        """Writes a tile to the flat images, and removes the signs that mark stopped pixels."""
         image, alpha, depth, median, distortion = images
         for i in range(PIXELS):
             state[at + T + i] = abs(state[at + T + i])
@@ -302,7 +302,7 @@ def composite_discs_forward(real: type) -> Kernel:
                         )  # fmt: skip
                     if not runs:
                         running &= ~(np.int64(1) << b)
-                        # What the block was not asked about any more does not reach it in the backward pass either.
+                        # Discs that the stopped block has skipped must not reach it in the backward pass.
                         for e in range(taken, count):
                             pairs[first + entries[e]] &= ~(np.int32(1) << b)
                 if running == 0:
@@ -314,13 +314,12 @@ def composite_discs_forward(real: type) -> Kernel:
 
 
 # Planes of the backward pass; V_IMAGE has one per channel. T_AT is the transmittance in front of the current disc,
-# BEHIND what lies behind it, weighted by the incoming gradients, COVERED the coverage in the end, WEIGHT how much of it
-# shows.
+# BEHIND the gradient-weighted sum behind it, COVERED the final coverage, WEIGHT the disc's blending weight.
 T_AT, BEHIND, COVERED, WEIGHT, V_DEPTH, V_MEDIAN, V_DISTORTION, V_IMAGE = (plane * tile.PIXELS for plane in range(8))
 
-# Columns of a pair's row, sums over its pixels: gradients of both numerators and of e, times dx, times dy and alone;
-# those of the falloff around the centre, times dx and dy; of the logarithm of the coverage; of the centre's depth; the
-# absolute gradient's; and from PAIR_VALUES on those of the channels.
+# Columns of a pair's row, sums over its pixels: gradients of both numerators and of e, times dx, times dy and alone; of
+# the falloff around the centre, times dx and dy; of the logarithm of the coverage; of the centre's depth; the absolute
+# gradient; and, starting at PAIR_VALUES, gradients of the channels.
 UP, VP, E, AROUND, G, V_Z, ABSGRAD, PAIR_VALUES = 0, 3, 6, 9, 11, 12, 13, 16
 
 
@@ -330,7 +329,7 @@ def _value_of(real: type) -> Scalar:
 
     @inlined
     def value_of(planes, i, batch, splat, groups):
-        """Contribution of a disc's channels to a block."""
+        """Dot product of a disc's channels with the gradients of the image, for a block."""
         dot = load(planes, V_IMAGE + i) * item(batch, splat + VALUES)
         for d in range(1, 4 * groups):
             dot = dot + load(planes, V_IMAGE + d * PIXELS + i) * item(batch, splat + VALUES + d)
@@ -340,12 +339,12 @@ def _value_of(real: type) -> Scalar:
 
 
 NONE, ENDLESS = np.float32(0.0), np.float32(np.inf)
-"""In single precision, which holds them exactly, so that they widen nothing."""
+"""Exact in single precision, so that expressions are not promoted to double."""
 
 
 @inlined
 def sharpness_of(sharpness):
-    """Endless where there is no low-pass: then no pixel has a gradient through it, and zero times it is none."""
+    """The sharpness, or zero if it is infinite for lack of a low-pass: zero times infinity would be NaN."""
     return sharpness if sharpness < ENDLESS else NONE
 
 
@@ -357,7 +356,7 @@ def _unblend(real: type) -> Scalar:
 
     @inlined
     def unblend(planes, state, at, batch, splat, blocks, groups, near, sharpness, row, row_at):
-        """Takes a disc off the pixels of its blocks and writes its sums but for those of the channels."""
+        """Removes a disc from the pixels of its blocks and writes its sums, except for those of the channels."""
         none, most = full(zero), full(alpha_max)
         found = (
             item(batch, splat + U_X), item(batch, splat + U_Y), item(batch, splat + V_X),
@@ -419,7 +418,7 @@ def _begin_gradients(real: type) -> Scalar:
 
     @inlined
     def begin(planes, state, at, v_images, first, width, columns, rows, channels):
-        """Loads a tile's gradients; returns how many pairs of it any pixel has blended."""
+        """Loads a tile's gradients; returns the number of pairs up to the last one blended by a pixel."""
         v_image, v_alpha, v_depth, v_median, v_distortion = v_images
         planes[:] = zero
         most = state[at + LAST]
@@ -430,7 +429,7 @@ def _begin_gradients(real: type) -> Scalar:
         for y in range(rows):
             for x in range(columns):
                 pixel, i = first + y * width + x, lane_of(x, y)
-                # alpha = 1 - T_AT: its gradient acts like something behind every disc.
+                # alpha = 1 - T_AT: its gradient acts like that of a background.
                 planes[BEHIND + i] = -v_alpha[pixel] * planes[T_AT + i]
                 planes[V_DEPTH + i], planes[V_MEDIAN + i] = v_depth[pixel], v_median[pixel]
                 planes[V_DISTORTION + i] = v_distortion[pixel]
@@ -502,11 +501,11 @@ class Saved(NamedTuple):
 def composite_discs(
     discs: Discs, channels: Tensor, bins: TileBins, *, near: float, low_pass: float, needs_gradients: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Saved]:
-    """The fields of `BlendedDiscs`, and what `composite_discs_gradients` starts from, which costs nothing here."""
+    """The fields of `BlendedDiscs`, and the state for `composite_discs_gradients`, which costs nothing extra here."""
     cameras, count, num_channels = channels.shape
     shape, real = (bins.num_cameras, bins.height, bins.width), REAL_OF[channels.dtype]
     images = [channels.new_zeros(s) for s in ((*shape, num_channels), shape, shape, shape, shape)]
-    # Of PyTorch, because its arrays begin with a cache line, and a packed disc is whole ones.
+    # Arrays of PyTorch, because they are aligned to cache lines, and a packed disc fills whole ones.
     sizes = cameras * count * packed_width(num_channels), len(bins.active) * STATE
     packed, state = (torch.empty(size, dtype=channels.dtype).numpy() for size in sizes)
     saved = Saved(packed, np.zeros(len(bins.pair_splats), np.int32), state)
@@ -523,9 +522,9 @@ def composite_discs_gradients(
     discs: Discs, channels: Tensor, bins: TileBins, saved: Saved, v_outputs: Sequence[Tensor],
     *, near: float, low_pass: float, with_absgrad: bool,
 ) -> tuple[Tensor | None, ...]:  # fmt: skip
-    """Gradients of means2d, maps, opacities, depths, channels and absgrad; the last where `with_absgrad`."""
+    """Gradients of means2d, maps, opacities, depths, channels and absgrad; the last is None without `with_absgrad`."""
     (cameras, count, num_channels), real = channels.shape, REAL_OF[channels.dtype]
-    # Of tiles that are not active nothing is written.
+    # Zeros, because the rows of inactive tiles are never written.
     width = tile.LANES * ((PAIR_VALUES + 4 * tile.groups_of(num_channels) + tile.LANES - 1) // tile.LANES)
     rows = torch.zeros(len(bins.pair_splats) * width, dtype=channels.dtype).numpy()
     composite_discs_backward(real)(
@@ -550,7 +549,7 @@ def _real_options(real: type, near: float, low_pass: float) -> tuple[Any, Any]:
 
 @functools.cache
 def sum_disc_rows(real: type) -> Kernel:
-    """Fills the gradients of each disc, which are zero, from the rows of its pairs, in a fixed order."""
+    """Fills the gradients, initially zero, of each disc from the rows of its pairs, in a fixed order."""
     full, load = vector_kind(real, tile.LANES)
     zero, LANES = real(0.0), tile.LANES
 
@@ -574,7 +573,7 @@ def sum_disc_rows(real: type) -> Kernel:
                     v_channels[s, d] = total[PAIR_VALUES + d]
                 for j in range(2):
                     v_maps[s, j], v_maps[s, 2 + j], v_maps[s, 4 + j] = total[UP + j], total[VP + j], total[E + j]
-                    # What no pixel shows stays zero, even where its geometry is not finite.
+                    # Gradients of invisible discs stay zero, even if their geometry is not finite.
                     if total[UP + 2] != zero or total[VP + 2] != zero or total[E + 2] != zero:
                         v_means[s, j] -= total[UP + 2] * maps[s, j]
                         v_means[s, j] -= total[VP + 2] * maps[s, 2 + j]

@@ -1,8 +1,8 @@
-"""A tile's blocks of pixels, its packed splats, and the rows of sums that become their gradients.
+"""Blocks of pixels of a tile, packed splats, and rows of sums that become their gradients.
 
 A tile of 16 x 16 pixels is traversed in *blocks* of 4 x 4, each one vector. A trained splat covers 5 to 40 pixels of a
-tile; in blocks that is half as many lanes as in rows, and what is not reached costs nothing. A *plane* holds one value
-for every pixel of a tile, block after block.
+tile; in blocks that is half as many lanes as in rows, and blocks that it does not reach cost nothing. A *plane* holds
+one value for every pixel of a tile, block after block.
 
 The backward pass writes one row of sums per (tile, splat) pair; the gradients of each splat are summed from its rows in
 a fixed order.
@@ -49,42 +49,42 @@ ACROSS = TILE // BLOCK
 """Blocks in a row of a tile."""
 
 # Planes of a tile's state, which the backward pass starts from. LAST and LAST_GLASS hold the position in the tile's
-# list of the last splat that the pixel looked at before it stopped. While the forward pass runs, T and T_GLASS are
-# negative where the pixel has stopped.
+# list of the last splat that the pixel evaluated before it stopped. During the forward pass, T and T_GLASS are negative
+# in stopped pixels.
 T, LAST, T_GLASS, LAST_GLASS, STATE = 0, PIXELS, 2 * PIXELS, 3 * PIXELS, 4 * PIXELS
 
 GROUP = 4
 """Channels are blended four at a time."""
 
 STOP_AFTER = 8
-"""Splats after which a block looks whether all of its pixels have stopped."""
+"""Splats after which a block checks whether all of its pixels have stopped."""
 
 TILES = 4
-"""Tiles of a task, which asks for memory once for all of them."""
+"""Tiles per task, which allocates memory once for all of them."""
 
 CHUNK = 128
-"""Pairs that a tile fetches at once; they lie anywhere in memory."""
+"""Pairs that a tile fetches at once, from scattered memory."""
 
 # Columns of a packed splat. It falls off as 2^(BITS + quadratic form of the offset); along a line of constant x, the
 # form is largest at SLOPE_Y times the offset in x.
 MEAN_X, MEAN_Y, FORM_XX, FORM_XY, FORM_YY, BITS, SLOPE_X, SLOPE_Y, VALUES = range(9)
 ORDER = SLOPE_X
-"""Of a fetched splat whose blocks are known: its position in the tile's list."""
+"""Column reused, once a fetched splat's blocks are known, for its position in the tile's list."""
 
 SLACK = 0.02
-"""By how much the logarithm of a coverage may be rounded where a block is left out."""
+"""Tolerance for rounding of the logarithm of a coverage, when a block is culled."""
 
 GLASS = BLOCKS
-"""In what is known of a pair, the bits below tell which blocks it reaches, this one that its splat is glass."""
+"""Bit of a pair's flags that marks glass; the lower bits mark the blocks that it reaches."""
 
 
 def groups_of(num_values: int) -> int:
-    """Groups of channels that hold `num_values`."""
+    """Number of groups of channels for `num_values`."""
     return (num_values + GROUP - 1) // GROUP
 
 
 def packed_width(num_values: int) -> int:
-    """Columns of a packed splat that carries `num_values` channels in whole groups: whole vectors."""
+    """Columns of a packed splat with `num_values` channels, rounded up to whole groups and vectors."""
     return LANES * ((VALUES + GROUP * groups_of(num_values) + LANES - 1) // LANES)
 
 
@@ -100,20 +100,20 @@ def flat(tensor: Tensor) -> NDArray[Any]:
 
 
 def pixel_centers(real: type) -> tuple[Scalar, Scalar]:
-    """Functions that give the pixel centres of a tile's first block, x and y."""
+    """Functions that return the pixel centres of a tile's first block, x and y."""
     xs = constant(real, tuple(i % BLOCK + 0.5 for i in range(LANES)))
     ys = constant(real, tuple(i // BLOCK + 0.5 for i in range(LANES)))
     return xs, ys
 
 
 def begin_state(real: type) -> Scalar:
-    """Builds the function that makes the state of a tile before its first splat."""
+    """Builds the function that initialises the state of a tile."""
     full = vector_kind(real, LANES).full
     zero, one, never = real(0.0), real(1.0), real(-1.0)
 
     @inlined
     def begin(state, at, columns, rows):
-        """Fresh transmittances; pixels beyond the image's edge start as stopped. Returns bits of blocks that run."""
+        """Sets transmittances to one, and to zero (stopped) outside the image; returns bits of running blocks."""
         running = np.int64(0)
         for b in range(BLOCKS):
             x, y, i = b % ACROSS * BLOCK, b // ACROSS * BLOCK, at + b * LANES
@@ -132,12 +132,12 @@ def begin_state(real: type) -> Scalar:
 
 
 def finish_state(real: type) -> Scalar:
-    """Builds the function that makes the state of a tile after its last splat."""
+    """Builds the function that finishes the state of a tile after its last splat."""
     load = vector_kind(real, LANES).load
 
     @inlined
     def finish(state, at):
-        """Takes off the signs that tell which pixels have stopped."""
+        """Removes the signs that mark stopped pixels."""
         for i in range(0, PIXELS, LANES):
             store(state, at + T + i, absolute(load(state, at + T + i)))
             store(state, at + T_GLASS + i, absolute(load(state, at + T_GLASS + i)))
@@ -146,7 +146,7 @@ def finish_state(real: type) -> Scalar:
 
 
 def pack_of(real: type) -> Scalar:
-    """The step that copies one splat's geometry into its packed row."""
+    """Builds the step that copies one splat's geometry to its packed row."""
     screen_form = blend_maths(real).screen_form
     half, zero, nothing, endless = real(0.5), real(0.0), real(-np.inf), real(np.inf)
     alpha_min, bits = real(ALPHA_MIN), 1.0 / math.log(2.0)
@@ -176,7 +176,7 @@ def place(tile, width, height):
 
 
 def fetch_of(real: type) -> Scalar:
-    """The step that copies packed splats of consecutive pairs side by side, their means relative to the tile."""
+    """Builds the step that copies packed splats of consecutive pairs to a batch, with means relative to the tile."""
     load = vector_kind(real, LANES).load
 
     @inlined
@@ -193,7 +193,7 @@ def fetch_of(real: type) -> Scalar:
 
 
 def reached_of(real: type) -> Scalar:
-    """The step that gives the blocks of a tile that a fetched splat reaches, as bits."""
+    """Builds the step that returns the blocks of a tile that a fetched splat reaches, as bits."""
     full = vector_kind(real, LANES).full
     lefts = constant(real, tuple(b % ACROSS * BLOCK + 0.5 for b in range(BLOCKS)))
     tops = constant(real, tuple(b // ACROSS * BLOCK + 0.5 for b in range(BLOCKS)))
@@ -222,7 +222,7 @@ def lane_of(x, y):
 
 @inlined
 def list_plain_block(entries, pairs, first, last, block):
-    """As `list_block`, where none of the fetched splats is glass."""
+    """As `list_block`, if none of the fetched splats is glass."""
     count = 0
     for p in range(first, last):
         entries[count] = np.int32(p - first)
@@ -232,7 +232,7 @@ def list_plain_block(entries, pairs, first, last, block):
 
 @inlined
 def list_block(entries, pairs, first, last, block):
-    """Lists which of the fetched splats reach a block, glass as the complement; returns how many there are."""
+    """Lists the fetched splats that reach a block, glass as the complement of its index; returns their number."""
     count = 0
     for p in range(first, last):
         k, pair = np.int32(p - first), item(pairs, p)
@@ -243,13 +243,13 @@ def list_block(entries, pairs, first, last, block):
 
 @inlined
 def exponent(batch, at, dx, dy):
-    """The logarithm to base 2 of a fetched splat's coverage at offsets from its mean."""
+    """Base-2 logarithm of a fetched splat's coverage at offsets from its mean."""
     along = dx * item(batch, at + FORM_XX) + dy * item(batch, at + FORM_XY)
     return along * dx + (dy * item(batch, at + FORM_YY) * dy + item(batch, at + BITS))
 
 
 def exp2_of(real: type) -> Scalar:
-    """The step that gives 2^t of a vector for -100 < t < 1; elsewhere anything."""
+    """Builds the step that evaluates 2^t of a vector for -100 < t < 1; undefined elsewhere."""
     c0, c1, c2, c3, c4, c5 = (real(c) for c in EXP2_COEFFICIENTS)
     natural = real(math.log(2.0))
 
@@ -268,19 +268,19 @@ def exp2_of(real: type) -> Scalar:
 SPLATS = 512
 """Splats per task."""
 
-# Columns of a pair's row: the sum of g = v_alpha alpha over its pixels, and of g times powers of the offset from the
-# mean; of |g| times the slope of the exponent to base 2, that of `absgrad`; and the gradients of its values.
+# Columns of a pair's row, sums over its pixels: of g = v_alpha alpha, and of g times powers of the offset from the
+# mean; for `absgrad`, of |g times the derivative of the base-2 exponent|; and the gradients of its values.
 G, G_X, G_Y, G_XX, G_XY, G_YY, ABSGRAD_X, ABSGRAD_Y, PAIR_VALUES = range(9)
 
 
 def sum_channels_of(real: type, image: int, weight: int, values: int) -> Scalar:
-    """The step that sums gradients of channels, given the first planes of both and the first column of the sums."""
+    """Builds the step that sums gradients of channels, given the planes of gradients and weights, and a column."""
     full, load = vector_kind(real, LANES)
     zero = real(0.0)
 
     @inlined
     def sum_channels(planes, blocks, group, groups, rows, row, sums):
-        """Fills a pair's sums from a group of channels on; `sums` is scratch."""
+        """Fills a pair's sums, starting at a group of channels; `sums` is scratch."""
         none = full(zero)
         for d in range(group * GROUP, groups * GROUP, GROUP):
             s0, s1, s2, s3, left = none, none, none, none, blocks
@@ -299,15 +299,15 @@ def sum_channels_of(real: type, image: int, weight: int, values: int) -> Scalar:
 
 
 def new_pair_rows(bins: TileBins, num_values: int, real: type) -> NDArray[Any]:
-    """Room for one row per pair, flat.
+    """Flat buffer for one row per pair.
 
-    A kernel fills the rows of active tiles. Only where other tiles have pairs must the rest be zero beforehand.
+    A kernel fills the rows of active tiles. The buffer is zeroed only if other tiles have pairs.
     """
     width = LANES * ((PAIR_VALUES + GROUP * groups_of(num_values) + LANES - 1) // LANES)
     size = len(bins.pair_splats) * width
     filled = len(bins.active) == len(bins.tile_offsets) - 1 or _pairs_of_active_tiles(bins) == len(bins.pair_splats)
     dtype = torch.float64 if real is np.float64 else torch.float32
-    # Of PyTorch, because its arrays begin with a cache line, and a row is one.
+    # An array of PyTorch, because it is aligned to cache lines, and a row fills one.
     rows: NDArray[Any] = (torch.empty if filled else torch.zeros)(size, dtype=dtype).numpy()
     return rows
 
@@ -361,8 +361,8 @@ def _sum_rows(real: type) -> Kernel:
                     store(total, column, part)
                 for d in range(v_values.shape[1]):
                     v_values[s, d] = total[PAIR_VALUES + d]
-                # alpha = opacity exp(-q / 2), q = xx dx^2 + 2 xy dx dy + yy dy^2. What no pixel shows stays zero, even
-                # where its geometry is not finite.
+                # alpha = opacity exp(-q / 2), q = xx dx^2 + 2 xy dx dy + yy dy^2. Gradients of invisible splats stay
+                # zero, even if their geometry is not finite.
                 if total[G_XX] != zero or total[G] != zero:
                     xx, xy, yy = conics[s, 0], conics[s, 1], conics[s, 2]
                     v_means[s, 0] = xx * total[G_X] + xy * total[G_Y]

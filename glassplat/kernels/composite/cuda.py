@@ -1,6 +1,6 @@
-"""Blending of sorted splats on the GPU: one block for each active tile, one thread for each pixel, front to back.
+"""Blending of sorted splats on the GPU, front to back: one block per active tile, one thread per pixel.
 
-The number of channels is part of a kernel, so that a pixel's sums stay in registers.
+Kernels are compiled for a number of channels, so that a pixel's sums stay in registers.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ class Saved(NamedTuple):
     """Results of the forward pass for the backward pass.
 
     final [A, 2, 256]: both transmittances of each pixel of the active tiles.
-    last [A, 2, 256] int32: the last pair, counted from the tile's first, that each pixel blended, -1 for none.
-    looked_at [A] int32: how many pairs of each tile any pixel blended, those in between included.
-    bucket_tiles [B] int32: the active tile that each bucket belongs to, -1 for buckets that none has.
-    kept [B, D + 1, 256], with glass [B, D + 3, 256]: of each pixel that had not stopped, its transmittance before the
-        first pair of a bucket, what its channels had gathered, its second transmittance, and what its mask had.
-    kept_spread [B, 256]: what the deviation had gathered there, where it was asked for.
-    center, lean [C, H, W]: of the channel whose deviation was asked for, as on the CPU.
+    last [A, 2, 256] int32: the last pair that each pixel blended, relative to the tile's first, -1 for none.
+    looked_at [A] int32: number of pairs of each tile up to the last one that any pixel blended.
+    bucket_tiles [B] int32: the active tile that each bucket belongs to, -1 for unused buckets.
+    kept [B, D + 1, 256], with glass [B, D + 3, 256]: for each running pixel before the first pair of a bucket, its
+        transmittance, channel sums, second transmittance and mask sum.
+    kept_spread [B, 256]: sum of the deviation there, if requested.
+    center, lean [C, H, W]: mean and lean of the channel whose deviation is requested, as on the CPU.
     outputs: image, alpha, mask and deviation.
 
-    B is 0 where no gradients are needed.
+    B is 0 if no gradients are needed.
     """
 
     final: Tensor
@@ -68,7 +68,7 @@ def composite(
     """As `glassplat.kernels.composite.cpu.composite`."""
     real, (_, count, num_channels) = REAL_OF[channels.dtype], channels.shape
     shape, tiles = (bins.num_cameras, bins.height, bins.width), len(bins.active)
-    # Where all tiles are active, every pixel is written.
+    # If all tiles are active, every pixel is written.
     new = channels.new_empty if tiles == len(bins.tile_offsets) - 1 else channels.new_zeros
     image, alpha, mask = (new(s) for s in ((*shape, num_channels), shape, shape))
     zeros = channels.new_zeros if deviation else channels.new_empty
@@ -84,7 +84,7 @@ def composite(
         channels.new_empty(buckets if deviation else 0, PIXELS),
         center,
         lean,
-        # Without their history: it holds this record, and would keep itself alive.
+        # Detached, because the autograd graph holds this record: a reference cycle would keep both alive.
         (image.detach(), alpha.detach(), mask.detach(), deviated.detach()),
     )
     lists = (bins.pair_splats, bins.tile_offsets, bins.active)
@@ -138,7 +138,7 @@ def composite_gradients(
 def through_mean(
     v_image: Tensor, v_alpha: Tensor, v_deviation: Tensor, saved: Saved, channel: int
 ) -> tuple[Tensor, Tensor]:
-    """Adds what the deviation's gradient does through the mean, which is the channel's sum over the coverage."""
+    """Adds the deviation's gradient through the mean, which is the channel's sum over the coverage."""
     alpha = saved.outputs[1]
     covered = alpha > LEAST_ALPHA
     v_sum = torch.where(covered, -v_deviation * saved.lean / torch.where(covered, alpha, 1), 0)
@@ -149,7 +149,7 @@ def through_mean(
 
 @cache
 def composite_forward(real: type, num_channels: int = 4) -> Kernel:
-    """Fills image, alpha and mask of the active tiles, and what the backward pass needs."""
+    """Fills image, alpha and mask of the active tiles, and the state for the backward pass."""
     load, coverage = tile_steps(real)
     zero, one, t_min = real(0.0), real(1.0), real(TRANSMITTANCE_MIN)
     alpha_min, alpha_max, stopped = real(ALPHA_MIN), real(ALPHA_MAX), np.int32(PIXELS)
@@ -173,7 +173,7 @@ def composite_forward(real: type, num_channels: int = 4) -> Kernel:
         column, row = pixel % TILE, pixel // TILE
         x, y, bit = real(np.int32(column)), real(np.int32(row)), np.int32(1 << row)
         inside = column < columns and row < num_rows
-        # Numbers, because a truth that changes in a loop takes the machine three instructions more.
+        # Integers, because a Boolean that changes in a loop costs three more instructions.
         running, glass_running = np.int32(inside), np.int32(inside)
         t, t_glass, shown, last_order, last_glass = one, one, zero, np.int32(-1), np.int32(-1)
         for d in range(num_channels):
@@ -183,7 +183,7 @@ def composite_forward(real: type, num_channels: int = 4) -> Kernel:
         start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
         first_bucket, first_glass = start // BUCKET + n, np.int32(camera * splats_per_camera + num_primary)
         keeps, keeps_glass = bucket_tiles.size > 0, num_primary < splats_per_camera
-        # What stands before the first mark of this camera, counted from the number of its first glass splat.
+        # Offset of this camera's marks, relative to the index of its first glass splat.
         before_marks = camera * (splats_per_camera - num_primary) - first_glass
         for first in range(0, stop - start, PIXELS):
             if not cuda.syncthreads_or(running):
@@ -249,7 +249,7 @@ def composite_forward(real: type, num_channels: int = 4) -> Kernel:
 
 @cache
 def composite_deviation(real: type) -> Kernel:
-    """The second traversal: fills the mean of a channel, and the deviation and lean from it, of the active tiles."""
+    """Second traversal: fills a channel's mean, and the deviation and lean from it, in active tiles."""
     load, coverage = tile_steps(real)
     zero, one, least_alpha, on_mean = real(0.0), real(1.0), real(LEAST_ALPHA), real(ON_MEAN * np.finfo(real).eps)
     alpha_min, alpha_max = real(ALPHA_MIN), real(ALPHA_MAX)
@@ -295,7 +295,7 @@ def composite_deviation(real: type) -> Kernel:
                     kept_spread[start // BUCKET + n + (first + group) // BUCKET, pixel] = spread
                 i = group
                 group = np.int32(min(group + BUCKET, here))
-                # Behind the last splat that the pixel blended, it has stopped.
+                # The pixel has stopped after the last splat that it blended.
                 end = np.int32(min(group, last_order + 1 - first))
                 while i < end:
                     k = np.uint32(i)

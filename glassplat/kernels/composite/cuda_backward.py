@@ -1,10 +1,10 @@
-"""Gradients of blending on the GPU: one thread for each (tile, splat) pair, after Taming 3DGS (arXiv 2406.15643).
+"""Gradients of blending on the GPU: one thread per (tile, splat) pair, after Taming 3DGS (arXiv 2406.15643).
 
-A warp takes a bucket of 32 consecutive pairs of a tile, one for each lane. The pixels of the tile pass through the
-lanes from the nearest splat to the farthest: in step i, lane l has pixel i - l, and leaves what the next lane needs of
-it in shared memory. So every lane sums its own splat's gradient in registers; there is no atomic and no sum across
-threads. What a pixel is when it enters a bucket was stored by the forward pass: its transmittances and how much it had
-gathered. One gradient row is written per pair, and the rows of each splat are summed afterwards in a fixed order.
+A warp processes a bucket of 32 consecutive pairs of a tile, one per lane. The pixels of the tile pass through the lanes
+from the nearest splat to the farthest: in step i, lane l has pixel i - l, and leaves its state for the next lane in
+shared memory. So every lane sums its own splat's gradient in registers, without atomics or sums across threads. The
+forward pass has stored the state of pixels at the start of each bucket: their transmittances and partial sums. One
+gradient row is written per pair, and the rows of each splat are summed afterwards in a fixed order.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from glassplat.kernels.maths.fast_maths import reciprocal_maths
 from glassplat.kernels.records import ON_MEAN, TILE
 
 WARPS = 2
-"""Buckets of a block; they have nothing to do with each other."""
+"""Buckets per block, which are independent of each other."""
 THREADS, SLOTS = WARPS * BUCKET, WARPS * PIXELS
 
 BEHIND, LAST, T_GLASS, BEHIND_GLASS, LAST_GLASS, STATES = (*(at(i * SLOTS) for i in range(1, 6)), 6 * SLOTS)
-"""Where what follows the transmittances begins in shared memory: what lies behind each pixel, and the last lane whose
-splat it blended; all three of glass; and the end."""
+"""Offsets in shared memory after the transmittances: gradient-weighted sums behind the current splat, and the last lane
+whose splat each pixel blended; the same three planes for glass; and the end."""
 
 EXTRAS = 5
-"""Planes of a tile's pixel gradients beyond those of its channels."""
+"""Number of planes of a tile's pixel gradients beyond those of its channels."""
 
 
 @cache
 def composite_cotangents(real: type, num_channels: int = 4) -> Kernel:
-    """Gathers, tile by tile, the gradients of each pixel [A, D + 5, 256]: one plane per channel, then the
-    gradients of the mask and of the deviation, the mean that the latter is measured from, and what the pixel gathered
-    in all and of glass, each part times its gradient.
+    """Gathers, tile by tile, the gradients of each pixel [A, D + 5, 256]: one plane per channel, then the gradients of
+    the mask and of the deviation, the mean that the latter refers to, and the gradient-weighted sums of all that the
+    pixel has blended and of its glass.
     """
     shown, spread, middle, total, total_glass = range(num_channels, num_channels + EXTRAS)
 
@@ -58,7 +58,7 @@ def composite_cotangents(real: type, num_channels: int = 4) -> Kernel:
         if column >= columns or row >= rows:
             return
         y, x = y0 + row, x0 + column
-        # alpha = 1 - T: its gradient acts like something behind every splat.
+        # alpha = 1 - T: its gradient acts like that of a background.
         of_glass = v_mask[camera, y, x] * mask[camera, y, x]
         gathered = of_glass - v_alpha[camera, y, x] * final[n, 0, pixel]
         v_pixels[n, shown, pixel], v_pixels[n, total_glass, pixel] = v_mask[camera, y, x], of_glass
@@ -84,7 +84,7 @@ def _enter(real: type, num_channels: int) -> Scalar:
     def enter(
         mine, v_at, had, had_spread, lasts, channel, has_glass, v_pixels, kept, kept_spread, state,
     ):  # fmt: skip
-        """Puts what a pixel is before a bucket's first pair into shared memory."""
+        """Writes a pixel's state before a bucket's first pair to shared memory."""
         behind = v_pixels[at(v_at + total)]
         for d in range(num_channels):
             behind -= v_pixels[at(v_at + d * PIXELS)] * kept[at(had + PIXELS + d * PIXELS)]
@@ -105,7 +105,7 @@ def _write(num_channels: int, with_absgrad: bool) -> Scalar:
     def write(
         out, pair, g_x, g_y, g_xx, g_xy, g_yy, g_0, v_value, channel, v_apart, glass, v_mark, absgrad_x, absgrad_y
     ):  # fmt: skip
-        """Fills the gradient row of a pair; the mark's gradient takes the place of the first channel's."""
+        """Fills the gradient row of a pair; a mark's gradient is stored in the column of the first channel."""
         out[pair, 0], out[pair, 1], out[pair, 2] = g_x, g_y, g_xx
         out[pair, 3], out[pair, 4], out[pair, 5] = g_xy, g_yy, g_0
         for d in range(num_channels):
@@ -121,7 +121,7 @@ def _write(num_channels: int, with_absgrad: bool) -> Scalar:
 
 
 def _planes(num_channels: int) -> tuple[int, ...]:
-    """Offset of the planes for a tile's gradients beyond those of its channels."""
+    """Offsets of the planes of a tile's gradients beyond those of its channels."""
     return tuple(PIXELS * (num_channels + i) for i in range(EXTRAS))
 
 
@@ -163,7 +163,7 @@ def composite_backward(real: type, num_channels: int = 4, with_absgrad: bool = T
         planes = num_channels + 3 if has_glass else num_channels + 1
         entry, tile_pixels, tile_last = bucket * planes * PIXELS, n * (num_channels + EXTRAS) * PIXELS, n * 2 * PIXELS
         for pixel in range(lane, PIXELS, BUCKET):
-            # A pixel that had stopped before stored nothing, and no lane will look at it.
+            # A pixel that stopped earlier has stored nothing, and no lane evaluates it.
             own_last, own_glass = last[at(tile_last + pixel)] - first, last[at(tile_last + PIXELS + pixel)] - first
             if own_last < 0 and own_glass < 0:
                 state[at(warp * PIXELS + pixel) + lasts] = state[at(warp * PIXELS + pixel) + glass_lasts] = -one
@@ -188,13 +188,13 @@ def composite_backward(real: type, num_channels: int = 4, with_absgrad: bool = T
         for d in range(num_channels):
             v_value[d] = zero
         g_x, g_y, g_xx, g_xy, g_yy, g_0, v_mark, v_apart = zero, zero, zero, zero, zero, zero, zero, zero
-        # A pixel's number counts from ABOVE rows above the tile, so that before a lane's first pixel and after its last
-        # one it is in rows that no splat reaches; so is a splat that is not there.
+        # Pixels are numbered starting `above` rows above the tile. Before a lane's first pixel and after its last one,
+        # the number is in rows that no splat reaches; padding lanes reach none at all.
         reached, own_pixels = np.int32(reached << above), tile_pixels - above * TILE
         own_state = np.int32(warp * PIXELS + (glass_state if glass else 0) - above * TILE)
         p, end = np.int32(above * TILE - lane), np.int32(above * TILE + PIXELS + BUCKET - 1 - lane)
         while p < end:
-            # The lanes of a warp wait for each other; the simulator knows no warps, but blocks.
+            # Synchronises the lanes of a warp; the simulator supports only blocks.
             if SIMULATED:
                 cuda.syncthreads()
             else:
@@ -205,7 +205,7 @@ def composite_backward(real: type, num_channels: int = 4, with_absgrad: bool = T
                 covered, mine = coverage(geometry, 0, x, y), at(own_state + p)
                 if covered >= alpha_min and place_in_bucket <= state[mine + lasts]:
                     a = min(covered, alpha_max)
-                    # In 32 bits, which hold the places of any gradients that a GPU's memory does (16 GiB).
+                    # 32-bit indices suffice for pixel gradients of up to 16 GiB.
                     v_at, inverse = at(np.uint32(own_pixels + p)), reciprocal(one - a)
                     if glass:
                         t_glass, of_all = state[mine], mine - at(glass_state)

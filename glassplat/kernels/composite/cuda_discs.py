@@ -1,8 +1,8 @@
 """Blending of sorted discs on the GPU.
 
-Forwards there is one block for each active tile, one thread for each pixel. Backwards there is one thread for each
-(tile, disc) pair: a warp takes a bucket of 32 consecutive pairs of a tile, one for each lane, and the pixels of the
-tile pass through the lanes (`cuda_backward`). So every lane sums its own disc's gradient in registers.
+The forward pass uses one block per active tile, one thread per pixel. The backward pass uses one thread per (tile,
+disc) pair: a warp processes a bucket of 32 consecutive pairs of a tile, one per lane, and the pixels of the tile pass
+through the lanes (`cuda_backward`). So every lane sums its own disc's gradient in registers.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from glassplat.kernels.records import REAL_OF, TILE, Discs, TileBins
 CENTER_X, CENTER_Y, U_X, U_Y, V_X, V_Y, W_X, W_Y, OPACITY, Z, INVERSE_Z, COLUMNS = range(12)
 """Columns of a disc's geometry; the centre is relative to that of the tile's first pixel."""
 
-# Planes of what a tile's pixels end with, and with `LAST` and `MEDIAN` of the pairs that decided it.
+# Planes of the final state of a tile's pixels, and, with `LAST` and `MEDIAN`, of the pairs that determined it.
 T, FIRST, TOTAL, SQUARES, FINALS = range(5)
 LAST, MEDIAN, ORDERS = range(3)
 
-# Planes of what a pixel had gathered before a bucket, the channels after them.
+# Planes of a pixel's partial sums before a bucket, followed by those of its channels.
 KEPT_T, KEPT_DEPTH, KEPT_TOTAL, KEPT_SQUARES, KEPT_VALUES = range(5)
 
 
@@ -45,7 +45,7 @@ def _load(real: type) -> Scalar:
 
     @inlined
     def load(geometry, i, s, means, maps, opacities, depths, centers, conics, x0, y0, num_rows):
-        """Copies a disc's geometry into row `i` of an array; returns the rows its outline reaches, a bit for each."""
+        """Copies a disc's geometry to row `i` of an array; returns the rows that its outline reaches, as bits."""
         opacity, depth, total = opacities[s], depths[s], means[s, 0] + means[s, 1] + depths[s]
         geometry[i, CENTER_X], geometry[i, CENTER_Y] = means[s, 0] - real(x0) - half, means[s, 1] - real(y0) - half
         for j in range(6):
@@ -56,7 +56,7 @@ def _load(real: type) -> Scalar:
         if not (abs(total) < endless and alpha_min <= opacity < endless and zero < depth):
             return np.int32(0)
         if conics[s, 0] == zero and conics[s, 1] == zero and conics[s, 2] == zero:
-            # It crosses the near plane and may reach any row.
+            # The disc crosses the near plane and may reach any row.
             return np.int32((1 << num_rows) - 1)
         reach = vertical_reach(conics[s, 0], conics[s, 1], conics[s, 2], opacity)
         first, last = row_range(centers[s, 1] - real(y0), reach, num_rows)
@@ -72,10 +72,10 @@ def _cover(real: type) -> Scalar:
 
     @inlined
     def cover(geometry, i, x, y, near, sharpness):
-        """As in `cpu_discs`, of the disc in row `i` and the pixel in column x and row y of the tile."""
+        """As in `cpu_discs`, for the disc in row `i` and the pixel in column x and row y of the tile."""
         dx, dy = x - geometry[i, CENTER_X], y - geometry[i, CENTER_Y]
-        # Written out, because the compiler would choose anew in every kernel which products and sums to fuse: a disc
-        # at exactly 1/255 could be in the image and not in its gradient.
+        # Explicit fused operations, because the compiler would fuse differently in each kernel: a disc at exactly 1/255
+        # could be in the image and not in its gradient.
         e = fused(dx, geometry[i, W_X], fused(dy, geometry[i, W_Y], one))
         inverse, solid = one, far
         u, v = zero, zero
@@ -98,24 +98,24 @@ def _cover(real: type) -> Scalar:
 
 
 WARPS = 2
-"""Buckets of a block; they have nothing to do with each other."""
+"""Buckets per block, which are independent of each other."""
 THREADS, SLOTS = WARPS * BUCKET, WARPS * PIXELS
 
 BEHIND, BLENDED, MIDDLE, STATES = at(SLOTS), at(2 * SLOTS), at(3 * SLOTS), 4 * SLOTS
-"""Where what follows the transmittances begins in shared memory: what lies behind each pixel, the last lane whose disc
-it blended and the one whose depth is its median; and the end."""
+"""Offsets in shared memory after the transmittances: gradient-weighted sums behind the current disc, the last lane
+whose disc each pixel blended, the lane of its median disc; and the end."""
 
 # Planes of a tile's pixel gradients beyond those of its channels.
 V_DEPTH, V_MEDIAN, V_DISTORTION, GATHERED, SAVED_FIRST, SAVED_COVERED, SAVED_TOTAL, SAVED_SQUARES, EXTRAS = range(9)
 
-# Columns of a pair's row, as on the CPU; the channels' follow.
+# Columns of a pair's row, as on the CPU, followed by those of channels.
 UP, VP, E, AROUND, G, G_Z, ABSGRAD, MOMENTS = 0, 3, 6, 9, 11, 12, 13, 15
 
 
 @cache
 def composite_discs_cotangents(real: type, num_channels: int = 6) -> Kernel:
-    """Gathers, tile by tile, the gradients of each pixel [A, D + 8, 256]: one plane per channel, then those
-    that the constants name. What the pixel gathered in all holds each part times its gradient.
+    """Gathers, tile by tile, the gradients of each pixel [A, D + 8, 256]: one plane per channel, then those named by
+    the constants. GATHERED is the gradient-weighted sum of all outputs of the pixel.
     """
     zero, one, two = real(0.0), real(1.0), real(2.0)
 
@@ -131,7 +131,7 @@ def composite_discs_cotangents(real: type, num_channels: int = 6) -> Kernel:
         y, x = y0 + row, x0 + column
         t, total, squares = finals[n, T, pixel], finals[n, TOTAL, pixel], finals[n, SQUARES, pixel]
         covered, v_spread = one - t, v_distortion[camera, y, x]
-        # alpha = 1 - T: its gradient acts like something behind every disc.
+        # alpha = 1 - T: its gradient acts like that of a background.
         gathered = v_depth[camera, y, x] * depth[camera, y, x] - v_alpha[camera, y, x] * t
         if v_spread != zero:
             gathered += v_spread * two * (covered * squares - total * total)
@@ -152,7 +152,7 @@ def composite_discs_cotangents(real: type, num_channels: int = 6) -> Kernel:
 
 
 def _enter(real: type, num_channels: int) -> Scalar:
-    """Puts what a pixel is before a bucket's first pair into shared memory."""
+    """Builds the step that writes a pixel's state before a bucket's first pair to shared memory."""
     one, two, behinds = real(1.0), real(2.0), BEHIND
     of_depth, of_spread, gathered = (PIXELS * (num_channels + plane) for plane in (V_DEPTH, V_DISTORTION, GATHERED))
     of_covered, of_total, of_squares = (
@@ -216,7 +216,7 @@ def composite_discs_backward(real: type, num_channels: int = 6) -> Kernel:
             own_last = orders[at(tile_orders + LAST * PIXELS + pixel)] - first
             state[mine + lasts] = real(own_last)
             state[mine + middles] = real(orders[at(tile_orders + MEDIAN * PIXELS + pixel)] - first)
-            # A pixel that had stopped before stored nothing, and no lane will look at it.
+            # A pixel that stopped earlier has stored nothing, and no lane evaluates it.
             if own_last >= 0:
                 enter(mine, tile_pixels + pixel, entry + pixel, v_pixels, kept, state)
         order, tile, own = first + lane, np.uint32(n), real(np.int32(lane))
@@ -239,14 +239,14 @@ def composite_discs_backward(real: type, num_channels: int = 6) -> Kernel:
         around_x, around_y, g, g_depth, absgrad_x, absgrad_y = zero, zero, zero, zero, zero, zero
         own_pixels, step = at(tile) * at((num_channels + EXTRAS) * PIXELS), np.int32(0)
         while step < PIXELS + BUCKET - 1:
-            # The lanes of a warp wait for each other; the simulator knows no warps, but blocks.
+            # Synchronises the lanes of a warp; the simulator supports only blocks.
             if SIMULATED:
                 cuda.syncthreads()
             else:
                 cuda.syncwarp()
             p = np.int32(step - lane)
             step = np.int32(step + 1)
-            # A disc that is not there reaches no row, and none was blended where the tile reaches beyond the image.
+            # A padding lane reaches no row, and pixels of the tile outside the image have blended no disc.
             if 0 <= p < PIXELS and np.int32(reached & np.int32(1 << (p >> 4))) != 0:
                 x, y, mine = real(np.int32(p & (TILE - 1))), real(np.int32(p >> 4)), at(warp * PIXELS + p)
                 (dx, dy), (u, v, inverse), e, covered, on_disc = cover(geometry, 0, x, y, near, sharpness)
@@ -264,7 +264,7 @@ def composite_discs_backward(real: type, num_channels: int = 6) -> Kernel:
                     v_z = weight * v_pixels[v_at + of_depth]
                     if own == state[mine + middles]:
                         v_z += v_pixels[v_at + of_median]
-                    # The derivative of a square is twice as steep: `lean` holds the sum of distances but for half.
+                    # The derivative is twice `apart` times the coverage minus the total, which `lean` subtracts twice.
                     v_inverse = weight * v_spread * two * (lean + v_pixels[v_at + of_total])
                     behind = state[mine + behinds] - weight * worth
                     gain = (t * worth - behind * reciprocal(one - a)) * a if covered < alpha_max else zero
@@ -302,10 +302,10 @@ SUM_THREADS = 256
 class Saved(NamedTuple):
     """Results of the forward pass for the backward pass.
 
-    finals [A, 4, 256], orders [A, 2, 256] int32: of each pixel of the active tiles, the planes named above; orders
-    count from the tile's first pair, -1 for none. looked_at [A] int32: how many pairs of each tile any pixel
-    blended. bucket_tiles [B] int32: the active tile that each bucket belongs to, -1 for none. kept [B, D + 4, 256]:
-    what each pixel had gathered before a bucket. outputs: image and depth.
+    finals [A, 4, 256], orders [A, 2, 256] int32: the planes named above, for each pixel of the active tiles; orders are
+    relative to the tile's first pair, -1 for none. looked_at [A] int32: number of pairs of each tile up to the last one
+    that any pixel blended. bucket_tiles [B] int32: the active tile that each bucket belongs to, -1 for none. kept
+    [B, D + 4, 256]: each pixel's partial sums before a bucket. outputs: image and depth.
     """
 
     finals: Tensor
@@ -331,7 +331,7 @@ def composite_discs(
         torch.empty(tiles, dtype=torch.int32, device=device),
         torch.full((buckets,), -1, dtype=torch.int32, device=device),
         channels.new_empty(buckets, KEPT_VALUES + num_channels, PIXELS),
-        # Without their history: it holds this record, and would keep itself alive.
+        # Detached, because the autograd graph holds this record: a reference cycle would keep both alive.
         (image.detach(), depth.detach()),
     )
     composite_discs_forward(REAL_OF[channels.dtype], num_channels)(
@@ -367,7 +367,7 @@ def composite_discs_gradients(
 
 
 def _from_sums(sums: Tensor, discs: Discs, with_absgrad: bool) -> tuple[Tensor | None, ...]:
-    """Gradients of each disc from the sums over its pixels; what no pixel shows stays zero, finite or not."""
+    """Gradients of each disc from the sums over its pixels; invisible discs get zeros, even if not finite."""
     leading, size = discs.opacities.shape, sums.shape[0]
     by_row = sums[:, :AROUND].unflatten(1, (3, 3))
     v_maps, alone = by_row[:, :, :2], by_row[:, :, 2:]
@@ -387,7 +387,7 @@ def _sharpness(low_pass: float) -> float:
 
 @cache
 def composite_discs_forward(real: type, num_channels: int = 6) -> Kernel:
-    """Fills the images of the active tiles, and what the backward pass needs."""
+    """Fills the images of the active tiles, and the state for the backward pass."""
     load, cover = _load(real), _cover(real)
     zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
     t_min, alpha_max, stopped = real(TRANSMITTANCE_MIN), real(ALPHA_MAX), np.int32(PIXELS)
@@ -489,7 +489,7 @@ def composite_discs_forward(real: type, num_channels: int = 6) -> Kernel:
 
 @cache
 def sum_disc_rows(real: type) -> Kernel:
-    """One thread for each column of each disc: sums its pairs' rows in a fixed order."""
+    """Sums the rows of each disc's pairs in a fixed order, one thread per column and disc."""
     zero = real(0.0)
 
     @kernel("sum_disc_rows", real, "real2 int1 long1 real2")

@@ -1,9 +1,9 @@
-"""A tile's pixels on the GPU, its splats in shared memory, how much they cover, and the rows of their gradients.
+"""A tile's pixels on the GPU, its splats in shared memory, their coverage, and the rows of their gradients.
 
 A row of a (tile, splat) pair holds sums over a tile's pixels: of g dx, g dy, g dx^2, g dx dy, g dy^2 and g, with g the
 gradient of the exponent of the splat's falloff and (dx, dy) the offset from its centre, then one value per channel, and
-the two of `absgrad` if it is asked for. All of these add up over tiles; what they mean for mean, conic and opacity is
-worked out once per splat.
+the two of `absgrad` if requested. All of these are summed over tiles; the gradients of mean, conic and opacity are
+computed from the sums once per splat.
 """
 
 from __future__ import annotations
@@ -24,32 +24,31 @@ from glassplat.kernels.records import REAL_OF, TILE, Splats, TileBins
 PIXELS = TILE * TILE
 
 BUCKET = 32
-"""Consecutive pairs of a tile that a warp takes in the backward pass, one for each lane.
+"""Consecutive pairs of a tile that a warp processes in the backward pass, one per lane.
 
-Bucket `k` of the n-th active tile, whose pairs begin at `start`, has the number `start // BUCKET + n + k`, which no
-other bucket has.
+Bucket `k` of the n-th active tile, whose pairs begin at `start`, has the unique number `start // BUCKET + n + k`.
 """
 
 MEAN_X, MEAN_Y, FORM_XX, FORM_XY, FORM_YY, OPACITY, COLUMNS = 0, 1, 2, 3, 4, 5, 8
-"""Columns of a splat's geometry; the mean is relative to the centre of the tile's first pixel. Eight, so that one load
-fetches four."""
+"""Columns of a splat's geometry; the mean is relative to the centre of the tile's first pixel. Eight columns, so that
+one load fetches four."""
 
-# Indices are unsigned, because Numba lets signed ones count from the end, which costs three instructions each.
+# Indices are unsigned, because Numba supports negative ones by wrapping, which costs three instructions each.
 at = np.uint64
 
 ALIGNMENT = None if SIMULATED else 16
-"""Bytes that one load fetches of shared memory; the simulator takes none."""
+"""Bytes per load from shared memory; the simulator does not support alignment."""
 
 
 def tile_steps(real: type) -> tuple[Scalar, Scalar]:
-    """Steps that every blending kernel takes: `load` and `coverage`."""
+    """Builds the steps shared by all blending kernels: `load` and `coverage`."""
     maths = blend_maths(real)
     screen_form, vertical_reach, row_range = maths.screen_form, maths.vertical_reach, maths.row_range
     exp2, fused, half = exp2_maths(real), fused_maths(), real(0.5)
 
     @inlined
     def load(geometry, i, s, means, conics, opacities, x0, y0, num_rows):
-        """Copies a splat's geometry into row `i` of an array; returns the rows of pixels it reaches, a bit for each."""
+        """Copies a splat's geometry to row `i` of an array; returns the rows of pixels that it reaches, as bits."""
         xx, xy, yy, opacity = conics[s, 0], conics[s, 1], conics[s, 2], opacities[s]
         mean_y = means[s, 1] - real(y0)
         geometry[i, MEAN_X], geometry[i, MEAN_Y] = means[s, 0] - real(x0) - half, mean_y - half
@@ -62,8 +61,8 @@ def tile_steps(real: type) -> tuple[Scalar, Scalar]:
     def coverage(geometry, i, x, y):
         """Opacity times falloff of the splat in row `i` at the pixel in column x and row y of the tile."""
         dx, dy = x - geometry[i, MEAN_X], y - geometry[i, MEAN_Y]
-        # Written out, because the compiler would choose anew in every kernel which products and sums to fuse: a splat
-        # at exactly 1/255 could be in the image and not in its gradient.
+        # Explicit fused operations, because the compiler would fuse differently in each kernel: a splat at exactly
+        # 1/255 could be in the image and not in its gradient.
         along = fused(geometry[i, FORM_XX], dx, geometry[i, FORM_XY] * dy)
         exponent = fused(along, dx, geometry[i, FORM_YY] * dy * dy)
         return geometry[i, OPACITY] * exp2(exponent)
@@ -76,7 +75,7 @@ MOMENTS = 6
 
 
 def new_pair_rows(bins: TileBins, channels: Tensor, with_absgrad: bool) -> Tensor:
-    """One gradient row per pair [P, 6 + D, + 2 of absgrad], all zero: a tile fills those of pairs that it blended."""
+    """One gradient row per pair [P, 6 + D, + 2 of absgrad], all zero; tiles fill the rows of blended pairs."""
     return channels.new_zeros(len(bins.pair_splats), MOMENTS + channels.shape[2] + (2 if with_absgrad else 0))
 
 
@@ -97,7 +96,7 @@ def sum_pair_rows(
 
 @cache
 def sum_rows(real: type) -> Kernel:
-    """One thread for each column of each splat: neighbouring threads read neighbouring numbers."""
+    """Sums rows with one thread per column and splat, so that neighbouring threads read neighbouring numbers."""
     zero, half = real(0.0), real(0.5)
 
     @kernel("sum_pair_rows", real, "real2 int1 long1 real2 real1 real2 real2 real1 real2 real2")

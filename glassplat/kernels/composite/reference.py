@@ -1,4 +1,4 @@
-"""The definition of blending: every ellipsoid or disc over every pixel, front to back."""
+"""Reference blending, which defines the result: every ellipsoid or disc over every pixel, front to back."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def composite(
 
 
 def _spread(weights: dict[int, Tensor], values: Tensor, total: Tensor, alpha: Tensor, through_mean: bool) -> Tensor:
-    """Sum of w_i |z_i - mean| over the splats, with weights [H, W] by splat and values [G]."""
+    """Sum of w_i |z_i - mean| over the splats, given weights [H, W] per splat and values [G]."""
     covered = alpha > LEAST_ALPHA
     mean = torch.where(covered, total / torch.where(covered, alpha, 1), 0)
     mean = mean if through_mean else mean.detach()
@@ -83,13 +83,13 @@ def _camera_composite(
 
 
 def alphas_front_to_back(splats: Splats, bins: TileBins, absgrad: Tensor | None = None) -> Iterator[tuple[int, Tensor]]:
-    """Index and coverage [H, W] of every splat of one camera that is drawn, nearest first; `absgrad` [G, 2]."""
+    """Yields index and coverage [H, W] of every drawn splat of one camera, nearest first; `absgrad` is [G, 2]."""
     like = splats.means2d
     x = torch.arange(bins.width, dtype=like.dtype) + 0.5
     y = torch.arange(bins.height, dtype=like.dtype)[:, None] + 0.5
     for index in torch.argsort(splats.depths, stable=True).tolist():
         xx, xy, yy = splats.conics[index]
-        # In double precision, as in the kernels: of a needle's conic it is a small difference of large products.
+        # In double precision, as in the kernels: for a needle's conic, it is a small difference of large products.
         determinant = xx.double() * yy.double() - xy.double() ** 2
         if not bool((splats.radii[index] > 0).all() & (xx > 0) & (determinant > 0)):
             continue
@@ -103,7 +103,7 @@ def alphas_front_to_back(splats: Splats, bins: TileBins, absgrad: Tensor | None 
 
 
 class _MovePerPixel(torch.autograd.Function):
-    """A move [H, W, 2] of a splat's centre for each pixel on its own, all zero; the gradient is summed unsigned."""
+    """A zero shift [H, W, 2] of a splat's centre for each pixel; absolute values of the gradient are summed."""
 
     @staticmethod
     def forward(ctx: Any, absgrad: Tensor, height: int, width: int) -> Tensor:
@@ -115,7 +115,7 @@ class _MovePerPixel(torch.autograd.Function):
 
 
 def active_pixels(bins: TileBins) -> Tensor:
-    """[C, H, W] bool: whether a pixel lies in an active tile."""
+    """Mask [C, H, W] of pixels in active tiles."""
     columns, rows = -(-bins.width // TILE), -(-bins.height // TILE)
     tiles = torch.zeros(bins.num_cameras * rows * columns, dtype=torch.bool)
     tiles[bins.active.long()] = True
@@ -175,7 +175,7 @@ def _camera(
 
 
 def _layer(discs: Discs, index: int, bins: TileBins, near: float, low_pass: float, absgrad: Tensor | None) -> _Layer:
-    """Coverage and depth of a disc; where it does not cover, the depth is that of its centre."""
+    """Coverage and depth of a disc; where it is not drawn, the depth is that of its centre."""
     like = discs.means2d
     x = torch.arange(bins.width, dtype=like.dtype) + 0.5
     y = torch.arange(bins.height, dtype=like.dtype)[:, None] + 0.5

@@ -10,7 +10,7 @@ from glassplat.kernels.records import TILE, Splats, TileBins, check_device, chec
 
 
 def tile_grid(width: int, height: int) -> tuple[int, int]:
-    """Rows and columns of tiles that cover an image of that size in pixels."""
+    """Number of rows and columns of tiles that cover an image of the given size in pixels."""
     return -(-height // TILE), -(-width // TILE)
 
 
@@ -18,14 +18,14 @@ def tile_grid(width: int, height: int) -> tuple[int, int]:
 def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | None = None) -> TileBins:
     """Lists, for every tile of every camera, the splats that cover any of its pixels, nearest first.
 
-    A splat is listed where its ellipse {coverage >= 1/255} crosses the rows of pixel centres of a tile: every tile with
-    such a pixel, and hardly any other. Equal depths keep the order of the splats. Not differentiable.
+    A splat is listed in a tile if its ellipse {coverage >= 1/255} crosses the tile's rows of pixel centres, which adds
+    few tiles without a covered pixel. Equal depths keep the order of the splats. Not differentiable.
 
     Args:
-        splats: [C, G, ...]; those with `radii == 0` are left out. Depths must be positive where they are not.
+        splats: [C, G, ...]; those with `radii == 0` are skipped. Depths of all others must be positive.
         width: of the image, pixels.
         height: of the image, pixels.
-        active_tiles: [C, rows, columns] bool, tiles to fill and traverse; all if None.
+        active_tiles: [C, rows, columns] bool, tiles to rasterise; all if None.
     """
     _check(splats, width, height, active_tiles)
     plain = Splats(*(tensor.detach().contiguous() for tensor in splats))

@@ -1,7 +1,7 @@
-"""Binning on the CPU: which tiles a splat touches, the splats by depth, and the two together as one list per tile.
+"""Binning on the CPU: finds the tiles of each splat, sorts splats by depth, and joins both to one list per tile.
 
-Work is split into chunks that depend on the data alone, and each chunk knows from prefix sums where its results go, so
-that they are the same for any number of threads.
+Work is split into chunks that depend only on the data. Prefix sums give the output position of each chunk, so results
+are the same for any number of threads.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
 
 @inlined
 def pixel_range(low, high, size):
-    """First and last pixel whose centre lies in [low, high], within an image of that size."""
+    """First and last pixel whose centre lies in [low, high], clipped to an image of the given size."""
     # Clamped before the conversion, so that infinities are well defined.
     first = np.int64(math.ceil(min(max(low - 0.5, 0.0), float(size))))
     last = np.int64(math.floor(min(max(high - 0.5, -1.0), float(size - 1))))
@@ -66,7 +66,7 @@ def pixel_range(low, high, size):
 
 @inlined
 def rows_of(means2d, conics, opacities, radii, s, height):
-    """First and last row of pixels that a splat reaches (last < first: none), and its half height."""
+    """First and last row of pixels that a splat covers (last < first if none), and its half height."""
     if not (radii[s, 0] > 0 and abs(means2d[s, 0]) + abs(means2d[s, 1]) < np.inf):
         return 0, -1, -1.0
     y = np.float64(means2d[s, 1])
@@ -86,7 +86,7 @@ def shape_of(means2d, conics, s, rows):
 
 @inlined
 def columns_of(shape, row, width):
-    """First and last tile that a splat touches in a row of tiles, last < first where it touches none."""
+    """First and last tile that a splat touches in a row of tiles; last < first if none."""
     x, y, first, last, ellipse = shape
     low, high = max(first, row * TILE) + 0.5 - y, min(last, row * TILE + TILE - 1) + 0.5 - y
     left, right = band(ellipse, low, high)
@@ -98,7 +98,7 @@ def columns_of(shape, row, width):
 
 @inlined
 def active_between(active_tiles, camera, row, left, right):
-    """Number of active tiles from one column to another, both included."""
+    """Number of active tiles between two columns, inclusive."""
     found = right - left + 1
     if active_tiles.size > 0:
         for column in range(left, right + 1):
@@ -109,18 +109,18 @@ def active_between(active_tiles, camera, row, left, right):
 
 @cache
 def tile_spans(real: type) -> Kernel:
-    """Finds the splats that are to be seen, and the tile columns that each of them touches, tile row by tile row.
+    """Finds the visible splats, and the tile columns that each of them touches, row by row.
 
-    Most splats of a scene lie outside of the view; what follows looks at the V that do not, next to each other.
+    Most splats of a scene lie outside the view; later passes process only the V visible ones, stored contiguously.
 
     Returns:
-        kept [V]: splats that touch a row of pixels, in their order.
-        starts [C + 1]: where each camera begins in `kept`.
-        spans [R, 2]: first and last tile column; last < first where a row is not touched.
-        span_offsets [V + 1]: where the rows of each of them begin in `spans`.
+        kept [V]: splats that cover a row of pixels, in their order.
+        starts [C + 1]: start of each camera in `kept`.
+        spans [R, 2]: first and last tile column of each row; last < first if the row is not touched.
+        span_offsets [V + 1]: start of each visible splat's rows in `spans`.
         first_rows [V]: tile row of the first span of each.
-        slots [V + 1]: active tiles of all of them before.
-        splat_offsets [S + 1]: the same for each splat, seen or not.
+        slots [V + 1]: number of active tiles of all earlier visible splats.
+        splat_offsets [S + 1]: the same for every splat, visible or not.
     """
 
     @kernel("tile_spans", real)
@@ -128,7 +128,7 @@ def tile_spans(real: type) -> Kernel:
         num_splats = opacities.size
         per_camera = num_splats // max(1, num_cameras)
         num_chunks = (num_splats + SPAN_CHUNK - 1) // SPAN_CHUNK
-        # What a chunk finds stands from its first splat on, until it is known what all before it find.
+        # A chunk stores its results starting at its first splat, until the counts of all earlier chunks are known.
         found, heights = np.empty(num_splats, np.int32), np.empty(num_splats)
         rows = np.empty((num_splats, 2), np.int32)
         counts, row_counts = np.zeros(num_chunks + 1, np.int64), np.zeros(num_chunks + 1, np.int64)
@@ -189,8 +189,8 @@ def tile_spans(real: type) -> Kernel:
 def depth_order(key: type) -> Kernel:
     """Sorts the kept splats of each camera by depth, nearest first, equal depths by index.
 
-    Depths are positive, so their bits, taken as integers of type `key`, sort as they do: a radix sort from the lowest
-    digit, each pass a counting sort.
+    Positive depths sort like their bits as integers of type `key`. This is a radix sort from the lowest digit, with a
+    counting sort in each pass.
 
     Returns:
         order [V]: positions in `kept`, camera by camera.
@@ -258,7 +258,7 @@ def tile_pairs() -> Kernel:
         order, kept, starts, spans, span_offsets, first_rows, slots, active_tiles, per_camera, rows, columns
     ):  # fmt: skip
         num_cameras, num_kept, num_tiles = starts.size - 1, kept.size, rows * columns
-        # The tiles of each splat in a row, in place of spans: read twice below, in an order that defeats the caches.
+        # Lists each splat's tiles contiguously, not as spans: they are read twice below, out of order.
         tiles = np.empty(slots[num_kept], np.int32)
         num_span_chunks = (num_kept + SPAN_CHUNK - 1) // SPAN_CHUNK
         stride = even_stride(num_span_chunks)

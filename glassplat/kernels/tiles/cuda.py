@@ -1,11 +1,11 @@
-"""Binning on the GPU: three passes over the splats to count their tiles, order the counts and list their rows of tiles,
-two over the pairs; torch scans and sorts. There are few steps, as to start one takes longer than a small one itself.
+"""Binning on the GPU. Three passes over the splats count their tiles, order the counts and list their rows of tiles;
+two more process the pairs; torch scans and sorts. Kernels are few, because a launch takes longer than a small one.
 
 Splats are sorted by depth first. Their pairs are written in that order, so that one stable sort of the pairs by tile,
 an integer of 16 bits up to 32,767 tiles of all cameras, leaves each tile's splats nearest first. Each pair has a
-thread, which searches the sums of the counts for its splat, then those of the splat's rows: no thread waits for one
-that covers the whole image. Only the passes over the splats compute in float64, which most GPUs do 32 or 64 times
-slower.
+thread, which finds its splat by binary search in the prefix sums, then its row in those of the splat, so that no thread
+has to process a splat that covers the whole image. Only the passes over the splats use float64, which is 32 or 64 times
+slower on most GPUs.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ THREADS = 128
 
 
 def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | None) -> TileBins:
-    """As `glassplat.kernels.tiles.cpu.bin_tiles`; waits for the GPU once, to learn the number of pairs."""
+    """As `glassplat.kernels.tiles.cpu.bin_tiles`; synchronises once, to read the number of pairs."""
     num_cameras, per_camera = splats.depths.shape
     count, device, real = num_cameras * per_camera, splats.depths.device, REAL_OF[splats.depths.dtype]
     rows, columns = -(-height // TILE), -(-width // TILE)
     num_tiles = num_cameras * rows * columns
     shapes = (splats.means2d.view(count, 2), splats.conics.view(count, 3), splats.opacities.view(count))
     seen = (*shapes, splats.radii.view(count, 2), active_tiles, per_camera, width, height)
-    # One sum over sections of equal length: the pairs of each splat, its rows of tiles, which tiles are active where
-    # not all are, and the pairs again in the order of depths. So each total is where a section ends.
+    # One prefix sum over sections of equal length: the pairs of each splat, its rows of tiles, flags of active tiles if
+    # not all are, and the pairs again in depth order. Totals are read at the ends of sections.
     masked = active_tiles is not None and num_tiles > 0
     length = max(count, num_tiles if masked else 1)
     by_depth = (3 if masked else 2) * length
@@ -43,7 +43,7 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
     order = torch.argsort(splats.depths, dim=1, stable=True).flatten()
     order_counts()(blocks_for(count, THREADS), THREADS, per_camera, by_depth, order, sums)
     sums.cumsum_(0)
-    # The one thing that the program asks of the GPU, and waits for.
+    # The only synchronisation with the GPU.
     num_pairs, *totals = sums[length : by_depth + 1 : length].tolist()
     check_pair_count(num_pairs)
     spans = torch.empty(totals[0] - num_pairs, 3, dtype=torch.int32, device=device)
@@ -71,13 +71,13 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)
 def _every_tile(count: int, device: torch.device) -> Tensor:
-    """The numbers of all tiles, the same tensor at every call: leave it as it is."""
+    """Indices of all tiles, in a cached tensor that must not be modified."""
     return torch.arange(count, dtype=torch.int32, device=device)
 
 
 @inlined
 def is_active(active_tiles, tile):
-    """Return whether a tile is active; tiles are counted over all cameras."""
+    """Return whether a tile is active; tiles are numbered over all cameras."""
     rows, columns = active_tiles.shape[1], active_tiles.shape[2]
     row = tile // columns
     return active_tiles[row // rows, row % rows, tile % columns]
@@ -85,8 +85,8 @@ def is_active(active_tiles, tile):
 
 @cache
 def count_tiles(real: type) -> Kernel:
-    """Writes what is summed up: of each splat how many active tiles it touches, and how many rows of tiles that it may
-    touch any in; of each tile whether it is active, where not all are. A zero is in front.
+    """Writes the summands: for each splat the number of active tiles that it touches and of tile rows that it may
+    touch; for each tile whether it is active, if not all are. They are preceded by a zero.
     """
 
     @kernel("count_tiles", real, "real2 real2 real1 real2 bool3 int int int long long1")
@@ -114,7 +114,7 @@ def count_tiles(real: type) -> Kernel:
 
 @cache
 def order_counts(key: type = np.int64) -> Kernel:
-    """Writes the rest of it: the pairs of each splat, camera by camera in the order of depths."""
+    """Writes the last section: the number of pairs of each splat, camera by camera in depth order."""
 
     @kernel("order_counts", key, "int long long1 long1")
     def fill(per_camera, by_depth, order, sums):
@@ -127,9 +127,9 @@ def order_counts(key: type = np.int64) -> Kernel:
 
 @cache
 def list_spans(real: type) -> Kernel:
-    """Lists the rows of tiles of each splat: the row, its first column, and the pairs of the splat up to its end.
+    """Lists the tile rows of each splat: the row, its first column, and the splat's pairs up to the end of the row.
 
-    Lists the active tiles besides, where not all are.
+    Lists the active tiles too, if not all are.
     """
 
     @kernel("list_spans", real, "real2 real2 real1 real2 bool3 int int int long long1 int2 int1")
@@ -144,7 +144,7 @@ def list_spans(real: type) -> Kernel:
         begin = sums[length + s] - sums[length]
         for i in range(begin, sums[length + s + 1] - sums[length]):
             row, left, right = first + i - begin, 0, -1
-            # Should the passes ever round differently, a row that only the first one saw is empty.
+            # If the passes ever round differently, a row that only the first one found is empty.
             if row * TILE <= rows[1]:
                 left, right = columns_of(shape, row, width)
             found += active_between(active_tiles, s // per_camera, row, left, right)
@@ -155,7 +155,7 @@ def list_spans(real: type) -> Kernel:
 
 @inlined
 def search(values, begin, end, x):
-    """The last place, from `begin` and before `end`, whose ascending value is at most x; `begin` if none is."""
+    """Last position in [begin, end) of ascending values with a value of at most x; `begin` if there is none."""
     low, high = begin, end
     while high - low > 1:
         middle = (low + high) // 2
@@ -193,7 +193,7 @@ def emit_tiles(key: type = np.int16) -> Kernel:
             else:
                 high = middle
         if low == end:
-            # Should the passes ever round differently, what is left over goes behind the last tile, where none looks.
+            # If the passes ever round differently, surplus pairs go to an unused tile after the last one.
             tiles[pair] = key(num_tiles)
             return
         if low > begin:
@@ -211,7 +211,7 @@ def emit_tiles(key: type = np.int16) -> Kernel:
 
 @cache
 def list_pairs(key: type = np.int16) -> Kernel:
-    """Writes the splats and slots of the pairs, which are sorted by tile now, and where each tile's pairs begin."""
+    """Writes the splats and slots of the pairs, sorted by tile, and the start of each tile's pairs."""
     keys = "short1" if key is np.int16 else "int1"
 
     @kernel("list_pairs", key, f"{keys} long1 int1 int1 int1 int1 long1")

@@ -1,7 +1,7 @@
-"""Binning by brute force: the definition of `glassplat.kernels.tiles.bin_tiles`, by the same name and signature.
+"""Brute-force reference of `glassplat.kernels.tiles.bin_tiles`, with the same name and signature.
 
-It looks at every pixel of every splat, so a tile is listed exactly where a pixel centre has coverage of at least 1/255.
-The kernel may list a few tiles more, where the ellipse passes between pixel centres.
+It evaluates every pixel of every splat, so a tile is listed exactly if a pixel centre has coverage of at least 1/255.
+The kernel may list a few more tiles, if the ellipse passes between pixel centres.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
 
 
 def _offsets(counts: Tensor) -> Tensor:
-    """Starts of the groups [len + 1], from their sizes."""
+    """Start of each group [len + 1], from the sizes."""
     return torch.cat([counts.new_zeros(1), counts.cumsum(0)])
 
 
 def _covered_tiles(splats: Splats, width: int, height: int) -> Tensor:
-    """Tiles [C, G, rows, columns] bool with any pixel centre where the coverage is at least 1/255."""
+    """Mask [C, G, rows, columns] of tiles with a pixel centre whose coverage is at least 1/255."""
     dtype = splats.means2d.dtype
     x, y = torch.arange(width, dtype=dtype) + 0.5, torch.arange(height, dtype=dtype) + 0.5
     dx = x - splats.means2d[..., 0, None, None]
