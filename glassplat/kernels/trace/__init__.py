@@ -1,18 +1,18 @@
-"""Rays through Gaussians, front to back, with gradients to both, and the hierarchy of boxes that finds these.
+"""Tracing of rays through Gaussians, front to back, with gradients of both, and its bounding volume hierarchy.
 
-Meaning: a ray meets a disc where it crosses the disc's plane, and an ellipsoid where its density is largest along the
-ray. It covers opacity x exp(-r^2 / 2) there, r the distance from the centre in standard deviations; at most 0.99, and
-nothing below 1/255 or beyond 3 deviations. Hits blend in the order of their distance, equal ones in the order of the
-Gaussians. A ray ends before the Gaussian that would take its transmittance below 1e-4. Not met, and without a gradient,
-are discs seen from their edge (cosine below 1e-3), hits at or before `near`, and whatever is not finite.
+Definition: a ray hits a disc where it crosses the disc's plane, and an ellipsoid where its density is largest along the
+ray. Its coverage is opacity x exp(-r^2 / 2) there, with r the distance from the centre in standard deviations; it is at
+most 0.99, and zero below 1/255 or beyond 3 deviations. Hits are blended by distance, equal ones in the order of the
+Gaussians. A ray stops before the Gaussian that would reduce its transmittance below 1e-4. Edge-on discs (cosine below
+1e-3), hits at or before `near`, and non-finite inputs are ignored and get no gradient.
 
-Search: Gaussians lie in the order of a Hilbert curve, with a box around each eight, and a node around each eight boxes.
-The tree needs no pointers. A search keeps the nearest 16 hits beyond the last known one, and starts again from there
-while the ray still sees something.
+Search: Gaussians are sorted along a Hilbert curve; a leaf bounds eight of them, and a node eight children. The tree
+needs no pointers. A search returns the nearest 16 hits (later ones on the CPU: 64) beyond the last known one, and is
+repeated from there until the ray stops.
 
-Gradients: the forward pass keeps what rays meet while it is little, the backward pass searches for the rest again, as
-the same code. It adds up the rows of each Gaussian in a fixed order: no atomics, the same bits for any number of
-threads. `reference.py` is the definition, every ray against every Gaussian.
+Gradients: the forward pass stores the hits of rays that have few; the backward pass repeats the search for other rays,
+with the same code. It sums the rows of each Gaussian in a fixed order: no atomics, the same bits for any number of
+threads. `reference.py` defines the result, by testing every ray against every Gaussian.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from glassplat.kernels.records import FLAT, SOLID, Bvh, RawGaussians, Rays, Shap
 def shapes_of(gaussians: RawGaussians) -> Shapes:
     """Activated shapes; differentiable. With `log_scales` [N, 2] they are discs, with [N, 3] ellipsoids.
 
-    What has no size, no orientation or something that is not finite becomes invisible and gets no gradient.
+    Gaussians without a valid size or orientation, or with a non-finite parameter, become invisible and get no gradient.
     """
     usable = _usable(gaussians)
-    # Harmless stand-ins: a NaN masked afterwards would still reach the gradients, as NaN times zero.
+    # Placeholders: a NaN masked afterwards would still reach the gradients, as NaN times zero.
     tensors = (torch.where(_over(usable, x), x, torch.ones_like(x)) for x in gaussians)
     means, quats, log_scales, logit_opacities, sh = tensors
     inverse = torch.exp(-log_scales)
@@ -49,7 +49,7 @@ def shapes_of(gaussians: RawGaussians) -> Shapes:
 
 @torch.no_grad()
 def _usable(gaussians: RawGaussians) -> Tensor:
-    """[N] whether a Gaussian has a place, a size and an orientation."""
+    """Mask [N] of Gaussians with finite parameters and a valid size and orientation."""
     everything = torch.cat([tensor.flatten(1) if tensor.dim() > 1 else tensor[:, None] for tensor in gaussians], dim=1)
     norm = gaussians.quats.square().sum(-1)
     sized = (gaussians.log_scales.abs() <= MOST_LOG_SCALE).all(dim=1)
@@ -61,20 +61,20 @@ def _over(mask: Tensor, tensor: Tensor) -> Tensor:
 
 
 def reach(opacities: Tensor) -> Tensor:
-    """[N] distance in standard deviations up to which Gaussians are met; 0 where they are met nowhere."""
+    """Distance [N] in standard deviations up to which rays hit Gaussians; 0 for invisible ones."""
     squared = 2 * torch.log(opacities / ALPHA_MIN)
     return squared.clamp(min=0, max=MOST_DEVIATIONS**2).sqrt().nan_to_num()
 
 
 @torch.no_grad()
 def build_bvh(shapes: Shapes, *, flat: bool) -> Bvh:
-    """Orders Gaussians along a curve through space, and puts boxes around eight of them, around eight boxes, and so on.
+    """Sorts Gaussians along a space-filling curve, and builds a hierarchy of boxes with eight children per node.
 
-    A Gaussian that rays meet nowhere gets an empty box: its opacity is too low, or something of it is not finite.
+    A Gaussian that no ray can hit, because its opacity is too low or a value is not finite, gets an empty box.
 
     Args:
         shapes: activated Gaussians, float32 or float64.
-        flat: whether they are discs.
+        flat: True for discs, False for ellipsoids.
     """
     return kernels_for("trace", shapes.means.device).build_bvh(shapes, flat=flat)
 
@@ -83,30 +83,29 @@ def trace(
     gaussians: RawGaussians, rays: Rays, bvh: Bvh | None = None,
     *, sh_degree: int, near: float, contributions: Tensor | None = None,
 ) -> Traced:  # fmt: skip
-    """Blends what each ray meets, nearest first (EnvGS, Section 4.2 and Eq. 2).
+    """Blends the Gaussians that each ray hits, nearest first (EnvGS, Section 4.2 and Eq. 2).
 
-    Gaussians are discs (2DGS) where `log_scales` is [N, 2], met where the ray crosses their plane, and ellipsoids
-    (3DGS) where it is [N, 3], met where their density along the ray is largest. A Gaussian covers with its opacity
-    times the falloff there, up to 3 standard deviations from its centre and 0.99, not at all below 1/255. A ray ends
-    before the Gaussian that would take its transmittance below 1e-4. Colours are seen along the ray, offset by 0.5 and
+    Gaussians are discs (2DGS) if `log_scales` is [N, 2], hit where the ray crosses their plane, and ellipsoids (3DGS)
+    if it is [N, 3], hit where their density along the ray is largest. The coverage is the opacity times the falloff
+    there, up to 3 standard deviations from the centre; it is at most 0.99, and zero below 1/255. A ray stops before the
+    Gaussian that would reduce its transmittance below 1e-4. Colours are evaluated along the ray, offset by 0.5 and
     clamped at 0; equal distances keep the Gaussians' order.
 
-    A disc that is seen from its edge (cosine below 1e-3), a Gaussian of which something is not finite and one whose hit
-    lies at or before `near` are not met; a ray without length, or that is not finite, meets nothing. None of them gets
-    a gradient.
+    Edge-on discs (cosine below 1e-3), Gaussians with a non-finite value, and hits at or before `near` are ignored; rays
+    that have zero length or are not finite hit nothing. None of them gets a gradient.
 
-    Differentiable in all tensors of `gaussians`, in origins and in directions (Eqs. 13 and 14, and the colour's turn
-    with the direction besides); the same bits for any number of threads.
+    Differentiable in all tensors of `gaussians`, in origins and in directions (Eqs. 13 and 14, plus the dependence of
+    colours on the direction); the same bits for any number of threads.
 
     Args:
         gaussians: raw tensors, float32 or float64.
         rays: of the same floating-point type.
-        bvh: `build_bvh` of these Gaussians, which is built otherwise.
+        bvh: result of `build_bvh` for these Gaussians; built if None.
         sh_degree: highest degree of the spherical harmonics to evaluate; `gaussians.sh` may hold more, or none at all,
             which makes all colours zero.
-        near: smallest distance of a hit, in lengths of the ray's direction, at least 0.
-        contributions: [N, 2], any values; they change nothing. Its gradient is what each Gaussian adds to the rays,
-            whatever the objective: the sums of its blending weights, and of these times the distances in world units.
+        near: minimum distance of hits, in multiples of the direction's length, at least 0.
+        contributions: [N, 2], values are ignored. Its gradient is each Gaussian's contribution to the rays, independent
+            of the loss: the sums of its blending weights, and of these times the distances in world units.
     """
     _check(gaussians, rays, bvh, sh_degree, near, contributions)
     shapes, flat = shapes_of(gaussians), gaussians.log_scales.shape[1] == FLAT

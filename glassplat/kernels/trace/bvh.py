@@ -1,7 +1,7 @@
-"""The order of Gaussians along a curve in space, and the boxes around them.
+"""Order of Gaussians along a space-filling curve, and the boxes around them.
 
-On Hilbert's curve any run of points fills a compact part of space. Boxes around runs of eight are smaller than along a
-Morton curve, which leaps: rays enter two fifths fewer of them.
+On a Hilbert curve, any run of points fills a compact part of space. Boxes around runs of eight are smaller than on a
+Morton curve, which jumps: rays enter two fifths fewer of them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from glassplat.kernels.trace.steps import WIDTH
 
 
 def level_offsets(count: int) -> list[int]:
-    """Starts of the nodes of each level over `count` Gaussians, the lowest first, and the end of the last one."""
+    """Start of each level's nodes over `count` Gaussians, leaves first, and the end of the last level."""
     offsets = [0]
     while count > 1 or (count == 1 and len(offsets) == 1):
         count = -(-count // WIDTH)
@@ -32,16 +32,16 @@ def level_offsets(count: int) -> list[int]:
 
 
 def _half_widths(real: type, flat: bool) -> Scalar:
-    """Builds (x, y, z): half the size of a Gaussian's box, from its frame and how many deviations it reaches.
+    """Builds the half widths (x, y, z) of a Gaussian's box, from its frame and its extent in standard deviations.
 
-    Widened by what the faces of the box lose in rounding.
+    They include the rounding error of the box's faces.
     """
     zero, one, slack = real(0.0), real(1.0), real(2.0 * np.finfo(real).eps)
 
     @inlined
     def squares(frames, g, axis):  # type: ignore[no-untyped-def]
         x, y, z = frames[g, axis, 0], frames[g, axis, 1], frames[g, axis, 2]
-        # A row is an axis divided by its deviation; divided by its squared length it is their product.
+        # A row is an axis divided by its deviation; divided by its squared length, it is the axis times the deviation.
         inverse = one / (x * x + y * y + z * z)
         x, y, z = x * inverse, y * inverse, z * inverse
         return x * x, y * y, z * z
@@ -61,7 +61,7 @@ def _half_widths(real: type, flat: bool) -> Scalar:
 
 
 def leaf_fitting(real: type, flat: bool) -> Scalar:
-    """Builds the step that fits the box at place k of a node, which is empty, to a Gaussian that can be met."""
+    """Builds the step that fits the empty box at position k of a leaf to a Gaussian that rays can hit."""
     zero, nowhere, half_widths = real(0.0), real("inf"), _half_widths(real, flat)
 
     @inlined
@@ -81,13 +81,13 @@ def leaf_fitting(real: type, flat: bool) -> Scalar:
 
 
 BITS = 20
-"""Bits for each axis."""
+"""Bits per axis."""
 CHUNK = 1024
 """Points per task."""
 
 
 def hilbert_codes(points: Tensor) -> Tensor:
-    """[N] int64: place of each point [N, 3] along the curve through their bounding cube.
+    """Positions [N] int64 of points [N, 3] along the Hilbert curve through their bounding cube.
 
     What is not finite comes last.
     """
@@ -98,9 +98,9 @@ def hilbert_codes(points: Tensor) -> Tensor:
 
 
 def curve_cells(points: Tensor) -> tuple[Tensor, Tensor]:
-    """[N, 3] int64 cells of a grid over the finite points' bounding cube, and [N] which ones are finite.
+    """Cells [N, 3] int64 of points in a grid over the bounding cube of the finite ones, and a mask [N] of these.
 
-    On any device, and without asking it for a number.
+    Runs on any device, without synchronisation.
     """
     finite = points.isfinite().all(dim=1)
     if not len(points):
@@ -114,7 +114,7 @@ def curve_cells(points: Tensor) -> tuple[Tensor, Tensor]:
 
 @inlined
 def hilbert_axes(x, y, z):  # type: ignore[no-untyped-def]
-    """Coordinates turned, from the largest cube to the smallest, into the axes of the curve within it.
+    """Coordinates transformed, from the largest cube to the smallest, to the axes of the curve within it.
 
     In each cube the curve enters and leaves at corners that lie along one edge; reflecting and exchanging axes brings
     every cube into that position (Skilling 2004).
@@ -147,7 +147,7 @@ def hilbert_axes(x, y, z):  # type: ignore[no-untyped-def]
 
 @inlined
 def curve_place(x, y, z):  # type: ignore[no-untyped-def]
-    """The place of a cell along the curve."""
+    """Position of a cell along the curve."""
     x, y, z = hilbert_axes(x, y, z)
     place = np.int64(0)
     for j in range(BITS):
@@ -158,7 +158,7 @@ def curve_place(x, y, z):  # type: ignore[no-untyped-def]
 
 @cache
 def hilbert_places(real: type) -> Kernel:
-    """Fills the places of cells along the curve."""
+    """Fills the positions of cells along the curve."""
 
     @kernel("hilbert_places", real)
     def fill(cells: NDArray[Any], places: NDArray[Any]) -> None:
@@ -171,7 +171,7 @@ def hilbert_places(real: type) -> Kernel:
 
 
 MORTON_BITS = 21
-"""Bits for each axis: three times as many fit into an integer of 64 bits with a sign."""
+"""Bits per axis; three axes fit into a signed 64-bit integer."""
 _SPREADS = (
     (32, 0x1F00000000FFFF),
     (16, 0x1F0000FF0000FF),
@@ -183,7 +183,7 @@ _SPREADS = (
 
 @torch.no_grad()
 def morton_codes(means: Tensor) -> Tensor:
-    """[N] int64: place of each point [N, 3] along a Morton curve (Z-order) through their bounding cube.
+    """Positions [N] int64 of points [N, 3] along a Morton curve (Z-order) through their bounding cube.
 
     What is not finite comes last.
     """

@@ -1,12 +1,12 @@
-"""Ray tracing on the CPU: the hierarchy of boxes, the rays, and their gradients.
+"""Ray tracing on the CPU: the bounding volume hierarchy, the rays, and their gradients.
 
-Boxes are fitted one level after the other, from the lowest up. Rays are traced in blocks of neighbouring ones, each ray
-in chunks of its nearest hits: sixteen that end most rays, then four times as many, because a search begins at the root
-of the tree each time. Blocks have a fixed size, whatever the number of threads.
+Boxes are fitted level by level, leaves first. Rays are traced in blocks of neighbours, each ray in chunks of its
+nearest hits: first sixteen, which suffice for most rays, then four times as many, because every search starts at the
+root of the tree. Blocks have a fixed size, independent of the number of threads.
 
-Gradients have the same bits for any number of threads, without atomics. What rays meet is written down, ray by ray:
-few hits by the forward pass; rays that meet more are traced again. Then every block of rays keeps a row of sums for
-each Gaussian that it has met, and in the end each Gaussian adds up its rows, in the order of the blocks.
+Gradients have the same bits for any number of threads, without atomics. The hits are listed ray by ray: the forward
+pass stores them for rays that have few; the others are traced again. Then every block of rays sums one row for each
+Gaussian that it has hit. Finally the rows of each Gaussian are added in the order of the blocks.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from glassplat.kernels.trace.steps import (
 
 
 def build_bvh(shapes: Shapes, *, flat: bool) -> Bvh:
-    """As the operation."""
+    """As `glassplat.kernels.trace.build_bvh`."""
     count, real = shapes.means.shape[0], REAL_OF[shapes.means.dtype]
     order = torch.argsort(hilbert_codes(shapes.means.detach()), stable=True).to(torch.int32)
     offsets = torch.tensor(level_offsets(count))
@@ -90,11 +90,11 @@ def fit_boxes(real: type, flat: bool) -> Kernel:
 BLOCK = 64
 """Rays per task of the forward pass."""
 GRADIENT_BLOCK = 256
-"""Rays per task of the backward pass, whose sums share rows."""
+"""Rays per task of the backward pass, which share rows of sums."""
 LATER_CHUNK = 64
-"""Hits that a search returns at most where a ray has gone on through the first ones."""
+"""Maximum number of hits of each search after a ray's first one."""
 SUM_CHUNK = 512
-"""Gaussians per task of the last sum."""
+"""Gaussians per task of the final sum."""
 
 
 def trace_gradients(
@@ -105,7 +105,7 @@ def trace_gradients(
     means, sh, hits, kept = shapes[0], shapes[3], outputs[3], outputs[4]
     real, count = REAL_OF[means.dtype], means.shape[0]
     hit_offsets = torch.cat([hits.new_zeros(1, dtype=torch.int64), hits.cumsum(0)])
-    # Not `empty`: two kernels search, and where one rounds otherwise and finds less, what is left must be a Gaussian.
+    # Zeros: if the second kernel rounds differently and finds fewer hits, the remaining indices must be valid.
     met = torch.zeros(int(hit_offsets[-1]), dtype=torch.int32)
     num_blocks = -(-hits.shape[0] // GRADIENT_BLOCK)
     distinct = torch.zeros(num_blocks, dtype=torch.int64)
@@ -118,7 +118,7 @@ def trace_gradients(
     row_offsets = torch.cat([distinct.new_zeros(1), distinct.cumsum(0)])
     num_rows = int(row_offsets[-1])
     owners = torch.empty(num_rows, dtype=torch.int32)
-    # Not `numpy.zeros`: whoever meets a Gaussian first clears its row, in memory that the last step has used already.
+    # Uninitialised: rows are cleared at their first use, and the allocator can reuse memory of the previous step.
     rows, sh_rows = (means.new_empty(num_rows, *shape).numpy() for shape in ((GEOMETRY,), sh.shape[1:]))
     v_rays = tuple(torch.zeros_like(ray) for ray in rays)
     places[...] = -1
@@ -135,7 +135,7 @@ def trace_gradients(
 def _sum_rows(
     rows: NDArray[Any], sh_rows: NDArray[Any], owners: Tensor, count: int, real: type
 ) -> tuple[Tensor, Tensor]:
-    """Sums [N, 15] of rows per (block, Gaussian), and [N, K, 3] of their harmonics."""
+    """Sums [N, 15] over the rows of each Gaussian, and [N, K, 3] over those of its harmonics."""
     order = torch.argsort(owners, stable=True)
     offsets = torch.cat([owners.new_zeros(1, dtype=torch.int64), torch.bincount(owners, minlength=count).cumsum(0)])
     sums, sh_sums = np.zeros((count, GEOMETRY), real), np.zeros((count, *sh_rows.shape[1:]), real)
@@ -145,7 +145,7 @@ def _sum_rows(
 
 @cache
 def trace_collect(real: type, flat: bool) -> Kernel:
-    """Fills `met`, each ray's Gaussians from the nearest on, and the number of different ones in each block."""
+    """Fills `met`, the Gaussians hit by each ray, nearest first, and the number of distinct ones in each block."""
     next_hits, ray = next_hits_maths(real, flat), ray_reader(real)
 
     @kernel("trace_collect_discs" if flat else "trace_collect_ellipsoids", real)
@@ -187,7 +187,7 @@ def trace_collect(real: type, flat: bool) -> Kernel:
 
 
 def _hit_gradients(real: type, flat: bool) -> Scalar:
-    """Adds one hit's gradients to its Gaussian's row and to its ray."""
+    """Builds the step that adds one hit's gradients to its Gaussian's row and to its ray."""
     meet_gradient, half, most = ray_hit_maths(real, flat).meet_gradient, real(0.5), real(ALPHA_MAX)
     zero = real(0.0)
 
@@ -210,7 +210,7 @@ def _hit_gradients(real: type, flat: bool) -> Scalar:
 
 @cache
 def trace_backward(real: type, flat: bool) -> Kernel:
-    """Fills each block's rows and their owners, and the gradients of the rays, which are zero beforehand."""
+    """Fills each block's rows and their owners, and the gradients, initially zero, of the rays."""
     coverage, add_gradients = coverage_maths(real, blend_maths(real).exp2), _hit_gradients(real, flat)
     meet, hit_color_gradient = ray_hit_maths(real, flat).meet, color_backward(real)
     zero, half, one, nowhere = real(0.0), real(0.5), real(1.0), real("inf")
@@ -231,7 +231,7 @@ def trace_backward(real: type, flat: bool) -> Kernel:
                 o = origins[r, 0], origins[r, 1], origins[r, 2]
                 d = directions[r, 0], directions[r, 1], directions[r, 2]
                 length = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) ** half
-                # What is still to come, of the objective: all of it at first.
+                # Gradient-weighted sum of the remaining hits, initially of all.
                 behind = v_depths[r] * depths[r]
                 for j in range(3):
                     unit[j], v_unit[j] = d[j] / length, zero
@@ -247,7 +247,7 @@ def trace_backward(real: type, flat: bool) -> Kernel:
                     row = own[g]
                     offset, frame = shape_of(means, frames, g, o)
                     t, q, squared = meet(offset, d, frame)
-                    # On a threshold, what the search has met may be missed by other roundings.
+                    # At a threshold, a hit of the search may be missed here because of different rounding.
                     if not t < nowhere:
                         continue
                     covered, alpha = coverage(opacities[g], squared)
@@ -280,7 +280,7 @@ def trace_backward(real: type, flat: bool) -> Kernel:
 
 @cache
 def sum_block_rows(real: type) -> Kernel:
-    """Adds up each Gaussian's rows."""
+    """Sums each Gaussian's rows."""
 
     @kernel("trace_sum_rows", real)
     def total(rows, sh_rows, order, offsets, sums, sh_sums):
@@ -300,16 +300,16 @@ def sum_block_rows(real: type) -> Kernel:
 
 
 MOST_KEPT, KEPT_BYTES = 256, 2**27
-"""Hits of a ray that the forward pass keeps at most, and bytes for those of all rays, of which few are written to."""
+"""Maximum number of hits per ray stored by the forward pass, and bytes for all rays, most of them never touched."""
 
 
 def trace(
     shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tensor],
     *, flat: bool, degree: int, near: float, learning: bool,
 ) -> tuple[Tensor, ...]:  # fmt: skip
-    """Fields of `Traced`, and [blocks, K, BLOCK] int32 each ray's nearest Gaussians for its gradients.
+    """Fields of `Traced`, and each ray's nearest Gaussians [blocks, K, BLOCK] int32 for its gradients.
 
-    Degree -1 is no colour.
+    Degree -1 skips colours.
     """
     origins = rays[0]
     count, real = origins.shape[0], REAL_OF[origins.dtype]
@@ -334,7 +334,7 @@ def trace(
 
 @cache
 def trace_forward(real: type, flat: bool) -> Kernel:
-    """Fills colors, alphas, depths, hits and the nearest of them."""
+    """Fills colors, alphas, depths and hits, and lists the nearest Gaussians."""
     next_hits, ray = next_hits_maths(real, flat), ray_reader(real)
     color = color_maths(real).color
     zero, half, one, least = real(0.0), real(0.5), real(1.0), real(TRANSMITTANCE_MIN)

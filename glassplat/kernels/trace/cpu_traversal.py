@@ -1,7 +1,7 @@
-"""Finding a ray's next hits, front to back, through the hierarchy of boxes.
+"""BVH traversal that finds a ray's next hits, front to back.
 
-Each search returns the nearest hits beyond the last one that is known, ordered by (t, Gaussian), and leaves out boxes
-that begin behind the farthest of those found so far (Knoll et al. 2019; EnvGS, Section 4.2).
+Each search returns the nearest hits beyond the last known one, ordered by (t, Gaussian), and skips boxes that start
+beyond the farthest of the hits found so far (Knoll et al. 2019; EnvGS, Section 4.2).
 """
 
 from __future__ import annotations
@@ -22,24 +22,23 @@ from glassplat.kernels.records import REAL_OF
 from glassplat.kernels.trace.steps import LEVEL_BITS, NODE, SLACK, WIDTH, coverage_maths, insert
 
 LEAF = 13 * WIDTH
-"""Numbers of what a node of the lowest level holds: means, rows of frames and opacities, each for all its places."""
+"""Numbers per leaf: means, rows of frames and opacities, each for all its positions."""
 
 
 def arrays_of(bvh: Sequence[Tensor]) -> tuple[NDArray[Any], ...]:
-    """Order, boxes in one dimension, and where levels begin, as kernels take them."""
+    """Order, flat boxes and level offsets, as arrays for the kernels."""
     order, boxes, offsets = bvh
     return order.numpy(), boxes.numpy().reshape(-1), offsets.numpy()
 
 
 def _entry(real: type) -> Scalar:
-    """Puts down where a ray enters each of a node's boxes; returns which of them it meets, as bits."""
+    """Builds the step that writes a ray's entry distances of a node's boxes, and returns the boxes hit, as bits."""
     full, load = vector_kind(real, WIDTH)
     zero, sooner, later = real(0.0), real(1.0 - SLACK), real(1.0 + SLACK)
 
     @inlined
     def enter(boxes, node, o, inverse, first, last, entries):  # type: ignore[no-untyped-def]
-        # Faces are chosen by the sign of the direction, so that an empty box, whose lowest corner lies above its
-        # highest, is missed.
+        # Faces are chosen by the sign of the direction, so that rays miss empty boxes (minimum above maximum).
         lowest = node * NODE
         highest = lowest + 3 * WIDTH
         x0, x1 = (lowest, highest) if inverse[0] > zero else (highest, lowest)
@@ -58,16 +57,16 @@ def _entry(real: type) -> Scalar:
 
 
 def _lanes(real: type, flat: bool) -> Scalar:
-    """Puts down (t, squared |q|) of a ray and eight Gaussians; returns which of them it may meet, as bits.
+    """Builds the step that writes (t, squared |q|) of a ray and eight Gaussians, and returns possible hits, as bits.
 
-    What `maths/disc.py` does with one of them.
+    It vectorises the intersection of `maths/disc.py`.
     """
     load, edge_on, farthest = vector_kind(real, WIDTH).load, real(EDGE_ON**2), real(MOST_DEVIATIONS**2)
     zero = real(0.0)
 
     @inlined
     def row(leaves, at, x, y, z, d):  # type: ignore[no-untyped-def]
-        """One row of the frames times offsets, and times the direction."""
+        """Products of one row of the frames with the offsets, and with the direction."""
         a, b, c = load(leaves, at), load(leaves, at + WIDTH), load(leaves, at + 2 * WIDTH)
         return a * x + b * y + c * z, a * d[0] + b * d[1] + c * d[2]
 
@@ -100,7 +99,7 @@ def _lanes(real: type, flat: bool) -> Scalar:
         length = f0 * f0 + f1 * f1 + f2 * f2
         t = (e0 * f0 + e1 * f1 + e2 * f2) / length
         u, v, w = t * f0 - e0, t * f1 - e1, t * f2 - e2
-        # What rounding leaves along the ray, see `maths/disc.py`.
+        # Removes the rounding error along the ray, see `maths/disc.py`.
         rest = (u * f0 + v * f1 + w * f2) / length
         u, v, w = u - rest * f0, v - rest * f1, w - rest * f2
         squared = u * u + v * v + w * w
@@ -113,7 +112,7 @@ def _lanes(real: type, flat: bool) -> Scalar:
 
 @cache
 def pack_leaves(real: type) -> Kernel:
-    """Fills what the lowest nodes hold, in their order; what stands behind the last Gaussian is met nowhere."""
+    """Fills the leaves in order; positions after the last Gaussian are padded so that rays never hit them."""
     zero = real(0.0)
 
     @kernel("trace_pack_leaves", real)
@@ -136,7 +135,7 @@ def pack_leaves(real: type) -> Kernel:
 
 
 def packed_leaves(shapes: Sequence[Tensor], order: Tensor) -> NDArray[Any]:
-    """Contents of the lowest nodes of a hierarchy, in one dimension."""
+    """Flat contents of the leaves of a hierarchy."""
     means, frames, opacities = shapes[:3]
     leaves = means.new_empty(-(-order.shape[0] // WIDTH), 13, WIDTH)
     inputs = (tensor.numpy() for tensor in (means, frames, opacities, order, leaves))
@@ -145,7 +144,7 @@ def packed_leaves(shapes: Sequence[Tensor], order: Tensor) -> NDArray[Any]:
 
 
 def next_hits_maths(real: type, flat: bool) -> Scalar:
-    """Builds `next_hits`, which fills (ts, ids, alphas) with at most `most` next hits of a ray and returns how many."""
+    """Builds `next_hits`, which fills (ts, ids, alphas) with up to `most` next hits of a ray; returns their number."""
     enter, meet = _entry(real), _lanes(real, flat)
     coverage = coverage_maths(real, blend_maths(real).exp2)
     zero, nowhere, sooner = real(0.0), real("inf"), real(1.0 - SLACK)
@@ -172,14 +171,14 @@ def next_hits_maths(real: type, flat: bool) -> Scalar:
                     k = lowest_bit(met)
                     met &= met - 1
                     at, place = entries[k], top
-                    # Nearest last, so that it is taken next.
+                    # Nearest last, so that it is popped first.
                     while place > begin and waiting[place - 1] < at:
                         stack[place], waiting[place] = stack[place - 1], waiting[place - 1]
                         place -= 1
                     stack[place], waiting[place] = ((child + k) << LEVEL_BITS) | (level - 1), at
                     top += 1
                 continue
-            # Eight Gaussians take hardly longer than the boxes around them would.
+            # Testing eight Gaussians takes hardly longer than testing boxes around them.
             met = meet(leaves, node, o, d, first, farthest, entries, squares)
             while met != 0:
                 k = lowest_bit(met)

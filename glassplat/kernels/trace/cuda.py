@@ -1,12 +1,11 @@
-"""Ray tracing on the GPU: the hierarchy of boxes, a thread for each ray, and the gradients.
+"""Ray tracing on the GPU: the bounding volume hierarchy, one thread per ray, and the gradients.
 
-Of the hierarchy torch sorts, and each level is one launch; nothing comes back to the program. A ray's next hits are
+To build the hierarchy, torch sorts, and each level is one launch; there is no synchronisation. A ray's next hits are
 found by the search of `cpu_traversal`, in chunks of the nearest.
 
-Gradients have the same bits every time, without atomics. What each ray meets is written down, ray by ray. A thread for
-each ray goes through its hits, front to back, adds up the ray's own gradients, and leaves two numbers at each hit. Then
-hits are sorted by their Gaussians, and a warp for each Gaussian works out what its hits give to it, 32 at a time, and
-adds that up in the order of the rays.
+Gradients have the same bits every time, without atomics. The hits are listed ray by ray. One thread per ray traverses
+its hits front to back, sums the ray's own gradients, and stores two numbers per hit. Then hits are sorted by Gaussian.
+One warp per Gaussian computes the gradients from its hits, 32 at a time, and sums them in the order of the rays.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ from glassplat.kernels.trace.steps import (
 
 THREADS = 128
 MOST_KEPT, KEPT_BYTES = 64, 2**28
-"""Hits of a ray that the forward pass keeps at most, and bytes for those of all rays."""
+"""Maximum number of hits per ray stored by the forward pass, and bytes for all rays."""
 
 
 def build_bvh(shapes: Shapes, *, flat: bool) -> Bvh:
@@ -69,7 +68,7 @@ def build_bvh(shapes: Shapes, *, flat: bool) -> Bvh:
 
 
 def _on_device(numbers: list[int], device: torch.device) -> Tensor:
-    """A list of few integers, filled in one by one: a copy from the program's memory would be waited for."""
+    """A short list of integers as a tensor, filled one by one: a copy from host memory would synchronise."""
     found = torch.empty(len(numbers), dtype=torch.int64, device=device)
     for place, number in enumerate(numbers):
         found[place : place + 1].fill_(number)
@@ -86,7 +85,7 @@ def hilbert_codes(points: Tensor) -> Tensor:
 
 @cache
 def hilbert_places(key: type = np.int64) -> Kernel:
-    """Fills the places of cells along the curve."""
+    """Fills the positions of cells along the curve."""
 
     @kernel("hilbert_places", key, "long2 long1")
     def fill(cells, places):
@@ -99,7 +98,7 @@ def hilbert_places(key: type = np.int64) -> Kernel:
 
 @cache
 def fit_leaves(real: type, flat: bool) -> Kernel:
-    """Fills the boxes of the lowest level, a thread for each Gaussian and each place that is left."""
+    """Fills the boxes of the leaves, one thread per Gaussian and per unused position."""
     nowhere, fit_leaf = real("inf"), leaf_fitting(real, flat)
 
     @kernel("fit_leaves_discs" if flat else "fit_leaves_ellipsoids", real, "real2 real3 real1 int1 real3")
@@ -118,7 +117,7 @@ def fit_leaves(real: type, flat: bool) -> Kernel:
 
 @cache
 def fit_level(real: type) -> Kernel:
-    """Fills the boxes of a level of nodes from the one below, which begins at node `below` and ends before `first`."""
+    """Fills the boxes of a level from those of the level below, which spans nodes `below` to `first` (exclusive)."""
     nowhere = real("inf")
 
     @kernel("fit_level", real, "long long long real3")
@@ -139,14 +138,13 @@ def fit_level(real: type) -> Kernel:
 
 
 ZERO = np.float32(0.0)
-"""In single precision, which holds it exactly, so that no comparison is widened."""
+"""Exact in single precision, so that comparisons are not promoted to double."""
 
 
 @inlined
 def enter(boxes, at, o, inverse, first, last):
-    """Distances at which a ray enters and leaves a box, within two bounds; it meets the box if they are in order."""
-    # Faces are chosen by the sign of the direction, so that an empty box, whose lowest corner lies above its
-    # highest, is missed.
+    """Distances at which a ray enters and leaves a box, within two bounds; it hits the box if they are in order."""
+    # Faces are chosen by the sign of the direction, so that rays miss empty boxes (minimum above maximum).
     low, high = at, at + 3 * WIDTH
     x0, x1 = (low, high) if inverse[0] > ZERO else (high, low)
     y0, y1 = (low, high) if inverse[1] > ZERO else (high, low)
@@ -186,7 +184,7 @@ def next_hits_maths(real: type, flat: bool) -> Scalar:
                     continue
                 if level > 0:
                     place = top
-                    # Nearest last, so that it is taken next.
+                    # Nearest last, so that it is popped first.
                     while place > begin and waiting[place - 1] < enters:
                         stack[place], waiting[place] = stack[place - 1], waiting[place - 1]
                         place -= 1
@@ -213,16 +211,16 @@ def next_hits_maths(real: type, flat: bool) -> Scalar:
 WARP = 32
 HARMONICS = (MAX_DEGREE + 1) ** 2
 STRIDE = HARMONICS + 1
-"""Of shared rows of harmonics, an odd number as that of `GEOMETRY`: lanes that write a column meet different banks."""
+"""Stride of shared rows of harmonics, odd like `GEOMETRY`: lanes that write a column access different banks."""
 
 
 class Hits(NamedTuple):
-    """Hits of rays, ray by ray, from the nearest on.
+    """Hits of rays, ray by ray, nearest first.
 
-    offsets [R + 1] int64: where each ray's hits begin.
+    offsets [R + 1] int64: start of each ray's hits.
     met, rays [H] int32: the Gaussian and the ray of a hit.
-    alphas, weights [H]: what it covers, and its blending weight.
-    v_squares [H]: gradient of the objective with respect to its squared distance in deviations.
+    alphas, weights [H]: its coverage and its blending weight.
+    v_squares [H]: gradient of the loss with respect to its squared distance in standard deviations.
     """
 
     offsets: Tensor
@@ -250,14 +248,14 @@ def trace_ray_gradients(real: type, flat: bool) -> Kernel:
         means, frames, sh, origins, directions, degree, starts, met, hit_rays, met_alphas, weights, v_squares,
         colors, alphas, depths, v_colors, v_alphas, v_depths, v_origins, v_directions,
     ):  # fmt: skip
-        # Nobody reads it, and the compiler leaves it out.
+        # Never read, and removed by the compiler.
         v_sh = cuda.local.array((1, HARMONICS, 3), real)
         r = cuda.grid(1)
         if r >= origins.shape[0] or starts[r] == starts[r + 1]:
             return
         o, d, _, length, _ = ray(origins, directions, r)
         unit = d[0] / length, d[1] / length, d[2] / length
-        # What is still to come, of the objective: all of it at first.
+        # Gradient-weighted sum of the remaining hits, initially of all.
         behind = v_depths[r] * depths[r]
         for j in range(3):
             behind += v_colors[r, j] * colors[r, j]
@@ -268,7 +266,7 @@ def trace_ray_gradients(real: type, flat: bool) -> Kernel:
             offset, frame = shape_of(means, frames, g, o)
             t, q, _ = meet(offset, d, frame)
             weight, value, v_squared = alpha * left, zero, zero
-            # On the threshold, another fusing of products and sums may find a disc seen from its edge.
+            # At the threshold, differently fused operations may find a disc edge-on.
             if t < nowhere:
                 if degree >= 0:
                     value, v_unit = hit_color_gradient(sh[g : g + 1], degree, unit, v_colors, r, weight, v_sh)
@@ -295,20 +293,20 @@ def trace_ray_gradients(real: type, flat: bool) -> Kernel:
 
 @cache
 def trace_gaussian_gradients(real: type, flat: bool) -> Kernel:
-    """Fills the gradients of Gaussians that rays meet, one block of one warp for each; the others' are zero before."""
+    """Fills the gradients, initially zero, of Gaussians that rays hit, one block of one warp for each."""
     ray, hit_color_gradient = ray_reader(real), color_backward(real)
     meet, meet_gradient = ray_hit_maths(real, flat)
     zero, two, nowhere = real(0.0), real(2.0), real("inf")
 
     @inlined
     def fill(row, offset, d, frame, length, weight, v_depth, v_squared, opacity):
-        """The gradients of one hit's mean, frame and opacity, and what it adds to the contributions."""
+        """Fills a row with one hit's gradients of mean, frame and opacity, and its contributions."""
         t, q, _ = meet(offset, d, frame)
         if not t < nowhere:
             for j in range(GEOMETRY):
                 row[j] = zero
             return
-        # Tuples are indexed by constants only: a variable index compiles to a switch.
+        # Tuples are indexed only by constants, because a variable index compiles to a switch.
         v_o, _, v_frame = meet_gradient(offset, d, frame, t, q, weight * v_depth * length, v_squared)
         row[0], row[1], row[2] = -v_o[0], -v_o[1], -v_o[2]
         row[FRAME_AT], row[FRAME_AT + 1], row[FRAME_AT + 2] = v_frame[0]
@@ -377,7 +375,7 @@ def trace(
     shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tensor],
     *, flat: bool, degree: int, near: float, learning: bool,
 ) -> tuple[Tensor, ...]:  # fmt: skip
-    """As `glassplat.kernels.trace.cpu.trace`, but that hits are kept as [K, R], with what each of them covers."""
+    """As `glassplat.kernels.trace.cpu.trace`, but stores hits as [K, R], along with their coverage."""
     origins = rays[0]
     count = origins.shape[0]
     bytes_of_hits = (4 + origins.element_size()) * max(count, 1)
@@ -397,7 +395,7 @@ def trace_gradients(
     shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tensor], outputs: Sequence[Tensor],
     cotangents: Sequence[Tensor], *, flat: bool, degree: int, near: float,
 ) -> tuple[Tensor, ...]:  # fmt: skip
-    """As `glassplat.kernels.trace.cpu.trace_gradients`; waits for the GPU once, to learn the number of hits."""
+    """As `glassplat.kernels.trace.cpu.trace_gradients`; synchronises once, to read the number of hits."""
     means, sh, counts = shapes[0], shapes[3], outputs[3]
     real, num_rays, count = REAL_OF[means.dtype], counts.shape[0], means.shape[0]
     offsets = torch.zeros(num_rays + 1, dtype=torch.int64, device=means.device)
@@ -405,7 +403,7 @@ def trace_gradients(
     total = int(offsets[-1].item())
     whose = [torch.empty(total, dtype=torch.int32, device=means.device) for _ in range(2)]
     hits = Hits(offsets, *whose, *(means.new_empty(total) for _ in range(3)))
-    # No colours: only what is met, and how much it covers.
+    # No colours: only the Gaussians hit and their coverage.
     collect = _search(shapes, rays, bvh, flat)
     collect(-1, near, hits.offsets, hits.met, hits.alphas, *outputs[4:], None, None, None, None)
     v_rays = [torch.zeros_like(ray) for ray in rays]
@@ -426,7 +424,7 @@ def trace_gradients(
 
 
 def _search(shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tensor], flat: bool) -> Callable[..., None]:
-    """The launch of `trace_forward` for these shapes and rays; takes the rest of its arguments."""
+    """Binds `trace_forward` to these shapes and rays; the result takes its remaining arguments."""
     order, boxes, offsets = bvh
     blocks = blocks_for(rays[0].shape[0], THREADS)
 
@@ -440,11 +438,11 @@ def _search(shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tens
 
 @cache
 def trace_forward(real: type, flat: bool) -> Kernel:
-    """Fills colors, alphas, depths, hits, and the nearest of these; or where `starts` has elements, each ray's
-    Gaussians and their coverage, from what was kept or by another search.
+    """Fills colors, alphas, depths and hits, and stores the nearest hits. If `starts` has elements, fills each ray's
+    Gaussians and their coverage instead, from the stored hits or by another search.
 
-    Both are one kernel, so that both find the same hits: another one's products and sums may be fused in another way,
-    and a Gaussian that covers just 1/255 would be met by one of them alone.
+    Both are one kernel, so that both find the same hits: separate kernels may fuse operations differently, and a
+    Gaussian that covers just 1/255 would be hit in only one of them.
     """
     ray, next_hits, color = ray_reader(real), next_hits_maths(real, flat), color_maths(real).color
     zero, half, one, least = real(0.0), real(0.5), real(1.0), real(TRANSMITTANCE_MIN)

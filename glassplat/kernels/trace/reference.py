@@ -1,4 +1,4 @@
-"""Ray tracing in plain PyTorch, every ray against every Gaussian: the definition of `glassplat.kernels.trace.trace`."""
+"""Reference of `glassplat.kernels.trace.trace` in plain PyTorch, which tests every ray against every Gaussian."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from glassplat.kernels.trace import shapes_of
 
 
 class _Hits(NamedTuple):
-    """Distance parameter and coverage [R, N] of every Gaussian on every ray; coverage 0 where they do not meet."""
+    """Distance parameter and coverage [R, N] of every Gaussian on every ray; coverage is 0 without a hit."""
 
     t: Tensor
     alpha: Tensor
 
 
 class _Contributions(torch.autograd.Function):
-    """Hands alphas on; the gradient of `contributions` [N, 2] is `sums` [N, 2], whatever that of the alphas."""
+    """Returns alphas unchanged; the gradient of `contributions` [N, 2] is `sums` [N, 2] for any gradient of alphas."""
 
     @staticmethod
     def forward(ctx: Any, alphas: Tensor, contributions: Tensor, sums: Tensor) -> Tensor:
@@ -43,7 +43,7 @@ def trace(
     near: float,
     contributions: Tensor | None = None,
 ) -> Traced:
-    """Traces rays; see `glassplat.kernels.trace.trace`. The hierarchy is not looked at."""
+    """Traces rays; see `glassplat.kernels.trace.trace`. The hierarchy is ignored."""
     flat = gaussians.log_scales.shape[1] == FLAT
     shapes = shapes_of(gaussians)
     with torch.no_grad():
@@ -72,7 +72,7 @@ def trace(
 
 
 def _meet(shapes: Shapes, origins: Tensor, directions: Tensor, flat: bool, near: float) -> _Hits:
-    """Places where rays meet Gaussians, and their coverage there."""
+    """Intersections of rays with Gaussians, and the coverage there."""
     offsets = shapes.means - origins[:, None]
     local_offset = torch.einsum("nij,rnj->rni", shapes.frames, offsets)
     local_direction = torch.einsum("nij,rj->rni", shapes.frames, directions)

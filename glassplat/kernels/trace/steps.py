@@ -1,4 +1,4 @@
-"""Steps of a search that CPU and GPU share: what a ray is, what it meets of a Gaussian, and the nearest hits."""
+"""Steps of a search shared by CPU and GPU: reading rays, coverage and colour of hits, and lists of nearest hits."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from glassplat.kernels.maths.disc import MOST_DEVIATIONS
 from glassplat.kernels.maths.harmonics import color_maths
 
 CHUNK = 16
-"""Hits that a ray's first search returns at most."""
+"""Maximum number of hits of a ray's first search."""
 WIDTH = 8
 """Children of a node."""
 NODE = 6 * WIDTH
-"""Numbers of a node: the lowest x, y, z and the highest x, y, z of its children."""
+"""Numbers per node: minimum x, y, z and maximum x, y, z of its children."""
 STACK = 80
-"""Nodes that wait at most: seven siblings on each of the eleven levels that 32-bit places can have, and the nearest."""
+"""Maximum number of pending nodes: seven siblings on each of eleven levels, enough for 32-bit positions, plus one."""
 LEVEL_BITS = 4
-"""Of what stands on the stack: a node's number lies above its level."""
+"""Bits of a node's level in a stack entry; the upper bits hold its index."""
 SLACK = 1e-5
-"""Share by which boxes begin earlier and end later, so that rounding loses no hit."""
+"""Relative enlargement of boxes along a ray, so that rounding loses no hit."""
 LARGEST_INVERSE = 1e15
-"""In place of 1 / 0 in the direction of a ray of length 1: for all that are not too short to be squared in float32."""
+"""Replaces 1 / 0 for a direction of length 1; valid for lengths whose square does not underflow in float32."""
 FRAME_AT, OPACITY_AT, CONTRIBUTION_AT, GEOMETRY = 3, 12, 13, 15
 """Columns of a row: gradients of mean (3), frame (9), opacity, contributions (2); harmonics have rows of their own."""
 
 
 def ray_reader(real: type) -> Scalar:
-    """(origin, direction, inverse direction, length) of a ray, and whether it is one."""
+    """Builds the step that reads (origin, direction, inverse direction, length) of a ray, and whether it is valid."""
     zero, one, largest, most = real(0.0), real(1.0), real(LARGEST_INVERSE), real("inf")
 
     @inlined
@@ -52,7 +52,7 @@ def ray_reader(real: type) -> Scalar:
 
 @inlined
 def shape_of(means, frames, g, o):  # type: ignore[no-untyped-def]
-    """Offset from the origin, and frame, of one Gaussian."""
+    """Offset of one Gaussian from a ray's origin, and its frame."""
     offset = means[g, 0] - o[0], means[g, 1] - o[1], means[g, 2] - o[2]
     first = frames[g, 0, 0], frames[g, 0, 1], frames[g, 0, 2]
     second = frames[g, 1, 0], frames[g, 1, 1], frames[g, 1, 2]
@@ -61,7 +61,7 @@ def shape_of(means, frames, g, o):  # type: ignore[no-untyped-def]
 
 
 def coverage_maths(real: type, exp2: Scalar) -> Scalar:
-    """(coverage before clamping, blended alpha) from the opacity and the squared distance; alpha is 0 beyond reach.
+    """Builds (coverage before clamping, alpha) from opacity and squared distance; both are 0 for misses.
 
     `exp2` is 2^t for t <= 0.
     """
@@ -81,7 +81,7 @@ def coverage_maths(real: type, exp2: Scalar) -> Scalar:
 
 
 def color_backward(real: type) -> Scalar:
-    """The value of a hit's colour to the objective and the gradient of the unit direction; adds that of harmonics.
+    """Builds the step that adds a hit's gradient of harmonics; returns (colour . v_colour, gradient of unit direction).
 
     `sh` and `v_sh` are of one Gaussian, [1, K, 3].
     """
@@ -104,7 +104,7 @@ def color_backward(real: type) -> Scalar:
 
 @inlined
 def insert(ts, ids, alphas, count, most, t, g, alpha):  # type: ignore[no-untyped-def]
-    """Puts a hit in its place among the `most` nearest, ordered by (t, Gaussian); returns how many there are."""
+    """Inserts a hit into the `most` nearest, ordered by (t, Gaussian); returns their number."""
     place = count if count < most else most - 1
     while place > 0 and (ts[place - 1] > t or (ts[place - 1] == t and ids[place - 1] > g)):
         ts[place], ids[place], alphas[place] = ts[place - 1], ids[place - 1], alphas[place - 1]
