@@ -105,9 +105,9 @@ def _cover(real: type) -> Scalar:
     def cover(batch, at, x, y, near, sharpness):
         """Coverage of a fetched disc over the block whose corner is (x, y).
 
-        Returns the offsets (dx, dy) of the pixels; (u, v, 1 / e) and e at the intersections, or (0, 0, 1) and 1 where
-        the falloff around the centre is larger; the coverage before clamping, 0 where not drawn; and a mask of pixels
-        that show the disc rather than that falloff. `sharpness` is one over the variance of the low-pass.
+        Returns the offsets (dx, dy) of the pixels; (u, v, 1 / e) and e at the intersections; the coverage before
+        clamping, 0 where not drawn; and a mask of pixels that show the disc. Elsewhere, only the falloff around the
+        centre counts; (0, 0, 1) and 1 replace the intersection. `sharpness` is one over the low-pass variance.
         """
         dx = x_centers() + (x - item(batch, at + CENTER_X))
         dy = y_centers() + (y - item(batch, at + CENTER_Y))
@@ -205,7 +205,7 @@ def _blend_channels(real: type) -> Scalar:
         s2, s3 = load(planes, at + 2 * PIXELS), load(planes, at + 3 * PIXELS)
         for e in range(count):
             weight, value = load(weights, e * LANES), item(entries, e) * width + column
-            # Channels of discs that no pixel of the block shows may not be finite.
+            # Skips discs that no pixel of the block shows, because their channels can be non-finite.
             if bits_of(weight > zero) != 0:
                 s0 = s0 + weight * item(batch, value)
                 s1 = s1 + weight * item(batch, value + 1)

@@ -1,9 +1,9 @@
 """A tile's pixels on the GPU, its splats in shared memory, their coverage, and the rows of their gradients.
 
-A row of a (tile, splat) pair holds sums over a tile's pixels: of g dx, g dy, g dx^2, g dx dy, g dy^2 and g, with g the
-gradient of the exponent of the splat's falloff and (dx, dy) the offset from its centre, then one value per channel, and
-the two of `absgrad` if requested. All of these are summed over tiles; the gradients of mean, conic and opacity are
-computed from the sums once per splat.
+A row of a (tile, splat) pair holds sums over a tile's pixels: of g dx, g dy, g dx^2, g dx dy, g dy^2 and g, then one
+value per channel, and the two of `absgrad` if requested. Here g is the gradient of the exponent of the splat's falloff,
+and (dx, dy) the offset from its centre. All of these are summed over tiles; the gradients of mean, conic and opacity
+are computed from the sums once per splat.
 """
 
 from __future__ import annotations

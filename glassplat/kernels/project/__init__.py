@@ -99,12 +99,12 @@ def project(
 ) -> Projected:
     """Projects Gaussians into cameras: activation, EWA splatting, bounds, culling and view-dependent colour.
 
-    A Gaussian is culled in a camera if its depth is at most `near`, its centre is not on the kept side of the camera's
-    clip plane, its coverage stays below 1/255 throughout the camera's window, or a parameter is not finite. Then its
-    radii and all its other outputs are zero and it gets no gradient from that camera.
+    A Gaussian is culled in a camera if its depth is at most `near`, its centre is on the clipped side of the clip
+    plane, its coverage stays below 1/255 throughout the camera's window, or a parameter is not finite. Then its radii
+    and all its other outputs are zero and it gets no gradient from that camera.
 
     A splat's covariance is J A Sigma A^T J^T plus 0.3 px^2 on the diagonal, with A the upper 3x3 block of
-    `cam_from_world` and J the Jacobian of the projection; beyond 1.3 times the image, J is that of the border. Colours
+    `cam_from_world` and J the Jacobian of the projection. Beyond 1.3 times the image, J is that of the border. Colours
     are evaluated along the direction from the camera centre, defined as -A^T t, to the mean, offset by 0.5 and clamped
     at 0. A may be a mirrored, left-handed pose.
 
@@ -185,11 +185,11 @@ def project_discs(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: i
     A disc lies in the plane of the first two axes of its rotation and falls off with two standard deviations; the third
     axis is its normal. It is cut off at three deviations, or earlier if its coverage falls to 1/255.
 
-    A disc is culled in a camera if the depth of its centre is at most `near`, its centre is not on the kept side of the
-    camera's clip plane, it is seen edge-on (the cosine between its normal and the ray to its centre is at most 1e-3),
-    its outline lies outside the camera's window, its opacity is at most 1/255, a log scale is beyond -40 or 40, or a
-    parameter or its map is not finite. Then its radii and all its other outputs are zero and it gets no gradient from
-    that camera. A disc that crosses the near plane is kept if its part beyond that plane may be visible. Then its
+    A disc is culled in a camera if the depth of its centre is at most `near`, its centre is on the clipped side of the
+    clip plane, its outline lies outside the camera's window, or it is seen edge-on (cosine between its normal and the
+    ray to its centre at most 1e-3). It is also culled if its opacity is at most 1/255, a log scale is beyond -40 or 40,
+    or a parameter or its map is not finite. Then its radii and all its other outputs are zero and it gets no gradient
+    from that camera. A disc that crosses the near plane is kept if its part beyond that plane may be visible. Then its
     outline is the whole image, and `composite_discs` omits the part in front of the plane.
 
     Colours are those of `project`: along the direction from the camera centre, -A^T t, to the mean. A may be a

@@ -3,8 +3,8 @@ two more process the pairs; torch scans and sorts. Kernels are few, because a la
 
 Splats are sorted by depth first. Their pairs are written in that order, so that one stable sort of the pairs by tile,
 an integer of 16 bits up to 32,767 tiles of all cameras, leaves each tile's splats nearest first. Each pair has a
-thread, which finds its splat by binary search in the prefix sums, then its row in those of the splat, so that no thread
-has to process a splat that covers the whole image. Only the passes over the splats use float64, which is 32 or 64 times
+thread, which finds its splat by binary search in the prefix sums, then its row in those of the splat. So no thread has
+to process a splat that covers the whole image. Only the passes over the splats use float64, which is 32 or 64 times
 slower on most GPUs.
 """
 
