@@ -102,8 +102,8 @@ def _describe_preparation(path: Path, finding: Finding) -> None:
     try:
         report = read_json(path / RECORD)["report"]
         finding.facts["prepared"] = (
-            f"{report['registered']} of {report['photographs']} photographs registered, points "
-            f"{report['reprojection_error']:.2f} pixels off"
+            f"{report['registered']} of {report['photographs']} photographs registered, "
+            f"mean reprojection error {report['reprojection_error']:.2f} pixels"
         )
         finding.problems += report["advice"]
     except (OSError, ValueError, KeyError, TypeError):

@@ -191,7 +191,7 @@ def write_clean(command: Clean, console: Console) -> None:
     model = command.file.open(command.scene, command.device)
     tidy, found = model.clean(command.rules)
     summary = ", ".join(f"{count} {rule}" for rule, count in found.items() if count) or "no floaters"
-    say(console, f"{len(tidy.scene.primary)} of {len(model.scene.primary)} Gaussians stay; found {summary}")
+    say(console, f"{len(tidy.scene.primary)} of {len(model.scene.primary)} Gaussians kept; found {summary}")
     if found["outside"] > len(model.scene.primary) / 2:
         warn(console, f"--box removes {found['outside']} Gaussians, more than half; is it in the scene's own units?")
     if command.scale is not None:
