@@ -1,4 +1,4 @@
-"""The first panes: a rectangle for every annotated pane (TR-Gaussians, Section III-C1 and Appendix A)."""
+"""Initial panes: a rectangle for every annotated pane (TR-Gaussians, Section III-C1 and Appendix A)."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ Array = NDArray[np.float64]
 log = logging.getLogger("glassplat.panes")
 
 LEAST_MEETING, LEAST_OF_MEDIAN = 0.3, 0.5
-"""A mask does not fit if its outline meets the others by less than this, or by less than this share of the median."""
+"""Minimum share of a mask's outline that must meet the others, absolute and relative to the median over the masks."""
 EDGES_PER_VIEW = 100
 
 
 def report_masks(label: int, plane: masks.FramedPlanes, views: Sequence[masks.PaneView]) -> None:
-    """Logs how well each mask of a pane fits the others on its plane, and warns of those that do not, by name."""
+    """Logs how well each mask of a pane fits the others on its plane, and warns of those that do not fit, by name."""
     meeting, overlap = meeting_of_each(plane, views), masks.agreement_of_each(plane.planes, views)
     shares = ["nothing to compare" if np.isnan(share) else f"{share:.0%}" for share in meeting]
     found = [f"{view.name} {share}" for view, share in zip(views, shares, strict=True)]
@@ -47,18 +47,18 @@ def report_masks(label: int, plane: masks.FramedPlanes, views: Sequence[masks.Pa
 
 
 def odd_ones(meeting: Array) -> NDArray[np.bool_]:
-    """[V] which masks do not fit the others, from what `meeting_of_each` says; all of them may not."""
+    """[V] bool: masks that do not fit the others, from the shares of `meeting_of_each`; possibly all of them."""
     known = meeting[~np.isnan(meeting)]
     limit = max(LEAST_MEETING, LEAST_OF_MEDIAN * float(np.median(known))) if len(known) else 0.0
     return np.asarray(meeting < limit)
 
 
 def meeting_of_each(plane: masks.FramedPlanes, views: Sequence[masks.PaneView]) -> Array:
-    """[V] share of each mask's outline that meets those of the others on one plane; NaN where nothing is compared.
+    """[V] share of each mask's outline that meets those of the others on one plane; NaN if nothing is compared.
 
-    The overlap of the areas does not tell: masks of one pane from elsewhere overlap by half and more, and a post that
-    hides half of a pane costs as much. Outlines that are hidden meet nothing, but those of a wrong mask do not either,
-    nor do the others meet them.
+    The overlap of areas does not identify wrong masks: masks of a pane from other positions overlap by half or more,
+    and a post that occludes half of a pane costs as much. Occluded outlines meet nothing. The outline of a wrong mask
+    meets none of the others either, and none of them meets it.
     """
     views = [_without_shared_edges(view) for view in views]
     tolerance = max(MIDDLE, *(1 / view.diagonal for view in views))
@@ -75,7 +75,7 @@ def meeting_of_each(plane: masks.FramedPlanes, views: Sequence[masks.PaneView]) 
 
 
 def _without_shared_edges(view: masks.PaneView) -> masks.PaneView:
-    """The view without what other panes may hide: no edge between them counts, and no distance is known there."""
+    """The view without edges that other panes may occlude; distances next to other panes become NaN."""
     from scipy import ndimage
 
     beside: NDArray[np.bool_] = ndimage.binary_dilation(view.hidden, iterations=2)
@@ -86,24 +86,25 @@ def _without_shared_edges(view: masks.PaneView) -> masks.PaneView:
 
 
 LEAST_APART = 0.01
-"""Distance between annotated cameras below which nothing is tried, in scene extents."""
+"""Distance between annotated cameras below which no plane is fitted, in scene extents."""
 UNSURE, VERY_UNSURE = 2.5, 5.0
-"""Degrees by which a plane may be turned without its masks telling before more masks are asked for, and before it is
-refused. Of 27 panes 24 come to at most 1.5. Beyond, the little that masks say misleads: a mirror that came to 3.6,
-small and marked in four photographs from nearly one place, was off by 29."""
+"""Tilt uncertainties of a plane, in degrees, above which more masks are requested, and above which it is refused. For
+24 of 27 panes it is at most 1.5. Beyond, weak evidence misleads: a small mirror with 3.6, marked in four photographs
+from nearly the same position, was off by 29."""
 MOST_CONTRADICTION = 0.7
-"""What may tell against a plane, as `contradiction` counts it, before it is refused."""
+"""Value of `contradiction` above which a plane is refused."""
 MOST_LOSS = 0.04
-"""By how much more may tell against a plane shared with other panes than against a pane's own. Of two well measured
-panes that are turned by 2 degrees 0.03 does, by 3 degrees 0.05; planes that chance put before the true one, 0.03."""
+"""Maximum excess of the `contradiction` of a plane shared with other panes over that of a pane's own. It is 0.03 for
+two well measured panes at an angle of 2 degrees, 0.05 at 3 degrees, and 0.03 where chance preferred a plane to the true
+one."""
 
 MOST_CAMERAS = 100
-"""Cameras that are asked whether they see a point through a pane."""
+"""Maximum number of cameras that decide which points are seen through a pane."""
 
 
 @dataclass(frozen=True)
 class _Pane:
-    """One fitted pane, in NumPy."""
+    """One fitted pane, as NumPy arrays."""
 
     center: Array
     normal: Array
@@ -122,36 +123,35 @@ def fit_planes(
     options: PlaneFit | None = None,
     unmarked: Sequence[tuple[str, Camera]] = (),
 ) -> Planes:
-    """A reflection plane for every pane that the masks name, in the order of their labels.
+    """A reflection plane for every pane in the masks, in the order of the labels.
 
     As in the paper, candidates are points that project near a mask's edge, RANSAC draws planes through them, and
-    rotating calipers bound the rectangle. Beyond the paper, the masks themselves choose among the planes and place the
-    best one exactly: on the pane's own plane, and on no other, the masks of all views coincide (`mask_agreement`), and
-    their edges do (`edge_matches`). RANSAC alone often prefers a wall or the floor. No points are needed: further
-    planes are drawn through the masks.
+    rotating calipers bound the rectangle. Beyond the paper, the masks rank the planes and refine the best one: only on
+    the pane's own plane do the masks of all views (`mask_agreement`) and their edges (`edge_matches`) coincide. RANSAC
+    alone often prefers a wall or the floor. Points are optional, because further planes are drawn through the masks.
 
-    Gaussians may mislead, so that each pane is fitted to the measured points as well, and of both planes the one is
-    kept that masks and measured points support better (`best_supported`). Panes of one front get one plane, which the
-    masks of all place together (`JointObjective`), unless that fits one of them worse than its own. A pane that mirrors
-    many points, such as a mirror with ragged masks, is placed by these (`plane_of_images`).
+    Gaussians may mislead, so each pane is fitted to the measured points as well. Of the two planes, the one with better
+    support by masks and measured points is kept (`best_supported`). Panes of one front share a plane, fitted to the
+    masks of all (`JointObjective`), unless it fits one of them worse than its own. A pane that mirrors many points,
+    such as a mirror with ragged masks, is positioned by them (`plane_of_images`).
 
     Args:
         centers: [N, 3] centres of the primary Gaussians, or SfM points.
-        annotations: cameras and their label images [H, W]; 0 is no pane.
+        annotations: cameras and their label images [H, W]; 0 means no pane.
         extent: radius of the capture in world units.
-        measured: [M, 3] SfM points, where `centers` are those of Gaussians; None where there are none.
+        measured: [M, 3] SfM points, if `centers` are those of Gaussians; None if there are none.
         names: of the annotated photographs, for messages.
-        labels: the panes to fit; all that the masks name if None.
-        options: how to fit; the defaults if None.
-        unmarked: names and cameras of photographs without masks: they tell which points are seen through a pane, and a
-            refusal names the best to mark.
+        labels: of the panes to fit; all labels in the masks if None.
+        options: of the fit; the defaults if None.
+        unmarked: names and cameras of photographs without masks. They help to find points seen through a pane, and
+            error messages name the best ones to mark.
 
     Returns:
-        Planes whose normals point to the side that most annotated cameras are on.
+        Planes whose normals point to the side of most annotated cameras.
 
     Raises:
-        PlaneFitError: no mask names a pane, or a pane has too few views or views from one place, or its
-            masks agree on no plane or on many.
+        PlaneFitError: no mask contains a pane, a pane has too few views or views from one position only, or its masks
+            agree on no plane or on many.
     """
     options = options or PlaneFit()
     named = sorted({int(label) for _, image in annotations for label in image.unique()} - {0})
@@ -179,7 +179,7 @@ def fit_planes(
 
 @contextmanager
 def _advice(label: int, count: int) -> Iterator[None]:
-    """Says what else can be done about a pane that has no plane, where it is one of several."""
+    """Adds advice to the error about a pane without a plane, if it is one of several."""
     try:
         yield
     except PlaneFitError as error:
@@ -195,19 +195,19 @@ def _usable(positions: Tensor) -> Array:
 
 
 class _UndecidedError(ValueError):
-    """The masks of a pane leave its plane open."""
+    """The masks of a pane do not determine its plane."""
 
 
 @dataclass(frozen=True)
 class _Found:
-    """A pane and its plane before the rectangle is bounded.
+    """A pane and its plane, before its rectangle is fitted.
 
     Attributes:
         label: of the pane.
-        evidence: its masks and the points that were measured.
-        plane: the best one, of H = 1.
-        fault: why this plane cannot be trusted; None if it can.
-        is_settled: whether more than its own masks has placed it: other panes on it, or points that it mirrors.
+        evidence: its masks and the points along its edge, measured ones if there are any.
+        plane: the best plane, H = 1.
+        fault: reason not to trust this plane; None if it is trusted.
+        is_settled: true if more than its own masks determined the plane: other panes on it, or points that it mirrors.
     """
 
     label: int
@@ -218,22 +218,22 @@ class _Found:
 
     @property
     def has_few(self) -> bool:
-        """Return whether two views alone show it."""
+        """Return whether only two views show it."""
         return len(self.evidence.views) == 2
 
     @property
     def is_open(self) -> bool:
-        """Return whether its own masks say too little of its plane."""
+        """Return whether its own masks do not determine its plane reliably."""
         return isinstance(self.fault, _UndecidedError) or (self.has_few and self.fault is None and not self.is_settled)
 
 
 def _found_pane(
     label: int, clouds: Mapping[str, Array], views: Sequence[masks.PaneView], *, extent: float, options: PlaneFit
 ) -> _Found:
-    """The pane on the plane of its masks, or of what they are without gaps where that tells against it.
+    """The pane on the plane of its masks, or on that of the masks with gaps filled if these contradict it.
 
-    Gaps between parts of a pane lie on its plane. But the edges of a post before it meet on a plane of their own, and
-    may turn the pane's to that.
+    Gaps between parts of a pane lie on its plane. But the edges of a post occluding it meet on a plane of their own,
+    and may tilt the pane's plane towards that.
     """
     _check_views(label, views, extent)
     found = _fitted_pane(label, clouds, views, extent=extent, options=options)
@@ -255,7 +255,7 @@ def _found_pane(
 def _fitted_pane(
     label: int, clouds: Mapping[str, Array], views: Sequence[masks.PaneView], *, extent: float, options: PlaneFit
 ) -> _Found:
-    """The plane, of those fitted to each cloud, that masks and the first cloud support best."""
+    """The pane on the plane that masks and the first cloud support best, of those fitted with each cloud."""
     objectives = {}
     for source, points in clouds.items():
         chosen = points[masks.plane_candidates(points, views, band=options.band)]
@@ -284,9 +284,9 @@ def _fault(plane: masks.FramedPlanes, objective: Objective, options: PlaneFit) -
 
 
 def _in_one_plane(found: Sequence[_Found], seed: int) -> list[_Found]:
-    """The panes, those of one front on one plane, which all their masks place together.
+    """The panes; those of one front share a plane, fitted to the masks of all.
 
-    A pane that few or cut outlines leave undecided is decided by its neighbours.
+    A pane whose plane is undetermined, because its outlines are few or cut off, may take that of another pane.
     """
     panes = {pane.label: pane for pane in found}
     for labels in _neighbours(found):
@@ -297,7 +297,7 @@ def _in_one_plane(found: Sequence[_Found], seed: int) -> list[_Found]:
 
 
 def _choose_plane(pane: _Found, trusted: Sequence[_Found]) -> _Found:
-    """The pane on that plane of another one which serves it as well as its own; as it is if there is none."""
+    """The pane on the best plane of another pane that fits about as well as its own; unchanged if there is none."""
     losses = [_loss(pane, other.plane) for other in trusted]
     if not losses or min(losses) > MOST_LOSS:
         return pane
@@ -308,9 +308,9 @@ def _choose_plane(pane: _Found, trusted: Sequence[_Found]) -> _Found:
 
 
 def _placed_by_images(pane: _Found, cloud: Array, cameras: Sequence[Camera], options: PlaneFit) -> _Found:
-    """The pane on the plane about which points seen through it are mirror images of others; as it is if none is clear.
+    """The pane on the plane that mirrors points seen through it onto others; unchanged if there is no clear one.
 
-    Its masks must not tell against that plane more than they may against one shared with other panes.
+    Its masks limit the loss on that plane as for a plane shared with other panes (`MOST_LOSS`).
     """
     if pane.is_settled or not (pane.fault is None or pane.is_open):
         return pane
@@ -337,12 +337,12 @@ def _placed_by_images(pane: _Found, cloud: Array, cameras: Sequence[Camera], opt
 
 
 def _loss(pane: _Found, plane: masks.FramedPlanes) -> float:
-    """The excess of the contradiction of a plane over that of the pane's own."""
+    """The excess of the `contradiction` of a plane over that of the pane's own plane."""
     return float((search.contradiction(plane, pane.evidence) - search.contradiction(pane.plane, pane.evidence))[0])
 
 
 def _neighbours(found: Sequence[_Found]) -> list[list[int]]:
-    """Labels of panes with trusted planes that may lie in one surface, directly or by way of third ones."""
+    """Groups of labels of panes with trusted planes that may lie in one surface, directly or through other panes."""
     panes = {pane.label: pane for pane in found if pane.fault is None}
 
     def may_share(one: int, other: int) -> bool:
@@ -353,7 +353,7 @@ def _neighbours(found: Sequence[_Found]) -> list[list[int]]:
 
 
 def _joint(panes: Sequence[_Found], seed: int) -> list[_Found]:
-    """Those of the panes that one plane serves as well as their own, on it."""
+    """The panes that a joint plane fits about as well as their own planes, on that plane."""
     panes = list(panes)
     while len(panes) > 1:
         objective = JointObjective([pane.evidence for pane in panes])
@@ -372,7 +372,7 @@ def _finish(pane: _Found, options: PlaneFit, unmarked: Sequence[tuple[str, Camer
     """The pane with its rectangle.
 
     Raises:
-        PlaneFitError: its plane cannot be trusted, or its masks agree nowhere on it.
+        PlaneFitError: its plane is not trusted, or its masks agree nowhere on it.
     """
     views = pane.evidence.views
     try:
@@ -400,13 +400,13 @@ def _reason_to_distrust(pane: _Found) -> str:
 
 
 MOST_NAMED = 3
-"""Photographs that a refusal or a warning names."""
+"""Maximum number of photographs named in an error or a warning."""
 WELL_INSIDE = 0.2
-"""Share of the image's sides between them and the middle of a pane that a photograph shows well."""
+"""Minimum distance of a pane's middle from the border of an image that shows it well, as a share of the sides."""
 
 
 def _worth_marking(views: Sequence[masks.PaneView], unmarked: Sequence[tuple[str, Camera]]) -> str:
-    """Names of photographs without masks that should show the pane well from elsewhere, for a message."""
+    """Names of photographs without masks that should show the pane well from other positions, for a message."""
     middle = _seen_middle(views)
     centers = [view.center for view in views]
     names: list[str] = []
@@ -421,7 +421,7 @@ def _worth_marking(views: Sequence[masks.PaneView], unmarked: Sequence[tuple[str
 
 
 def _seen_middle(views: Sequence[masks.PaneView]) -> Array:
-    """[3] the point nearest to the rays through the middles of the masks."""
+    """[3] the point closest, in least squares, to the rays through the middles of the masks."""
     system, right = np.zeros((3, 3)), np.zeros(3)
     for view in views:
         ray = view.directions(view.middle)[0]
@@ -432,7 +432,7 @@ def _seen_middle(views: Sequence[masks.PaneView]) -> Array:
 
 
 def _turn(middle: Array, center: Array, other: Array) -> float:
-    """Radians between the directions in which two cameras see a point."""
+    """Angle in radians between the directions from a point to two cameras."""
     first, second = center - middle, other - middle
     return float(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second))
 
@@ -476,12 +476,12 @@ def _check_outlines(found: masks.FramedPlanes, objective: Objective) -> None:
 
 
 def _tilt_degrees(found: masks.FramedPlanes, objective: Objective) -> float:
-    """Degrees by which a plane may be turned before its masks tell."""
+    """Tilt uncertainty of a plane in degrees (see `search.tilt_uncertainty`)."""
     return float(np.degrees(search.tilt_uncertainty(found, objective, MIDDLE)[0]))
 
 
 def _left_open(degrees: float, objective: Objective) -> str:
-    """A plane that may be turned by so many degrees, for a message."""
+    """Description of a plane with the given tilt uncertainty, for a message."""
     return (
         f"the masks determine the plane only to {min(degrees, 90):.0f} degrees: they show too little of its "
         f"outline or were taken too close together, and {len(objective.points)} points lie along it"
@@ -530,7 +530,7 @@ def _planes(panes: Sequence[_Pane], labels: Sequence[int], options: PlaneFit) ->
 
 
 def with_mirrors(planes: Planes, labels: tuple[int, ...], reflectance: float) -> Planes:
-    """The planes with some of them, by label, made mirrors of a base reflectance that stays."""
+    """The planes, with those of the given labels made mirrors of fixed base reflectance."""
     kept = tuple(label for label in planes.labels if label in labels)
     mirrors = torch.tensor([label in kept for label in planes.labels], device=planes.centers.device)
     fixed = torch.full_like(planes.logit_reflectances, logit(reflectance))

@@ -1,9 +1,9 @@
-"""Annotated masks of a pane, their edges and rays; planes and rectangles through points; and where masks agree.
+"""Annotated masks of a pane, their edges and rays; planes and rectangles through points; and agreement of masks.
 
-Masks of several views agree on a plane in this sense: a plane maps every pixel of one view to a pixel of another. On
-the pane's own plane the mask of the first view lands on the mask of the second; on any other plane parallax pulls them
-apart. Outside of an image nothing is known, so that a mask which leaves its image is no contradiction; nor is anything
-known where a mask shows another pane, which may stand in front.
+A plane induces a homography, which maps every pixel of one view to a pixel of another. On the pane's own plane, the
+mask of the first view lands on the mask of the second; on any other plane, parallax separates them. Nothing is known
+outside an image, so a mask that leaves its image is not a contradiction. Nor is anything known where a mask shows
+another pane, which may be in front.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Rectangle:
 
 
 def min_area_rectangle(points: Array) -> Rectangle:
-    """The rectangle of least area that holds all points [P, 2].
+    """The rectangle of minimum area that contains all points [P, 2].
 
     One of its sides lies along an edge of the convex hull (Freeman and Shapira, 1975), so it is
     enough to measure the hull along each of its edges.
@@ -96,7 +96,7 @@ class FramedPlanes:
 
     Attributes:
         planes: H planes.
-        frames: [H] how far the frame stands out from the glass, world units.
+        frames: [H] heights of the frames above the glass, world units.
     """
 
     planes: PlaneEquations
@@ -106,26 +106,26 @@ class FramedPlanes:
         return len(self.frames)
 
     def select(self, index: NDArray[np.int64]) -> FramedPlanes:
-        """Those at `index`."""
+        """The planes at `index`."""
         return FramedPlanes(self.planes.select(index), self.frames[index])
 
 
 def join_planes(parts: Sequence[FramedPlanes]) -> FramedPlanes:
-    """All planes of several sets."""
+    """The planes of several sets, concatenated."""
     normals = np.concatenate([part.planes.normals for part in parts])
     offsets = np.concatenate([part.planes.offsets for part in parts])
     return FramedPlanes(PlaneEquations(normals, offsets), np.concatenate([part.frames for part in parts]))
 
 
 def in_plane_axes(planes: PlaneEquations) -> tuple[Array, Array]:
-    """Two directions [H, 3] each that are perpendicular to the normals and to one another; unit vectors."""
+    """Two unit vectors [H, 3] per plane, perpendicular to its normal and to each other."""
     first = np.cross(planes.normals, np.eye(3)[np.argmin(np.abs(planes.normals), axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return first, np.cross(planes.normals, first)
 
 
 def random_planes(points: Array, count: int, rng: np.random.Generator) -> PlaneEquations:
-    """Planes through random triplets of points [N, 3]; up to `count`, since flat triplets are dropped.
+    """Planes through random triplets of points [N, 3]; up to `count`, because nearly collinear triplets are dropped.
 
     Args:
         points: [N, 3] at least three positions.
@@ -135,7 +135,7 @@ def random_planes(points: Array, count: int, rng: np.random.Generator) -> PlaneE
     a, b, c = points[(len(points) * rng.random((3, count))).astype(np.int64)]
     normals = np.cross(b - a, c - a)
     area = np.linalg.norm(normals, axis=1)
-    # A triplet close to a line says nothing about the tilt of a plane around that line.
+    # A nearly collinear triplet does not determine the tilt of a plane about its line.
     spread = np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - a, axis=1)
     usable = area > 0.1 * np.maximum(spread, np.finfo(np.float64).tiny)
     normals = normals[usable] / area[usable, None]
@@ -150,25 +150,25 @@ def support(planes: PlaneEquations, points: Array, *, distance: float) -> Array:
 
 Mask = NDArray[np.bool_]
 
-THINNEST_PART = 0.005  # Half width below which a part of a mask is taken for an artefact, in image diagonals.
+THINNEST_PART = 0.005  # Half width below which a part of a mask is treated as an artefact, in image diagonals.
 
 EDGE_SMOOTHING = 0.005
-"""Standard deviation with which a mask is smoothed before its edge has a direction, in image diagonals."""
+"""Standard deviation of the Gaussian that smooths a mask to find the direction of its edge, in image diagonals."""
 
 
 @dataclass(frozen=True)
 class PaneView:
-    """Region of one pane, and of what is certainly no pane, in one annotated view.
+    """Mask of one pane in one annotated view, with its edge.
 
     Attributes:
         cam_from_world: [4, 4] rigid transform, world to camera.
         intrinsics: [4] fx, fy, cx, cy in pixels.
         mask: [H, W] true on the pane.
-        hidden: [H, W] true on other panes, behind which this one may go on.
-        distance: [H, W] pixels from a pixel's centre to the edge of the mask, positive inside. Where
-            the mask leaves the image there is no edge, because the pane goes on.
+        hidden: [H, W] true on other panes, behind which this one may continue.
+        distance: [H, W] distance in pixels from a pixel's centre to the edge of the mask, positive inside. Where the
+            mask leaves the image there is no edge, because the pane continues.
         edge: [E, 2] points (x, y) half-way between a pixel on the pane and a neighbour off it.
-        outward: [E, 2] unit vectors across the edge, off the pane.
+        outward: [E, 2] unit vectors normal to the edge, pointing away from the pane.
         name: of the photograph, for messages.
     """
 
@@ -188,7 +188,7 @@ class PaneView:
 
     @cached_property
     def middle(self) -> Array:
-        """[1, 2] where the middle of the mask's pixels is (medians of x and of y)."""
+        """[1, 2] middle of the mask's pixels (medians of x and of y)."""
         row, column = np.nonzero(self.mask)
         return np.array([[np.median(column) + 0.5, np.median(row) + 0.5]])
 
@@ -198,17 +198,17 @@ class PaneView:
         return float(np.hypot(*self.mask.shape))
 
     def directions(self, pixels: Array) -> Array:
-        """[P, 3] world directions of the rays through pixel positions [P, 2]; camera z grows by 1 along each."""
+        """[P, 3] world directions of the rays through pixel positions [P, 2], with z = 1 in the camera's frame."""
         fx, fy, cx, cy = self.intrinsics
         in_camera = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], axis=1)
         return in_camera @ self.cam_from_world[:3, :3]
 
     def sight_limits(self, pixels: Array, outward: Array) -> Array:
-        """[P, 3] unit normals of the planes through the camera and lines in the image.
+        """[P, 3] unit normals, in world axes, of the planes through the camera centre and lines in the image.
 
         Args:
             pixels: [P, 2] a point of each line.
-            outward: [P, 2] unit vectors across the lines, to the side that the normals point to.
+            outward: [P, 2] unit vectors normal to the lines, on the side that the plane normals point to.
         """
         fx, fy, cx, cy = self.intrinsics
         a, b = outward[:, 0] * fx, outward[:, 1] * fy
@@ -217,9 +217,9 @@ class PaneView:
         return in_camera / np.linalg.norm(in_camera, axis=1, keepdims=True) @ self.cam_from_world[:3, :3]
 
     def project(self, points: Array) -> tuple[Array, Mask]:
-        """Pixel positions [..., 2] of world points [..., 3], and whether the image holds them."""
+        """Pixel positions [..., 2] of world points [..., 3], and [...] bool: points inside the image."""
         fx, fy, cx, cy = self.intrinsics
-        # Each coordinate lies in one piece: this is run for millions of points.
+        # Each coordinate is contiguous in memory, because this runs for millions of points.
         x, y, depth = self.cam_from_world[:3, :3] @ points.reshape(-1, 3).T + self.cam_from_world[:3, 3:]
         scale = 1 / np.where(depth > 0, depth, np.inf)
         x, y = fx * x * scale + cx, fy * y * scale + cy
@@ -228,15 +228,15 @@ class PaneView:
         return np.stack([x, y], axis=-1).reshape(*points.shape[:-1], 2), held.reshape(points.shape[:-1])
 
     def covers(self, pixels: Array, held: Mask) -> Mask:
-        """[...] whether pixel positions [..., 2] lie on the pane; false where `held` is false."""
+        """[...] bool: pixel positions [..., 2] on the pane; false where `held` is false."""
         return held & self._read(self.mask, pixels, held)
 
     def tells(self, pixels: Array, held: Mask) -> Mask:
-        """[...] whether it is known if the pane is at pixel positions [..., 2]; false where `held` is false."""
+        """[...] bool: pixel positions [..., 2] that no other pane covers; false where `held` is false."""
         return held & ~self._read(self.hidden, pixels, held)
 
     def _read(self, image: Mask, pixels: Array, held: Mask) -> Mask:
-        """[...] the image at pixel positions [..., 2]; anything where `held` is false."""
+        """[...] values of an image at pixel positions [..., 2]; arbitrary where `held` is false."""
         column, row = (np.where(held, pixels[..., axis], 0).astype(np.int64) for axis in (0, 1))
         return image.ravel()[row * image.shape[1] + column]
 
@@ -257,7 +257,7 @@ class PaneView:
 
 
 def cameras_of(views: Sequence[PaneView]) -> Cameras:
-    """The cameras of views, at least one."""
+    """The cameras of at least one view, stacked."""
     return Cameras(
         np.stack([view.cam_from_world for view in views]),
         np.stack([view.center for view in views]),
@@ -272,7 +272,7 @@ def pane_view(camera: Camera, labels: Tensor, label: int, *, name: str = "") -> 
     Args:
         camera: the view's camera.
         labels: [H, W] integer label image, of the camera's size.
-        label: which pane.
+        label: of the pane.
         name: of the photograph, for messages.
 
     Raises:
@@ -299,16 +299,15 @@ def pane_view(camera: Camera, labels: Tensor, label: int, *, name: str = "") -> 
 
 
 WIDEST_GAP, LEAST_FILLED = 0.04, 0.01
-"""Width of gaps in a mask that are filled, in image diagonals, and the share of it that they must have."""
+"""Maximum width of gaps that are filled in a mask, in image diagonals, and their minimum share of the mask."""
 
 
 GAPS_SEEN_AT = 500
-"""Diagonal in pixels to which a mask is thinned out to see whether it has any; to close one of 12 megapixels takes ten
-seconds."""
+"""Diagonal in pixels to which a mask is subsampled to detect gaps; closing those of 12 megapixels takes ten seconds."""
 
 
 def without_gaps(view: PaneView) -> PaneView:
-    """The view with narrow gaps of its mask filled, such as a thing before the pane leaves; itself if it has none."""
+    """The view with narrow gaps in its mask filled, such as those of occluding objects; unchanged if it has none."""
     step = max(int(view.diagonal / GAPS_SEEN_AT), 1)
     coarse = view.mask[::step, ::step]
     if not _is_larger(_close_gaps(coarse), coarse):
@@ -325,9 +324,7 @@ def _is_larger(mask: Mask, other: Mask) -> bool:
 
 
 def _close_gaps(mask: Mask) -> Mask:
-    """The mask after everything that is nearer to it than half the width of a gap has been joined to it and taken off
-    its outside again.
-    """
+    """The mask after morphological closing, by a disk whose radius is half the maximum width of a gap."""
     from scipy import ndimage
 
     reach = round(WIDEST_GAP / 2 * float(np.hypot(*mask.shape))) + 1
@@ -346,7 +343,7 @@ def _array(tensor: Tensor) -> Array:
 def _without_slivers(mask: Mask) -> Mask:
     """The mask without parts that are only a few pixels wide.
 
-    Label images that were resized or saved with blending carry a line of label 1 around label 2.
+    Label images that were resized or saved with interpolation have a line of label 1 around label 2.
     """
     from scipy import ndimage
 
@@ -365,18 +362,18 @@ def _signed_distance(mask: Mask) -> Array:
     """[H, W] distance to the mask's edge in pixels, positive inside."""
     if mask.all() or not mask.any():
         return np.full(mask.shape, np.hypot(*mask.shape) if mask.all() else -np.hypot(*mask.shape))
-    # The edge runs half a pixel before the nearest centre on the other side.
+    # The edge is half a pixel closer than the nearest pixel centre beyond it.
     from scipy import ndimage
 
     distance: Array = 0.5 - ndimage.distance_transform_edt(~mask)
-    window = _window(mask, 1)  # A pixel's nearest one outside is no farther than those around the mask.
+    window = _window(mask, 1)  # Holds the nearest outside pixel of each pixel inside.
     inside = ndimage.distance_transform_edt(mask[window])
     distance[window] = np.where(mask[window], inside - 0.5, distance[window])
     return distance
 
 
 def _window(mask: Mask, margin: int) -> tuple[slice, slice]:
-    """Rows and columns of all pixels of a mask, and so many more on every side; all where it has none."""
+    """Rows and columns of the bounding box of a mask, extended by a margin on every side; all if the mask is empty."""
     if not mask.any():
         return slice(None), slice(None)
     found = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
@@ -396,11 +393,11 @@ def _edge_points(mask: Mask) -> Array:
 
 
 FARTHEST_SMOOTHED = 4.0
-"""Standard deviations at which the Gaussian that smooths a mask is cut off."""
+"""Radius in standard deviations at which the Gaussian that smooths a mask is truncated."""
 
 
 def _outward(mask: Mask, edge: Array) -> Array:
-    """[E, 2] unit vectors down the slope of the smoothed mask at its edge points."""
+    """[E, 2] unit vectors along the negative gradient of the smoothed mask at its edge points."""
     from scipy import ndimage
 
     sigma = EDGE_SMOOTHING * np.hypot(*mask.shape)
@@ -419,10 +416,10 @@ def pane_views(
 
     Args:
         annotations: cameras and their label images [H, W].
-        label: which pane.
-        most: largest number of views; where a capture has a mask for every photograph, those that
-            show much of the pane and were taken far from one another tell enough.
-        names: of the photographs; they are numbered from 1 if None.
+        label: of the pane.
+        most: maximum number of views. If every photograph has a mask, views that show much of the pane from positions
+            far apart are sufficient.
+        names: of the photographs; annotations are numbered from 1 if None.
     """
     centers = np.array([_array(camera.center) for camera, _ in annotations])
     shares = np.array([float((labels == label).double().mean()) for _, labels in annotations])
@@ -437,7 +434,7 @@ def _far_apart(positions: Array, values: Array, count: int) -> list[int]:
     chosen: list[int] = []
     distance = np.ones(len(values))
     while len(chosen) < min(count, int((values > 0).sum())):
-        # Views from one place have no distance; the small constant still takes the largest of them.
+        # Views from one position have distance zero; the small constant still selects the largest value among them.
         worth = values * (distance + 1e-9)
         worth[chosen] = 0
         chosen.append(int(np.argmax(worth)))
@@ -447,15 +444,14 @@ def _far_apart(positions: Array, values: Array, count: int) -> list[int]:
 
 
 CANDIDATE_AGREEMENT = 0.5
-"""Share of the views whose image holds a point in which it must lie along the edge. Not all: something may stand before
-the edge."""
+"""Minimum share, of the views that contain a point, in which it lies along the edge; others may show it occluded."""
 
 
 def plane_candidates(points: Array, views: Sequence[PaneView], *, band: float) -> NDArray[np.bool_]:
-    """[N] bool: which points lie along the pane's edge (TR-Gaussians, Appendix A, steps 1 and 2).
+    """[N] bool: points along the pane's edge (TR-Gaussians, Appendix A, steps 1 and 2).
 
-    A point on the frame projects close to the mask's edge in every view; a point before or behind
-    it may do so in one view but moves away in others. So the views vote.
+    A point on the frame projects close to the mask's edge in every view; a point in front of or behind it may do so in
+    one view but not in others. So the views vote.
 
     Args:
         points: [N, 3] world positions.
@@ -471,13 +467,13 @@ def plane_candidates(points: Array, views: Sequence[PaneView], *, band: float) -
 
 
 RAYS_PER_VIEW = 400
-"""Pixels of each mask that are followed into the others."""
+"""Number of pixels of each view that are mapped into the others."""
 UNKNOWN_WEIGHT = 0.05
-"""Weight of what leaves the other image, against planes on which hardly anything can be compared."""
+"""Weight of pixels that leave the other image; it penalises planes on which hardly anything can be compared."""
 
 
 def meet(planes: PlaneEquations, origin: Array, directions: Array) -> tuple[Array, Mask]:
-    """Points [H, P, 3] where rays meet planes, and whether that is in front of their origin.
+    """Intersections [H, P, 3] of rays with planes, and [H, P] bool: those in front of the origin.
 
     Args:
         planes: H planes.
@@ -492,12 +488,12 @@ def meet(planes: PlaneEquations, origin: Array, directions: Array) -> tuple[Arra
 
 
 def mask_agreement(planes: PlaneEquations, views: Sequence[PaneView], *, pixels_per_view: int = RAYS_PER_VIEW) -> Array:
-    """[H] how well the masks agree on each plane: intersection over union, pooled over pairs of views.
+    """[H] agreement of the masks on each plane: intersection over union, pooled over pairs of views.
 
     Args:
         planes: hypotheses.
         views: annotated views of one pane, at least two.
-        pixels_per_view: number of rays that are followed from each view.
+        pixels_per_view: number of rays from each view.
     """
     both, either = _overlaps(planes, views, pixels_per_view)
     agreement: Array = both.sum(axis=(1, 2)) / np.maximum(either.sum(axis=(1, 2)), 1)
@@ -505,14 +501,14 @@ def mask_agreement(planes: PlaneEquations, views: Sequence[PaneView], *, pixels_
 
 
 def agreement_of_each(plane: PlaneEquations, views: Sequence[PaneView]) -> Array:
-    """[V] how well the mask of each view agrees with those of all others on one plane; as `mask_agreement`."""
+    """[V] agreement of the mask of each view with those of all others on one plane; as in `mask_agreement`."""
     both, either = (pairs[0] + pairs[0].T for pairs in _overlaps(plane, views, RAYS_PER_VIEW))
     agreement: Array = both.sum(axis=1) / np.maximum(either.sum(axis=1), 1)
     return agreement
 
 
 def _overlaps(planes: PlaneEquations, views: Sequence[PaneView], pixels_per_view: int) -> tuple[Array, Array]:
-    """Pixels of each view on the pane in another one as well, and on it in either; [H, V, V], from and to."""
+    """Pixel counts of the intersection and the union of the masks of two views; [H, V, V], from and to."""
     seen = []
     for view in views:
         pixels = view.grid(pixels_per_view)

@@ -1,4 +1,4 @@
-"""Mirrors told from glass, what seems to be behind panes, and what they mirror unseen."""
+"""Materials of panes: mirror or glass, virtual Gaussians behind panes, mirrored lamps and unseen surroundings."""
 
 from __future__ import annotations
 
@@ -26,42 +26,42 @@ log = logging.getLogger("glassplat.panes")
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 MIRROR_SLOPE, MIRROR_CORRELATION = 0.35, 0.3
-"""Above both an aligned pane is taken for a mirror. In linear radiance the slope was at most 0.20 of 15 panes of glass
-in ten captures, a dark television among them, at most 0.30 of 29 in sixteen more, and 0.52 and more of fifteen mirrors;
-one of glass whose plane was off by 6 degrees came to 0.48. In sRGB, whose curve is steep where it is dark, the
-television came to 0.35 and 0.38."""
+"""An aligned pane above both is classified as a mirror. In linear radiance, the slope was at most 0.20 for 15 panes of
+glass in ten captures, including a dark television, at most 0.30 for 29 in sixteen more, and at least 0.52 for fifteen
+mirrors; for a glass pane whose plane was off by 6 degrees it was 0.48. In sRGB, whose curve is steep in dark regions,
+it was 0.35 and 0.38 for the television."""
 SURE_SLOPE, SURE_CORRELATION = 0.6, 0.15
-"""The same for a mirror beyond doubt, which may correlate less: one that shows more detail than a rough first scene has
-came to 0.25 and 0.30, with slopes of 0.89 and 0.98. Where a pane in its plane is glass, it takes such a slope: one of a
-front came to 0.42, of 16 % of it."""
+"""The same for a clear mirror, which may correlate less: one that shows more detail than a coarse first scene contains
+had correlations of 0.25 and 0.30, with slopes of 0.89 and 0.98. If a coplanar pane is glass, this slope is required:
+one glass pane of a front had 0.42, measured on 16 % of its pixels."""
 LEAST_COVERAGE = 0.95
-"""Coverage of the mirrored image from which a pixel counts; a rough first scene has holes, which are no dark things."""
+"""Coverage of the mirrored image above which a pixel counts: holes in a coarse first scene are not dark objects."""
 WINDOW = 0.15
-"""Side of the window whose mean is taken off, as a share of the image width: it removes differences in brightness."""
+"""Side of the window whose mean is subtracted, to remove differences in brightness; as a share of the image width."""
 FEWEST_PIXELS, LEAST_SHARE = 200, 0.1
-"""Of a pane's pixels, how many must be covered by what it would mirror for it to be judged: by a few hundredths of a
-glass front, chosen by what is known of its surroundings, it may look like a mirror. Of mirrors 15 % and more are."""
+"""Minimum number and share of a pane's pixels whose mirrored image is covered, for a classification. A few percent of a
+glass front, selected by the known part of its surroundings, may look like a mirror. Mirrors have at least 15 %."""
 INNER_SHARE = 0.8
-"""Share of a rectangle's sides that is compared: its rim shows the frame, mirrored as well as directly."""
+"""Share of a rectangle's sides that is compared, because its rim shows the frame, mirrored as well as directly."""
 MOST_PHOTOGRAPHS, REDUCED_WIDTH = 40, 200
-"""How many photographs tell mirrors from glass, and their largest width in pixels."""
+"""Maximum number of photographs used to distinguish mirrors from glass, and their maximum width in pixels."""
 TILTS_DEG, TILT_PHOTOGRAPHS = (-3.0, -1.5, 0.0, 1.5, 3.0), 8
-"""Tilts about either axis that are tried before a plane is aligned, and how many photographs judge them."""
+"""Tilts about either axis that are tried before a plane is aligned, and the number of photographs that rank them."""
 ALIGN_STEPS, ALIGN_RATE = 60, 2e-3
-"""Steps of Adam, one photograph each, and their rate: radians, and shares of the scene extent."""
+"""Steps of Adam, one photograph each, and the learning rate in radians and shares of the scene extent."""
 LEAST_GAIN_OF_ALIGNING, PERFECT = 1.15, 0.999
-"""How many times as well photographs must agree with an aligned plane, and a correlation that counts as perfect. They
-agree best with planes off by up to 0.5 degrees or 1.5 % of the extent; masks know better, or not at all
-(lab/panes.md)."""
+"""Minimum ratio of the agreement of photographs with an aligned plane to that with the fitted one, and a correlation
+that counts as perfect. Photographs agree best with planes off by up to 0.5 degrees or 1.5 % of the extent; masks are
+more accurate, or useless (lab/panes.md)."""
 POLISH_STEPS, POLISH_ROUNDS, POLISH_PHOTOGRAPHS = (4e-3, 2e-3, 1e-3), 4, 16
-"""Of a mirror: radians and shares of the extent by which it is moved, how often at most by each, and how many
-photographs judge that at least, if there are so many."""
+"""For mirrors: step sizes in radians and shares of the extent, maximum number of rounds with each, and minimum number
+of photographs to evaluate them, if available."""
 FEWEST_IN_VIEW = 100
-"""Compared pixels with which a photograph has a say."""
+"""Minimum number of compared pixels for a photograph to count."""
 
 
 class Likeness(NamedTuple):
-    """Dependence of a pane's photographs on what the plane would mirror there, in linear radiance.
+    """Regression of a pane's photographs on the image mirrored by its plane, in linear radiance.
 
     slope: change of the photograph per change of the mirrored image; 1 for a mirror, about R0 for glass.
     correlation: of the two, over pixels and channels.
@@ -80,8 +80,8 @@ class Likeness(NamedTuple):
 class JudgedPane(NamedTuple):
     """A pane that may be a mirror.
 
-    pane: a single plane, where it fits the photographs best if it is a mirror; like: how like one it is there;
-    compared: how many pixels tell; shown: how many show the pane.
+    pane: a single plane, aligned to the photographs as if it were a mirror; like: its likeness to one there;
+    compared: number of pixels compared; shown: number of pixels that show the pane.
     """
 
     pane: Planes
@@ -91,20 +91,20 @@ class JudgedPane(NamedTuple):
 
     @property
     def is_known(self) -> bool:
-        """Return whether enough is known of what it would mirror."""
+        """Return whether enough of its mirrored image is covered by Gaussians."""
         return self.compared >= FEWEST_PIXELS and self.compared >= LEAST_SHARE * self.shown
 
     @property
     def is_mirror(self) -> bool:
-        """Return whether it is one, as far as enough is known."""
+        """Return whether it is a mirror; false if not enough is known."""
         return self.is_known and self.like.is_mirror
 
 
 class Photograph(NamedTuple):
-    """A photograph reduced to what tells mirrors from glass.
+    """A downscaled photograph, used to distinguish mirrors from glass.
 
-    camera: of its size; pixels [H, W, 3] in [0, 1], at the scene's exposure; valid [H, W] bool, which of them count;
-    labels [H, W] of panes, None where it is not annotated.
+    camera: scaled to its size; pixels [H, W, 3] in [0, 1], at the scene's exposure; valid [H, W] bool, pixels that
+    count; labels [H, W] of panes, None if it is not annotated.
     """
 
     camera: Camera
@@ -114,9 +114,9 @@ class Photograph(NamedTuple):
 
 
 class ComparedPart(NamedTuple):
-    """A part of a photograph in which a pane may mirror.
+    """A part of a photograph in which a pane may show a reflection.
 
-    camera: of the photograph; region [H, W] bool; pixels [P, 3] of the region, about their local means.
+    camera: of the photograph; region [H, W] bool; pixels [P, 3] of the region, minus their local means.
     """
 
     camera: Camera
@@ -130,7 +130,7 @@ def photographs_of(scene: Scene, views: Sequence[View]) -> list[Photograph]:
 
 
 def reduced_photograph(scene: Scene, view: View) -> Photograph:
-    """A view, not wider than `REDUCED_WIDTH`."""
+    """A view, downscaled to at most `REDUCED_WIDTH`."""
     device = scene.primary.means.device
     camera = view.camera.to(device)
     factor = min(1.0, REDUCED_WIDTH / camera.width)
@@ -147,12 +147,12 @@ def reduced_photograph(scene: Scene, view: View) -> Photograph:
 
 
 def judged_pane(scene: Scene, label: int, photographs: Sequence[Photograph]) -> JudgedPane:
-    """Likeness of a pane to a mirror, where it is most like one.
+    """Likeness of a pane to a mirror, on the plane that maximises it.
 
-    Nothing is transmitted by a mirror, so its photograph is the mirrored scene; through glass it is mostly what
-    stands behind, which has nothing to do with the mirrored scene. A rough first scene is enough to tell, if the plane
-    is exact: one that is tilted by a degree mirrors by two. So the plane is aligned first, as if it were a mirror's:
-    the best of a few tilts, then gradient ascent of the correlation. Where that gains little, the plane stays.
+    A mirror transmits nothing, so its photograph is the mirrored scene. Glass mostly shows objects behind it, which are
+    unrelated to the mirrored scene. A coarse first scene suffices to distinguish them, if the plane is accurate: a tilt
+    of one degree turns the reflection by two. So the plane is aligned first, as if it were a mirror's: the best of a
+    few tilts, then gradient ascent on the correlation. If the gain is small, the fitted plane is kept.
 
     Args:
         scene: primary Gaussians after the first stage, with fitted planes and glass.
@@ -190,23 +190,23 @@ def degrees_between(normal: Tensor, other: Tensor) -> float:
 
 @torch.no_grad()
 def pane_shown(scene: Scene, photograph: Photograph, mirrored: MirroredImage) -> Tensor:
-    """[H, W] bool: the pixels that show the inner part of the scene's only pane, and count."""
+    """[H, W] bool: the valid pixels that show the inner part of the scene's only pane."""
     shown = mirrored.seen & photograph.valid
     return shown if photograph.labels is None else shown & (photograph.labels == scene.planes.labels[0])
 
 
 @torch.no_grad()
 def compared_region(scene: Scene, photograph: Photograph) -> Tensor:
-    """[H, W] bool: those of them where it is known what the pane would mirror."""
+    """[H, W] bool: the pixels of `pane_shown` at which Gaussians cover the mirrored image."""
     mirrored = mirrored_image(scene, photograph.camera)
     return pane_shown(scene, photograph, mirrored) & (mirrored.coverage > LEAST_COVERAGE)
 
 
 @torch.no_grad()
 def compared_pixels(scene: Scene, photograph: Photograph) -> tuple[Tensor, Tensor, int]:
-    """Mirrored and photographed radiance [P, 3] of the scene's only pane, about local means, and how many show it.
+    """Mirrored and photographed radiance [P, 3] of the scene's only pane, minus local means, and its pixel count.
 
-    Pixels of which it is not known what the pane would mirror are shown, but not compared.
+    Pixels whose mirrored image is not covered by Gaussians are counted, but not compared.
     """
     mirrored = mirrored_image(scene, photograph.camera)
     shown = pane_shown(scene, photograph, mirrored)
@@ -218,7 +218,7 @@ def compared_pixels(scene: Scene, photograph: Photograph) -> tuple[Tensor, Tenso
 
 
 def aligned_pane(scene: Scene, telling: Sequence[ComparedPart]) -> Scene:
-    """The scene with its only pane turned and shifted to where it is most like a mirror; itself if that gains little.
+    """The scene with its only pane moved to where it is most like a mirror; unchanged if the gain is small.
 
     Args:
         scene: with one pane.
@@ -228,13 +228,13 @@ def aligned_pane(scene: Scene, telling: Sequence[ComparedPart]) -> Scene:
     moments, taken = (torch.zeros_like(offsets), torch.zeros_like(offsets)), 0
     for step in range(ALIGN_STEPS):
         moving = offsets.clone().requires_grad_()
-        # Strides that share no factor with the number visit all of them, neighbours far apart.
+        # A stride coprime to the number of parts visits all of them, neighbours far apart.
         like = agreement(moved_pane(scene, moving), telling[step * 7919 % len(telling)])
         if not like.requires_grad:
             continue
         (slope,) = torch.autograd.grad(-like, moving)
         taken += 1
-        # Not `torch.optim`, whose first optimiser imports PyTorch's compiler, which takes longer than all of this.
+        # Not `torch.optim`: its first optimiser imports PyTorch's compiler, which takes longer than the alignment.
         adam([Update(offsets, slope, *moments, ALIGN_RATE * (1 - step / ALIGN_STEPS), taken)], eps=1e-8)
     aligned = moved_pane(scene, offsets)
     return aligned if agrees_better(aligned, scene, telling) else scene
@@ -242,10 +242,10 @@ def aligned_pane(scene: Scene, telling: Sequence[ComparedPart]) -> Scene:
 
 @torch.no_grad()
 def polished_pane(scene: Scene, telling: Sequence[ComparedPart]) -> Scene:
-    """The scene with its only pane where photographs agree best nearby: ever smaller steps along one axis at a time.
+    """The scene with its only pane moved to where photographs agree best nearby, by a search along one axis at a time.
 
-    Gradient ascent, one photograph a step, leaves a mirror up to 2 % of the extent away from that place, and training
-    brings back only a part of it.
+    Gradient ascent, one photograph a step, leaves a mirror up to 2 % of the extent away from that optimum, and training
+    recovers only a part of it.
     """
     some = telling[:: max(1, len(telling) // POLISH_PHOTOGRAPHS)]
 
@@ -269,14 +269,14 @@ def polished_pane(scene: Scene, telling: Sequence[ComparedPart]) -> Scene:
 def agrees_better(aligned: Scene, fitted: Scene, telling: Sequence[ComparedPart]) -> bool:
     """Return whether photographs agree so much better with the aligned pane that the fitted plane must be wrong."""
     found = mean_agreements([aligned, fitted], telling)
-    # By Fisher's transform, from 0.9 to 0.97 is as far as from 0.3 to 0.7.
+    # On Fisher's scale, the step from 0.9 to 0.97 is about as large as that from 0.3 to 0.7.
     other, own = (math.atanh(max(-PERFECT, min(value, PERFECT))) for value in found)
     return other > LEAST_GAIN_OF_ALIGNING * own
 
 
 @torch.no_grad()
 def tilted_best(scene: Scene, telling: Sequence[ComparedPart]) -> Tensor:
-    """[3] the offsets of `moved_pane` whose tilts, of those in `TILTS_DEG`, agree best with photographs."""
+    """[3] offsets for `moved_pane`: the combination of `TILTS_DEG` that agrees best with photographs."""
     means = scene.primary.means
     tilts = [math.radians(degrees) for degrees in TILTS_DEG]
     candidates = [means.new_tensor([first, second, 0.0]) for first in tilts for second in tilts]
@@ -305,13 +305,13 @@ def moved_pane(scene: Scene, offsets: Tensor) -> Scene:
 
 
 MIRRORING = Planar(BLACK, intensity=False, reflection_gradient="planes")
-"""Renders what a pane mirrors."""
+"""Renders the image mirrored by a pane."""
 
 
 def agreement(scene: Scene, part: ComparedPart, first: FirstPass | None = None) -> Tensor:
-    """Correlation of what the scene's only pane mirrors with a part of a photograph.
+    """Correlation of the image mirrored by the scene's only pane with a part of a photograph.
 
-    `first` is what is seen directly, if that is known already.
+    `first` is the direct view, if it has been rendered already.
     """
     (mirrored,) = MIRRORING.reflections(scene, part.camera, (BLACK,), first)
     one, other = about_local_mean(mirrored, part.region)[part.region], part.pixels
@@ -321,9 +321,7 @@ def agreement(scene: Scene, part: ComparedPart, first: FirstPass | None = None) 
 
 @torch.no_grad()
 def mean_agreements(scenes: Sequence[Scene], telling: Sequence[ComparedPart]) -> list[float]:
-    """Mean of `agreement` over parts of photographs, at least one: of each of several scenes that differ in where their
-    only pane stands.
-    """
+    """Mean of `agreement` over at least one part of a photograph, for several scenes that differ only in their pane."""
     sums = [0.0] * len(scenes)
     for part in telling:
         first = MIRRORING.first_pass(scenes[0], part.camera)
@@ -335,7 +333,7 @@ def mean_agreements(scenes: Sequence[Scene], telling: Sequence[ComparedPart]) ->
 class MirroredImage(NamedTuple):
     """Image that the panes would mirror at full strength.
 
-    color [H, W, 3]; coverage [H, W], how much of it is covered by Gaussians; seen [H, W] bool, where there is a pane.
+    color [H, W, 3]; coverage [H, W] of it by Gaussians; seen [H, W] bool, pixels of panes.
     """
 
     color: Tensor
@@ -344,7 +342,7 @@ class MirroredImage(NamedTuple):
 
 
 def mirrored_image(scene: Scene, camera: Camera) -> MirroredImage:
-    """Renders before black and before white, whose difference is what is not covered."""
+    """Renders the reflection over black and over white; their difference is the part not covered."""
     before_black, before_white = Planar(intensity=False).reflections(scene, camera, (BLACK, WHITE))
     seen = before_white.amax(dim=-1) > 0
     return MirroredImage(before_black, torch.where(seen, 1 - (before_white - before_black).mean(dim=-1), 0), seen)
@@ -352,7 +350,7 @@ def mirrored_image(scene: Scene, camera: Camera) -> MirroredImage:
 
 @torch.no_grad()
 def mirrored_coverage(scene: Scene, pane: Planes, camera: Camera) -> tuple[float, int]:
-    """Pixels of a view in which a pane could mirror, and how many of them Gaussians cover."""
+    """Number of a pane's pixels in a view whose mirrored image Gaussians cover, and number of all its pixels."""
     mirrored = mirrored_image(replace(scene, planes=pane), camera)
     return float(mirrored.coverage.sum()), int(mirrored.seen.sum())
 
@@ -364,7 +362,7 @@ def about_local_mean(image: Tensor, region: Tensor) -> Tensor:
 
 
 def likeness(mirrored: Tensor, photographed: Tensor) -> Likeness:
-    """Regression of photographed on mirrored values [P, 3], both about their means."""
+    """Regression of photographed on mirrored values [P, 3], both minus their means."""
     covariance = (mirrored * photographed).sum()
     spread, target_spread = (mirrored * mirrored).sum(), (photographed * photographed).sum()
     tiny = torch.finfo(mirrored.dtype).tiny
@@ -373,15 +371,15 @@ def likeness(mirrored: Tensor, photographed: Tensor) -> Likeness:
 
 
 MOST_SEEN_DIRECTLY = 0.5
-"""A Gaussian is virtual when fewer than this share of the views that hold it see it past the mirrors."""
+"""A Gaussian is virtual if less than this share of the views that contain it see it directly, not through mirrors."""
 
 
 @torch.no_grad()
 def virtual_points(points: Tensor, mirrors: Planes, cameras: Sequence[Camera]) -> Tensor:
-    """[N] bool: which points are the mirror image of something, because most views see them through a mirror.
+    """[N] bool: points that are mirror images, because most views see them through a mirror.
 
-    Nothing real is seen through a mirror, so these can go as soon as the mirror reflects. Left in place they would keep
-    explaining what it shows, and its reflectance would sink to let them.
+    Nothing real is seen through a mirror, so these can be removed as soon as the mirror reflects. Otherwise they would
+    continue to explain its image, and its reflectance would decrease instead.
 
     Args:
         points: [N, 3] world positions.
@@ -399,36 +397,36 @@ def virtual_points(points: Tensor, mirrors: Planes, cameras: Sequence[Camera]) -
 
 
 HIDDEN = 1.1
-"""Depth beyond the mean one of its pixel, as a ratio, at which a Gaussian is seen through what should hide it."""
+"""Ratio of a Gaussian's depth to the mean depth of its pixel above which other surfaces should occlude it."""
 OPEN = 0.85
-"""Depth up to which, as a ratio to the mean one of its pixel, a view shows that nothing is there; beyond its inverse
-something stands before it."""
+"""Ratio of a position's depth to the mean depth of its pixel below which a view shows that the position is empty; above
+the inverse it is occluded."""
 OFTEN, ALWAYS = 0.5, 0.9
-"""Shares of the views that show a Gaussian behind panes in which it is hidden: often, and as good as always."""
+"""Minimum shares, of the views that show a Gaussian behind panes, in which it is hidden often, and almost always."""
 LEAST_STEADY, LEAST_CONFIRMED = 0.9, 0.4
-"""Shares of what may be reflections of which one at least must be reached: those always hidden of those often hidden,
-and those whose places in front are those of surfaces, as far as views look at them. Of ten fronts of glass behind which
-reflections had been built each reached one (0.60 to 0.97, 0.12 to 1.00), of six before real things, many of them far
-away and of uncertain depth, none did (0.47 to 0.69, 0.02 to 0.25)."""
+"""Minimum shares of possible reflections, at least one of which must be reached: always hidden ones among those often
+hidden, and ones whose mirrored positions lie on surfaces among those with mirrored positions in view. Each of ten glass
+fronts with reflections built behind them reached one (0.60 to 0.97, 0.12 to 1.00). Of six fronts with real objects
+behind them, many far away and of uncertain depth, none did (0.47 to 0.69, 0.02 to 0.25)."""
 FEWEST_LOOKED_AT, FAIRLY_STEADY = 0.1, 0.7
-"""Shares of which one at least must be reached before surfaces in front confirm anything: those always hidden whose
-places views look at, of all that are always hidden; and those always hidden of those often hidden. A real front before
-a street came to 0.01, all of it confirmed, and to 0.51. Of twelve fronts with reflections behind them the one
-photographed from the front came to 0.03 and 0.85, the others to 0.11 and more. Below the second share, surfaces confirm
-only what views look at: with the rest, a room of 0.59 lost three decibels of its transmission in a short run."""
+"""Minimum shares, at least one of which must be reached for surfaces in front to confirm reflections: always hidden
+Gaussians with mirrored positions in view among all that are always hidden; and always hidden ones among those often
+hidden. A real front facing a street had 0.01, all of it confirmed, and 0.51. Of twelve fronts with reflections behind
+them, the one photographed from the front had 0.03 and 0.85, the others at least 0.11. Below the second share, only
+those in view are confirmed: with the rest, a room with 0.59 lost 3 dB of its transmission in a short run."""
 
 
 @torch.no_grad()
 def reflections_behind(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Tensor:
-    """[N] bool: which primary Gaussians stand behind glass for what it mirrors.
+    """[N] bool: primary Gaussians behind glass that represent its reflections.
 
-    Before a pane reflects, what it mirrors is built where it seems to be, and stays there as long as it explains the
-    photographs as well. Most of it seems to be farther away than what is really there, and shows through that. So a
-    Gaussian is meant if most views hold it behind the panes, and nearly all in which these are not hidden hold it
-    beyond the mean depth; and if its mirror image is possible, and not in a place that views look straight through.
-    None is meant where many more are hidden in some views alone, and views past the panes find surfaces in too few of
-    these places, or look at hardly any: then they are real things. Where somewhat more are, and surfaces are found,
-    only those are meant whose places views look at.
+    Before a pane reflects, training builds its reflections at their virtual positions, where they stay as long as they
+    explain the photographs equally well. Most of them are farther away than the real surfaces, and show through these.
+    So a Gaussian is selected if it is behind the panes in most views, and beyond the mean depth in nearly all of those
+    in which the panes are not occluded. Its mirrored position must also be possible: not one that views show to be
+    empty. None is selected if many more Gaussians are hidden in some views only, and views past the panes find surfaces
+    at too few of the mirrored positions, or see hardly any of them: then they are real objects. If somewhat more are,
+    and surfaces are found, only those with mirrored positions in view are selected.
 
     Args:
         scene: with panes or without.
@@ -460,13 +458,13 @@ def reflections_behind(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -
 
 
 def mostly_reflections(often: Tensor, always: Tensor, looked_at: Tensor, confirmed: Tensor) -> Tensor:
-    """[] bool: what is hidden behind a front of glass is mostly what it mirrors. All arguments count Gaussians.
+    """[] bool: Gaussians hidden behind a glass front are mostly its reflections. All arguments are counts of Gaussians.
 
     Args:
         often: hidden in most views.
         always: hidden in nearly all.
-        looked_at: those of them whose places in front are in some view.
-        confirmed: those of these whose places are those of surfaces.
+        looked_at: those of them whose mirrored positions are in some view.
+        confirmed: those of these whose mirrored positions lie on surfaces.
     """
     is_confirmed = (looked_at > 0) & (confirmed >= LEAST_CONFIRMED * looked_at)
     is_known = (looked_at >= FEWEST_LOOKED_AT * always) | (always >= FAIRLY_STEADY * often)
@@ -474,9 +472,9 @@ def mostly_reflections(often: Tensor, always: Tensor, looked_at: Tensor, confirm
 
 
 def relative_depths(points: Tensor, camera: Camera, depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Depths [N] of points over those in an image [H, W] at their pixels, and [N] bool which lie in the image.
+    """Ratios [N] of points' depths to a depth image [H, W] at their pixels, and [N] bool: points inside the image.
 
-    The ratio is 1 where the image holds nothing.
+    The ratio is 1 where the depth image is empty.
     """
     pixels, depths = camera.project(points)
     there = depth[nearest_pixels(pixels, camera)]
@@ -484,27 +482,27 @@ def relative_depths(points: Tensor, camera: Camera, depth: Tensor) -> tuple[Tens
 
 
 CLIPPED = 0.98
-"""Value of the darkest channel from which a pixel may be brighter than it can show."""
+"""Value of the darkest channel above which a pixel may be clipped."""
 LAMP_SHARE = 0.6
-"""Of what photographs show directly of a lamp, how much is clipped; of what they show of its image, how much lies where
-a pane mirrors it."""
+"""Minimum share of a lamp's directly visible pixels that are clipped, and of its mirror image's pixels that lie where a
+pane mirrors it."""
 LEAST_GAIN, MOST_GAIN = 1.5, 30.0
-"""Radiance of a lamp, where white is 1."""
+"""Minimum and maximum radiance of a lamp; white is 1."""
 LEAST_BRIGHT = 0.8
-"""Of the pixels in which a pane mirrors a lamp, how many are bright enough for one."""
+"""Minimum share of the pixels in which a pane mirrors a lamp that are bright enough for one."""
 IMAGE_BRIGHTNESS = 0.5
-"""Of the darkest channel of a lamp's image, sRGB: what is darker a pane mirrors of white things."""
+"""Minimum sRGB value of the darkest channel of a lamp's mirror image; white objects have darker ones."""
 LAMP_RIM = 0.012
-"""How far from where it should be an image is looked for, as a share of the image width."""
+"""Distance from its expected position within which a mirror image is searched for, as a share of the image width."""
 FEWEST_SEEN = 0.3
-"""Pixels, of all photographs together, below which nothing is told."""
+"""Minimum number of pixels over all photographs for a decision."""
 
 
 class Lamps(NamedTuple):
     """Lamps that panes mirror.
 
-    images [N] bool: primary Gaussians behind the panes that show them; gains [N]: factors on how bright primary
-    Gaussians are where they are mirrored, 1 for all but lamps.
+    images [N] bool: primary Gaussians behind the panes that represent their mirror images; gains [N]: factors on the
+    radiance of primary Gaussians in reflections, 1 for all but lamps.
     """
 
     images: Tensor
@@ -513,18 +511,18 @@ class Lamps(NamedTuple):
 
 @torch.no_grad()
 def mirrored_lamps(scene: Scene, panes: Planes, photographs: Sequence[Photograph]) -> Lamps | None:
-    """Lamps that panes of glass mirror, with the radiance that their reflections have; None without any.
+    """Lamps mirrored by panes of glass, with the radiance of their reflections; None if there are none.
 
-    A photograph cannot say how much brighter than white a lamp is, but its reflection at a few hundredths can. Before
-    that is known, the first scene has built the reflection behind the glass, as bright as it looks, and there it stays,
-    because it explains the photographs. So lamps are found by what is clipped wherever it is seen directly, and so
-    bright wherever a pane mirrors it that no reflection of white would do. What stands behind the pane where it
-    mirrors a lamp, and nowhere else, is its image.
+    A photograph does not show how much brighter than white a lamp is, but its reflection, a few percent as bright,
+    does. The first scene has built this reflection as Gaussians behind the glass, where they stay because they explain
+    the photographs. So lamps are Gaussians that are clipped wherever they are seen directly, and too bright for a
+    reflection of white wherever a pane mirrors them. Gaussians behind the pane that are seen only where it mirrors a
+    lamp are its mirror image.
 
     Args:
         scene: with the panes.
         panes: of glass.
-        photographs: those that tell.
+        photographs: downscaled training views.
     """
     alone = replace(scene, planes=panes)
     lamps = _lamps_among(alone, photographs)
@@ -541,7 +539,7 @@ def mirrored_lamps(scene: Scene, panes: Planes, photographs: Sequence[Photograph
 
 
 def _lamps_among(scene: Scene, photographs: Sequence[Photograph]) -> Tensor:
-    """[N] bool: what is clipped where it is seen directly, and brighter than white where it is mirrored."""
+    """[N] bool: Gaussians that are clipped where seen directly, and brighter than white where mirrored."""
     clipped, direct, bright, mirrored = scene.primary.means.new_zeros(4, len(scene.primary))
     for photograph in photographs:
         strength = Planar(nearest_only=True)(scene, photograph.camera).layers["strength"]
@@ -557,14 +555,14 @@ def _lamps_among(scene: Scene, photographs: Sequence[Photograph]) -> Tensor:
 
 
 class LitPixels(NamedTuple):
-    """[H, W] bool each: where a view shows a pane, and where this mirrors mostly lamps."""
+    """[H, W] bool each: pixels of a view that show a pane, and those in which it mirrors mostly lamps."""
 
     glass: Tensor
     lit: Tensor
 
 
 def _lit_pixels(scene: Scene, lamps: Tensor, camera: Camera) -> LitPixels:
-    """Those of a view, of lamps [N] bool."""
+    """The lit pixels of a view, for lamps [N] bool."""
     sh = torch.zeros_like(scene.primary.sh)
     sh[:, 0] = (lamps.float()[:, None] - 0.5) / SH_ZERO
     painted = replace(scene.primary.with_tensors({"sh": sh}), active_sh_degree=0)
@@ -574,7 +572,7 @@ def _lit_pixels(scene: Scene, lamps: Tensor, camera: Camera) -> LitPixels:
 
 
 def _images_of(scene: Scene, seen: Sequence[LitPixels], photographs: Sequence[Photograph]) -> Tensor:
-    """[N] bool: what is bright, behind the panes, and mostly where these mirror lamps."""
+    """[N] bool: bright Gaussians behind the panes that are seen mostly where these mirror lamps."""
     means = scene.primary.means
     near, through = means.new_zeros(2, len(means))
     for photograph, (glass, lit) in zip(photographs, seen, strict=True):
@@ -588,7 +586,7 @@ def _images_of(scene: Scene, seen: Sequence[LitPixels], photographs: Sequence[Ph
 
 
 def _gains_of(scene: Scene, seen: Sequence[LitPixels], photographs: Sequence[Photograph]) -> Tensor:
-    """[N] radiance that the photographs leave to the reflections of lamps over what they have; 1 where none is seen."""
+    """[N] ratios of the radiance that photographs leave to reflections of lamps to the rendered one; 1 if unseen."""
     left, had = scene.primary.means.new_zeros(2, len(scene.primary))
     for photograph, (_, lit) in zip(photographs, seen, strict=True):
         layers = Planar(nearest_only=True)(scene, photograph.camera).layers
@@ -605,13 +603,13 @@ def _gains_of(scene: Scene, seen: Sequence[LitPixels], photographs: Sequence[Pho
 UNCOVERED = 0.5
 """Coverage of the mirrored image below which it counts as a hole."""
 HOLE_CAMERAS, RAYS_ACROSS, CELLS_ACROSS = 24, 40, 40
-"""Cameras that look for holes, rays across an image, and cells across the room with a place each."""
+"""Number of cameras that find holes, of rays across an image, and of cells across the room, with one position each."""
 BEYOND = 0.05
-"""Of the Gaussians, how many are farther from the middle of the cameras than the end of the room."""
+"""Share of the Gaussians that are farther from the middle of the cameras than the end of the room."""
 
 
 class Unseen(NamedTuple):
-    """Places [P, 3] that panes mirror and no photograph shows, their likely colour [3], sRGB, and their distance."""
+    """Positions [P, 3] that panes mirror and no photograph shows, their likely colour [3], sRGB, and their spacing."""
 
     places: Tensor
     color: Tensor
@@ -620,14 +618,14 @@ class Unseen(NamedTuple):
 
 @torch.no_grad()
 def unseen_places(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Unseen:
-    """Places at the end of the room that panes mirror, and where no Gaussian stands.
+    """Positions at the end of the room that panes mirror and that no Gaussian covers.
 
-    A pane cannot mirror nothing. What is dark in its image for want of Gaussians, the transmission has too much of.
+    A pane always mirrors something. Where its image is dark for lack of Gaussians, the transmission is too bright.
 
     Args:
         scene: with the panes.
         panes: of glass.
-        cameras: of the photographs; some of them are enough.
+        cameras: of the photographs; a subset of them is used.
     """
     device = scene.primary.means.device
     cameras = [camera.to(device) for camera in evenly(cameras, HOLE_CAMERAS)]
@@ -642,7 +640,7 @@ def unseen_places(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Uns
             colors.append(image.color[image.seen & (image.coverage > LEAST_COVERAGE)].clamp(0, 1))
             places.append(_ends_of_rays(pane, camera, image.seen & (image.coverage < UNCOVERED), middle, radius))
     found, known = torch.cat(places), torch.cat(colors)
-    # In the axes of a camera, so that it does not matter which way the world is turned.
+    # In the axes of a camera, so that the result does not depend on the orientation of the world.
     size = 2 * radius / CELLS_ACROSS
     cells = ((found - middle) @ cameras[0].cam_from_world[:3, :3].T / size).floor().long()
     _, cell = torch.unique(cells, dim=0, return_inverse=True)
@@ -652,7 +650,7 @@ def unseen_places(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Uns
 
 
 def _ends_of_rays(pane: Planes, camera: Camera, hole: Tensor, middle: Tensor, radius: Tensor) -> Tensor:
-    """[P, 3] where rays through some pixels of a hole [H, W] leave a sphere, once the pane has mirrored them."""
+    """[P, 3] points where rays through pixels of a hole [H, W], mirrored by the pane, leave a sphere."""
     step = max(camera.width // RAYS_ACROSS, 1)
     row, column = (hole[::step, ::step].nonzero() * step + 0.5).to(middle).unbind(dim=1)
     x, y = (column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy

@@ -1,12 +1,12 @@
-"""The objective of a pane's plane: how well edges, outline, points and frame fit it.
+"""The objective for a pane's plane: the fit of edges, outline, points and frame.
 
-Where a plane is the pane's, the mask's edge in one view lands on the edge in every other. Two things disturb that, and
-both are known from the geometry:
+On the pane's own plane, the mask's edge in one view lands on the edge in every other. Two effects disturb this, and
+both follow from the geometry:
 
-- A frame stands out from the glass by some height. To a camera inside of the pane's outline the edge is where the
-  glass meets the frame, which is on the plane. A camera that looks in from beyond an edge sees the glass end at the top
-  of the frame instead. For a camera h above the plane and a beyond the edge's line, a frame of height d hides d a / h.
-- A pixel covers more of the plane in a view from far away or at a grazing angle, and its edge is that much less exact.
+- A frame protrudes from the glass by some height. For a camera within the pane's outline, the edge is where the glass
+  meets the frame, which is on the plane. A camera beyond an edge sees the glass end at the top of the frame instead.
+  For a camera at height h above the plane and distance a beyond the edge's line, a frame of height d hides d a / h.
+- A pixel covers more of the plane in a view from far away or at a grazing angle, so its edge is less accurate there.
 """
 
 from __future__ import annotations
@@ -36,22 +36,21 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 UNEVEN_FRAME = 0.15
-"""By how much the height of a frame may differ from place to place, as a share of it."""
+"""Variation of the height of a frame along its pane's outline, as a share of the height."""
 
 
 @dataclass(frozen=True)
 class EdgeMatches:
-    """Mask edges of V views, followed over H planes into each other.
+    """Mask edges of V views, mapped into each other over H planes.
 
     Attributes:
-        distances: [H, V, P] how far edge point p lands from the edge in view v, in image diagonals, positive on the
-            pane; scaled so that a doubt of one pixel in both views counts alike on every plane and in every pair.
-        shifts: [H, V, P] the part of that distance which a frame hides, per world unit of its height.
-        compared: [H, V, P] whether there is anything to compare: the edge point lands inside of the image of another
-            view. The distance is 0 where there is not.
-        turns: [H, P] by how much the edge at point p is turned against the pane's sides, if it is a rectangle:
-            the sine of twice the angle.
-        sources: [P] the view whose mask's edge point p lies on.
+        distances: [H, V, P] distances of mapped edge point p from the edge in view v, in image diagonals, positive on
+            the pane; scaled so that an error of one pixel in both views weighs the same on every plane and in any pair.
+        shifts: [H, V, P] part of that distance caused by a frame, per world unit of its height.
+        compared: [H, V, P] true if the edge point lands inside the image of another view. Other distances are 0.
+        turns: [H, P] deviation of the edge at point p from the directions of a rectangular pane's sides: the sine of
+            twice the angle.
+        sources: [P] the view that edge point p comes from.
     """
 
     distances: Array
@@ -61,19 +60,19 @@ class EdgeMatches:
     sources: NDArray[np.int64]
 
     def residuals(self, frames: Array, tolerance: float) -> Array:
-        """[H, V, P] distances that frames [H] of some height leave unexplained, in units of the tolerance."""
+        """[H, V, P] distances not explained by frames of heights [H], in units of the tolerance."""
         hidden = frames[:, None, None] * self.shifts
-        # A frame is not equally high all round.
+        # The height of a frame varies along the outline.
         return (self.distances - hidden) / np.sqrt(tolerance**2 + (UNEVEN_FRAME * hidden) ** 2)
 
 
 def edge_matches(planes: PlaneEquations, views: Sequence[PaneView], *, edges_per_view: int) -> EdgeMatches:
-    """Follows the mask edge of each view to each other view.
+    """Maps the mask edge of each view into every other view.
 
     Args:
         planes: H hypotheses.
         views: V annotated views of one pane.
-        edges_per_view: number of edge points followed from each view.
+        edges_per_view: number of edge points taken from each view.
     """
     thinned = [slice(None, None, max(len(view.edge) // edges_per_view, 1)) for view in views]
     points = [view.edge[chosen] for view, chosen in zip(views, thinned, strict=True)]
@@ -90,8 +89,8 @@ def edge_matches(planes: PlaneEquations, views: Sequence[PaneView], *, edges_per
 def _turns(planes: PlaneEquations, outward: Array) -> Array:
     """[H, P] sine of twice the angle between directions in the plane and the nearest side of the pane.
 
-    Its sign is that against the side across which most edges lie, whatever axes the plane has: with another sign after
-    a small move there would be no slope to follow.
+    Its sign is relative to the dominant direction of the edges, whatever the axes of the plane: a sign that flips after
+    a small move would invalidate the numerical derivatives.
     """
     if not outward.shape[1]:
         return np.zeros(outward.shape[:2])
@@ -105,18 +104,18 @@ def _turns(planes: PlaneEquations, outward: Array) -> Array:
 
 
 NEAREST, FARTHEST = 0.05, 20.0
-"""Depths between which panes are looked for, in units of the distance between the annotated cameras."""
+"""Minimum and maximum depth at which panes are searched for, in units of the distance between the annotated cameras."""
 MOST_OBLIQUE = 0.1
-"""Cosine between a pane's normal and a ray through its mask below which no plane is drawn."""
+"""Cosine between a plane's normal and a ray through the mask below which a random plane is dropped."""
 
 
 def planes_through_masks(views: Sequence[PaneView], count: int, rng: np.random.Generator) -> PlaneEquations:
-    """`count` random planes, each through a pixel of a mask and facing that camera.
+    """Up to `count` random planes, each through a pixel of a mask and facing that camera.
 
-    Depths are uniform in their logarithm, normals uniform on the half sphere.
+    Depths are log-uniform, normals uniform on the hemisphere; planes at grazing angles are dropped.
 
     Args:
-        views: annotated views of the pane, at least two from different places.
+        views: annotated views of the pane, at least two from different positions.
         count: number of planes.
         rng: source of randomness.
     """
@@ -144,7 +143,7 @@ def pane_centers(planes: PlaneEquations, views: Sequence[PaneView]) -> Array:
     found, seen = np.zeros((len(planes), 3)), np.zeros(len(planes))
     for view in views:
         points, hit = meet(planes, view.center, view.directions(view.middle))
-        # A view that hardly sees the plane puts its middle far away.
+        # A view at a grazing angle places the middle far away.
         rays = points[:, 0] - view.center
         squared = np.maximum(np.einsum("hd,hd->h", rays, rays), np.finfo(np.float64).tiny)
         weights = np.where(hit[:, 0], 1 / squared, 0)
@@ -184,19 +183,19 @@ def move_planes(planes: PlaneEquations, anchors: Array, steps: Array) -> PlaneEq
 
 
 COARSE, MIDDLE, FINE = 0.01, 0.004, 0.002
-"""Distances, in image diagonals, at which the loss of two mask edges that do not meet is one half."""
+"""Distances between mask edges, in image diagonals, at which their loss is one half."""
 POINTS_WEIGHT = 0.1
-"""Weight of the points on a plane against the mask edges: they decide what the edges leave open."""
+"""Weight of the points on a plane relative to the mask edges; they decide where the edges are ambiguous."""
 OUTLINE_WEIGHT, OUTLINE_TOLERANCE = 0.1, 0.2
-"""Weight of a rectangular outline against the mask edges, and the sine at which its loss is one half."""
+"""Weight of a rectangular outline relative to the mask edges, and the sine at which its loss is one half."""
 USUAL_FRAME, FRAME_WEIGHT = 0.02, 0.01
-"""Height of a frame over its glass that is not unlikely, scene extents, and the weight of that against the edges."""
+"""Typical height of a frame above its glass in scene extents, and the weight of this prior relative to the edges."""
 EDGES = 600
-"""Edge points that are followed, in all views together."""
+"""Number of edge points over all views together."""
 WHOLE_PARTS = 4
-"""Panes in one plane that have so many each; more of them share as many."""
+"""Number of coplanar panes up to which each has `EDGES` edge points; more panes share the same total."""
 PIXELS = 600
-"""Pixels whose rays are followed to compare masks, in all views together."""
+"""Number of pixels mapped to compare masks, over all views together."""
 
 
 @dataclass(frozen=True)
@@ -222,13 +221,13 @@ class Terms:
 
 @dataclass(frozen=True)
 class Objective:
-    """Everything known about one pane.
+    """Evidence for the plane of one pane.
 
     Attributes:
         views: annotated views of the pane, at least two.
-        points: [N, 3] points along its edge; there may be none.
+        points: [N, 3] points along its edge, possibly none.
         extent: radius of the capture in world units.
-        distance: of a point from its plane at which its loss is one half, world units.
+        distance: of a point from the plane at which its loss is one half, world units.
     """
 
     views: Sequence[PaneView]
@@ -237,13 +236,13 @@ class Objective:
     distance: float
 
     def support(self, planes: PlaneEquations) -> Array:
-        """[H] share of the points near each plane; 0 where there are no points."""
+        """[H] share of the points near each plane; 0 if there are no points."""
         if not len(self.points):
             return np.zeros(len(planes))
         return support(planes, self.points, distance=self.distance)
 
     def agreement(self, planes: PlaneEquations) -> Array:
-        """[H] how well the masks agree on each plane."""
+        """[H] agreement of the masks on each plane (`mask_agreement`)."""
         return mask_agreement(planes, self.views, pixels_per_view=max(PIXELS // len(self.views), 1))
 
     def anchors(self, planes: PlaneEquations) -> Array:
@@ -261,8 +260,8 @@ class Objective:
 
         Args:
             planes: hypotheses.
-            tolerance: distance of mask edges at which the loss is one half, in image diagonals; at least a pixel is
-                taken, because a mask drawn in pixels says no more than that.
+            tolerance: distance of mask edges at which the loss is one half, in image diagonals; at least one pixel is
+                used, because masks are no more accurate.
             edges: number of edge points in all views together.
         """
         tolerance = max(tolerance, *(1 / view.diagonal for view in self.views))
@@ -286,10 +285,10 @@ class Objective:
 
 @dataclass(frozen=True)
 class JointObjective:
-    """Everything known about several panes in one plane, behind frames of one height; each pane counts alike.
+    """Evidence for the common plane of several panes, whose frames are equally high; each pane has the same weight.
 
     Attributes:
-        parts: what is known about each pane, at least one.
+        parts: evidence for each pane, at least one.
     """
 
     parts: Sequence[Objective]
@@ -300,7 +299,7 @@ class JointObjective:
         return self.parts[0].extent
 
     def agreement(self, planes: PlaneEquations) -> Array:
-        """[H] how well the masks agree on each plane, in the mean over the panes."""
+        """[H] agreement of the masks on each plane, averaged over the panes."""
         return self._mean([part.agreement(planes) for part in self.parts])
 
     def anchors(self, planes: PlaneEquations) -> Array:
@@ -308,11 +307,11 @@ class JointObjective:
         return self._mean([part.anchors(planes) for part in self.parts])
 
     def reach(self, planes: PlaneEquations) -> Array:
-        """[H] median distance of the cameras from the middle of a pane, in the mean over the panes."""
+        """[H] median distance of the cameras from the middle of a pane, averaged over the panes."""
         return self._mean([part.reach(planes) for part in self.parts])
 
     def terms(self, planes: FramedPlanes, tolerance: float, *, edges: int = EDGES) -> Terms:
-        """The residuals of H planes; as `Objective.terms`, with so many edge points for each pane, or fewer of many."""
+        """The residuals of H planes, as `Objective.terms`; with `edges` points for each pane, or fewer for many."""
         each = edges * min(len(self.parts), WHOLE_PARTS) // len(self.parts)
         terms = [part.terms(planes, tolerance, edges=each) for part in self.parts]
         return Terms(
@@ -326,27 +325,27 @@ class JointObjective:
         return mean
 
 
-OUTLINE_PIXELS = 4000  # Of the mask of each view, that are followed onto the plane.
-CELLS = 128  # Along the longer side of the map of the plane.
-GRAZING = 0.06  # Cosine to the normal below which a pixel covers too much of the plane to say where the pane ends.
-SMALLEST_PART = 0.05  # Of the largest connected part; below it a part is an error in a mask.
-AGREEMENT = 0.34  # Share of the views that must show the pane where they look; the others may be occluded.
+OUTLINE_PIXELS = 4000  # Number of pixels of each view; those of the mask are projected onto the plane.
+CELLS = 128  # Number of grid cells along the longer side of the map of the plane.
+GRAZING = 0.06  # Cosine to the normal below which a pixel covers too much of the plane to locate the pane's border.
+SMALLEST_PART = 0.05  # Share of the largest connected part below which a part is an error in a mask.
+AGREEMENT = 0.34  # Minimum share, of the views of a point, that show the pane there; others may be occluded.
 
 
 def pane_rectangle(plane: PlaneEquations, views: Sequence[PaneView], axes: Array) -> Rectangle:
-    """The smallest rectangle, on one plane, around everything that the masks call pane.
+    """The smallest rectangle, on one plane, around the region of the pane in the masks.
 
-    Follows the masks' pixels to the plane instead of bounding the inliers of the plane fit, as the
-    paper's Appendix A does: points on a frame are few, and a corner without any would be cut off.
+    The paper's Appendix A bounds the inliers of the plane fit. Here the masks' pixels are projected onto the plane
+    instead: points on a frame are few, and a corner without any would be cut off.
 
     Args:
         plane: one plane.
         views: annotated views of the pane.
-        axes: [2, 3] orthonormal directions in the plane, in which the rectangle is expressed;
-            its origin is the point of the plane nearest to the world's.
+        axes: [2, 3] orthonormal directions in the plane, in which the rectangle is expressed; its origin is the point
+            of the plane nearest to the world's origin.
 
     Raises:
-        ValueError: no part of the plane is pane in enough views.
+        ValueError: no part of the plane shows the pane in enough views.
     """
     foot = plane.normals[0] * plane.offsets[0]
     seen = np.concatenate([_pixels_on_plane(plane, view) for view in views])
@@ -363,7 +362,7 @@ def pane_rectangle(plane: PlaneEquations, views: Sequence[PaneView], axes: Array
 
 
 def _pixels_on_plane(plane: PlaneEquations, view: PaneView) -> Array:
-    """[P, 3] where the plane is seen through the pixels of a mask."""
+    """[P, 3] points of the plane that are seen through the pixels of a mask."""
     pixels = view.grid(OUTLINE_PIXELS)
     directions = view.directions(pixels[view.covers(pixels, np.ones(len(pixels), dtype=bool))])
     points, hit = meet(plane, view.center, directions)
@@ -371,7 +370,7 @@ def _pixels_on_plane(plane: PlaneEquations, view: PaneView) -> Array:
 
 
 def _is_pane(points: Array, views: Sequence[PaneView], normal: Array) -> Mask:
-    """[P] bool: whether enough of the views whose image holds a point [P, 3] of the plane show pane there."""
+    """[P] bool: points [P, 3] of the plane at which enough of the views that contain them show the pane."""
     shown, held_count = np.zeros(len(points)), np.zeros(len(points))
     for view in views:
         pixels, held = view.project(points)

@@ -1,6 +1,6 @@
-"""The search for a pane's plane: hypotheses from points and masks, judged and refined by the masks.
+"""The search for a pane's plane: hypotheses from points and masks, ranked and refined by the masks.
 
-Where a pane mirrors many measured points, these place it, too.
+If a pane mirrors many measured points, these help to position it.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ Evidence = Objective | JointObjective
 
 ITERATIONS = 15
 STEP = 3e-4
-"""Step of the numerical derivative: radians, distances of the cameras, scene extents. A fraction of a pixel."""
+"""Step of the numerical derivative, a fraction of a pixel: in radians, distances of the cameras, scene extents."""
 SMALLEST_CURVATURE = 1e-12
 FIRST_DAMPING, EASE, STIFFEN = 1e-2, 0.3, 5.0
 NOTICEABLE = 0.01
-"""Share of the largest possible cost."""
+"""Change of the cost that counts as noticeable, as a share of its maximum."""
 SETTLED = 1e-4
-"""Change of a parameter below which a plane has arrived."""
+"""Change of a parameter below which a plane has converged."""
 
 
 def refine_planes(planes: FramedPlanes, objective: Evidence, tolerances: Sequence[float]) -> FramedPlanes:
-    """Each plane after tilt, offset and height of the frame have minimised the objective.
+    """Each plane after minimising the objective over tilt, offset and height of the frame.
 
-    The Geman-McClure loss ignores what is far off, and it must: where something stands before the pane, the mask's edge
-    is not the pane's and matches no other view.
+    The Geman-McClure loss ignores outliers, as it must: where the pane is occluded, the mask's edge is not the pane's
+    and matches no other view.
 
     Args:
         planes: H planes to start from.
-        objective: what is known about the pane.
-        tolerances: distances of mask edges at which the loss is one half, in image diagonals, one after the other.
+        objective: evidence for the plane.
+        tolerances: distances of mask edges at which the loss is one half, in image diagonals, applied in sequence.
     """
     for tolerance in tolerances:
         planes = _minimise(planes, objective, tolerance)
@@ -59,7 +59,7 @@ def refine_planes(planes: FramedPlanes, objective: Evidence, tolerances: Sequenc
 
 
 def _minimise(planes: FramedPlanes, objective: Evidence, tolerance: float) -> FramedPlanes:
-    """All planes after damped steps; those that have arrived are left where they are."""
+    """All planes after damped Gauss-Newton steps; converged planes are moved no further."""
     count = len(planes)
     damping, active = np.full(count, FIRST_DAMPING), np.arange(count)
     anchors, scales = objective.anchors(planes.planes), _scales(planes, objective)
@@ -80,7 +80,7 @@ def _minimise(planes: FramedPlanes, objective: Evidence, tolerance: float) -> Fr
 
 
 def _scales(planes: FramedPlanes, objective: Evidence) -> Array:
-    """[H, 4] what a step of one means for each plane: a radian twice, a distance of the cameras, a scene extent."""
+    """[H, 4] units of each plane's parameters: a radian for two tilts, a distance of the cameras, a scene extent."""
     ones = np.ones(len(planes))
     return np.stack([ones, ones, objective.reach(planes.planes), objective.extent * ones], axis=1)
 
@@ -109,19 +109,19 @@ def _nearby(
 
 
 def _loss_weights(terms: Terms) -> Array:
-    """[H, M] weights with which least squares have the slope of the Geman-McClure loss."""
+    """[H, M] weights with which least squares have the gradient of the Geman-McClure loss."""
     weights: Array = terms.weights / (1 + terms.residuals**2) ** 2
     return weights
 
 
 def _products(first: Array, second: Array) -> Array:
-    """[H, 4, 4] sums of products of slopes [4, H, M]."""
+    """[H, 4, 4] sums of products of derivatives [4, H, M]."""
     found: Array = np.einsum("ahm,bhm->hab", first, second)
     return found
 
 
 def _step_planes(planes: FramedPlanes, anchors: Array, steps: Array) -> FramedPlanes:
-    """The planes after steps [H, 4]: two tilts, a shift, a change of the frame, which has no negative height."""
+    """The planes after steps [H, 4]: two tilts, a shift, and a change of the frame's height, clamped at 0."""
     return FramedPlanes(move_planes(planes.planes, anchors, steps[:, :3]), np.maximum(planes.frames + steps[:, 3], 0))
 
 
@@ -133,13 +133,13 @@ def _replace_planes(planes: FramedPlanes, index: NDArray[np.int64], others: Fram
 
 
 def tilt_uncertainty(planes: FramedPlanes, objective: Evidence, tolerance: float) -> Array:
-    """[H] angle, radians, by which each plane could turn before its cost shows a change of `NOTICEABLE`.
+    """[H] angle in radians by which each plane can tilt before its cost changes by `NOTICEABLE`.
 
-    The plane is free to shift and the frame to grow meanwhile. The Gauss-Newton matrix at the plane tells.
+    It follows from the Gauss-Newton matrix at the plane, where shift and frame height are free to adapt.
     """
     anchors, scales = objective.anchors(planes.planes), _scales(planes, objective)
     here, residuals = _nearby(planes, objective, tolerance, anchors, scales)
-    # Where an edge comes into an image, or leaves it, a residual jumps from zero or to it, which is no slope.
+    # Where an edge point enters or leaves an image, its residual jumps from or to zero, which is not a derivative.
     jacobian = np.where((residuals == 0) == (here.residuals == 0), residuals - here.residuals, 0) / STEP
     hessian = _products(jacobian * _loss_weights(here), jacobian)
     turns = np.linalg.inv(hessian + SMALLEST_CURVATURE * np.eye(4))[:, :2, :2]
@@ -148,47 +148,47 @@ def tilt_uncertainty(planes: FramedPlanes, objective: Evidence, tolerance: float
 
 
 AGREEMENT_WEIGHT = 0.1
-"""Weight of the agreement of the masks against that of their edges, which know of frames."""
+"""Weight of the agreement of the masks relative to that of their edges, which account for frames."""
 POOL, LEAST_OF_BEST = 200, 0.5
-"""Number of the hypotheses on which the masks agree best whose edges are compared, and the share of the best agreement
-below which no edges are looked at."""
+"""Number of hypotheses with the best mask agreement whose edges are compared, and the share of the best agreement below
+which edges are not considered."""
 BY_AREAS, BY_EDGES, CHILDREN = 12, 6, 30
-"""Number of hypotheses that are followed because masks agree on them, and because edges meet, and of the planes tried
-around each of them in each round."""
+"""Number of hypotheses that are kept for the agreement of masks, and for that of edges, and of the planes tried around
+each of them in each round."""
 ROUNDS = ((0.3, 0.1, 2 * COARSE), (0.1, 0.03, COARSE))
 """Spread of these (radians, distances of the cameras from the pane) and tolerance of the edges, for each round."""
 SHAKE = (0.03, 0.01, MIDDLE)
 """The same for the last round, between two refinements."""
 MOST_STARTS = 6
-"""Planes from which that of several panes is looked for."""
+"""Maximum number of planes from which the search for a joint plane starts."""
 FRAME_SPREAD = 0.5
 """Standard deviation of the logarithm of the height of frames in each round."""
 COARSE_EDGES = 200
-"""Edge points, in all views together, while hypotheses are many."""
+"""Number of edge points over all views together, while there are many hypotheses."""
 ONE_SURFACE, LARGEST_RISE = float(np.radians(8)), 0.05
-"""Angle between the planes of two panes, and distance of the one's middle from the other's plane in scene extents, up
-to which it is tried whether they lie in one plane."""
+"""Maximum angle between the planes of two panes, and distance of the one's middle from the other's plane in scene
+extents, for which a joint plane is tried."""
 HIGHEST_FRAME = 0.1
-"""Height of a frame over its glass, in scene extents, above which a plane is taken for a wrong one."""
+"""Height of a frame above its glass, in scene extents, above which a plane is treated as wrong."""
 
 
 def best_plane(objective: Objective, *, hypotheses: int, refine: int, rng: np.random.Generator) -> FramedPlanes:
     """The one plane on which the masks of all views coincide best.
 
     Hypotheses pass through triplets of points, as in RANSAC, and through pixels of the masks, because a pane may have
-    no points on its frame. The agreement of the masks ranks them. The best ones are followed by random search, refined,
-    shaken and refined again, as the loss has many local minima where posts or plants hide parts of the pane.
+    no points on its frame. The agreement of the masks ranks them. The best ones are improved by random search, refined,
+    perturbed and refined again, because the loss has many local minima where posts or plants occlude parts of the pane.
 
     Args:
-        objective: views of the pane, at least two, and candidate points, of which there may be none.
+        objective: views of the pane, at least two, and candidate points, possibly none.
         hypotheses: number of planes drawn through triplets of points, and again through the masks.
-        refine: number of planes that are refined at last.
+        refine: number of planes in the last refinement.
         rng: source of randomness.
     """
     beam = first_hypotheses(objective, hypotheses, rng)
     for tilt, shift, tolerance in ROUNDS:
         beam = _follow_beam(beam, objective, (tilt, shift), tolerance, rng)
-    # Of a pane that things hide in every mask, planes far behind frames of any height may outdo its own.
+    # If a pane is occluded in every mask, planes far behind impossibly high frames may fit better than its own.
     beam = _possible(_best_planes(refine_planes(beam, objective, (COARSE, MIDDLE)), objective), objective)
     tilt, shift, tolerance = SHAKE
     shaken = _follow_beam(beam, objective, (tilt, shift), tolerance, rng)
@@ -199,11 +199,11 @@ def best_plane(objective: Objective, *, hypotheses: int, refine: int, rng: np.ra
 
 
 def best_joint_plane(objective: JointObjective, starts: FramedPlanes, rng: np.random.Generator) -> FramedPlanes:
-    """The one plane on which the masks of several panes coincide best, near those that they led to one by one.
+    """The one plane on which the masks of several panes coincide best, near the planes of the single panes.
 
     Args:
-        objective: what is known about the panes.
-        starts: the plane of each, fitted alone; of many, those are followed on which all masks coincide best.
+        objective: evidence for all panes.
+        starts: the plane of each pane, fitted alone; of many, only those on which all masks coincide best are used.
         rng: source of randomness.
     """
     beam = starts
@@ -217,17 +217,17 @@ def best_joint_plane(objective: JointObjective, starts: FramedPlanes, rng: np.ra
 
 
 def in_one_surface(one: FramedPlanes, other: FramedPlanes, objectives: tuple[Objective, Objective]) -> bool:
-    """Return whether two panes, from their planes fitted one by one, may lie in one surface.
+    """Return whether two panes, whose planes were fitted separately, may lie in one surface.
 
     Args:
         one: plane of the first pane.
         other: plane of the second pane.
-        objectives: what is known about each.
+        objectives: evidence for each.
     """
     if angle(one, other) > ONE_SURFACE:
         return False
     middles = [objective.anchors(plane.planes) for objective, plane in zip(objectives, (one, other), strict=True)]
-    # Of the two planes one may be turned about its own middle, so that it passes the other's far off.
+    # One of the planes may be tilted about its own middle, and so miss the other's middle by far.
     rises = abs(one.planes.distances(middles[1])), abs(other.planes.distances(middles[0]))
     return float(np.min(rises)) <= LARGEST_RISE * objectives[0].extent
 
@@ -239,17 +239,17 @@ def contradiction(
     *,
     edges: int = EDGES,
 ) -> Array:
-    """[H] what tells against planes, their masks included, at several tolerances; in no unit, near 0 on the pane."""
+    """[H] evidence against planes: cost, averaged over tolerances, less mask agreement; no unit, near 0 on the pane."""
     costs = [objective.terms(planes, tolerance, edges=edges).cost for tolerance in tolerances]
     mean: Array = np.mean(costs, axis=0) - AGREEMENT_WEIGHT * objective.agreement(planes.planes)
     return mean
 
 
 def first_hypotheses(objective: Objective, count: int, rng: np.random.Generator) -> FramedPlanes:
-    """The planes, of those drawn through points and masks, on which the masks agree best, or their edges.
+    """The planes, of those drawn through points and masks, on which the masks or their edges agree best.
 
-    Areas lead there from afar. But where a pane fills most of the photographs they agree by more than nine tenths on
-    planes that are off by a right angle, and only edges tell.
+    Areas guide the search from afar. But if a pane fills most of the photographs, they agree by more than nine tenths
+    even on planes that are off by a right angle, and only edges discriminate.
     """
     drawn = [planes_through_masks(objective.views, count, rng)]
     if len(objective.points) >= 3:
@@ -268,7 +268,7 @@ def first_hypotheses(objective: Objective, count: int, rng: np.random.Generator)
 def _follow_beam(
     beam: FramedPlanes, objective: Evidence, spread: tuple[float, float], tolerance: float, rng: np.random.Generator
 ) -> FramedPlanes:
-    """The best plane around each of the beam's, best first."""
+    """The best of the planes sampled around each plane of the beam, best first."""
     tilt, shift = spread
     shifts = shift * objective.reach(beam.planes)
     around = planes_nearby(beam.planes, objective.anchors(beam.planes), CHILDREN, tilt=tilt, shift=shifts, rng=rng)
@@ -281,21 +281,21 @@ def _follow_beam(
 
 
 def _possible(planes: FramedPlanes, objective: Evidence) -> FramedPlanes:
-    """The planes whose frames are no higher than frames are; all of them if there is none."""
+    """The planes whose frames have a possible height; all planes if there are none."""
     kept = np.flatnonzero(_has_possible_frames(planes, objective))
     return planes.select(kept) if len(kept) else planes
 
 
 def _has_possible_frames(planes: FramedPlanes, objective: Evidence) -> NDArray[np.bool_]:
-    """[K] whether the frames before the planes are no higher than frames are."""
+    """[K] bool: planes whose frames have a possible height."""
     possible: NDArray[np.bool_] = planes.frames <= HIGHEST_FRAME * objective.extent
     return possible
 
 
 def _best_planes(planes: FramedPlanes, objective: Evidence, *, least: int = 0) -> FramedPlanes:
-    """The first so many planes, and all others that the masks do not rule out besides the best.
+    """The first `least` planes, and all others whose mask agreement is not far below the best.
 
-    Where other panes or posts hide much of a pane, edges that meet by chance may outdo its own.
+    Where other panes or posts occlude much of a pane, edges that meet by chance may fit better than its own.
     """
     agreement = objective.agreement(planes.planes)
     kept = (agreement >= LEAST_OF_BEST * agreement.max()) | (np.arange(len(planes)) < least)
@@ -306,27 +306,27 @@ log = logging.getLogger("glassplat.panes")
 
 
 class Fit(NamedTuple):
-    """A plane and what it was fitted to, for messages."""
+    """A plane, and the name of the points that it was fitted to."""
 
     source: str
     plane: FramedPlanes
 
 
 def score(plane: FramedPlanes, evidence: Objective) -> float:
-    """Support of masks and points for a plane: 1 where all outlines meet and all points lie on it, free of scale."""
+    """Support of masks and points for a plane, free of scale: 1 if all outlines meet and all points lie on it."""
     return 1 - float(contradiction(plane, evidence)[0])
 
 
 def best_supported(label: int, fits: Sequence[Fit], evidence: Objective) -> FramedPlanes:
-    """The plane with the highest score, the first one of equals; says so in the log.
+    """The plane with the highest score, the first one of equals; logs all scores.
 
-    One behind an impossibly high frame counts only if all are.
+    Planes behind impossibly high frames count only if there are no others.
 
     Args:
         label: of the pane.
         fits: at least one.
-        evidence: the masks, and the points that were measured, not made by training. A first scene explains reflections
-            by Gaussians behind the pane, and many of them lie where nothing is.
+        evidence: the masks, and measured points rather than points made by training. A first scene explains reflections
+            by Gaussians behind the pane, many of them in empty space.
     """
     scores = [score(fit.plane, evidence) for fit in fits]
     possible = [n for n, fit in enumerate(fits) if _has_possible_frames(fit.plane, evidence)[0]]
@@ -342,21 +342,21 @@ def best_supported(label: int, fits: Sequence[Fit], evidence: Objective) -> Fram
 
 
 def angle(one: FramedPlanes, other: FramedPlanes) -> float:
-    """Radians between the first planes of two sets, whichever way they face."""
+    """Angle in radians between the first planes of two sets, regardless of the signs of their normals."""
     first, second = one.planes.normals[0], other.planes.normals[0]
     return float(np.arctan2(np.linalg.norm(np.cross(first, second)), abs(first @ second)))
 
 
 IMAGE_TURN, IMAGE_TURN_STEP = 15.0, 0.75
 IMAGE_SHIFT, IMAGE_SHIFT_STEP = 0.06, 0.01
-"""Planes that are tried about the one of the masks: degrees of tilt along two axes, shifts in scene extents."""
+"""Ranges and steps of the search around the plane of the masks: two tilts in degrees, a shift in scene extents."""
 IMAGE_TOLERANCE = 0.01
-"""Distance between a point and another one's mirror image at which they are still one, in scene extents."""
+"""Standard deviation of the distance between a point and the mirror image of another that match, in scene extents."""
 LEAST_IMAGES, LEAST_PEAK, PEAK_WIDTH = 12.0, 1.4, 3.0
-"""Pairs of points and mirror images that place a plane; how many times those of any plane turned by more than so many
-degrees. Of 27 panes of drawn rooms 10 have such a peak, each within 0.6 degrees of the true plane."""
+"""Pairs of points and mirror images that determine a plane, and their minimum ratio to those of any plane tilted by
+more than the given degrees. Of 27 panes in synthetic rooms, 10 have such a peak, within 0.6 degrees of the truth."""
 MOST_BEFORE = 0.5
-"""Share of the pairs that the plane of the masks has already, from which it is as good."""
+"""Share of the pairs that the plane of the masks needs to count as equally good."""
 MOST_IMAGES, MOST_CELLS = 500, 200
 HALVINGS = 4
 
@@ -366,9 +366,9 @@ class Images(NamedTuple):
 
     Attributes:
         plane: H = 1 plane.
-        pairs: of a point and a mirror image, each weighted by how near they are.
-        before: those on the plane about which the search began.
-        peak: their number over that of the best plane turned elsewhere.
+        pairs: number of pairs of a point and a mirror image, each weighted by proximity.
+        before: number of pairs on the plane at which the search starts.
+        peak: ratio of the number of pairs to that of the best plane tilted elsewhere.
     """
 
     plane: PlaneEquations
@@ -378,7 +378,7 @@ class Images(NamedTuple):
 
     @property
     def is_clear(self) -> bool:
-        """Return whether they place the plane, and elsewhere than it was."""
+        """Return whether the pairs determine a plane, and another one than before."""
         elsewhere = self.before < MOST_BEFORE * self.pairs
         return elsewhere and self.pairs >= LEAST_IMAGES and self.peak >= LEAST_PEAK
 
@@ -386,19 +386,19 @@ class Images(NamedTuple):
 def plane_of_images(plane: PlaneEquations, middle: Array, behind: Array, others: Array, extent: float) -> Images | None:
     """The plane near the first one of `plane` that maps most points seen through a pane onto others.
 
-    Structure from motion places points on mirrored things where they seem to be. The true plane of a mirror maps them
-    onto the things themselves, which a plane of ragged masks misses by twice its error. Behind glass they are few
-    among those that are really there, which meet others by chance.
+    Structure from motion places points on mirrored objects at their virtual positions. The true plane of a mirror maps
+    them onto the objects themselves, which a plane of ragged masks misses by twice its error. Behind glass they are few
+    among real points, which match others by chance.
 
     Args:
-        plane: about which to search.
-        middle: [3] point of the pane, about which the planes turn.
+        plane: at which the search starts.
+        middle: [3] point of the pane, about which planes are tilted.
         behind: [V, 3] points that are seen through the pane.
         others: [P, 3] all other points.
         extent: radius of the capture in world units.
 
     Returns:
-        The best plane, clear or not; None where there are too few points.
+        The best plane, clear or not; None if there are too few points.
     """
     if len(behind) < LEAST_IMAGES or len(others) < LEAST_IMAGES:
         return None
@@ -420,7 +420,7 @@ def plane_of_images(plane: PlaneEquations, middle: Array, behind: Array, others:
     best = steps[np.unravel_index(counts.argmax(), counts.shape)]
     tilts = np.arctan(steps[..., :2]) - np.arctan(best[:2])
     elsewhere = counts[np.linalg.norm(tilts, axis=-1) > np.radians(PEAK_WIDTH)].max()
-    # The cells of the field are coarse; the distances themselves place the plane within a step.
+    # The cells of the field are coarse; exact distances refine the plane within a step.
     tree = cKDTree(others)
 
     def pairs(steps: Array) -> Array:
@@ -439,7 +439,7 @@ def plane_of_images(plane: PlaneEquations, middle: Array, behind: Array, others:
 
 
 def _closeness(points: Array, tolerance: float) -> Field:
-    """Nearness of places to the points, from 1 on one to 0 far off, a tolerance being one standard deviation.
+    """Proximity to the points, from 1 at a point to 0 far away; Gaussian, with the tolerance as standard deviation.
 
     The outermost points are left out.
     """
