@@ -1,4 +1,4 @@
-"""Every metric of a trained scene over the test views of its data set."""
+"""All metrics of a trained scene over the test views of its data set."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ NO_VIEW_TRUTH = "the ground truth lacks this view"
 
 
 class PaneRegions(NamedTuple):
-    """The pixels that show panes, by one source for the whole data set, so that means do not mix two.
+    """The pixels that show panes, from a single source for the whole data set, so that means do not mix sources.
 
     Attributes:
         source: description of the region for readers of the metrics.
-        of: the pixels of a view, its frame and its truth that show a pane, [H, W] bool, or why they are not known.
-        planes: fitted to the masks and to measured points, whatever was trained; None where masks are not the source.
+        of: returns the pixels of panes [H, W] bool from a view, its frame and its truth, or why they are unknown.
+        planes: fitted to masks and measured points, independent of training; None if masks are not the source.
     """
 
     source: str
@@ -55,11 +55,11 @@ TRUE_REGIONS = PaneRegions(
     "ground-truth pane labels", lambda view, frame, truth: NO_VIEW_TRUTH if truth is None else truth.labels > 0
 )
 RENDERED_REGIONS = PaneRegions("rendered mask > 0.5", _rendered_region)
-"""As the method itself renders them, so that methods may be scored over different pixels."""
+"""As rendered by the method itself, so methods may be scored over different pixels."""
 
 
 def marked_regions(planes: Planes) -> PaneRegions:
-    """The view's mask, or without one what the planes fitted to the masks cover; what stands before them included."""
+    """The view's mask or, without one, the area of the planes fitted to the masks, including objects in front."""
 
     def region(view: View, frame: Frame, truth: TrueView | None) -> Tensor | str:
         if view.pane_labels is not None:
@@ -71,7 +71,7 @@ def marked_regions(planes: Planes) -> PaneRegions:
 
 STEPS = 40
 FIRST_STEP, LAST_STEP = 1.5e-3, 5e-5
-"""Radians, and extents; steps shrink from the one to the other."""
+"""First and last learning rate of the alignment, in radians and extents; it decays exponentially."""
 SSIM_SHARE = 0.2
 Listener = Callable[[int, int], None]
 
@@ -79,16 +79,16 @@ Listener = Callable[[int, int], None]
 def with_aligned_test_views(
     scene: Scene, renderer: Renderer, dataset: Dataset, listen: Listener = lambda done, count: None
 ) -> Dataset:
-    """The capture with each test camera moved to where its photograph agrees best with the scene.
+    """The capture with each test camera moved to where the scene agrees best with its photograph.
 
-    Poses from structure from motion are off, and a scene whose training cameras were refined is at odds with those of
-    the test views through no fault of its own (as is done for NeRF--, BARF and nerfstudio).
+    Poses from structure from motion have errors, and a scene whose training cameras were refined does not match the
+    unrefined poses of test views. NeRF--, BARF and nerfstudio align test cameras in the same way.
 
     Args:
         scene: trained; not changed.
-        renderer: how photographs show it.
-        dataset: whose test views are aligned.
-        listen: is told how many views are done.
+        renderer: renders it as photographs show it.
+        dataset: with the test views to align.
+        listen: called with the numbers of finished views and of all views.
     """
     test = []
     for done, view in enumerate(dataset.test):
@@ -98,13 +98,13 @@ def with_aligned_test_views(
 
 
 def aligned_camera(scene: Scene, renderer: Renderer, view: View) -> Camera:
-    """The camera from which the scene looks most like the view's photograph, starting from the view's own.
+    """The camera from which the scene is most similar to the view's photograph, starting at the view's own.
 
-    The two are compared in the colours in which `evaluate` compares them.
+    The two are compared in the same colours as by `evaluate`.
 
     Args:
         scene: trained; gets no gradient.
-        renderer: how photographs show it.
+        renderer: renders it as photographs show it.
         view: photograph and camera.
     """
     device = scene.primary.means.device
@@ -122,7 +122,7 @@ def aligned_camera(scene: Scene, renderer: Renderer, view: View) -> Camera:
         loss = found.l1.lerp(1 - found.ssim, SSIM_SHARE)
         if (value := float(loss.detach())) < lowest:
             best, lowest = twist.detach().clone(), value
-        if not loss.requires_grad:  # Nothing of the scene is in sight.
+        if not loss.requires_grad:  # The scene is not visible.
             break
         loss.backward()
         optimizer.step()
@@ -131,16 +131,16 @@ def aligned_camera(scene: Scene, renderer: Renderer, view: View) -> Camera:
 
 
 MIRROR_STRENGTH = 0.999
-"""From this true strength on, nothing is transmitted."""
+"""True strength at and above which nothing is transmitted."""
 ALL_IGNORED = f"fewer than {metrics.SMALLEST_REGION} pixels are not ignored"
 LEFT_IGNORED = f"fewer than {metrics.SMALLEST_REGION} pixels of the left half are not ignored"
 TOO_FEW = f"fewer than {metrics.SMALLEST_REGION} pixels show a pane"
 
 SCENE_COLORS, NEIGHBOURS_COLORS = "the scene's own", "mean of the neighbouring photographs, by name"
-"""How test views are taken to be exposed."""
+"""Exposures assumed for test views."""
 
 Truths = tuple[GroundTruth | None, TrueView | None]
-"""What is known of the data set, and of one view."""
+"""Ground truth of the data set, and of one view."""
 
 
 @dataclass(frozen=True)
@@ -148,8 +148,8 @@ class Evaluation:
     """Metrics as plain data, ready to be written as JSON.
 
     Attributes:
-        results: one value per metric; where it is None, `<name>_reason` says why.
-        per_view: the same per view name, for the metrics that views have.
+        results: one value per metric; if it is None, `<name>_reason` gives the reason.
+        per_view: the same for every view by name, for metrics of single views.
     """
 
     results: dict[str, Any]
@@ -158,15 +158,15 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class EvaluatedView:
-    """A test view while its frame is at hand.
+    """A test view with its rendered frame.
 
     Attributes:
         view: the photograph and its camera.
-        frame: what was rendered, on the CPU, in the scene's colours.
-        truth: the true layers, where they are known.
-        surface: the true surface, where it is known.
+        frame: as rendered, on the CPU, in the scene's colours.
+        truth: the true layers, if known.
+        surface: the true surface, if known.
         metrics: as in `Evaluation.per_view`, without the reflection's, which needs all views.
-        exposures: of the photographs, with the one that this view is taken to have.
+        exposures: of the photographs, including the one assumed for this view.
     """
 
     view: View
@@ -178,7 +178,7 @@ class EvaluatedView:
 
     @property
     def photographed(self) -> Frame:
-        """The frame with its image in the colours of the photograph, as it was measured."""
+        """The frame with its image in the colours of the photograph, as used by the metrics."""
         return in_photograph_colors(self.frame, self.exposures, self.view.name)
 
 
@@ -186,7 +186,7 @@ ViewListener = Callable[[EvaluatedView], None]
 
 
 def in_photograph_colors(frame: Frame, exposures: Exposures, name: str) -> Frame:
-    """The frame with a layer `photographed` in the colours of that photograph; itself where it has the scene's."""
+    """The frame with a layer `photographed` in the colours of that photograph; unchanged without an exposure for it."""
     if name not in exposures.names:
         return frame
     image = exposures.apply(frame.photographed, name)
@@ -195,7 +195,7 @@ def in_photograph_colors(frame: Frame, exposures: Exposures, name: str) -> Frame
 
 @dataclass(frozen=True)
 class _Measurement:
-    """Contribution of one view; `reflection` holds rendered and true pane pixels until the gain is known."""
+    """Metrics of one view; `reflection` holds rendered and true pane pixels until the gain is known."""
 
     metrics: dict[str, metrics.Outcome]
     seconds: float
@@ -210,33 +210,33 @@ def evaluate(
     regions: PaneRegions | None = None,
     listen: ViewListener = lambda evaluated: None,
 ) -> Evaluation:
-    """Renders every test view and measures it, on uint8-quantised sRGB at the data set's resolution.
+    """Renders and evaluates every test view, in uint8-quantised sRGB at the data set's resolution.
 
-    `psnr`, `ssim` and `lpips` are means over the views, and so are `corrected_psnr`, after the affine transform of
-    colours that brings each render closest to its photograph, and `right_half_psnr`, of the right halves after that of
-    the left ones: how a photograph that nobody trained on was exposed is not known. The region metrics are means over
-    the views in which the region has at least 100 pixels: `pane_psnr` over the pane's pixels, `transmission_psnr` over
-    those that transmit (true strength below 0.999) against `gt/trans`, `reflection_psnr` against `gt/refl`
-    after one gain for the whole scene. The pane is what `regions` say; `pane_region` names them. A method without
-    layers is scored with its image as its transmission: that is what its user has.
+    `psnr`, `ssim` and `lpips` are means over the views. So are `corrected_psnr`, after the affine colour transform that
+    best fits each render to its photograph, and `right_half_psnr`, of the right halves after the transform fitted to
+    the left ones: the exposure of a test photograph is unknown. The region metrics are means over the views in which
+    the region has at least 100 pixels: `pane_psnr` over the pane's pixels, `transmission_psnr` over those that transmit
+    (true strength below 0.999) against `gt/trans`, `reflection_psnr` against `gt/refl` after one gain for the whole
+    scene. `regions` defines the pixels of `pane_psnr`, and `pane_region` names their source. A method without layers is
+    scored with its image as its transmission, because its user has nothing else.
 
-    `reflective_psnr` is that over the pixels of which more than half is mirrored, where the true strength is known.
-    `normal_error_deg` is the mean angle between the layer `normal` and the true normals over the pixels that show a
-    surface, `reflective_normal_error_deg` the same where it mirrors more than half, `strength_error` the mean
-    difference of the layer `strength` from the true one. `environment_psnr` compares the learned environment with the
-    capture's `environment.exr` or `.png`, after one gain. `peak_memory_mib` is that of the whole process so far.
+    `reflective_psnr` is the PSNR over the pixels that mirror more than half of their light, if the true strength is
+    known. `normal_error_deg` is the mean angle between the layer `normal` and the true normals over the pixels that
+    show a surface; `reflective_normal_error_deg` is the same over those that mirror more than half. `strength_error` is
+    the mean absolute error of the layer `strength`. `environment_psnr` compares the learned environment with the
+    capture's `environment.exr` or `.png`, after one gain. `peak_memory_mib` is that of the whole process until now.
 
-    Images are compared in the colours of their photographs, layers in the scene's: where exposures were learned, a test
-    view is taken to be exposed as the mean of its neighbours in the order of names; `test_exposures` says so.
+    Images are compared in the colours of their photographs, layers in those of the scene. If exposures were learned, a
+    test view is assigned the mean exposure of its neighbours by name, which `test_exposures` records.
 
-    Pixels that a view ignores are left out; `ssim` and `lpips`, which are taken over windows, take them for right.
+    Ignored pixels of a view are left out; `ssim` and `lpips`, which use windows, treat them as correct.
 
     Args:
-        scene: what to render.
-        renderer: how; called under `no_grad`. The median of its times is `seconds_per_frame`.
-        dataset: the test views; ground truth is read where it has some.
-        regions: which pixels show a pane; those of the ground truth if None, or else of the rendered mask.
-        listen: called once per view with its frame, which is not kept afterwards; draws pictures of it.
+        scene: to render.
+        renderer: called under `no_grad`. The median of its times is `seconds_per_frame`.
+        dataset: with the test views; its ground truth is read if there is any.
+        regions: pixels that show panes; if None, those of the ground truth, or else of the rendered mask.
+        listen: called once per view with its frame, which is not kept afterwards; draws reports, for example.
 
     Raises:
         InputError: no test views, a render that is not finite, or broken ground truth.
@@ -246,9 +246,9 @@ def evaluate(
     truth = load_truth(dataset.truth)
     lpips = metrics.load_lpips()
     regions = regions or (RENDERED_REGIONS if truth is None else TRUE_REGIONS)
-    # With a photographer frames hold two images, what photographs show and what nobody disturbs; the latter is timed.
+    # With a photographer, frames hold two images, with and without the photographer; rendering without is timed.
     timed = with_photographer(renderer, "absent") if len(scene.photographer) else renderer
-    # The first frame may wait for the compiler; it must not count.
+    # The first frame may include compilation, so it is not counted.
     timed_render(timed, scene, dataset.test[0])
     measurements, learned = {}, scene.exposures.to("cpu")
     for view in dataset.test:
@@ -289,7 +289,7 @@ def timed_render(renderer: Renderer, scene: Scene, view: View) -> tuple[Frame, f
     with torch.no_grad():
         start = time.perf_counter()
         frame = renderer(scene, view.camera)
-        # Reading a pixel waits for a device that works asynchronously.
+        # Reading a pixel synchronises with an asynchronous device.
         frame.rgb[0, 0, 0].item()
         seconds = time.perf_counter() - start
     frame = Frame(frame.rgb.cpu(), {name: layer.cpu() for name, layer in frame.layers.items()})
@@ -299,7 +299,7 @@ def timed_render(renderer: Renderer, scene: Scene, view: View) -> tuple[Frame, f
 
 
 def peak_memory_mib() -> metrics.Outcome:
-    """Largest resident size of this process so far, in MiB, or why it is not known."""
+    """Peak resident set size of this process so far in MiB, or the reason why it is unknown."""
     try:
         import resource  # Windows has none.
     except ImportError:
@@ -346,12 +346,12 @@ def _lpips(lpips: metrics.Lpips | str, image: Tensor, photo: Tensor) -> metrics.
 
 
 def _counted_psnr(image: Tensor, photo: Tensor, counted: Tensor | None) -> metrics.Outcome:
-    """Of the pixels that are not ignored, if any are."""
+    """PSNR of the pixels that are not ignored."""
     return metrics.psnr(image, photo) if counted is None else _region_psnr(image, photo, counted, ALL_IGNORED)
 
 
 def _right_half_psnr(image: Tensor, photo: Tensor, counted: Tensor | None) -> metrics.Outcome:
-    """Of the right half, in the colours that the left half tells (as is done for NeRF in the Wild)."""
+    """PSNR of the right half after the colour transform fitted to the left half (as in NeRF in the Wild)."""
     middle = max(photo.shape[1] // 2, 1)
     if counted is not None and _too_few(counted[:, :middle]):
         return LEFT_IGNORED
@@ -365,7 +365,7 @@ def _region_psnr(image: Tensor, target: Tensor, region: Tensor, reason: str) -> 
 
 
 def _too_few(region: Tensor | None) -> bool:
-    """Return whether there is a region [H, W] that is too small to measure anything in it."""
+    """Return whether a region [H, W] is given that is too small for a metric."""
     return region is not None and int(region.sum()) < metrics.SMALLEST_REGION
 
 
@@ -381,7 +381,7 @@ def _transmission_psnr(frame: Frame, truth: GroundTruth | None, true_view: TrueV
 def _reflection_pixels(
     frame: Frame, truth: GroundTruth | None, true_view: TrueView | None
 ) -> tuple[Tensor, Tensor] | str:
-    """Rendered and true reflection [P, 3] at the pane's pixels; the true one in [0, 1], where lamps are white."""
+    """Rendered and true reflection [P, 3] at the pane's pixels; the true one in [0, 1], with lamps clipped to white."""
     if "reflection" not in frame.layers:
         return "the method renders no reflection"
     if true_view is None:
@@ -407,7 +407,7 @@ def _add_reflection(measurements: Iterable[_Measurement]) -> float | None:
 
 
 def _means(per_view: list[dict[str, metrics.Outcome]]) -> dict[str, metrics.Outcome]:
-    """Mean of every metric over the views that have it and are not perfect, or all reasons why none has."""
+    """Mean of every metric over the views that have it and are not perfect, or all reasons why there is none."""
     means: dict[str, metrics.Outcome] = {}
     for name in per_view[0]:
         outcomes = [of_view[name] for of_view in per_view]
@@ -419,7 +419,7 @@ def _means(per_view: list[dict[str, metrics.Outcome]]) -> dict[str, metrics.Outc
 
 
 def _description(scene: Scene, dataset: Dataset) -> dict[str, Any]:
-    """Description of the measurement."""
+    """Settings of the evaluation, and sizes of the scene."""
     sizes = dict.fromkeys(f"{view.camera.width}x{view.camera.height}" for view in dataset.test)
     is_exposed = scene.exposures.reaches(view.name for view in dataset.test)
     return {

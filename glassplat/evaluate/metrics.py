@@ -2,9 +2,9 @@
 
 LPIPS is that of Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric" (CVPR 2018).
 
-How bright an environment is trades off against how strongly surfaces reflect it, so the learned map is first given the
-energy of the true one, by one factor (3DGS-DR, Section 4.1). Energy is the mean over the sphere of the sRGB values, in
-which 3DGS-DR blends the reflection: there the two trade off exactly.
+The brightness of an environment trades off against the strength with which surfaces reflect it, so the learned map is
+first scaled by one factor to the energy of the true one (3DGS-DR, Section 4.1). Energy is the mean of sRGB values over
+the sphere: 3DGS-DR blends the reflection in sRGB, where the trade-off is exact.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
 
 Outcome = float | str
-"""A metric's value, or a sentence on why there is none."""
+"""A metric's value, or the reason why there is none."""
 
 SMALLEST_REGION = 100
-"""Pixels that a view's region needs to count; a sliver of a pane says nothing."""
+"""Minimum number of pixels of a view's region; a sliver of a pane is not informative."""
 NO_LPIPS = "no LPIPS"
 
 
 def json_values(outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
-    """JSON values: numbers as they are; None, and `<name>_reason`, where there is no finite number."""
+    """JSON values: finite numbers are unchanged; others become None, with a `<name>_reason`."""
     result: dict[str, Any] = {}
     for name, outcome in outcomes.items():
         reason = outcome if isinstance(outcome, str) else "infinite: the images are equal"
@@ -88,7 +88,7 @@ SURFACE_METRICS = {
     ),
     "environment_lpips": Metric("LPIPS, environment", "{:.4f}", "the same as a perceptual distance; lower is better"),
 }
-"""Shown where they are known: only synthetic captures of objects have the truth they need."""
+"""Shown if they are known: only synthetic captures of objects have the necessary ground truth."""
 FACTS = {
     "num_gaussians": Metric("Gaussians", "{:,}", "how many the scene has"),
     "train_seconds": Metric("training", "{:.0f} s", "training time, without compilation of kernels"),
@@ -124,12 +124,12 @@ PLANE_COLUMNS = {
 
 
 def format_value(value: object, pattern: str) -> str:
-    """A value with its unit; a dash where there is none."""
+    """A value with its unit; a dash if there is none."""
     return "-" if value is None else pattern.format(value)
 
 
 def shown_metrics(results: Mapping[str, Any]) -> dict[str, Metric]:
-    """The metrics to show of an evaluation: all of any method, and those of surfaces that are known."""
+    """The metrics to show for an evaluation: general ones always, those of surfaces only if they are known."""
     always, known = METRICS | FACTS, SURFACE_METRICS | SURFACE_FACTS
     return {
         name: metric
@@ -191,30 +191,29 @@ def psnr(image: Tensor, target: Tensor, region: Tensor | None = None) -> float:
 def color_corrected(
     image: Tensor, target: Tensor, columns: slice = slice(None), region: Tensor | None = None
 ) -> Tensor:
-    """The image [H, W, 3] in the colours of another, by the affine transform that brings it closest in least squares.
+    """The image [H, W, 3] after the affine colour transform that fits it to another one in least squares.
 
-    Exposure and white balance of a photograph that nobody trained on are not known; what is left then is what the
-    scene is to blame for.
+    Exposure and white balance of a test photograph are unknown; the remaining error is due to the scene.
 
     Args:
         image: sRGB, uint8 or floating point in [0, 1].
         target: of the same shape.
-        columns: of the pixels that the transform is found from.
-        region: [H, W] bool, of them those that count; None takes all.
+        columns: of the pixels that the transform is fitted to.
+        region: [H, W] bool, those of them that count; all if None.
     """
     _check_shapes(image, target)
     source, wanted = (quantize(picture).to(torch.float64) / 255 for picture in (image, target))
     chosen = torch.ones(image.shape[:2], dtype=torch.bool) if region is None else region
     known = source[:, columns][chosen[:, columns]]
     known = torch.cat([known, torch.ones_like(known[:, :1])], dim=1)
-    # The identity where the pixels leave the transform open, as those of one colour do.
+    # Regularised towards the identity, because pixels of a single colour, say, do not determine the transform.
     rest = wanted[:, columns][chosen[:, columns]] - known[:, :3]
     transform = torch.linalg.solve(known.T @ known + 1e-3 * torch.eye(4, dtype=torch.float64), known.T @ rest)
     return (source + source @ transform[:3] + transform[3]).to(torch.float32)
 
 
 def ssim(image: Tensor, target: Tensor) -> float:
-    """Mean structural similarity of two images [H, W, 3]; Gaussian window 11, sigma 1.5, as 3DGS.
+    """Mean structural similarity of two images [H, W, 3]; Gaussian window 11, sigma 1.5, as in 3DGS.
 
     Raises:
         ValueError: shapes disagree.
@@ -224,15 +223,15 @@ def ssim(image: Tensor, target: Tensor) -> float:
 
 
 MOST_ROUNDS = 20
-"""Of the search for what a factor clips; two or three decide it."""
+"""Maximum number of rounds of the search for clipped pixels; two or three usually suffice."""
 
 
 def reflection_gain(images: list[Tensor], targets: list[Tensor]) -> float:
-    """The one factor on `images` that, clipped at white, brings them closest to `targets` in least squares.
+    """The common factor on `images` that, clipped at white, fits them to `targets` in least squares.
 
-    The reflection layer's scale trades off against the strength and the intensity a(u), so it is
-    compared up to a factor shared by the whole scene. 1 where the images are black. A photograph of a lamp
-    is white however bright the lamp is, so that what is clipped has no part in the factor.
+    The reflection layer's scale trades off against the strength and the intensity a(u), so it is compared up to a
+    factor shared by the whole scene. It is 1 for black images. A photograph of a lamp is white however bright the lamp
+    is, so clipped pixels do not contribute.
 
     Args:
         images: pixels [P, 3], floating point; one entry per view, of any number of pixels.
@@ -252,7 +251,7 @@ def reflection_gain(images: list[Tensor], targets: list[Tensor]) -> float:
 
 
 def _least_squares(pairs: list[tuple[Tensor, Tensor]]) -> float:
-    """The factor on the first of each pair; 1 where it does not matter."""
+    """The least-squares factor on the first of each pair; 1 if it is undetermined."""
     power = sum((image.square().sum().item() for image, _ in pairs), 0.0)
     product = sum(((image * target).sum().item() for image, target in pairs), 0.0)
     return product / power if power > 0 else 1.0
@@ -271,11 +270,10 @@ def plane_table(
 ) -> list[dict[str, Any]]:
     """One entry per fitted plane: label, center, normal, base_reflectance, and its errors.
 
-    `normal_error_deg` is the angle between the normals, whose sign does not matter; `offset_error` the
-    distance of the true centre from the fitted plane over `extent`; `base_reflectance_error` an absolute
-    difference. Without a true pane of that label they are None, with a reason next to each.
-    Glass that may be tinted has its `transmittance` of red, green and blue.
-    `normal_drift_deg` and `offset_drift` compare in the same way with the plane that the masks led to, where known.
+    `normal_error_deg` is the angle between the normals regardless of sign, `offset_error` the distance of the true
+    centre from the fitted plane over `extent`, and `base_reflectance_error` an absolute difference. Without a true pane
+    of that label they are None, each with a reason. Glass that may be tinted has its RGB `transmittance`.
+    `normal_drift_deg` and `offset_drift` are the same measures relative to the plane fitted to the masks, if known.
 
     Args:
         planes: the fitted planes.
@@ -307,7 +305,7 @@ def plane_table(
 
 
 def missing_panes(planes: Planes, truth: GroundTruth | None) -> list[int]:
-    """Labels of true panes that no fitted plane stands for."""
+    """Labels of true panes without a fitted plane."""
     return [] if truth is None else sorted({plane.label for plane in truth.planes} - set(planes.labels))
 
 
@@ -331,9 +329,9 @@ def _difference(fitted: dict[str, Any], center: Sequence[float], normal: Sequenc
 
 
 REFLECTIVE = 0.5
-"""Above this true strength a pixel mirrors more than it shows of its own."""
+"""True strength above which a pixel counts as reflective: it mirrors more than half of its light."""
 NO_DIRECTION_DEG = 90.0
-"""The error of a vector without direction: what guessing comes to."""
+"""The error of a vector without direction: the mean error of a random guess."""
 NO_NORMALS, NO_STRENGTH = "the method renders no normals", "the method renders no strength"
 NO_TRUE_NORMALS = "there are no true normals for the photograph"
 NO_TRUE_STRENGTH = "there is no true strength for the photograph"
@@ -348,7 +346,7 @@ def surface_metrics(frame: Frame, photo: Tensor, truth: TrueSurface | None) -> d
         frame: its image as photographed, and its layers `normal` [H, W, 3], world axes, of any length, and `strength`
             [H, W].
         photo: [H, W, 3] uint8.
-        truth: the true surface at the frame's size, None where nothing is known.
+        truth: the true surface at the frame's size; None if unknown.
     """
     truth = truth or NOTHING_KNOWN
     normal_errors = _normal_errors(frame, truth)
@@ -361,7 +359,7 @@ def surface_metrics(frame: Frame, photo: Tensor, truth: TrueSurface | None) -> d
 
 
 def angular_errors_deg(vectors: Tensor, truth: Tensor) -> Tensor:
-    """Angles [...] in degrees between vectors [..., 3] of any length and others; 90 where one has no direction."""
+    """Angles [...] in degrees between vectors [..., 3] of any length; 90 where one has no direction."""
     a, b = vectors.to(torch.float64), truth.to(torch.float64)
     # The arc tangent keeps its precision for small angles; the arc cosine does not.
     angles = torch.rad2deg(torch.atan2(torch.linalg.cross(a, b).norm(dim=-1), (a * b).sum(dim=-1)))
@@ -377,7 +375,7 @@ def _reflective_psnr(frame: Frame, photo: Tensor, truth: TrueSurface) -> Outcome
 
 
 def _normal_errors(frame: Frame, truth: TrueSurface) -> Tensor | str:
-    if truth.normals is None:  # First: a method whose evaluation leaves normals out may well render them.
+    if truth.normals is None:  # Checked first: evaluation may skip normals that the method can render.
         return NO_TRUE_NORMALS
     return angular_errors_deg(frame.layers["normal"], truth.normals) if "normal" in frame.layers else NO_NORMALS
 
@@ -387,7 +385,7 @@ def _strength_errors(frame: Frame, truth: TrueSurface) -> Tensor | str:
         return NO_STRENGTH
     if truth.strength is None:
         return NO_TRUE_STRENGTH
-    # Where there are panes, `strength` is theirs.
+    # In scenes with panes, `strength` is that of the panes.
     return NO_STRENGTH if "mask" in frame.layers else (frame.layers["strength"] - truth.strength).abs()
 
 
@@ -409,11 +407,11 @@ SMALLEST_SIDE = 32
 
 @dataclass(frozen=True)
 class Lpips:
-    """The distance with one backbone.
+    """LPIPS with one backbone.
 
     Attributes:
         network: the distance of two batches [1, 3, H, W] in [0, 1].
-        backbone: which network; a value without it means nothing.
+        backbone: name of the network; values of different networks are not comparable.
     """
 
     network: Callable[[Tensor, Tensor], Tensor]
@@ -439,9 +437,9 @@ class Lpips:
 
 
 def load_lpips() -> Lpips | str:
-    """The distance with the backbone that splatting papers report, or why there is none.
+    """LPIPS with the backbone that splatting papers use, or the reason why it is unavailable.
 
-    torchmetrics needs torchvision, which gets the weights of the network when they are first used.
+    torchmetrics needs torchvision, which downloads the weights of the network on first use.
     """
     try:
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
@@ -449,13 +447,13 @@ def load_lpips() -> Lpips | str:
         network = LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True)
     except ImportError:
         return "pip install 'glassplat[lpips]'"
-    except (OSError, RuntimeError) as error:  # torchvision of another build, or weights that cannot be had.
+    except (OSError, RuntimeError) as error:  # torchvision of another build, or weights that are unavailable.
         return _other_build() or f"torchmetrics cannot load it: {error}"
     return Lpips(network)
 
 
 def _other_build() -> str | None:
-    """Reason and remedy where torchvision was built for another PyTorch; None where it can be imported."""
+    """Reason and remedy if torchvision was built for another PyTorch; None otherwise."""
     try:
         importlib.import_module("torchvision")
     except RuntimeError:
@@ -482,11 +480,11 @@ NO_TRUE_ENVIRONMENT = "the data set has no true environment"
 
 
 PANORAMA_HEIGHT = 64
-"""Rows at which environments are compared."""
+"""Height in rows at which environments are compared."""
 
 
 def learned_environment(scene: Scene) -> Tensor | None:
-    """The scene's environment as a panorama [H, 2H, 3]; None where it has none."""
+    """The scene's environment as a panorama [H, 2H, 3]; None if it has none."""
     if scene.environment.is_empty:
         return None
     with torch.no_grad():
@@ -510,8 +508,8 @@ def environment_metrics(learned: Tensor | None, truth: Tensor | None, lpips: Lpi
     """`environment_psnr`, `environment_gain` and `environment_lpips` of a scene.
 
     Args:
-        learned: [H, 2H, 3] as in `environment_psnr`; None where the method learns none.
-        truth: [h, 2h, 3], or None where it is not known.
+        learned: [H, 2H, 3] as in `environment_psnr`; None if the method learns none.
+        truth: [h, 2h, 3], or None if unknown.
         lpips: the distance, or why there is none.
     """
     if learned is None or truth is None:
@@ -526,13 +524,13 @@ def environment_metrics(learned: Tensor | None, truth: Tensor | None, lpips: Lpi
 
 
 def environment_psnr(learned: Tensor, truth: Tensor) -> tuple[float, float]:
-    """Peak signal-to-noise ratio over the whole sphere in decibels, and the gain that the learned map was given.
+    """Peak signal-to-noise ratio over the whole sphere in decibels, and the gain applied to the learned map.
 
-    Directions count by their solid angle. Infinite for equal maps.
+    Directions are weighted by solid angle. The ratio is infinite for equal maps.
 
     Args:
         learned: [H, 2H, 3] panorama, sRGB, floating point.
-        truth: [h, 2h, 3] panorama, floating point or uint8; averaged down where it is larger.
+        truth: [h, 2h, 3] panorama, floating point or uint8; downsampled by area averaging if larger.
 
     Raises:
         ValueError: a panorama is not twice as wide as high, or contains non-finite values.
@@ -544,7 +542,7 @@ def environment_psnr(learned: Tensor, truth: Tensor) -> tuple[float, float]:
 
 
 def environment_lpips(learned: Tensor, truth: Tensor, lpips: Lpips | str) -> Outcome:
-    """The perceptual distance of the panoramas as they are seen, not weighted by solid angle (the paper's measure).
+    """LPIPS of the panoramas as plain images, not weighted by solid angle (the paper's measure).
 
     Args:
         learned: as in `environment_psnr`.
@@ -558,7 +556,7 @@ def environment_lpips(learned: Tensor, truth: Tensor, lpips: Lpips | str) -> Out
 
 
 def _equalise(learned: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, float]:
-    """The learned map at the energy of the true one, the true one at its size, and the factor; 1 for a black map."""
+    """The learned map scaled to the energy of the true one, the true one at its size, and the factor (1 if black)."""
     image, target = _panorama(learned, "learned"), _panorama(truth, "true")
     target = _resize_panorama(target, image.shape[0])
     energy = _mean_over_sphere(image)
@@ -577,7 +575,7 @@ def _panorama(pixels: Tensor, which: str) -> Tensor:
 
 
 def _resize_panorama(panorama: Tensor, height: int) -> Tensor:
-    """A panorama at another height."""
+    """A panorama resized to another height."""
     if panorama.shape[0] == height:
         return panorama
     channels_first = panorama.permute(2, 0, 1)[None]

@@ -56,7 +56,7 @@ dialog { max-width: none; max-height: none; width: 100vw; height: 100vh; padding
 dialog img { display: block; margin: auto; min-width: 100% }
 """
 
-# Without scripts the links open the picture itself.
+# Without scripts the links open the image itself.
 SCRIPT = """
 const large = document.getElementById("large");
 for (const link of document.querySelectorAll("figure a"))
@@ -82,14 +82,14 @@ COLUMNS = (*COLORED, "strength", "normal", "mask")
 
 @dataclass(frozen=True)
 class Panel:
-    """One picture [H, W, 3] in [0, 1] or uint8, and what is written above it."""
+    """One image [H, W, 3] in [0, 1] or uint8, and its caption."""
 
     caption: str
     image: Tensor
 
 
 Row = Sequence[Panel | None]
-"""Panels side by side; None leaves the place empty."""
+"""Panels side by side; None leaves a gap."""
 
 
 def comparison_sheet(
@@ -103,12 +103,11 @@ def comparison_sheet(
 ) -> NDArray[np.uint8]:
     """The sheet [H, W, 3] of one view.
 
-    First row: photograph, render, error, depth. Second row, where the method has them: transmission, base,
-    reflection, environment, strength, normals, mask. Third row, where they are known: the true ones, in the same
-    columns.
+    First row: photograph, render, error, depth. Second row, if the method renders them: transmission, base, reflection,
+    environment, strength, normals, mask. Third row, if they are known: the true ones, in the same columns.
 
     Args:
-        frame: what was rendered, on the CPU.
+        frame: as rendered, on the CPU.
         photo: [H, W, 3] uint8.
         truth: the true layers.
         surface: the true surface.
@@ -120,7 +119,7 @@ def comparison_sheet(
 
 
 def compose_sheet(rows: Sequence[Row], title: str, subtitle: str) -> NDArray[np.uint8]:
-    """Panels in rows, with captions and a title line; those of a row have the size of its first one."""
+    """Panels in rows, with captions and a title line; all panels of a row have the size of its first one."""
     sizes = [_panel_size(*next(panel for panel in row if panel).image.shape[1::-1]) for row in rows]
     width = max(len(row) * (size[0] + GAP) - GAP for row, size in zip(rows, sizes, strict=True))
     height = sum(CAPTION_HEIGHT + size[1] + GAP for size in sizes) - GAP
@@ -171,7 +170,7 @@ def _rendered_panels(frame: Frame, scale: float) -> dict[str, Panel]:
 
 
 def _true_panels(truth: TrueView | None, surface: TrueSurface, scale: float) -> dict[str, Panel]:
-    """Panels of what is known to be true, by the name of the layer that should be like it."""
+    """Panels of the ground truth, by the name of the corresponding layer."""
     panels = {}
     if surface.strength is not None:
         panels["strength"] = _strength_panel("true strength", surface.strength, scale)
@@ -191,7 +190,7 @@ def _strength_panel(caption: str, strength: Tensor, scale: float) -> Panel:
 
 def _strength_scale(maps: Sequence[Tensor]) -> float:
     """One scale for rendered and true strength, so that the two can be compared by eye."""
-    # Glass at grazing angles reaches 1; the bulk of the pane is what should be seen.
+    # Glass reaches 1 at grazing angles, but the bulk of the pane should be visible.
     peaks = [float(np.percentile(strength.numpy(), 98)) for strength in maps]
     return min(max([*peaks, SMALLEST_STRENGTH_SCALE]), 1.0)
 
@@ -236,19 +235,19 @@ def _one_line(text: str) -> str:
 
 MOST_VIEWS = 2
 SMALLEST_SHARE = 0.05
-"""Part of the image that must be pane for a view to be worth showing."""
+"""Minimum share of the image that must show a pane for a view to be included."""
 
 
 class Uses:
-    """Keeps the views that show most of a pane, out of all that pass by, and draws them."""
+    """Selects the views that show most of a pane, and draws them."""
 
     def __init__(self, blend: Blend) -> None:
-        """Begins with no view; `blend` is the space in which the run blends the reflection."""
+        """Starts without views; `blend` is the colour space in which the run blends the reflection."""
         self._blend = blend
         self._rows: list[tuple[float, list[Panel]]] = []
 
     def add(self, evaluated: EvaluatedView) -> None:
-        """Looks at a view, and keeps its panels if it shows more of a pane than those kept."""
+        """Keeps the panels of a view if it shows more of a pane than those kept so far."""
         frame, photo = evaluated.frame, evaluated.view.photo
         share = float((frame.layers["strength"] > 0).float().mean())
         if share < SMALLEST_SHARE:
@@ -262,7 +261,7 @@ class Uses:
         self._rows = sorted([*self._rows, (share, row)], key=lambda kept: -kept[0])[:MOST_VIEWS]
 
     def picture(self) -> NDArray[np.uint8] | None:
-        """The views kept [H, W, 3], one per row; None where no view shows a pane."""
+        """Image [H, W, 3] of the views kept, one per row; None if no view shows a pane."""
         return compose_sheet([row for _, row in self._rows], "Uses of the layers", "") if self._rows else None
 
 
@@ -271,10 +270,10 @@ SETTINGS = ("iterations", "seed", "resolution", "split", "lpips_backbone", "pane
 
 
 class Report:
-    """The pictures of an evaluation, drawn while it runs: each view's frame is used once and let go.
+    """The images of an evaluation, drawn while it runs: each view's frame is used once and released.
 
     Writes `sheets/<view>.png` for every test view, `uses.png` for a method that separates the reflection, and
-    `index.html` that shows them all. Nothing outside the folder is referred to, so it can be moved or sent.
+    `index.html`, which shows them all. Nothing outside the folder is referenced, so it can be moved or sent.
     """
 
     def __init__(self, folder: Path, dataset: Dataset, blend: Blend | None) -> None:
@@ -282,15 +281,15 @@ class Report:
 
         Args:
             folder: a run's directory.
-            dataset: the test views that will come.
-            blend: the space in which the run blends the reflection; None for a method without reflection.
+            dataset: with the test views that will be added.
+            blend: the colour space in which the run blends the reflection; None for a method without reflection.
         """
         self._folder = folder
         self._sheets = sheet_names([view.name for view in dataset.test])
         self._uses = Uses(blend) if blend is not None else None
 
     def add(self, evaluated: EvaluatedView) -> None:
-        """Draws one view; for `evaluate` to call."""
+        """Draws one view; called by `evaluate`."""
         view, subtitle = evaluated.view, _metrics_line(evaluated.metrics)
         sheet = comparison_sheet(
             evaluated.photographed,
@@ -308,7 +307,7 @@ class Report:
         """Writes the overview.
 
         Args:
-            results: as `evaluate` returns them, with what the caller added.
+            results: as `evaluate` returns them, with additions of the caller.
             per_view: as `evaluate` returns it.
         """
         uses = self._uses.picture() if self._uses is not None else None
@@ -319,7 +318,7 @@ class Report:
 
 
 def sheet_names(names: list[str]) -> dict[str, str]:
-    """File of each view's sheet, relative to the run; distinct also for `a.jpg` and `a.png`."""
+    """File of each view's sheet, relative to the run; distinct even for `a.jpg` and `a.png`."""
     return {name: f"sheets/{file}" for name, file in flat_picture_names(names).items()}
 
 
@@ -330,7 +329,7 @@ def overview_page(
     *,
     uses: str | None = None,
 ) -> str:
-    """The overview as one HTML page; its only references are the pictures, by relative path."""
+    """The overview as one HTML page; its only references are the images, by relative path."""
     title = f"glassplat: {results.get('method', 'evaluation')}"
     known = {name.replace("_", " "): results[name] for name in SETTINGS if results.get(name) is not None}
     settings = " · ".join(f"{_escape(name)} <b>{_escape(value)}</b>" for name, value in known.items())
@@ -364,7 +363,7 @@ def _cards(results: Mapping[str, Any]) -> str:
 
 
 def _missing(results: Mapping[str, Any]) -> str:
-    """Reasons for the dashes among the metrics."""
+    """Reasons for missing metrics."""
     known = metrics.shown_metrics(results)
     lines = [
         f"<p>Not measured: <b>{_escape('; '.join(known[name].label for name in names))}</b>: {_escape(reason)}</p>"

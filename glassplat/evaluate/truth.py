@@ -1,6 +1,6 @@
 """Ground truth of synthetic captures: layers, panes, normals and reflectivity.
 
-Normals and reflectivity lie next to a test photograph:
+Normals and reflectivity are stored next to a test photograph:
 
 ```
 r_0.png            the photograph
@@ -8,8 +8,8 @@ r_0_normal.png     (n + 1) / 2 of the unit normals in world axes; alpha is the c
 r_0_strength.png   grey of 8 or 16 bits: the share of mirror-like reflection
 ```
 
-Shiny Blender has the normals, this project's own captures have both; it could not be tried on Shiny Blender's own
-files. The lens must be a pinhole: what lies next to a photograph is reduced with it, but not undistorted.
+Shiny Blender has the normals, this project's own captures have both; Shiny Blender's own files could not be tested. The
+camera must be a pinhole: files next to a photograph are downscaled with it, but not undistorted.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ class TrueView:
     """The true layers of one test view.
 
     Attributes:
-        transmission: [H, W, 3] uint8 sRGB, what passes the first pane on each ray: tinted by it, and with what panes
-            behind it reflect.
-        reflection: [H, W, 3] uint8 sRGB, what the panes reflect, at full strength.
+        transmission: [H, W, 3] uint8 sRGB, light transmitted by the first pane on each ray: tinted by it, and including
+            reflections of panes behind it.
+        reflection: [H, W, 3] uint8 sRGB, light reflected by the panes, at full strength.
         strength: [H, W] float32, true Fresnel strength in [0, 1].
-        labels: [H, W] uint8, pane label of pixels that a pane covers fully, else 0.
+        labels: [H, W] uint8, pane label of pixels that a pane covers completely, else 0.
     """
 
     transmission: Tensor
@@ -52,7 +52,7 @@ class TrueView:
 
 @dataclass(frozen=True)
 class TruePlane:
-    """A pane as it really is; vectors in world units, reflectance at normal incidence."""
+    """A true pane; vectors in world units, reflectance at normal incidence."""
 
     label: int
     center: tuple[float, ...]
@@ -74,24 +74,24 @@ TRUE_PLANE: dict[str, Field] = {
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """The folder `gt/` of a scene; views are read when asked for."""
+    """The folder `gt/` of a scene; views are read on demand."""
 
     folder: Path
     planes: tuple[TruePlane, ...]
 
     def view(self, image_name: str, width: int, height: int) -> TrueView | None:
-        """The true layers for a photograph, averaged down to the given size.
+        """The true layers for a photograph, downsampled by area averaging to the given size.
 
         Args:
-            image_name: the photograph's name, which the files bear, in its folder or in none.
+            image_name: the photograph's name, after which the files are named, with its folder or without.
             width: of the rendered view, pixels.
             height: of the rendered view, pixels.
 
         Returns:
-            None where the folder holds nothing for this view.
+            None if the folder has no files for this view.
 
         Raises:
-            InputError: only some of the view's files are there, or a file is broken.
+            InputError: only some of the view's files exist, or a file is broken.
         """
         in_folder, in_none = self._paths(Path(image_name).with_suffix("")), self._paths(Path(Path(image_name).stem))
         paths = in_folder if any(path.is_file() for path in in_folder.values()) else in_none
@@ -122,16 +122,16 @@ class GroundTruth:
 
 
 def _png_or_jpeg(stem: Path) -> Path:
-    """Path of a picture: the JPEG of that name if there is one, else the PNG."""
+    """Path of an image: the JPEG of that name if there is one, else the PNG."""
     jpeg = stem.with_name(f"{stem.name}.jpg")
     return jpeg if jpeg.is_file() else stem.with_name(f"{stem.name}.png")
 
 
 def load_truth(folder: Path | None) -> GroundTruth | None:
-    """Opens a data set's folder of known layers and panes; None for None.
+    """Opens a data set's folder of true layers and panes; None for None.
 
     Raises:
-        InputError: its `planes.json` cannot be understood.
+        InputError: its `planes.json` is invalid.
     """
     if folder is None:
         return None
@@ -159,7 +159,7 @@ def _resized_color(pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[
 
 
 def _resized_labels(labels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """A label survives only where it covers the whole of the larger pixel."""
+    """Downsampled labels; a label remains only where it covers the whole of the larger pixel."""
     result = np.zeros(size[::-1], dtype=np.uint8)
     for label in np.unique(labels[labels > 0]):
         result[resize_by_area(labels == label, *size) > 1 - LEAST_SHARE] = label
@@ -168,9 +168,9 @@ def _resized_labels(labels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray
 
 NORMAL_MARK, STRENGTH_MARK = "_normal", "_strength"
 COVERED = 0.5
-"""Above this coverage a pixel shows the surface."""
+"""Coverage above which a pixel shows the surface."""
 NEARLY_UNIT = 0.25
-"""How far from 1 the length of a stored vector may be for it to be a normal and not the colour of a background."""
+"""Maximum deviation from 1 of the length of a stored vector that is a normal, and not the colour of a background."""
 
 
 @dataclass(frozen=True)
@@ -179,8 +179,8 @@ class TrueSurface:
 
     Attributes:
         covered: [H, W] bool, where there is a surface.
-        normals: [H, W, 3] float32 unit vectors in world axes, zero where not covered; None where they are not known.
-        strength: [H, W] float32 share of mirror-like reflection in [0, 1]; None where it is not known.
+        normals: [H, W, 3] float32 unit vectors in world axes, zero where not covered; None if unknown.
+        strength: [H, W] float32 share of mirror-like reflection in [0, 1]; None if unknown.
     """
 
     covered: Tensor
@@ -192,12 +192,12 @@ NOTHING_KNOWN = TrueSurface(torch.zeros(0, 0, dtype=torch.bool), None, None)
 
 
 def true_surface(view: View) -> TrueSurface | None:
-    """The true surface of a view at its size, from the files next to its photograph; None where there are none.
+    """The true surface of a view at its size, from the files next to its photograph; None if there are none.
 
-    Coverage is the alpha of the normals, else that of the photograph, else all that holds a normal.
+    Coverage is the alpha of the normals, else that of the photograph, else all pixels with a normal.
 
     Raises:
-        InputError: a file is no image, or is not as large as the photograph.
+        InputError: a file is not an image, or differs in size from the photograph.
     """
     size = (view.camera.width, view.camera.height)
     vectors, strength = _read_beside(view, NORMAL_MARK), _read_beside(view, STRENGTH_MARK)
@@ -213,7 +213,7 @@ def true_surface(view: View) -> TrueSurface | None:
 
 
 def _read_beside(view: View, mark: str) -> NDArray[np.float32] | None:
-    """[H, W, C] in [0, 1] of the file next to a photograph, None where there is none."""
+    """[H, W, C] in [0, 1] of the file next to a photograph; None if there is none."""
     path = view.image_path.with_name(f"{view.image_path.stem}{mark}.png")
     if not path.is_file():
         return None

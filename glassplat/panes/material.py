@@ -27,9 +27,9 @@ log = logging.getLogger("glassplat.panes")
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 MIRROR_SLOPE, MIRROR_CORRELATION = 0.35, 0.3
 """An aligned pane above both is classified as a mirror. In linear radiance, the slope was at most 0.20 for 15 panes of
-glass in ten captures, including a dark television, at most 0.30 for 29 in sixteen more, and at least 0.52 for fifteen
-mirrors; for a glass pane whose plane was off by 6 degrees it was 0.48. In sRGB, whose curve is steep in dark regions,
-it was 0.35 and 0.38 for the television."""
+glass in ten captures, including a dark television, and at most 0.30 for 29 in sixteen more. It was at least 0.52 for
+fifteen mirrors, and 0.48 for glass whose plane was off by 6 degrees. In sRGB, whose curve is steep in dark regions, it
+was 0.35 and 0.38 for the television."""
 SURE_SLOPE, SURE_CORRELATION = 0.6, 0.15
 """The same for a clear mirror, which may correlate less: one that shows more detail than a coarse first scene contains
 had correlations of 0.25 and 0.30, with slopes of 0.89 and 0.98. If a coplanar pane is glass, this slope is required:
@@ -423,10 +423,10 @@ def reflections_behind(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -
     Before a pane reflects, training builds its reflections at their virtual positions, where they stay as long as they
     explain the photographs equally well. Most of them are farther away than the real surfaces, and show through these.
     So a Gaussian is selected if it is behind the panes in most views, and beyond the mean depth in nearly all of those
-    in which the panes are not occluded. Its mirrored position must also be possible: not one that views show to be
-    empty. None is selected if many more Gaussians are hidden in some views only, and views past the panes find surfaces
-    at too few of the mirrored positions, or see hardly any of them: then they are real objects. If somewhat more are,
-    and surfaces are found, only those with mirrored positions in view are selected.
+    in which the panes are not occluded. Also, views must not show its mirrored position to be empty. None is selected
+    if many more Gaussians are hidden in some views only, and views past the panes find surfaces at too few of the
+    mirrored positions, or see hardly any of them: then they are real objects. If only somewhat more are, and surfaces
+    are found, those with mirrored positions in view are selected.
 
     Args:
         scene: with panes or without.

@@ -45,7 +45,7 @@ class EdgeMatches:
 
     Attributes:
         distances: [H, V, P] distances of mapped edge point p from the edge in view v, in image diagonals, positive on
-            the pane; scaled so that an error of one pixel in both views weighs the same on every plane and in any pair.
+            the pane. They are scaled so that an error of a pixel in both views weighs equally on all planes and pairs.
         shifts: [H, V, P] part of that distance caused by a frame, per world unit of its height.
         compared: [H, V, P] true if the edge point lands inside the image of another view. Other distances are 0.
         turns: [H, P] deviation of the edge at point p from the directions of a rectangular pane's sides: the sine of
