@@ -46,7 +46,7 @@ INNER_SHARE = 0.8
 MOST_PHOTOGRAPHS, REDUCED_WIDTH = 40, 200
 """Maximum number of photographs used to distinguish mirrors from glass, and their maximum width in pixels."""
 TILTS_DEG, TILT_PHOTOGRAPHS = (-3.0, -1.5, 0.0, 1.5, 3.0), 8
-"""Tilts about either axis that are tried before a plane is aligned, and the number of photographs that rank them."""
+"""Tilts about either axis tried before a plane is aligned, and the minimum number of photographs that rank them."""
 ALIGN_STEPS, ALIGN_RATE = 60, 2e-3
 """Steps of Adam, one photograph each, and the learning rate in radians and shares of the scene extent."""
 LEAST_GAIN_OF_ALIGNING, PERFECT = 1.15, 0.999
