@@ -172,7 +172,7 @@ async def soak(
         command = ["-m", "glassplat", "view", str(run), "--port", str(port), "--output", kept]
         viewer = await asyncio.create_subprocess_exec(sys.executable, *command, stdout=log, stderr=log)
         try:
-            address = await printed_address(log, viewer)
+            address = await asyncio.wait_for(printed_address(log, viewer), LAST_PICTURE)
             browsers = [Looker(address, seed, pause, count, is_deaf=seed < deaf) for seed in range(clients)]
             tasks = [asyncio.create_task(browser.live()) for browser in browsers]
             samples = await sampled(viewer.pid, 60 * minutes, count, say)
@@ -200,7 +200,7 @@ async def soak(
 async def printed_address(log: IO[str], viewer: asyncio.subprocess.Process) -> str:
     """Address that the viewer prints; raises RuntimeError if it ends before."""
     while viewer.returncode is None:
-        found = re.search(r"look at (http\S+)", os.pread(log.fileno(), 1_000_000, 0).decode())
+        found = re.search(r"viewer: (http\S+)", os.pread(log.fileno(), 1_000_000, 0).decode())
         if found:
             return found[1]
         await asyncio.sleep(0.2)

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 def announce(viewer: Viewer, console: Console) -> None:
     """Prints the address of the viewer."""
-    say(console, f"viewer: {viewer.address}")
+    say(console, viewer)
     if is_local(viewer.host):
         say(
             console,

@@ -273,7 +273,7 @@ class Viewer:
         self._server.on_client_disconnect(controls.log_errors(self._on_disconnect))
 
     def __repr__(self) -> str:
-        return f"look at {self.address}"
+        return f"viewer: {self.address}"
 
     @property
     def port(self) -> int:

@@ -174,7 +174,7 @@ def test_a_training_that_nobody_watches_says_where_to_look(
     options = ["--data", str(data), "--output", str(tmp_path / "run"), "--iterations", "5", "--device", "cpu"]
     with port_in_use() as first:
         assert main(["train", "splat", *options, "--view"]) == 0
-    found = re.search(r"look at http://localhost:(\d+)", capsys.readouterr().out)
+    found = re.search(r"viewer: http://localhost:(\d+)", capsys.readouterr().out)
     assert found is not None and int(found[1]) > first
     assert hosts == ["127.0.0.1"]
 
