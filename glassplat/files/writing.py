@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import importlib
+import itertools
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -181,18 +182,21 @@ def real_path(path: Path) -> Path:
 def check_links(folder: Path, names: Sequence[str]) -> None:
     """Refuse links that lead out of a folder in which files and folders of these names will be written.
 
-    In a folder from another person, such as a run or a capture, links could make any file be overwritten.
+    In a folder from another person, such as a run or a capture, links could make any file be overwritten. A link to an
+    empty folder, for example on another disk, is allowed.
 
     Raises:
         InputError: there is such a link; nothing has been written.
     """
     inside = real_path(folder)
-    for path in (path for name in names for path in (folder / name, *(folder / name).rglob("*"))):
-        if path.is_symlink() and not real_path(path).is_relative_to(inside):
-            raise InputError(
-                f"{path} is a link that leads out of {folder}, to {real_path(path)}; nothing was written. Put what it "
-                "leads to in its place, or remove it"
-            )
+    for top in (folder / name for name in names):
+        for path in itertools.chain([top], top.rglob("*")):  # A folder is searched after the link to it was checked.
+            leads_out = path.is_symlink() and not real_path(path).is_relative_to(inside)
+            if leads_out and not (path.is_dir() and not any(path.iterdir())):
+                raise InputError(
+                    f"{path} is a link that leads out of {folder}, to {real_path(path)}; nothing was written. Put what "
+                    "it leads to in its place, or remove it"
+                )
 
 
 def scene_source(path: Path) -> Path:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from glassplat.cli.main import main
+from glassplat.errors import InputError
+from glassplat.files.writing import check_links
 from tests.cli.colmap_run import write_colmap_capture, write_colmap_run
 from tests.cli.tiny_run import write_run
 
@@ -100,6 +103,22 @@ def test_a_link_in_the_run_of_somebody_else_leads_nowhere(
     assert main(again if name == "log.jsonl" else ["eval", str(run)]) == 2
     assert "leads out of" in " ".join(capsys.readouterr().err.split())
     assert contents(mine.parent) == {"0.png": b"mine"}
+
+
+def test_a_link_to_an_empty_folder_is_followed_and_no_folder_outside_is_searched(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def searched(path: Path, pattern: str) -> Iterator[Path]:
+        yield from () if path.samefile(tmp_path / "empty") else pytest.fail(f"{path} is searched for {pattern}")
+
+    monkeypatch.setattr(Path, "rglob", searched)
+    for name in ("run", "empty", "full/inner"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "run" / "point_cloud").symlink_to(tmp_path / "empty")
+    (tmp_path / "run" / "sheets").symlink_to(tmp_path / "full")
+    check_links(tmp_path / "run", ["point_cloud"])
+    with pytest.raises(InputError, match="sheets is a link that leads out of"):
+        check_links(tmp_path / "run", ["point_cloud", "sheets"])
 
 
 def test_an_output_that_is_a_link_to_a_folder_is_that_folder(tmp_path: Path) -> None:
