@@ -49,7 +49,7 @@ class Train(Generic[RecipeKind]):
         resume: continue the run in `output`.
         mask_polarity: mask value that marks panes.
         checkpoint_every: seconds between checkpoints.
-        memory: gigabytes of memory for photographs; by default a quarter of the machine's.
+        memory: gigabytes of memory for photographs; by default a quarter of what the machine or job allows.
         config: recipe.json with default values of the options.
         view: watch the training in the browser.
     """
@@ -206,7 +206,7 @@ SCENE = Path(__file__).parents[1] / "demo_scene"
 DEMO_DOWNSCALE = 3.2
 """Reduces the bundled photographs to 200x150 pixels, which train in minutes on two cores."""
 LEAST_ITERATIONS = 8
-"""One for each stage of `planar` and more."""
+"""Enough for a step in each stage of `planar`."""
 
 
 @dataclass(frozen=True)

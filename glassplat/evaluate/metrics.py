@@ -69,9 +69,13 @@ METRICS = {
     "ssim": Metric("SSIM", "{:.4f}", "structural similarity, 1 for equal images; higher is better"),
     "lpips": Metric("LPIPS", "{:.4f}", "perceptual distance by a trained network, 0 for equal images; lower is better"),
     "pane_psnr": Metric("PSNR, pane", "{:.2f} dB", "PSNR of the pixels that show a pane; higher is better"),
-    "transmission_psnr": Metric("PSNR, transmission", "{:.2f} dB", "PSNR of the transmission over the panes"),
+    "transmission_psnr": Metric(
+        "PSNR, transmission", "{:.2f} dB", "PSNR of the transmission over the panes, against the truth"
+    ),
     "reflection_psnr": Metric(
-        "PSNR, reflection", "{:.2f} dB", "PSNR of the reflection over the panes, scaled by the reflection gain"
+        "PSNR, reflection",
+        "{:.2f} dB",
+        "PSNR of the reflection over the panes, scaled by the reflection gain, against the truth",
     ),
 }
 SURFACE_METRICS = {
@@ -84,7 +88,9 @@ SURFACE_METRICS = {
     ),
     "strength_error": Metric("strength error", "{:.3f}", "mean absolute error of the reflection strength, 0 to 1"),
     "environment_psnr": Metric(
-        "PSNR, environment", "{:.2f} dB", "PSNR of the learned environment, scaled by the environment gain"
+        "PSNR, environment",
+        "{:.2f} dB",
+        "PSNR of the learned environment, scaled by the environment gain, against the truth",
     ),
     "environment_lpips": Metric("LPIPS, environment", "{:.4f}", "the same as a perceptual distance; lower is better"),
 }

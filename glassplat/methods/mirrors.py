@@ -80,7 +80,7 @@ def mean_in_region(scene: Scene, shown: Tensor, values: Tensor) -> float:
 
 
 def in_region(scene: Scene) -> Tensor:
-    """[N] bool: primary Gaussians inside the region."""
+    """[N] bool: primary Gaussians inside the region; all if there is none."""
     means = scene.primary.means
     if scene.environment.region is None:
         return torch.ones(len(means), dtype=torch.bool, device=means.device)

@@ -79,7 +79,7 @@ def _common_point(centers: torch.Tensor, forward: torch.Tensor) -> torch.Tensor 
 
 
 MOST_CELLS = 32
-"""Default number of cells along an edge of the box (EnvGS, Section 4.3)."""
+"""Maximum number of cells along an edge of the box by default; that of the paper (EnvGS, Section 4.3)."""
 GAUSSIANS_PER_PIXEL = 0.5
 """Default number of Gaussians per pixel of a photograph."""
 NARROWEST = 1e-3

@@ -639,7 +639,7 @@ def load(
 
 def _from_run(path: Path, device: DeviceName) -> Model:
     directory = RunDirectory(path)
-    recipe: Any = with_background(directory.recipe(), BLACK)  # Runs of earlier versions have no cameras.json.
+    recipe: Any = with_background(directory.recipe(), BLACK)  # Runs of earlier versions record none.
     scene, _ = directory.latest_scene()
     with input_checked():
         recipe.renderer().check(scene)

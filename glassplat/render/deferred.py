@@ -74,7 +74,7 @@ def environment_from_equirect(image: Tensor, size: int) -> Environment:
     if height < 1 or tuple(image.shape) != (height, 2 * height, 3):
         raise ValueError(f"the panorama has shape {tuple(image.shape)}; expected (H, 2 H, 3)")
     if not image.is_floating_point() or not bool(torch.isfinite(image).all()):
-        raise ValueError("the panorama contains non-finite values floating-point numbers; expected sRGB in [0, 1]")
+        raise ValueError("the panorama contains integers or non-finite values; expected floating-point sRGB in [0, 1]")
     if size < 1:
         raise ValueError(f"the environment's size is {size}; expected at least 1 texel along a face")
     samples = max(1, math.ceil(height / (2 * size)))

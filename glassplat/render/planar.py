@@ -54,7 +54,7 @@ from glassplat.scene.panes import nearest_panes
 from glassplat.scene.scene import Scene
 
 DEPTH_CHANNEL = 3
-"""Channels of the first pass, after the colours."""
+"""Channel of the depth in the first pass, after the colours."""
 PHOTOGRAPHED = "photographed"
 """Layer with the photographer in the panes, in addition to an image without."""
 PhotographerMode = Literal["absent", "present", "beside"]

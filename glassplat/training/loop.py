@@ -89,7 +89,7 @@ def train(
     Raises:
         TrainingDivergedError: a loss is not finite; the message names term, step and view.
         NoGaussiansError: no Gaussians are left, or none are visible in any view.
-        RankLostError: another rank has ended; the state is that of the last message.
+        RankLostError: another rank has ended; the state is that after the last `StepDone`, or `ActionDone` after it.
     """
     ranks = ranks or Ranks()
     check_population(state)

@@ -392,9 +392,9 @@ class SurroundingsStart:
     """Options for the first surroundings.
 
     Attributes:
-        source: Gaussians on a grid over the scene's bounding box (paper), copies of the scene's Gaussians that do not
-            reflect, or both.
-        cells: grid cells along an edge of the box; by default as many as suit the photographs, at most 32 (paper: 32).
+        source: Gaussians in every cell of the scene's box (paper), copies of the scene's Gaussians that do not reflect,
+            or both.
+        cells: cells along an edge of the box; by default as many as suit the photographs, at most 32 (paper: 32).
         per_cell: Gaussians in each cell.
         outside: share of the points left out of the box at either end of each axis.
         opacity: of those in the box.

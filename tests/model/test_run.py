@@ -40,7 +40,7 @@ from glassplat.training.checkpoint import load_checkpoint, recorded, save_checkp
 from glassplat.training.messages import CheckpointWritten, Message, RunBegun, StepDone, Working
 from glassplat.training.ranks import Ranks
 from glassplat.training.stage import Clock, TrainState
-from tests.training.rank_process import forked
+from tests.training.rank_process import LONGEST, forked
 from tests.training.tiny_capture import tiny_capture, true_scene, write_tiny_capture
 
 SETTINGS = RunSettings("tiny", iterations=12)
@@ -90,7 +90,7 @@ def killed_at(path: Path, stem: str, suffix: str) -> None:
 @pytest.mark.parametrize(("stem", "suffix"), [(".point_cloud.", ".ply"), (".scene.", ".json")])
 def test_what_a_killed_run_left_half_written_goes(tmp_path: Path, stem: str, suffix: str) -> None:
     process = forked(killed_at, tmp_path / "run", stem, suffix)
-    process.join()
+    process.join(LONGEST)
     assert process.exitcode == -signal.SIGKILL
     scene = tmp_path / "run" / "point_cloud" / "iteration_12"
     assert any(path.name.startswith(stem) for path in scene.iterdir())

@@ -50,7 +50,7 @@ def test_the_table_of_a_page_is_that_of_the_preset(method: str) -> None:
     assert with_table(page, method) == page, "python -m tools.make_differences writes the tables anew"
 
 
-@pytest.mark.parametrize("preset", ["default", "paper"])
+@pytest.mark.parametrize("preset", ["glassplat", "paper"])
 @pytest.mark.parametrize("method", RECIPES)
 def test_what_learns_once_learns_to_the_end(method: str, preset: Any) -> None:
     stages = recipe_of(method, preset).stages(0)
