@@ -72,7 +72,7 @@ def test_writers_that_pick_a_format_see_the_suffix_of_a_link(tmp_path: Path) -> 
 
 def test_an_error_without_a_number_is_told_without_one(tmp_path: Path) -> None:
     with (
-        pytest.raises(OSError, match=r"^could not write .* \(a library said so\); whatever"),
+        pytest.raises(OSError, match=r"^could not write .* \(a library said so\); the previous"),
         atomic_write(tmp_path / "a"),
     ):
         raise OSError("a library said so")

@@ -217,7 +217,7 @@ def test_cut_off_file_is_named(tmp_path: Path, suffix: str) -> None:
         ("a.png", np.zeros((2, 2, 2), dtype=np.uint8), ValueError, r"got \[2, 2, 2\]"),
         ("a.png", np.zeros((0, 2, 3), dtype=np.uint8), ValueError, r"got \[0, 2, 3\]"),
         ("a.png", np.zeros((2, 2, 3), dtype=np.int64), TypeError, "got int64"),
-        ("a.png", torch.full((2, 2), float("nan")), ValueError, "not finite"),
+        ("a.png", torch.full((2, 2), float("nan")), ValueError, "non-finite"),
         ("a.xyz", np.zeros((2, 2, 3), dtype=np.uint8), ValueError, "image format of .*a.xyz"),
     ],
 )

@@ -98,7 +98,7 @@ def compressed_header(count: int, chunks: int, kind: str = "uint") -> bytes:
     [
         ("a.splat", bytes(33), "32 per Gaussian"),
         ("a.splat", b"", "32 per Gaussian"),
-        ("a.obj", b"v 0 0 0", "no splat file"),
+        ("a.obj", b"v 0 0 0", "not a readable splat file"),
         ("a.ply", compressed_header(2**60, 2**52) + bytes(64), "cut off"),
         ("a.ply", compressed_header(1, 2) + bytes(112), "2 chunks"),
         ("a.ply", compressed_header(1, 1, "int") + bytes(64), "expected uint"),
