@@ -95,7 +95,7 @@ class Prepare:
 
 @dataclass(frozen=True)
 class Annotate(Command):
-    """Mark the panes of a capture in the browser: corners in a few photographs, and what stands in front of them.
+    """Mark the panes of a capture in the browser: their corners in a few photographs, and what occludes them.
 
     Attributes:
         capture: directory of the capture.

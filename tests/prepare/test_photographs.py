@@ -279,7 +279,7 @@ def a_capture(folder: Path) -> None:
         (broken, r"cannot read .*1\.png as an image"),
         (several, r"2 of 3 photographs cannot be used \(1\.png, 2\.png\).*The first: cannot read .*1\.png as"),
         (no_picture, r"cannot read .*1\.png as an image"),
-        (tiny, r"thumbnail\.png is 30x20 pixels; expected at least 64"),
+        (tiny, r"thumbnail\.png is 30x20 pixels; expected a photograph of at least 64"),
         (heic, r"1 photographs in .* are HEIC files.*IMG_1\.HEIC.*save them as JPEG.*pip install 'glassplat\[heic\]'"),
         (heic_by_another_name, r"1 photographs in .* are HEIC files.*IMG_2\.jpg.*save them as JPEG"),
         (too_few, r"holds too few photographs: 2; expected at least 3"),
