@@ -95,7 +95,7 @@ def test_a_video_is_looked_into(tmp_path: Path, capsys: pytest.CaptureFixture[st
     (tmp_path / "notes.mp4").write_text("no video")
     found = told(tmp_path / "notes.mp4", capsys)
     assert found["kind"] == "a file with a video's suffix" and not found["next"]
-    assert "OpenCV can read no picture of it" in found["problems"][0]
+    assert "OpenCV cannot read a frame of it" in found["problems"][0]
 
 
 def test_without_opencv_a_video_is_told_by_its_name(

@@ -93,7 +93,7 @@ def test_bad_input_is_named() -> None:
         environment_from_equirect(torch.zeros(4, 4, 3), 4)
     with pytest.raises(ValueError, match=r"shape \(\); expected"):
         environment_from_equirect(torch.tensor(0.5), 4)
-    with pytest.raises(ValueError, match="not finite"):
+    with pytest.raises(ValueError, match="non-finite"):
         environment_from_equirect(torch.full((4, 8, 3), torch.nan), 4)
     with pytest.raises(ValueError, match="size is 0"):
         environment_from_equirect(torch.zeros(4, 8, 3), 0)
