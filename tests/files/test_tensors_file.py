@@ -135,7 +135,10 @@ def test_a_file_that_is_cut_off_is_named(tmp_path: Path, kept: int) -> None:
 
 
 def test_what_is_no_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="absent does not exist"), opened_tensors(tmp_path / "absent", "x-1", "an x"):
+    with (
+        pytest.raises(FileNotFoundError, match="absent does not exist"),
+        opened_tensors(tmp_path / "absent", "x-1", "an x"),
+    ):
         pass
     with pytest.raises(ValueError, match="cannot be read"), opened_tensors(tmp_path, "x-1", "an x"):
         pass
