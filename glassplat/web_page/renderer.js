@@ -150,9 +150,10 @@ function makeRenderer(canvas, scene) {
     if (bounds.some(Boolean)) yield* mask(orders.joint, 0, around(bounds));
     for (const [k, pane] of panes.entries()) {
       if (!bounds[k]) continue;
-      const side = sideOf(pane, view.pose), pose = mirroredPose(view.pose, pane), own = overlap[k] && orders.masks[k];
-      present[k] = own?.isKnown ? 2 : 1;
-      if (own?.isKnown) yield* mask(own, k + 1, bounds[k]);
+      const side = sideOf(pane, view.pose), pose = mirroredPose(view.pose, pane), own = orders.masks[k];
+      present[k] = own?.isKnown && overlap[k] ? 2 : 1;
+      // Where only panes that were taken away overlap it, the mask of all must not be of their glass.
+      if (own?.isKnown) yield* mask(own, overlap[k] ? k + 1 : 0, bounds[k]);
       yield* splats('mirrored', orders.mirrored[k], targets.mirrored[k], { ...mirrors, bounds: bounds[k], pose, side }, most);
     }
     show(view, present, direct, mirrors);

@@ -123,3 +123,23 @@ def test_a_pane_without_glass_does_not_reflect_by_that_of_another(label: int, tm
         for _, camera in CAMERAS[:2]:
             for layer in ("rgb", "reflection", "strength"):
                 assert likeness(browser, scene, Planar(), camera, layer) > 42
+
+
+@needs_browser
+def test_a_pane_that_is_taken_away_takes_its_glass_with_it(tmp_path: Path) -> None:
+    scene = in_single_precision(showcase(joined(pane(2.0, half=0.8), pane(3.0, half=0.9, label=2))))
+    between = scene.primary.select(torch.tensor([0])).with_tensors(
+        {
+            "means": torch.tensor([[-0.4, 0.0, 2.5]]),
+            "log_scales": torch.full((1, 3), -1.4),
+            "logit_opacities": torch.tensor([8.0]),
+        }
+    )
+    scene = replace(scene, primary=scene.primary.concat(between), glass=closed_glass(scene.planes))
+    write_page(tmp_path / "index.html", scene, Planar(), CAMERAS, "a thing between two")
+    with Browser(tmp_path / "index.html", 320, 240) as browser:
+        browser.evaluate("glassplat.then(({ panel }) => { panel.set('pane', '0'); panel.set('glass', 'none'); })")
+        left = scene.planes.select([1])
+        without = replace(scene, planes=left, glass=closed_glass(left))
+        for layer in ("rgb", "strength"):
+            assert likeness(browser, without, Planar(), CAMERAS[1][1], layer) > 45
