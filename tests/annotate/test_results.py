@@ -355,8 +355,8 @@ def test_a_damaged_document_is_named(room: Path) -> None:
 def test_the_wrong_order_of_corners_is_called_into_question(room: Path) -> None:
     session = opened_session(room)
     document = marked_document()
-    corners = document["panes"][0]["corners"]
-    corners[1], corners[2] = corners[2], corners[1]
+    _, second, _, fourth = document["panes"][0]["corners"]
+    second[NAMES[0]], fourth[NAMES[0]] = fourth[NAMES[0]], second[NAMES[0]]  # The other way round: no sides cross.
     answer = saved(session, document)["panes"][0]
     assert answer["message"].startswith("the sides cross in ")
 
