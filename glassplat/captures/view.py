@@ -652,7 +652,7 @@ def _vectors(path: Path) -> NDArray[np.float32]:
     return np.nan_to_num(vectors.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PointCloud:
     """Coloured points in world space.
 

@@ -130,7 +130,8 @@ class Model:
     def render(self, camera: Camera | str, *, layers: Sequence[str] = ("rgb",)) -> Frame:
         """Renders the image and its layers; differentiable in every tensor of the scene and in the camera's pose.
 
-        Kernels have first derivatives only: a gradient of a gradient, as with `create_graph=True`, is refused.
+        Kernels have first derivatives only: second ones, as with `create_graph=True`, are refused, or zero if the loss
+        is linear in the image.
 
         `frame.rgb` is [H, W, 3] in sRGB, not clamped; `frame.layers` are further images by name, [H, W] or [H, W, 3].
         It is faster under `torch.no_grad()`.
@@ -200,7 +201,7 @@ class Model:
     def to(self, device: torch.device | torch.dtype | str) -> Model:
         """The same on another device, or in another precision, as float64 for `torch.autograd.gradcheck`.
 
-        Cameras are wherever they are: rendering takes them to the scene's device.
+        Cameras stay where they are: rendering takes them to the scene's device.
         """
         cameras = self.cameras
         if isinstance(device, torch.dtype):

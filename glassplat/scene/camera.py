@@ -22,7 +22,7 @@ def waits(device: torch.device) -> bool:
 
 
 def to_device(tensor: Tensor, device: torch.device | torch.dtype | str) -> Tensor:
-    """The tensor on a device, perhaps on its way there, or of another type; what is computed from it comes later."""
+    """The tensor on a device, or in another precision; if it is still on its way, what is computed from it waits."""
     if isinstance(device, torch.dtype) or tensor.device.type != "cpu" or torch.device(device).type != "cuda":
         return tensor.to(device)
     # Asynchronous copies need pinned memory.

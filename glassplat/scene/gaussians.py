@@ -15,11 +15,12 @@ DISC_SCALES = 2
 SH_COEFFICIENTS = (0, 1, 4, 9, 16)
 """Possible numbers of SH coefficients: none, or those of degrees 0 to 3."""
 ALL_DEGREES = -1
+"""Stands for the highest that `sh` holds."""
 PER_GAUSSIAN = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
 
 def check_rows(tensors: Mapping[str, Tensor], count: int, rows: Mapping[str, tuple[tuple[int, ...], ...]]) -> None:
-    """Refuse tensors, other than `sh`, without `count` rows of one of their shapes; of a single number if not given.
+    """Refuse tensors that lack `count` rows of a shape allowed by `rows`, else single numbers; `sh` only if no tensor.
 
     Raises:
         TypeError: something is no tensor.
@@ -31,7 +32,7 @@ def check_rows(tensors: Mapping[str, Tensor], count: int, rows: Mapping[str, tup
         allowed = [(count, *row) for row in rows.get(name, ((),))]
         if name != "sh" and tensor.shape not in allowed:
             expected = " or ".join(map(str, allowed))
-            raise ValueError(f"{name} has shape {tuple(tensor.shape)}; expected {expected}, all of as many rows")
+            raise ValueError(f"{name} has shape {tuple(tensor.shape)}; expected {expected}, as many rows in all tensors")
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +66,7 @@ class Gaussians:
         if len(sizes) != 3 or sizes[0] != count or sizes[1] not in SH_COEFFICIENTS or sizes[2] != 3:
             raise ValueError(
                 f"sh has shape {sizes}; expected (N, K, 3) with K one of {SH_COEFFICIENTS}, as degrees "
-                f"up to 3 have them, and N = {count} as of the means"
+                f"up to 3 have them, and N = {count} as in means"
             )
         if self.active_sh_degree == ALL_DEGREES:
             object.__setattr__(self, "active_sh_degree", max(self.max_sh_degree, 0))

@@ -364,7 +364,8 @@ def test_gaussians_of_a_model_are_plain_data() -> None:
 
 def test_what_holds_tensors_is_told_from_its_copies() -> None:
     whole = model()
-    for thing in (whole, whole.scene, whole.scene.primary, whole.scene.planes, whole.cameras["2.png"]):
+    parts = whole.scene.primary, whole.scene.planes, whole.cameras["2.png"], tiny_capture().points
+    for thing in (whole, whole.scene, *parts):
         assert thing in {thing} and thing not in [copy.deepcopy(thing)]
 
 
@@ -386,6 +387,15 @@ def test_tensors_of_another_shape_are_refused(name: str, shape: tuple[int, ...],
         model().with_parameters({name: torch.zeros(shape)})
     with pytest.raises(TypeError, match="is a list; expected a tensor"):
         model().with_parameters({name: [0.0]})  # type: ignore[dict-item]
+
+
+def test_second_derivatives_are_refused_or_zero() -> None:
+    means = model().scene.primary.means.clone().requires_grad_()
+    image = model().with_parameters({"primary.means": means}).render("2.png").rgb
+    first, second = (torch.autograd.grad(loss, means, create_graph=True)[0] for loss in (image.sum(), (image**2).sum()))
+    assert not first.requires_grad and second.requires_grad
+    with pytest.raises(RuntimeError, match="differentiate twice"):
+        second.sum().backward()
 
 
 def test_a_model_in_double_precision_is_rendered_from_its_cameras() -> None:

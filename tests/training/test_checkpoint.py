@@ -147,7 +147,7 @@ def test_what_lacks_in_the_header_is_named(checkpoint: Path, key: str) -> None:
 
 TENSORS: list[tuple[str, Any, str]] = [
     ("scene/primary/means", None, r"primary has the tensors \[.*\]; expected \[.*'means'"),
-    ("scene/primary/means", torch.zeros(4, 3), r"expected \(4, 4\), all of as many rows"),
+    ("scene/primary/means", torch.zeros(4, 3), r"expected \(4, 4\), as many rows in all tensors"),
     ("scene/primary/quats", torch.zeros(40, 3), r"quats of primary has shape \[40, 3\]; expected rows of \[4\]"),
     ("scene/primary/sh", torch.zeros(40, 2, 3), r"sh of primary has shape \[40, 2, 3\]"),
     ("scene/primary/means", torch.zeros(40, 3, dtype=torch.int64), "holds torch.int64; expected floating-point"),
