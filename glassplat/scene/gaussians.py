@@ -32,7 +32,9 @@ def check_rows(tensors: Mapping[str, Tensor], count: int, rows: Mapping[str, tup
         allowed = [(count, *row) for row in rows.get(name, ((),))]
         if name != "sh" and tensor.shape not in allowed:
             expected = " or ".join(map(str, allowed))
-            raise ValueError(f"{name} has shape {tuple(tensor.shape)}; expected {expected}, as many rows in all tensors")
+            raise ValueError(
+                f"{name} has shape {tuple(tensor.shape)}; expected {expected}, as many rows in all tensors"
+            )
 
 
 @dataclass(frozen=True, eq=False)

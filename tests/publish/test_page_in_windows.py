@@ -15,7 +15,7 @@ from tools.browser import Browser
 
 
 @needs_browser
-def test_every_control_can_be_reached_on_a_narrow_screen(tmp_path: Path) -> None:
+def test_every_control_can_be_reached_on_a_narrow_screen_until_all_are_hidden(tmp_path: Path) -> None:
     write_page(tmp_path / "index.html", true_scene(), Planar(), CAMERAS, "Narrow")
     with Browser(tmp_path / "index.html", 320, 240) as browser:
         browser.wait("document.body.classList.contains('ready')", "the page")
@@ -25,6 +25,11 @@ def test_every_control_can_be_reached_on_a_narrow_screen(tmp_path: Path) -> None
           return Math.min(left, top) < 0 || right > innerWidth || bottom > innerHeight;
         }).map((one) => one.id || one.textContent)"""
         assert browser.evaluate(outside) == []
+        look = "getComputedStyle(document.querySelector('nav'))"
+        shown = f"{look}.visibility"
+        browser.wait(f"{look}.opacity === '1'", "all controls")
+        assert browser.evaluate(f"document.body.classList.add('bare'), {shown}") == "visible", "controls fade"
+        browser.wait(f"{shown} === 'hidden'", "controls that no key reaches")
 
 
 @needs_browser
