@@ -157,7 +157,7 @@ def test_what_takes_long_between_steps_is_shown() -> None:
     assert lines[0] == "step 0: fitting planes to the masks"
     busy = [line for line in lines if "unnecessary Gaussians" in line]
     assert len(busy) >= 3
-    assert all(re.fullmatch(r"step 7: looking for .* needs, \d+ of 40 done", line) for line in busy)
+    assert all(re.fullmatch(r"step 7: searching for unnecessary Gaussians, \d+ of 40 done", line) for line in busy)
 
 
 def test_what_is_quick_between_steps_is_not() -> None:
@@ -167,7 +167,7 @@ def test_what_is_quick_between_steps_is_not() -> None:
 def test_a_checkpoint_is_named_in_the_next_line_and_makes_none() -> None:
     messages: list[Message] = [CheckpointWritten(3), *(step(number) for number in range(4, 10))]
     lines = lines_of(messages, 1.0)
-    assert lines and all(line.endswith("left, saved at step 3") or "not known yet" in line for line in lines)
+    assert lines and all(line.endswith("left, saved at step 3") or "estimating the remaining time" in line for line in lines)
 
 
 def test_events_are_lines_but_for_frequent_ones() -> None:

@@ -69,7 +69,7 @@ def test_where_the_masks_lead_nowhere_the_method_says_it(tmp_path: Path) -> None
     assert pane_regions(open_run(path).dataset, "auto") is RENDERED_REGIONS
 
 
-@pytest.mark.parametrize(("source", "said"), [("truth", "no ground truth"), ("masks", "no masks")])
+@pytest.mark.parametrize(("source", "said"), [("truth", "no ground truth"), ("masks", "no pane masks")])
 def test_a_source_that_the_capture_lacks_is_an_error(tmp_path: Path, source: str, said: str) -> None:
     dataset = open_run(write_run(tmp_path / "run")).dataset
     with pytest.raises(InputError, match=said):
