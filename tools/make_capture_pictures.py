@@ -1,11 +1,11 @@
-"""Makes the screenshots of docs/tutorial.md and docs/capture.md, from scenes of our own.
+"""Makes the screenshots of docs/tutorial.md, docs/capture.md and docs/looking.md, from scenes of our own.
 
     python -m tools.make_capture_pictures --scene SCENE --capture CAPTURE --run RUN --busy BUSY --output docs/images
 
 `--scene` ships the truth about its panes (`gt/planes.json`), which is where corners are clicked on the page of
 `glassplat annotate`; of `--capture`, which `glassplat prepare` made, the report is shown, and of `--run` the overview
-that `glassplat eval` wrote. `--busy` is a scene of `tools.make_pane_scene --passers-by`; a photograph of it is shown
-next to its masks. What is not given keeps its pictures.
+that `glassplat eval` wrote, and its scene in `glassplat view`. `--busy` is a scene of `tools.make_pane_scene
+--passers-by`; a photograph of it is shown next to its masks. What is not given keeps its pictures.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import argparse
 import json
 import shutil
 import tempfile
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,14 +22,22 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+import glassplat
+from glassplat.cli.serving import photographs_of
+from glassplat.model.model import viewer_state
 from glassplat.prepare.preparation import PAGE
 from glassplat.scene.camera import NumpyCamera
-from tools.browser import Browser
+from glassplat.viewer.render_loop import LOCAL, vacant_port
+from glassplat.viewer.server import Viewer
+from tools.browser import Browser, wait_until
 from tools.marking_page import MarkingPage, marking_page
 
 SIZE = (1180, 700)
 PAGE_SIZE = (1180, 860)
+VIEWER_SIZE = (1100, 740)
 PAGE_QUALITY = 82
+SETTLED = 3.0
+"""Seconds after which the viewer has drawn what was asked."""
 COLORS = 128
 GAP, CAPTION = 8, 22
 """Pixels between tiles, and above them."""
@@ -58,6 +67,8 @@ def save(page: MarkingPage, path: Path) -> None:
 def draw_page(page: Path, picture: Path) -> None:
     """Saves how a page on disk begins."""
     with Browser(page, *PAGE_SIZE, query="") as window:
+        window.run("for (const one of document.images) one.loading = 'eager'")
+        window.wait("[...document.images].every(one => one.complete)", "the pictures of the page")
         Image.fromarray(window.picture()).convert("RGB").save(picture, quality=PAGE_QUALITY, optimize=True)
     print(picture)
 
@@ -79,6 +90,32 @@ def draw(scene: Path, output: Path) -> None:
             post = 0.62 * left[[0, 1, 2, 3]] + 0.38 * left[[1, 0, 3, 2]]
             page.cut(third, np.stack([post[0], post[1], post[2], post[3]]))
             save(page, output / "annotate-cut.png")
+
+
+def draw_viewer(run: Path, output: Path) -> None:
+    """Saves the viewer of a run; then a pane that can be moved, next to the layer *error*."""
+    state = viewer_state(glassplat.load(run), photographs_of(run))
+    viewer = Viewer(state, LOCAL, vacant_port(LOCAL))
+    viewer.start()
+    try:
+        with Browser(viewer.address, *VIEWER_SIZE) as window:
+            (client,) = wait_until(lambda: tuple(viewer._clients.values()), "the browser to connect")
+            window.wait("document.body.innerText.includes('Nearest photograph')", "the controls")
+            window.press(".mantine-Notification-closeButton")  # Says that the browser has no GPU.
+            pictures = []
+            for control, value in ((client._layer, "rgb"), (client._panes._chosen, "1"), (client._layer, "error")):
+                control.value = value
+                time.sleep(SETTLED)
+                pictures.append(Image.fromarray(window.picture()))
+    finally:
+        viewer.stop()
+    pictures[0].save(output / "view.jpg", quality=PAGE_QUALITY, optimize=True)
+    width, height = VIEWER_SIZE[0] * 2 // 3, VIEWER_SIZE[1] * 2 // 3
+    sheet = Image.new("RGB", (2 * width + GAP, height), "white")
+    for place, picture in enumerate(pictures[1:]):
+        sheet.paste(picture.resize((width, height), Image.Resampling.LANCZOS), (place * (width + GAP), 0))
+    sheet.save(output / "view_edit.jpg", quality=PAGE_QUALITY, optimize=True)
+    print(output / "view.jpg", output / "view_edit.jpg")
 
 
 def draw_masks(scene: Path, picture: Path) -> None:
@@ -119,6 +156,7 @@ def main() -> None:
         draw_page(options.capture / PAGE, options.output / "tutorial-prepare.jpg")
     if options.run:
         draw_page(options.run / "index.html", options.output / "tutorial-eval.jpg")
+        draw_viewer(options.run, options.output)
     if options.busy:
         draw_masks(options.busy, options.output / "masks.jpg")
 
