@@ -14,7 +14,7 @@ from mkdocs.structure.files import File, Files
 import glassplat
 
 ROOT = Path(__file__).parent.parent
-PAGES = ("CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md", "LICENSE", "Dockerfile")
+PAGES = ("CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md", "LICENSE", "CITATION.cff", "Dockerfile")
 PATTERNS = ("lab/*.md", "examples/*.py", "examples/*.ipynb")
 
 NAMES = "<!-- names -->"
