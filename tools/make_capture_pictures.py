@@ -54,7 +54,7 @@ def true_corners(scene: Path) -> NDArray[np.float64]:
 
 def whole_views(cameras: Sequence[NumpyCamera], corners: NDArray[np.float64]) -> list[int]:
     """Views that show the whole pane, with a little room next to the photograph."""
-    return [number for number, camera in enumerate(cameras) if camera.holds(corners, 0.2).all()]
+    return [number for number, camera in enumerate(cameras) if camera.contains(corners, 0.2).all()]
 
 
 def save(page: MarkingPage, path: Path) -> None:

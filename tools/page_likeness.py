@@ -19,7 +19,7 @@ import torch
 
 from glassplat.captures.dataset import TEST_EVERY
 from glassplat.evaluate.metrics import psnr
-from glassplat.files.spz import FLIP
+from glassplat.files.spz import HALF_TURN_X
 from glassplat.model.model import Model, load
 from glassplat.scene.camera import Camera
 from tools.browser import Browser
@@ -30,7 +30,7 @@ DRAG_STEPS = 40
 
 def wanted(camera: Camera, layer: str) -> str:
     """A call of the page's script for the picture of a camera."""
-    flip = torch.tensor(FLIP)
+    flip = torch.tensor(HALF_TURN_X)
     rotation, position = camera.cam_from_world[:3, :3] * flip, camera.center * flip
     values: dict[str, Any] = {"rotation": rotation.flatten().tolist(), "position": position.tolist()}
     values |= {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}

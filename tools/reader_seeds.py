@@ -26,7 +26,7 @@ from glassplat.captures.view import View, estimated_normals, normals_reader
 from glassplat.files.glb import write_glb
 from glassplat.files.images import read_colors
 from glassplat.files.ply import write_gaussians
-from glassplat.files.scene_folder import drawable, read_scene, read_splats, write_scene
+from glassplat.files.scene_folder import read_scene, read_splats, select_drawable, write_scene
 from glassplat.files.sidecars import (
     read_cameras,
     read_corrections,
@@ -98,7 +98,7 @@ def camera_of() -> Camera:
 
 
 def _splats(path: Path) -> None:
-    drawable(read_splats(path), path)
+    select_drawable(read_splats(path), path)
 
 
 def _ply_seeds(folder: Path) -> None:

@@ -45,7 +45,7 @@ time.time_ns = lambda: truth[1]() + shift.randint(-10**15, 10**15)
 """A clock that jumps by days each time somebody looks."""
 
 
-class Whole(NamedTuple):
+class Integer(NamedTuple):
     """A training that nobody disturbed."""
 
     method: str
@@ -63,7 +63,7 @@ def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
     made_apart(write_tiny_capture, data)
 
     @cache
-    def whole(method: str) -> Whole:
+    def whole(method: str) -> Integer:
         return undisturbed(method, data, place / method)
 
     for number in range(cases):
@@ -81,7 +81,7 @@ def made_apart(write: Callable[[Path], object], folder: Path) -> None:
     writer.join()
 
 
-def training(whole: Whole, folder: Path, *more: str) -> Sequence[str | Path]:
+def training(whole: Integer, folder: Path, *more: str) -> Sequence[str | Path]:
     """Options of a short training with a checkpoint after every step."""
     return [
         "train", whole.method, "--data", whole.data, "--output", folder, "--iterations", str(STEPS), "--device", "cpu",
@@ -89,15 +89,15 @@ def training(whole: Whole, folder: Path, *more: str) -> Sequence[str | Path]:
     ]  # fmt: skip
 
 
-def undisturbed(method: str, data: Path, folder: Path) -> Whole:
+def undisturbed(method: str, data: Path, folder: Path) -> Integer:
     """A training that ends by itself; the first one compiles kernels."""
     for _ in range(2):
         shutil.rmtree(folder, ignore_errors=True)
         begun = time.monotonic()
-        ended = run_forked(training(Whole(method, data, folder, frozenset(), 0), folder))
+        ended = run_forked(training(Integer(method, data, folder, frozenset(), 0), folder))
         if ended.code != 0:
             raise RuntimeError(f"{method} cannot be trained at all: {ended.output[-500:]}")
-    return Whole(method, data, folder, digests_of(folder), time.monotonic() - begun)
+    return Integer(method, data, folder, digests_of(folder), time.monotonic() - begun)
 
 
 def digests_of(folder: Path) -> frozenset[tuple[str, str]]:
@@ -106,13 +106,13 @@ def digests_of(folder: Path) -> frozenset[tuple[str, str]]:
     return frozenset((path.name, hashlib.sha256(path.read_bytes()).hexdigest()) for path in files)
 
 
-def other_bits(folder: Path, whole: Whole) -> str:
+def other_bits(folder: Path, whole: Integer) -> str:
     """Fault of a run that ended with other files than one that nobody disturbed, with their names."""
     differing = digests_of(folder) ^ whole.digests
     return f"it ended with other bits: {sorted({name for name, _ in differing})}" if differing else ""
 
 
-def resumed(whole: Whole, folder: Path) -> str:
+def resumed(whole: Integer, folder: Path) -> str:
     """Fault of a run that goes on; one that has nothing to go on from begins again."""
     if folder.exists():
         fault = run_forked(["info", folder]).fault()
@@ -124,7 +124,7 @@ def resumed(whole: Whole, folder: Path) -> str:
     return other_bits(folder, whole)
 
 
-def wait_for_moment(draw: random.Random, whole: Whole, folder: Path) -> None:
+def wait_for_moment(draw: random.Random, whole: Integer, folder: Path) -> None:
     """Any moment of a training; two thirds of them are after its first checkpoint."""
     if draw.random() < 1 / 3:
         time.sleep(draw.uniform(0, whole.seconds))
@@ -135,7 +135,7 @@ def wait_for_moment(draw: random.Random, whole: Whole, folder: Path) -> None:
     time.sleep(draw.uniform(0, 0.4 * whole.seconds))
 
 
-def killed(draw: random.Random, whole: Whole, folder: Path) -> str:
+def killed(draw: random.Random, whole: Integer, folder: Path) -> str:
     """A training is killed, and loses little."""
 
     def kill(pid: int) -> None:
@@ -149,14 +149,14 @@ def killed(draw: random.Random, whole: Whole, folder: Path) -> str:
     return ended.fault() or resumed(whole, folder)
 
 
-def interrupted(draw: random.Random, whole: Whole, folder: Path) -> str:
+def interrupted(draw: random.Random, whole: Integer, folder: Path) -> str:
     """Somebody presses Ctrl-C one to four times within half a second."""
     times = draw.randint(1, 4)
     sent = Sent(signal.SIGINT, draw.uniform(0, 2 * whole.seconds + 3), times, 0.5 / times)
     return run(training(whole, folder), sent=sent).fault() or resumed(whole, folder)
 
 
-def out_of_disk(draw: random.Random, whole: Whole, folder: Path) -> str:
+def out_of_disk(draw: random.Random, whole: Integer, folder: Path) -> str:
     """The disk is full at some write; later there is space."""
     with small_disk(folder, draw.choice((0, 4, 8, 16, 40, 100, 200)) + draw.randrange(1, 40)) as change:
         fault = run_forked(training(whole, folder / "run")).fault()
@@ -164,7 +164,7 @@ def out_of_disk(draw: random.Random, whole: Whole, folder: Path) -> str:
         return fault or resumed(whole, folder / "run")
 
 
-def read_only(draw: random.Random, whole: Whole, folder: Path) -> str:
+def read_only(draw: random.Random, whole: Integer, folder: Path) -> str:
     """The disk becomes read-only in the middle; later it can be written."""
     with small_disk(folder, 1 << 20) as change:
 
@@ -181,7 +181,7 @@ def read_only(draw: random.Random, whole: Whole, folder: Path) -> str:
         return fault or resumed(whole, folder / "run")
 
 
-def taken_away(draw: random.Random, whole: Whole, folder: Path) -> str:
+def taken_away(draw: random.Random, whole: Integer, folder: Path) -> str:
     """The output is removed, or replaced by a file, while the command works."""
     replaced = draw.random() < 0.5
 
@@ -198,7 +198,7 @@ def taken_away(draw: random.Random, whole: Whole, folder: Path) -> str:
     return ended.fault()
 
 
-def two_at_once(draw: random.Random, whole: Whole, folder: Path) -> str:
+def two_at_once(draw: random.Random, whole: Integer, folder: Path) -> str:
     """Two processes train into one folder: one does, the other one is refused."""
     with ThreadPoolExecutor(2) as pool:
         ended: list[Ended] = list(pool.map(lambda _: run(training(whole, folder)), range(2)))
@@ -210,7 +210,7 @@ def two_at_once(draw: random.Random, whole: Whole, folder: Path) -> str:
     return other_bits(folder, whole)
 
 
-def clock_jumps(draw: random.Random, whole: Whole, folder: Path) -> str:
+def clock_jumps(draw: random.Random, whole: Integer, folder: Path) -> str:
     """The clock jumps to and fro by days."""
     site = folder.with_name(f"{folder.name}-clock")
     site.mkdir()
@@ -232,7 +232,7 @@ def killer(seconds: float) -> Callable[[int], None]:
     return kill
 
 
-def written(draw: random.Random, whole: Whole, folder: Path) -> str:
+def written(draw: random.Random, whole: Integer, folder: Path) -> str:
     """Something is made of a finished run, killed or out of disk on the way, and made again."""
     made = folder / "made"
     film = ["--seconds", "0.5", "--fps", "8", "--width", "64"]
@@ -255,7 +255,7 @@ def written(draw: random.Random, whole: Whole, folder: Path) -> str:
         return again(fault)
 
 
-def marked(draw: random.Random, whole: Whole, folder: Path) -> str:
+def marked(draw: random.Random, whole: Integer, folder: Path) -> str:
     """Two programs save marks of one capture, and are killed or out of disk: what was saved is there."""
     with small_disk(folder, 1 << 20) as change:
         room = folder / "room"
@@ -309,7 +309,7 @@ def save_marks(room: Path, log: Path) -> None:
             print(place, file=lines, flush=True)
 
 
-def prepared(draw: random.Random, whole: Whole, folder: Path) -> str:
+def prepared(draw: random.Random, whole: Integer, folder: Path) -> str:
     """A preparation is killed or out of disk, and goes on."""
     is_killed = draw.random() < 0.5
     with small_disk(folder, 1 << 20) as change:
@@ -332,7 +332,7 @@ def prepared_again(command: Sequence[str | Path], capture: Path) -> str:
     return "" if last.code == 0 else f"prepare --resume: {last.fault() or last.output[-400:]}"
 
 
-KINDS: tuple[Callable[[random.Random, Whole, Path], str], ...] = (
+KINDS: tuple[Callable[[random.Random, Integer, Path], str], ...] = (
     killed, out_of_disk, interrupted, marked, killed, written, read_only, taken_away, killed, two_at_once, out_of_disk,
     killed, written, clock_jumps, killed, interrupted, marked, out_of_disk, killed, prepared,
 )  # fmt: skip

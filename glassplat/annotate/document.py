@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from glassplat.annotate.fit import Marks, Shape
-from glassplat.files.records import ByName, Choice, Field, Items, Number, Optional, Whole, check_fields, read_json
+from glassplat.files.records import Choice, DictOf, Field, Integer, ListOf, Number, Optional, check_fields, read_json
 from glassplat.files.writing import write_text
 from glassplat.scene.camera import NumpyCamera
 
@@ -29,7 +29,7 @@ LOCK = "annotations.lock"
 MOST_PANES, MOST_CORNERS, MOST_STROKES, MOST_PLACES = 64, 32, 500, 20_000
 """Limits of one document: more than users mark, and small enough to process."""
 FARTHEST = 1e6
-PLACE = Items(Number(-FARTHEST, FARTHEST), 2)
+PLACE = ListOf(Number(-FARTHEST, FARTHEST), 2)
 
 
 class Record(Field):
@@ -40,7 +40,7 @@ class Record(Field):
     def __init__(self, fields: Mapping[str, Field]) -> None:
         self._fields = fields
 
-    def _converted(self, value: Any, where: str) -> dict[str, Any]:
+    def _convert(self, value: Any, where: str) -> dict[str, Any]:
         return check_fields(value, self._fields, where)
 
 
@@ -49,20 +49,20 @@ STROKE = Record(
         "kind": Choice(("polygon", "brush")),
         "effect": Choice(("cut", "keep")),
         "radius": Optional(Number(0.1, 10_000), default=10.0),
-        "points": Items(PLACE),
+        "points": ListOf(PLACE),
     }
 )
 PANE = Record(
     {
-        "label": Whole(1, MOST_PANES),
+        "label": Integer(1, MOST_PANES),
         "material": Choice(("glass", "mirror", "screen")),
         "shape": Choice(("rectangle", "polygon")),
-        "corners": Items(ByName(PLACE)),
-        "edges": Optional(Items(ByName(Items(PLACE, 2))), default=()),
-        "strokes": Optional(ByName(Items(STROKE)), default={}),
+        "corners": ListOf(DictOf(PLACE)),
+        "edges": Optional(ListOf(DictOf(ListOf(PLACE, 2))), default=()),
+        "strokes": Optional(DictOf(ListOf(STROKE)), default={}),
     }
 )
-DOCUMENT: dict[str, Field] = {"version": Choice((1,)), "panes": Items(PANE)}
+DOCUMENT: dict[str, Field] = {"version": Choice((1,)), "panes": ListOf(PANE)}
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ def seen_outline(camera: NumpyCamera, corners: Array) -> Array:
 
     Clipped ends lie far outside the photograph, at most 1 / `NEAR` focal lengths, which keeps edges straight.
     """
-    return camera.pixels(_before_camera(camera.in_camera(corners)))
+    return camera.pixels(_before_camera(camera.to_camera_axes(corners)))
 
 
 def _before_camera(points: Array) -> Array:

@@ -217,7 +217,7 @@ def mark_residuals(marks: Marks, cameras: Sequence[NumpyCamera], shape: PaneShap
 
 def corner_information(camera: NumpyCamera, shape: PaneShape) -> Array:
     """[F, F] information that a fit would gain if all corners visible in a view were marked."""
-    held = camera.holds(shape.corners())
+    held = camera.contains(shape.corners())
     marks = Marks(
         [{0: pixel} if seen else {} for pixel, seen in zip(camera.project(shape.corners()), held, strict=True)]
     )

@@ -20,7 +20,7 @@ from glassplat.captures.files import read_poses, with_masks
 from glassplat.captures.masks import PANE_FOLDER, PLANES, mask_paths
 from glassplat.captures.view import PhotoFile, View
 from glassplat.errors import InputError, first_names
-from glassplat.files.images import files_below, image_size, is_hidden, leads_out, write_image
+from glassplat.files.images import files_below, image_size, is_hidden, leaves_folder, write_image
 from glassplat.files.records import read_json
 from glassplat.files.sidecars import planes_json, write_planes
 from glassplat.files.writing import file_digest, remove_empty, remove_unfinished, write_text
@@ -206,7 +206,7 @@ def earlier_masks(root: Path) -> set[str]:
             "two kinds cannot be mixed: train with these masks, or move that folder away and mark the panes "
             "here"
         )
-    return {name for name in known if not leads_out(name)}
+    return {name for name in known if not leaves_folder(name)}
 
 
 def pane_labels(name: str, camera: NumpyCamera, panes: Solved) -> Labels:

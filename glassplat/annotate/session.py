@@ -33,7 +33,7 @@ from glassplat.captures.dataset import Dataset
 from glassplat.captures.masks import PANE_FOLDER, PLANES
 from glassplat.captures.view import View
 from glassplat.errors import InputError, first_names, input_checked
-from glassplat.files.records import Field, Items, Text, Whole, check_fields
+from glassplat.files.records import Field, Integer, ListOf, Text, check_fields
 from glassplat.files.writing import check_folder, check_links
 from glassplat.scene.camera import NumpyCamera
 
@@ -51,7 +51,7 @@ def settling_views(fit: PaneFit, cameras: Sequence[NumpyCamera], marked: Collect
     corners = fit.shape.corners()
     found = []
     for number, camera in enumerate(cameras):
-        if number in marked or camera.holds(corners, MARGIN).sum() < min(LEAST_CORNERS, len(corners)):
+        if number in marked or camera.contains(corners, MARGIN).sum() < min(LEAST_CORNERS, len(corners)):
             continue
         found.append((number, tilt_deviation(fit.information + corner_information(camera, fit.shape))))
     return sorted(found, key=lambda pair: pair[1])[:OFFERED]
@@ -64,7 +64,7 @@ def second_views(outline: Array, view: int, cameras: Sequence[NumpyCamera], poin
     """
     camera = cameras[view]
     inside = fill_polygon(outline, (int(camera.size[0]), int(camera.size[1])))
-    held = camera.holds(points)
+    held = camera.contains(points)
     column, row = np.floor(camera.project(points[held])).astype(np.int64).T
     through = points[held][inside[row, column]]
     if not len(through):
@@ -78,7 +78,7 @@ def second_views(outline: Array, view: int, cameras: Sequence[NumpyCamera], poin
 
 def first_view(cameras: Sequence[NumpyCamera], points: Array) -> int:
     """The view that shows the most measured points."""
-    return int(np.argmax([camera.holds(points).sum() for camera in cameras])) if len(points) else 0
+    return int(np.argmax([camera.contains(points).sum() for camera in cameras])) if len(points) else 0
 
 
 def _worth(points: Array, camera: NumpyCamera, other: NumpyCamera) -> float:
@@ -86,7 +86,7 @@ def _worth(points: Array, camera: NumpyCamera, other: NumpyCamera) -> float:
     one, two = (points - one.center for one in (camera, other))
     cosine = (one * two).sum(1) / (np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1))
     angle = float(np.median(np.arccos(np.clip(cosine, -1, 1))))
-    return float(other.holds(points).mean()) * min(angle, WANTED_ANGLE)
+    return float(other.contains(points).mean()) * min(angle, WANTED_ANGLE)
 
 
 Panes = Mapping[int, Any]
@@ -163,7 +163,7 @@ MOST_GRABBED = 2000
 """Maximum number of points of a hand-drawn outline."""
 KNOWN_VERSIONS = 200
 """Number of remembered versions of the document on which a page may base its changes."""
-GRABBED: dict[str, Field] = {"view": Whole(0, 10**9), "points": Items(PLACE)}
+GRABBED: dict[str, Field] = {"view": Integer(0, 10**9), "points": ListOf(PLACE)}
 
 
 class ChangedElsewhereError(ValueError):
@@ -195,7 +195,7 @@ class Session:
     def __init__(self, dataset: Dataset) -> None:
         self.root = dataset.root
         self.views: tuple[View, ...] = tuple(sorted((*dataset.train, *dataset.test), key=lambda view: view.name))
-        self.cameras = [NumpyCamera.of(view.camera) for view in self.views]
+        self.cameras = [NumpyCamera.from_camera(view.camera) for view in self.views]
         points = dataset.points.positions.double().numpy() if dataset.measured_points else np.zeros((0, 3))
         self._points: Array = points[:: max(1, len(points) // POINTS_USED)]
         self._numbers = {view.name: number for number, view in enumerate(self.views)}
@@ -406,7 +406,7 @@ class Session:
         source = self.cameras[view]
         far = self._reach()
         ends = source.center + source.rays(place) * np.geomspace(0.01 * far, 10 * far, 60)[:, None]
-        ends = ends[camera.in_camera(ends)[:, 2] > 0.005 * far]
+        ends = ends[camera.to_camera_axes(ends)[:, 2] > 0.005 * far]
         if len(ends) < 2:
             return None
         return np.round(camera.project(ends[[0, -1]]), 1).tolist()
@@ -429,7 +429,9 @@ def _crosses_itself(outline: Array) -> bool:
 def _places(camera: NumpyCamera, corners: Array) -> list[list[float] | None]:
     """Pixels of corners; None for those behind the camera."""
     places = np.round(camera.project(corners), 2).tolist()
-    return [place if depth > 0 else None for place, depth in zip(places, camera.in_camera(corners)[:, 2], strict=True)]
+    return [
+        place if depth > 0 else None for place, depth in zip(places, camera.to_camera_axes(corners)[:, 2], strict=True)
+    ]
 
 
 def opened_session(root: Path) -> Session:

@@ -25,7 +25,7 @@ from glassplat.captures.capture import Capture, RawPoints, Shot
 from glassplat.captures.transforms import TRAIN, WHOLE
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.images import files_below
-from glassplat.files.records import reading
+from glassplat.files.records import wrap_read_errors
 from glassplat.options import short_repr
 
 UNIT_TOLERANCE = 1e-2
@@ -106,7 +106,7 @@ def _records_of(path: Path) -> list[Any]:
     """All records in one file of a model; errors name the file."""
     binary, text = PARSERS[path.stem]
     try:
-        with reading(path):
+        with wrap_read_errors(path):
             if path.suffix == ".bin":
                 return list(binary(_Bytes(path.read_bytes())))
             with path.open(encoding="utf-8-sig") as stream:

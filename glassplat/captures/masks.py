@@ -73,7 +73,7 @@ def read_mask_at_threshold(path: Path) -> MaskValues:
 def _read_shades(path: Path) -> NDArray[np.uint8]:
     """[H, W] grey values, or palette indices of labels shown in colours; transparency takes precedence."""
     image = _open_mask(path)
-    if image.mode in images.SHADES_16:
+    if image.mode in images.GREY_MODES_16:
         return _in_eight_bits(np.array(image), path)
     if image.mode in ("1", "L", "LA"):
         return np.array(image.convert("L"))
@@ -85,7 +85,7 @@ def _open_mask(path: Path) -> Image.Image:
     """The mask; if any pixel is transparent, its opacity thresholded at one half as white and black."""
     with input_checked():
         image = images.open_image(path)
-        opaque = None if image.mode in images.SHADES_16 else images.opacity(image)
+        opaque = None if image.mode in images.GREY_MODES_16 else images.opacity(image)
     image.info.pop("transparency", None)  # Pillow warns about some encodings of it.
     return image if opaque is None else Image.fromarray(np.where(opaque < THRESHOLD, 0, WHITE).astype(np.uint8))
 
@@ -327,7 +327,7 @@ def _highest_value(path: Path) -> int:
 def _brightness(path: Path) -> NDArray[np.uint8]:
     """[H, W] brightness of a mask, or its thresholded opacity if it has transparent pixels."""
     image = _open_mask(path)
-    if image.mode in images.SHADES_16:
+    if image.mode in images.GREY_MODES_16:
         return _in_eight_bits(np.array(image), path)
     return np.array(image.convert("RGB")).max(axis=2)
 
@@ -462,7 +462,7 @@ def mask_paths(photographs: Iterable[str]) -> dict[str, Path]:
 
     Names are assigned to photographs inside the capture first, then to those whose names lead out of it.
     """
-    return images.picture_paths(sorted(photographs, key=lambda name: (images.leads_out(name), name)))
+    return images.image_paths(sorted(photographs, key=lambda name: (images.leaves_folder(name), name)))
 
 
 Owners = Mapping[str, list[str]]

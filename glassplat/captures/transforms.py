@@ -76,13 +76,13 @@ LISTED = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Order of `distortion_params`, as in nerfstudio."""
 LENS: dict[str, records.Field] = {
     "camera_model": records.Optional(records.Choice((*PERSPECTIVE, FISHEYE))),
-    "is_fisheye": records.Optional(records.Flag(), default=False),
+    "is_fisheye": records.Optional(records.Boolean(), default=False),
     **dict.fromkeys(("w", "h"), records.Optional(records.Number(1, LARGEST_SIDE))),
     **dict.fromkeys(("fl_x", "fl_y"), records.Optional(records.Number(above=0))),
     **dict.fromkeys(("camera_angle_x", "camera_angle_y"), records.Optional(records.Number(above=0, most=math.pi))),
     **dict.fromkeys(("cx", "cy"), records.Optional(records.Number())),
     **dict.fromkeys(COEFFICIENTS, records.Optional(records.Number(), default=0.0)),
-    "distortion_params": records.Optional(records.Items(records.Number(), len(LISTED))),
+    "distortion_params": records.Optional(records.ListOf(records.Number(), len(LISTED))),
 }
 
 
@@ -160,14 +160,14 @@ OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 Settings = Mapping[str, Any]
 FRAME: dict[str, records.Field] = {
     "file_path": records.Text(),
-    "transform_matrix": records.Items(records.Items(records.COORDINATE, 4)),
+    "transform_matrix": records.ListOf(records.ListOf(records.COORDINATE, 4)),
     "mask_path": records.Optional(records.Text()),
 }
 FILE: dict[str, records.Field] = {
     "ply_file_path": records.Optional(records.Text()),
-    "train_filenames": records.Optional(records.Items(records.Text())),
-    "val_filenames": records.Optional(records.Items(records.Text())),
-    "test_filenames": records.Optional(records.Items(records.Text())),
+    "train_filenames": records.Optional(records.ListOf(records.Text())),
+    "val_filenames": records.Optional(records.ListOf(records.Text())),
+    "test_filenames": records.Optional(records.ListOf(records.Text())),
 }
 """Fields read in addition to the lens (`LENS`); other fields of the file are ignored."""
 

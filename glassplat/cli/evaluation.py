@@ -136,7 +136,7 @@ def cameras_of_test_views(stored: StoredRun, aligned: bool) -> str:
     """Description of the cameras of test views."""
     if aligned:
         return "aligned with their photographs"
-    moved = stored.scene.poses.reaches(view.name for view in stored.dataset.test)
+    moved = stored.scene.poses.covers_any(view.name for view in stored.dataset.test)
     return "moved like those of the neighbouring photographs, by name" if moved else UNMOVED
 
 

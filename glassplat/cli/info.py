@@ -17,7 +17,7 @@ from glassplat.cli.console import count_noun, import_held, say, shell_word, warn
 from glassplat.errors import InputError, UnknownFormatError, first_names, input_checked
 from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES, files_below, is_hidden
 from glassplat.files.records import Text, check_fields, read_json
-from glassplat.files.writing import SCENE, SPLAT_SUFFIXES, check_folder, scene_source
+from glassplat.files.writing import SCENE_FILE, SPLAT_SUFFIXES, check_folder, scene_source
 from glassplat.model.run_directory import RunDirectory
 from glassplat.prepare.photographs import (
     LEAST_SIDE,
@@ -183,7 +183,7 @@ def preparation_finding(path: Path) -> Iterator[Finding]:
 def splat_finding(path: Path) -> Iterator[Finding]:
     """A file of Gaussians."""
     first = Finding("a splat file", {"bytes": path.stat().st_size})
-    if (path.parent / SCENE).is_file():
+    if (path.parent / SCENE_FILE).is_file():
         first.facts["next to it"] = ", ".join(sorted(one.name for one in path.parent.iterdir() if one != path))
     yield first
     yield import_held(DETAILS).splats_part(path)
@@ -304,7 +304,7 @@ def _finder_of_folder(path: Path) -> Finder:
         raise InputError(f"{path} holds a scene, but no recipe.json; expected what `glassplat train --output` wrote")
     if path.name.endswith(".partial") and (path / "settings.json").is_file():
         return preparation_finding
-    if (path / SCENE).is_file():
+    if (path / SCENE_FILE).is_file():
         return scene_finding
     if scene_source(path) != path:
         return export_finding

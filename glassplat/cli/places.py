@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Literal
 
 from glassplat.cli.console import message_console, say
 from glassplat.errors import InputError, first_names, input_checked
-from glassplat.files.records import read_json, readable_name, reading
-from glassplat.files.writing import LOADED, check_folder, make_folder, real_path, scene_source, write_text
+from glassplat.files.records import read_json, readable_name, wrap_read_errors
+from glassplat.files.writing import LOADABLE, check_folder, make_folder, real_path, scene_source, write_text
 from glassplat.kernels.backend.devices import DeviceName
 from glassplat.model.run_directory import RunDirectory
 from glassplat.options import Finite, PaneLabel, Share, Up
@@ -83,9 +83,9 @@ def check_scene(path: Path) -> None:
         check_file(path)
         return
     if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist; expected {LOADED}")
+        raise FileNotFoundError(f"{path} does not exist; expected {LOADABLE}")
     if not (path / "recipe.json").is_file():
-        raise InputError(f"{path} holds no scene; expected {LOADED}")
+        raise InputError(f"{path} holds no scene; expected {LOADABLE}")
     RunDirectory(path).check_begun()
 
 
@@ -107,7 +107,7 @@ def _in_words(path: Path) -> str:
 
 def check_file(path: Path) -> None:
     """Checks that a file can be read."""
-    with input_checked(), reading(path), path.open("rb"):
+    with input_checked(), wrap_read_errors(path), path.open("rb"):
         pass
 
 
@@ -163,7 +163,7 @@ class SceneEdits:
         from glassplat.scene.scene import (
             as_mirrors,
             glass_of_pane,
-            row_of,
+            row_of_label,
             shift_pane,
             tilt_pane,
             with_reflectance,
@@ -179,7 +179,7 @@ class SceneEdits:
             for label, reflectance in self.reflectance.items():
                 scene = with_reflectance(scene, label, reflectance)
             moved = {*self.tilt, *self.shift}
-            owned = {label: glass_of_pane(scene, row_of(scene.planes, label)) for label in moved}
+            owned = {label: glass_of_pane(scene, row_of_label(scene.planes, label)) for label in moved}
             for label, angles in self.tilt.items():
                 scene = tilt_pane(scene, label, *angles, owned=owned[label])
             for label, distance in self.shift.items():

@@ -18,7 +18,7 @@ from glassplat.cli.console import count_noun, say, shell_word, warn
 from glassplat.cli.places import chosen_views
 from glassplat.cli.progress import Plan, TrainingProgress
 from glassplat.errors import InputError, input_checked
-from glassplat.files.images import picture_paths
+from glassplat.files.images import image_paths
 from glassplat.files.sidecars import read_cameras
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
 from glassplat.methods.recipe import photo_background, resolve_background
@@ -123,7 +123,7 @@ def _without_photographs(directory: RunDirectory) -> Dataset:
 
 def pictures_of(dataset: Dataset) -> dict[str, Path]:
     """File name of each view's image; independent of the chosen views."""
-    return picture_paths([view.name for view in chosen_views(dataset, "all")])
+    return image_paths([view.name for view in chosen_views(dataset, "all")])
 
 
 def photographs_of(dataset: Dataset) -> list[Path]:

@@ -13,7 +13,7 @@ import tyro
 from glassplat.cli.console import Command
 from glassplat.cli.places import SceneEdits, SplatFile, Split, check_claim, check_file, check_scene, say_scene
 from glassplat.errors import InputError, input_checked
-from glassplat.files.writing import FORGED_SUFFIXES, WRITTEN, check_folder
+from glassplat.files.writing import GAUSSFORGE_SUFFIXES, OUTPUT_FORMATS, check_folder
 from glassplat.kernels.backend.devices import DeviceName
 from glassplat.model.run_directory import RunDirectory
 from glassplat.options import Cleaning, Downscale, Finite, Positive, Range
@@ -191,7 +191,7 @@ class Video(Command):
 if TYPE_CHECKING:
     Format = str
 else:
-    Format = Literal[WRITTEN]
+    Format = Literal[OUTPUT_FORMATS]
 
 
 @dataclass(frozen=True)
@@ -267,8 +267,8 @@ class Export(Command):
     def check(self) -> None:
         """Checks the options, the scene and the output folder."""
         if not self.formats:
-            raise InputError(f"nothing to write without --formats; expected some of {', '.join(WRITTEN)}")
-        if {f".{kind}" for kind in self.formats} & {*FORGED_SUFFIXES} and find_spec("gaussforge") is None:
+            raise InputError(f"nothing to write without --formats; expected some of {', '.join(OUTPUT_FORMATS)}")
+        if {f".{kind}" for kind in self.formats} & {*GAUSSFORGE_SUFFIXES} and find_spec("gaussforge") is None:
             raise InputError("--formats sog and ksplat need gaussforge; pip install 'glassplat[formats]'")
         if self.url is not None and not self.url.startswith(("https://", "http://")):
             raise InputError(f"--url is {self.url}; expected an address that begins with https://")

@@ -36,7 +36,7 @@ from glassplat.render.frame import check_layers
 from glassplat.render.layers import layer_image
 from glassplat.render.planar import Planar, dereflected_photo
 from glassplat.scene.camera import Camera
-from glassplat.scene.corrections import in_order
+from glassplat.scene.corrections import natural_sort_key
 from glassplat.scene.scene import Scene
 from glassplat.training.messages import Working
 
@@ -145,7 +145,7 @@ def _cameras(command: Video, model: models.Model) -> list[Camera]:
             cameras = interpolate_cameras([camera for _, camera in read_cameras(command.keyframes)], frames)
         elif command.path == "interpolate":
             cameras = interpolate_cameras(
-                keyframes_of([model.cameras[name] for name in sorted(model.cameras, key=in_order)]), frames
+                keyframes_of([model.cameras[name] for name in sorted(model.cameras, key=natural_sort_key)]), frames
             )
         else:
             cameras = model.orbit(frames)

@@ -421,7 +421,7 @@ def _means(per_view: list[dict[str, metrics.Outcome]]) -> dict[str, metrics.Outc
 def _description(scene: Scene, dataset: Dataset) -> dict[str, Any]:
     """Settings of the evaluation, and sizes of the scene."""
     sizes = dict.fromkeys(f"{view.camera.width}x{view.camera.height}" for view in dataset.test)
-    is_exposed = scene.exposures.reaches(view.name for view in dataset.test)
+    is_exposed = scene.exposures.covers_any(view.name for view in dataset.test)
     return {
         "resolution": ", ".join(sizes),
         "split": dataset.split,

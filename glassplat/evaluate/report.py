@@ -18,7 +18,7 @@ from glassplat.captures.dataset import Dataset
 from glassplat.evaluate import metrics
 from glassplat.evaluate.evaluate import EvaluatedView
 from glassplat.evaluate.truth import NOTHING_KNOWN, TrueSurface, TrueView
-from glassplat.files.images import flat_picture_names, write_image
+from glassplat.files.images import flat_image_names, write_image
 from glassplat.files.writing import write_text
 from glassplat.options import Blend
 from glassplat.render.frame import Frame
@@ -319,7 +319,7 @@ class Report:
 
 def sheet_names(names: list[str]) -> dict[str, str]:
     """File of each view's sheet, relative to the run; distinct even for `a.jpg` and `a.png`."""
-    return {name: f"sheets/{file}" for name, file in flat_picture_names(names).items()}
+    return {name: f"sheets/{file}" for name, file in flat_image_names(names).items()}
 
 
 def overview_page(

@@ -28,7 +28,7 @@ from glassplat.captures.cameras import LEAST_SHARE, area_resize
 from glassplat.captures.view import View
 from glassplat.errors import InputError, input_checked
 from glassplat.files.images import image_size, read_colors, read_image, read_image_float, resize_by_area
-from glassplat.files.records import COORDINATE, Field, Flag, Items, Number, Whole, check_fields, read_json
+from glassplat.files.records import COORDINATE, Boolean, Field, Integer, ListOf, Number, check_fields, read_json
 from glassplat.options import short_repr
 
 
@@ -63,11 +63,11 @@ class TruePlane:
     base_reflectance: float
 
 
-VECTOR = Items(COORDINATE, 3)
+VECTOR = ListOf(COORDINATE, 3)
 TRUE_PLANE: dict[str, Field] = {
-    "label": Whole(1, 255),
+    "label": Integer(1, 255),
     **dict.fromkeys(("center", "normal", "half_u", "half_v"), VECTOR),
-    "mirror": Flag(),
+    "mirror": Boolean(),
     "base_reflectance": Number(0, 1),
 }
 

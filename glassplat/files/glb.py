@@ -31,12 +31,12 @@ from glassplat.kernels.project.reference import sh_basis
 from glassplat.options import short_repr
 from glassplat.scene import SH_ZERO
 from glassplat.scene.camera import quat_from_rotation, quat_product, rotation_from_quat
-from glassplat.scene.gaussians import DISC_SCALES, Gaussians, half_turned
+from glassplat.scene.gaussians import DISC_SCALES, Gaussians, rotate_half_turn
 
-DIRECTIONS = 64
+NUM_DIRECTIONS = 64
 
 
-def turned_harmonics(sh: Tensor, rotation: Tensor) -> Tensor:
+def rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
     """Rotated SH coefficients: the new colour along d is the old colour along R^T d.
 
     Rotations do not mix degrees, so a few directions determine the map between the coefficients exactly.
@@ -47,10 +47,10 @@ def turned_harmonics(sh: Tensor, rotation: Tensor) -> Tensor:
     """
     count = sh.shape[1]
     generator = torch.Generator().manual_seed(0)
-    directions = torch.nn.functional.normalize(torch.randn(DIRECTIONS, 3, generator=generator, dtype=torch.float64))
+    directions = torch.nn.functional.normalize(torch.randn(NUM_DIRECTIONS, 3, generator=generator, dtype=torch.float64))
     before, after = (sh_basis(rays)[:, :count] for rays in (directions, directions @ rotation.to(directions)))
-    turn = torch.linalg.lstsq(before, after).solution
-    return torch.einsum("jk,nkc->njc", turn.to(sh), sh)
+    sh_rotation = torch.linalg.lstsq(before, after).solution
+    return torch.einsum("jk,nkc->njc", sh_rotation.to(sh), sh)
 
 
 MAGIC, VERSION = b"glTF", 2
@@ -61,34 +61,34 @@ COMPONENTS: dict[int, str] = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2"
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 MOST_BYTES = 2**32 - 1
 
-INDEX = records.Whole(0, 2**31)
+INDEX = records.Integer(0, 2**31)
 ACCESSOR: dict[str, records.Field] = {
     "bufferView": INDEX,
-    "byteOffset": records.Optional(records.Whole(0, MOST_BYTES), 0),
+    "byteOffset": records.Optional(records.Integer(0, MOST_BYTES), 0),
     "componentType": records.Choice(tuple(COMPONENTS)),
-    "normalized": records.Optional(records.Flag(), False),
-    "count": records.Whole(1, MOST_BYTES),
+    "normalized": records.Optional(records.Boolean(), False),
+    "count": records.Integer(1, MOST_BYTES),
     "type": records.Choice(tuple(WIDTHS)),
 }
 VIEW: dict[str, records.Field] = {
-    "buffer": records.Whole(0, 0),
-    "byteOffset": records.Optional(records.Whole(0, MOST_BYTES), 0),
-    "byteLength": records.Whole(1, MOST_BYTES),
-    "byteStride": records.Optional(records.Whole(4, 252)),
+    "buffer": records.Integer(0, 0),
+    "byteOffset": records.Optional(records.Integer(0, MOST_BYTES), 0),
+    "byteLength": records.Integer(1, MOST_BYTES),
+    "byteStride": records.Optional(records.Integer(4, 252)),
 }
 NODE: dict[str, records.Field] = {
     "mesh": records.Optional(INDEX),
-    "children": records.Optional(records.Items(INDEX), ()),
-    "matrix": records.Optional(records.Items(records.Number(-1e12, 1e12), 16)),
-    "translation": records.Optional(records.Items(records.Number(-1e12, 1e12), 3), (0.0, 0.0, 0.0)),
-    "rotation": records.Optional(records.Items(records.Number(-1.01, 1.01), 4), (0.0, 0.0, 0.0, 1.0)),
-    "scale": records.Optional(records.Items(records.Number(-1e12, 1e12), 3), (1.0, 1.0, 1.0)),
+    "children": records.Optional(records.ListOf(INDEX), ()),
+    "matrix": records.Optional(records.ListOf(records.Number(-1e12, 1e12), 16)),
+    "translation": records.Optional(records.ListOf(records.Number(-1e12, 1e12), 3), (0.0, 0.0, 0.0)),
+    "rotation": records.Optional(records.ListOf(records.Number(-1.01, 1.01), 4), (0.0, 0.0, 0.0, 1.0)),
+    "scale": records.Optional(records.ListOf(records.Number(-1e12, 1e12), 3), (1.0, 1.0, 1.0)),
 }
 PRIMITIVE: dict[str, records.Field] = {
-    "attributes": records.ByName(INDEX),
-    "mode": records.Optional(records.Whole(0, 6), 4),
+    "attributes": records.DictOf(INDEX),
+    "mode": records.Optional(records.Integer(0, 6), 4),
 }
-SCENE: dict[str, records.Field] = {"nodes": records.Optional(records.Items(INDEX), ())}
+SCENE: dict[str, records.Field] = {"nodes": records.Optional(records.ListOf(INDEX), ())}
 ASSET: dict[str, records.Field] = {"version": records.Text()}
 
 
@@ -122,7 +122,7 @@ class GltfWriter:
         self._accessors.append(accessor)
         return len(self._accessors) - 1
 
-    def file(self, document: Mapping[str, Any]) -> bytes:
+    def to_bytes(self, document: Mapping[str, Any]) -> bytes:
         """The GLB of a document together with the arrays."""
         whole = {**document, "accessors": self._accessors, "bufferViews": self._views}
         whole["buffers"] = [{"byteLength": self._size}]
@@ -140,10 +140,10 @@ class GltfReader:
 
     def __init__(self, path: Path) -> None:
         """Reads the file."""
-        with records.reading(path):
+        with records.wrap_read_errors(path):
             data = path.read_bytes()
         self.path, self.size = path, len(data)
-        text, self._buffer = _chunks(data, path)
+        text, self._buffer = _read_chunks(data, path)
         document = records.parse_json(text, str(path))
         if not isinstance(document, dict):
             raise ValueError(f"{path} holds {short_repr(document)}; expected a glTF document")
@@ -197,7 +197,7 @@ class GltfReader:
         return _dequantise(rows, normalized=accessor["normalized"])
 
 
-def _chunks(data: bytes, path: Path) -> tuple[str, bytes]:
+def _read_chunks(data: bytes, path: Path) -> tuple[str, bytes]:
     """The document's text, and the buffer, which may be empty."""
     if len(data) < HEADER.size + CHUNK.size or data[:4] != MAGIC:
         raise ValueError(f"{path} is not a GLB: expected glTF at its beginning; give a .glb file")
@@ -254,10 +254,10 @@ class Placement:
 def placement_of(node: Mapping[str, Any], outer: Placement, where: str) -> Placement:
     """Placement of a node, within the placement of its parent."""
     if node["matrix"] is not None:
-        own = _of_matrix(torch.tensor(node["matrix"], dtype=torch.float64).reshape(4, 4).T, where)
+        own = _placement_from_matrix(torch.tensor(node["matrix"], dtype=torch.float64).reshape(4, 4).T, where)
     else:
         x, y, z, w = node["rotation"]
-        own = _check_placement(
+        own = _checked_placement(
             torch.tensor([w, x, y, z], dtype=torch.float64),
             torch.tensor(node["scale"], dtype=torch.float64),
             torch.tensor(node["translation"], dtype=torch.float64),
@@ -279,32 +279,32 @@ def place_gaussians(gaussians: Gaussians, placement: Placement) -> Gaussians:
         means=means.float(),
         quats=quats.float(),
         log_scales=gaussians.log_scales + math.log(placement.scale),
-        sh=turned_harmonics(gaussians.sh, rotation),
+        sh=rotate_sh(gaussians.sh, rotation),
     )
 
 
-def _of_matrix(matrix: Tensor, where: str) -> Placement:
+def _placement_from_matrix(matrix: Tensor, where: str) -> Placement:
     linear = matrix[:3, :3]
     scale = float(linear.norm()) / math.sqrt(3)
     unit = linear / scale if scale > 0 else linear
     is_affine = torch.equal(matrix[3], torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64))
     shear = float((unit @ unit.T - torch.eye(3, dtype=torch.float64)).abs().max())
     if not is_affine or not shear < TOLERANCE or float(torch.linalg.det(unit)) < 0:
-        raise ValueError(_unlike(where))
-    return _check_placement(
+        raise ValueError(_not_a_similarity(where))
+    return _checked_placement(
         quat_from_rotation(unit), torch.full((3,), scale, dtype=torch.float64), matrix[:3, 3], where
     )
 
 
-def _check_placement(quat: Tensor, scales: Tensor, shift: Tensor, where: str) -> Placement:
+def _checked_placement(quat: Tensor, scales: Tensor, shift: Tensor, where: str) -> Placement:
     scale = float(scales[0])
-    alike = bool(((scales - scale).abs() <= TOLERANCE * abs(scale)).all())
-    if not (LEAST_NODE_SCALE <= scale <= MOST_SCALE) or not alike or not float(quat.norm()) > TOLERANCE:
-        raise ValueError(_unlike(where))
+    is_uniform = bool(((scales - scale).abs() <= TOLERANCE * abs(scale)).all())
+    if not (LEAST_NODE_SCALE <= scale <= MOST_SCALE) or not is_uniform or not float(quat.norm()) > TOLERANCE:
+        raise ValueError(_not_a_similarity(where))
     return Placement(torch.nn.functional.normalize(quat, dim=0), scale, shift)
 
 
-def _unlike(where: str) -> str:
+def _not_a_similarity(where: str) -> str:
     return (
         f"{where} skews, mirrors or stretches splats; expected a turn, a shift and one scale: apply the transform first"
     )
@@ -322,7 +322,7 @@ SPLATS: dict[str, records.Field] = {
 }
 """Properties that the renderers support; the sorting method is not checked."""
 HIGHEST_DEGREE = 3
-TURN = (-1.0, -1.0, 1.0)
+HALF_TURN_Z = (-1.0, -1.0, 1.0)
 """Signs of a half turn around z, which converts to the frame of glTF and back."""
 LEAST_SHARE, LEAST_SCALE = 1e-7, 1e-12
 PLAIN_COUNT, BYTES_PER_GAUSSIAN = 2**20, 8
@@ -382,16 +382,18 @@ def read_glb(path: Path | str) -> Gaussians:
     most = max(part.sh.shape[1] for part in found)
     are_discs = all(part.are_discs for part in found)
     shared = functools.reduce(set.intersection, (set(part.channels) for part in found))
-    alike = (_alike(part, most, are_discs=are_discs) for part in found)
+    padded = (_pad_gaussians(part, most, are_discs=are_discs) for part in found)
     whole = functools.reduce(
         Gaussians.concat,
-        (replace(part, channels={name: part.channels[name] for name in sorted(shared)}) for part in alike),
+        (replace(part, channels={name: part.channels[name] for name in sorted(shared)}) for part in padded),
     )
-    return half_turned(replace(whole, active_sh_degree=round(most**0.5) - 1), TURN)
+    return rotate_half_turn(replace(whole, active_sh_degree=round(most**0.5) - 1), HALF_TURN_Z)
 
 
 def _glb_bytes(gaussians: Gaussians) -> bytes:
-    turned = half_turned(replace(gaussians, sh=gaussians.sh[:, : (gaussians.active_sh_degree + 1) ** 2]), TURN)
+    turned = rotate_half_turn(
+        replace(gaussians, sh=gaussians.sh[:, : (gaussians.active_sh_degree + 1) ** 2]), HALF_TURN_Z
+    )
     quats = torch.nn.functional.normalize(turned.quats, dim=1)
     quats = torch.where(quats.norm(dim=1, keepdim=True) > 0, quats, quats.new_tensor([1.0, 0.0, 0.0, 0.0]))
     opacities = torch.sigmoid(turned.logit_opacities)
@@ -410,7 +412,7 @@ def _glb_bytes(gaussians: Gaussians) -> bytes:
         attributes[CHANNEL + name.upper()] = writer.add(as_numpy(values))
     splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
     primitive = {"mode": POINTS, "attributes": attributes, "extensions": {EXTENSION: splats}}
-    return writer.file(
+    return writer.to_bytes(
         {
             "asset": {"version": "2.0", "generator": "glassplat"},
             "extensionsUsed": [EXTENSION],
@@ -528,7 +530,7 @@ def _harmonic_names(count: int) -> list[str]:
     return [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{n}" for degree in degrees for n in range(2 * degree + 1)]
 
 
-def _alike(part: Gaussians, coefficients: int, *, are_discs: bool) -> Gaussians:
+def _pad_gaussians(part: Gaussians, coefficients: int, *, are_discs: bool) -> Gaussians:
     """A set padded to the given number of coefficients, and to three scales unless all sets are discs."""
     sh = torch.nn.functional.pad(part.sh, (0, 0, 0, coefficients - part.sh.shape[1]))
     log_scales = part.log_scales

@@ -33,7 +33,7 @@ MOST_PIXELS = 2**27
 """Largest image, in pixels; decoding takes about ten bytes a pixel."""
 COMPRESSION = 4
 """Compression level of PNG files, up to 9: half the time of Pillow's default 6 for 5 % more bytes."""
-SHADES_16 = ("I", "I;16", "I;16B", "I;16L", "I;16N")
+GREY_MODES_16 = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 _FULL_SCALE_16 = 65535
 
 # Harmless damaged tags cause warnings that name no file; harmful ones raise errors.
@@ -43,7 +43,7 @@ Image.MAX_IMAGE_PIXELS = None
 
 
 @cache
-def reads_heif() -> bool:
+def can_read_heif() -> bool:
     """Return whether HEIC photographs can be read; registers the Pillow plugin."""
     try:
         from pi_heif import register_heif_opener
@@ -57,7 +57,7 @@ def open_image(path: Path) -> Image.Image:
     """Open and fully decode an image in its stored mode; orientation tags are not applied."""
     with checked_image(path) as image:
         image.load()
-        _check_shades(image)
+        _check_bit_depth(image)
         return image
 
 
@@ -88,21 +88,21 @@ def read_image(path: Path | str) -> NDArray[np.uint8]:
     Sixteen-bit grey is scaled to eight bits. Colours are not converted; use `read_colors` for photographs.
     """
     with checked_image(Path(path)) as image:
-        return _pixels(_in_eight_bits(image))
+        return _pixels(_to_eight_bits(image))
 
 
 def read_colors(path: Path | str) -> NDArray[np.uint8]:
     """Read a photograph as `read_image` does, with colours converted to sRGB by the embedded profile."""
     with checked_image(Path(path)) as image:
-        return _pixels(in_srgb(image))
+        return _pixels(convert_to_srgb(image))
 
 
 def read_image_float(path: Path | str) -> NDArray[np.float32]:
     """Read an image as float32 [H, W, C] in [0, 1], with the full precision of sixteen-bit grey."""
     with checked_image(Path(path)) as image:
-        if image.mode in SHADES_16:
-            return _shades(image)[:, :, None]
-        return _pixels(_in_eight_bits(image)).astype(np.float32) / np.float32(255)
+        if image.mode in GREY_MODES_16:
+            return _grey_levels(image)[:, :, None]
+        return _pixels(_to_eight_bits(image)).astype(np.float32) / np.float32(255)
 
 
 def write_image(path: Path | str, image: Tensor | NDArray[np.generic]) -> None:
@@ -128,11 +128,11 @@ def write_image(path: Path | str, image: Tensor | NDArray[np.generic]) -> None:
 def checked_image(path: Path) -> Iterator[Image.Image]:
     """An open image of checked size; Pillow's errors about bad files become one error that names the file."""
     try:
-        with Image.open(path, formats=(*FORMATS, "HEIF") if reads_heif() else FORMATS) as image:
+        with Image.open(path, formats=(*FORMATS, "HEIF") if can_read_heif() else FORMATS) as image:
             if image.width * image.height > MOST_PIXELS:
                 size = f"{image.width}x{image.height} pixels"
                 raise ValueError(f"it is {size}; expected at most {MOST_PIXELS / 1e6:.0f} megapixels: reduce it")
-            _turn_back(image)
+            _undo_rotation(image)
             yield image
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{path} does not exist; expected an image") from error
@@ -143,40 +143,40 @@ def checked_image(path: Path) -> Iterator[Image.Image]:
         raise ValueError(f"cannot read {path} as an image ({reason}); replace the file or remove it") from error
 
 
-BACK = {2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}
+INVERSE_ORIENTATION = {2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}
 """The EXIF orientation that undoes each orientation."""
 
 
-def _turn_back(image: ImageFile.ImageFile) -> None:
+def _undo_rotation(image: ImageFile.ImageFile) -> None:
     """Undo Pillow's automatic rotation of TIFFs, which it applies to no other format, and restore their tag."""
     orientation = image.getexif().get(ExifTags.Base.Orientation) if image.format == "TIFF" else None
-    if orientation in BACK:
+    if orientation in INVERSE_ORIENTATION:
         image.filename = ""  # With a name, Pillow would memory-map grey files in their rotated size.
         image.load()
-        image.getexif()[ExifTags.Base.Orientation] = BACK[orientation]
+        image.getexif()[ExifTags.Base.Orientation] = INVERSE_ORIENTATION[orientation]
         ImageOps.exif_transpose(image, in_place=True)
         image.getexif()[ExifTags.Base.Orientation] = orientation
 
 
-SPACES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}
+PIXEL_MODES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}
 """Pillow's pixel mode by the colour space of a profile."""
 NEARLY_SRGB = 1
 """Of 255: a profile that changes no colour by more is a variant of sRGB, and pixels stay unchanged."""
 
 
-def in_srgb(image: Image.Image) -> Image.Image:
+def convert_to_srgb(image: Image.Image) -> Image.Image:
     """The image in eight bits, converted from its embedded profile to sRGB.
 
     Without a profile, EXIF tags may declare Adobe RGB. Images without either, with an sRGB profile, or with a profile
     that is broken or for another pixel mode stay unchanged.
     """
     profile = image.info.get("icc_profile") or (adobe_rgb_profile() if _is_adobe_rgb(image) else None)
-    image = _in_eight_bits(image)
-    known = _to_srgb(profile) if profile and isinstance(profile, bytes) else None
+    image = _to_eight_bits(image)
+    srgb_transform = _srgb_transform(profile) if profile and isinstance(profile, bytes) else None
     own = "CMYK" if image.mode == "CMYK" else "L" if image.mode in ("1", "L", "LA") else "RGB"
-    if known is None or (own, known[0]) not in {("L", "RGB"), (own, own)}:
+    if srgb_transform is None or (own, srgb_transform[0]) not in {("L", "RGB"), (own, own)}:
         return image
-    mode, transform = known
+    mode, transform = srgb_transform
     converted = transform.apply(image if image.mode == mode else image.convert(mode))
     if image.has_transparency_data:
         converted.putalpha(image.convert("RGBA").getchannel("A"))
@@ -215,11 +215,11 @@ def adobe_rgb_profile() -> bytes:
 
 
 @lru_cache(maxsize=8)
-def _to_srgb(profile: bytes) -> tuple[str, ImageCms.ImageCmsTransform] | None:
+def _srgb_transform(profile: bytes) -> tuple[str, ImageCms.ImageCmsTransform] | None:
     """Pixel mode of a profile and its transform to sRGB; None if it is broken, unsupported, or already sRGB."""
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-        mode = SPACES[source.profile.xcolor_space.strip()]
+        mode = PIXEL_MODES[source.profile.xcolor_space.strip()]
         target = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB"))
         transform = ImageCms.ImageCmsTransform(source, target, mode, "RGB")
     except (OSError, ValueError, KeyError):
@@ -232,11 +232,11 @@ def _to_srgb(profile: bytes) -> tuple[str, ImageCms.ImageCmsTransform] | None:
     return (mode, transform) if changed > NEARLY_SRGB else None
 
 
-def _in_eight_bits(image: Image.Image) -> Image.Image:
+def _to_eight_bits(image: Image.Image) -> Image.Image:
     """The image, with sixteen-bit grey scaled to eight bits."""
-    if image.mode in SHADES_16:
-        return Image.fromarray(np.round(_shades(image) * 255).astype(np.uint8))
-    _check_shades(image)
+    if image.mode in GREY_MODES_16:
+        return Image.fromarray(np.round(_grey_levels(image) * 255).astype(np.uint8))
+    _check_bit_depth(image)
     return image
 
 
@@ -247,7 +247,7 @@ def _pixels(image: Image.Image) -> NDArray[np.uint8]:
     return pixels[:, :, None] if pixels.ndim == 2 else pixels
 
 
-def _check_shades(image: Image.Image) -> None:
+def _check_bit_depth(image: Image.Image) -> None:
     """Raise ValueError for values without a defined white level."""
     if image.mode == "F":
         raise ValueError("it holds floating-point numbers; expected colours of 8 or 16 bits")
@@ -257,15 +257,15 @@ def _check_shades(image: Image.Image) -> None:
             raise ValueError(f"it holds values from {least} to {most}; expected colours of 8 or 16 bits")
 
 
-def _shades(image: Image.Image) -> NDArray[np.float32]:
+def _grey_levels(image: Image.Image) -> NDArray[np.float32]:
     """Sixteen-bit grey as [H, W] in [0, 1]."""
-    _check_shades(image)
+    _check_bit_depth(image)
     return np.asarray(image).astype(np.float32) / np.float32(_FULL_SCALE_16)
 
 
 def resize_by_area(pixels: NDArray[np.generic], width: int, height: int) -> NDArray[np.float32]:
     """[H, W] or [H, W, C] as [height, width(, C)]: exact means over the area of each new pixel, for any factor."""
-    rows, columns = _shares_of_area(pixels.shape[0], height), _shares_of_area(pixels.shape[1], width)
+    rows, columns = _area_weights(pixels.shape[0], height), _area_weights(pixels.shape[1], width)
     planes = pixels.reshape(*pixels.shape[:2], -1)
     means = np.empty((height, width, planes.shape[2]), dtype=np.float32)
     for index in range(planes.shape[2]):  # One by one, because all as floats take more memory than the photograph.
@@ -274,7 +274,7 @@ def resize_by_area(pixels: NDArray[np.generic], width: int, height: int) -> NDAr
 
 
 @lru_cache(maxsize=16)
-def _shares_of_area(old: int, new: int) -> Any:
+def _area_weights(old: int, new: int) -> Any:
     """[new, old] sparse matrix: share of each new pixel that each old pixel covers, along one side."""
     from scipy import sparse
 
@@ -321,7 +321,7 @@ def is_hidden(relative: PurePath) -> bool:
 Parts = tuple[str, ...]
 
 
-def picture_paths(names: Sequence[str]) -> dict[str, Path]:
+def image_paths(names: Sequence[str]) -> dict[str, Path]:
     """PNG path of each view, always inside the output folder, and close to the photograph's name.
 
     Folders inside the capture are kept (`left/1.jpg` becomes `left/1.png`). Absolute paths and paths with `..` lose the
@@ -331,46 +331,46 @@ def picture_paths(names: Sequence[str]) -> dict[str, Path]:
     Args:
         names: of all views of the capture, so that a view's path does not depend on the selection.
     """
-    return _distinct(_inside(names))
+    return _unique_paths(_confined_parts(names))
 
 
-def flat_picture_names(names: Sequence[str]) -> dict[str, str]:
+def flat_image_names(names: Sequence[str]) -> dict[str, str]:
     """The same without folders: file names in a single folder."""
-    flat = {name: ("_".join(parts),) for name, parts in _inside(names).items()}
-    return {name: path.name for name, path in _distinct(flat).items()}
+    flat = {name: ("_".join(parts),) for name, parts in _confined_parts(names).items()}
+    return {name: path.name for name, path in _unique_paths(flat).items()}
 
 
-def _distinct(parts: Mapping[str, Parts]) -> dict[str, Path]:
+def _unique_paths(parts: Mapping[str, Parts]) -> dict[str, Path]:
     """A unique file for every name; names without a clash are assigned first."""
-    plain = {name: _key(_plain(own)) for name, own in parts.items()}
-    times = Counter(plain.values())
+    preferred = {name: _case_folded(_png_path(own)) for name, own in parts.items()}
+    occurrences = Counter(preferred.values())
     taken: set[str] = set()
     paths: dict[str, Path] = {}
     # The deepest first, so that no file takes the path of a folder.
-    for name in sorted(parts, key=lambda name: (-len(parts[name]), times[plain[name]] > 1)):
-        wanted = _candidates(parts[name], clash=times[plain[name]] > 1)
-        path = next(path for path in wanted if not {_key(path), f"{_key(path)}/"} & taken)
-        taken |= {_key(path), *(f"{_key(folder)}/" for folder in path.parents)}
+    for name in sorted(parts, key=lambda name: (-len(parts[name]), occurrences[preferred[name]] > 1)):
+        candidates = _candidate_paths(parts[name], clash=occurrences[preferred[name]] > 1)
+        path = next(path for path in candidates if not {_case_folded(path), f"{_case_folded(path)}/"} & taken)
+        taken |= {_case_folded(path), *(f"{_case_folded(folder)}/" for folder in path.parents)}
         paths[name] = Path(path)
     return {name: paths[name] for name in parts}
 
 
-def _inside(names: Sequence[str]) -> dict[str, Parts]:
+def _confined_parts(names: Sequence[str]) -> dict[str, Parts]:
     """Folders and file of each name, confined to the output folder; backslashes are separators, as on Windows."""
-    parts = {name: _normal(name) for name in names}
-    outside = [name for name in names if leads_out(name)]
+    parts = {name: _normalise_parts(name) for name in names}
+    outside = [name for name in names if leaves_folder(name)]
     columns = zip(*(parts[name][:-1] for name in outside), strict=False)
     shared = sum(1 for _ in takewhile(lambda column: len(set(column)) == 1, columns))
     return parts | {name: parts[name][shared:] for name in outside}
 
 
-def leads_out(name: str) -> bool:
+def leaves_folder(name: str) -> bool:
     """Return whether a name is an absolute path, or contains `..`."""
     path = PureWindowsPath(name)
     return bool(path.anchor) or ".." in path.parts
 
 
-def _normal(name: str) -> Parts:
+def _normalise_parts(name: str) -> Parts:
     path = PureWindowsPath(name)
     kept: list[str] = []
     for part in path.parts[bool(path.anchor) :]:
@@ -381,19 +381,19 @@ def _normal(name: str) -> Parts:
     return tuple(kept) or ("view",)
 
 
-def _plain(parts: Parts) -> PurePosixPath:
+def _png_path(parts: Parts) -> PurePosixPath:
     return PurePosixPath(*parts).with_suffix(".png")
 
 
-def _candidates(parts: Parts, *, clash: bool) -> Iterator[PurePosixPath]:
+def _candidate_paths(parts: Parts, *, clash: bool) -> Iterator[PurePosixPath]:
     """Names in order of preference; with the photograph's own suffix if the plain name would clash."""
     if not clash:
-        yield _plain(parts)
+        yield _png_path(parts)
     whole = PurePosixPath(*parts)
     yield whole.with_name(f"{whole.name}.png")
     yield from (whole.with_name(f"{whole.name}-{number}.png") for number in count(2))
 
 
-def _key(path: PurePosixPath) -> str:
+def _case_folded(path: PurePosixPath) -> str:
     """Key of a path, equal for paths that a case-insensitive file system does not distinguish."""
     return unicodedata.normalize("NFC", str(path)).casefold()

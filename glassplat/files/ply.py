@@ -15,36 +15,36 @@ from glassplat.scene import SH_ZERO
 from glassplat.scene.gaussians import DISC_SCALES, PER_GAUSSIAN, Gaussians
 
 CHUNK = 256
-PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+PACKED_COLUMNS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 BOUNDS = tuple(f"{end}_{name}" for end in ("min", "max") for name in ("x", "y", "z", "scale_x", "scale_y", "scale_z"))
 COLOR_BOUNDS = tuple(f"{end}_{name}" for end in ("min", "max") for name in "rgb")
 HARMONICS = (9, 24, 45)
 HARMONIC_RANGE = 8.0
 ELEVEN_TEN_ELEVEN = ((21, 11), (11, 10), (0, 11))
-BYTES = ((24, 8), (16, 8), (8, 8), (0, 8))
-TENS = ((20, 10), (10, 10), (0, 10))
+EIGHT_BITS = ((24, 8), (16, 8), (8, 8), (0, 8))
+TEN_BITS = ((20, 10), (10, 10), (0, 10))
 
 Floats = NDArray[np.float32]
 
 
 def is_compressed(table: PlyTable) -> bool:
     """Return whether a PLY is a compressed one of PlayCanvas/SuperSplat."""
-    return set(PACKED) <= table.columns.keys()
+    return set(PACKED_COLUMNS) <= table.columns.keys()
 
 
 @np.errstate(over="ignore", invalid="ignore")  # The caller reports values out of range; NumPy must not warn.
 def read_compressed(path: Path, table: PlyTable) -> Gaussians:
     """Reads the Gaussians of a compressed PLY whose `vertex` table has been read."""
-    words = [table.columns[name] for name in PACKED]
+    words = [table.columns[name] for name in PACKED_COLUMNS]
     if any(word.dtype != np.uint32 for word in words):
         raise ValueError(f"{path} stores packed values in {[str(word.dtype) for word in words]}; expected uint")
     position, rotation, scale, color = words
     count = len(position)
     bounds = _bounds(path, count)
-    means = _between(_unit(position, ELEVEN_TEN_ELEVEN), bounds, ("x", "y", "z"))
-    scales = _between(_unit(scale, ELEVEN_TEN_ELEVEN), bounds, ("scale_x", "scale_y", "scale_z"))
-    shares = _unit(color, BYTES)
-    colors = _between(shares[:, :3], bounds, ("r", "g", "b")) if "min_r" in bounds else shares[:, :3]
+    means = _dequantise(_bit_fields(position, ELEVEN_TEN_ELEVEN), bounds, ("x", "y", "z"))
+    scales = _dequantise(_bit_fields(scale, ELEVEN_TEN_ELEVEN), bounds, ("scale_x", "scale_y", "scale_z"))
+    shares = _bit_fields(color, EIGHT_BITS)
+    colors = _dequantise(shares[:, :3], bounds, ("r", "g", "b")) if "min_r" in bounds else shares[:, :3]
     constant = (colors[:, None] - 0.5) / SH_ZERO
     rest = _harmonics(path, table, count)
     opacities = torch.from_numpy(shares[:, 3].clip(0.5 / 255, 1 - 0.5 / 255))
@@ -71,13 +71,13 @@ def _bounds(path: Path, count: int) -> dict[str, Floats]:
     return {name: np.repeat(columns[name].astype(np.float32), CHUNK)[:count] for name in names}
 
 
-def _between(shares: Floats, bounds: dict[str, Floats], names: tuple[str, ...]) -> Floats:
+def _dequantise(shares: Floats, bounds: dict[str, Floats], names: tuple[str, ...]) -> Floats:
     low, high = (np.stack([bounds[f"{end}_{name}"] for name in names], axis=1) for end in ("min", "max"))
-    between: Floats = low * (1 - shares) + high * shares
-    return between
+    values: Floats = low * (1 - shares) + high * shares
+    return values
 
 
-def _unit(words: NDArray[np.uint32], fields: tuple[tuple[int, int], ...]) -> Floats:
+def _bit_fields(words: NDArray[np.uint32], fields: tuple[tuple[int, int], ...]) -> Floats:
     """Bit fields (shift, width) normalised to [0, 1], [N, F]."""
     parts = [((words >> np.uint32(shift)) & np.uint32(2**width - 1)) / (2**width - 1) for shift, width in fields]
     return np.stack(parts, axis=1).astype(np.float32)
@@ -85,16 +85,16 @@ def _unit(words: NDArray[np.uint32], fields: tuple[tuple[int, int], ...]) -> Flo
 
 def _rotations(words: NDArray[np.uint32]) -> Floats:
     """Quaternions [N, 4] `wxyz`; two bits hold the index of the largest component, which is not stored."""
-    three = (_unit(words, TENS) - np.float32(0.5)) * np.float32(np.sqrt(2))
-    largest = np.sqrt((1 - (three**2).sum(axis=1)).clip(min=0))
-    which = words >> np.uint32(30)
+    stored = (_bit_fields(words, TEN_BITS) - np.float32(0.5)) * np.float32(np.sqrt(2))
+    largest = np.sqrt((1 - (stored**2).sum(axis=1)).clip(min=0))
+    largest_index = words >> np.uint32(30)
     quats = np.zeros((len(words), 4), dtype=np.float32)
-    place = np.zeros(len(words), dtype=np.int64)
+    position = np.zeros(len(words), dtype=np.int64)
     rows = np.arange(len(words))
     for component in range(4):
-        left_out = which == component
-        quats[:, component] = np.where(left_out, largest, three[rows, np.minimum(place, 2)])
-        place += ~left_out
+        is_largest = largest_index == component
+        quats[:, component] = np.where(is_largest, largest, stored[rows, np.minimum(position, 2)])
+        position += ~is_largest
     return quats
 
 

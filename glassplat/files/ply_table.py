@@ -11,7 +11,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from glassplat.files.records import reading
+from glassplat.files.records import wrap_read_errors
 from glassplat.files.writing import atomic_write
 
 SCALAR_TYPES = {
@@ -72,7 +72,7 @@ def read_table(path: Path, name: str = "vertex") -> PlyTable:
     """
     if not os.path.isfile(path):
         raise FileNotFoundError(f"no PLY file at {path}; check the path")
-    with reading(path), path.open("rb") as stream:
+    with wrap_read_errors(path), path.open("rb") as stream:
         header = read_header(stream, path)
         element = header.element(name)
         if element is None:
@@ -136,7 +136,7 @@ def read_header(stream: BinaryIO, path: Path) -> PlyHeader:
         elif words[0] == "element" and len(words) == 3 and words[2].isdigit():
             elements.append(PlyElement(words[1], int(words[2]), ()))
         elif words[0] == "property" and elements:
-            elements[-1] = _with_property(elements[-1], words, path)
+            elements[-1] = _add_property(elements[-1], words, path)
         else:
             raise ValueError(f"cannot read the line {' '.join(words)!r} in the header of {path}; the file is damaged")
     if not ply_format:
@@ -161,7 +161,7 @@ def _header_lines(stream: BinaryIO, path: Path) -> list[list[str]]:
     )
 
 
-def _with_property(element: PlyElement, words: list[str], path: Path) -> PlyElement:
+def _add_property(element: PlyElement, words: list[str], path: Path) -> PlyElement:
     is_list = len(words) == 5 and words[1] == "list"
     is_scalar = len(words) == 3 and words[1] in SCALAR_TYPES
     if not (is_list or is_scalar):
@@ -211,12 +211,12 @@ def _read_ascii(
     except ValueError as error:
         raise ValueError(f"{path} contains something that is not a number ({error}); the file is damaged") from error
     return {
-        name: _in_declared_type(values[:, i], str(kind), name, path)
+        name: _convert_to_declared_type(values[:, i], str(kind), name, path)
         for i, (name, kind) in enumerate(element.properties)
     }
 
 
-def _in_declared_type(values: NDArray[np.float64], kind: str, name: str, path: Path) -> NDArray:
+def _convert_to_declared_type(values: NDArray[np.float64], kind: str, name: str, path: Path) -> NDArray:
     """A column of a text file in its declared type; out of range, floats become infinite and integers are refused."""
     if not kind.startswith("f"):
         limits = np.iinfo(kind)

@@ -5,7 +5,7 @@ at most `MOST_DIGITS` digits; longer ones become floats, which may be infinite.
 
 A table of fields checks a JSON object:
 
-    SCENE = {"extent": Number(above=0), "active_sh_degree": Whole(0, 3), "files": Optional(Items(Text()), ())}
+    SCENE = {"extent": Number(above=0), "active_sh_degree": Integer(0, 3), "files": Optional(ListOf(Text()), ())}
     header = check_fields(read_json(path), SCENE, str(path))
 """
 
@@ -28,7 +28,7 @@ LARGEST_TEXT = 2**28
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
+def wrap_read_errors(path: Path) -> Iterator[None]:
     """Turns exceptions from opening or reading a file into errors that name the file and the cause."""
     try:
         if not stat.S_ISREG(os.stat(path).st_mode):
@@ -43,7 +43,7 @@ def reading(path: Path) -> Iterator[None]:
 
 def read_text(path: Path) -> str:
     """The text of a UTF-8 file, with or without a byte-order mark."""
-    with reading(path):
+    with wrap_read_errors(path):
         size = os.stat(path).st_size
         if size > LARGEST_TEXT:
             raise ValueError(f"{path} has {size} bytes; expected a text file of at most {LARGEST_TEXT}")
@@ -69,7 +69,7 @@ def read_json(path: Path) -> Any:
 def parse_json(text: str, where: str) -> Any:
     """The value of a JSON text; `where` names the text in messages."""
     try:
-        value = json.loads(text, parse_int=_whole, object_pairs_hook=_without_repeats)
+        value = json.loads(text, parse_int=_parse_int, object_pairs_hook=_dict_without_duplicates)
     except RecursionError as error:
         raise ValueError(_too_deep(where)) from error
     except ValueError as error:
@@ -78,11 +78,11 @@ def parse_json(text: str, where: str) -> Any:
     return value
 
 
-def _whole(digits: str) -> int | float:
+def _parse_int(digits: str) -> int | float:
     return int(digits) if len(digits) <= MOST_DIGITS else float(digits)
 
 
-def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _dict_without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
         ((repeated, _),) = Counter(name for name, _ in pairs).most_common(1)
@@ -97,13 +97,13 @@ def _check_nesting_and_text(value: Any, where: str) -> None:
         unprintable = next((text for text in level if isinstance(text, str) and not is_encodable(text)), None)
         if unprintable is not None:
             raise ValueError(f"{where} holds the text {unprintable!r}, which is not valid Unicode; write it again")
-        level = [inner for outer in level for inner in _inside(outer)]
+        level = [inner for outer in level for inner in _children(outer)]
         if not level:
             return
     raise ValueError(_too_deep(where))
 
 
-def _inside(value: Any) -> list[Any]:
+def _children(value: Any) -> list[Any]:
     if isinstance(value, dict):
         return [*value.keys(), *value.values()]
     return value if isinstance(value, list) else []
@@ -123,7 +123,7 @@ def _too_deep(where: str) -> str:
     return f"{where} is nested more than {DEEPEST} levels deep; expected a file written by a splatting program"
 
 
-LEAST_WHOLE, MOST_WHOLE = -(2**63), 2**63 - 1
+INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
 LARGEST_COORDINATE = 1e12
 """World units; squares of larger values, and sums of these, may exceed float32."""
 
@@ -135,14 +135,14 @@ class Field:
 
     def read(self, value: Any, where: str) -> Any:
         """Checks a value and converts it to the type that the program uses."""
-        if not self._fits(value):
+        if not self._is_valid(value):
             raise ValueError(f"{where} is {short_repr(value)}; expected {self.expected}")
-        return self._converted(value, where)
+        return self._convert(value, where)
 
-    def _fits(self, value: Any) -> bool:
+    def _is_valid(self, value: Any) -> bool:
         return True
 
-    def _converted(self, value: Any, where: str) -> Any:
+    def _convert(self, value: Any, where: str) -> Any:
         return value
 
 
@@ -153,31 +153,31 @@ class Number(Field):
         self._least, self._most, self._above = least, most, above
         self.expected = "a finite number" + _range_text(least, most, above)
 
-    def _fits(self, value: Any) -> bool:
+    def _is_valid(self, value: Any) -> bool:
         is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and is_finite(value)
         return is_number and self._least <= value <= self._most and value > self._above
 
-    def _converted(self, value: Any, where: str) -> float:
+    def _convert(self, value: Any, where: str) -> float:
         return float(value)
 
 
-class Whole(Field):
+class Integer(Field):
     """An integer from `least` to `most`; 2.0 and true are refused."""
 
-    def __init__(self, least: int = LEAST_WHOLE, most: int = MOST_WHOLE) -> None:
+    def __init__(self, least: int = INT64_MIN, most: int = INT64_MAX) -> None:
         self._least, self._most = least, most
         self.expected = "a whole number" + _range_text(least, most)
 
-    def _fits(self, value: Any) -> bool:
+    def _is_valid(self, value: Any) -> bool:
         return isinstance(value, int) and not isinstance(value, bool) and self._least <= value <= self._most
 
 
-class Flag(Field):
+class Boolean(Field):
     """A boolean; 0 and 1 are refused."""
 
     expected = "true or false"
 
-    def _fits(self, value: Any) -> bool:
+    def _is_valid(self, value: Any) -> bool:
         return isinstance(value, bool)
 
 
@@ -186,7 +186,7 @@ class Text(Field):
 
     expected = "a text that is not empty"
 
-    def _fits(self, value: Any) -> bool:
+    def _is_valid(self, value: Any) -> bool:
         return isinstance(value, str) and bool(value)
 
 
@@ -197,34 +197,34 @@ class Choice(Field):
         self._choices = choices
         self.expected = f"one of {', '.join(map(repr, choices))}"
 
-    def _fits(self, value: Any) -> bool:
+    def _is_valid(self, value: Any) -> bool:
         return any(value == choice and type(value) is type(choice) for choice in self._choices)
 
 
-class Items(Field):
+class ListOf(Field):
     """A list of values of one kind, with `count` entries if given; read as a tuple."""
 
     def __init__(self, item: Field, count: int | None = None) -> None:
         self._item, self._count = item, count
         self.expected = f"a list of {'' if count is None else f'{count} '}values, each {item.expected}"
 
-    def _fits(self, value: Any) -> bool:
+    def _is_valid(self, value: Any) -> bool:
         return isinstance(value, (list, tuple)) and self._count in (None, len(value))
 
-    def _converted(self, value: Any, where: str) -> tuple[Any, ...]:
+    def _convert(self, value: Any, where: str) -> tuple[Any, ...]:
         return tuple(self._item.read(one, f"entry {index} of {where}") for index, one in enumerate(value, start=1))
 
 
-class ByName(Field):
+class DictOf(Field):
     """An object that maps any names to values of one kind; read as a dictionary."""
 
     def __init__(self, item: Field) -> None:
         self._item, self.expected = item, f"an object whose values are each {item.expected}"
 
-    def _fits(self, value: Any) -> bool:
+    def _is_valid(self, value: Any) -> bool:
         return isinstance(value, dict)
 
-    def _converted(self, value: Any, where: str) -> dict[str, Any]:
+    def _convert(self, value: Any, where: str) -> dict[str, Any]:
         return {name: self._item.read(one, f"{name!r} of {where}") for name, one in value.items()}
 
 
@@ -234,7 +234,7 @@ class Nullable(Field):
     def __init__(self, field: Field) -> None:
         self._field, self.expected = field, f"{field.expected}, or null"
 
-    def _converted(self, value: Any, where: str) -> Any:
+    def _convert(self, value: Any, where: str) -> Any:
         return None if value is None else self._field.read(value, where)
 
 
@@ -244,7 +244,7 @@ class Optional(Field):
     def __init__(self, field: Field, default: Any = None) -> None:
         self._field, self.default, self.expected = field, default, field.expected
 
-    def _converted(self, value: Any, where: str) -> Any:
+    def _convert(self, value: Any, where: str) -> Any:
         return self._field.read(value, where)
 
 
@@ -271,7 +271,7 @@ def check_fields(value: Any, fields: Mapping[str, Field], where: str) -> dict[st
 
 def _range_text(least: float, most: float, above: float = -math.inf) -> str:
     """The range of a number, for messages; 64-bit limits are omitted."""
-    is_above, has_least, has_most = above > -math.inf, least > LEAST_WHOLE, most < MOST_WHOLE
+    is_above, has_least, has_most = above > -math.inf, least > INT64_MIN, most < INT64_MAX
     if has_least and has_most:
         return f" from {least:g} to {most:g}"
     lower = f" above {above:g}" if is_above else f" of at least {least:g}" if has_least else ""

@@ -19,7 +19,7 @@ from glassplat.files.glb import MAGIC, read_glb
 from glassplat.files.ply import is_compressed, read_compressed, read_gaussians, write_gaussians
 from glassplat.files.ply_table import read_table
 from glassplat.files.spz import GZIP, read_spz, three_log_scales
-from glassplat.files.writing import FORGED_SUFFIXES, SCENE, SPLAT_SUFFIXES, write_bytes, write_text
+from glassplat.files.writing import GAUSSFORGE_SUFFIXES, SCENE_FILE, SPLAT_SUFFIXES, write_bytes, write_text
 from glassplat.scene import SH_ZERO
 from glassplat.scene.corrections import Direction, Exposures, PoseCorrections
 from glassplat.scene.gaussians import Gaussians
@@ -34,8 +34,8 @@ LARGEST_LOG = 40.0
 """Largest logarithm; the square of its exponential fits float32."""
 EXTENT = records.Number(above=1 / records.LARGEST_COORDINATE, most=4 * records.LARGEST_COORDINATE)
 """World units; squares of smaller values may underflow float32."""
-SH_DEGREE = records.Whole(0, 3)
-DIRECTION = records.Nullable(records.Items(records.Number(-1.001, 1.001), 3))
+SH_DEGREE = records.Integer(0, 3)
+DIRECTION = records.Nullable(records.ListOf(records.Number(-1.001, 1.001), 3))
 UNIT_TOLERANCE = 1e-3
 HEADER: dict[str, records.Field] = {
     "extent": EXTENT,
@@ -43,7 +43,7 @@ HEADER: dict[str, records.Field] = {
     "surroundings_sh_degree": records.Optional(SH_DEGREE),
     "photographer_sh_degree": records.Optional(SH_DEGREE),
     "up": records.Optional(DIRECTION),
-    "files": records.Optional(records.Items(records.Choice(FILES))),
+    "files": records.Optional(records.ListOf(records.Choice(FILES))),
 }
 """`files` lists the parts of the scene, so that a lost file is detected and one of an earlier scene is ignored; folders
 of earlier versions lack it."""
@@ -80,15 +80,15 @@ def write_scene(folder: Path, scene: Scene) -> None:
         if len(corrections):
             sidecars.write_corrections(folder / name, corrections)
             files += [name]
-    write_text(folder / SCENE, json.dumps(header, indent=2) + "\n")
+    write_text(folder / SCENE_FILE, json.dumps(header, indent=2) + "\n")
 
 
 def read_scene(folder: Path) -> Scene:
     """Reads a scene that `write_scene` wrote."""
-    header = records.check_fields(records.read_json(folder / SCENE), HEADER, str(folder / SCENE))
+    header = records.check_fields(records.read_json(folder / SCENE_FILE), HEADER, str(folder / SCENE_FILE))
     for name in header["files"] or ():
         if not os.path.isfile(folder / name):
-            raise FileNotFoundError(f"no {name} in {folder}; {SCENE} says that the scene has one: export it again")
+            raise FileNotFoundError(f"no {name} in {folder}; {SCENE_FILE} says that the scene has one: export it again")
     files = FILES if header["files"] is None else header["files"]
     listed = [name for name in files if (folder / name).is_file()]
     scene = Scene(_colored(folder, PRIMARY, header["active_sh_degree"]), header["extent"])
@@ -102,7 +102,7 @@ def read_scene(folder: Path) -> Scene:
         photographer = _ellipsoids(
             _colored(folder, PHOTOGRAPHER, header["photographer_sh_degree"]), folder / PHOTOGRAPHER
         )
-        scene = replace(scene, photographer=photographer, up=direction(header["up"], str(folder / SCENE)))
+        scene = replace(scene, photographer=photographer, up=direction(header["up"], str(folder / SCENE_FILE)))
     if EXPOSURES in listed:
         scene = replace(scene, exposures=sidecars.read_corrections(folder / EXPOSURES, Exposures))
     if POSES in listed:
@@ -122,18 +122,18 @@ def direction(up: Sequence[float] | None, where: str) -> Direction | None:
 
 def _colored(folder: Path, name: str, active_sh_degree: int | None) -> Gaussians:
     """Gaussians with the SH degree from the scene's header, or else the highest degree stored."""
-    gaussians = _drawable(folder / name)
+    gaussians = _read_drawable(folder / name)
     if active_sh_degree is None:
         return gaussians
     try:
         return replace(gaussians, active_sh_degree=active_sh_degree)
     except ValueError as error:
-        raise ValueError(f"{folder / SCENE} and {folder / name} do not belong together: {error}") from error
+        raise ValueError(f"{folder / SCENE_FILE} and {folder / name} do not belong together: {error}") from error
 
 
 def _glass(path: Path) -> Gaussians:
     """Glass with its marks, which determine where it reflects."""
-    glass = _ellipsoids(_drawable(path), path)
+    glass = _ellipsoids(_read_drawable(path), path)
     if "logit_mark" not in glass.channels:
         raise ValueError(f"{path} has no property logit_mark; expected glass as `planar` exports it")
     return glass
@@ -146,7 +146,7 @@ def _ellipsoids(gaussians: Gaussians, path: Path) -> Gaussians:
     return gaussians
 
 
-def _drawable(path: Path) -> Gaussians:
+def _read_drawable(path: Path) -> Gaussians:
     """Reads Gaussians and refuses colours and channels that make images non-finite; renderers skip undrawable ones."""
     gaussians = read_gaussians(path)
     bounds = {"sh": LARGEST_COLOR} | {
@@ -170,7 +170,7 @@ def read_splats(path: Path | str) -> Gaussians:
     The format is detected by the first bytes, or by the suffix for .splat, .sog and .ksplat.
     """
     path = Path(path)
-    with records.reading(path), path.open("rb") as stream:
+    with records.wrap_read_errors(path), path.open("rb") as stream:
         head = stream.read(4)
     if head[:3] == b"ply":
         table = read_table(path)
@@ -179,14 +179,14 @@ def read_splats(path: Path | str) -> Gaussians:
         return read_spz(path)
     if head == MAGIC:
         return read_glb(path)
-    if path.suffix.lower() in FORGED_SUFFIXES:
-        return read_forged(path)
+    if path.suffix.lower() in GAUSSFORGE_SUFFIXES:
+        return read_with_gaussforge(path)
     if path.suffix.lower() == ".splat":
-        return _read_rows(path)
+        return _read_dot_splat(path)
     raise ValueError(f"{path} is not a readable splat file; expected one of {', '.join(SPLAT_SUFFIXES)}")
 
 
-def drawable(gaussians: Gaussians, path: Path | str) -> tuple[Gaussians, int]:
+def select_drawable(gaussians: Gaussians, path: Path | str) -> tuple[Gaussians, int]:
     """The drawable Gaussians, and the number of others: non-finite or extreme values, or zero quaternions."""
     bounds = {
         "means": records.LARGEST_COORDINATE,
@@ -207,21 +207,21 @@ def drawable(gaussians: Gaussians, path: Path | str) -> tuple[Gaussians, int]:
             f"none of the {lost} Gaussians in {path} can be drawn: they contain NaN or values that are too large"
         )
     kept = gaussians.select(good) if lost else gaussians
-    held = {
+    clamped = {
         "logit_opacities": kept.logit_opacities.clamp(-LARGEST_LOG, LARGEST_LOG),
         "log_scales": kept.log_scales.clamp(min=-LARGEST_LOG),
     }
-    return kept.with_tensors(held), lost
+    return kept.with_tensors(clamped), lost
 
 
-def _read_rows(path: Path) -> Gaussians:
+def _read_dot_splat(path: Path) -> Gaussians:
     """A .splat: 32 bytes per Gaussian, with activated colours and opacities, and linear scales."""
     size = os.stat(path).st_size
     if size == 0 or size % SPLAT_ROW.itemsize:
         raise ValueError(
             f"{path} has {size} bytes; expected {SPLAT_ROW.itemsize} per Gaussian: it is cut off, or not a .splat"
         )
-    with records.reading(path):
+    with records.wrap_read_errors(path):
         rows = np.fromfile(path, dtype=SPLAT_ROW)
     shares = torch.from_numpy(rows["color"].astype(np.float32) / 255)
     scales = torch.from_numpy(rows["scale"].astype(np.float32))
@@ -234,10 +234,10 @@ def _read_rows(path: Path) -> Gaussians:
     )
 
 
-def read_forged(path: Path) -> Gaussians:
+def read_with_gaussforge(path: Path) -> Gaussians:
     """Reads a .sog (PlayCanvas) or .ksplat (GaussianSplats3D), both lossy, in the frame of a PLY."""
-    forge, kind = _forge(path), path.suffix.lower()[1:]
-    with records.reading(path):
+    forge, kind = _gaussforge(path), path.suffix.lower()[1:]
+    with records.wrap_read_errors(path):
         data = path.read_bytes()
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder) / "scene.ply"
@@ -248,14 +248,14 @@ def read_forged(path: Path) -> Gaussians:
             raise ValueError(str(error).replace(str(plain), str(path))) from error
 
 
-def write_forged(path: Path, gaussians: Gaussians) -> None:
+def write_with_gaussforge(path: Path, gaussians: Gaussians) -> None:
     """Writes a .sog or .ksplat; discs get the smallest third scale of SPZ.
 
     Raises:
         ValueError: gaussforge is not installed, or cannot write these Gaussians; or there are none.
         OSError: the file cannot be written; an older one is unchanged.
     """
-    forge = _forge(path)
+    forge = _gaussforge(path)
     if not len(gaussians):
         raise ValueError(f"there are no Gaussians to write as {path}; expected one at least")
     # SOG omits the largest component of a quaternion, which follows from unit length.
@@ -268,12 +268,12 @@ def write_forged(path: Path, gaussians: Gaussians) -> None:
     write_bytes(path, data)
 
 
-def _forge(path: Path) -> Any:
+def _gaussforge(path: Path) -> Any:
     try:
         from gaussforge import GaussForge
     except ImportError as error:
         raise ValueError(
-            f"{path}: {' and '.join(FORGED_SUFFIXES)} need gaussforge ({error}); pip install 'glassplat[formats]'"
+            f"{path}: {' and '.join(GAUSSFORGE_SUFFIXES)} need gaussforge ({error}); pip install 'glassplat[formats]'"
         ) from error
     return GaussForge()
 

@@ -27,7 +27,7 @@ from glassplat.files.writing import atomic_write, make_folder, write_text
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 from glassplat.options import CLEAR_GLASS, short_repr
 from glassplat.scene.camera import Camera, quat_from_rotation
-from glassplat.scene.corrections import ByPhotograph, Exposures, PoseCorrections
+from glassplat.scene.corrections import Exposures, PerPhotograph, PoseCorrections
 from glassplat.scene.panes import HIGHEST_LABEL, Planes
 from glassplat.scene.scene import Environment
 
@@ -74,7 +74,7 @@ def system_error(text: str) -> OSError:
 
 
 @contextmanager
-def opened_tensors(path: Path, file_format: str, what: str) -> Iterator[TensorsFile]:
+def open_tensors(path: Path, file_format: str, what: str) -> Iterator[TensorsFile]:
     """Opens a file of `write_tensors`, and checks the format in its header.
 
     Args:
@@ -83,7 +83,7 @@ def opened_tensors(path: Path, file_format: str, what: str) -> Iterator[TensorsF
         what: kind of the file for messages, such as "an environment".
     """
     try:
-        with records.reading(path), _unicode_name(path) as name, _open_table(name) as file:
+        with records.wrap_read_errors(path), _unicode_name(path) as name, _open_safetensors(name) as file:
             header = records.parse_json((file.metadata() or {}).get(HEADER_KEY, "{}"), f"the header of {path}")
             if not isinstance(header, dict) or header.get("format") != file_format:
                 found = header.get("format") if isinstance(header, dict) else header
@@ -95,7 +95,7 @@ def opened_tensors(path: Path, file_format: str, what: str) -> Iterator[TensorsF
 
 
 @contextmanager
-def _open_table(path: Path) -> Iterator[Any]:
+def _open_safetensors(path: Path) -> Iterator[Any]:
     """Opens a file with the library; retries if the file was replaced, because the library opens the path twice."""
     while True:
         before = _file_identity(path)
@@ -136,20 +136,20 @@ LEAST_ANGLE = 1e-3
 """Smallest angle between tangent and normal, radians; below, the rectangle's sides are undefined."""
 LEAST_HALF_SIZE = 1e-9
 LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE = 1e-6, 1.0
-VECTOR = records.Items(records.COORDINATE, 3)
+VECTOR = records.ListOf(records.COORDINATE, 3)
 LOGIT = records.Number(-1e3, 1e3)
 PLANE: dict[str, records.Field] = {
-    "label": records.Whole(1, HIGHEST_LABEL),
-    "mirror": records.Optional(records.Flag(), default=False),
+    "label": records.Integer(1, HIGHEST_LABEL),
+    "mirror": records.Optional(records.Boolean(), default=False),
     "center": VECTOR,
     "normal": VECTOR,
     "tangent": VECTOR,
-    "half_sizes": records.Items(records.Number(LEAST_HALF_SIZE, records.LARGEST_COORDINATE), 2),
+    "half_sizes": records.ListOf(records.Number(LEAST_HALF_SIZE, records.LARGEST_COORDINATE), 2),
     "base_reflectance": records.Optional(records.Number(0, 1), default=CLEAR_GLASS),
     "raw_normal": records.Optional(VECTOR),
     "logit_reflectance": records.Optional(LOGIT),
-    "transmittance": records.Optional(records.Items(records.Number(LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE), 3)),
-    "log_transmittance": records.Optional(records.Items(LOGIT, 3)),
+    "transmittance": records.Optional(records.ListOf(records.Number(LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE), 3)),
+    "log_transmittance": records.Optional(records.ListOf(LOGIT, 3)),
 }
 
 
@@ -300,10 +300,10 @@ LARGEST_SIDE = 2**17
 FOCAL = records.Number(above=0, most=1e9)
 CAMERA: dict[str, records.Field] = {
     "img_name": records.Text(),
-    "width": records.Whole(1, LARGEST_SIDE),
-    "height": records.Whole(1, LARGEST_SIDE),
-    "position": records.Items(records.COORDINATE, 3),
-    "rotation": records.Items(records.Items(records.Number(-1.01, 1.01), 3), 3),
+    "width": records.Integer(1, LARGEST_SIDE),
+    "height": records.Integer(1, LARGEST_SIDE),
+    "position": records.ListOf(records.COORDINATE, 3),
+    "rotation": records.ListOf(records.ListOf(records.Number(-1.01, 1.01), 3), 3),
     "fx": FOCAL,
     "fy": FOCAL,
     "cx": records.Optional(records.COORDINATE),
@@ -366,15 +366,15 @@ def _camera_entry(index: int, name: str, camera: Camera) -> dict[str, Any]:
 
 
 LARGEST_ENTRY = 1e3
-TRANSFORM = records.Items(records.Items(records.Number(-LARGEST_ENTRY, LARGEST_ENTRY), 4), 3)
+TRANSFORM = records.ListOf(records.ListOf(records.Number(-LARGEST_ENTRY, LARGEST_ENTRY), 4), 3)
 LARGEST_TWIST = 1e2
-TWIST = records.Items(records.Number(-LARGEST_TWIST, LARGEST_TWIST), 6)
-Correction = TypeVar("Correction", bound=ByPhotograph)
-ENTRIES: dict[type[ByPhotograph], records.Field] = {Exposures: TRANSFORM, PoseCorrections: TWIST}
+TWIST = records.ListOf(records.Number(-LARGEST_TWIST, LARGEST_TWIST), 6)
+Correction = TypeVar("Correction", bound=PerPhotograph)
+ENTRIES: dict[type[PerPhotograph], records.Field] = {Exposures: TRANSFORM, PoseCorrections: TWIST}
 """Required values of a photograph, by kind of correction."""
 
 
-def write_corrections(path: Path, corrections: ByPhotograph) -> None:
+def write_corrections(path: Path, corrections: PerPhotograph) -> None:
     """Writes the values of each photograph; `read_corrections` returns them exactly."""
     entries = dict(zip(corrections.names, corrections.values.detach().cpu().tolist(), strict=True))
     write_text(path, json.dumps(entries, indent=1) + "\n")
@@ -382,7 +382,7 @@ def write_corrections(path: Path, corrections: ByPhotograph) -> None:
 
 def read_corrections(path: Path, kind: type[Correction]) -> Correction:
     """Reads the exposures or poses that `write_corrections` wrote, as float32."""
-    entries = records.ByName(ENTRIES[kind]).read(records.read_json(path), str(path))
+    entries = records.DictOf(ENTRIES[kind]).read(records.read_json(path), str(path))
     values = torch.tensor(list(entries.values()), dtype=torch.float32).reshape(len(entries), *kind.SHAPE)
     return kind(values, tuple(entries))
 
@@ -416,7 +416,7 @@ def write_colmap(
 
 
 FORMAT = "glassplat-environment-1"
-REGION = records.Nullable(records.Items(records.COORDINATE, 4))
+REGION = records.Nullable(records.ListOf(records.COORDINATE, 4))
 """Centre and radius of the sphere that contains everything that reflects the environment."""
 
 
@@ -434,7 +434,7 @@ def read_environment(path: Path | str) -> Environment:
     path = Path(path)
     if not os.path.isfile(path):
         raise FileNotFoundError(f"no environment at {path}; expected the environment.safetensors of a run")
-    with opened_tensors(path, FORMAT, "an environment") as file:
+    with open_tensors(path, FORMAT, "an environment") as file:
         region = records.check_fields(file.header, {"region": records.Optional(REGION)}, f"the header of {path}")[
             "region"
         ]
@@ -466,7 +466,7 @@ def read_equirect(path: Path | str) -> Tensor:
         image = srgb_from_linear(torch.from_numpy(_read_exr(path)))
     else:
         _check_size(path, *image_size(path))
-        image = torch.from_numpy(_color(read_image_float(path), path))
+        image = torch.from_numpy(_rgb(read_image_float(path), path))
     if not bool(torch.isfinite(image).all()):
         raise ValueError(f"{path} contains non-finite values; expected radiance of at least 0")
     return image.clamp(0, 1)
@@ -515,9 +515,9 @@ def _check_size(path: Path, width: int, height: int) -> None:
 
 def _read_exr(path: Path) -> NDArray[np.float32]:
     """Linear radiance [H, W, 3]."""
-    (left, top), (right, bottom) = _in_exr(path, lambda file: file.header()["dataWindow"], header_only=True)
+    (left, top), (right, bottom) = _read_from_exr(path, lambda file: file.header()["dataWindow"], header_only=True)
     _check_size(path, int(right) - int(left) + 1, int(bottom) - int(top) + 1)
-    channels = _in_exr(
+    channels = _read_from_exr(
         path, lambda file: {name: one.pixels for name, one in file.channels().items()}, separate_channels=True
     )
     if not {"R", "G", "B"} <= channels.keys():
@@ -525,18 +525,18 @@ def _read_exr(path: Path) -> NDArray[np.float32]:
     return np.stack([channels[name] for name in "RGB"], axis=-1).astype(np.float32)
 
 
-def _in_exr(path: Path, look: Callable[[Any], Any], **options: bool) -> Any:
+def _read_from_exr(path: Path, read: Callable[[Any], Any], **options: bool) -> Any:
     """Reads from an EXR file; errors of the library become one that names the file."""
     import OpenEXR  # As above.
 
     try:
         with OpenEXR.File(str(path), **options) as file:
-            return look(file)
+            return read(file)
     except (RuntimeError, ValueError, KeyError) as error:
         raise ValueError(f"cannot read {path} as OpenEXR ({error}); replace the file or remove it") from error
 
 
-def _color(pixels: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
+def _rgb(pixels: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
     """RGB of an image, without transparency."""
     if pixels.shape[2] < 3:
         raise ValueError(f"{path} is grey; expected a panorama in colour")

@@ -24,15 +24,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.files.ply import as_numpy, as_tensor
-from glassplat.files.records import reading
+from glassplat.files.records import wrap_read_errors
 from glassplat.files.writing import write_bytes
-from glassplat.scene.gaussians import Gaussians, half_turned
+from glassplat.scene.gaussians import Gaussians, rotate_half_turn
 
 log = logging.getLogger(__name__)
 
 Bytes = NDArray[np.uint8]
 
-FLIP = (1.0, -1.0, -1.0)
+HALF_TURN_X = (1.0, -1.0, -1.0)
 """Signs of a half turn around x, which converts to the frame of SPZ and the web page, and back."""
 HARMONICS = (0, 3, 8, 15, 24)
 """Number of SH coefficients beyond degree 0, by degree; those of degree 4 are skipped."""
@@ -76,17 +76,17 @@ def fractional_bits_for(means: Tensor) -> int:
     return bits
 
 
-def packed_sections(gaussians: Gaussians, layout: Layout) -> list[Bytes]:
+def pack_sections(gaussians: Gaussians, layout: Layout) -> list[Bytes]:
     """The six sections of Gaussians in the capture's frame, for a layout of version 3 or 4."""
-    gaussians = half_turned(gaussians, FLIP)
+    gaussians = rotate_half_turn(gaussians, HALF_TURN_X)
     opacities = torch.sigmoid(gaussians.logit_opacities)
     return [
-        _packed_positions(as_numpy(gaussians.means), layout.fractional_bits),
-        _rounded(as_numpy(opacities) * 255),
-        _rounded(as_numpy(gaussians.sh[:, 0]) * (COLOR_SCALE * 255) + 127.5),
-        _rounded((as_numpy(three_log_scales(gaussians)) - LOWEST_LOG_SCALE) * STEPS_PER_LOG),
-        _packed_rotations(as_numpy(gaussians.quats)),
-        _rounded(as_numpy(gaussians.sh[:, 1:]) * 128 + 128),
+        _pack_positions(as_numpy(gaussians.means), layout.fractional_bits),
+        _to_bytes(as_numpy(opacities) * 255),
+        _to_bytes(as_numpy(gaussians.sh[:, 0]) * (COLOR_SCALE * 255) + 127.5),
+        _to_bytes((as_numpy(three_log_scales(gaussians)) - LOWEST_LOG_SCALE) * STEPS_PER_LOG),
+        _pack_rotations(as_numpy(gaussians.quats)),
+        _to_bytes(as_numpy(gaussians.sh[:, 1:]) * 128 + 128),
     ]
 
 
@@ -105,21 +105,21 @@ def unpack_gaussians(sections: list[Bytes], layout: Layout) -> Gaussians:
     constant = (colors.reshape(count, 1, 3).astype(np.float32) / 255 - 0.5) / COLOR_SCALE
     shares = np.clip(opacities.astype(np.float32) / 255, 0.5 / 255, 1 - 0.5 / 255)
     stored = Gaussians(
-        means=as_tensor(_unpacked_positions(positions, layout)),
-        quats=as_tensor(_unpacked_rotations(rotations, layout)),
+        means=as_tensor(_unpack_positions(positions, layout)),
+        quats=as_tensor(_unpack_rotations(rotations, layout)),
         log_scales=as_tensor(scales.reshape(count, 3).astype(np.float32) / STEPS_PER_LOG + LOWEST_LOG_SCALE),
         logit_opacities=torch.logit(as_tensor(shares)),
         sh=as_tensor(np.concatenate([constant, rest], axis=1)),
     )
-    return half_turned(stored, FLIP)
+    return rotate_half_turn(stored, HALF_TURN_X)
 
 
-def _packed_positions(means: NDArray[np.float32], bits: int) -> Bytes:
+def _pack_positions(means: NDArray[np.float32], bits: int) -> Bytes:
     fixed = np.rint(means.astype(np.float64) * 2**bits).clip(-LARGEST_POSITION, LARGEST_POSITION).astype("<i4")
     return np.ascontiguousarray(fixed.reshape(-1, 1).view(np.uint8)[:, :3]).reshape(-1)
 
 
-def _unpacked_positions(section: Bytes, layout: Layout) -> NDArray[np.float32]:
+def _unpack_positions(section: Bytes, layout: Layout) -> NDArray[np.float32]:
     if layout.version == 1:
         halves = section.view("<f2").reshape(layout.number, 3)
         # NumPy warns about arithmetic with signalling NaNs; renderers skip NaNs.
@@ -131,7 +131,7 @@ def _unpacked_positions(section: Bytes, layout: Layout) -> NDArray[np.float32]:
     return fixed.astype(np.float32) / np.float32(2**layout.fractional_bits)
 
 
-def _packed_rotations(quats: NDArray[np.float32]) -> Bytes:
+def _pack_rotations(quats: NDArray[np.float32]) -> Bytes:
     """The three smallest components of (x, y, z, w), ten bits each; the top two bits index the omitted one."""
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     unit = np.roll(np.divide(quats, norms, out=np.zeros_like(quats), where=norms > 0), -1, axis=1)
@@ -147,7 +147,7 @@ def _packed_rotations(quats: NDArray[np.float32]) -> Bytes:
     return packed.astype("<u4").view(np.uint8)
 
 
-def _unpacked_rotations(section: Bytes, layout: Layout) -> NDArray[np.float32]:
+def _unpack_rotations(section: Bytes, layout: Layout) -> NDArray[np.float32]:
     """Quaternions [N, 4] `wxyz`."""
     if layout.version < 3:
         vector = section.reshape(layout.number, 3).astype(np.float32) / 127.5 - 1
@@ -166,7 +166,7 @@ def _unpacked_rotations(section: Bytes, layout: Layout) -> NDArray[np.float32]:
     return np.roll(quats, 1, axis=1)
 
 
-def _rounded(values: NDArray[np.float32]) -> Bytes:
+def _to_bytes(values: NDArray[np.float32]) -> Bytes:
     return np.rint(values).clip(0, 255).astype(np.uint8).reshape(-1)
 
 
@@ -219,27 +219,27 @@ def spz_bytes(gaussians: Gaussians, version: int = 3) -> bytes:
             step,
             farthest,
         )
-    _warn_of_sizes(gaussians.log_scales)
-    sections = [section.tobytes() for section in packed_sections(gaussians, layout)]
-    head = (MAGIC, version, layout.number, layout.degree, layout.fractional_bits, 0)
+    _warn_about_sizes(gaussians.log_scales)
+    sections = [section.tobytes() for section in pack_sections(gaussians, layout)]
+    header = (MAGIC, version, layout.number, layout.degree, layout.fractional_bits, 0)
     if version == 4:
-        return _streamed(head, sections)
+        return _pack_streams(header, sections)
     packer = zlib.compressobj(9, zlib.DEFLATED, GZIP_WINDOW)
-    return packer.compress(HEADER.pack(*head, 0) + b"".join(sections)) + packer.flush()
+    return packer.compress(HEADER.pack(*header, 0) + b"".join(sections)) + packer.flush()
 
 
 MOST_CLIPPED = 0.001
 """Share of Gaussians whose scales may be clipped without a warning."""
-THIN = 3.0
+THIN_LOG_RATIO = 3.0
 """Log ratio of length to thickness above which the thickness of a Gaussian is invisible."""
 
 
-def _warn_of_sizes(log_scales: Tensor) -> None:
+def _warn_about_sizes(log_scales: Tensor) -> None:
     """Warns if many Gaussians are too large for SPZ, or so small that clipping visibly thickens them."""
-    lowest, highest, within = LOWEST_LOG_SCALE, LOWEST_LOG_SCALE + 255 / STEPS_PER_LOG, 0.5 / STEPS_PER_LOG
+    lowest, highest, tolerance = LOWEST_LOG_SCALE, LOWEST_LOG_SCALE + 255 / STEPS_PER_LOG, 0.5 / STEPS_PER_LOG
     largest, smallest = log_scales.amax(dim=1), log_scales.amin(dim=1)
-    small = (smallest < lowest - within) & (largest < lowest + THIN)
-    share = float((small | (largest > highest + within)).double().mean())
+    small = (smallest < lowest - tolerance) & (largest < lowest + THIN_LOG_RATIO)
+    share = float((small | (largest > highest + tolerance)).double().mean())
     if share > MOST_CLIPPED:
         log.warning(
             "SPZ and the web page hold sizes of %.2g to %.3g units; those of %.3g %% of the Gaussians are "
@@ -256,7 +256,7 @@ def read_spz(path: Path | str) -> Gaussians:
     Memory is bounded by the largest count accepted for a file of this size, whatever is compressed in it.
     """
     path = Path(path)
-    with reading(path):
+    with wrap_read_errors(path):
         data = path.read_bytes()
     if data.startswith(GZIP):
         layout, sections = _read_gzip(data, path)
@@ -267,12 +267,12 @@ def read_spz(path: Path | str) -> Gaussians:
     return unpack_gaussians(sections, layout)
 
 
-def _streamed(head: tuple[int, ...], sections: list[bytes]) -> bytes:
+def _pack_streams(header: tuple[int, ...], sections: list[bytes]) -> bytes:
     """Header, table of sizes, and the non-empty sections."""
     stored = [section for section in sections if section]
     packed = [zstandard.ZstdCompressor(level=12).compress(section) for section in stored]
     table = b"".join(STREAM.pack(len(p), len(s)) for p, s in zip(packed, stored, strict=True))
-    return STREAMED_HEADER.pack(*head, len(stored), STREAMED_HEADER.size) + table + b"".join(packed)
+    return STREAMED_HEADER.pack(*header, len(stored), STREAMED_HEADER.size) + table + b"".join(packed)
 
 
 def _read_gzip(data: bytes, path: Path) -> tuple[Layout, list[Bytes]]:
@@ -323,13 +323,13 @@ def _read_streams(data: bytes, path: Path) -> tuple[Layout, list[Bytes]]:
                 f"section {index} of {path} has {announced} bytes, packed in {packed}; expected {size}, packed "
                 "in the rest of the file: it is cut off or damaged"
             )
-        found.append(_unpacked_stream(data[at : at + packed], size, index, path))
+        found.append(_unpack_stream(data[at : at + packed], size, index, path))
         at += packed
     sections = iter(found)
     return layout, [next(sections) if size else np.zeros(0, dtype=np.uint8) for size in layout.sizes()]
 
 
-def _unpacked_stream(packed: bytes, size: int, index: int, path: Path) -> Bytes:
+def _unpack_stream(packed: bytes, size: int, index: int, path: Path) -> Bytes:
     try:
         with zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(packed) as stream:
             section = stream.read(size + 1)

@@ -17,21 +17,21 @@ from uuid import uuid4
 
 from glassplat.errors import InputError
 
-FORGED_SUFFIXES = (".sog", ".ksplat")
+GAUSSFORGE_SUFFIXES = (".sog", ".ksplat")
 """Formats that need an extra to be read and written."""
-SPLAT_SUFFIXES = (".ply", ".spz", ".glb", ".splat", *FORGED_SUFFIXES)
+SPLAT_SUFFIXES = (".ply", ".spz", ".glb", ".splat", *GAUSSFORGE_SUFFIXES)
 """Suffixes of readable files of Gaussians."""
-LOADED = f"a run, a folder of an export, or a splat file ({', '.join(SPLAT_SUFFIXES)})"
+LOADABLE = f"a run, a folder of an export, or a splat file ({', '.join(SPLAT_SUFFIXES)})"
 """Paths that can be opened as a scene."""
 SPLAT_WRITERS = {
     "ply": "glassplat.files.ply:write_gaussians",
     "spz": "glassplat.files.spz:write_spz",
     "glb": "glassplat.files.glb:write_glb",
-    "sog": "glassplat.files.scene_folder:write_forged",
-    "ksplat": "glassplat.files.scene_folder:write_forged",
+    "sog": "glassplat.files.scene_folder:write_with_gaussforge",
+    "ksplat": "glassplat.files.scene_folder:write_with_gaussforge",
 }
 """Output formats of Gaussians by suffix: the function `(path, gaussians)` of each, imported when needed."""
-WRITTEN = (*SPLAT_WRITERS, "html")
+OUTPUT_FORMATS = (*SPLAT_WRITERS, "html")
 """All formats of `export` and `Model.save`; `html` is the page of a whole model."""
 
 
@@ -42,7 +42,7 @@ def write_splats(kind: str, path: Path, gaussians: Any, **options: Any) -> None:
     getattr(importlib.import_module(module), name)(path, shown, **options)
 
 
-UNFINISHED = re.compile(r"\..{0,32}\.[0-9a-f]{12}\.tmp(\..{1,31})?")
+TEMPORARY_NAME = re.compile(r"\..{0,32}\.[0-9a-f]{12}\.tmp(\..{1,31})?")
 """Name of a temporary file of `atomic_write`."""
 
 
@@ -97,7 +97,7 @@ def file_digest(path: Path) -> str:
 def remove_unfinished(folder: Path, suffixes: Sequence[str]) -> None:
     """Remove temporary files of killed writers from a folder; no writer of such files may be running there."""
     for path in folder.glob(".*"):
-        if UNFINISHED.fullmatch(path.name) and path.suffix in suffixes:
+        if TEMPORARY_NAME.fullmatch(path.name) and path.suffix in suffixes:
             with suppress(OSError):
                 path.unlink()
 
@@ -111,9 +111,9 @@ def _flush_to_disk(path: Path) -> None:
         os.close(descriptor)
 
 
-SCENE = "scene.json"
+SCENE_FILE = "scene.json"
 """The file that marks a folder as an exported scene."""
-IN_THE_WAY = (errno.EEXIST, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
+OBSTRUCTION_ERRNOS = (errno.EEXIST, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
 
 
 def check_folder(path: Path) -> None:
@@ -155,7 +155,7 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         remove_empty(missing)
-        if error.errno not in IN_THE_WAY:
+        if error.errno not in OBSTRUCTION_ERRNOS:
             raise
         raise NotADirectoryError(
             f"cannot create the folder {path} ({error.strerror}); choose another output folder"

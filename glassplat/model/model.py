@@ -21,7 +21,7 @@ from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files import writing
 from glassplat.files.ply import read_gaussians, write_gaussians
 from glassplat.files.records import read_text
-from glassplat.files.scene_folder import drawable, read_splats
+from glassplat.files.scene_folder import read_splats, select_drawable
 from glassplat.files.sidecars import planes_json, read_cameras, read_planes, write_cameras, write_equirect, write_planes
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
 from glassplat.methods.planar_recipe import PlanarRecipe
@@ -38,10 +38,10 @@ from glassplat.render.layers import layer_image
 from glassplat.render.planar import with_photographer
 from glassplat.scene import scene
 from glassplat.scene.camera import LEAST_SINE, Camera
-from glassplat.scene.corrections import DEFAULT_UP, upward
+from glassplat.scene.corrections import DEFAULT_UP, estimate_up
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
-from glassplat.scene.scene import Scene, closed_glass, with_intensity, with_pane
+from glassplat.scene.scene import Scene, covering_glass, with_intensity, with_pane
 from glassplat.viewer.drawing import ERROR, ViewerState, Writer
 from glassplat.viewer.render_loop import LOCAL, vacant_port
 from glassplat.viewer.server import Viewer
@@ -323,7 +323,7 @@ class Model:
 
     def _level_direction(self, normal: Sequence[float]) -> list[float] | None:
         """[3] horizontal direction perpendicular to a normal; None if undetermined."""
-        up = upward([*self.cameras.values()]) if self.cameras else DEFAULT_UP
+        up = estimate_up([*self.cameras.values()]) if self.cameras else DEFAULT_UP
         across = np.asarray([*normal], np.float64)
         level = np.cross(up, across) if across.shape == (3,) else np.zeros(3)
         return level.tolist() if np.linalg.norm(level) > LEAST_SINE * np.linalg.norm(across) else None
@@ -413,8 +413,8 @@ def save_model(model: Model, path: Path, *, overwrite: bool) -> Path:
     kind = path.suffix.lower().removeprefix(".")
     if not kind:
         return save_folder(model, path, overwrite=overwrite)
-    if kind not in writing.WRITTEN:
-        endings = ", ".join(f".{known}" for known in writing.WRITTEN)
+    if kind not in writing.OUTPUT_FORMATS:
+        endings = ", ".join(f".{known}" for known in writing.OUTPUT_FORMATS)
         raise InputError(f"{path}: expected a name that ends in {endings}, or a folder's")
     names = (PLANES, GLASS, CAMERAS, *(() if model.scene.environment.is_empty else (ENVIRONMENT, PANORAMA)))
     beside = [path.with_name(name) for name in names] if kind in writing.SPLAT_WRITERS else []
@@ -586,8 +586,8 @@ def _glass(file: Path, planes: Planes, *, own: bool) -> Gaussians:
     """The glass stored next to the file, or an even sheet of Gaussians on each pane."""
     beside = file.with_name("glass.ply")
     if not len(planes) or not own or not beside.is_file():
-        return closed_glass(planes)
-    glass, _ = drawable(read_gaussians(beside), beside)
+        return covering_glass(planes)
+    glass, _ = select_drawable(read_gaussians(beside), beside)
     if "logit_mark" not in glass.channels:
         raise InputError(f"{beside} has no property logit_mark; expected glass as `glassplat export` writes it")
     return glass
@@ -628,7 +628,7 @@ def load(
     """
     path = Path(path)
     if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist; expected {writing.LOADED}")
+        raise FileNotFoundError(f"{path} does not exist; expected {writing.LOADABLE}")
     source = writing.scene_source(path)
     if not source.is_dir():
         model = _from_file(source, device, None if planes is None else Path(planes), up)
@@ -653,7 +653,7 @@ def _from_run(path: Path, device: DeviceName) -> Model:
 def _from_file(path: Path, device: DeviceName, planes_file: Path | None, up: Up) -> Model:
     """A model from a splat file, on black, with the files that `export` writes next to it."""
     with input_checked():
-        gaussians, lost = drawable(read_splats(path), path)
+        gaussians, lost = select_drawable(read_splats(path), path)
         if not len(gaussians):
             raise InputError(f"{path} holds no Gaussians; expected a trained splat")
         planes = _planes(path, planes_file)

@@ -17,7 +17,7 @@ from glassplat.panes.material import virtual_points
 from glassplat.panes.objective import MIDDLE, JointObjective, Objective, edge_matches, pane_rectangle
 from glassplat.scene import logit
 from glassplat.scene.camera import Camera, NumpyCamera
-from glassplat.scene.panes import Planes, linked_groups, name_labels
+from glassplat.scene.panes import Planes, connected_components, name_labels
 
 Array = NDArray[np.float64]
 log = logging.getLogger("glassplat.panes")
@@ -349,7 +349,7 @@ def _neighbours(found: Sequence[_Found]) -> list[list[int]]:
         first, second = panes[one], panes[other]
         return search.in_one_surface(first.plane, second.plane, (first.evidence, second.evidence))
 
-    return [group for group in linked_groups(list(panes), may_share) if len(group) > 1]
+    return [group for group in connected_components(list(panes), may_share) if len(group) > 1]
 
 
 def _joint(panes: Sequence[_Found], seed: int) -> list[_Found]:
@@ -410,8 +410,8 @@ def _worth_marking(views: Sequence[masks.PaneView], unmarked: Sequence[tuple[str
     middle = _seen_middle(views)
     centers = [view.center for view in views]
     names: list[str] = []
-    cameras = [(name, NumpyCamera.of(camera)) for name, camera in unmarked]
-    held = [(name, camera.center) for name, camera in cameras if camera.holds(middle, margin=-WELL_INSIDE)]
+    cameras = [(name, NumpyCamera.from_camera(camera)) for name, camera in unmarked]
+    held = [(name, camera.center) for name, camera in cameras if camera.contains(middle, margin=-WELL_INSIDE)]
     while held and len(names) < MOST_NAMED:
         apart = [min(_turn(middle, center, other) for other in centers) for _, center in held]
         name, center = held.pop(int(np.argmax(apart)))

@@ -135,7 +135,7 @@ def reduced_photograph(scene: Scene, view: View) -> Photograph:
     camera = view.camera.to(device)
     factor = min(1.0, REDUCED_WIDTH / camera.width)
     size = (max(round(factor * camera.height), 1), max(round(factor * camera.width), 1))
-    pixels = scene.exposures.undone(view.photo.to(device).float() / 255, view.name)
+    pixels = scene.exposures.apply_inverse(view.photo.to(device).float() / 255, view.name)
     pixels = torch.nn.functional.interpolate(pixels.movedim(-1, 0)[None], size, mode="area")[0].movedim(0, -1)
     valid = torch.ones_like(pixels[..., 0]) if view.ignored is None else 1.0 - view.ignored.to(device).float()
     if view.ignored is not None:

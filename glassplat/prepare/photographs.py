@@ -19,7 +19,7 @@ from PIL import ExifTags, Image, ImageOps
 from glassplat.captures.masks import IGNORE_FOLDER, MASK_FOLDER, MASK_MARK, PANE_FOLDER
 from glassplat.errors import InputError, first_names
 from glassplat.files import images
-from glassplat.files.records import readable_name, reading
+from glassplat.files.records import readable_name, wrap_read_errors
 from glassplat.training.messages import Working
 
 
@@ -175,7 +175,7 @@ def capture_names(paths: Sequence[Path], folder: Path) -> dict[Path, str]:
         counts[name] += 1
         if counts[name] > 1:
             spoken[path] = f"{name}-{counts[name]}"
-    pictures = images.picture_paths(list(spoken.values()))
+    pictures = images.image_paths(list(spoken.values()))
     return {path: pictures[name].with_suffix(PICTURE_SUFFIX).as_posix() for path, name in spoken.items()}
 
 
@@ -211,7 +211,7 @@ def _upright(path: Path) -> Image.Image:
     """The image as 8-bit sRGB over black, rotated by its EXIF orientation."""
     with images.checked_image(path) as image:
         orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
-        shown = images.in_srgb(image)
+        shown = images.convert_to_srgb(image)
         shown.getexif()[ExifTags.Base.Orientation] = orientation
         upright = ImageOps.exif_transpose(shown)
     if not upright.has_transparency_data:
@@ -234,7 +234,7 @@ def _photograph_paths(folder: Path) -> list[Path]:
             f"({first_names(list(unreadable))}); save them as JPEG and remove these (a phone does so if its "
             "camera is set to 'most compatible'). To read HEIC: pip install 'glassplat[heic]'"
         )
-    suffixes = (*images.IMAGE_SUFFIXES, *(images.HEIF_SUFFIXES if images.reads_heif() else ()))
+    suffixes = (*images.IMAGE_SUFFIXES, *(images.HEIF_SUFFIXES if images.can_read_heif() else ()))
     paths = [path for path in files if path.suffix.lower() in suffixes]
     if not paths:
         found = first_names(sorted(path.name for path in files)) or "nothing"
@@ -245,12 +245,12 @@ def _photograph_paths(folder: Path) -> list[Path]:
 def _unreadable_kind(path: Path) -> str | None:
     """Format of a photograph that Pillow cannot read, by its suffix or first bytes; None for all others."""
     suffix = path.suffix.lower()
-    if suffix in UNREADABLE or (suffix in images.HEIF_SUFFIXES and not images.reads_heif()):
+    if suffix in UNREADABLE or (suffix in images.HEIF_SUFFIXES and not images.can_read_heif()):
         return suffix[1:].upper()
-    if suffix not in images.IMAGE_SUFFIXES or images.reads_heif():
+    if suffix not in images.IMAGE_SUFFIXES or images.can_read_heif():
         return None
     try:
-        with reading(path), path.open("rb") as file:
+        with wrap_read_errors(path), path.open("rb") as file:
             start = file.read(12)
     except (ValueError, FileNotFoundError):
         return None  # Reported when it is decoded.
@@ -274,7 +274,7 @@ def _examine(path: Path, name: str, max_size: int, least_side: int = LEAST_SIDE)
             image.draft("RGB", (LEAST_SIDE, LEAST_SIDE))
             image.load()
             transparent = images.opacity(image) is not None
-        with reading(path):
+        with wrap_read_errors(path):
             contents = hashlib.blake2b(path.read_bytes(), digest_size=16).digest()
     except (ValueError, FileNotFoundError) as error:
         raise InputError(str(error)) from error

@@ -20,12 +20,12 @@ from glassplat.captures.dataset import Dataset, load_dataset
 from glassplat.captures.view import PointCloud, View
 from glassplat.errors import InputError
 from glassplat.evaluate.report import STYLE
-from glassplat.files.records import Field, Items, Number, Text, Whole, check_fields, read_json
+from glassplat.files.records import Field, Integer, ListOf, Number, Text, check_fields, read_json
 from glassplat.files.writing import write_text
 from glassplat.panes.material import virtual_points
 from glassplat.prepare.preparation import RECORD
 from glassplat.scene.camera import NumpyCamera
-from glassplat.scene.corrections import in_order
+from glassplat.scene.corrections import natural_sort_key
 from glassplat.scene.panes import Planes
 
 Array = NDArray[np.float64]
@@ -50,7 +50,7 @@ def plan(views: Sequence[View], points: PointCloud, behind: NDArray[np.bool_], p
         behind: [N] mask of those behind panes.
         planes: panes, if any are known.
     """
-    cameras = [NumpyCamera.of(view.camera) for view in views]
+    cameras = [NumpyCamera.from_camera(view.camera) for view in views]
     axes = _from_above(cameras)
     centers = np.stack([camera.center for camera in cameras]) @ axes.T
     places = points.positions.cpu().double().numpy() @ axes.T
@@ -150,7 +150,7 @@ svg { background: #0c0d0f; border-radius: 8px }
 """
 
 
-COUNT, NAMES = Whole(0), Items(Text())
+COUNT, NAMES = Integer(0), ListOf(Text())
 REPORT: dict[str, Field] = {
     "photographs": COUNT,
     "registered": COUNT,
@@ -208,7 +208,7 @@ def _read_report(path: Path) -> dict[str, Any]:
 
 
 def _page(report: Mapping[str, Any], dataset: Dataset, model: Any, planes: Planes | None, title: str) -> str:
-    views = sorted((*dataset.train, *dataset.test), key=lambda view: in_order(view.name))
+    views = sorted((*dataset.train, *dataset.test), key=lambda view: natural_sort_key(view.name))
     behind = _behind(dataset, planes)
     points = list(model.points3D.values())
     tracks = np.array([point.track.length() for point in points])

@@ -26,7 +26,7 @@ from PIL import Image
 from torch import Tensor
 
 from glassplat.errors import InputError
-from glassplat.files.spz import FLIP, spz_bytes
+from glassplat.files.spz import HALF_TURN_X, spz_bytes
 from glassplat.files.writing import write_bytes, write_text
 from glassplat.kernels.environment import cube_lookup
 from glassplat.render.frame import NEAR_PER_EXTENT, Renderer
@@ -34,7 +34,7 @@ from glassplat.render.layers import contributions
 from glassplat.render.panes import nearest_hits, panes_in_camera
 from glassplat.render.traced import traced_colors
 from glassplat.scene.camera import Camera
-from glassplat.scene.corrections import upward
+from glassplat.scene.corrections import estimate_up
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes, nearest_panes
 from glassplat.scene.scene import Scene, without_glass
@@ -108,7 +108,7 @@ class Surveyed(NamedTuple):
 
     Attributes:
         focus: [3] the point nearest to the sight lines of all cameras.
-        up: [3] unit vector, away from the ground, as `upward` finds it.
+        up: [3] unit vector, away from the ground, as `estimate_up` finds it.
         distance: median distance of the cameras from the focus, world units.
         reach: distance from the nearest photograph up to which the scene is known, world units.
     """
@@ -141,7 +141,7 @@ def survey_capture(cameras: Sequence[Camera], extent: float) -> Surveyed:
         )
         spacing = float(distances.amin(dim=1).median())
     reach = max(SPACINGS * spacing, SHARE_OF_DISTANCE * distance, 1e-6)
-    return Surveyed(focus, torch.tensor(upward(cameras), dtype=torch.float64), distance, reach)
+    return Surveyed(focus, torch.tensor(estimate_up(cameras), dtype=torch.float64), distance, reach)
 
 
 @torch.no_grad()
@@ -413,7 +413,7 @@ def cube_bytes(scene: Scene, settings: Mapping[str, Any]) -> bytes:
     """
     near, environment = settings["mirrored"] == "near", scene.environment
     size = CUBE_SIZE if near else min(environment.size, CUBE_SIZE)
-    directions = cube_directions(size).reshape(-1, 3) * torch.tensor(FLIP, dtype=torch.float32)
+    directions = cube_directions(size).reshape(-1, 3) * torch.tensor(HALF_TURN_X, dtype=torch.float32)
     directions = directions.to(scene.primary.means)
     if near and len(scene.surroundings):
         weights = torch.sigmoid(scene.primary.logit_opacities) * torch.sigmoid(scene.primary.channels["logit_strength"])
@@ -470,7 +470,7 @@ def described_pane(planes: Planes, index: int) -> dict[str, Any]:
 
 def described_view(name: str, camera: Camera) -> dict[str, Any]:
     """One photograph's camera in the page's world; the rotation by rows."""
-    rotation = camera.cam_from_world[:3, :3].cpu() * torch.tensor(FLIP, dtype=torch.float32)
+    rotation = camera.cam_from_world[:3, :3].cpu() * torch.tensor(HALF_TURN_X, dtype=torch.float32)
     return {
         "name": name,
         "rotation": [round(value, 6) for value in rotation.flatten().tolist()],
@@ -486,5 +486,5 @@ def described_view(name: str, camera: Camera) -> dict[str, Any]:
 
 def in_page(vector: Tensor) -> list[float]:
     """A point or a direction [3] of the capture in the page's world."""
-    turned: list[float] = (vector.detach().cpu().double().numpy() * np.asarray(FLIP)).tolist()
+    turned: list[float] = (vector.detach().cpu().double().numpy() * np.asarray(HALF_TURN_X)).tolist()
     return turned

@@ -19,7 +19,7 @@ from glassplat.kernels.records import TILE, PaneHits, Panes, Projected, Splats
 from glassplat.kernels.tiles import bin_tiles
 from glassplat.options import Blend
 from glassplat.render.frame import project_gaussians
-from glassplat.scene.camera import Camera, constant, mirror_matrices, waits
+from glassplat.scene.camera import Camera, constant, mirror_matrices, synchronises
 from glassplat.scene.corrections import world_from_photographer
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
@@ -51,7 +51,7 @@ class SeenPanes:
 def panes_in_camera(planes: Planes, camera: Camera) -> Panes:
     """The rectangles in the camera frame, without gradients."""
     pose = camera.cam_from_world
-    if waits(pose.device):
+    if synchronises(pose.device):
         given = planes.centers, planes.raw_normals, planes.tangents, planes.half_sizes
         centers, raw_normals, tangents, half_sizes = (tensor.to(pose) for tensor in given)
         return pane_kernels.panes_in_camera(centers, raw_normals, tangents, half_sizes, pose)
@@ -177,7 +177,7 @@ def mirrored_views(planes: Planes, camera: Camera) -> MirroredViews:
     longer than all Gaussians.
     """
     pose = camera.cam_from_world
-    if waits(planes.centers.device):
+    if synchronises(planes.centers.device):
         return pane_kernels.mirrored_views(planes.centers, planes.raw_normals, pose)
     normals = planes.normals
     poses = pose @ mirror_matrices(planes.centers, normals)

@@ -428,7 +428,7 @@ def dereflected_photo(
     photographed = photo.to(torch.float32) / 255
     # Clipping is evaluated in the camera's colours, the rest in the scene's.
     clipped = photographed
-    photographed = exposures.undone(photographed, name).clamp(0, 1)
+    photographed = exposures.apply_inverse(photographed, name).clamp(0, 1)
     tint = frame.layers.get("tint", torch.ones((), dtype=torch.float32)).clamp(min=DARKEST_GLASS)
     light, reflected = decode(photographed), decode(frame.photographed) - (1 - share) * tint * decode(without_panes)
     # Trust is almost zero before this division would amplify noise.

@@ -15,7 +15,7 @@ def logit(share: float) -> float:
     return math.log(share / (1 - share))
 
 
-def among_known(tensors: Mapping[str, Any], known: Iterable[str], owner: str) -> dict[str, Any]:
+def check_tensor_names(tensors: Mapping[str, Any], known: Iterable[str], owner: str) -> dict[str, Any]:
     """The tensors by name, checked against those of `owner`.
 
     Raises:

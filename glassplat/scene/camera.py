@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 
-def waits(device: torch.device) -> bool:
+def synchronises(device: torch.device) -> bool:
     """Return whether reading results from this device synchronises, as on a GPU."""
     return device.type == "cuda"
 
@@ -242,7 +242,7 @@ class NumpyCamera:
     size: Array
 
     @staticmethod
-    def of(camera: Camera) -> NumpyCamera:
+    def from_camera(camera: Camera) -> NumpyCamera:
         """The same camera."""
         pose = camera.cam_from_world.detach().cpu().double().numpy()
         return NumpyCamera(
@@ -257,7 +257,7 @@ class NumpyCamera:
         """Length of the image diagonal, in pixels."""
         return float(np.hypot(*self.size))
 
-    def in_camera(self, points: Array) -> Array:
+    def to_camera_axes(self, points: Array) -> Array:
         """[..., 3] world points in the camera's axes, +z forward."""
         return np.asarray((points - self.center) @ self.rotation.T)
 
@@ -269,7 +269,7 @@ class NumpyCamera:
 
     def project(self, points: Array) -> Array:
         """[..., 2] pixels of world points [..., 3]."""
-        return self.pixels(self.in_camera(points))
+        return self.pixels(self.to_camera_axes(points))
 
     def rays(self, pixels: Array) -> Array:
         """[..., 3] unit world directions through pixels [..., 2], which may be outside the image."""
@@ -278,9 +278,9 @@ class NumpyCamera:
         world = np.stack([x, y, np.ones_like(x)], axis=-1) @ self.rotation
         return np.asarray(world / np.linalg.norm(world, axis=-1, keepdims=True))
 
-    def holds(self, points: Array, margin: float = 0.0) -> NDArray[np.bool_]:
+    def contains(self, points: Array, margin: float = 0.0) -> NDArray[np.bool_]:
         """[...] bool: world points inside the image, enlarged by `margin` of its sides."""
-        in_camera = self.in_camera(points)
+        in_camera = self.to_camera_axes(points)
         pixels = self.pixels(in_camera)
         room = margin * self.size
         return np.asarray(

@@ -11,34 +11,34 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from glassplat.scene import among_known
+from glassplat.scene import check_tensor_names
 from glassplat.scene.camera import Camera
 
 
-def neighbours(name: str, names: Sequence[str]) -> list[int]:
+def neighbour_rows(name: str, names: Sequence[str]) -> list[int]:
     """Rows of the neighbours of `name` in sorted `names`; only one at either end.
 
     Numbers in names are sorted numerically. Photographs of other folders are not neighbours, since their order in time
     is unknown; the list may be empty.
     """
-    folder, here = PurePosixPath(name).parent, in_order(name)
-    beside = [row for row, known in enumerate(names) if PurePosixPath(known).parent == folder and known != name]
-    before = [row for row in beside if in_order(names[row]) < here]
-    after = [row for row in beside if in_order(names[row]) > here]
+    folder, key = PurePosixPath(name).parent, natural_sort_key(name)
+    same_folder = [row for row, known in enumerate(names) if PurePosixPath(known).parent == folder and known != name]
+    before = [row for row in same_folder if natural_sort_key(names[row]) < key]
+    after = [row for row in same_folder if natural_sort_key(names[row]) > key]
     return [
-        *([max(before, key=lambda row: in_order(names[row]))] if before else []),
-        *([min(after, key=lambda row: in_order(names[row]))] if after else []),
+        *([max(before, key=lambda row: natural_sort_key(names[row]))] if before else []),
+        *([min(after, key=lambda row: natural_sort_key(names[row]))] if after else []),
     ]
 
 
-def in_order(name: str) -> tuple[list[tuple[int, str]], str]:
+def natural_sort_key(name: str) -> tuple[list[tuple[int, str]], str]:
     """Sort key of names: their parts without suffix, numbers by value, so that `a.jpg` comes before `a1.jpg`."""
     parts = re.findall(r"\d+|\D+", str(PurePosixPath(name).with_suffix("")))
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts], name
 
 
 @dataclass(frozen=True)
-class ByPhotograph:
+class PerPhotograph:
     """Base class of per-photograph values.
 
     Attributes:
@@ -66,7 +66,7 @@ class ByPhotograph:
         """Number of photographs."""
         return len(self.names)
 
-    def of(self, name: str) -> Tensor | None:
+    def values_of(self, name: str) -> Tensor | None:
         """Values of a photograph; None if it has none."""
         return self.values[self.names.index(name)] if name in self.names else None
 
@@ -75,13 +75,13 @@ class ByPhotograph:
 
         Unchanged if the photograph has values, or no neighbours.
         """
-        rows = [] if name in self.names else neighbours(name, self.names)
+        rows = [] if name in self.names else neighbour_rows(name, self.names)
         if not rows:
             return self
         mean = self.values[rows].mean(dim=0, keepdim=True)
         return replace(self, values=torch.cat([self.values, mean]), names=(*self.names, name))
 
-    def reaches(self, names: Iterable[str]) -> bool:
+    def covers_any(self, names: Iterable[str]) -> bool:
         """Return whether any of these photographs has values of its own or of neighbours."""
         return any(name in self.interpolate(name).names for name in names)
 
@@ -91,7 +91,7 @@ class ByPhotograph:
 
     def with_tensors(self, tensors: Mapping[str, Tensor]) -> Self:
         """The corrections with tensors replaced by name."""
-        known = among_known(tensors, self.tensors(), "these corrections")
+        known = check_tensor_names(tensors, self.tensors(), "these corrections")
         return replace(self, values=known.get(self.TENSOR, self.values))
 
     def to(self, device: torch.device | torch.dtype | str) -> Self:
@@ -105,7 +105,7 @@ class ByPhotograph:
 
 
 @dataclass(frozen=True)
-class Exposures(ByPhotograph):
+class Exposures(PerPhotograph):
     """For each photograph, the affine map from scene colours to its own: c' = c + A c + b, sRGB.
 
     Exposure and white balance vary between photographs. In sRGB, a power of radiance, both are approximately factors
@@ -119,14 +119,14 @@ class Exposures(ByPhotograph):
 
     def apply(self, image: Tensor, name: str) -> Tensor:
         """An image [..., 3] of the scene in the colours of a photograph; differentiable in both."""
-        own = self.of(name)
+        own = self.values_of(name)
         if own is None:
             return image
         return image @ (torch.eye(3, dtype=image.dtype, device=image.device) + own[:, :3].T) + own[:, 3]
 
-    def undone(self, photo: Tensor, name: str) -> Tensor:
+    def apply_inverse(self, photo: Tensor, name: str) -> Tensor:
         """A photograph [..., 3] in the colours of the scene: the inverse of `apply`."""
-        own = self.of(name)
+        own = self.values_of(name)
         if own is None:
             return photo
         own = own.to(photo)
@@ -134,7 +134,7 @@ class Exposures(ByPhotograph):
 
 
 @dataclass(frozen=True)
-class PoseCorrections(ByPhotograph):
+class PoseCorrections(PerPhotograph):
     """For each photograph, a small motion of its camera about its own centre, in axes parallel to the world's.
 
     cam_from_world = [R | t] becomes exp(twist turned by R) cam_from_world. In these axes, a common shift of all
@@ -156,7 +156,7 @@ class PoseCorrections(ByPhotograph):
             name: name of the photograph.
             extent: extent of the scene, world units.
         """
-        twist = self.of(name)
+        twist = self.values_of(name)
         if twist is None:
             return camera
         cam_axes_from_world = camera.cam_from_world[:3, :3].to(twist)
@@ -172,10 +172,10 @@ def moved_camera(camera: Camera, twist: Tensor, extent: float) -> Camera:
         extent: extent of the scene, world units.
     """
     pose = camera.cam_from_world
-    return replace(camera, cam_from_world=motion(twist, extent).to(pose.dtype) @ pose.to(twist.device))
+    return replace(camera, cam_from_world=motion_from_twist(twist, extent).to(pose.dtype) @ pose.to(twist.device))
 
 
-def motion(twist: Tensor, extent: float) -> Tensor:
+def motion_from_twist(twist: Tensor, extent: float) -> Tensor:
     """[4, 4] the rigid motion of a twist [6] of `moved_camera`; smooth everywhere, including at zero."""
     x, y, z, *shift = twist.unbind()
     zero = torch.zeros_like(x)
@@ -197,7 +197,7 @@ LEAST_AGREEMENT = 0.1
 """Length of a mean of unit vectors below which its direction is undefined."""
 
 
-def upward(cameras: Sequence[Camera]) -> Direction:
+def estimate_up(cameras: Sequence[Camera]) -> Direction:
     """Up direction estimated from the cameras: unit, world axes.
 
     Handheld cameras are pitched, but hardly rolled, so that their x axes are horizontal. The up direction is
@@ -206,11 +206,11 @@ def upward(cameras: Sequence[Camera]) -> Direction:
     """
     rotations = torch.stack([camera.cam_from_world[:3, :3] for camera in cameras]).double().cpu()
     level = rotations[:, 0]
-    spread = level.T @ level / len(cameras) + TILT_PENALTY * torch.eye(3, dtype=torch.float64)
+    scatter = level.T @ level / len(cameras) + TILT_PENALTY * torch.eye(3, dtype=torch.float64)
     for axis in (1, 2):
-        told = -rotations[:, axis].mean(dim=0)
-        if float(told.norm()) > LEAST_AGREEMENT:
-            x, y, z = torch.nn.functional.normalize(torch.linalg.solve(spread, told), dim=0).tolist()
+        mean_up = -rotations[:, axis].mean(dim=0)
+        if float(mean_up.norm()) > LEAST_AGREEMENT:
+            x, y, z = torch.nn.functional.normalize(torch.linalg.solve(scatter, mean_up), dim=0).tolist()
             return (x, y, z)
     return DEFAULT_UP
 
@@ -224,12 +224,12 @@ def world_from_photographer(camera: Camera, up: Direction | None) -> Tensor:
     """
     rotation = camera.cam_from_world[:3, :3].T
     if up is not None:
-        rotation = _stood_up(rotation, torch.tensor(up, dtype=rotation.dtype, device=rotation.device))
+        rotation = _upright_rotation(rotation, torch.tensor(up, dtype=rotation.dtype, device=rotation.device))
     top = torch.cat([rotation, camera.center[:, None]], dim=1)
     return torch.cat([top, top.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
 
 
-def _stood_up(world_from_cam: Tensor, up: Tensor) -> Tensor:
+def _upright_rotation(world_from_cam: Tensor, up: Tensor) -> Tensor:
     """[3, 3] the rotation whose y axis points down and whose z axis is the horizontal viewing direction."""
     right, ahead = world_from_cam[:, 0], world_from_cam[:, 2]
     across = torch.linalg.cross(ahead, up) + LEVEL_SHARE * (right - (right @ up) * up)

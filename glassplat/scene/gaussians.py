@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from glassplat.scene import among_known
+from glassplat.scene import check_tensor_names
 
 DISC_SCALES = 2
 """Number of scales of a disc; ellipsoids have one more."""
@@ -107,7 +107,7 @@ class Gaussians:
 
     def with_tensors(self, tensors: Mapping[str, Tensor]) -> Gaussians:
         """The set with some tensors or channels replaced by name."""
-        changed = among_known(tensors, self.tensors(), "these Gaussians")
+        changed = check_tensor_names(tensors, self.tensors(), "these Gaussians")
         channels = {name: changed.pop(name, tensor) for name, tensor in self.channels.items()}
         return replace(self, **changed, channels=channels)
 
@@ -167,16 +167,16 @@ def mirrored_gaussians(gaussians: Gaussians, center: Tensor, normal: Tensor) -> 
     return gaussians.with_tensors({"means": means, "quats": quats, "sh": sh})
 
 
-HALF_TURNED_HARMONICS = {
+HALF_TURN_SH_SIGNS = {
     (1.0, -1.0, -1.0): (1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1),
     (-1.0, -1.0, 1.0): (1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1),
 }
 """Signs of the harmonics under these sign changes of x, y and z."""
 
 
-def half_turned(gaussians: Gaussians, signs: tuple[float, float, float]) -> Gaussians:
+def rotate_half_turn(gaussians: Gaussians, signs: tuple[float, float, float]) -> Gaussians:
     """The Gaussians rotated by 180 degrees about the x axis, signs (1, -1, -1), or the z axis, (-1, -1, 1); exact."""
     flip = gaussians.means.new_tensor(signs)
-    harmonics = gaussians.sh.new_tensor(HALF_TURNED_HARMONICS[signs][: gaussians.sh.shape[1]])[:, None]
+    harmonics = gaussians.sh.new_tensor(HALF_TURN_SH_SIGNS[signs][: gaussians.sh.shape[1]])[:, None]
     quats = gaussians.quats * torch.cat([flip.new_ones(1), flip])
     return gaussians.with_tensors({"means": gaussians.means * flip, "quats": quats, "sh": gaussians.sh * harmonics})

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from glassplat.scene import among_known
+from glassplat.scene import check_tensor_names
 from glassplat.scene.camera import Camera, constant
 from glassplat.scene.gaussians import check_rows
 
@@ -123,7 +123,7 @@ class Planes:
 
     def with_tensors(self, tensors: Mapping[str, Tensor]) -> Planes:
         """The planes with some tensors replaced by name."""
-        return replace(self, **among_known(tensors, self.tensors(), "planes"))
+        return replace(self, **check_tensor_names(tensors, self.tensors(), "planes"))
 
     def select(self, rows: Sequence[int]) -> Planes:
         """The planes at the given positions, in that order."""
@@ -216,22 +216,22 @@ def coplanar_groups(planes: Planes, rows: Sequence[int]) -> list[list[int]]:
     Returns:
         Groups that partition the rows, in order of their first rows.
     """
-    groups = linked_groups(rows, lambda one, other: _coplanar(planes, one, other))
+    groups = connected_components(rows, lambda one, other: _are_coplanar(planes, one, other))
     areas = planes.half_sizes.prod(dim=1)
     return [sorted(group, key=lambda row: (-float(areas[row]), row)) for group in groups]
 
 
-def linked_groups(rows: Sequence[int], are_linked: Callable[[int, int], bool]) -> list[list[int]]:
+def connected_components(rows: Sequence[int], are_linked: Callable[[int, int], bool]) -> list[list[int]]:
     """Connected components of linked rows, in order of their smallest rows."""
     groups: list[list[int]] = []
     for row in rows:
-        near = [group for group in groups if any(are_linked(row, other) for other in group)]
-        joined = [*(other for group in near for other in group), row]
-        groups = sorted([*(group for group in groups if group not in near), joined], key=min)
+        linked = [group for group in groups if any(are_linked(row, other) for other in group)]
+        component = [*(other for group in linked for other in group), row]
+        groups = sorted([*(group for group in groups if group not in linked), component], key=min)
     return groups
 
 
-def _coplanar(planes: Planes, one: int, other: int) -> bool:
+def _are_coplanar(planes: Planes, one: int, other: int) -> bool:
     normals, between = planes.normals[[one, other]], planes.centers[one] - planes.centers[other]
     angle = torch.linalg.cross(normals[0], normals[1]).norm().clamp(max=1).asin()
     offset = (normals @ between).abs().amax()

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-from glassplat.scene import among_known, logit
+from glassplat.scene import check_tensor_names, logit
 from glassplat.scene.camera import quat_from_rotation, quat_product, rotation_from_quat
 from glassplat.scene.corrections import Direction, Exposures, PoseCorrections
 from glassplat.scene.gaussians import Gaussians
@@ -64,7 +64,7 @@ class Environment:
 
     def with_tensors(self, tensors: Mapping[str, Tensor]) -> Environment:
         """The environment with its tensors replaced by name."""
-        return replace(self, **among_known(tensors, ENVIRONMENT_TENSORS, "environments"))
+        return replace(self, **check_tensor_names(tensors, ENVIRONMENT_TENSORS, "environments"))
 
     def to(self, device: torch.device | torch.dtype | str) -> Environment:
         """The same environment on another device, or in another precision."""
@@ -215,7 +215,7 @@ def without_pane(scene: Scene, label: int) -> Scene:
     Raises:
         ValueError: no pane has the label.
     """
-    row = row_of(scene.planes, label)
+    row = row_of_label(scene.planes, label)
     if len(scene.planes) == 1:
         return without_glass(scene)
     glass = scene.glass.select(~glass_of_pane(scene, row))
@@ -244,7 +244,7 @@ def with_reflectance(scene: Scene, label: int, base_reflectance: float) -> Scene
     """
     if not 0 <= base_reflectance <= 1:
         raise ValueError(f"a reflectance of {base_reflectance} for pane {label}; expected a number in [0, 1]")
-    row = row_of(scene.planes, label)
+    row = row_of_label(scene.planes, label)
     logits = scene.planes.logit_reflectances.clone()
     logits[row] = torch.logit(logits.new_tensor(base_reflectance)).clamp(-LARGEST_LOGIT, LARGEST_LOGIT)
     mirrors = tuple(k for k in scene.planes.mirrors if k != label or base_reflectance == 1)
@@ -266,7 +266,7 @@ def tilt_pane(
     Raises:
         ValueError: no pane has the label, or an angle is not finite.
     """
-    row = row_of(scene.planes, label)
+    row = row_of_label(scene.planes, label)
     _check_finite(label, about_tangent, about_bitangent)
     about_tangent, about_bitangent = float(about_tangent), float(about_bitangent)
     angle = math.radians(math.hypot(about_tangent, about_bitangent))
@@ -275,7 +275,7 @@ def tilt_pane(
     tangent, bitangent = (axes[row] for axes in scene.planes.axes())
     axis = torch.nn.functional.normalize(about_tangent * tangent + about_bitangent * bitangent, dim=0)
     turn = torch.cat([axis.new_tensor([math.cos(angle / 2)]), math.sin(angle / 2) * axis])
-    return _turn_pane(scene, row, turn, glass_of_pane(scene, row) if owned is None else owned)
+    return _rotate_pane(scene, row, turn, glass_of_pane(scene, row) if owned is None else owned)
 
 
 def shift_pane(scene: Scene, label: int, distance: float, *, owned: Tensor | None = None) -> Scene:
@@ -290,7 +290,7 @@ def shift_pane(scene: Scene, label: int, distance: float, *, owned: Tensor | Non
     Raises:
         ValueError: no pane has the label, or the distance is not finite.
     """
-    row = row_of(scene.planes, label)
+    row = row_of_label(scene.planes, label)
     _check_finite(label, distance)
     if distance == 0:
         return scene
@@ -321,7 +321,7 @@ def move_panes(scene: Scene, moves: Sequence[PaneMove]) -> Scene:
     Raises:
         ValueError: no pane has a label, a number is not finite, or a quaternion has no length.
     """
-    rows = [row_of(scene.planes, label) for label, _, _ in moves]
+    rows = [row_of_label(scene.planes, label) for label, _, _ in moves]
     owned = {row: glass_of_pane(scene, row) for row in rows}
     for row, (label, turn, step) in zip(rows, moves, strict=True):
         _check_finite(label, *turn, *step)
@@ -329,7 +329,7 @@ def move_panes(scene: Scene, moves: Sequence[PaneMove]) -> Scene:
             raise ValueError(f"pane {label} cannot be turned by a quaternion of no length; expected w, x, y, z")
         if any(turn[1:]):
             quat = torch.nn.functional.normalize(scene.planes.centers.new_tensor(turn), dim=0)
-            scene = _turn_pane(scene, row, quat, owned[row])
+            scene = _rotate_pane(scene, row, quat, owned[row])
         if any(step):
             scene = _translate_pane(scene, row, scene.planes.centers.new_tensor(step), owned[row])
     return scene
@@ -340,29 +340,29 @@ def glass_of_pane(scene: Scene, row: int) -> Tensor:
     return nearest_panes(scene.glass.means, scene.planes) == row
 
 
-def row_of(planes: Planes, label: int) -> int:
+def row_of_label(planes: Planes, label: int) -> int:
     """The position of the pane with a label.
 
     Raises:
         ValueError: there is none; the message lists the known labels.
     """
     if label not in planes.labels:
-        there_are = f"the panes are {name_labels(planes.labels)}" if len(planes) else "it has no panes"
-        raise ValueError(f"the scene has no pane {label!r}; {there_are}")
+        known_labels = f"the panes are {name_labels(planes.labels)}" if len(planes) else "it has no panes"
+        raise ValueError(f"the scene has no pane {label!r}; {known_labels}")
     return planes.labels.index(label)
 
 
-def _turn_pane(scene: Scene, row: int, turn: Tensor, owned: Tensor) -> Scene:
+def _rotate_pane(scene: Scene, row: int, quat: Tensor, owned: Tensor) -> Scene:
     """The scene with a pane and its glass [N] bool rotated about its centre by a unit quaternion [4]."""
-    rotation = rotation_from_quat(turn)
+    rotation = rotation_from_quat(quat)
     planes = scene.planes
-    turned = {name: _with_row(getattr(planes, name), row, rotation) for name in ("raw_normals", "tangents")}
+    rotated = {name: _rotate_row(getattr(planes, name), row, rotation) for name in ("raw_normals", "tangents")}
     glass, of_pane = scene.glass, owned[:, None]
     center = planes.centers[row].to(glass.means)
     means = (glass.means - center) @ rotation.to(glass.means).T + center
-    quats = quat_product(turn.to(glass.quats).expand_as(glass.quats), glass.quats)
-    placed = {"means": torch.where(of_pane, means, glass.means), "quats": torch.where(of_pane, quats, glass.quats)}
-    return replace(scene, glass=glass.with_tensors(placed), planes=planes.with_tensors(turned))
+    quats = quat_product(quat.to(glass.quats).expand_as(glass.quats), glass.quats)
+    moved = {"means": torch.where(of_pane, means, glass.means), "quats": torch.where(of_pane, quats, glass.quats)}
+    return replace(scene, glass=glass.with_tensors(moved), planes=planes.with_tensors(rotated))
 
 
 def _translate_pane(scene: Scene, row: int, step: Tensor, owned: Tensor) -> Scene:
@@ -370,16 +370,16 @@ def _translate_pane(scene: Scene, row: int, step: Tensor, owned: Tensor) -> Scen
     centers = scene.planes.centers.clone()
     centers[row] += step
     means = scene.glass.means
-    placed = torch.where(owned[:, None], means + step.to(means), means)
+    moved = torch.where(owned[:, None], means + step.to(means), means)
     planes = scene.planes.with_tensors({"centers": centers})
-    return replace(scene, glass=scene.glass.with_tensors({"means": placed}), planes=planes)
+    return replace(scene, glass=scene.glass.with_tensors({"means": moved}), planes=planes)
 
 
-def _with_row(vectors: Tensor, row: int, rotation: Tensor) -> Tensor:
+def _rotate_row(vectors: Tensor, row: int, rotation: Tensor) -> Tensor:
     """The vectors [K, 3] with one of them rotated."""
-    turned = vectors.clone()
-    turned[row] = rotation @ vectors[row]
-    return turned
+    rotated = vectors.clone()
+    rotated[row] = rotation @ vectors[row]
+    return rotated
 
 
 def _check_finite(label: int, *numbers: float) -> None:
@@ -391,7 +391,7 @@ OVERLAP = 0.7
 """Standard deviation of a glass Gaussian, in distances between neighbours; together, they form an even sheet."""
 THICKNESS = 0.05
 """Standard deviation along the normal, as a share of that in the plane."""
-CLOSED_OPACITY, CLOSED_MARK, CLOSED_OVERLAP = 0.99, 0.9999, 1.2
+COVERING_OPACITY, COVERING_MARK, COVERING_OVERLAP = 0.99, 0.9999, 1.2
 """The same for untrained panes, without gaps through which a mirror would transmit."""
 
 MARK = 0.99
@@ -426,11 +426,11 @@ def glass_gaussians(planes: Planes, *, count: int = 1000, seed: int = 0, opacity
     return glass.with_tensors({name: tensor.to(planes.centers) for name, tensor in glass.tensors().items()})
 
 
-def closed_glass(planes: Planes) -> Gaussians:
+def covering_glass(planes: Planes) -> Gaussians:
     """Glass Gaussians for untrained panes: they cover every rectangle with a mask of almost 1."""
-    glass = glass_gaussians(planes, opacity=CLOSED_OPACITY)
-    wider = glass.log_scales + math.log(CLOSED_OVERLAP / OVERLAP)
-    marks = torch.full_like(glass.channels["logit_mark"], logit(CLOSED_MARK))
+    glass = glass_gaussians(planes, opacity=COVERING_OPACITY)
+    wider = glass.log_scales + math.log(COVERING_OVERLAP / OVERLAP)
+    marks = torch.full_like(glass.channels["logit_mark"], logit(COVERING_MARK))
     return glass.with_tensors({"log_scales": wider, "logit_mark": marks})
 
 
@@ -447,7 +447,7 @@ def with_pane(scene: Scene, pane: Planes) -> Scene:
     if set(pane.labels) & set(scene.planes.labels):
         raise ValueError(f"the scene has a pane {pane.labels[0]} already; its panes are {list(scene.planes.labels)}")
     pane = pane.with_tensors({name: tensor.to(scene.primary.means) for name, tensor in pane.tensors().items()})
-    glass = closed_glass(pane)
+    glass = covering_glass(pane)
     return replace(
         scene,
         primary=with_intensity(scene.primary),
@@ -466,13 +466,13 @@ def with_intensity(gaussians: Gaussians) -> Gaussians:
 def _pane_discs(planes: Planes, index: int, *, count: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
     """Means [M, 3], quats [M, 4] and log scales [M, 3] of the discs on one pane."""
     half = planes.half_sizes[index].detach().cpu()
-    places = SobolEngine(dimension=2, scramble=True, seed=seed + index).draw(count, dtype=torch.float32)
+    samples = SobolEngine(dimension=2, scramble=True, seed=seed + index).draw(count, dtype=torch.float32)
     tangent, bitangent = (axis[index].detach().cpu() for axis in planes.axes())
-    in_plane = (2 * places - 1) * half
+    in_plane = (2 * samples - 1) * half
     means = planes.centers[index].detach().cpu() + in_plane @ torch.stack([tangent, bitangent])
 
     frame = torch.stack([tangent, bitangent, planes.normals[index].detach().cpu()], dim=1)
     quat = quat_from_rotation(frame).float()
-    along = OVERLAP * math.sqrt(float(4 * half.prod()) / count)
-    log_scales = torch.tensor([along, along, THICKNESS * along], dtype=torch.float32).log()
+    spacing = OVERLAP * math.sqrt(float(4 * half.prod()) / count)
+    log_scales = torch.tensor([spacing, spacing, THICKNESS * spacing], dtype=torch.float32).log()
     return means, quat.repeat(len(means), 1), log_scales.repeat(len(means), 1)

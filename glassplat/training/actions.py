@@ -492,7 +492,7 @@ def unexplained_places(
         looks = looks[pixels]
         looks &= ~crosses_pane(here, scene.planes, camera.center)
         missing = _missing_pixels(losses.residual(frame, view, scene))[pixels] & looks
-        photographed = scene.exposures.undone(to_device(view.photo, device)[pixels].float() / 255, view.name)
+        photographed = scene.exposures.apply_inverse(to_device(view.photo, device)[pixels].float() / 255, view.name)
         color = photographed.clamp(0, 1) * missing[:, None]
         looking[rows] += looks
         agreeing[rows] += missing

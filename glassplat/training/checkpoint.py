@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from glassplat.errors import InputError, input_checked
-from glassplat.files.records import ByName, Field, Items, Nullable, Number, Optional, Text, Whole, check_fields
+from glassplat.files.records import DictOf, Field, Integer, ListOf, Nullable, Number, Optional, Text, check_fields
 from glassplat.files.scene_folder import DIRECTION, EXTENT, SH_DEGREE, direction
-from glassplat.files.sidecars import HIGHEST_LABEL, REGION, TensorsFile, opened_tensors, write_tensors
+from glassplat.files.sidecars import HIGHEST_LABEL, REGION, TensorsFile, open_tensors, write_tensors
 from glassplat.scene.corrections import Exposures, PoseCorrections
 from glassplat.scene.gaussians import DISC_SCALES, PER_GAUSSIAN, Gaussians
 from glassplat.scene.panes import Planes
@@ -22,23 +22,23 @@ from glassplat.training.densify import ScreenStatistics
 from glassplat.training.stage import Optimizer, TrainState
 
 FORMAT = "glassplat-checkpoint-1"
-LABELS = Items(Whole(1, HIGHEST_LABEL))
+LABELS = ListOf(Integer(1, HIGHEST_LABEL))
 HEADER: dict[str, Field] = {
     "method": Optional(Nullable(Text())),
-    "step": Whole(0),
-    "seed": Whole(),
+    "step": Integer(0),
+    "seed": Integer(),
     "seconds": Number(0),
     "extent": EXTENT,
     "labels": LABELS,
     "mirrors": Optional(LABELS, ()),
     "region": Optional(REGION),
-    "active_sh_degree": ByName(SH_DEGREE),
-    "updates": ByName(Whole(0)),
-    "paused": Optional(ByName(Whole(0)), {}),
-    "raised_rates": Optional(ByName(Number(0)), {}),
-    "records": Optional(ByName(Number()), {}),
-    "photographs": Optional(Items(Text()), ()),
-    "corrected": Optional(Items(Text()), ()),
+    "active_sh_degree": DictOf(SH_DEGREE),
+    "updates": DictOf(Integer(0)),
+    "paused": Optional(DictOf(Integer(0)), {}),
+    "raised_rates": Optional(DictOf(Number(0)), {}),
+    "records": Optional(DictOf(Number()), {}),
+    "photographs": Optional(ListOf(Text()), ()),
+    "corrected": Optional(ListOf(Text()), ()),
     "up": Optional(DIRECTION),
 }
 """`Optional` fields were added after the first checkpoints were written."""
@@ -153,7 +153,7 @@ def opened_checkpoint(path: Path) -> Iterator[TensorsFile]:
     if not os.path.isfile(path):
         raise FileNotFoundError(f"no checkpoint at {path}; expected the file that training writes there")
     try:
-        with opened_tensors(path, FORMAT, "a checkpoint") as file:
+        with open_tensors(path, FORMAT, "a checkpoint") as file:
             yield TensorsFile(check_fields(file.header, HEADER, f"the header of {path}"), file.file)
     except InputError as error:
         raise InputError(f"{path} holds no training state: {error}; use an older one or train again") from error

@@ -14,7 +14,7 @@ from glassplat.captures.dataset import Dataset
 from glassplat.render.planar import Planar
 from glassplat.scene import logit
 from glassplat.scene.camera import Camera
-from glassplat.scene.corrections import ByPhotograph, Exposures, PoseCorrections, upward
+from glassplat.scene.corrections import Exposures, PerPhotograph, PoseCorrections, estimate_up
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes, rectangle_offsets
 from glassplat.scene.scene import Scene
@@ -24,7 +24,7 @@ from glassplat.training.stage import Clock, Setup, Stage, TrainState, Work, carr
 
 END_SHARE = 0.1
 """Learning rate at the end of the run, as a share of that at the start."""
-CORRECTIONS: dict[str, type[ByPhotograph]] = {"exposures": Exposures, "poses": PoseCorrections}
+CORRECTIONS: dict[str, type[PerPhotograph]] = {"exposures": Exposures, "poses": PoseCorrections}
 """Corrections of photographs, by part of the scene."""
 
 
@@ -144,7 +144,7 @@ class AddPhotographer:
         body = first_photographer(
             state.scene.planes, cameras, count=self.options.count, sh_degree=self.options.sh_degree, seed=self.seed
         )
-        up = upward(cameras) if self.options.upright else None
+        up = estimate_up(cameras) if self.options.upright else None
         state.scene = replace(state.scene, photographer=body, up=up)
         return True
 

@@ -82,7 +82,7 @@ def of_all(term: LossFunction) -> LossFunction:
 
 def _direct_mean(values: Tensor, activation: Callable[[Tensor], Tensor], frame: Frame) -> Tensor:
     """Mean of the activated `values` [N, ...] over Gaussians in direct view; over all if visibility is unknown."""
-    if frame.direct is None or not camera.waits(values.device):
+    if frame.direct is None or not camera.synchronises(values.device):
         chosen = activation(values if frame.direct is None else values[frame.direct])
         return chosen.sum() / max(chosen.numel(), 1)
     # Masked instead of gathered, because their number is only known on the GPU.

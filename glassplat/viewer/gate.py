@@ -28,7 +28,7 @@ from websockets.protocol import State
 
 from glassplat.access import Access, RefusedError
 from glassplat.errors import InputError
-from glassplat.files.records import COORDINATE, ByName, Choice, Field, Items, Number, Optional, Whole, check_fields
+from glassplat.files.records import COORDINATE, Choice, DictOf, Field, Integer, ListOf, Number, Optional, check_fields
 
 LARGEST_MESSAGE = 64 * 1024
 """Bytes; a page sends cameras and values of controls."""
@@ -37,7 +37,7 @@ LARGEST_WINDOW = 16_384
 """Maximum width and height of the browser's window, pixels."""
 LEAST_TURN, MOST_TURN = 1e-3, 1e3
 """Bounds of the length of a quaternion."""
-POSITION, TURN = Items(COORDINATE, 3), Items(Number(-MOST_TURN, MOST_TURN), 4)
+POSITION, TURN = ListOf(COORDINATE, 3), ListOf(Number(-MOST_TURN, MOST_TURN), 4)
 PAGE_PATH = re.compile(r"/|(/[\w@+-][\w@+.,-]{0,199}){1,8}", re.ASCII)
 """Path of a file of viser's page: no component starts with a dot, and no character is percent-encoded."""
 HEADERS = {"X-Frame-Options": "DENY", "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
@@ -52,7 +52,7 @@ class ShortText(Field):
 
     expected = f"a text of at most {LONGEST_TEXT} characters"
 
-    def _fits(self, value: Any) -> bool:
+    def _is_valid(self, value: Any) -> bool:
         return isinstance(value, str) and len(value) <= LONGEST_TEXT
 
 
@@ -61,7 +61,7 @@ class ControlValue(Field):
 
     expected = "a number, true, false or a short text"
 
-    def _converted(self, value: Any, where: str) -> Any:
+    def _convert(self, value: Any, where: str) -> Any:
         if isinstance(value, bool):
             return value
         return (ShortText() if isinstance(value, str) else COORDINATE).read(value, where)
@@ -75,20 +75,20 @@ MESSAGES: dict[str, dict[str, Field]] = {
         "fov": Number(1e-3, 3.14),
         "near": COORDINATE,
         "far": COORDINATE,
-        "image_height": Whole(1, LARGEST_WINDOW),
-        "image_width": Whole(1, LARGEST_WINDOW),
+        "image_height": Integer(1, LARGEST_WINDOW),
+        "image_width": Integer(1, LARGEST_WINDOW),
         "look_at": POSITION,
         "up_direction": POSITION,
     },
-    "GuiUpdateMessage": {"uuid": ShortText(), "updates": ByName(ControlValue())},
+    "GuiUpdateMessage": {"uuid": ShortText(), "updates": DictOf(ControlValue())},
     "TransformControlsUpdateMessage": {**GIZMO, "wxyz": TURN, "position": POSITION},
     "TransformControlsDragStartMessage": GIZMO,
     "TransformControlsDragEndMessage": GIZMO,
     "ScenePointerMessage": {
         "event_type": Choice(("click",)),
         "ray_origin": POSITION,
-        "ray_direction": Items(Number(-1.001, 1.001), 3),
-        "screen_pos": Items(Items(Number(0, 1), 2), 1),
+        "ray_direction": ListOf(Number(-1.001, 1.001), 3),
+        "screen_pos": ListOf(ListOf(Number(0, 1), 2), 1),
         "modifier": Choice((None,)),
     },
 }

@@ -24,7 +24,7 @@ U, V = np.array([-1.0, 1, 1, -1]), np.array([-1.0, -1, 1, 1])
 
 
 def cameras_on(pane: Pane, places: Sequence[Sequence[float]] = EYES) -> list[NumpyCamera]:
-    return [NumpyCamera.of(camera_from(place, pane.center)) for place in places]
+    return [NumpyCamera.from_camera(camera_from(place, pane.center)) for place in places]
 
 
 def corner_marks(pane: Pane, cameras: Sequence[NumpyCamera], *, noise: float = 0.0, seed: int = 0) -> Marks:
@@ -75,7 +75,7 @@ def test_another_view_lowers_the_doubt_as_foretold() -> None:
 def test_a_corner_outside_of_the_image_may_be_marked() -> None:
     wide = FRONT.larger(2.5)
     cameras = cameras_on(wide)
-    assert not all(camera.holds(wide.at(U, V)).all() for camera in cameras)
+    assert not all(camera.contains(wide.at(U, V)).all() for camera in cameras)
     fit = fit_pane(corner_marks(wide, cameras), cameras, "rectangle")
     np.testing.assert_allclose(fit.shape.corners(), wide.at(U, V), atol=1e-3)
 
@@ -131,7 +131,8 @@ def test_where_a_long_front_ends_may_be_marked_in_one_photograph_only() -> None:
     front = Pane(np.array([0.0, 0, 0]), np.array([0.0, 0, 1.0]), np.array([1.0, 0, 0]), (7.0, 1.7))
     walk = {-1.5: -5.5, -2.5: -6.5, -4.0: -7.0, 1.5: -4.0, 5.5: 2.5}
     cameras = [
-        NumpyCamera.of(camera_from((x, 0.2, 5.0 - 0.2 * x), np.array([target, 0, 0]))) for x, target in walk.items()
+        NumpyCamera.from_camera(camera_from((x, 0.2, 5.0 - 0.2 * x), np.array([target, 0, 0])))
+        for x, target in walk.items()
     ]
     corners = front.at(U, V)
     pieces = {0: (0.0, 0.2), 1: (0.0, 0.15), 3: (0.1, 0.3), 4: (0.45, 0.9)}

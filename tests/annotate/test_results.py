@@ -240,7 +240,7 @@ def test_without_a_pane_nothing_is_written(room: Path) -> None:
 
 def test_the_nearer_pane_hides_the_farther_one(room: Path) -> None:
     behind = Pane(FRONT.center + np.array([0.3, 0.0, 0.5]), FRONT.normal, FRONT.tangent, (0.8, 0.5))
-    cameras = [NumpyCamera.of(camera_from(place, FRONT.center)) for place in PLACES]
+    cameras = [NumpyCamera.from_camera(camera_from(place, FRONT.center)) for place in PLACES]
     panes = []
     for label, pane in enumerate((behind, FRONT), start=1):
         corners = pane.at(np.array([-1.0, 1, 1, -1]), np.array([-1.0, -1, 1, 1]))
@@ -257,7 +257,7 @@ def test_the_nearer_pane_hides_the_farther_one(room: Path) -> None:
 
 
 def test_an_outline_that_passes_the_camera_is_cut_off() -> None:
-    camera = NumpyCamera.of(camera_from((0.0, 0.0, 0.0), np.array([0.0, 0.0, 1.0])))
+    camera = NumpyCamera.from_camera(camera_from((0.0, 0.0, 0.0), np.array([0.0, 0.0, 1.0])))
     floor = np.array([[-5.0, 1, -5], [5, 1, -5], [5, 1, 5], [-5, 1, 5]])
     mask = fill_polygon(seen_outline(camera, floor), (300, 220))
     horizon = 110 + 240 * 1 / 5
@@ -268,7 +268,7 @@ def test_an_outline_that_passes_the_camera_is_cut_off() -> None:
 
 
 def test_an_outline_that_passes_the_camera_keeps_its_edges_straight() -> None:
-    camera = NumpyCamera.of(camera_from((0.0, 0.0, 0.0), np.array([0.0, 0.0, 1.0])))
+    camera = NumpyCamera.from_camera(camera_from((0.0, 0.0, 0.0), np.array([0.0, 0.0, 1.0])))
     wall = np.array([[-2.0, -1, 6], [2.5, -1, -20], [2.5, 1, -20], [-2, 1, 6]])
     mask = fill_polygon(seen_outline(camera, wall), (300, 220))
     x, y = np.meshgrid(np.arange(300) + 0.5, np.arange(220) + 0.5)

@@ -8,16 +8,16 @@ from typing import Any
 import pytest
 
 from glassplat.files.records import (
-    ByName,
+    Boolean,
     Choice,
+    DictOf,
     Field,
-    Flag,
-    Items,
+    Integer,
+    ListOf,
     Nullable,
     Number,
     Optional,
     Text,
-    Whole,
     check_fields,
 )
 
@@ -26,15 +26,15 @@ CASES: list[tuple[Field, list[Any], list[Any]]] = [
     (Number(), [0, -1.5, 1e300, 2**64], NOT_NUMBERS),
     (Number(0, 1), [0, 1, 0.5], [-1e-9, 1.1, *NOT_NUMBERS]),
     (Number(above=0, most=5), [1e-300, 5], [0, -1, 5.1, *NOT_NUMBERS]),
-    (Whole(), [0, -(2**63), 2**63 - 1], [2**63, 1.0, *NOT_NUMBERS]),
-    (Whole(1, 3), [1, 3], [0, 4, 2.0, *NOT_NUMBERS]),
-    (Flag(), [True, False], [0, 1, "true", None]),
+    (Integer(), [0, -(2**63), 2**63 - 1], [2**63, 1.0, *NOT_NUMBERS]),
+    (Integer(1, 3), [1, 3], [0, 4, 2.0, *NOT_NUMBERS]),
+    (Boolean(), [True, False], [0, 1, "true", None]),
     (Text(), ["a"], ["", 1, None, ["a"]]),
     (Choice(("auto", 1)), ["auto", 1], ["", True, 1.0, None, [], {}]),
-    (Items(Whole()), [[], [1, 2]], [None, "12", {"0": 1}, [1, None]]),
-    (Items(Number(), 2), [[1, 2]], [[], [1], [1, 2, 3], [1, math.nan], 12]),
-    (ByName(Whole()), [{}, {"a": 1}], [[], {"a": None}, "a"]),
-    (Nullable(Whole(0)), [None, 1], [-1, "a"]),
+    (ListOf(Integer()), [[], [1, 2]], [None, "12", {"0": 1}, [1, None]]),
+    (ListOf(Number(), 2), [[1, 2]], [[], [1], [1, 2, 3], [1, math.nan], 12]),
+    (DictOf(Integer()), [{}, {"a": 1}], [[], {"a": None}, "a"]),
+    (Nullable(Integer(0)), [None, 1], [-1, "a"]),
 ]
 
 
@@ -49,7 +49,7 @@ def test_a_field_takes_what_it_says_and_nothing_else(kind: Field, good: list[Any
 
 
 def test_numbers_are_read_in_one_type() -> None:
-    assert isinstance(Number().read(2, "it"), float) and isinstance(Whole().read(2, "it"), int)
+    assert isinstance(Number().read(2, "it"), float) and isinstance(Integer().read(2, "it"), int)
 
 
 @pytest.mark.parametrize(
@@ -60,9 +60,9 @@ def test_numbers_are_read_in_one_type() -> None:
         (Number(above=0), "a finite number above 0"),
         (Number(above=0, most=2), "a finite number above 0 and of at most 2"),
         (Number(most=2), "a finite number of at most 2"),
-        (Whole(1), "a whole number of at least 1"),
+        (Integer(1), "a whole number of at least 1"),
         (Choice(("a", "b")), "one of 'a', 'b'"),
-        (Items(Whole(0), 2), "a list of 2 values, each a whole number of at least 0"),
+        (ListOf(Integer(0), 2), "a list of 2 values, each a whole number of at least 0"),
         (Nullable(Text()), "a text that is not empty, or null"),
     ],
 )
@@ -70,7 +70,7 @@ def test_what_was_expected_reads_well(kind: Field, text: str) -> None:
     assert kind.expected == text
 
 
-TABLE = {"size": Whole(1), "name": Optional(Text(), "nobody")}
+TABLE = {"size": Integer(1), "name": Optional(Text(), "nobody")}
 
 
 def test_an_object_is_checked_by_its_table() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from glassplat.files.records import DEEPEST, _without_repeats, parse_json, read_json
+from glassplat.files.records import DEEPEST, _dict_without_duplicates, parse_json, read_json
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_a_repeated_key_among_many_is_found_in_linear_time() -> None:
             return str.__eq__(self, other)
 
     with pytest.raises(ValueError, match="the key '1999' occurs twice"):
-        _without_repeats([(Key(key), 0) for key in (*range(2000), 1999)])
+        _dict_without_duplicates([(Key(key), 0) for key in (*range(2000), 1999)])
     assert comparisons < 10 * 2000
 
 

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from glassplat.files.images import flat_picture_names, picture_paths
+from glassplat.files.images import flat_image_names, image_paths
 
 
 def test_pictures_are_named_after_photographs() -> None:
-    assert picture_paths(["left/1.jpg", "2.png"]) == {"left/1.jpg": Path("left/1.png"), "2.png": Path("2.png")}
-    assert len(set(picture_paths(["1.jpg", "1.png", "1.tif"]).values())) == 3
+    assert image_paths(["left/1.jpg", "2.png"]) == {"left/1.jpg": Path("left/1.png"), "2.png": Path("2.png")}
+    assert len(set(image_paths(["1.jpg", "1.png", "1.tif"]).values())) == 3
 
 
 @pytest.mark.parametrize(
@@ -33,7 +33,7 @@ def test_pictures_are_named_after_photographs() -> None:
     ],
 )
 def test_names_that_lead_elsewhere_or_to_one_file(names: list[str], expected: list[str]) -> None:
-    paths = picture_paths(names)
+    paths = image_paths(names)
     assert list(paths) == names
     assert [path.as_posix() for path in paths.values()] == expected
 
@@ -45,8 +45,8 @@ NAMES = st.lists(st.lists(PARTS, min_size=1, max_size=4).map("/".join).filter(bo
 @given(NAMES)
 def test_no_picture_leaves_its_folder_or_stands_in_anothers_way(names: list[str]) -> None:
     for paths in (
-        list(picture_paths(names).values()),
-        [Path(name) for name in flat_picture_names(names).values()],
+        list(image_paths(names).values()),
+        [Path(name) for name in flat_image_names(names).values()],
     ):
         assert all(not path.is_absolute() and ".." not in path.parts and path.suffix == ".png" for path in paths)
         plain = [path.as_posix().casefold() for path in paths]
@@ -56,6 +56,6 @@ def test_no_picture_leaves_its_folder_or_stands_in_anothers_way(names: list[str]
 
 
 def test_pictures_side_by_side_are_distinct() -> None:
-    names = flat_picture_names(["left/1.jpg", "left_1.png", "2.jpg"])
+    names = flat_image_names(["left/1.jpg", "left_1.png", "2.jpg"])
     assert len(set(names.values())) == 3 and names["2.jpg"] == "2.png"
     assert all("/" not in name for name in names.values())

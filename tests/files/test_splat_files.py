@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from glassplat.files import scene_folder
 from glassplat.files.ply import BOUNDS, COLOR_BOUNDS, write_gaussians
-from glassplat.files.scene_folder import SPLAT_ROW, drawable, read_splats, write_forged
+from glassplat.files.scene_folder import SPLAT_ROW, read_splats, select_drawable, write_with_gaussforge
 from glassplat.files.spz import write_spz
 from glassplat.kernels.project.reference import rotations
 from glassplat.scene import SH_ZERO
@@ -79,11 +79,11 @@ def test_what_cannot_be_drawn_is_left_out_and_counted(tmp_path: Path) -> None:
     gaussians.means[3], gaussians.quats[5], gaussians.log_scales[7, 1] = torch.nan, 0, 200
     gaussians.sh[9, 4, 1], gaussians.logit_opacities[11] = torch.inf, torch.inf
     gaussians.log_scales[13] = -torch.inf
-    kept, lost = drawable(gaussians, "a.ply")
+    kept, lost = select_drawable(gaussians, "a.ply")
     assert (len(kept), lost) == (46, 4)
     assert all(bool(tensor.isfinite().all()) for tensor in kept.tensors().values())
     with pytest.raises(ValueError, match=r"none of the 50 Gaussians in a\.ply"):
-        drawable(gaussians.with_tensors({"means": torch.full((50, 3), torch.nan)}), "a.ply")
+        select_drawable(gaussians.with_tensors({"means": torch.full((50, 3), torch.nan)}), "a.ply")
 
 
 def compressed_header(count: int, chunks: int, kind: str = "uint") -> bytes:
@@ -128,14 +128,14 @@ def test_mutated_files_are_read_or_refused(tmp_path_factory: pytest.TempPathFact
     path = tmp_path_factory.mktemp("ply") / "a.ply"
     path.write_bytes(bytes(data))
     with suppress(ValueError):
-        kept, _ = drawable(read_splats(path), path)
+        kept, _ = select_drawable(read_splats(path), path)
         assert all(bool(tensor.isfinite().all()) for tensor in kept.tensors().values())
 
 
 def forged(gaussians: Gaussians, path: Path) -> Gaussians:
     """What comes back from a file of gaussforge, which sorts them."""
     pytest.importorskip("gaussforge")
-    write_forged(path, gaussians)
+    write_with_gaussforge(path, gaussians)
     read = read_splats(path)
     return read.select(torch.cdist(gaussians.means, read.means).argmin(dim=1))
 
@@ -158,11 +158,11 @@ def test_other_programs_files_hold_discs_and_are_never_empty(tmp_path: Path, kin
     torch.testing.assert_close(after.log_scales[:, :2], discs.log_scales, rtol=0, atol=0.05)
     assert float(after.log_scales[:, 2].max()) < -9
     with pytest.raises(ValueError, match=rf"no Gaussians to write as .*a\.{kind}; expected one at least"):
-        write_forged(tmp_path / f"a.{kind}", discs.select(torch.zeros(len(discs), dtype=torch.bool)))
+        write_with_gaussforge(tmp_path / f"a.{kind}", discs.select(torch.zeros(len(discs), dtype=torch.bool)))
 
 
 def test_messages_name_the_file_of_another_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_folder, "_forge", lambda path: None)
+    monkeypatch.setattr(scene_folder, "_gaussforge", lambda path: None)
     monkeypatch.setattr(scene_folder, "_convert", lambda *_: b"ply\n")
     (tmp_path / "a.sog").write_bytes(b"")
     with pytest.raises(ValueError, match=r"the header of .*a\.sog has") as caught:

@@ -16,7 +16,7 @@ from safetensors.torch import save_file
 
 from glassplat.cli.console import described_os_error
 from glassplat.files import sidecars
-from glassplat.files.sidecars import opened_tensors, system_error, write_equirect, write_tensors
+from glassplat.files.sidecars import open_tensors, system_error, write_equirect, write_tensors
 
 TENSORS = {"a": torch.arange(1000.0), "b": torch.zeros(0, 3)}
 
@@ -59,7 +59,7 @@ def test_what_the_system_says_keeps_its_number(name: str, tmp_path: Path) -> Non
 def test_tensors_and_header_survive(tmp_path: Path) -> None:
     path = tmp_path / "a.safetensors"
     write_tensors(path, TENSORS, {"format": "x-1", "step": 3})
-    with opened_tensors(path, "x-1", "an x") as file:
+    with open_tensors(path, "x-1", "an x") as file:
         read = file.tensors()
         assert file.header["step"] == 3
     assert read.keys() == TENSORS.keys() and all(torch.equal(read[name], TENSORS[name]) for name in read)
@@ -96,7 +96,7 @@ def test_the_file_may_be_read_by_whom_other_files_may_be(tmp_path: Path) -> None
 def test_a_foreign_header_is_named(tmp_path: Path, header: str | None, message: str) -> None:
     path = tmp_path / "a.safetensors"
     save_file(TENSORS, path, metadata=None if header is None else {"glassplat": header})
-    with pytest.raises(ValueError, match=message), opened_tensors(path, "x-1", "an x"):
+    with pytest.raises(ValueError, match=message), open_tensors(path, "x-1", "an x"):
         pass
 
 
@@ -117,7 +117,7 @@ def test_a_file_that_is_replaced_while_it_is_opened_is_opened_again(
         return files[-1]
 
     monkeypatch.setattr(sidecars, "safe_open", replacing)
-    with opened_tensors(path, "x-1", "an x") as file:
+    with open_tensors(path, "x-1", "an x") as file:
         assert file.header["step"] == 2 and torch.equal(file.tensors()["a"], torch.ones(size))
     assert len(files) == 2
 
@@ -129,7 +129,7 @@ def test_a_file_that_is_cut_off_is_named(tmp_path: Path, kept: int) -> None:
     os.truncate(path, kept)
     with (
         pytest.raises(ValueError, match=r"a\.safetensors is truncated or not an x"),
-        opened_tensors(path, "x-1", "an x"),
+        open_tensors(path, "x-1", "an x"),
     ):
         pass
 
@@ -137,10 +137,10 @@ def test_a_file_that_is_cut_off_is_named(tmp_path: Path, kept: int) -> None:
 def test_what_is_no_file_is_named(tmp_path: Path) -> None:
     with (
         pytest.raises(FileNotFoundError, match="absent does not exist"),
-        opened_tensors(tmp_path / "absent", "x-1", "an x"),
+        open_tensors(tmp_path / "absent", "x-1", "an x"),
     ):
         pass
-    with pytest.raises(ValueError, match="cannot be read"), opened_tensors(tmp_path, "x-1", "an x"):
+    with pytest.raises(ValueError, match="cannot be read"), open_tensors(tmp_path, "x-1", "an x"):
         pass
 
 
@@ -149,7 +149,7 @@ def test_a_long_reason_is_cut_short(tmp_path: Path) -> None:
     (tmp_path / "a.safetensors").write_bytes(len(header).to_bytes(8, "little") + header)
     with (
         pytest.raises(ValueError, match=r"truncated or not a test .*; expected a complete") as caught,
-        opened_tensors(tmp_path / "a.safetensors", "x", "a test"),
+        open_tensors(tmp_path / "a.safetensors", "x", "a test"),
     ):
         pass
     assert len(str(caught.value)) < 500 + len(str(tmp_path))
@@ -158,5 +158,5 @@ def test_a_long_reason_is_cut_short(tmp_path: Path) -> None:
 def test_a_folder_whose_name_is_no_text_is_read_again(tmp_path: Path) -> None:
     folder = tmp_path / os.fsdecode(b"caf\xe9")
     write_tensors(folder / "a.safetensors", {"a": torch.ones(2)}, {"format": "x"})
-    with opened_tensors(folder / "a.safetensors", "x", "a test") as opened:
+    with open_tensors(folder / "a.safetensors", "x", "a test") as opened:
         assert opened.tensors()["a"].tolist() == [1, 1]

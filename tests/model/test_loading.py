@@ -15,7 +15,7 @@ from glassplat import InputError, load
 from glassplat.cli.main import main
 from glassplat.files.ply import write_gaussians
 from glassplat.files.sidecars import write_planes
-from glassplat.files.writing import FORGED_SUFFIXES, SPLAT_SUFFIXES, SPLAT_WRITERS, write_splats
+from glassplat.files.writing import GAUSSFORGE_SUFFIXES, SPLAT_SUFFIXES, SPLAT_WRITERS, write_splats
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.options import BLACK
 from tests.cli.tiny_run import write_run
@@ -127,7 +127,7 @@ def test_hostile_files_get_one_message(suffix: str, tmp_path: Path, capsys: pyte
 
 @pytest.mark.parametrize("kind", SPLAT_WRITERS)
 def test_every_format_that_is_written_is_read(kind: str, tmp_path: Path) -> None:
-    if f".{kind}" in FORGED_SUFFIXES:
+    if f".{kind}" in GAUSSFORGE_SUFFIXES:
         pytest.importorskip("gaussforge")
     write_splats(kind, tmp_path / f"a.{kind}", typical())
     read = load(tmp_path / f"a.{kind}", device="cpu").scene.primary
@@ -141,7 +141,7 @@ def test_harmonics_that_are_not_shown_are_not_written(kind: str, tmp_path: Path)
     assert load(tmp_path / f"a.{kind}", device="cpu").scene.primary.active_sh_degree == 0
 
 
-@pytest.mark.parametrize("suffix", FORGED_SUFFIXES)
+@pytest.mark.parametrize("suffix", GAUSSFORGE_SUFFIXES)
 def test_lossy_formats_keep_every_gaussian_near_its_place(suffix: str, tmp_path: Path) -> None:
     pytest.importorskip("gaussforge")
     model = load(write_run(tmp_path / "run"), device="cpu").without_glass()
@@ -151,7 +151,7 @@ def test_lossy_formats_keep_every_gaussian_near_its_place(suffix: str, tmp_path:
     assert float(moved.max()) < 1e-3 * model.scene.extent
 
 
-@pytest.mark.parametrize("suffix", FORGED_SUFFIXES)
+@pytest.mark.parametrize("suffix", GAUSSFORGE_SUFFIXES)
 def test_without_gaussforge_it_is_said_how_to_get_it(
     suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

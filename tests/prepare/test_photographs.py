@@ -290,7 +290,7 @@ def a_capture(folder: Path) -> None:
 def test_what_cannot_be_used_is_named(
     spoil: object, expected: str, tmp_path: Path, heard: Heard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("glassplat.files.images.reads_heif", lambda: False)
+    monkeypatch.setattr("glassplat.files.images.can_read_heif", lambda: False)
     folder = three(tmp_path / "in")
     spoil(folder)  # type: ignore[operator]
     with pytest.raises(InputError, match=expected):
@@ -301,7 +301,7 @@ def test_what_cannot_be_used_is_named(
 def test_heic_is_expected_where_it_can_be_read(
     reads: bool, tmp_path: Path, heard: Heard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("glassplat.files.images.reads_heif", lambda: reads)
+    monkeypatch.setattr("glassplat.files.images.can_read_heif", lambda: reads)
     with pytest.raises(InputError) as refused:
         photographs_in(tmp_path, 1600, heard)
     assert (".tiff, .heic, .heif files" in str(refused.value)) == reads

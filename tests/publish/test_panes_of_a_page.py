@@ -12,7 +12,7 @@ from glassplat.publish.web_page import write_page
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.panes import Planes
-from glassplat.scene.scene import Scene, as_mirrors, closed_glass
+from glassplat.scene.scene import Scene, as_mirrors, covering_glass
 from tests.browser_needed import needs_browser
 from tests.publish.test_web_page import CAMERAS, likeness
 from tests.render.test_seen_panes import vitrine
@@ -117,7 +117,7 @@ def test_a_large_window_with_many_panes_is_drawn_more_coarsely(tmp_path: Path) -
 def test_a_pane_without_glass_does_not_reflect_by_that_of_another(label: int, tmp_path: Path) -> None:
     panes = joined(pane(2.0, half=0.8), pane(3.0, half=0.9, label=2))
     scene = in_single_precision(showcase(panes))
-    scene = replace(scene, glass=closed_glass(scene.planes.select([label - 1])))
+    scene = replace(scene, glass=covering_glass(scene.planes.select([label - 1])))
     write_page(tmp_path / "index.html", scene, Planar(), CAMERAS, "one has glass")
     with Browser(tmp_path / "index.html", 320, 240) as browser:
         for _, camera in CAMERAS[:2]:
@@ -135,11 +135,11 @@ def test_a_pane_that_is_taken_away_takes_its_glass_with_it(tmp_path: Path) -> No
             "logit_opacities": torch.tensor([8.0]),
         }
     )
-    scene = replace(scene, primary=scene.primary.concat(between), glass=closed_glass(scene.planes))
+    scene = replace(scene, primary=scene.primary.concat(between), glass=covering_glass(scene.planes))
     write_page(tmp_path / "index.html", scene, Planar(), CAMERAS, "a thing between two")
     with Browser(tmp_path / "index.html", 320, 240) as browser:
         browser.evaluate("glassplat.then(({ panel }) => { panel.set('pane', '0'); panel.set('glass', 'none'); })")
         left = scene.planes.select([1])
-        without = replace(scene, planes=left, glass=closed_glass(left))
+        without = replace(scene, planes=left, glass=covering_glass(left))
         for layer in ("rgb", "strength"):
             assert likeness(browser, without, Planar(), CAMERAS[1][1], layer) > 45

@@ -57,8 +57,8 @@ def test_the_loss_compares_in_the_colours_of_the_photograph() -> None:
 def test_a_view_without_a_transform_gets_the_mean_of_its_neighbours() -> None:
     exposures = Exposures(drawn(4, 3, 4), ("x/8.png", "x/10.png", "y/9.png", "x/12.png"))
     found = exposures.interpolate("x/9.png")
-    torch.testing.assert_close(found.of("x/9.png"), exposures.values[:2].mean(dim=0))
-    torch.testing.assert_close(exposures.interpolate("x/20.png").of("x/20.png"), exposures.values[3])
+    torch.testing.assert_close(found.values_of("x/9.png"), exposures.values[:2].mean(dim=0))
+    torch.testing.assert_close(exposures.interpolate("x/20.png").values_of("x/20.png"), exposures.values[3])
     assert exposures.interpolate("x/10.png") is exposures
     assert exposures.interpolate("z/9.png") is exposures
     assert len(Exposures.neutral().interpolate("a")) == 0
@@ -67,5 +67,5 @@ def test_a_view_without_a_transform_gets_the_mean_of_its_neighbours() -> None:
 def test_what_an_exposure_does_can_be_undone() -> None:
     exposures = Exposures(0.2 * drawn(2, 3, 4, seed=1), ("a", "b"))
     image = drawn(4, 5, 3)
-    torch.testing.assert_close(exposures.undone(exposures.apply(image, "b"), "b"), image)
-    assert exposures.undone(image, "c") is image
+    torch.testing.assert_close(exposures.apply_inverse(exposures.apply(image, "b"), "b"), image)
+    assert exposures.apply_inverse(image, "c") is image

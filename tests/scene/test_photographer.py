@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from glassplat.scene.camera import Camera
-from glassplat.scene.corrections import DEFAULT_UP, upward, world_from_photographer
+from glassplat.scene.corrections import DEFAULT_UP, estimate_up, world_from_photographer
 from tests.render.tiny_scene import camera_at
 
 UP = (0.36, 0.48, -0.8)
@@ -36,31 +36,31 @@ def angle_deg(direction: tuple[float, float, float], other: tuple[float, float, 
 
 def test_cameras_that_are_tilted_down_tell_where_up_is() -> None:
     cameras = [turned(yaw, -40 + (yaw % 7)) for yaw in range(0, 360, 25)]
-    assert angle_deg(upward(cameras), UP) < 0.5
+    assert angle_deg(estimate_up(cameras), UP) < 0.5
     wobbly = [turned(yaw, -40, 3 * (-1) ** (yaw % 2)) for yaw in range(0, 360, 25)]
-    assert angle_deg(upward(wobbly), UP) < 1.5
+    assert angle_deg(estimate_up(wobbly), UP) < 1.5
 
 
 def test_cameras_that_are_tilted_down_on_one_side_of_a_thing_tell_where_up_is() -> None:
     """Their images stand upright along a direction that is as far from up as they are tilted."""
     cameras = [turned(yaw, -30) for yaw in range(-40, 41, 20)]
-    assert angle_deg(upward(cameras), UP) < 3
-    assert upward(100 * cameras) == pytest.approx(upward(cameras))
+    assert angle_deg(estimate_up(cameras), UP) < 3
+    assert estimate_up(100 * cameras) == pytest.approx(estimate_up(cameras))
 
 
 def test_cameras_that_look_one_way_are_taken_to_stand_upright() -> None:
-    assert angle_deg(upward([turned(10, 0), turned(10, 0)]), UP) < 1e-3
+    assert angle_deg(estimate_up([turned(10, 0), turned(10, 0)]), UP) < 1e-3
 
 
 @pytest.mark.parametrize("wobble_deg", [0, 4])
 def test_cameras_that_look_straight_down_look_away_from_up(wobble_deg: float) -> None:
     cameras = [turned(yaw, -90 + wobble_deg * (yaw % 4 - 1), wobble_deg) for yaw in range(0, 360, 90)]
-    assert angle_deg(upward(cameras), UP) < max(wobble_deg, 0.1)
-    assert math.hypot(*upward(cameras)) == pytest.approx(1)
+    assert angle_deg(estimate_up(cameras), UP) < max(wobble_deg, 0.1)
+    assert math.hypot(*estimate_up(cameras)) == pytest.approx(1)
 
 
 def test_cameras_that_contradict_each_other_tell_the_usual_direction() -> None:
-    assert upward([turned(0, 0), turned(0, 180)]) == DEFAULT_UP
+    assert estimate_up([turned(0, 0), turned(0, 180)]) == DEFAULT_UP
 
 
 @pytest.mark.parametrize("pitch_deg", [0.0, -35.0, 50.0, -89.9])

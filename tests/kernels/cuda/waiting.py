@@ -145,4 +145,4 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch, waits: Waits) -> None:
     # Its kernel is not asked for on a CPU.
     monkeypatch.setattr(densify, "add_views", add_views_in_torch)
     # The function itself, as others import it by its name.
-    monkeypatch.setattr(camera.waits, "__code__", (lambda device: True).__code__)
+    monkeypatch.setattr(camera.synchronises, "__code__", (lambda device: True).__code__)
