@@ -20,8 +20,8 @@ from benchmarks.timing import Work, interleaved_seconds
 from glassplat.kernels.composite import composite
 from glassplat.kernels.records import Splats
 from glassplat.kernels.tiles import bin_tiles
-from glassplat.render.frame import joined_splats, project_gaussians
-from glassplat.render.splat import blended_discs, projected_discs
+from glassplat.render.frame import concat_splats, project_gaussians
+from glassplat.render.splat import blend_discs, projected_discs
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 
@@ -52,10 +52,10 @@ def ellipsoids(gaussians: Gaussians, camera: Camera) -> Primitive:
     """Projection, tiles and blending of ellipsoids with colour and depth."""
     own = learning(gaussians)
     projected = project_gaussians(own, camera, near=NEAR)
-    splats = Splats(*(t.detach() for t in joined_splats(projected)))
+    splats = Splats(*(t.detach() for t in concat_splats(projected)))
     bins = bin_tiles(splats, camera.width, camera.height)
     channels = torch.cat([projected.colors, projected.depths[..., None]], dim=-1)
-    blended = composite(joined_splats(projected), channels, bins)
+    blended = composite(concat_splats(projected), channels, bins)
     works: dict[str, Work] = {
         "project forward": lambda: project_gaussians(gaussians, camera, near=NEAR),
         "project backward": backward(projected, own),
@@ -74,11 +74,11 @@ def discs(gaussians: Gaussians, camera: Camera) -> Primitive:
     projected = projected_discs(own, camera, near=NEAR)
     fixed = type(projected)(*(t.detach() for t in projected))
     channels = torch.cat([projected.colors, projected.normals], dim=-1)
-    blended = blended_discs(projected, channels, camera, near=NEAR)
+    blended = blend_discs(projected, channels, camera, near=NEAR)
     works: dict[str, Work] = {
         "project forward": lambda: projected_discs(flat, camera, near=NEAR),
         "project backward": backward(projected, own),
-        "tiles and blending forward": lambda: blended_discs(fixed, channels.detach(), camera, near=NEAR),
+        "tiles and blending forward": lambda: blend_discs(fixed, channels.detach(), camera, near=NEAR),
         "all backward": backward(blended, own),
     }
     return Primitive(works, len(bin_tiles(projected.outlines, camera.width, camera.height).pair_splats))

@@ -23,7 +23,7 @@ from glassplat.kernels.photometric import photometric
 from glassplat.kernels.project import project
 from glassplat.kernels.records import Splats, TileBins
 from glassplat.kernels.tiles import bin_tiles
-from glassplat.render.frame import joined_splats
+from glassplat.render.frame import concat_splats
 
 RAYS_WIDTH = 1024
 """Of the square image of a mirror ball that throws the rays, in pixels."""
@@ -37,7 +37,7 @@ def kernel_times(count: int) -> Table:
     scene = bench_scene(count, 0, 0.0, camera).to("cuda")
     raw, batch = raw_of(scene.primary, trainable=True), batch_of(camera.to("cuda"))
     projected = project(raw, batch, sh_degree=3, near=0.03)
-    splats = joined_splats(type(projected)(*(tensor.detach() for tensor in projected)))
+    splats = concat_splats(type(projected)(*(tensor.detach() for tensor in projected)))
     bins = bin_tiles(splats, WIDTH, HEIGHT)
     leaves: Any = [tensor.clone().requires_grad_() for tensor in (*splats[:3], projected.colors.detach())]
     blended = composite(splats._replace(means2d=leaves[0], conics=leaves[1], opacities=leaves[2]), leaves[3], bins)

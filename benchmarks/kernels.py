@@ -24,7 +24,7 @@ from glassplat.kernels.project import project
 from glassplat.kernels.project import reference as project_twin
 from glassplat.kernels.records import CameraBatch, Projected, RawGaussians, Splats, TileBins
 from glassplat.kernels.tiles import bin_tiles
-from glassplat.render.frame import joined_splats
+from glassplat.render.frame import concat_splats
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 
@@ -75,7 +75,7 @@ def kernel_times() -> Table:
     raw, batch = raw_of(gaussians, trainable=True), batch_of(camera)
     projected = project(raw, batch, sh_degree=3, near=0.03)
     flat = Projected(*(t.detach() for t in projected))
-    splats = joined_splats(flat)
+    splats = concat_splats(flat)
     bins = bin_tiles(splats, WIDTH, HEIGHT)
     leaves = splats._replace(
         means2d=splats.means2d.clone().requires_grad_(),
@@ -136,7 +136,7 @@ def twin_ratios() -> Table:
     gaussians = room(1000)
     raw, batch = raw_of(gaussians), batch_of(camera)
     flat = project(raw, batch, sh_degree=3, near=0.03)
-    splats = joined_splats(flat)
+    splats = concat_splats(flat)
     bins = bin_tiles(splats, 64, 48)
     picture, photo = torch.rand(HEIGHT, WIDTH, 3), torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8)
     large = raw_of(room(COUNT))

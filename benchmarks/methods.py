@@ -19,7 +19,7 @@ from glassplat.methods.glossy_recipes import DeferredRecipe
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.render.deferred import INVISIBLE, Deferred
-from glassplat.render.frame import NEAR_PER_EXTENT, Renderer, joined_splats, project_gaussians
+from glassplat.render.frame import NEAR_PER_EXTENT, Renderer, concat_splats, project_gaussians
 from glassplat.render.panes import mirrored_views, nearest_hits, panes_in_camera
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
@@ -59,7 +59,7 @@ def bare_work(scene: Scene, camera: Camera) -> Work:
                 clip_planes=views.half_spaces,
                 windows=hits.windows,
             )
-            splats = joined_splats(mirrored)
+            splats = concat_splats(mirrored)
             composite(splats, mirrored.colors, bin_tiles(splats, camera.width, camera.height, hits.tiles))
 
     return work

@@ -78,11 +78,11 @@ def mirrored_rays(width: int) -> Rays:
 def own_works(case: Case) -> dict[str, Work]:
     """Both passes without colours and with those of degree 3, and the hierarchy built."""
     options: dict[str, Any] = {"flat": True, "near": 0.0}
-    colored = cpu.trace(case.shapes, case.rays, case.bvh, degree=3, learning=True, **options)
+    colored = cpu.trace(case.shapes, case.rays, case.bvh, degree=3, needs_gradients=True, **options)
     cotangents = [torch.ones_like(output) for output in colored[:3]]
     return {
-        "trace": lambda: cpu.trace(case.shapes, case.rays, case.bvh, degree=-1, learning=False, **options),
-        "colored": lambda: cpu.trace(case.shapes, case.rays, case.bvh, degree=3, learning=True, **options),
+        "trace": lambda: cpu.trace(case.shapes, case.rays, case.bvh, degree=-1, needs_gradients=False, **options),
+        "colored": lambda: cpu.trace(case.shapes, case.rays, case.bvh, degree=3, needs_gradients=True, **options),
         "backward": lambda: cpu.trace_gradients(
             case.shapes, case.rays, case.bvh, colored, cotangents, degree=3, **options
         ),
@@ -155,7 +155,7 @@ def case_of(count: int, width: int) -> Case:
 def add_case(tables: tuple[Table, Table], case: Case, embree: Embree | None, rounds: int) -> str:
     """Adds a row to both tables; says how far the two agree."""
     works, agreement = own_works(case), ""
-    found = cpu.trace(case.shapes, case.rays, case.bvh, flat=True, degree=-1, learning=False, near=0.0)
+    found = cpu.trace(case.shapes, case.rays, case.bvh, flat=True, degree=-1, needs_gradients=False, near=0.0)
     if embree is not None:
         scene = embree.scene(case.shapes, robust=False)
         theirs = embree.trace(scene, case.rays)

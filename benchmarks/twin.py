@@ -30,7 +30,7 @@ from glassplat.kernels.composite.cpu import composite_forward
 from glassplat.kernels.composite.cpu_backward import composite_backward
 from glassplat.kernels.records import Splats, TileBins
 from glassplat.kernels.tiles import bin_tiles
-from glassplat.render.frame import joined_splats, project_gaussians
+from glassplat.render.frame import concat_splats, project_gaussians
 
 SOURCE = Path(__file__).with_name("composite_twin.cpp")
 COMPILERS = ("c++", "g++")
@@ -79,7 +79,7 @@ def room_splats(count: int, width: int, height: int) -> tuple[Splats, Array, Til
     camera = bench_camera(width, height)
     with torch.no_grad():
         projected = project_gaussians(room(count), camera, near=0.03)
-    splats = joined_splats(projected)
+    splats = concat_splats(projected)
     channels = torch.cat([projected.colors, projected.depths[..., None]], dim=-1)
     return splats, channels.numpy().reshape(-1, CHANNELS), bin_tiles(splats, width, height)
 

@@ -62,7 +62,7 @@ class Rays(NamedTuple):
     on_pane: NDArray[np.bool_]
 
 
-class Followed(NamedTuple):
+class FollowedEdges(NamedTuple):
     """Edges on H planes, and their positions in V views: distances, shifts [H, V, P], outward [H, P, 3], compared
     [H, V, P]; `EdgeMatches` describes them.
     """
@@ -83,7 +83,7 @@ class Field(NamedTuple):
     cell: float
 
 
-def follow_edges(normals: Array, offsets: Array, cameras: Cameras, edges: Edges, fields: list[Array]) -> Followed:
+def follow_edges(normals: Array, offsets: Array, cameras: Cameras, edges: Edges, fields: list[Array]) -> FollowedEdges:
     """Transfers mask edges to all views over each plane.
 
     Args:
@@ -99,7 +99,7 @@ def follow_edges(normals: Array, offsets: Array, cameras: Cameras, edges: Edges,
     fields = [np.ascontiguousarray(field, np.float64) for field in fields]  # Kept alive until the kernel has returned.
     addresses = np.array([field.ctypes.data for field in fields], np.int64)
     follow_edges_kernel()(normals, offsets, *cameras, *edges, addresses, distances, shifts, outward, compared)
-    return Followed(distances, shifts, outward, compared)
+    return FollowedEdges(distances, shifts, outward, compared)
 
 
 def overlaps(
@@ -141,7 +141,7 @@ def along_ray(normal, offset, center, ray):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def seen_at(pose, lens, size, x, y, z):  # type: ignore[no-untyped-def]
+def project_to_image(pose, lens, size, x, y, z):  # type: ignore[no-untyped-def]
     """Column and row of a point in an image, in pixels, its depth, and whether it is inside the image."""
     depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
     if not depth > 0.0:
@@ -208,7 +208,7 @@ def follow_edges_kernel() -> Kernel:
                 own_hidden = min(max(steep, 0.0), STEEPEST)
                 for v in range(views):
                     c, size = centers[v], sizes[v]
-                    column, row, depth, held = seen_at(poses[v], lenses[v], size, x, y, z)
+                    column, row, depth, held = project_to_image(poses[v], lenses[v], size, x, y, z)
                     held = held and hit and source != v
                     compared[h, v, p] = held
                     if not held:
@@ -251,7 +251,7 @@ def overlaps_kernel() -> Kernel:
                         # A plane behind the camera cannot hold a pane that the camera sees.
                         either[h, source, v] += 1.0 if on else 0.0
                         continue
-                    column, row, _, held = seen_at(poses[v], lenses[v], size, x, y, z)
+                    column, row, _, held = project_to_image(poses[v], lenses[v], size, x, y, z)
                     pixel = int(row) * size[1] + int(column) if held else 0
                     if not held or at(addresses[1, v], 0, size[0] * size[1])[pixel]:
                         either[h, source, v] += unknown_weight if on else 0.0

@@ -21,7 +21,7 @@ from torch.nn.functional import interpolate, normalize
 
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import View, estimated_normals, evenly
-from glassplat.render.deferred import cell_side, depth_normals, resize_environment, seen_surface, view_directions
+from glassplat.render.deferred import blend_surface, cell_side, depth_normals, resize_environment, view_directions
 from glassplat.render.frame import Renderer
 from glassplat.render.layers import contributions, gather_pixels
 from glassplat.scene import SH_ZERO, logit
@@ -218,7 +218,7 @@ def seen_normals(scene: Scene, views: Sequence[View], estimated: bool = False) -
 
 def slopes_of_depths(scene: Scene, camera: Camera) -> Tensor:
     """[H, W, 3] normals of a camera's depth map, world axes; zero where unreliable."""
-    surface = seen_surface(scene, camera, background=(0.0, 0.0, 0.0))
+    surface = blend_surface(scene, camera, background=(0.0, 0.0, 0.0))
     cells, trusted = depth_normals(surface.depth, surface.alpha, camera)
     return _whole_size(cells * trusted[..., None], cell_side(camera), surface.depth.shape)
 

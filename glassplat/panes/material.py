@@ -14,7 +14,7 @@ from torch import Tensor
 from glassplat.captures.view import View, evenly
 from glassplat.kernels.adam import Update, adam
 from glassplat.kernels.maths.images import linear_from_srgb
-from glassplat.render.layers import gather_pixels, gathered_mirrored, window_means, window_sums
+from glassplat.render.layers import gather_mirrored_pixels, gather_pixels, window_means, window_sums
 from glassplat.render.planar import FirstPass, Planar
 from glassplat.render.splat import Splat
 from glassplat.scene import SH_ZERO, logit
@@ -547,7 +547,9 @@ def _lamps_among(scene: Scene, photographs: Sequence[Photograph]) -> Tensor:
         darkest = photograph.pixels.amin(dim=-1)
         shown = gather_pixels(scene, photograph.camera, torch.stack([past & (darkest > CLIPPED), past], dim=-1).float())
         enough = linear_from_srgb(darkest.clamp(0, 1)) > LEAST_GAIN * strength
-        there = gathered_mirrored(scene, photograph.camera, torch.stack([through & enough, through], dim=-1).float())
+        there = gather_mirrored_pixels(
+            scene, photograph.camera, torch.stack([through & enough, through], dim=-1).float()
+        )
         clipped, direct = clipped + shown[:, 0], direct + shown[:, 1]
         bright, mirrored = bright + there[:, 0], mirrored + there[:, 1]
     enough_seen = (direct > FEWEST_SEEN) & (mirrored > FEWEST_SEEN)
@@ -594,7 +596,7 @@ def _gains_of(scene: Scene, seen: Sequence[LitPixels], photographs: Sequence[Pho
         behind = linear_from_srgb(layers["transmission"].clamp(0, 1))
         radiance = (linear_from_srgb(photograph.pixels.clamp(0, 1)) - (1 - strength) * behind) / strength
         values = torch.stack([radiance.clamp(min=0), linear_from_srgb(layers["reflection"].clamp(min=0))]).mean(dim=-1)
-        sums = gathered_mirrored(scene, photograph.camera, (values * (lit & photograph.valid)).movedim(0, -1))
+        sums = gather_mirrored_pixels(scene, photograph.camera, (values * (lit & photograph.valid)).movedim(0, -1))
         left, had = left + sums[:, 0], had + sums[:, 1]
     gains = (left / had.clamp(min=1e-6)).clamp(1, MOST_GAIN)
     return torch.where(had > 0, gains, 1)

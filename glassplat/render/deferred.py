@@ -21,17 +21,17 @@ from glassplat.kernels.records import NORMAL_MIN, Shaded
 from glassplat.render.frame import (
     NEAR_PER_EXTENT,
     Frame,
-    OverBackground,
     ScreenPass,
+    WithBackground,
     check_colored,
     check_ellipsoids,
     check_numbers,
     over_background,
     project_gaussians,
-    reaches_pixel,
     screen_pass,
+    visible_gaussians,
 )
-from glassplat.render.splat import blended_discs, blended_ellipsoids, disc_layers, ellipsoid_channels, projected_discs
+from glassplat.render.splat import blend_discs, blend_ellipsoids, disc_layers, ellipsoid_channels, projected_discs
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import FACES, Environment, Scene
 
@@ -51,7 +51,7 @@ def equirect_from_environment(environment: Environment, height: int) -> Tensor:
     Raises:
         ValueError: the environment is empty, or the height is below 1.
     """
-    _check_lit(environment)
+    _check_not_empty(environment)
     if height < 1:
         raise ValueError(f"the panorama's height is {height}; expected at least 1 row")
     samples = max(1, math.ceil(2 * environment.size / height))
@@ -78,14 +78,14 @@ def environment_from_equirect(image: Tensor, size: int) -> Environment:
     if size < 1:
         raise ValueError(f"the environment's size is {size}; expected at least 1 texel along a face")
     samples = max(1, math.ceil(height / (2 * size)))
-    fine = _looked_up(image, texel_directions(samples * size).to(image))
+    fine = _sample_panorama(image, texel_directions(samples * size).to(image))
     colors = fine.reshape(FACES, size, samples, size, samples, 3).mean(dim=(2, 4))
     return Environment(torch.logit(colors.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN)))
 
 
 def resize_environment(environment: Environment, size: int) -> Environment:
     """The environment at another resolution; raw values are interpolated between texel centres."""
-    _check_lit(environment)
+    _check_not_empty(environment)
     return replace(environment, raw=cube_lookup(environment.raw, texel_directions(size).to(environment.raw)))
 
 
@@ -109,12 +109,12 @@ def texel_directions(size: int) -> Tensor:
     return directions
 
 
-def _check_lit(environment: Environment) -> None:
+def _check_not_empty(environment: Environment) -> None:
     if environment.is_empty:
         raise ValueError("the scene has no environment; expected one trained with `deferred`")
 
 
-def _looked_up(image: Tensor, directions: Tensor) -> Tensor:
+def _sample_panorama(image: Tensor, directions: Tensor) -> Tensor:
     """The panorama in directions [..., 3], with bilinear interpolation across its ends and poles."""
     height, width = image.shape[:2]
     # Beyond a pole, the opposite meridian follows.
@@ -131,17 +131,17 @@ def _looked_up(image: Tensor, directions: Tensor) -> Tensor:
 CELLS_ACROSS = 32
 """Cells along the longer side of an image; depths and normals are averaged over cells before they are compared."""
 LEAST_COVERAGE = 0.5
-LEAST_ACROSS = 3
+LEAST_CELLS_ACROSS = 3
 """Minimum number of cells along the shorter side, if there are enough pixels: a normal needs a cell and its
 neighbours."""
-STEEPEST = 0.15
+MOST_DEPTH_CHANGE = 0.15
 """Maximum change of depth between neighbouring cells, as a share of the depth, on one surface."""
 
 
 def cell_side(camera: Camera) -> int:
     """Pixels along the side of a cell."""
     shorter, longer = sorted((camera.width, camera.height))
-    return max(1, min(round(longer / CELLS_ACROSS), shorter // LEAST_ACROSS))
+    return max(1, min(round(longer / CELLS_ACROSS), shorter // LEAST_CELLS_ACROSS))
 
 
 def depth_normals(depth: Tensor, alpha: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
@@ -163,8 +163,12 @@ def depth_normals(depth: Tensor, alpha: Tensor, camera: Camera) -> tuple[Tensor,
     down[1:-1] = points[2:] - points[:-2]
     # In a frame with x to the right, y down and z forward, down x along points to the camera.
     normals = torch.nn.functional.normalize(torch.linalg.cross(down, along), dim=-1)
-    steepness = _most_nearby(mean_depth) + _most_nearby(-mean_depth)
-    whole = (_most_nearby(1 - share) == 0) & (steepness < STEEPEST * mean_depth) & (normals.abs().sum(-1) > 0)
+    steepness = _neighbourhood_max(mean_depth) + _neighbourhood_max(-mean_depth)
+    whole = (
+        (_neighbourhood_max(1 - share) == 0)
+        & (steepness < MOST_DEPTH_CHANGE * mean_depth)
+        & (normals.abs().sum(-1) > 0)
+    )
     rotation = camera.cam_from_world[:3, :3].to(depth)
     return normals @ rotation, whole.to(depth.dtype)
 
@@ -174,7 +178,7 @@ def cell_means(image: Tensor, side: int) -> Tensor:
     return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), side).permute(1, 2, 0)
 
 
-def _most_nearby(image: Tensor) -> Tensor:
+def _neighbourhood_max(image: Tensor) -> Tensor:
     """[h, w] largest value among each cell and its eight neighbours."""
     return torch.nn.functional.max_pool2d(image[None], 3, 1, 1)[0]
 
@@ -224,7 +228,7 @@ class Surface:
         }
 
 
-def seen_surface(
+def blend_surface(
     scene: Scene,
     camera: Camera,
     *,
@@ -242,22 +246,22 @@ def seen_surface(
         screen = (screen_pass("primary", discs),) if with_absgrad else ()
         strengths = torch.sigmoid(scene.primary.channels["logit_strength"])[None, :, None]
         channels = torch.cat([discs.colors, discs.normals, strengths], dim=-1)
-        blended = blended_discs(discs, channels, camera, near=near, screen=screen)
+        blended = blend_discs(discs, channels, camera, near=near, screen=screen)
         image, extra = blended.image[0], disc_layers(blended, scene.extent)
         alpha, distance = extra.pop("alpha"), extra.pop("depth")
         color, normal, strength = image.split((3, 3, 1), dim=2)
-        direct = reaches_pixel(discs)
+        direct = visible_gaussians(discs)
     else:
         projected = project_gaussians(scene.primary, camera, near=near)
         screen = (screen_pass("primary", projected),) if with_absgrad else ()
         depths = projected.depths[0, :, None] if depth else None
         channels = ellipsoid_channels(scene.primary, projected, camera, depths)
-        result = blended_ellipsoids(projected, channels[None], camera, screen=screen)
+        result = blend_ellipsoids(projected, channels[None], camera, screen=screen)
         image, alpha = result.image[0], result.alpha[0]
         # Split in one operation, because slices have gradients as large as the image.
         color, normal, strength, *last = image.split((3, 3, 1, 1) if depth else (3, 3, 1), dim=2)
         distance = mean_depth(last[0].squeeze(2), alpha) if depth else alpha.new_zeros(0)
-        direct = reaches_pixel(projected)
+        direct = visible_gaussians(projected)
     return Surface(
         image=image,
         color=color,
@@ -280,11 +284,11 @@ def reflected_rays(surface: Surface, camera: Camera, chosen: tuple[Tensor, ...])
     rotation = camera.cam_from_world[:3, :3]
     rows, columns = (index.to(rotation) for index in chosen)
     d = pixel_rays(camera.shared_intrinsics.to(rotation), columns, rows) @ rotation
-    places = camera.center + surface.depth[chosen][:, None] * d
+    positions = camera.center + surface.depth[chosen][:, None] * d
     normal = surface.normal[chosen]
     normal = normal / normal.norm(dim=-1, keepdim=True).clamp(min=NORMAL_MIN)
     mirrored = d - 2 * (d * normal).sum(-1, keepdim=True) * normal
-    return places, torch.nn.functional.normalize(mirrored, dim=-1)
+    return positions, torch.nn.functional.normalize(mirrored, dim=-1)
 
 
 def shaded_pixels(
@@ -323,7 +327,7 @@ INVISIBLE = 1 / 512
 
 
 @dataclass(frozen=True)
-class Deferred(OverBackground):
+class Deferred(WithBackground):
     """Blends colour, normal and reflection strength, then shades every pixel once (3DGS-DR, Section 3.1).
 
         C, N, R = sum_i (c_i, n_i, r_i) alpha_i T_i                   (Eqs. 1 and 2)
@@ -355,7 +359,7 @@ class Deferred(OverBackground):
         """
         check_reflective(scene)
         camera = camera.to(scene.primary.means.device)
-        surface = seen_surface(scene, camera, background=self.background, depth=self.depth, with_absgrad=with_absgrad)
+        surface = blend_surface(scene, camera, background=self.background, depth=self.depth, with_absgrad=with_absgrad)
         shaded = shaded_pixels(scene, camera, surface.image, surface.alpha, self.background, self.least_strength)
         layers = surface.layers(shaded.base) | {"reflection": shaded.reflection}
         if self.environment:

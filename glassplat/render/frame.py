@@ -129,7 +129,7 @@ class Renderer(Protocol):
 
 
 @dataclass(frozen=True)
-class OverBackground:
+class WithBackground:
     """Base class of renderers, with the background.
 
     Attributes:
@@ -156,9 +156,9 @@ def check_layers(renderer: Renderer, scene: Scene, layers: Sequence[str], method
     known = renderer.layers(scene)
     foreign = [layer for layer in layers if layer not in known]
     if foreign or not layers:
-        asked = f"renders no layer {', '.join(foreign)}" if foreign else "renders nothing without layers"
+        problem = f"renders no layer {', '.join(foreign)}" if foreign else "renders nothing without layers"
         trained = "; only a run trained with --photographer.learn has photographed" if "photographed" in foreign else ""
-        raise InputError(f"{method} {asked}; expected layers out of {', '.join(known)}{trained}")
+        raise InputError(f"{method} {problem}; expected layers out of {', '.join(known)}{trained}")
 
 
 NEAR_PER_EXTENT = 0.01
@@ -202,7 +202,7 @@ def camera_batch(camera: Camera, poses: Tensor | None = None) -> CameraBatch:
     return CameraBatch(poses, intrinsics, camera.width, camera.height)
 
 
-def joined_splats(*parts: Projected) -> Splats:
+def concat_splats(*parts: Projected) -> Splats:
     """One list of splats per camera from several projected sets, in the order given."""
     if len(parts) == 1:
         only = parts[0]
@@ -211,7 +211,7 @@ def joined_splats(*parts: Projected) -> Splats:
     return Splats(*(torch.cat([getattr(part, name) for part in parts], dim=1) for name in names))
 
 
-def reaches_pixel(projected: Projected | ProjectedDiscs) -> Tensor:
+def visible_gaussians(projected: Projected | ProjectedDiscs) -> Tensor:
     """[N] bool: Gaussians visible in any of the cameras."""
     reached = projected.radii[..., 0] > 0
     return reached[0] if len(reached) == 1 else reached.any(dim=0)
@@ -223,7 +223,7 @@ def screen_pass(part: str, projected: Projected | ProjectedDiscs, *, direct: boo
     return ScreenPass(part, projected.means2d, absgrad, projected.radii, direct=direct)
 
 
-def joined_absgrad(screen: Sequence[ScreenPass]) -> Tensor | None:
+def concat_absgrad(screen: Sequence[ScreenPass]) -> Tensor | None:
     """The `absgrad` [C, G, 2] for `composite`, for parts in this order; None without records."""
     absgrads = [record.absgrad for record in screen]
     return torch.cat(absgrads, dim=1) if len(absgrads) > 1 else next(iter(absgrads), None)
@@ -264,7 +264,7 @@ def check_colored(gaussians: Gaussians) -> None:
         raise ValueError("the Gaussians have no colours; expected f_dc_0 to f_dc_2, as every trained splat has them")
 
 
-_sound: WeakIdKeyDictionary = WeakIdKeyDictionary()
+_checked_versions: WeakIdKeyDictionary = WeakIdKeyDictionary()
 """Tensors that passed `check_numbers`: the version of their values, and the allowed maximum."""
 
 
@@ -278,11 +278,11 @@ def check_numbers(values: Mapping[str, Tensor], most: float = math.inf) -> None:
         ValueError: a value is NaN, infinite or above `most`; the message names the tensor.
     """
     for name, tensor in values.items():
-        mark = None if tensor.is_inference() else (tensor._version, most)
-        if tensor.requires_grad or (mark is not None and _sound.get(tensor) == mark):
+        version = None if tensor.is_inference() else (tensor._version, most)
+        if tensor.requires_grad or (version is not None and _checked_versions.get(tensor) == version):
             continue
         if bool((tensor.isfinite() & (tensor <= most)).all()):
-            _sound[tensor] = mark
+            _checked_versions[tensor] = version
         else:
             limit = "" if most == math.inf else f" of at most {most:g}"
             raise ValueError(f"{name} holds values that cannot be drawn; expected finite numbers{limit}")

@@ -10,10 +10,10 @@ from torch import Tensor
 from glassplat.kernels.composite import composite
 from glassplat.kernels.records import Projected
 from glassplat.kernels.tiles import bin_tiles
-from glassplat.render.frame import NEAR_PER_EXTENT, Frame, joined_splats, project_gaussians
+from glassplat.render.frame import NEAR_PER_EXTENT, Frame, concat_splats, project_gaussians
 from glassplat.render.panes import nearest_hits, panes_in_camera, project_mirrored, seen_panes
 from glassplat.render.planar import detach_gaussians
-from glassplat.render.splat import blended_discs, projected_discs
+from glassplat.render.splat import blend_discs, projected_discs
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
@@ -135,7 +135,7 @@ def contributions(scene: Scene, camera: Camera) -> Tensor:
     # Colours are not needed.
     primary, near = replace(detach_gaussians(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
     if primary.are_discs:
-        return _disc_sums(primary, camera, near, primary.means.new_ones(camera.height, camera.width, 1))[:, 0]
+        return _gather_discs(primary, camera, near, primary.means.new_ones(camera.height, camera.width, 1))[:, 0]
     most = _weight_sums(project_gaussians(primary, camera, near=near), camera)
     seen = seen_panes(scene.planes, camera, nearest_hits(panes_in_camera(scene.planes, camera), camera))
     if seen is None:
@@ -149,11 +149,11 @@ def gather_pixels(scene: Scene, camera: Camera, values: Tensor) -> Tensor:
     camera = camera.to(scene.primary.means.device)
     primary, near = replace(detach_gaussians(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
     if primary.are_discs:
-        return _disc_sums(primary, camera, near, values)
-    return _sums(project_gaussians(primary, camera, near=near), camera, values)[0]
+        return _gather_discs(primary, camera, near, values)
+    return _gather(project_gaussians(primary, camera, near=near), camera, values)[0]
 
 
-def gathered_mirrored(scene: Scene, camera: Camera, values: Tensor) -> Tensor:
+def gather_mirrored_pixels(scene: Scene, camera: Camera, values: Tensor) -> Tensor:
     """[N, D] the same, with the weights in the reflection of each pixel's nearest pane."""
     camera = camera.to(scene.primary.means.device)
     primary, near = replace(detach_gaussians(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
@@ -162,21 +162,21 @@ def gathered_mirrored(scene: Scene, camera: Camera, values: Tensor) -> Tensor:
         return values.new_zeros(len(primary), values.shape[-1])
     of_pane = seen.order[0] == torch.arange(len(seen.planes), device=values.device)[:, None, None]
     projected = project_mirrored(primary, camera, seen, near=near)
-    return _sums(projected, camera, of_pane[..., None] * values, seen.tiles).sum(dim=0)
+    return _gather(projected, camera, of_pane[..., None] * values, seen.tiles).sum(dim=0)
 
 
 def _weight_sums(projected: Projected, camera: Camera, tiles: Tensor | None = None) -> Tensor:
     """[N] blending weights summed over the pixels of the images."""
     ones = projected.depths.new_ones(camera.height, camera.width, 1)
-    return _sums(projected, camera, ones, tiles)[..., 0].amax(dim=0)
+    return _gather(projected, camera, ones, tiles)[..., 0].amax(dim=0)
 
 
-def _sums(projected: Projected, camera: Camera, values: Tensor, tiles: Tensor | None = None) -> Tensor:
+def _gather(projected: Projected, camera: Camera, values: Tensor, tiles: Tensor | None = None) -> Tensor:
     """[C, N, D] gradient of a constant channel if `values` are the gradients of the images.
 
     They are [C, H, W, D], or [H, W, D] for all images.
     """
-    splats = joined_splats(projected)
+    splats = concat_splats(projected)
     with torch.enable_grad():
         ones = projected.depths.new_ones(*projected.depths.shape, values.shape[-1]).requires_grad_()
         image = composite(splats, ones, bin_tiles(splats, camera.width, camera.height, tiles)).image
@@ -184,32 +184,32 @@ def _sums(projected: Projected, camera: Camera, values: Tensor, tiles: Tensor | 
     return sums
 
 
-def _disc_sums(discs: Gaussians, camera: Camera, near: float, values: Tensor) -> Tensor:
-    """[N, D] as `_sums`, for discs and one camera."""
+def _gather_discs(discs: Gaussians, camera: Camera, near: float, values: Tensor) -> Tensor:
+    """[N, D] as `_gather`, for discs and one camera."""
     projected = projected_discs(discs, camera, near=near)
     with torch.enable_grad():
         ones = projected.depths.new_ones(*projected.depths.shape, values.shape[-1]).requires_grad_()
-        image = blended_discs(projected, ones, camera, near=near).image
+        image = blend_discs(projected, ones, camera, near=near).image
         (sums,) = torch.autograd.grad((image * values).sum(), ones)
     return sums[0]
 
 
-def window_means(image: Tensor, region: Tensor, reach: int) -> Tensor:
+def window_means(image: Tensor, region: Tensor, radius: int) -> Tensor:
     """[H, W, D] float64 means over the part of each window (see `window_sums`) inside a region [H, W]."""
     inside = region.to(image.dtype)[..., None]
-    sums = window_sums(torch.cat([image * inside, inside], dim=-1), reach)
+    sums = window_sums(torch.cat([image * inside, inside], dim=-1), radius)
     return sums[..., :-1] / sums[..., -1:].clamp(min=1)
 
 
-def window_sums(image: Tensor, reach: int) -> Tensor:
-    """[H, W, D] float64 sums over the square of pixels up to `reach` away, cut off at the image's border.
+def window_sums(image: Tensor, radius: int) -> Tensor:
+    """[H, W, D] float64 sums over the square of pixels up to `radius` away, cut off at the image's border.
 
     Differences of running sums along each axis, so that the cost does not depend on the window.
     """
     sums = image.double()
     for axis in (0, 1):
         running = torch.cat([torch.zeros_like(sums.narrow(axis, 0, 1)), sums.cumsum(axis)], dim=axis)
-        places = torch.arange(image.shape[axis], device=image.device)
-        after, before = (places + reach + 1).clamp(max=len(places)), (places - reach).clamp(min=0)
+        positions = torch.arange(image.shape[axis], device=image.device)
+        after, before = (positions + radius + 1).clamp(max=len(positions)), (positions - radius).clamp(min=0)
         sums = running.index_select(axis, after) - running.index_select(axis, before)
     return sums

@@ -95,7 +95,7 @@ def seen_panes(
         hits.append(further)
         seen = [a or b for a, b in zip(seen, shown, strict=True)]
     tiles = torch.stack([h.tiles for h in hits]).any(dim=0)
-    windows = first.windows if len(hits) == 1 else _joined_windows(hits)
+    windows = first.windows if len(hits) == 1 else _union_windows(hits)
     positions = tuple(k for k, is_seen in enumerate(seen) if is_seen)
     rows = constant(positions, torch.int64, tiles.device)
     if len(positions) == len(planes):
@@ -114,13 +114,13 @@ def _visible_panes(hits: PaneHits) -> list[bool]:
     return found
 
 
-def _joined_windows(hits: list[PaneHits]) -> Tensor:
+def _union_windows(hits: list[PaneHits]) -> Tensor:
     """[K, 4] bounding boxes of the windows of all hits; zeros if empty."""
     windows = torch.stack([h.windows for h in hits])
     empty = (windows[..., 2] == 0)[..., None]
     first = torch.where(empty, torch.inf, windows[..., :2]).amin(dim=0)
-    joined = torch.cat([first, windows[..., 2:].amax(dim=0)], dim=1)
-    return torch.where(empty.all(dim=0), 0, joined)
+    union = torch.cat([first, windows[..., 2:].amax(dim=0)], dim=1)
+    return torch.where(empty.all(dim=0), 0, union)
 
 
 def project_mirrored(
@@ -188,15 +188,15 @@ def mirrored_views(planes: Planes, camera: Camera) -> MirroredViews:
     return MirroredViews(poses, planes.normals @ pose[:3, :3].T, half_spaces)
 
 
-FAINT = 0.5
+LEAST_VISIBILITY = 0.5
 """Visibility in a pixel below which the layers are those of the pane behind, as at a pane's border."""
 
 
 class CompositedPanes(NamedTuple):
     """An image behind panes.
 
-    rgb [H, W, 3]; transmission and reflection [H, W, 3] and strength [H, W] of the nearest pane above `FAINT`,
-    combined with those in front; and share [H, W] of the image added by all panes.
+    rgb [H, W, 3]; transmission and reflection [H, W, 3] and strength [H, W] of the nearest pane above
+    `LEAST_VISIBILITY`, combined with those in front; and share [H, W] of the image added by all panes.
     """
 
     rgb: Tensor
@@ -224,7 +224,7 @@ def composite_panes(
         intensity: as for `blend_panes`.
         blend: space of blending.
     """
-    laid = []
+    composited = []
     transmittances = seen.planes.transmittances
     for mask, pane in zip(reversed(masks), reversed(seen.order), strict=True):
         if transmittances is not None:
@@ -241,23 +241,23 @@ def composite_panes(
             intensity=intensity,
             linear=blend == "linear",
         )
-        laid.append((image, result))
+        composited.append((image, result))
         image = result.rgb
-    share = _all_of_them([result.strength for _, result in laid])
-    behind, nearest = laid.pop()
+    share = _total_share([result.strength for _, result in composited])
+    behind, nearest = composited.pop()
     layers = (behind, nearest.reflection, nearest.strength)
-    if not laid:
+    if not composited:
         return CompositedPanes(image, *layers, share)
-    faint = masks[0] < FAINT
-    for number, (behind, farther) in enumerate(reversed(laid), 1):
+    faint = masks[0] < LEAST_VISIBILITY
+    for number, (behind, farther) in enumerate(reversed(composited), 1):
         reflection = farther.reflection
         for mask, pane in zip(masks[:number], seen.order, strict=False):
             if transmittances is not None:
                 behind = tint_by_panes(behind, mask, pane, transmittances, blend)
                 reflection = tint_by_panes(reflection, mask, pane, transmittances, blend)
         where = faint & (farther.strength > 0)
-        layers = _joined_layers(layers, (behind, reflection, farther.strength), where, blend)
-        faint = faint & (masks[number] < FAINT)
+        layers = _merge_layers(layers, (behind, reflection, farther.strength), where, blend)
+        faint = faint & (masks[number] < LEAST_VISIBILITY)
     return CompositedPanes(image, *layers, share)
 
 
@@ -271,7 +271,7 @@ def tint_by_panes(image: Tensor, mask: Tensor, pane: Tensor, transmittances: Ten
         transmittances: transmittances of all panes.
         blend: space in which transmittances apply.
     """
-    decode, encode = curves(blend)
+    decode, encode = blend_conversions(blend)
     # The gradient of an embedding is deterministic for any number of threads, unlike that of indexing.
     through = torch.nn.functional.embedding(pane.clamp(min=0).long(), transmittances)
     shown = (mask > 0) & (pane >= 0)
@@ -287,7 +287,7 @@ def tint_of_panes(seen: SeenPanes, masks: Sequence[Tensor], transmittances: Tens
     return tint
 
 
-def _all_of_them(strengths: Sequence[Tensor]) -> Tensor:
+def _total_share(strengths: Sequence[Tensor]) -> Tensor:
     """[H, W] share of the image added by panes of these strengths, farthest first."""
     share, *nearer = strengths
     for strength in nearer:
@@ -299,31 +299,31 @@ Layers = tuple[Tensor, Tensor, Tensor]
 """Transmission, reflection and strength."""
 
 
-def _joined_layers(layers: Layers, farther: Layers, where: Tensor, blend: Blend) -> Layers:
+def _merge_layers(layers: Layers, farther: Layers, where: Tensor, blend: Blend) -> Layers:
     """Those of a pane and of one seen through its glass as if they were one, in some pixels.
 
     They give the same image: R = R_1 + (1 - R_1) R_2 and R C_r = R_1 C_1 + (1 - R_1) R_2 C_2.
     """
-    decode, encode = curves(blend)
+    decode, encode = blend_conversions(blend)
     (transmission, reflection, strength), (behind, mirrored, share) = layers, farther
     pixels = where.nonzero(as_tuple=True)
     first = strength[pixels]
     second = (1 - first) * share[pixels]
-    both = first + second
+    total = first + second
     light = first[:, None] * decode(reflection[pixels]) + second[:, None] * decode(mirrored[pixels])
     return (
         transmission.index_put(pixels, behind[pixels]),
-        reflection.index_put(pixels, encode(light / both[:, None])),
-        strength.index_put(pixels, both),
+        reflection.index_put(pixels, encode(light / total[:, None])),
+        strength.index_put(pixels, total),
     )
 
 
-def curves(blend: Blend) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
+def blend_conversions(blend: Blend) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
     """Conversions to the space of blending and back to sRGB."""
-    return (linear_from_srgb, srgb_from_linear) if blend == "linear" else (_unchanged, _unchanged)
+    return (linear_from_srgb, srgb_from_linear) if blend == "linear" else (_identity, _identity)
 
 
-def _unchanged(color: Tensor) -> Tensor:
+def _identity(color: Tensor) -> Tensor:
     return color
 
 
@@ -375,5 +375,5 @@ def _splats_near(splats: Splats, pixels: Tensor) -> Tensor:
     low = torch.stack([columns.min, rows.min]) // TILE * TILE
     high = (torch.stack([columns.max, rows.max]) // TILE + 1) * TILE
     means, radii = splats.means2d[0], splats.radii[0]
-    reaches = (means + radii >= low) & (means - radii <= high) & (radii > 0)
-    return reaches.all(dim=1).nonzero().flatten()
+    overlaps = (means + radii >= low) & (means - radii <= high) & (radii > 0)
+    return overlaps.all(dim=1).nonzero().flatten()

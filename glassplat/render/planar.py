@@ -11,7 +11,7 @@ from torch import Tensor
 
 from glassplat.kernels import Fresnel
 from glassplat.kernels.composite import composite, mean_depth
-from glassplat.kernels.panes import layer_slopes, slopes_at
+from glassplat.kernels.panes import layer_derivatives, sample_derivatives
 from glassplat.kernels.project import GradientSum
 from glassplat.kernels.records import Deviation, PaneHits, Panes, Splats
 from glassplat.kernels.tiles import bin_tiles
@@ -19,24 +19,24 @@ from glassplat.options import BLACK, Blend, Rgb
 from glassplat.render.frame import (
     NEAR_PER_EXTENT,
     Frame,
-    OverBackground,
     Renderer,
     ScreenPass,
+    WithBackground,
     check_colored,
     check_ellipsoids,
     check_numbers,
-    joined_absgrad,
-    joined_splats,
+    concat_absgrad,
+    concat_splats,
     over_background,
     project_gaussians,
-    reaches_pixel,
     screen_pass,
+    visible_gaussians,
 )
 from glassplat.render.panes import (
     CompositedPanes,
     SeenPanes,
+    blend_conversions,
     composite_panes,
-    curves,
     nearest_hits,
     own_masks,
     panes_in_camera,
@@ -86,7 +86,7 @@ class SecondPass(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Planar(OverBackground):
+class Planar(WithBackground):
     """Renders transmission, reflection and their blend (TR-Gaussians, Section III-A).
 
         C = (1 - R) C_t + R C_r                      (Eq. 1)
@@ -99,7 +99,7 @@ class Planar(OverBackground):
 
     If there are several panes on a ray, Eq. 1 is applied from the farthest to the nearest: the C_t of a pane is the C
     of the pane behind it (the paper renders only the nearest). The layers R, C_r and C_t are those of the nearest pane
-    with a visibility above `FAINT`; see `glassplat.render.panes.composite_panes`.
+    with a visibility above `LEAST_VISIBILITY`; see `glassplat.render.panes.composite_panes`.
 
     Layers: `transmission`, `reflection` [H, W, 3]; `strength`, `mask`, `depth`, `alpha` [H, W]; `without_panes` [H, W,
     3], the image without panes. Frames also have `pane` [H, W] int32, the nearest pane, -1 for none; `share` [H, W],
@@ -233,7 +233,7 @@ class Planar(OverBackground):
         near, total = NEAR_PER_EXTENT * scene.extent, GradientSum()
         primary = project_gaussians(scene.primary, camera, near=near, total=total)
         glass = project_gaussians(scene.glass, camera, near=near)
-        splats = joined_splats(primary, glass)
+        splats = concat_splats(primary, glass)
         bins = bin_tiles(splats, camera.width, camera.height)
         channels = torch.cat([primary.colors, primary.depths[..., None]], dim=-1)
         channels = torch.nn.functional.pad(channels, (0, 0, 0, len(scene.glass)))
@@ -250,7 +250,7 @@ class Planar(OverBackground):
             marks=marks,
             num_primary=len(scene.primary),
             deviation=deviation,
-            absgrad=joined_absgrad(screen),
+            absgrad=concat_absgrad(screen),
         )
         alpha = result.alpha.squeeze(0)
         # Squeezed and split, because indexing an image allocates a gradient of zeros.
@@ -263,7 +263,7 @@ class Planar(OverBackground):
             deviation=result.deviation.squeeze(0) if deviation else None,
             splats=splats,
             marks=marks,
-            direct=reaches_pixel(primary),
+            direct=visible_gaussians(primary),
             screen=screen,
             total=total,
         )
@@ -288,11 +288,11 @@ class Planar(OverBackground):
             mirrored.append(body)
             # Densified by mirror images, as no view shows it directly.
             screen += (screen_pass("photographer", body),) if with_absgrad else ()
-        splats = joined_splats(*mirrored)
+        splats = concat_splats(*mirrored)
         bins = bin_tiles(splats, camera.width, camera.height, seen.tiles)
-        result = composite(splats, channels, bins, absgrad=joined_absgrad(screen))
+        result = composite(splats, channels, bins, absgrad=concat_absgrad(screen))
         reflections = over_background(result.image, result.alpha, (*self.background, 0.0))
-        return SecondPass(reflections, result.alpha, reaches_pixel(projected), screen)
+        return SecondPass(reflections, result.alpha, visible_gaussians(projected), screen)
 
     def _composite_panes(
         self, first: FirstPass, seen: SeenPanes, masks: Sequence[Tensor], second: SecondPass, camera: Camera
@@ -357,17 +357,17 @@ def check_panes(scene: Scene) -> None:
 def weighted_screen(
     first: FirstPass, second: SecondPass, hits: PaneHits, result: CompositedPanes, blend: Blend
 ) -> tuple[ScreenPass, ...]:
-    """The records of both passes, weighted by the share of each layer in the image (see `layer_slopes`).
+    """The records of both passes, weighted by the share of each layer in the image (see `layer_derivatives`).
 
     Gaussians behind a pane are weighted by the transmission at their centres, mirror images by the mean over pixels of
     panes.
     """
     hit = hits.pane >= 0
     layers = result.strength, result.transmission, result.reflection
-    through, mirrored = layer_slopes(*layers, hit, linear=blend == "linear")
+    through, mirrored = layer_derivatives(*layers, hit, linear=blend == "linear")
     primary, glass = first.screen
     depths = first.splats.depths[:, : primary.means2d.shape[1]]
-    primary = replace(primary, weight=slopes_at(through, hits.depth, primary.means2d, depths))
+    primary = replace(primary, weight=sample_derivatives(through, hits.depth, primary.means2d, depths))
     weight = mirrored.sum() / hit.sum().clamp(min=1)
     return (primary, glass, *(replace(record, weight=weight) for record in second.screen))
 
@@ -422,7 +422,7 @@ def dereflected_photo(
     """
     if photo.shape != frame.rgb.shape:
         raise ValueError(f"the photograph is {list(photo.shape)}, the frame {list(frame.rgb.shape)}; expected one size")
-    decode, encode = curves(blend)
+    decode, encode = blend_conversions(blend)
     without_panes, share = frame.layers["without_panes"], frame.layers["share"][..., None]
     exposures = exposures.interpolate(name) if exposures and name else Exposures.neutral()
     photographed = photo.to(torch.float32) / 255
@@ -451,7 +451,7 @@ def as_mirror_image(frame: Frame, blend: Blend) -> Tensor:
         frame: a view rendered by `planar`, with all its layers.
         blend: space of Eq. 1 in the run.
     """
-    decode, encode = curves(blend)
+    decode, encode = blend_conversions(blend)
     layers = frame.layers
     share = (layers["mask"] * (layers["strength"] > 0))[..., None]
     behind, mirrored = decode(layers["transmission"]), decode(layers["reflection"])

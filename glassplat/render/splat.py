@@ -18,18 +18,18 @@ from glassplat.render.frame import (
     MEDIAN_DEPTH,
     NEAR_PER_EXTENT,
     Frame,
-    OverBackground,
     Renderer,
     ScreenPass,
+    WithBackground,
     camera_batch,
     check_colored,
-    joined_absgrad,
-    joined_splats,
+    concat_absgrad,
+    concat_splats,
     over_background,
     project_gaussians,
     raw_gaussians,
-    reaches_pixel,
     screen_pass,
+    visible_gaussians,
 )
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
@@ -53,7 +53,7 @@ def projected_discs(gaussians: Gaussians, camera: Camera, *, near: float) -> Pro
     )
 
 
-def blended_discs(
+def blend_discs(
     projected: ProjectedDiscs, channels: Tensor, camera: Camera, *, near: float, screen: Sequence[ScreenPass] = ()
 ) -> BlendedDiscs:
     """Blends channels [1, N, D] of discs over the pixels of a camera; fields of one camera, [1, H, W, ...].
@@ -67,7 +67,7 @@ def blended_discs(
     """
     discs = Discs(projected.means2d, projected.maps, projected.opacities, projected.depths, projected.outlines)
     bins = bin_tiles(projected.outlines, camera.width, camera.height)
-    return composite_discs(discs, channels, bins, near=near, absgrad=joined_absgrad(screen))
+    return composite_discs(discs, channels, bins, near=near, absgrad=concat_absgrad(screen))
 
 
 def disc_layers(blended: BlendedDiscs, extent: float) -> dict[str, Tensor]:
@@ -109,13 +109,13 @@ def ellipsoid_channels(
     )
 
 
-def blended_ellipsoids(
+def blend_ellipsoids(
     projected: Projected, channels: Tensor, camera: Camera, *, screen: Sequence[ScreenPass] = ()
 ) -> Composite:
-    """Blends channels [1, N, D] of ellipsoids over the pixels of a camera; arguments as for `blended_discs`."""
-    splats = joined_splats(projected)
+    """Blends channels [1, N, D] of ellipsoids over the pixels of a camera; arguments as for `blend_discs`."""
+    splats = concat_splats(projected)
     bins = bin_tiles(splats, camera.width, camera.height)
-    return composite(splats, channels, bins, absgrad=joined_absgrad(screen))
+    return composite(splats, channels, bins, absgrad=concat_absgrad(screen))
 
 
 @dataclass(frozen=True)
@@ -163,11 +163,11 @@ def ellipsoid_normals(scene: Scene, camera: Camera) -> Tensor:
     projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
     channels = ellipsoid_channels(scene.primary, projected, camera)
     normals = channels[None, :, NORMAL_AT:STRENGTH_AT].contiguous()
-    return blended_ellipsoids(projected, normals, camera).image[0]
+    return blend_ellipsoids(projected, normals, camera).image[0]
 
 
 @dataclass(frozen=True)
-class Splat(OverBackground):
+class Splat(WithBackground):
     """Renders the primary Gaussians by EWA splatting, or as discs where they are flat, and front-to-back blending.
 
         C(u) = sum_i c_i alpha_i T_i,   T_i = prod_{j<i} (1 - alpha_j)
@@ -198,7 +198,7 @@ class Splat(OverBackground):
         if self.depth:
             channels = torch.cat([channels, projected.depths[..., None]], dim=-1)
         screen = (screen_pass("primary", projected),) if with_absgrad else ()
-        result = blended_ellipsoids(projected, channels, camera, screen=screen)
+        result = blend_ellipsoids(projected, channels, camera, screen=screen)
         # As a batch of one, then split, because indexing an image allocates a gradient of zeros.
         color, *depth = result.image.squeeze(0).split((3, 1) if self.depth else 3, dim=-1)
         alpha = result.alpha.squeeze(0)
@@ -206,7 +206,7 @@ class Splat(OverBackground):
         if self.depth:
             layers["depth"] = mean_depth(depth[0].squeeze(-1), alpha)
         rgb = over_background(color, alpha, self.background)
-        return Frame(rgb, layers, direct=reaches_pixel(projected), screen=screen)
+        return Frame(rgb, layers, direct=visible_gaussians(projected), screen=screen)
 
     def _discs(self, scene: Scene, camera: Camera, with_absgrad: bool) -> Frame:
         near = NEAR_PER_EXTENT * scene.extent
@@ -215,12 +215,12 @@ class Splat(OverBackground):
         if self.normal:
             channels = torch.cat([channels, projected.normals], dim=-1)
         screen = (screen_pass("primary", projected),) if with_absgrad else ()
-        blended = blended_discs(projected, channels, camera, near=near, screen=screen)
+        blended = blend_discs(projected, channels, camera, near=near, screen=screen)
         layers = disc_layers(blended, scene.extent)
         if self.normal:
             layers["normal"] = blended.image[0, ..., 3:]
         rgb = over_background(blended.image[0, ..., :3], layers["alpha"], self.background)
-        return Frame(rgb, layers, direct=reaches_pixel(projected), screen=screen)
+        return Frame(rgb, layers, direct=visible_gaussians(projected), screen=screen)
 
     def check(self, scene: Scene) -> None:
         """Raises ValueError if the Gaussians have no colours."""

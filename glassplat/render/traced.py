@@ -16,10 +16,10 @@ from glassplat.kernels.trace import trace
 from glassplat.render.deferred import (
     INVISIBLE,
     Surface,
+    blend_surface,
     check_strengths,
     page_settings,
     reflected_rays,
-    seen_surface,
     shaded_pixels,
     view_directions,
 )
@@ -27,8 +27,8 @@ from glassplat.render.frame import (
     MEDIAN_DEPTH,
     NEAR_PER_EXTENT,
     Frame,
-    OverBackground,
     SpacePass,
+    WithBackground,
     check_colored,
     over_background,
 )
@@ -43,7 +43,7 @@ include the surface."""
 
 
 @dataclass(frozen=True)
-class Traced(OverBackground):
+class Traced(WithBackground):
     """Blends colour, normal, strength and depth of surfaces, then traces the reflection of each pixel (EnvGS, Section
     4.1).
 
@@ -84,7 +84,7 @@ class Traced(OverBackground):
         """
         check_mirrored(scene)
         camera = camera.to(scene.primary.means.device)
-        surface = seen_surface(scene, camera, background=self.background, with_absgrad=with_absgrad)
+        surface = blend_surface(scene, camera, background=self.background, with_absgrad=with_absgrad)
         part = scene.surroundings
         contributions = part.means.new_zeros(len(part), 2).requires_grad_() if with_absgrad and len(part) else None
         rgb, reflection = self._shade(scene, camera, surface, contributions)
@@ -107,11 +107,11 @@ class Traced(OverBackground):
         if not len(scene.surroundings):
             return rgb, reflection
         chosen = torch.where((surface.strength > self.least_strength) & (surface.depth > 0))
-        places, directions = reflected_rays(surface, camera, chosen)
+        positions, directions = reflected_rays(surface, camera, chosen)
         if not self.joint:
-            places, directions = places.detach(), directions.detach()
+            positions, directions = positions.detach(), directions.detach()
         near = START_PER_EXTENT * scene.extent
-        colors = traced_colors(scene, places, directions, near, self.background, contributions)
+        colors = traced_colors(scene, positions, directions, near, self.background, contributions)
         strength = surface.strength[chosen][:, None]
         mixed = (1 - strength) * surface.base[chosen] + strength * colors
         return rgb.index_put(chosen, mixed), reflection.index_put(chosen, colors)
@@ -188,15 +188,15 @@ def mirrored_contributions(scene: Scene, camera: Camera) -> Tensor:
     """
     camera = camera.to(scene.primary.means.device)
     with torch.no_grad():
-        surface = seen_surface(scene, camera, background=(0.0, 0.0, 0.0))
+        surface = blend_surface(scene, camera, background=(0.0, 0.0, 0.0))
         chosen = torch.where((surface.strength > INVISIBLE) & (surface.depth > 0))
-        places, directions = reflected_rays(surface, camera, chosen)
+        positions, directions = reflected_rays(surface, camera, chosen)
     part = scene.surroundings
     with torch.enable_grad():
         # The blending weight is the gradient of a constant colour.
         ones = torch.full_like(part.sh[:, :1], 0.5 / SH_ZERO).requires_grad_()
         plain = replace(part.with_tensors({n: t.detach() for n, t in part.tensors().items()}), active_sh_degree=0)
-        found = traced_surroundings(replace(plain, sh=ones), places, directions, START_PER_EXTENT * scene.extent)
+        found = traced_surroundings(replace(plain, sh=ones), positions, directions, START_PER_EXTENT * scene.extent)
         (sums,) = torch.autograd.grad((found.colors[:, 0] * surface.strength[chosen]).sum(), ones)
     return sums[:, 0, 0] / SH_ZERO
 

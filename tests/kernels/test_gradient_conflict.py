@@ -42,11 +42,11 @@ def test_sobel_is_the_sobel_operator() -> None:
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
 @pytest.mark.parametrize("size", [(3, 3), (3, 20), (17, 4), (40, 53)])
 @pytest.mark.parametrize("cell", [1, 5])
-@pytest.mark.parametrize("is_told", [False, True])
+@pytest.mark.parametrize("has_strength", [False, True])
 def test_kernel_matches_its_twin(
-    dtype: torch.dtype, tolerance: float, size: tuple[int, int], cell: int, is_told: bool
+    dtype: torch.dtype, tolerance: float, size: tuple[int, int], cell: int, has_strength: bool
 ) -> None:
-    images = (*pictures(*size, dtype), *([torch.full(size, 0.3, dtype=dtype)] if is_told else []))
+    images = (*pictures(*size, dtype), *([torch.full(size, 0.3, dtype=dtype)] if has_strength else []))
     value, gradient = with_gradient(gradient_conflict, images, cell)
     expected, expected_gradient = with_gradient(twin, images, cell)
     torch.testing.assert_close(value, expected, rtol=tolerance, atol=tolerance)

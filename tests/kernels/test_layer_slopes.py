@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
-from glassplat.kernels.panes import layer_slopes, slopes_at
-from glassplat.kernels.panes.reference import layer_slopes as reference_layer_slopes
+from glassplat.kernels.panes import layer_derivatives, sample_derivatives
+from glassplat.kernels.panes.reference import layer_derivatives as reference_layer_derivatives
 from tests.kernels.threads import assert_threads_change_no_bit
 
 
@@ -30,7 +30,7 @@ def test_slopes_are_finite_differences_of_the_image() -> None:
         return srgb_from_linear((1 - share) * linear_from_srgb(transmission) + share * linear_from_srgb(reflection))
 
     everywhere = torch.ones(5, 7, dtype=torch.bool)
-    through, mirrored = layer_slopes(strength, behind, reflected, everywhere, linear=True)
+    through, mirrored = layer_derivatives(strength, behind, reflected, everywhere, linear=True)
     by_behind = (image(behind + step, reflected) - image(behind - step, reflected)) / (2 * step)
     by_reflected = (image(behind, reflected + step) - image(behind, reflected - step)) / (2 * step)
     torch.testing.assert_close(through, by_behind[..., 0], rtol=1e-6, atol=0)
@@ -40,7 +40,7 @@ def test_slopes_are_finite_differences_of_the_image() -> None:
 
 def test_slopes_in_srgb_are_the_strength_and_its_rest() -> None:
     (strength, *layers), where = grey_layers(), some_pixels(5, 7)
-    through, mirrored = layer_slopes(strength, *layers, where, linear=False)
+    through, mirrored = layer_derivatives(strength, *layers, where, linear=False)
     torch.testing.assert_close(through, torch.where(where, 1 - strength, 1.0))
     torch.testing.assert_close(mirrored, torch.where(where, strength, 0.0))
 
@@ -49,7 +49,7 @@ def test_a_reflection_weighs_more_the_darker_it_is_behind_the_pane() -> None:
     grey, where = torch.linspace(0.1, 0.9, 9, dtype=torch.float64)[None], torch.ones(1, 9, dtype=torch.bool)
     behind = grey[..., None].expand(-1, -1, 3)
     strength = torch.full_like(grey, 0.1)
-    through, mirrored = layer_slopes(strength, behind, torch.full_like(behind, 0.5), where, linear=True)
+    through, mirrored = layer_derivatives(strength, behind, torch.full_like(behind, 0.5), where, linear=True)
     assert bool((mirrored.diff() < 0).all())
     assert bool((through.diff() > 0).all())
     assert mirrored[0, 4] == pytest.approx(0.1)  # As bright as each other.
@@ -63,21 +63,21 @@ def test_agrees_with_its_twin(size: tuple[int, int], linear: bool, dtype: torch.
     strength = torch.rand(size, generator=generator, dtype=torch.float64).to(dtype)
     layers = [1.3 * torch.rand(*size, 3, generator=generator, dtype=torch.float64).to(dtype) - 0.1 for _ in range(2)]
     where = some_pixels(*size)
-    found = layer_slopes(strength, *layers, where, linear=linear)
-    for own, wanted in zip(found, reference_layer_slopes(strength, *layers, where, linear=linear), strict=True):
+    found = layer_derivatives(strength, *layers, where, linear=linear)
+    for own, wanted in zip(found, reference_layer_derivatives(strength, *layers, where, linear=linear), strict=True):
         torch.testing.assert_close(own, wanted, rtol=tolerance, atol=tolerance)
 
 
 def test_what_is_left_out_may_be_anything() -> None:
     broken = torch.full((4, 6), torch.nan)
     layers = broken[..., None].expand(-1, -1, 3)
-    through, mirrored = layer_slopes(broken, layers, layers, torch.zeros(4, 6, dtype=torch.bool), linear=True)
+    through, mirrored = layer_derivatives(broken, layers, layers, torch.zeros(4, 6, dtype=torch.bool), linear=True)
     assert bool((through == 1).all()) and bool((mirrored == 0).all())
 
 
 def test_the_number_of_threads_changes_no_bit() -> None:
     layers, where = [layer.float() for layer in grey_layers(90, 70)], some_pixels(90, 70)
-    assert_threads_change_no_bit(lambda: layer_slopes(*layers, where, linear=True))
+    assert_threads_change_no_bit(lambda: layer_derivatives(*layers, where, linear=True))
 
 
 @pytest.mark.parametrize(
@@ -91,12 +91,12 @@ def test_bad_input_is_refused(change: dict[str, Tensor], error: type[Exception],
     arguments = {"strength": torch.zeros(4, 6), "where": torch.zeros(4, 6, dtype=torch.bool)}
     arguments |= {name: torch.zeros(4, 6, 3) for name in ("transmission", "reflection")}
     with pytest.raises(error, match=message):
-        layer_slopes(**(arguments | change), linear=True)
+        layer_derivatives(**(arguments | change), linear=True)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_slopes_are_read_at_centres_behind_the_surface(dtype: torch.dtype) -> None:
-    slopes = torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]], dtype=dtype)
+    derivatives = torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]], dtype=dtype)
     near = torch.tensor([[2.0, 2.0, torch.inf], [2.0, 2.0, 2.0]], dtype=dtype)
     nan, inf = torch.nan, torch.inf
     means = [
@@ -111,6 +111,8 @@ def test_slopes_are_read_at_centres_behind_the_surface(dtype: torch.dtype) -> No
         (1e30, 0),
     ]
     depths = [3.0, 3.0, 1.0, 3.0, 3.0, 3.0, 3.0, 3.0, 0.0]
-    found = slopes_at(slopes, near, torch.tensor([means], dtype=dtype), torch.tensor([depths], dtype=dtype))
+    found = sample_derivatives(
+        derivatives, near, torch.tensor([means], dtype=dtype), torch.tensor([depths], dtype=dtype)
+    )
     expected = [0.2, 0.5, 1.0, 1.0, 0.4, 0.4, 0.6, 0.4, 1.0]  # Beyond the border as at it, and NaN as at the first.
     torch.testing.assert_close(found, torch.tensor([expected], dtype=dtype), rtol=0, atol=0)

@@ -117,7 +117,7 @@ def test_a_tbb_that_happens_to_be_there_is_not_used_and_the_log_says_so_once(tmp
     said, result = printed_with_tbb(tmp_path, TWO_KERNELS)
     layer = result.split()[-1]
     assert layer in ("omp", "workqueue")
-    assert said == f"kernels run on 2 threads of {threads.NAMES[layer]}"
+    assert said == f"kernels run on 2 threads of {threads.LAYER_NAMES[layer]}"
     assert result.startswith("[4.0, 4.0]")
 
 
@@ -147,10 +147,10 @@ def test_two_python_threads_may_use_kernels_on_the_work_queue(tmp_path: Path) ->
 @pytest.mark.parametrize(("layer", "locked"), [("omp", False), ("tbb", False), ("workqueue", True)])
 def test_only_the_work_queue_costs_a_lock(layer: str, locked: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     def compiled(value: int) -> bool:
-        return value == 1 and threads._alone.locked()
+        return value == 1 and threads._work_queue_lock.locked()
 
     monkeypatch.setattr(threads, "threading_layer", lambda: layer)
-    enter = threads.entrance(compiled)
+    enter = threads.serialised(compiled)
     assert enter(1) is locked
     assert (enter is compiled) is not locked
-    assert not threads._alone.locked()
+    assert not threads._work_queue_lock.locked()

@@ -14,13 +14,13 @@ from glassplat.kernels.backend.cpu import Kernel, inlined, kernel
 from glassplat.kernels.backend.cpu_vector import (
     ROW,
     constant,
+    deinterleave,
+    drop_fourths,
     interleave,
     item,
-    sorted_apart,
+    pad_fourths,
     store,
     vector_kind,
-    with_fourths,
-    without_fourths,
 )
 
 REALS = [np.float32, np.float64]
@@ -120,7 +120,7 @@ def reorders(real: type, lanes: int) -> Kernel:
     def compute(a, out):
         four = (load(a, 0), load(a, lanes), load(a, 2 * lanes), load(a, 3 * lanes))
         mixed = interleave(four)
-        again = sorted_apart(mixed)
+        again = deinterleave(mixed)
         for i in range(4):
             store(out, i * lanes, mixed[i])
             store(out, (4 + i) * lanes, again[i])
@@ -141,10 +141,10 @@ def three_channels(real: type) -> Kernel:
 
     @kernel("vector_three_channels", real, parallel=False)
     def compute(row, three, four):
-        eight, rest = without_fourths(load(row, 0))
+        eight, rest = drop_fourths(load(row, 0))
         store(three, 0, eight)
         store(three, 8, rest)
-        store(four, 0, with_fourths(eight, rest))
+        store(four, 0, pad_fourths(eight, rest))
 
     return compute
 

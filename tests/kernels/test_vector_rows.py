@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from glassplat.kernels.backend.cpu import Kernel, kernel
-from glassplat.kernels.backend.cpu_vector import row_loader, store, store_all, thirds, transpose, triples, vector_kind
+from glassplat.kernels.backend.cpu_vector import (
+    join_triples,
+    row_loader,
+    split_triples,
+    store,
+    store_all,
+    transpose,
+    vector_kind,
+)
 
 kinds = pytest.mark.parametrize(
     ("real", "lanes"), [(real, lanes) for real in (np.float32, np.float64) for lanes in (4, 16)]
@@ -18,11 +26,11 @@ def sorting(real: type, lanes: int) -> Kernel:
 
     @kernel("vector_thirds", real, parallel=False)
     def compute(values, columns, again):
-        x, y, z = thirds(load(values, 0), load(values, lanes), load(values, 2 * lanes))
+        x, y, z = split_triples(load(values, 0), load(values, lanes), load(values, 2 * lanes))
         store(columns, 0, x)
         store(columns, lanes, y)
         store(columns, 2 * lanes, z)
-        store_all(again, 1, triples(x, y, z))
+        store_all(again, 1, join_triples(x, y, z))
 
     return compute
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.options import Blend
 from glassplat.render.layers import contributions
-from glassplat.render.panes import FAINT, curves, nearest_hits, panes_in_camera, seen_panes
+from glassplat.render.panes import LEAST_VISIBILITY, blend_conversions, nearest_hits, panes_in_camera, seen_panes
 from glassplat.render.planar import Planar
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes, nearest_panes
@@ -65,7 +65,7 @@ def test_each_pane_lays_its_reflection_over_what_is_behind_it(half: float, shift
 
 def test_the_layers_are_those_of_the_nearest_pane() -> None:
     both, front, back = (Planar()(vitrine(*labels), CAMERA) for labels in ((1, 2), (1,), (2,)))
-    seen = front.layers["mask"] >= FAINT
+    seen = front.layers["mask"] >= LEAST_VISIBILITY
     assert bool(seen.any()) and not bool(seen.all())
     for name in ("strength", "reflection"):
         torch.testing.assert_close(both.layers[name][seen], front.layers[name][seen])
@@ -91,7 +91,7 @@ def test_where_the_nearest_pane_cannot_be_seen_the_layers_are_those_of_the_next(
 def test_the_layers_recombine_to_the_image(blend: Blend, tint: tuple[tuple[float, ...], ...] | None) -> None:
     scene, logarithms = vitrine(1, 2), None if tint is None else torch.tensor(tint, dtype=torch.float64).log()
     frame = Planar(blend=blend)(replace(scene, planes=replace(scene.planes, log_transmittances=logarithms)), CAMERA)
-    decode, _ = curves(blend)
+    decode, _ = blend_conversions(blend)
     share = frame.layers["strength"][..., None]
     expected = (1 - share) * decode(frame.layers["transmission"]) + share * decode(frame.layers["reflection"])
     torch.testing.assert_close(decode(frame.rgb), expected, rtol=1e-4, atol=2e-5)
@@ -119,14 +119,14 @@ def test_panes_change_places_for_a_camera_on_the_other_side() -> None:
     other = replace(CAMERA, cam_from_world=half_turn)
     both, front, back = (Planar()(vitrine(*labels), other).layers for labels in ((1, 2), (1,), (2,)))
     assert float((front["strength"] * back["strength"]).max()) > 0.02
-    seen = back["mask"] >= FAINT
+    seen = back["mask"] >= LEAST_VISIBILITY
     assert bool(seen.any())
     for name in ("strength", "reflection"):
         torch.testing.assert_close(both[name][seen], back[name][seen])
 
 
 def test_a_mirror_behind_glass_shows_the_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("glassplat.render.panes.FAINT", 0.0)
+    monkeypatch.setattr("glassplat.render.panes.LEAST_VISIBILITY", 0.0)
     mirror = pane(4.0, label=2, base_reflectance=1 - 1e-9)
     scene = replace(vitrine(1, 2), planes=joined(FRONT, mirror))
     room = scene.primary.select(scene.primary.means[:, 2] < 1.0)
@@ -209,7 +209,7 @@ def test_what_a_pane_mirrors_only_through_another_counts_as_seen() -> None:
 
 
 def test_the_conflict_of_edges_does_not_ask_the_farther_reflection(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("glassplat.render.panes.FAINT", 0.0)
+    monkeypatch.setattr("glassplat.render.panes.LEAST_VISIBILITY", 0.0)
     scene = vitrine(1, 2)
     frame = Planar()(scene, CAMERA)
     alone = Planar()(vitrine(1), CAMERA)

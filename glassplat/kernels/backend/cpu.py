@@ -37,7 +37,7 @@ from glassplat.kernels.backend.cpu_cache import KernelCache
 CHOSEN_BY_USER = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES")
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
 """Codes of two parameters of glibc's `mallopt`."""
-KEPT = 128 << 20
+KEPT_BYTES = 128 << 20
 """Maximum of freed memory that a process keeps, in bytes."""
 LARGEST_RECYCLED = 32 << 20
 """Maximum size of recycled arrays in bytes, as large as glibc allows; larger ones are returned when freed."""
@@ -51,21 +51,21 @@ def keep_freed_memory() -> bool:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError, TypeError):  # Not glibc, or a system without one global C library.
         return False
-    return bool(mallopt(TRIM_THRESHOLD, KEPT)) and bool(mallopt(MMAP_THRESHOLD, LARGEST_RECYCLED))
+    return bool(mallopt(TRIM_THRESHOLD, KEPT_BYTES)) and bool(mallopt(MMAP_THRESHOLD, LARGEST_RECYCLED))
 
 
 log = logging.getLogger("glassplat.kernels")
 
-PRIORITY = ["omp", "workqueue", "tbb"]
-NAMES = {"omp": "OpenMP", "workqueue": "Numba's work queue", "tbb": "TBB"}
+LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
+LAYER_NAMES = {"omp": "OpenMP", "workqueue": "Numba's work queue", "tbb": "TBB"}
 
-_alone = threading.Lock()
+_work_queue_lock = threading.Lock()
 
 
 def prefer_openmp() -> None:
     """Puts TBB last, unless the user has set a priority; must run before Numba starts its threads."""
     if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
-        numba.config.THREADING_LAYER_PRIORITY = PRIORITY
+        numba.config.THREADING_LAYER_PRIORITY = LAYER_PRIORITY
 
 
 @cache
@@ -74,17 +74,17 @@ def threading_layer() -> str:
     prefer_openmp()  # Again: Numba re-reads its variables when the environment has changed.
     threads = numba.get_num_threads()
     layer = str(numba.threading_layer())
-    log.info("kernels run on %d thread%s of %s", threads, "" if threads == 1 else "s", NAMES.get(layer, layer))
+    log.info("kernels run on %d thread%s of %s", threads, "" if threads == 1 else "s", LAYER_NAMES.get(layer, layer))
     return layer
 
 
-def entrance(compiled: Callable[..., Any]) -> Callable[..., Any]:
+def serialised(compiled: Callable[..., Any]) -> Callable[..., Any]:
     """Wrapper of a parallel kernel that any thread may call: the work queue aborts if two threads enter it."""
     if threading_layer() != "workqueue":
         return compiled
 
     def enter(*arguments: Any) -> Any:
-        with _alone:
+        with _work_queue_lock:
             return compiled(*arguments)
 
     return enter
@@ -94,7 +94,7 @@ def entrance(compiled: Callable[..., Any]) -> Callable[..., Any]:
 prefer_openmp()
 keep_freed_memory()
 
-HOW = "".join(Path(__file__).with_name(name).read_text() for name in ("cpu.py", "cpu_vector.py"))
+COMPILER_SOURCE = "".join(Path(__file__).with_name(name).read_text() for name in ("cpu.py", "cpu_vector.py"))
 """Source of this file and of the vector operators, which kernels do not reference by name. It is part of the cache key,
 along with a kernel's own code."""
 
@@ -123,7 +123,7 @@ class Kernel:
 
     def _first_run(self, *arguments: Any) -> Any:
         """Starts the threads, which determines the threading layer and how a parallel kernel may be entered."""
-        self._run = entrance(self.dispatcher)
+        self._run = serialised(self.dispatcher)
         return self._run(*arguments)
 
     @property
@@ -149,7 +149,7 @@ def kernel(name: str, real: type, *, parallel: bool = True) -> Callable[[Callabl
         function.__qualname__ = full_name
         compiled = numba.njit(parallel=parallel, no_cfunc_wrapper=True, fastmath=set(FAST_MATH), error_model="numpy")
         dispatcher = compiled(function)
-        dispatcher._cache = KernelCache(function, compiled, flags=f"parallel={parallel} {HOW}")
+        dispatcher._cache = KernelCache(function, compiled, flags=f"parallel={parallel} {COMPILER_SOURCE}")
         return Kernel(dispatcher, full_name, parallel=parallel)
 
     return decorate

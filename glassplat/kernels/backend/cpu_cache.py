@@ -28,7 +28,7 @@ from numba.core.cpu import CPUContext
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic
 
-from glassplat.kernels.backend.devices import announced_compilation
+from glassplat.kernels.backend.devices import announce_compilation
 
 log = logging.getLogger("glassplat.kernels")
 
@@ -68,7 +68,7 @@ class TemporaryFolder(caching.InTreeCacheLocator):
         super().ensure_cache_path()
 
 
-class Nowhere(caching.InTreeCacheLocator):
+class ReadOnlyFolder(caching.InTreeCacheLocator):
     """The folder next to the source, if none is writable: kernels are read from it, and saving fails."""
 
     def ensure_cache_path(self) -> None:
@@ -83,7 +83,7 @@ class KernelFiles(caching.CompileResultCacheImpl):
         caching.InTreeCacheLocator,
         UserFolder,
         TemporaryFolder,
-        Nowhere,
+        ReadOnlyFolder,
     )
 
     def files(self, function: Callable[..., Any]) -> list[caching.IndexDataCacheFile]:
@@ -97,7 +97,7 @@ class KernelFiles(caching.CompileResultCacheImpl):
         stamp = self.locator.get_source_stamp()
         return [caching.IndexDataCacheFile(folder, self.filename_base, stamp) for folder in dict.fromkeys(folders)]
 
-    def remark(self) -> None:
+    def warn_if_elsewhere(self) -> None:
         """Logs once if kernels are not stored where the user may expect them."""
         folder = os.path.dirname(self.locator.get_cache_path())
         if isinstance(self.locator, TemporaryFolder):
@@ -114,7 +114,7 @@ class KernelFiles(caching.CompileResultCacheImpl):
                 self.locator.get_cache_path(),
             )
 
-    def not_kept(self, reason: Exception) -> None:
+    def warn_not_stored(self, reason: Exception) -> None:
         """Logs once that kernels will be compiled again in the next process."""
         _warn_once("cannot cache compiled kernels: %s; %s", str(reason), REMEDY)
 
@@ -133,13 +133,13 @@ def _user() -> int | None:
     return os.getuid() if hasattr(os, "getuid") else None
 
 
-PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
-NAMED = (ModuleType, type, BuiltinFunctionType, np.ufunc)
-SPELLED = (types.Type, ir.Type)
+LITERAL_TYPES = (bool, int, float, complex, str, bytes, type(None), np.generic)
+NAMED_TYPES = (ModuleType, type, BuiltinFunctionType, np.ufunc)
+TEXT_TYPES = (types.Type, ir.Type)
 """Types that are fully described by their text."""
 LIBRARIES = ("numba", "numpy", "llvmlite")
 INTRINSIC = type(intrinsic(lambda typing: None))
-DAMAGE = (EOFError, pickle.UnpicklingError, AttributeError, ImportError, LookupError, TypeError, ValueError)
+DAMAGE_ERRORS = (EOFError, pickle.UnpicklingError, AttributeError, ImportError, LookupError, TypeError, ValueError)
 """Exceptions on reading a file that is truncated, or was written by another program."""
 
 
@@ -164,7 +164,7 @@ def fingerprint(function: Callable[..., Any], flags: str) -> str:
 
 def _describe(value: Any, seen: set[int]) -> Iterator[str]:
     """The value as text, part by part; each function is described once."""
-    if isinstance(value, PLAIN):
+    if isinstance(value, LITERAL_TYPES):
         yield f"{type(value).__name__} {value!r}"
     elif isinstance(value, tuple | frozenset):
         parts = [" ".join(_describe(item, seen)) for item in value]
@@ -174,9 +174,9 @@ def _describe(value: Any, seen: set[int]) -> Iterator[str]:
         yield value.co_code.hex()
         yield " ".join(value.co_names)
         yield from _describe(value.co_consts, seen)
-    elif isinstance(value, NAMED) or (isinstance(value, FunctionType) and value.__module__.startswith(LIBRARIES)):
+    elif isinstance(value, NAMED_TYPES) or (isinstance(value, FunctionType) and value.__module__.startswith(LIBRARIES)):
         yield f"{getattr(value, '__module__', '')} {value.__name__}"
-    elif isinstance(value, SPELLED):
+    elif isinstance(value, TEXT_TYPES):
         yield f"{type(value).__name__} {value}"
     elif isinstance(value, INTRINSIC):
         yield "intrinsic"
@@ -202,26 +202,26 @@ def _described_function(function: FunctionType, seen: set[int]) -> Iterator[str]
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
         yield f"closes over {name}"
         yield from _describe(cell.cell_contents, seen)
-    for name in sorted(_globals_read(function.__code__) & function.__globals__.keys()):
+    for name in sorted(_global_names(function.__code__) & function.__globals__.keys()):
         yield f"reads {name}"
         yield from _describe(function.__globals__[name], seen)
 
 
-def _globals_read(code: CodeType) -> set[str]:
+def _global_names(code: CodeType) -> set[str]:
     """Names of the globals that a code object and those nested in it read."""
     read = {step.argval for step in dis.get_instructions(code) if step.opname == "LOAD_GLOBAL"}
     nested = (constant for constant in code.co_consts if isinstance(constant, CodeType))
-    return read.union(*map(_globals_read, nested))
+    return read.union(*map(_global_names, nested))
 
 
-def kept_data(files: Iterable[caching.IndexDataCacheFile], key: Any) -> Any:
+def load_data(files: Iterable[caching.IndexDataCacheFile], key: Any) -> Any:
     """Data stored under a key, from the first folder that has it; None if no folder has. Damaged files are skipped."""
     for file in files:
         try:
             data = file.load(key)
         except OSError:
             continue  # Not a folder, or not readable by this user.
-        except DAMAGE as error:
+        except DAMAGE_ERRORS as error:
             log.warning("%s cannot be read (%s); compiling again", file._index_path, error)
             continue
         if data is not None:
@@ -229,7 +229,7 @@ def kept_data(files: Iterable[caching.IndexDataCacheFile], key: Any) -> Any:
     return None
 
 
-def keep_data(file: caching.IndexDataCacheFile, key: Any, data: Any) -> None:
+def store_data(file: caching.IndexDataCacheFile, key: Any, data: Any) -> None:
     """Stores data under a key; a damaged index, which cannot be extended, is replaced by a new one.
 
     Raises:
@@ -237,7 +237,7 @@ def keep_data(file: caching.IndexDataCacheFile, key: Any, data: Any) -> None:
     """
     try:
         file.save(key, data)
-    except DAMAGE:
+    except DAMAGE_ERRORS:
         file.flush()
         file.save(key, data)
 
@@ -272,7 +272,7 @@ class KernelCache(caching.FunctionCache):
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
         """The kernel for a signature from the first folder that has it; damaged files are skipped."""
-        data = kept_data(self._files, self._index_key(sig, target_context.codegen()))
+        data = load_data(self._files, self._index_key(sig, target_context.codegen()))
         return None if data is None else self._impl.rebuild(target_context, data)
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, Any, str]:
@@ -289,23 +289,23 @@ class KernelCache(caching.FunctionCache):
 
     def _compile(self, sig: Any) -> Any:
         """Compiles and stores the kernel; continues if it cannot be stored."""
-        with announced_compilation(self._name_shown, "this machine"):
+        with announce_compilation(self._name_shown, "this machine"):
             dispatcher = self._compiled(self._function)
             dispatcher.compile(sig)
         (made,) = dispatcher.overloads.values()
         self.compilations += 1
-        self._keep(sig, made)
+        self._store(sig, made)
         return made
 
-    def _keep(self, sig: Any, made: Any) -> None:
+    def _store(self, sig: Any, made: Any) -> None:
         """Stores a compiled kernel on disk; a damaged index, which cannot be extended, is replaced by a new one."""
         try:
             try:
                 self.save_overload(sig, made)
-            except DAMAGE:
+            except DAMAGE_ERRORS:
                 self.flush()
                 self.save_overload(sig, made)
         except OSError as error:
-            self._impl.not_kept(error)
+            self._impl.warn_not_stored(error)
         else:
-            self._impl.remark()
+            self._impl.warn_if_elsewhere()

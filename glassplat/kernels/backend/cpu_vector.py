@@ -94,7 +94,7 @@ def vector_kind(real: type, lanes: int) -> VectorKind:
     @intrinsic
     def full(typing, value):
         if value == kind.element:
-            return plain(kind, (value,), lambda builder, x: _spread(builder, x, kind))
+            return plain_intrinsic(kind, (value,), lambda builder, x: _broadcast(builder, x, kind))
 
     @intrinsic
     def load(typing, array, at):
@@ -115,7 +115,7 @@ def constant(real: type, values: tuple[float, ...]) -> Intrinsic:
 
     @intrinsic
     def fixed(typing):
-        return plain(kind, (), lambda builder: ir.Constant(llvm_type(kind), [float(real(v)) for v in values]))
+        return plain_intrinsic(kind, (), lambda builder: ir.Constant(llvm_type(kind), [float(real(v)) for v in values]))
 
     return fixed
 
@@ -152,36 +152,38 @@ def store(typing, array, at, value):
 def select(typing, mask, chosen, other):
     """`chosen` where the mask is set, `other` elsewhere."""
     if isinstance(mask, MaskType) and isinstance(chosen, VectorType) and chosen == other:
-        return plain(chosen, (mask, chosen, other), lambda builder, *arguments: builder.select(*arguments))
+        return plain_intrinsic(chosen, (mask, chosen, other), lambda builder, *arguments: builder.select(*arguments))
 
 
-def _extreme(order: str) -> Intrinsic:
+def _llvm_extreme(order: str) -> Intrinsic:
     @intrinsic
     def extreme(typing, a, b):
         if isinstance(a, VectorType) and a == b:
-            return plain(a, (a, b), lambda builder, x, y: builder.select(builder.fcmp_ordered(order, x, y), x, y))
+            return plain_intrinsic(
+                a, (a, b), lambda builder, x, y: builder.select(builder.fcmp_ordered(order, x, y), x, y)
+            )
 
     return extreme
 
 
-minimum = _extreme("<")
+minimum = _llvm_extreme("<")
 """The smaller of two vectors, lane by lane; the second where either is NaN."""
-maximum = _extreme(">")
+maximum = _llvm_extreme(">")
 """The larger of two vectors, lane by lane; the second where either is NaN."""
 
 
-def _called(name: str) -> Intrinsic:
+def _llvm_unary(name: str) -> Intrinsic:
     @intrinsic
     def called(typing, value):
         if isinstance(value, VectorType):
-            return plain(value, (value,), lambda builder, x: _call(builder, name, value, x))
+            return plain_intrinsic(value, (value,), lambda builder, x: _call(builder, name, value, x))
 
     return called
 
 
-absolute = _called("fabs")
-square_root = _called("sqrt")
-exp = _called("exp")
+absolute = _llvm_unary("fabs")
+square_root = _llvm_unary("sqrt")
+exp = _llvm_unary("exp")
 """e^x; one library call per lane, accurate and slow."""
 
 
@@ -194,14 +196,14 @@ def fraction(typing, value):
         return builder.fsub(x, builder.sitofp(whole, x.type), flags=FLAGS)
 
     if isinstance(value, VectorType):
-        return plain(value, (value,), build)
+        return plain_intrinsic(value, (value,), build)
 
 
 @intrinsic
 def times_power_of_2(typing, value, exponent):
     """`value` times 2^n, where n is the truncated exponent; undefined where the result is not a normal number."""
     if isinstance(value, VectorType) and value == exponent:
-        return plain(value, (value, exponent), lambda builder, x, y: _times_power_of_2(builder, x, y, value))
+        return plain_intrinsic(value, (value, exponent), lambda builder, x, y: _times_power_of_2(builder, x, y, value))
 
 
 @intrinsic
@@ -213,14 +215,14 @@ def bits_of(typing, mask):
         return bits if mask.lanes == MASK_BITS else builder.zext(bits, ir.IntType(MASK_BITS))
 
     if isinstance(mask, MaskType):
-        return plain(types.int64, (mask,), build)
+        return plain_intrinsic(types.int64, (mask,), build)
 
 
 @intrinsic
 def lowest_bit(typing, bits):
     """Index of the lowest bit that is set in an int64; undefined for 0."""
     if bits == types.int64:
-        return plain(types.intp, (bits,), lambda builder, x: builder.cttz(x, ir.Constant(ir.IntType(1), 1)))
+        return plain_intrinsic(types.intp, (bits,), lambda builder, x: builder.cttz(x, ir.Constant(ir.IntType(1), 1)))
 
 
 @intrinsic
@@ -236,7 +238,7 @@ def sums_of(typing, vectors):
         return parts[0]
 
     if isinstance(vectors, types.UniTuple) and vectors.count == getattr(vectors.dtype, "lanes", 0):
-        return plain(vectors.dtype, (vectors,), build)
+        return plain_intrinsic(vectors.dtype, (vectors,), build)
 
 
 def shuffle(builder: Any, a: Any, b: Any, order: Any) -> Any:
@@ -262,7 +264,9 @@ def _times_power_of_2(builder: Any, x: Any, exponent: Any, kind: VectorType) -> 
     return builder.bitcast(builder.add(builder.bitcast(x, bits), raised), x.type)
 
 
-def plain(result: Any, arguments: tuple[Any, ...], build: Callable[..., Any]) -> tuple[Any, Callable[..., Any]]:
+def plain_intrinsic(
+    result: Any, arguments: tuple[Any, ...], build: Callable[..., Any]
+) -> tuple[Any, Callable[..., Any]]:
     """Signature and code generator of an intrinsic that needs only the values of its arguments."""
     return result(*arguments), lambda context, builder, sig, values: build(builder, *values)
 
@@ -272,7 +276,7 @@ def _pointer(context: Any, builder: Any, sig: Any, arguments: Any, kind: VectorT
     return builder.bitcast(builder.gep(data, [arguments[1]]), llvm_type(kind).as_pointer())
 
 
-def _spread(builder: Any, x: Any, kind: VectorType) -> Any:
+def _broadcast(builder: Any, x: Any, kind: VectorType) -> Any:
     index = ir.IntType(32)
     undefined = ir.Constant(llvm_type(kind), ir.Undefined)
     first = builder.insert_element(undefined, x, ir.Constant(index, 0))
@@ -300,7 +304,7 @@ def _arithmetic(symbol: Callable[..., Any], build: Callable[..., Any]) -> None:
     def lower(context: Any, builder: Any, sig: Any, values: Any) -> Any:
         kind = sig.return_type
         return build(
-            builder, *(v if t == kind else _spread(builder, v, kind) for v, t in zip(values, sig.args, strict=True))
+            builder, *(v if t == kind else _broadcast(builder, v, kind) for v, t in zip(values, sig.args, strict=True))
         )
 
     for arguments in ((VectorType, VectorType), (VectorType, types.Float), (types.Float, VectorType)):
@@ -317,7 +321,7 @@ def _comparison(symbol: Callable[..., Any], name: str) -> None:
 
     def lower(context: Any, builder: Any, sig: Any, values: Any) -> Any:
         kind = sig.args[0]
-        other = values[1] if sig.args[1] == kind else _spread(builder, values[1], kind)
+        other = values[1] if sig.args[1] == kind else _broadcast(builder, values[1], kind)
         return builder.fcmp_ordered(name, values[0], other)
 
     for second in (VectorType, types.Float):
@@ -365,7 +369,7 @@ ROW = 16
 def interleave(typing, vectors):
     """Interleaves four vectors: the first lanes of all four, then their second lanes, and so on.
 
-    The result is four vectors again; `sorted_apart` undoes it.
+    The result is four vectors again; `deinterleave` undoes it.
     """
 
     def build(builder, packed):
@@ -375,11 +379,11 @@ def interleave(typing, vectors):
         return cgutils.pack_array(builder, rows, a.type)
 
     if isinstance(vectors, types.UniTuple) and vectors.count == 4 and isinstance(vectors.dtype, VectorType):
-        return plain(vectors, (vectors,), build)
+        return plain_intrinsic(vectors, (vectors,), build)
 
 
 @intrinsic
-def sorted_apart(typing, vectors):
+def deinterleave(typing, vectors):
     """Collects every fourth lane of four vectors; undoes `interleave`."""
 
     def build(builder, packed):
@@ -389,7 +393,7 @@ def sorted_apart(typing, vectors):
         return cgutils.pack_array(builder, [evens[0], odds[0], evens[1], odds[1]], rows[0].type)
 
     if isinstance(vectors, types.UniTuple) and vectors.count == 4 and isinstance(vectors.dtype, VectorType):
-        return plain(vectors, (vectors,), build)
+        return plain_intrinsic(vectors, (vectors,), build)
 
 
 def zip_lanes(builder: Any, a: Any, b: Any) -> tuple[Any, Any]:
@@ -406,7 +410,7 @@ def _unzip_lanes(builder: Any, a: Any, b: Any) -> tuple[Any, Any]:
 
 
 @intrinsic
-def without_fourths(typing, row):
+def drop_fourths(typing, row):
     """The first three channels of a row of four pixels: 12 numbers, in vectors of 8 and 4 lanes."""
 
     def build(builder, x):
@@ -414,12 +418,12 @@ def without_fourths(typing, row):
         return cgutils.pack_struct(builder, [shuffle(builder, x, x, kept[:8]), shuffle(builder, x, x, kept[8:])])
 
     if isinstance(row, VectorType) and row.lanes == ROW:
-        return plain(types.Tuple((VectorType(row.element, 8), VectorType(row.element, 4))), (row,), build)
+        return plain_intrinsic(types.Tuple((VectorType(row.element, 8), VectorType(row.element, 4))), (row,), build)
 
 
 @intrinsic
-def with_fourths(typing, eight, four):
-    """A row of four pixels from three channels, as `without_fourths` returns them; the fourth is zero."""
+def pad_fourths(typing, eight, four):
+    """A row of four pixels from three channels, as `drop_fourths` returns them; the fourth is zero."""
 
     def build(builder, x, y):
         padded = shuffle(builder, y, y, [*range(4), *range(4)])
@@ -429,11 +433,11 @@ def with_fourths(typing, eight, four):
         return shuffle(builder, twelve, zeros, order)
 
     if isinstance(eight, VectorType) and (eight.lanes, four) == (8, VectorType(eight.element, 4)):
-        return plain(VectorType(eight.element, ROW), (eight, four), build)
+        return plain_intrinsic(VectorType(eight.element, ROW), (eight, four), build)
 
 
 @intrinsic
-def thirds(typing, first, second, third):
+def split_triples(typing, first, second, third):
     """Splits triples, stored in three consecutive vectors, into their first, second and third numbers."""
 
     def build(builder, a, b, c):
@@ -448,12 +452,12 @@ def thirds(typing, first, second, third):
         return cgutils.pack_array(builder, columns, a.type)
 
     if isinstance(first, VectorType) and first == second == third:
-        return plain(types.UniTuple(first, 3), (first, second, third), build)
+        return plain_intrinsic(types.UniTuple(first, 3), (first, second, third), build)
 
 
 @intrinsic
-def triples(typing, first, second, third):
-    """Joins first, second and third numbers to triples in three consecutive vectors; undoes `thirds`."""
+def join_triples(typing, first, second, third):
+    """Joins first, second and third numbers to triples in three consecutive vectors; undoes `split_triples`."""
 
     def build(builder, a, b, c):
         lanes, rows = a.type.count, []
@@ -465,7 +469,7 @@ def triples(typing, first, second, third):
         return cgutils.pack_array(builder, rows, a.type)
 
     if isinstance(first, VectorType) and first == second == third:
-        return plain(types.UniTuple(first, 3), (first, second, third), build)
+        return plain_intrinsic(types.UniTuple(first, 3), (first, second, third), build)
 
 
 @intrinsic
@@ -481,7 +485,7 @@ def transpose(typing, rows):
         return cgutils.pack_array(builder, parts, parts[0].type)
 
     if isinstance(rows, types.UniTuple) and rows.count == getattr(rows.dtype, "lanes", 0):
-        return plain(rows, (rows,), build)
+        return plain_intrinsic(rows, (rows,), build)
 
 
 def row_loader(real: type, lanes: int) -> Callable[..., Any]:

@@ -26,8 +26,8 @@ from cuda.core import Linker, LinkerOptions, ObjectCode
 from numba import config, cuda, types
 from torch import Tensor
 
-from glassplat.kernels.backend.cpu_cache import KernelFiles, fingerprint, keep_data, kept_data
-from glassplat.kernels.backend.devices import SIMULATED, announced_compilation
+from glassplat.kernels.backend.cpu_cache import KernelFiles, fingerprint, load_data, store_data
+from glassplat.kernels.backend.devices import SIMULATED, announce_compilation
 
 ENTRY = re.compile(r"\.entry\s+([\w$]+)\s*\(")
 COMPILERS = (
@@ -111,19 +111,19 @@ class ImageCache:
         """The kernel for a compute capability (major, minor), compiled unless it is on disk."""
         folders, key = KernelFiles(self._function), self.key(capability)
         files = folders.files(self._function)
-        found = kept_data(files, key)
+        found = load_data(files, key)
         # Another process may have written its own kernel under the same name at the same time.
         if found is not None and found[:2] == (key, hashlib.sha256(found[3]).digest()):
             return MachineCode(*found[2:])
-        with announced_compilation(self.name, "this GPU"):
+        with announce_compilation(self.name, "this GPU"):
             made = compile_kernel(self._function, self._signature, capability)
         try:
             folders.locator.ensure_cache_path()
-            keep_data(files[0], key, (key, hashlib.sha256(made.cubin).digest(), *made))
+            store_data(files[0], key, (key, hashlib.sha256(made.cubin).digest(), *made))
         except OSError as error:
-            folders.not_kept(error)
+            folders.warn_not_stored(error)
         else:
-            folders.remark()
+            folders.warn_if_elsewhere()
         return made
 
     def key(self, capability: tuple[int, int]) -> str:
@@ -193,7 +193,7 @@ class LoadedKernel:
         with self._lock:
             self._front.pack_into(self._memory, 0, *values)
             if shapes != self._shapes:
-                self._keep(shapes)
+                self._write_layouts(shapes)
             # A thread that has not used the GPU yet has no context, and another may have that of another GPU.
             current = check_driver("cuCtxGetCurrent", driver.cuCtxGetCurrent())
             elsewhere = int(current) != self._context
@@ -208,7 +208,7 @@ class LoadedKernel:
                     check_driver("cuCtxPopCurrent", driver.cuCtxPopCurrent())
             check_driver(self.name, done)
 
-    def _keep(self, shapes: Sequence[tuple[int, ...] | None]) -> None:
+    def _write_layouts(self, shapes: Sequence[tuple[int, ...] | None]) -> None:
         """Writes the fields of arrays with a new shape: number and bytes of the elements, shape, strides."""
         for shape, known, (layout, offset, size) in zip(shapes, self._shapes, self._sizes, strict=True):
             if shape == known:
@@ -306,7 +306,7 @@ class Kernel:
             else:
                 shape = argument.shape
                 if argument.dtype is not dtype or len(shape) != ndim or not argument.is_contiguous():
-                    raise refusal(argument, type_)
+                    raise argument_error(argument, type_)
                 values.append(argument.data_ptr())
                 shapes.append(shape)
                 tensor = argument
@@ -360,11 +360,11 @@ class Expected(NamedTuple):
         if argument is None:
             return np.empty((0,) * self.ndim, np.dtype(str(self.type.dtype)))
         if argument.dtype != self.dtype or argument.dim() != self.ndim or not argument.is_contiguous():
-            raise refusal(argument, self.type)
+            raise argument_error(argument, self.type)
         return argument.detach().numpy()
 
 
-def refusal(argument: Tensor, type_: Any) -> TypeError:
+def argument_error(argument: Tensor, type_: Any) -> TypeError:
     """Error for a tensor whose type, rank or layout is not the one that a kernel expects."""
     return TypeError(f"got {argument.dtype} of shape {tuple(argument.shape)}, expected contiguous {type_}")
 

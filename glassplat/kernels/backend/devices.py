@@ -35,7 +35,7 @@ def compile_seconds() -> float:
 
 
 @contextmanager
-def announced_compilation(name: str, where: str) -> Iterator[None]:
+def announce_compilation(name: str, where: str) -> Iterator[None]:
     """Logs that a kernel is being compiled, and how long it took."""
     log.info("compiling %s for %s (first use only, then cached on disk) ...", name, where)
     started = time.perf_counter()
@@ -167,12 +167,12 @@ def cuda_problem() -> str | None:
 
     if torch.version.cuda is None:
         return "PyTorch is built without CUDA; install another build (https://pytorch.org) or use --device cpu"
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         available = torch.cuda.is_available()
     if not available:
         reason = (
-            " ".join(str(warning.message).split(". ")[0] for warning in said) or "no NVIDIA GPU or driver was found"
+            " ".join(str(warning.message).split(". ")[0] for warning in caught) or "no NVIDIA GPU or driver was found"
         )
         return (
             f"{reason.strip()}; `nvidia-smi` should list the GPU. Install or update the NVIDIA driver (CUDA "

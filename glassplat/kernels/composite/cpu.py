@@ -41,13 +41,13 @@ from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
 from glassplat.kernels.backend.cpu_vector import (
     absolute,
     bits_of,
+    drop_fourths,
     interleave,
     item,
     minimum,
     select,
     store,
     vector_kind,
-    without_fourths,
 )
 from glassplat.kernels.composite import cpu_tile as tile
 from glassplat.kernels.composite.cpu_backward import composite_backward
@@ -60,8 +60,8 @@ from glassplat.kernels.composite.cpu_tile import (
     list_block,
     list_plain_block,
     new_pair_rows,
-    place,
     sum_pair_rows,
+    tile_bounds,
 )
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar
 from glassplat.kernels.records import LEAST_ALPHA, ON_MEAN, REAL_OF, Deviation, Splats, TileBins
@@ -230,7 +230,7 @@ def _write_tile(real: type) -> Scalar:
             if channels == 4:
                 store(image, (first + y * width) * 4, rows[y])
             else:
-                eight, four = without_fourths(rows[y])
+                eight, four = drop_fourths(rows[y])
                 store(image, (first + y * width) * 3, eight)
                 store(image, (first + y * width) * 3 + 8, four)
 
@@ -336,7 +336,7 @@ def composite_forward(real: type) -> Kernel:
             weights: Any = np.empty(CHUNK * LANES, real)
             begun = task * stride % num_tasks * TILES
             for n in range(begun, min(active.size, begun + TILES)):
-                camera, x0, y0, columns, rows = place(active[n], image_width, height)
+                camera, x0, y0, columns, rows = tile_bounds(active[n], image_width, height)
                 start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
                 at = n * STATE
                 running = begin(state, at, columns, rows)

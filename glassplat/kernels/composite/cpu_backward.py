@@ -17,19 +17,19 @@ from numba import prange
 from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
 from glassplat.kernels.backend.cpu_vector import (
     absolute,
+    deinterleave,
     item,
     lowest_bit,
     maximum,
     minimum,
+    pad_fourths,
     select,
-    sorted_apart,
     store,
     sums_of,
     vector_kind,
-    with_fourths,
 )
 from glassplat.kernels.composite import cpu_tile as tile
-from glassplat.kernels.composite.cpu_tile import PAIR_VALUES, exponent, lane_of, place
+from glassplat.kernels.composite.cpu_tile import PAIR_VALUES, exponent, lane_of, tile_bounds
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, Scalar
 from glassplat.kernels.records import LEAST_ALPHA, ON_MEAN
 
@@ -182,7 +182,7 @@ def _load_gradients(real: type) -> Scalar:
     def load_row_of_four(v_image, pixel, channels):
         if channels == 4:
             return load(v_image, pixel * 4)
-        return with_fourths(load_eight(v_image, pixel * 3), load_row(v_image, pixel * 3 + 8))
+        return pad_fourths(load_eight(v_image, pixel * 3), load_row(v_image, pixel * 3 + 8))
 
     @inlined
     def load_whole_block(planes, i, v_image, v_alpha, first, width, channels):
@@ -190,7 +190,7 @@ def _load_gradients(real: type) -> Scalar:
         r0, r1 = load_row_of_four(v_image, first, channels), load_row_of_four(v_image, first + width, channels)
         r2 = load_row_of_four(v_image, first + 2 * width, channels)
         r3 = load_row_of_four(v_image, first + 3 * width, channels)
-        v0, v1, v2, v3 = sorted_apart((r0, r1, r2, r3))
+        v0, v1, v2, v3 = deinterleave((r0, r1, r2, r3))
         store(planes, V_IMAGE + i, v0)
         store(planes, V_IMAGE + PIXELS + i, v1)
         store(planes, V_IMAGE + 2 * PIXELS + i, v2)
@@ -305,7 +305,7 @@ def composite_backward(real: type, with_absgrad: bool) -> Kernel:
                 start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
                 if start == stop:
                     continue
-                camera, x0, y0, columns, lines = place(active[n], image_width, height)
+                camera, x0, y0, columns, lines = tile_bounds(active[n], image_width, height)
                 corner, at = (camera * height + y0) * image_width + x0, n * STATE
                 looked_at = begin(planes, state, at, v_mask, corner, image_width, columns, lines, with_glass)
                 load_gradients(planes, v_image, v_alpha, corner, image_width, columns, lines, num_channels)

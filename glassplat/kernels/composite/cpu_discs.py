@@ -32,9 +32,9 @@ from glassplat.kernels.backend.cpu_vector import (
     vector_kind,
 )
 from glassplat.kernels.composite import cpu_tile as tile
-from glassplat.kernels.composite.cpu_tile import SPLATS, STOP_AFTER, lane_of, list_block, place
+from glassplat.kernels.composite.cpu_tile import SPLATS, STOP_AFTER, lane_of, list_block, tile_bounds
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar
-from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, meet_maths, meet_slopes
+from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, intersect_maths, offset_gradient
 from glassplat.kernels.records import REAL_OF, Discs, TileBins
 
 # Columns of a packed disc: first its outline as a packed splat, whose ORDER column is reused once blocks are known.
@@ -95,7 +95,7 @@ def _fetch(real: type) -> Scalar:
 
 
 def _cover(real: type) -> Scalar:
-    meet, exp2, full = meet_maths(real), tile.exp2_of(real), vector_kind(real, tile.LANES).full
+    intersect, exp2, full = intersect_maths(real), tile.exp2_of(real), vector_kind(real, tile.LANES).full
     x_centers, y_centers = tile.pixel_centers(real)
     zero, one, farthest = real(0.0), real(1.0), real(MOST_DEVIATIONS**2)
     half_bits, least = real(0.5 / math.log(2.0)), real(math.log2(ALPHA_MIN))
@@ -116,7 +116,7 @@ def _cover(real: type) -> Scalar:
             item(batch, at + W_X), item(batch, at + W_Y),
         )  # fmt: skip
         none, ones = full(zero), full(one)
-        up, vp, e = meet(found, dx, dy)
+        up, vp, e = intersect(found, dx, dy)
         inverse = ones / e
         u, v = up * inverse, vp * inverse
         solid = u * u + v * v
@@ -130,8 +130,8 @@ def _cover(real: type) -> Scalar:
         drawn = (q <= farthest) & (bits >= least)
         coverage = select(drawn, exp2(bits), none)
         on_disc = within & (solid <= select(nearer, around, full(far)))
-        met = select(on_disc, u, none), select(on_disc, v, none), select(on_disc, inverse, ones)
-        return (dx, dy), met, select(on_disc, e, ones), coverage, on_disc
+        hit = select(on_disc, u, none), select(on_disc, v, none), select(on_disc, inverse, ones)
+        return (dx, dy), hit, select(on_disc, e, ones), coverage, on_disc
 
     return cover
 
@@ -157,13 +157,13 @@ def _blend_block(real: type) -> Scalar:
         e = 0
         while e < count:
             splat = item(entries, e) * width
-            _, met, nearness, coverage, _ = cover(batch, splat, x, y, near, sharpness)
+            _, hit, nearness, coverage, _ = cover(batch, splat, x, y, near, sharpness)
             alpha = minimum(coverage, most)
             weight = alpha * t
             after = t - weight
             alive = after >= t_min
             weight = select(alive, weight, none)
-            z, position = met[2] * item(batch, splat + Z), full(item(batch, splat + ORDER))
+            z, position = hit[2] * item(batch, splat + Z), full(item(batch, splat + ORDER))
             inverse = nearness * item(batch, splat + INVERSE_Z)
             # Relative to the first disc of the pixel: squares of nearly equal inverse depths would cancel.
             first = select(t >= one, inverse, first)
@@ -268,7 +268,7 @@ def composite_discs_forward(real: type) -> Kernel:
         stride = even_stride(active.size)
         for task in prange(active.size):
             n = task * stride % active.size
-            camera, x0, y0, columns, rows = place(active[n], image_width, height)
+            camera, x0, y0, columns, rows = tile_bounds(active[n], image_width, height)
             start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
             at = n * STATE
             running = begin(state, at, columns, rows)
@@ -401,7 +401,7 @@ def _unblend(real: type) -> Scalar:
             vp_x, vp_y, vp_1 = vp_x + v_vp * dx, vp_y + v_vp * dy, vp_1 + v_vp
             e_x, e_y, e_1 = e_x + v_e * dx, e_y + v_e * dy, e_1 + v_e
             around_x, around_y = around_x + v_around * dx, around_y + v_around * dy
-            slope_x, slope_y = meet_slopes(found, v_up, v_vp, v_e)
+            slope_x, slope_y = offset_gradient(found, v_up, v_vp, v_e)
             absgrad_x = absgrad_x + absolute(slope_x + v_around * dx)
             absgrad_y = absgrad_y + absolute(slope_y + v_around * dy)
         sums = (
@@ -463,7 +463,7 @@ def composite_discs_backward(real: type) -> Kernel:
             start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
             if start == stop:
                 continue
-            camera, x0, y0, columns, lines = place(active[n], image_width, height)
+            camera, x0, y0, columns, lines = tile_bounds(active[n], image_width, height)
             corner, at = (camera * height + y0) * image_width + x0, n * STATE
             planes = np.empty(V_IMAGE + groups * 4 * PIXELS, real)
             sums: Any = np.empty(LANES, real)

@@ -167,7 +167,7 @@ def pack_of(real: type) -> Scalar:
 
 
 @inlined
-def place(tile, width, height):
+def tile_bounds(tile, width, height):
     """Camera, first column, first row, columns and rows of a tile."""
     tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     camera, rest = tile // (tiles_x * tiles_y), tile % (tiles_x * tiles_y)

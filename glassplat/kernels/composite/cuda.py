@@ -15,7 +15,7 @@ from numba import cuda
 from torch import Tensor
 
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
-from glassplat.kernels.composite.cpu_tile import joined_cameras, place
+from glassplat.kernels.composite.cpu_tile import joined_cameras, tile_bounds
 from glassplat.kernels.composite.cuda_backward import EXTRAS, THREADS, WARPS, composite_backward, composite_cotangents
 from glassplat.kernels.composite.cuda_discs import composite_discs, composite_discs_gradients
 from glassplat.kernels.composite.cuda_tile import (
@@ -169,7 +169,7 @@ def composite_forward(real: type, num_channels: int = 4) -> Kernel:
         most = cuda.shared.array(1, np.int32)
         sums = cuda.local.array(num_channels, real)
         n, pixel = cuda.blockIdx.x, cuda.threadIdx.x
-        camera, x0, y0, columns, num_rows = place(active[n], image.shape[2], image.shape[1])
+        camera, x0, y0, columns, num_rows = tile_bounds(active[n], image.shape[2], image.shape[1])
         column, row = pixel % TILE, pixel // TILE
         x, y, bit = real(np.int32(column)), real(np.int32(row)), np.int32(1 << row)
         inside = column < columns and row < num_rows
@@ -267,7 +267,7 @@ def composite_deviation(real: type) -> Kernel:
         reached = cuda.shared.array(PIXELS, np.int32)
         members = cuda.shared.array(PIXELS, np.int32)
         n, pixel = cuda.blockIdx.x, cuda.threadIdx.x
-        camera, x0, y0, columns, num_rows = place(active[n], image.shape[2], image.shape[1])
+        camera, x0, y0, columns, num_rows = tile_bounds(active[n], image.shape[2], image.shape[1])
         column, row = pixel % TILE, pixel // TILE
         x, y, bit = real(np.int32(column)), real(np.int32(row)), np.int32(1 << row)
         inside = column < columns and row < num_rows

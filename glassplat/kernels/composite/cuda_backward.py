@@ -17,7 +17,7 @@ from numba import cuda
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, kernel
 from glassplat.kernels.backend.devices import SIMULATED
-from glassplat.kernels.composite.cpu_tile import place
+from glassplat.kernels.composite.cpu_tile import tile_bounds
 from glassplat.kernels.composite.cuda_tile import BUCKET, COLUMNS, MEAN_X, MEAN_Y, MOMENTS, PIXELS, at, tile_steps
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, Scalar
 from glassplat.kernels.maths.fast_maths import reciprocal_maths
@@ -53,7 +53,7 @@ def composite_cotangents(real: type, num_channels: int = 4) -> Kernel:
         v_image, v_alpha, v_mask, v_deviation, v_spread, v_pixels,
     ):  # fmt: skip
         n, pixel = cuda.blockIdx.x, cuda.threadIdx.x
-        camera, x0, y0, columns, rows = place(active[n], v_image.shape[2], v_image.shape[1])
+        camera, x0, y0, columns, rows = tile_bounds(active[n], v_image.shape[2], v_image.shape[1])
         column, row = pixel % TILE, pixel // TILE
         if column >= columns or row >= rows:
             return
@@ -158,7 +158,7 @@ def composite_backward(real: type, num_channels: int = 4, with_absgrad: bool = T
         first = (bucket - n - start // BUCKET) * BUCKET
         if first >= looked_at[n]:
             return
-        camera, x0, y0, _, rows = place(active[n], width, height)
+        camera, x0, y0, _, rows = tile_bounds(active[n], width, height)
         first_glass, has_glass = camera * splats_per_camera + num_primary, num_primary < splats_per_camera
         planes = num_channels + 3 if has_glass else num_channels + 1
         entry, tile_pixels, tile_last = bucket * planes * PIXELS, n * (num_channels + EXTRAS) * PIXELS, n * 2 * PIXELS

@@ -20,10 +20,10 @@ from torch import Tensor
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.backend.devices import SIMULATED
-from glassplat.kernels.composite.cpu_tile import joined_cameras, place
+from glassplat.kernels.composite.cpu_tile import joined_cameras, tile_bounds
 from glassplat.kernels.composite.cuda_tile import BUCKET, PIXELS, at
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar, blend_maths
-from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, meet_slopes
+from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, offset_gradient
 from glassplat.kernels.maths.fast_maths import exp2_maths, fused_maths, reciprocal_maths
 from glassplat.kernels.records import REAL_OF, TILE, Discs, TileBins
 
@@ -124,7 +124,7 @@ def composite_discs_cotangents(real: type, num_channels: int = 6) -> Kernel:
     )
     def gather(active, finals, image, depth, v_image, v_alpha, v_depth, v_median, v_distortion, v_pixels):
         n, pixel = cuda.blockIdx.x, cuda.threadIdx.x
-        camera, x0, y0, columns, rows = place(active[n], v_image.shape[2], v_image.shape[1])
+        camera, x0, y0, columns, rows = tile_bounds(active[n], v_image.shape[2], v_image.shape[1])
         column, row = pixel % TILE, pixel // TILE
         if column >= columns or row >= rows:
             return
@@ -208,7 +208,7 @@ def composite_discs_backward(real: type, num_channels: int = 6) -> Kernel:
         first = (bucket - n - start // BUCKET) * BUCKET
         if first >= looked_at[n]:
             return
-        _, x0, y0, _, rows = place(active[n], width, height)
+        _, x0, y0, _, rows = tile_bounds(active[n], width, height)
         entry, tile_pixels = bucket * (KEPT_VALUES + num_channels) * PIXELS, n * (num_channels + EXTRAS) * PIXELS
         tile_orders = n * ORDERS * PIXELS
         for pixel in range(lane, PIXELS, BUCKET):
@@ -277,7 +277,7 @@ def composite_discs_backward(real: type, num_channels: int = 6) -> Kernel:
                         up_x, up_y, up_1 = up_x + v_up * dx, up_y + v_up * dy, up_1 + v_up
                         vp_x, vp_y, vp_1 = vp_x + v_vp * dx, vp_y + v_vp * dy, vp_1 + v_vp
                         e_x, e_y, e_1 = e_x + v_e * dx, e_y + v_e * dy, e_1 + v_e
-                        slope_x, slope_y = meet_slopes(found, v_up, v_vp, v_e)
+                        slope_x, slope_y = offset_gradient(found, v_up, v_vp, v_e)
                         absgrad_x, absgrad_y = absgrad_x + abs(slope_x), absgrad_y + abs(slope_y)
                     else:
                         moved_x, moved_y = gain * around * dx, gain * around * dy
@@ -408,7 +408,7 @@ def composite_discs_forward(real: type, num_channels: int = 6) -> Kernel:
         most = cuda.shared.array(1, np.int32)
         sums = cuda.local.array(num_channels, real)
         n, pixel = cuda.blockIdx.x, cuda.threadIdx.x
-        camera, x0, y0, columns, num_rows = place(active[n], image.shape[2], image.shape[1])
+        camera, x0, y0, columns, num_rows = tile_bounds(active[n], image.shape[2], image.shape[1])
         column, row = pixel % TILE, pixel // TILE
         x, y, bit = real(np.int32(column)), real(np.int32(row)), np.int32(1 << row)
         inside = column < columns and row < num_rows
@@ -445,7 +445,7 @@ def composite_discs_forward(real: type, num_channels: int = 6) -> Kernel:
                 while i < group:
                     k = np.uint32(i)
                     if np.int32(reached[k] & bit) != 0:
-                        _, met, e, covered, _ = cover(geometry, k, x, y, near, sharpness)
+                        _, hit, e, covered, _ = cover(geometry, k, x, y, near, sharpness)
                         weight = min(covered, alpha_max) * t
                         left = t - weight
                         if covered > zero and left >= t_min:
@@ -456,7 +456,7 @@ def composite_discs_forward(real: type, num_channels: int = 6) -> Kernel:
                             spread += weight * ((apart * (one - t) - two * total) * apart + squares)
                             total += weight * apart
                             squares += weight * apart * apart
-                            z = met[2] * geometry[k, Z]
+                            z = hit[2] * geometry[k, Z]
                             far += weight * z
                             last_order = np.int32(first + i)
                             if t > half:

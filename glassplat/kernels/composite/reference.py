@@ -140,11 +140,11 @@ def composite_discs(
     for c in range(bins.num_cameras):
         own = Discs(discs.means2d[c], discs.maps[c], discs.opacities[c], discs.depths[c], discs.outlines)
         found = _camera(own, channels[c], bins, near, low_pass, None if absgrad is None else absgrad[c])
-        blended.append([torch.where(_over(active[c], x), x, torch.zeros_like(x)) for x in found])
+        blended.append([torch.where(_expand_mask(active[c], x), x, torch.zeros_like(x)) for x in found])
     return BlendedDiscs(*(torch.stack(tensors) for tensors in zip(*blended, strict=True)))
 
 
-def _over(mask: Tensor, value: Tensor) -> Tensor:
+def _expand_mask(mask: Tensor, value: Tensor) -> Tensor:
     return mask.reshape(mask.shape + (1,) * (value.dim() - 2))
 
 

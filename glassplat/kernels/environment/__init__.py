@@ -221,11 +221,11 @@ class _ShadeEnvironment(torch.autograd.Function):
         cotangents = [gradient.contiguous() for gradient in gradients]
         kernels = kernels_for("environment", reflection.device)
         found = kernels.shade_environment_gradients(inputs, ctx.least_strength, (base, reflection), cotangents)
-        turn = _gradient_of_turn(inputs, ctx.least_strength, cotangents) if ctx.needs_input_grad[5] else None
+        turn = _rotation_gradient(inputs, ctx.least_strength, cotangents) if ctx.needs_input_grad[5] else None
         return (None, *found, None, turn, None)
 
 
-def _gradient_of_turn(inputs: list[Tensor], least_strength: float, cotangents: list[Tensor]) -> Tensor:
+def _rotation_gradient(inputs: list[Tensor], least_strength: float, cotangents: list[Tensor]) -> Tensor:
     """Gradient [3, 3] of the camera's rotation, which rotates the reflected rays.
 
     Only the refinement of cameras needs it, so it has no kernel of its own.

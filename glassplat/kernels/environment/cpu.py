@@ -345,13 +345,13 @@ def normal_of(blended, row, column):
     return blended[row, column, NORMAL_AT], blended[row, column, NORMAL_AT + 1], blended[row, column, NORMAL_AT + 2]
 
 
-def _place(real: type) -> Scalar:
+def _cube_positions(real: type) -> Scalar:
     maths = cube_maths(real)
     on_face, cell = maths.on_face, maths.cell
     one, half = real(1.0), real(0.5)
 
     @inlined
-    def place(run, whole, row, side, intrinsics, rotation):
+    def cube_positions(run, whole, row, side, intrinsics, rotation):
         """Positions on the cube that the pixels of a run reflect."""
         inverse_f, start = one / intrinsics[0], half - intrinsics[2]
         y = (real(np.int32(row)) + half - intrinsics[3]) / intrinsics[1]
@@ -376,25 +376,25 @@ def _place(real: type) -> Scalar:
             whole[CELL_ROW + i], whole[CELL + i] = cell_row, left
             whole[FIRST + i] = (cell_row * side + left) * np.int32(3)
 
-    return place
+    return cube_positions
 
 
 @cache
 def shade_environment_forward(real: type) -> Kernel:
     """Fills rgb, base and reflection."""
-    maths, place = cube_maths(real), _place(real)
-    logistic, between = maths.logistic, maths.between
+    maths, cube_positions = cube_maths(real), _cube_positions(real)
+    logistic, bilinear = maths.logistic, maths.bilinear
     shortest = real(NORMAL_MIN**2)
     zero, one = real(0.0), real(1.0)
 
     @inlined
-    def look(run, whole, flat, below):
+    def sample_cube(run, whole, flat, below):
         """The colour that each pixel of a run reflects; `below` is the offset of the next row of cells."""
         for d in range(3):
             for i in range(RUN):
                 at, along, down = whole[FIRST + i] + d, run[ALONG + i], run[DOWN + i]
                 under = at + below
-                run[SEEN + d * RUN + i] = between(flat[at], flat[at + 3], flat[under], flat[under + 3], along, down)
+                run[SEEN + d * RUN + i] = bilinear(flat[at], flat[at + 3], flat[under], flat[under + 3], along, down)
         for i in range(3 * RUN):
             run[SEEN + i] = logistic(run[SEEN + i])
 
@@ -425,8 +425,8 @@ def shade_environment_forward(real: type) -> Kernel:
                 if count < RUN and column < width - 1:
                     continue
                 if count > 0:
-                    place(run, whole, row, side, intrinsics, rotation)
-                    look(run, whole, flat, 3 * side)
+                    cube_positions(run, whole, row, side, intrinsics, rotation)
+                    sample_cube(run, whole, flat, 3 * side)
                 for i in range(count):
                     at = whole[COLUMN + i]
                     for d in range(3):
@@ -438,11 +438,11 @@ def shade_environment_forward(real: type) -> Kernel:
     return forward
 
 
-def _slopes(real: type) -> Scalar:
-    slopes, zero = cube_maths(real).slopes, real(0.0)
+def _position_gradients(real: type) -> Scalar:
+    bilinear_gradient, zero = cube_maths(real).bilinear_gradient, real(0.0)
 
     @inlined
-    def slopes_of_run(run, whole, flat, below):
+    def position_gradients(run, whole, flat, below):
         """Gradients of each pixel's position among the cells, from those of its lookup."""
         for i in range(RUN):
             run[BY_COLUMN + i], run[BY_ROW + i] = zero, zero
@@ -450,38 +450,42 @@ def _slopes(real: type) -> Scalar:
             for i in range(RUN):
                 at, v = whole[FIRST + i] + d, run[V_RAW + d * RUN + i]
                 under = at + below
-                by_column, by_row = slopes(
+                by_column, by_row = bilinear_gradient(
                     flat[at], flat[at + 3], flat[under], flat[under + 3], run[ALONG + i], run[DOWN + i]
                 )
                 run[BY_COLUMN + i] += v * by_column
                 run[BY_ROW + i] += v * by_row
 
-    return slopes_of_run
+    return position_gradients
 
 
-def _turn(real: type) -> Scalar:
+def _normal_gradients(real: type) -> Scalar:
     from_face = cube_maths(real).from_face
     half = real(0.5)
 
     @inlined
-    def turn(run, whole, side):
+    def normal_gradients(run, whole, side):
         """Replaces the normals by their gradients."""
         cells_per_u = half * real(side - np.int32(2))
         for i in range(RUN):
-            place = whole[AXIS + i], whole[FACE + i], run[PLACE + i], run[PLACE + RUN + i], run[PLACE + 2 * RUN + i]
-            g = from_face(place, run[BY_COLUMN + i] * cells_per_u, run[BY_ROW + i] * cells_per_u)
+            position = whole[AXIS + i], whole[FACE + i], run[PLACE + i], run[PLACE + RUN + i], run[PLACE + 2 * RUN + i]
+            g = from_face(position, run[BY_COLUMN + i] * cells_per_u, run[BY_ROW + i] * cells_per_u)
             ray = run[RAY + i], run[RAY + RUN + i], run[RAY + 2 * RUN + i]
             normal = run[NORMAL + i], run[NORMAL + RUN + i], run[NORMAL + 2 * RUN + i]
             x, y, z = mirrored_gradient(ray, normal, g)
             run[NORMAL + i], run[NORMAL + RUN + i], run[NORMAL + 2 * RUN + i] = x, y, z
 
-    return turn
+    return normal_gradients
 
 
 @cache
 def shade_environment_backward(real: type) -> Kernel:
     """Fills the gradients of blended, alpha and the lookups, and the cells and fractions of each pixel."""
-    place, slopes, turn = _place(real), _slopes(real), _turn(real)
+    cube_positions, position_gradients, normal_gradients = (
+        _cube_positions(real),
+        _position_gradients(real),
+        _normal_gradients(real),
+    )
     shortest = real(NORMAL_MIN**2)
     zero, one = real(0.0), real(1.0)
 
@@ -524,9 +528,9 @@ def shade_environment_backward(real: type) -> Kernel:
                 if count < RUN and column < width - 1:
                     continue
                 if count > 0:
-                    place(run, whole, row, side, intrinsics, rotation)
-                    slopes(run, whole, flat, 3 * side)
-                    turn(run, whole, side)
+                    cube_positions(run, whole, row, side, intrinsics, rotation)
+                    position_gradients(run, whole, flat, 3 * side)
+                    normal_gradients(run, whole, side)
                 for i in range(count):
                     at = whole[COLUMN + i]
                     for d in range(3):

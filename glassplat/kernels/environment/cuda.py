@@ -304,12 +304,12 @@ def shade_environment_gradients(
     return v_blended, v_alpha, texel_gradients(first_cells, fractions, v_raw, texels.shape[1])
 
 
-def _place(real: type) -> Scalar:
+def _cube_position(real: type) -> Scalar:
     maths, one, half = cube_maths(real), real(1.0), real(0.5)
     on_face, cell = maths.on_face, maths.cell
 
     @inlined
-    def place(row, column, normal, intrinsics, rotation, size):
+    def cube_position(row, column, normal, intrinsics, rotation, size):
         """The ray of a pixel, the position on the cube that it is reflected to, and the cells and fractions there."""
         x = (real(np.int32(column)) + half - intrinsics[2]) * (one / intrinsics[0])
         y = (real(np.int32(row)) + half - intrinsics[3]) / intrinsics[1]
@@ -324,14 +324,14 @@ def _place(real: type) -> Scalar:
         top, down = cell(at[3], size)
         return ray, at, left, along, top, down
 
-    return place
+    return cube_position
 
 
 @cache
 def shade_environment_forward(real: type) -> Kernel:
     """Fills rgb, base and reflection."""
-    maths, place = cube_maths(real), _place(real)
-    logistic, between = maths.logistic, maths.between
+    maths, cube_position = cube_maths(real), _cube_position(real)
+    logistic, bilinear = maths.logistic, maths.bilinear
     shortest, zero, one = real(NORMAL_MIN**2), real(0.0), real(1.0)
 
     @kernel("shade_environment_forward", real, "real real3 real2 real4 real1 real2 real1 real3 real3 real3")
@@ -348,10 +348,10 @@ def shade_environment_forward(real: type) -> Kernel:
             for d in range(3):
                 rgb[row, column, d], reflection[row, column, d] = base[row, column, d], zero
             return
-        _, at, left, along, top, down = place(row, column, normal, intrinsics, rotation, padded.shape[1] - 2)
+        _, at, left, along, top, down = cube_position(row, column, normal, intrinsics, rotation, padded.shape[1] - 2)
         upper, lower = padded[at[1], top], padded[at[1], top + 1]
         for d in range(3):
-            raw = between(upper[left, d], upper[left + 1, d], lower[left, d], lower[left + 1, d], along, down)
+            raw = bilinear(upper[left, d], upper[left + 1, d], lower[left, d], lower[left + 1, d], along, down)
             seen, behind = logistic(raw), base[row, column, d]
             reflection[row, column, d] = seen
             rgb[row, column, d] = behind + share * (seen - behind)
@@ -362,8 +362,8 @@ def shade_environment_forward(real: type) -> Kernel:
 @cache
 def shade_environment_backward(real: type) -> Kernel:
     """Fills the gradients of blended, alpha and the lookups, and the cells and fractions of each pixel."""
-    maths, place = cube_maths(real), _place(real)
-    from_face, slopes = maths.from_face, maths.slopes
+    maths, cube_position = cube_maths(real), _cube_position(real)
+    from_face, bilinear_gradient = maths.from_face, maths.bilinear_gradient
     shortest, zero, half, one = real(NORMAL_MIN**2), real(0.0), real(0.5), real(1.0)
 
     @kernel(
@@ -393,7 +393,7 @@ def shade_environment_backward(real: type) -> Kernel:
         if bare:
             first_cells[i] = 6 * side * side
             return
-        ray, at, left, along, top, down = place(row, column, normal, intrinsics, rotation, side - 2)
+        ray, at, left, along, top, down = cube_position(row, column, normal, intrinsics, rotation, side - 2)
         face, v_share, by_column, by_row = at[1], zero, zero, zero
         upper, lower = padded[face, top], padded[face, top + 1]
         for d in range(3):
@@ -401,7 +401,9 @@ def shade_environment_backward(real: type) -> Kernel:
             v_share += v * (seen - base[row, column, d])
             v = (v * share + v_reflection[row, column, d]) * seen * (one - seen)
             v_raw[i, d] = v
-            steepness = slopes(upper[left, d], upper[left + 1, d], lower[left, d], lower[left + 1, d], along, down)
+            steepness = bilinear_gradient(
+                upper[left, d], upper[left + 1, d], lower[left, d], lower[left + 1, d], along, down
+            )
             by_column += v * steepness[0]
             by_row += v * steepness[1]
         v_pixel[STRENGTH_AT] = v_share

@@ -13,7 +13,7 @@ import numpy as np
 
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import Scalar, blend_maths
-from glassplat.kernels.maths.projection import blend, dot
+from glassplat.kernels.maths.projection import dot, linear_combination
 
 
 class CubeMaths(NamedTuple):
@@ -24,17 +24,17 @@ class CubeMaths(NamedTuple):
         from_face: gradient of x, y, z from those of u and v, given the result of `on_face`.
         cell: first of the two cells around u or v, and the fraction of the way to the second one. The cell is valid for
             every value; the fraction of NaN is NaN.
-        between: bilinear interpolation of two cells of a row and the two below them, at the fractions along the row and
-            down.
-        slopes: its derivatives with respect to these fractions.
+        bilinear: bilinear interpolation of two cells of a row and the two below them, at the fractions along the row
+            and down.
+        bilinear_gradient: its derivatives with respect to these fractions.
         logistic: 1 / (1 + exp(-x)).
     """
 
     on_face: Scalar
     from_face: Scalar
     cell: Scalar
-    between: Scalar
-    slopes: Scalar
+    bilinear: Scalar
+    bilinear_gradient: Scalar
     logistic: Scalar
 
 
@@ -92,18 +92,18 @@ def _filter(real: type) -> tuple[Scalar, Scalar]:
     one = real(1.0)
 
     @inlined
-    def between(left, right, lower_left, lower_right, along, down):  # type: ignore[no-untyped-def]
+    def bilinear(left, right, lower_left, lower_right, along, down):  # type: ignore[no-untyped-def]
         above = left * (one - along) + right * along
         below = lower_left * (one - along) + lower_right * along
         return above * (one - down) + below * down
 
     @inlined
-    def slopes(left, right, lower_left, lower_right, along, down):  # type: ignore[no-untyped-def]
+    def bilinear_gradient(left, right, lower_left, lower_right, along, down):  # type: ignore[no-untyped-def]
         across = right - left
         twist = lower_right - lower_left - across
         return across + down * twist, lower_left - left + along * twist
 
-    return between, slopes
+    return bilinear, bilinear_gradient
 
 
 def _logistic(real: type) -> Scalar:
@@ -122,7 +122,7 @@ def _logistic(real: type) -> Scalar:
 
 def lookup_maths(real: type) -> tuple[Scalar, Scalar]:
     """Lookup of padded faces in direction `i`, and the gradient of that direction."""
-    on_face, from_face, cell, between, slopes, _ = cube_maths(real)
+    on_face, from_face, cell, bilinear, bilinear_gradient, _ = cube_maths(real)
     zero, half = real(0.0), real(0.5)
 
     @inlined
@@ -133,7 +133,7 @@ def lookup_maths(real: type) -> tuple[Scalar, Scalar]:
         row, down = cell(v, size)
         upper, lower = padded[face, row], padded[face, row + 1]
         for d in range(padded.shape[3]):
-            found[i, d] = between(
+            found[i, d] = bilinear(
                 upper[column, d], upper[column + 1, d], lower[column, d], lower[column + 1, d], along, down
             )
 
@@ -148,7 +148,7 @@ def lookup_maths(real: type) -> tuple[Scalar, Scalar]:
         upper, lower = padded[face, row], padded[face, row + 1]
         v_along, v_down = zero, zero
         for d in range(padded.shape[3]):
-            by_along, by_down = slopes(
+            by_along, by_down = bilinear_gradient(
                 upper[column, d], upper[column + 1, d], lower[column, d], lower[column + 1, d], along, down
             )
             v_along += v_found[i, d] * by_along
@@ -169,13 +169,13 @@ TWO = np.float32(2.0)
 @inlined
 def mirror_ray(ray, normal):  # type: ignore[no-untyped-def]
     """A ray mirrored by a normal of any length, times the square of that length."""
-    return blend(dot(normal, normal), ray, -TWO * dot(ray, normal), normal)
+    return linear_combination(dot(normal, normal), ray, -TWO * dot(ray, normal), normal)
 
 
 @inlined
 def mirrored_gradient(ray, normal, g):  # type: ignore[no-untyped-def]
     """Gradient of the normal from that of the mirrored ray."""
-    by_square = blend(TWO * dot(ray, g), normal, -TWO * dot(normal, g), ray)
+    by_square = linear_combination(TWO * dot(ray, g), normal, -TWO * dot(normal, g), ray)
     across = -TWO * dot(ray, normal)
     return by_square[0] + across * g[0], by_square[1] + across * g[1], by_square[2] + across * g[2]
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
-from glassplat.kernels.maths.projection import along, blend, cross, dot, scaled_sum
+from glassplat.kernels.maths.projection import cross, dot, dot_products, linear_combination, scaled_sum
 
 EDGE_ON = 1e-3
 """Cosine between ray and normal below which a disc is seen edge-on and not intersected."""
@@ -34,14 +34,14 @@ class RayHitMaths(NamedTuple):
     """Steps for one ray and one Gaussian; vectors are tuples, a frame is a tuple of three rows.
 
     Attributes:
-        meet: (t, q, squared |q|) from offset (centre minus origin), direction and frame; t is not finite where the two
-            do not meet.
-        meet_gradient: gradients (origin, direction, frame rows) from those of t and of squared |q|. That of the centre
-            is the negative of the origin's.
+        intersect: (t, q, squared |q|) from offset (centre minus origin), direction and frame; t is not finite where the
+            two do not meet.
+        intersect_gradient: gradients (origin, direction, frame rows) from those of t and of squared |q|. That of the
+            centre is the negative of the origin's.
     """
 
-    meet: Scalar
-    meet_gradient: Scalar
+    intersect: Scalar
+    intersect_gradient: Scalar
 
 
 def ray_hit_maths(real: type, flat: bool) -> RayHitMaths:
@@ -53,23 +53,23 @@ def _disc(real: type) -> RayHitMaths:
     zero, one, two, nowhere, edge_on = real(0.0), real(1.0), real(2.0), real("inf"), real(EDGE_ON)
 
     @inlined
-    def meet(offset, d, frame):  # type: ignore[no-untyped-def]
+    def intersect(offset, d, frame):  # type: ignore[no-untyped-def]
         slope = dot(frame[2], d)
         if not slope * slope > edge_on * edge_on * dot(d, d):
             return nowhere, (zero, zero, zero), nowhere
         t = dot(frame[2], offset) / slope
-        x = blend(t, d, -one, offset)
+        x = linear_combination(t, d, -one, offset)
         u, v = dot(frame[0], x), dot(frame[1], x)
         return t, (u, v, zero), u * u + v * v
 
     @inlined
-    def meet_gradient(offset, d, frame, t, q, v_t, v_squared):  # type: ignore[no-untyped-def]
+    def intersect_gradient(offset, d, frame, t, q, v_t, v_squared):  # type: ignore[no-untyped-def]
         inverse_slope = one / dot(frame[2], d)
-        x = blend(t, d, -one, offset)
+        x = linear_combination(t, d, -one, offset)
         v_u, v_v = two * v_squared * q[0], two * v_squared * q[1]
-        v_x = blend(v_u, frame[0], v_v, frame[1])
+        v_x = linear_combination(v_u, frame[0], v_v, frame[1])
         along_normal = (v_t + dot(v_x, d)) * inverse_slope
-        v_origin = blend(one, v_x, -along_normal, frame[2])
+        v_origin = linear_combination(one, v_x, -along_normal, frame[2])
         v_d = t * v_origin[0], t * v_origin[1], t * v_origin[2]
         v_frame = (
             (v_u * x[0], v_u * x[1], v_u * x[2]),
@@ -78,7 +78,7 @@ def _disc(real: type) -> RayHitMaths:
         )
         return v_origin, v_d, v_frame
 
-    return RayHitMaths(meet, meet_gradient)
+    return RayHitMaths(intersect, intersect_gradient)
 
 
 def _ellipsoid(real: type) -> RayHitMaths:
@@ -96,34 +96,36 @@ def _ellipsoid(real: type) -> RayHitMaths:
         Across a thin ellipsoid q is a difference of numbers as large as the inverse of its thickness. Gradients
         multiply its rounding error by the same factor again.
         """
-        return blend(one, q, -dot(q, f) / length, f)
+        return linear_combination(one, q, -dot(q, f) / length, f)
 
     @inlined
-    def meet(offset, d, frame):  # type: ignore[no-untyped-def]
-        e, f = along(offset, frame[0], frame[1], frame[2]), along(d, frame[0], frame[1], frame[2])
+    def intersect(offset, d, frame):  # type: ignore[no-untyped-def]
+        e, f = dot_products(offset, frame[0], frame[1], frame[2]), dot_products(d, frame[0], frame[1], frame[2])
         length = dot(f, f)
         if not length > zero:
             return nowhere, (zero, zero, zero), nowhere
         t = dot(e, f) / length
-        q = across(blend(t, f, -one, e), f, length)
+        q = across(linear_combination(t, f, -one, e), f, length)
         return t, q, dot(q, q)
 
     @inlined
-    def meet_gradient(offset, d, frame, t, q, v_t, v_squared):  # type: ignore[no-untyped-def]
-        e, f = along(offset, frame[0], frame[1], frame[2]), along(d, frame[0], frame[1], frame[2])
+    def intersect_gradient(offset, d, frame, t, q, v_t, v_squared):  # type: ignore[no-untyped-def]
+        e, f = dot_products(offset, frame[0], frame[1], frame[2]), dot_products(d, frame[0], frame[1], frame[2])
         length = dot(f, f)
         # Repeated, because the first projection leaves a rounding error of its own.
         q = across(q, f, length)
         # The derivative of |q| with respect to t is zero, because t minimises |q|.
         by_t = v_t / length
-        v_e = blend(-two * v_squared, q, by_t, f)
-        v_f = blend(two * v_squared * t, q, by_t, (e[0] - two * t * f[0], e[1] - two * t * f[1], e[2] - two * t * f[2]))
+        v_e = linear_combination(-two * v_squared, q, by_t, f)
+        v_f = linear_combination(
+            two * v_squared * t, q, by_t, (e[0] - two * t * f[0], e[1] - two * t * f[1], e[2] - two * t * f[2])
+        )
         v_offset = scaled_sum(v_e, frame[0], frame[1], frame[2])
         v_d = scaled_sum(v_f, frame[0], frame[1], frame[2])
         v_frame = (outer(v_e[0], v_f[0], offset, d), outer(v_e[1], v_f[1], offset, d), outer(v_e[2], v_f[2], offset, d))
         return (-v_offset[0], -v_offset[1], -v_offset[2]), v_d, v_frame
 
-    return RayHitMaths(meet, meet_gradient)
+    return RayHitMaths(intersect, intersect_gradient)
 
 
 LOW_PASS = math.sqrt(0.5)
@@ -138,15 +140,15 @@ class DiscMaths(NamedTuple):
     """Steps for one disc in one camera; vectors are tuples.
 
     Attributes:
-        crossed: (q x m, m x p, p x q) from tangents and centre.
-        faces: whether a disc is not seen edge-on, from p x q and the centre.
-        map_of: the map from crossed vectors, centre, inverse deviations and focal lengths.
+        cross_products: (q x m, m x p, p x q) from tangents and centre.
+        is_not_edge_on: whether a disc is not seen edge-on, from p x q and the centre.
+        pixel_map: the map from these products, centre, inverse deviations and focal lengths.
         map_gradient: gradients of tangents, centre and the logarithms of the deviations from those of the map.
     """
 
-    crossed: Scalar
-    faces: Scalar
-    map_of: Scalar
+    cross_products: Scalar
+    is_not_edge_on: Scalar
+    pixel_map: Scalar
     map_gradient: Scalar
 
 
@@ -159,17 +161,17 @@ def _shape(real: type) -> tuple[Scalar, Scalar, Scalar]:
     edge_on, largest = real(EDGE_ON), real(np.finfo(real).max)
 
     @inlined
-    def crossed(p, q, m):  # type: ignore[no-untyped-def]
+    def cross_products(p, q, m):  # type: ignore[no-untyped-def]
         return cross(q, m), cross(m, p), cross(p, q)
 
     @inlined
-    def faces(n, m):  # type: ignore[no-untyped-def]
+    def is_not_edge_on(n, m):  # type: ignore[no-untyped-def]
         slope = dot(n, m)
         # Written so that NaN fails the comparison.
         return edge_on * edge_on * dot(n, n) * dot(m, m) < slope * slope <= largest
 
     @inlined
-    def map_of(a, b, n, m, inverse_u, inverse_v, fx, fy):  # type: ignore[no-untyped-def]
+    def pixel_map(a, b, n, m, inverse_u, inverse_v, fx, fy):  # type: ignore[no-untyped-def]
         k = m[2] / dot(n, m)
         x, y = k / fx, k / fy
         return (
@@ -181,7 +183,7 @@ def _shape(real: type) -> tuple[Scalar, Scalar, Scalar]:
             n[1] * y,
         )
 
-    return crossed, faces, map_of
+    return cross_products, is_not_edge_on, pixel_map
 
 
 def _map_gradient(real: type) -> Scalar:
@@ -189,7 +191,7 @@ def _map_gradient(real: type) -> Scalar:
 
     @inlined
     def plus(a, b):  # type: ignore[no-untyped-def]
-        return blend(one, a, one, b)
+        return linear_combination(one, a, one, b)
 
     @inlined
     def map_gradient(p, q, m, n, found, inverse_u, inverse_v, fx, fy, g):  # type: ignore[no-untyped-def]
@@ -201,10 +203,10 @@ def _map_gradient(real: type) -> Scalar:
         g_a = g[0] * inverse_u * x, g[1] * inverse_u * y, zero
         g_b = g[2] * inverse_v * x, g[3] * inverse_v * y, zero
         g_slope = -total / slope
-        g_n = blend(g_slope, m, one, (g[4] * x, g[5] * y, zero))
+        g_n = linear_combination(g_slope, m, one, (g[4] * x, g[5] * y, zero))
         g_p = plus(cross(g_b, m), cross(q, g_n))
         g_q = plus(cross(m, g_a), cross(g_n, p))
-        g_m = blend(g_slope, n, one, plus(cross(g_a, q), cross(p, g_b)))
+        g_m = linear_combination(g_slope, n, one, plus(cross(g_a, q), cross(p, g_b)))
         return g_p, g_q, (g_m[0], g_m[1], g_m[2] + total / m[2]), -along_u, -along_v
 
     return map_gradient
@@ -264,7 +266,7 @@ def outline(found, opacity, nearest, near, width, height):  # type: ignore[no-un
 
 
 @inlined
-def box(m, p, q, deviations, squared, near, fx, fy):  # type: ignore[no-untyped-def]
+def crossing_box(m, p, q, deviations, squared, near, fx, fy):  # type: ignore[no-untyped-def]
     """Bounds (left, right, top, bottom) of a disc that crosses the near plane, in pixels from the principal point.
 
     They enclose a rectangle in the disc's plane, with one side along the depth gradient, clipped at the near plane.
@@ -295,20 +297,20 @@ def box(m, p, q, deviations, squared, near, fx, fy):  # type: ignore[no-untyped-
     return left, right, top, bottom
 
 
-def meet_maths(real: type) -> Scalar:
-    """Builds `meet`: the numerators of u and v, and e, at offsets that may be vectors (`backend/cpu_vector.py`)."""
+def intersect_maths(real: type) -> Scalar:
+    """Builds `intersect`: the numerators of u and v, and e, at offsets or vectors of them (`backend/cpu_vector.py`)."""
     one = real(1.0)
 
     @inlined
-    def meet(found, dx, dy):  # type: ignore[no-untyped-def]
+    def intersect(found, dx, dy):  # type: ignore[no-untyped-def]
         u_x, u_y, v_x, v_y, w_x, w_y = found
         return dx * u_x + dy * u_y, dx * v_x + dy * v_y, dx * w_x + dy * w_y + one
 
-    return meet
+    return intersect
 
 
 @inlined
-def meet_slopes(found, g_u, g_v, g_e):  # type: ignore[no-untyped-def]
-    """The gradient of the offset from those of the results of `meet`."""
+def offset_gradient(found, g_u, g_v, g_e):  # type: ignore[no-untyped-def]
+    """The gradient of the offset from those of the results of `intersect`."""
     u_x, u_y, v_x, v_y, w_x, w_y = found
     return g_u * u_x + g_v * v_x + g_e * w_x, g_u * u_y + g_v * v_y + g_e * w_y

@@ -85,7 +85,7 @@ def harmonic_basis(real: type) -> Callable[..., Any]:
     return basis
 
 
-def channel_with(take: Callable[..., Any]) -> Callable[..., Any]:
+def build_channel(take: Callable[..., Any]) -> Callable[..., Any]:
     """Builds the function that evaluates one colour channel from harmonics, for scalars or vectors.
 
     `take(sh, n, k, c)` reads channel c of coefficient k.
@@ -109,7 +109,7 @@ def channel_with(take: Callable[..., Any]) -> Callable[..., Any]:
     return channel
 
 
-def color_gradient_with(real: type, put: Callable[..., Any], v_basis: Callable[..., Any]) -> Callable[..., Any]:
+def build_color_gradient(real: type, put: Callable[..., Any], v_basis: Callable[..., Any]) -> Callable[..., Any]:
     """Builds the adjoint of three colour channels, for scalars or vectors; it returns the gradient of the direction.
 
     `put(g_sh, at, k, b, g)` stores or adds the gradient of coefficient k, from its harmonic b and the gradients g of
@@ -163,7 +163,7 @@ def _color(basis: Callable[..., Any]) -> Callable[..., Any]:
     def take(sh, n, k, c):
         return sh[n, k, c]
 
-    channel = channel_with(take)
+    channel = build_channel(take)
 
     @inlined
     def color(sh, n, degree, x, y, z):
@@ -186,7 +186,7 @@ def _color_gradient(real: type, basis: Callable[..., Any]) -> Callable[..., Any]
     def v_basis(sh, n, k, g):
         return sh[n, k, 0] * g[0] + sh[n, k, 1] * g[1] + sh[n, k, 2] * g[2]
 
-    adjoint = color_gradient_with(real, add, v_basis)
+    adjoint = build_color_gradient(real, add, v_basis)
 
     @inlined
     def color_gradient(sh, n, degree, x, y, z, g, g_sh):

@@ -21,23 +21,23 @@ _LOG2 = tuple(2 / math.log(2.0) / k for k in (1, 3, 5, 7, 9))
 _EXP2 = tuple(math.log(2.0) ** k / math.factorial(k) for k in range(8))
 
 
-class ColorMaths(NamedTuple):
+class ColorSpaceMaths(NamedTuple):
     """Scalar functions of colour for one floating-point type.
 
     Attributes:
         linear: linear radiance of an sRGB value (IEC 61966-2-1); continued beyond 1, and linearly below 0.
-        linear_slope: derivative of `linear`, given the sRGB value and its linear radiance.
+        linear_derivative: derivative of `linear`, given the sRGB value and its linear radiance.
         encoded: sRGB value of a linear radiance, the inverse of `linear`.
-        encoded_slope: derivative of `encoded`, given the radiance and its sRGB value.
+        encoded_derivative: derivative of `encoded`, given the radiance and its sRGB value.
     """
 
     linear: Scalar
-    linear_slope: Scalar
+    linear_derivative: Scalar
     encoded: Scalar
-    encoded_slope: Scalar
+    encoded_derivative: Scalar
 
 
-def color_space_maths(real: type) -> ColorMaths:
+def color_space_maths(real: type) -> ColorSpaceMaths:
     """Builds the functions for `real`, np.float32 or np.float64."""
     power = _fast_power() if real is np.float32 else _exact_power
     low, low_linear = real(THRESHOLD_SRGB), real(THRESHOLD_LINEAR)
@@ -50,7 +50,7 @@ def color_space_maths(real: type) -> ColorMaths:
         return curved if color > low else color * inverse_slope
 
     @inlined
-    def linear_slope(color, radiance):  # type: ignore[no-untyped-def]
+    def linear_derivative(color, radiance):  # type: ignore[no-untyped-def]
         return gamma * radiance / ((color if color > low else low) + offset) if color > low else inverse_slope
 
     @inlined
@@ -59,11 +59,11 @@ def color_space_maths(real: type) -> ColorMaths:
         return curved if radiance > low_linear else slope * radiance
 
     @inlined
-    def encoded_slope(radiance, color):  # type: ignore[no-untyped-def]
+    def encoded_derivative(radiance, color):  # type: ignore[no-untyped-def]
         safe = radiance if radiance > low_linear else low_linear
         return inverse_gamma * (color + offset) / safe if radiance > low_linear else slope
 
-    return ColorMaths(linear, linear_slope, encoded, encoded_slope)
+    return ColorSpaceMaths(linear, linear_derivative, encoded, encoded_derivative)
 
 
 def _fast_power() -> Scalar:

@@ -23,7 +23,7 @@ LEAST_COSINE = 1e-6
 
 DARKEST = 0.05
 """sRGB value above which the derivative of linear light is treated as proportional to it, as for a gamma of 2."""
-MOST_HELD = 2.0
+FULL_WEIGHT_RATIO = 2.0
 """Largest ratio s of `kernels.panes.gradient_conflict` with full weight; the weight falls to 0 at twice the ratio."""
 
 
@@ -32,19 +32,19 @@ class PaneMaths(NamedTuple):
 
     Attributes:
         strength: reflectance by a law, given the reflectance R0 at normal incidence and the cosine of the angle.
-        strength_slopes: derivatives of `strength` by R0 and by the cosine.
+        strength_derivatives: derivatives of `strength` by R0 and by the cosine.
         ray_length: length of the ray (x, y, 1).
     """
 
     strength: Scalar
-    strength_slopes: Scalar
+    strength_derivatives: Scalar
     ray_length: Scalar
 
 
 def pane_maths(real: type) -> PaneMaths:
     """Builds the functions for `real`, np.float32 or np.float64."""
-    schlick, schlick_slopes = _schlick(real)
-    two_surfaces, two_surfaces_slopes = _two_surfaces(real)
+    schlick, schlick_derivatives = _schlick(real)
+    two_surfaces, two_surfaces_derivatives = _two_surfaces(real)
     zero, one = real(0.0), real(1.0)
 
     @inlined
@@ -56,47 +56,47 @@ def pane_maths(real: type) -> PaneMaths:
         return base
 
     @inlined
-    def strength_slopes(law, base, cosine):  # type: ignore[no-untyped-def]
+    def strength_derivatives(law, base, cosine):  # type: ignore[no-untyped-def]
         if law == PANE:
-            return two_surfaces_slopes(base, cosine)
+            return two_surfaces_derivatives(base, cosine)
         if law == SCHLICK:
-            return schlick_slopes(base, cosine)
+            return schlick_derivatives(base, cosine)
         return one, zero
 
     @inlined
     def ray_length(x, y):  # type: ignore[no-untyped-def]
         return real(math.sqrt(x * x + y * y + one))
 
-    return PaneMaths(strength, strength_slopes, ray_length)
+    return PaneMaths(strength, strength_derivatives, ray_length)
 
 
-def counting(real: type) -> Scalar:
+def build_edge_weighting(real: type) -> Scalar:
     """Builds the weighting of a cell of shared edges; `kernels.panes.gradient_conflict` explains it."""
-    zero, one, two, most = real(0.0), real(1.0), real(2.0), real(MOST_HELD)
+    zero, one, two, most = real(0.0), real(1.0), real(2.0), real(FULL_WEIGHT_RATIO)
 
     @inlined
-    def counted(edges, held, full, is_told):  # type: ignore[no-untyped-def]
+    def weighted_edges(edges, held, full, has_strength):  # type: ignore[no-untyped-def]
         """The cell's contribution to the sum, and its derivative by the edges; the weight counts as constant."""
         weight = one
-        if is_told and held != zero:
+        if has_strength and held != zero:
             weight = min(max(two - abs(held) / (most * full), zero), one)
         slope = weight if edges > zero else -weight
         return weight * abs(edges), slope if edges != zero else zero
 
-    return counted
+    return weighted_edges
 
 
-def mixing(real: type) -> tuple[Scalar, Scalar]:
+def build_blend_channel(real: type) -> tuple[Scalar, Scalar]:
     """Builds the blending of one sRGB channel of a pixel with the pane's reflection, and its adjoint.
 
     `share` is the pane's reflectance and `gain` the intensity of the reflection; `linear` blends linear light instead
     of sRGB values.
     """
-    linear_of, linear_slope, encoded, encoded_slope = color_space_maths(real)
+    linear_of, linear_derivative, encoded, encoded_derivative = color_space_maths(real)
     one = real(1.0)
 
     @inlined
-    def mix(behind, mirrored, gain, share, linear):  # type: ignore[no-untyped-def]
+    def blend_channel(behind, mirrored, gain, share, linear):  # type: ignore[no-untyped-def]
         """The blended channel, and the reflection times its intensity."""
         if linear:
             lit, bright = linear_of(behind), linear_of(mirrored) * gain
@@ -105,21 +105,21 @@ def mixing(real: type) -> tuple[Scalar, Scalar]:
         return behind + share * (bright - behind), bright
 
     @inlined
-    def unmix(behind, mirrored, gain, share, linear, v_mixed, v_bright):  # type: ignore[no-untyped-def]
-        """Gradients of the first four arguments, given those of the results of `mix`."""
+    def blend_channel_gradient(behind, mirrored, gain, share, linear, v_mixed, v_bright):  # type: ignore[no-untyped-def]
+        """Gradients of the first four arguments, given those of the results of `blend_channel`."""
         if linear:
             lit, shone = linear_of(behind), linear_of(mirrored)
             bright = shone * gain
             mixed = lit + share * (bright - lit)
-            v_mixed *= encoded_slope(mixed, encoded(mixed))
-            v_bright = v_mixed * share + v_bright * encoded_slope(bright, encoded(bright))
-            v_behind = v_mixed * (one - share) * linear_slope(behind, lit)
-            v_mirrored = v_bright * gain * linear_slope(mirrored, shone)
+            v_mixed *= encoded_derivative(mixed, encoded(mixed))
+            v_bright = v_mixed * share + v_bright * encoded_derivative(bright, encoded(bright))
+            v_behind = v_mixed * (one - share) * linear_derivative(behind, lit)
+            v_mirrored = v_bright * gain * linear_derivative(mirrored, shone)
             return v_behind, v_mirrored, v_bright * shone, v_mixed * (bright - lit)
         v_bright += v_mixed * share
         return v_mixed * (one - share), v_bright * gain, v_bright * mirrored, v_mixed * (mirrored * gain - behind)
 
-    return mix, unmix
+    return blend_channel, blend_channel_gradient
 
 
 def _schlick(real: type) -> tuple[Scalar, Scalar]:
@@ -133,13 +133,13 @@ def _schlick(real: type) -> tuple[Scalar, Scalar]:
         return base + (one - base) * squared * squared * grazing
 
     @inlined
-    def schlick_slopes(base, cosine):  # type: ignore[no-untyped-def]
+    def schlick_derivatives(base, cosine):  # type: ignore[no-untyped-def]
         grazing = one - (cosine if cosine < one else one)
         squared = grazing * grazing
         fourth = squared * squared
         return one - fourth * grazing, -five * (one - base) * fourth if cosine < one else zero
 
-    return schlick, schlick_slopes
+    return schlick, schlick_derivatives
 
 
 def _two_surfaces(real: type) -> tuple[Scalar, Scalar]:
@@ -175,7 +175,7 @@ def _two_surfaces(real: type) -> tuple[Scalar, Scalar]:
         return half * (first + difference * difference / (along * (along + product * (one + w))))
 
     @inlined
-    def two_surfaces_slopes(base, cosine):  # type: ignore[no-untyped-def]
+    def two_surfaces_derivatives(base, cosine):  # type: ignore[no-untyped-def]
         across, along, w, rest, inside, c = terms(base, cosine)
         inverse_across, inverse_along, inverse_inside = one / across, one / along, one / inside
         first, second = inverse_across * inverse_across, inverse_along * inverse_along
@@ -185,4 +185,4 @@ def _two_surfaces(real: type) -> tuple[Scalar, Scalar]:
         by_cosine = (one - base) * w * w * inverse_inside * (second - first / (one + w))
         return by_base, by_cosine if (cosine > least) & (cosine < one) else zero
 
-    return two_surfaces, two_surfaces_slopes
+    return two_surfaces, two_surfaces_derivatives

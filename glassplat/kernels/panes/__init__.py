@@ -232,7 +232,7 @@ def inside_panes(pane: Tensor, strength: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def layer_slopes(
+def layer_derivatives(
     strength: Tensor, transmission: Tensor, reflection: Tensor, where: Tensor, *, linear: bool
 ) -> tuple[Tensor, Tensor]:
     """Derivatives of Eq. 1 of TR-Gaussians by the transmission and by the reflection, for grey layers.
@@ -260,16 +260,16 @@ def layer_slopes(
         raise TypeError(f"where is {where.dtype} of shape {tuple(where.shape)}; expected bool of {(height, width)}")
     kernels = kernels_for("panes", strength.device)
     layers = (tensor.detach().contiguous() for tensor in (strength, transmission, reflection, where))
-    through, mirrored = kernels.layer_slopes(*layers, linear=linear)
+    through, mirrored = kernels.layer_derivatives(*layers, linear=linear)
     return through, mirrored
 
 
 @torch.no_grad()
-def slopes_at(slopes: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
+def sample_derivatives(derivatives: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
     """Values of an image of derivatives at the centres of splats, 1 in front of a surface. Not differentiable.
 
     Args:
-        slopes: [H, W] derivatives by the transmission.
+        derivatives: [H, W] derivatives by the transmission.
         near: [H, W] depth of the surface, infinite where there is none.
         means2d: [C, N, 2] centres in pixels; those outside the image, and NaN, are clamped to its border.
         depths: [C, N] of the centres.
@@ -277,11 +277,11 @@ def slopes_at(slopes: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> 
     Returns:
         [C, N].
     """
-    size, leading = tuple(slopes.shape), tuple(depths.shape)
-    expected = {"slopes": (slopes, size), "near": (near, size), "means2d": (means2d, (*leading, 2))}
+    size, leading = tuple(derivatives.shape), tuple(depths.shape)
+    expected = {"derivatives": (derivatives, size), "near": (near, size), "means2d": (means2d, (*leading, 2))}
     check_tensors({**expected, "depths": (depths, leading)})
-    images = (tensor.detach().contiguous() for tensor in (slopes, near, means2d, depths))
-    found: Tensor = kernels_for("panes", slopes.device).slopes_at(*images)
+    images = (tensor.detach().contiguous() for tensor in (derivatives, near, means2d, depths))
+    found: Tensor = kernels_for("panes", derivatives.device).sample_derivatives(*images)
     return found
 
 
@@ -327,13 +327,13 @@ class _GradientConflict(torch.autograd.Function):
         *images, cell = arguments
         plain = [None if image is None else image.detach().contiguous() for image in images]
         mean: Tensor
-        mean, slopes = kernels_for("panes", images[0].device).gradient_conflict(*plain, cell)
-        ctx.save_for_backward(slopes)
+        mean, derivatives = kernels_for("panes", images[0].device).gradient_conflict(*plain, cell)
+        ctx.save_for_backward(derivatives)
         return mean
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_mean: Tensor) -> tuple[Tensor | None, ...]:
-        (slopes,) = ctx.saved_tensors
-        kernels = kernels_for("panes", slopes.device)
-        return kernels.gradient_conflict_gradient(slopes, v_mean), None, None, None, None
+        (derivatives,) = ctx.saved_tensors
+        kernels = kernels_for("panes", derivatives.device)
+        return kernels.gradient_conflict_gradient(derivatives, v_mean), None, None, None, None

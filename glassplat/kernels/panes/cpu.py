@@ -2,8 +2,8 @@
 
 Rays are intersected with rectangles row by row, where everything but one division is affine. Blending processes runs of
 pixels of one row and one pane. A run is first copied into *planes* of one flat buffer, one plane per quantity. Their
-offsets are known to the compiler, so that it can vectorise the colour-space curves. `layer_slopes` computes the greys
-of a row first, for the same reason.
+offsets are known to the compiler, so that it can vectorise the colour-space curves. `layer_derivatives` computes the
+greys of a row first, for the same reason.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from torch import Tensor
 from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
 from glassplat.kernels.backend.cpu_vector import (
     bits_of,
+    deinterleave,
     interleave,
-    sorted_apart,
+    join_triples,
+    split_triples,
     store,
     store_all,
-    thirds,
-    triples,
     vector_kind,
 )
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.images import color_space_maths
-from glassplat.kernels.maths.pane import DARKEST, counting, mixing, pane_maths
+from glassplat.kernels.maths.pane import DARKEST, build_blend_channel, build_edge_weighting, pane_maths
 from glassplat.kernels.records import DAZZLING, REAL_OF, TILE, PaneHits
 
 
@@ -178,7 +178,7 @@ def _load(real: type) -> Scalar:
                     load_lanes(reflections, at), load_lanes(reflections, at + LANES),
                     load_lanes(reflections, at + 2 * LANES), load_lanes(reflections, at + 3 * LANES),
                 )  # fmt: skip
-                red, green, blue, gain = sorted_apart(four)
+                red, green, blue, gain = deinterleave(four)
                 store(run, MIRRORED + i, red)
                 store(run, MIRRORED + RUN + i, green)
                 store(run, MIRRORED + 2 * RUN + i, blue)
@@ -209,25 +209,25 @@ def _copies(real: type) -> tuple[Scalar, Scalar]:
             load_lanes(image, 3 * pixel), load_lanes(image, 3 * pixel + LANES),
             load_lanes(image, 3 * pixel + 2 * LANES),
         )  # fmt: skip
-        red, green, blue = thirds(rows[0], rows[1], rows[2])
+        red, green, blue = split_triples(rows[0], rows[1], rows[2])
         store(run, at, red)
         store(run, at + RUN, green)
         store(run, at + 2 * RUN, blue)
 
     @inlined
     def store_triples(run, at, image, pixel):
-        rows = triples(load_lanes(run, at), load_lanes(run, at + RUN), load_lanes(run, at + 2 * RUN))
+        rows = join_triples(load_lanes(run, at), load_lanes(run, at + RUN), load_lanes(run, at + 2 * RUN))
         store_all(image, 3 * pixel, rows)
 
     return load_triples, store_triples
 
 
-def _shine(real: type) -> Scalar:
+def _fill_strengths(real: type) -> Scalar:
     strength, _, ray_length = pane_maths(real)
     zero, one, half = real(0.0), real(1.0), real(0.5)
 
     @inlined
-    def shine(run, normals, bases, k, row, first, intrinsics, law):
+    def fill_strengths(run, normals, bases, k, row, first, intrinsics, law):
         """Strength of every pixel of a run, before the mask in RAW and after it in SHARE; returns the rays' y."""
         inverse_f, c_x = one / intrinsics[0], intrinsics[2]
         y = (real(np.int32(row)) + half - intrinsics[3]) / intrinsics[1]
@@ -242,28 +242,33 @@ def _shine(real: type) -> Scalar:
             run[SHARE + i] = raw * marked if marked > zero else zero
         return y
 
-    return shine
+    return fill_strengths
 
 
-def _mix(real: type) -> Scalar:
-    mix_one, _ = mixing(real)
+def _blend_run(real: type) -> Scalar:
+    blend_channel, _ = build_blend_channel(real)
 
     @inlined
-    def mix(run, d, linear):
+    def blend_run(run, d, linear):
         """Blends channel d of a run into RGB and BRIGHT."""
         at = d * RUN
         for i in range(RUN):
-            run[RGB + at + i], run[BRIGHT + at + i] = mix_one(
+            run[RGB + at + i], run[BRIGHT + at + i] = blend_channel(
                 run[BEHIND + at + i], run[MIRRORED + at + i], run[GAIN + i], run[SHARE + i], linear
             )
 
-    return mix
+    return blend_run
 
 
 @cache
 def blend_panes_forward(real: type) -> Kernel:
     """Fills rgb, reflection and strength."""
-    load, shine, mix, store_triples = _load(real), _shine(real), _mix(real), _copies(real)[1]
+    load, fill_strengths, blend_run, store_triples = (
+        _load(real),
+        _fill_strengths(real),
+        _blend_run(real),
+        _copies(real)[1],
+    )
     load_lanes, zero = vector_kind(real, LANES).load, real(0.0)
 
     @kernel("blend_panes_forward", real)
@@ -284,9 +289,9 @@ def blend_panes_forward(real: type) -> Kernel:
                 for first in range(begin, end, RUN):
                     count = min(RUN, end - first)
                     load(run, behind, mask, mirrored, pane, intensity, row, k, first, count)
-                    shine(run, normals, bases, k, row, first, intrinsics, law)
+                    fill_strengths(run, normals, bases, k, row, first, intrinsics, law)
                     for d in range(3):
-                        mix(run, d, linear)
+                        blend_run(run, d, linear)
                     for start in range(0, count, LANES):
                         share = load_lanes(run, SHARE + start)
                         if bits_of(share > zero) == ALL:
@@ -308,32 +313,32 @@ def blend_panes_forward(real: type) -> Kernel:
     return forward
 
 
-def _unmix(real: type) -> Scalar:
-    (_, unmix_one), zero = mixing(real), real(0.0)
+def _blend_run_gradient(real: type) -> Scalar:
+    (_, blend_channel_gradient), zero = build_blend_channel(real), real(0.0)
 
     @inlined
-    def unmix(run, d, linear):
+    def blend_run_gradient(run, d, linear):
         """Gradients of channel d; those of BEHIND and MIRRORED replace V_RGB and V_BRIGHT, the others accumulate."""
         at = d * RUN
         for i in range(RUN):
             share = run[SHARE + i]
             v_mixed = run[V_RGB + at + i] if share > zero else zero
-            run[V_RGB + at + i], run[V_BRIGHT + at + i], v_gain, v_share = unmix_one(
+            run[V_RGB + at + i], run[V_BRIGHT + at + i], v_gain, v_share = blend_channel_gradient(
                 run[BEHIND + at + i], run[MIRRORED + at + i], run[GAIN + i], share, linear,
                 v_mixed, run[V_BRIGHT + at + i],
             )  # fmt: skip
             run[V_GAIN + i] += v_gain
             run[V_SHARE + i] += v_share
 
-    return unmix
+    return blend_run_gradient
 
 
-def _dim(real: type) -> Scalar:
-    strength_slopes = pane_maths(real).strength_slopes
+def _sum_strength_gradients(real: type) -> Scalar:
+    strength_derivatives = pane_maths(real).strength_derivatives
     zero, one, half, dazzling = real(0.0), real(1.0), real(0.5), real(DAZZLING)
 
     @inlined
-    def dim(run, base, first, intrinsics, law):
+    def sum_strength_gradients(run, base, first, intrinsics, law):
         """Sums over the run, from SHARE's gradient: for the normal, weighted by x and 1, and the base reflectance."""
         inverse_f = one / intrinsics[0]
         start = real(np.int32(first)) + half - intrinsics[2]
@@ -341,7 +346,7 @@ def _dim(real: type) -> Scalar:
         for i in range(RUN):
             marked, along, length = run[MASK + i], run[ALONG + i], run[LENGTH + i]
             v_raw = run[V_SHARE + i] * marked if (marked > zero) & (run[GAIN + i] <= dazzling) else zero
-            by_base, by_cosine = strength_slopes(law, base, abs(along) / length)
+            by_base, by_cosine = strength_derivatives(law, base, abs(along) / length)
             slope = v_raw * by_cosine / length
             slope = slope if along > zero else -slope
             sum_x += slope * (start + real(np.int32(i))) * inverse_f
@@ -349,13 +354,18 @@ def _dim(real: type) -> Scalar:
             sum_base += v_raw * by_base
         return sum_x, sum_1, sum_base
 
-    return dim
+    return sum_strength_gradients
 
 
 @cache
 def blend_panes_backward(real: type) -> Kernel:
     """Fills the gradients of transmission, mask, reflections, normals and base reflectances; all start at zero."""
-    load, shine, unmix, dim = _load(real), _shine(real), _unmix(real), _dim(real)
+    load, fill_strengths, blend_run_gradient, sum_strength_gradients = (
+        _load(real),
+        _fill_strengths(real),
+        _blend_run_gradient(real),
+        _sum_strength_gradients(real),
+    )
     load_lanes, (load_triples, store_triples) = vector_kind(real, LANES).load, _copies(real)
     zero = real(0.0)
 
@@ -380,7 +390,7 @@ def blend_panes_backward(real: type) -> Kernel:
                 for first in range(begin, end, RUN):
                     count = min(RUN, end - first)
                     load(run, behind, mask, mirrored, pane, intensity, row, k, first, count)
-                    y = shine(run, normals, bases, k, row, first, intrinsics, law)
+                    y = fill_strengths(run, normals, bases, k, row, first, intrinsics, law)
                     for i in range(RUN):
                         run[V_SHARE + i], run[V_GAIN + i] = v_strength[row, first + min(i, count - 1)], zero
                     for start in range(0, count, LANES):
@@ -394,8 +404,8 @@ def blend_panes_backward(real: type) -> Kernel:
                                 run[V_RGB + d * RUN + i] = v_rgb[row, column, d]
                                 run[V_BRIGHT + d * RUN + i] = v_reflection[row, column, d]
                     for d in range(3):
-                        unmix(run, d, linear)
-                    sum_x, sum_1, sum_base = dim(run, bases[k], first, intrinsics, law)
+                        blend_run_gradient(run, d, linear)
+                    sum_x, sum_1, sum_base = sum_strength_gradients(run, bases[k], first, intrinsics, law)
                     sums[row, k, 0] += sum_x
                     sums[row, k, 1] += sum_1 * y
                     sums[row, k, 2] += sum_1
@@ -435,24 +445,24 @@ def blend_panes_backward(real: type) -> Kernel:
     return backward
 
 
-def layer_slopes(
+def layer_derivatives(
     strength: Tensor, transmission: Tensor, reflection: Tensor, where: Tensor, *, linear: bool
 ) -> tuple[Tensor, Tensor]:
-    """The derivatives by transmission and reflection [H, W]; see `glassplat.kernels.panes.layer_slopes`."""
+    """The derivatives by transmission and reflection [H, W]; see `glassplat.kernels.panes.layer_derivatives`."""
     through, mirrored = torch.empty_like(strength), torch.empty_like(strength)
     layers = (tensor.numpy() for tensor in (strength, transmission, reflection, where))
-    layer_slopes_kernel(REAL_OF[strength.dtype])(*layers, linear, through.numpy(), mirrored.numpy())
+    layer_derivatives_kernel(REAL_OF[strength.dtype])(*layers, linear, through.numpy(), mirrored.numpy())
     return through, mirrored
 
 
 @functools.cache
-def layer_slopes_kernel(real: type) -> Kernel:
+def layer_derivatives_kernel(real: type) -> Kernel:
     """Fills both images [H, W]."""
-    linear_of, linear_slope, encoded, encoded_slope = color_space_maths(real)
+    linear_of, linear_derivative, encoded, encoded_derivative = color_space_maths(real)
     zero, one, third = real(0.0), real(1.0), real(1.0 / 3.0)
 
-    @kernel("layer_slopes", real)
-    def slopes(strength, transmission, reflection, where, linear, through, mirrored):
+    @kernel("layer_derivatives", real)
+    def derivatives(strength, transmission, reflection, where, linear, through, mirrored):
         height, width = strength.shape
         for row in prange(height):
             greys: NDArray[Any] = np.empty((2, width), real)
@@ -467,18 +477,18 @@ def layer_slopes_kernel(real: type) -> Kernel:
                 if linear:
                     lit, bright = linear_of(behind[x]), linear_of(mirror_image[x])
                     light = lit + share[x] * (bright - lit)
-                    slope = encoded_slope(light, encoded(light))
-                    by_behind *= slope * linear_slope(behind[x], lit)
-                    by_mirror_image *= slope * linear_slope(mirror_image[x], bright)
+                    slope = encoded_derivative(light, encoded(light))
+                    by_behind *= slope * linear_derivative(behind[x], lit)
+                    by_mirror_image *= slope * linear_derivative(mirror_image[x], bright)
                 out_through[x] = by_behind if shown[x] else one
                 out_mirrored[x] = by_mirror_image if shown[x] else zero
 
-    return slopes
+    return derivatives
 
 
-def slopes_at(slopes: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
-    """As `glassplat.kernels.panes.slopes_at`, of contiguous tensors."""
-    height, width = slopes.shape
+def sample_derivatives(derivatives: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
+    """As `glassplat.kernels.panes.sample_derivatives`, of contiguous tensors."""
+    height, width = derivatives.shape
     # Clamped to the image before the conversion, which is undefined for infinities and NaN; fmax maps NaN to 0.
     zero = means2d.new_zeros(())
     columns, rows = (
@@ -486,7 +496,7 @@ def slopes_at(slopes: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> 
         for axis, size in zip(means2d.unbind(-1), (width, height), strict=True)
     )
     pixels = (rows * width + columns).flatten()
-    surface, slope = (image.flatten().index_select(0, pixels).view_as(depths) for image in (near, slopes))
+    surface, slope = (image.flatten().index_select(0, pixels).view_as(depths) for image in (near, derivatives))
     return torch.where(depths > surface, slope, 1.0)
 
 
@@ -510,7 +520,7 @@ CHANNELS = 3
 def gradient_conflict(
     transmission: Tensor, reflection: Tensor, hit: Tensor, strength: Tensor | None, cell: int
 ) -> tuple[Tensor, Tensor]:
-    """The mean of the weighted edges, and slopes for its gradient (`kernels.panes.gradient_conflict`).
+    """The mean of the weighted edges, and derivatives for its gradient (`kernels.panes.gradient_conflict`).
 
     Args:
         transmission: [H, W, 3], contiguous like all of these.
@@ -521,20 +531,20 @@ def gradient_conflict(
     """
     height, width = hit.shape
     # A ring of zeros around the derivatives saves the border checks of the backward pass.
-    slopes = transmission.new_zeros(2, height + 2, CHANNELS * (width + 2))
+    derivatives = transmission.new_zeros(2, height + 2, CHANNELS * (width + 2))
     sums = torch.zeros(-(-(height - 2) // cell), dtype=torch.float64)
     images = (transmission, reflection, hit, hit if strength is None else strength)
     forward = conflict_forward(REAL_OF[hit.dtype])
-    forward(*(t.numpy() for t in images), strength is not None, cell, slopes.numpy(), sums.numpy())
-    return (sums.sum() / conflict_count(height, width)).to(transmission.dtype), slopes
+    forward(*(t.numpy() for t in images), strength is not None, cell, derivatives.numpy(), sums.numpy())
+    return (sums.sum() / conflict_count(height, width)).to(transmission.dtype), derivatives
 
 
-def gradient_conflict_gradient(slopes: Tensor, v_mean: Tensor) -> Tensor:
-    """Gradient of the transmission [H, W, 3], given the slopes of `gradient_conflict` and the gradient of the mean."""
-    real, height, width = REAL_OF[slopes.dtype], slopes.shape[1] - 2, slopes.shape[2] // CHANNELS - 2
-    v_transmission = slopes.new_empty(height, width, CHANNELS)
+def gradient_conflict_gradient(derivatives: Tensor, v_mean: Tensor) -> Tensor:
+    """Gradient of the transmission [H, W, 3], given the derivatives of `gradient_conflict` and the mean's gradient."""
+    real, height, width = REAL_OF[derivatives.dtype], derivatives.shape[1] - 2, derivatives.shape[2] // CHANNELS - 2
+    v_transmission = derivatives.new_empty(height, width, CHANNELS)
     factor = real(v_mean.item() / conflict_count(height, width))
-    conflict_backward(real)(slopes.numpy(), factor, v_transmission.numpy())
+    conflict_backward(real)(derivatives.numpy(), factor, v_transmission.numpy())
     return v_transmission
 
 
@@ -545,14 +555,14 @@ def conflict_count(height: int, width: int) -> int:
 
 @cache
 def conflict_forward(real: type) -> Kernel:
-    """Fills the sum of each row of cells, and slopes [2, H + 2, 3 (W + 2)], the derivatives by both Sobel images.
+    """Fills the sum of each row of cells, and derivatives [2, H + 2, 3 (W + 2)] by both Sobel images.
 
     Columns are summed first, and then cells, so that the loops over pixels are contiguous.
     """
-    zero, one, two, darkest, counted = real(0.0), real(1.0), real(2.0), real(DARKEST), counting(real)
+    zero, one, two, darkest, weighted_edges = real(0.0), real(1.0), real(2.0), real(DARKEST), build_edge_weighting(real)
 
     @kernel("gradient_conflict_forward", real)
-    def forward(transmission, reflection, hit, strength, is_told, cell, slopes, sums):
+    def forward(transmission, reflection, hit, strength, has_strength, cell, derivatives, sums):
         height, width = hit.shape
         floats = CHANNELS * width
         t, r = transmission.reshape(height, floats), reflection.reshape(height, floats)
@@ -571,7 +581,7 @@ def conflict_forward(real: type) -> Kernel:
                         strengths[CHANNELS * x + d] = strength[row, x]
                 t_up, t_here, t_down = t[row - 1], t[row], t[row + 1]
                 r_up, r_here, r_down = r[row - 1], r[row], r[row + 1]
-                out_x, out_y = slopes[0, row + 1], slopes[1, row + 1]
+                out_x, out_y = derivatives[0, row + 1], derivatives[1, row + 1]
                 for j in range(floats - 2 * CHANNELS):
                     k = j + 2 * CHANNELS
                     m = j + CHANNELS
@@ -584,7 +594,7 @@ def conflict_forward(real: type) -> Kernel:
                     shared[m] += product
                     out_x[m + CHANNELS] = weight * r_x
                     out_y[m + CHANNELS] = weight * r_y
-                    if is_told:
+                    if has_strength:
                         light_t, light_r = min(max(t_here[m], darkest), one), min(max(r_here[m], darkest), one)
                         held[m] += light_t * light_r * product
                         full[m] += weight * strengths[m] * light_r * light_r * (r_x * r_x + r_y * r_y)
@@ -598,13 +608,13 @@ def conflict_forward(real: type) -> Kernel:
                         edges += shared[CHANNELS * x + d]
                         holds += held[CHANNELS * x + d]
                         could += full[CHANNELS * x + d]
-                    added, factor = counted(edges, holds, could, is_told)
+                    added, factor = weighted_edges(edges, holds, could, has_strength)
                     total += added
                     for x in range(left, right):
                         factors[CHANNELS * x + d] = factor
             for row in range(top, bottom):
                 for axis in range(2):
-                    out = slopes[axis, row + 1]
+                    out = derivatives[axis, row + 1]
                     for m in range(CHANNELS, floats - CHANNELS):
                         out[m + CHANNELS] *= factors[m]
             sums[block] = total
@@ -614,17 +624,17 @@ def conflict_forward(real: type) -> Kernel:
 
 @cache
 def conflict_backward(real: type) -> Kernel:
-    """Fills the gradient of the transmission [H, W, 3], by the transposed Sobel operators on the slopes."""
+    """Fills the gradient of the transmission [H, W, 3], by the transposed Sobel operators on the derivatives."""
     two = real(2.0)
 
     @kernel("gradient_conflict_backward", real)
-    def backward(slopes, v_mean, v_transmission):
+    def backward(derivatives, v_mean, v_transmission):
         height, width = v_transmission.shape[:2]
         floats = CHANNELS * width
         out = v_transmission.reshape(height, floats)
         for row in prange(height):
-            x_up, x_here, x_down = slopes[0, row], slopes[0, row + 1], slopes[0, row + 2]
-            y_up, y_down = slopes[1, row], slopes[1, row + 2]
+            x_up, x_here, x_down = derivatives[0, row], derivatives[0, row + 1], derivatives[0, row + 2]
+            y_up, y_down = derivatives[1, row], derivatives[1, row + 2]
             target = out[row]
             for j in range(floats):
                 m, k = j + CHANNELS, j + 2 * CHANNELS

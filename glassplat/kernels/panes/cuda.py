@@ -18,7 +18,7 @@ from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.images import color_space_maths
-from glassplat.kernels.maths.pane import DARKEST, counting, mixing, pane_maths
+from glassplat.kernels.maths.pane import DARKEST, build_blend_channel, build_edge_weighting, pane_maths
 from glassplat.kernels.panes.cpu import CHANNELS, conflict_count
 from glassplat.kernels.records import DAZZLING, REAL_OF, TILE, PaneHits
 
@@ -37,11 +37,11 @@ def pane_hits(
     index = torch.empty(height, width, dtype=torch.int32, device=centers.device)
     depth = centers.new_empty(height, width)
     tiles = torch.zeros(count, rows, columns, dtype=torch.bool, device=centers.device)
-    reaches = torch.zeros(count, 4, dtype=torch.int32, device=centers.device)
+    extents = torch.zeros(count, 4, dtype=torch.int32, device=centers.device)
     before = (None, None) if beyond is None else (beyond.pane, beyond.depth)
-    pane_hits_forward(real)(rows * columns, PIXELS, *inputs, mask, *before, index, depth, tiles, reaches)
+    pane_hits_forward(real)(rows * columns, PIXELS, *inputs, mask, *before, index, depth, tiles, extents)
     windows = centers.new_empty(count, 4)
-    windows_of(real)(blocks_for(count, THREADS), THREADS, reaches, width, height, windows)
+    pane_windows_kernel(real)(blocks_for(count, THREADS), THREADS, extents, width, height, windows)
     return PaneHits(index, depth, tiles, windows)
 
 
@@ -73,7 +73,7 @@ def mirrored_views_gradients(
     return found
 
 
-def vectors(real: type) -> tuple[Scalar, Scalar]:
+def vector_maths(real: type) -> tuple[Scalar, Scalar]:
     """Builds the normalisation of a vector, with its inverse length, and the rotation of a vector by a pose."""
     least, one = real(SHORTEST), real(1.0)
 
@@ -83,34 +83,34 @@ def vectors(real: type) -> tuple[Scalar, Scalar]:
         return x * inverse, y * inverse, z * inverse, inverse
 
     @inlined
-    def turned(pose, x, y, z):
+    def rotate(pose, x, y, z):
         return (
             pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z,
             pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z,
             pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z,
         )
 
-    return unit, turned
+    return unit, rotate
 
 
 @cache
 def rectangles_in_camera(real: type) -> Kernel:
     """Fills all rectangles in one thread, because there are few."""
-    unit, turned = vectors(real)
+    unit, rotate = vector_maths(real)
 
     @kernel("panes_in_camera", real, "real2 real2 real2 real2 real2 real2 real3")
     def fill(centers, raw_normals, tangents, pose, placed, facing, axes):
         for k in range(centers.shape[0]):
-            c_x, c_y, c_z = turned(pose, centers[k, 0], centers[k, 1], centers[k, 2])
+            c_x, c_y, c_z = rotate(pose, centers[k, 0], centers[k, 1], centers[k, 2])
             placed[k, 0], placed[k, 1], placed[k, 2] = c_x + pose[0, 3], c_y + pose[1, 3], c_z + pose[2, 3]
             n_x, n_y, n_z, _ = unit(raw_normals[k, 0], raw_normals[k, 1], raw_normals[k, 2])
-            facing[k, 0], facing[k, 1], facing[k, 2] = turned(pose, n_x, n_y, n_z)
+            facing[k, 0], facing[k, 1], facing[k, 2] = rotate(pose, n_x, n_y, n_z)
             t_x, t_y, t_z = tangents[k, 0], tangents[k, 1], tangents[k, 2]
             along = t_x * n_x + t_y * n_y + t_z * n_z
             t_x, t_y, t_z, _ = unit(t_x - along * n_x, t_y - along * n_y, t_z - along * n_z)
-            axes[k, 0, 0], axes[k, 0, 1], axes[k, 0, 2] = turned(pose, t_x, t_y, t_z)
+            axes[k, 0, 0], axes[k, 0, 1], axes[k, 0, 2] = rotate(pose, t_x, t_y, t_z)
             b_x, b_y, b_z = n_y * t_z - n_z * t_y, n_z * t_x - n_x * t_z, n_x * t_y - n_y * t_x
-            axes[k, 1, 0], axes[k, 1, 1], axes[k, 1, 2] = turned(pose, b_x, b_y, b_z)
+            axes[k, 1, 0], axes[k, 1, 1], axes[k, 1, 2] = rotate(pose, b_x, b_y, b_z)
 
     return fill
 
@@ -121,14 +121,14 @@ def mirrored_views_forward(real: type) -> Kernel:
 
     With m = R n the pose mirrored about a plane has the rotation R - 2 m n^T and the translation t + 2 (c . n) m.
     """
-    unit, turned = vectors(real)
+    unit, rotate = vector_maths(real)
     zero, one, two = real(0.0), real(1.0), real(2.0)
 
     @kernel("mirrored_views_forward", real, "real2 real2 real2 real3 real2 real2")
     def forward(centers, raw_normals, pose, poses, normals, half_spaces):
         for k in range(centers.shape[0]):
             n_x, n_y, n_z, _ = unit(raw_normals[k, 0], raw_normals[k, 1], raw_normals[k, 2])
-            normals[k, 0], normals[k, 1], normals[k, 2] = turned(pose, n_x, n_y, n_z)
+            normals[k, 0], normals[k, 1], normals[k, 2] = rotate(pose, n_x, n_y, n_z)
             offset = centers[k, 0] * n_x + centers[k, 1] * n_y + centers[k, 2] * n_z
             # The camera's centre is -R^T t, so that its height above the plane is -t . m - c . n.
             height = -offset
@@ -151,7 +151,7 @@ def mirrored_views_forward(real: type) -> Kernel:
 @cache
 def mirrored_views_backward(real: type) -> Kernel:
     """Fills the gradients of centres, raw normals and pose in one thread."""
-    unit, turned = vectors(real)
+    unit, rotate = vector_maths(real)
     zero, two = real(0.0), real(2.0)
 
     @kernel("mirrored_views_backward", real, "real2 real2 real2 real3 real2 real2 real2 real2")
@@ -161,7 +161,7 @@ def mirrored_views_backward(real: type) -> Kernel:
                 v_pose[i, j] = zero
         for k in range(centers.shape[0]):
             n_x, n_y, n_z, inverse = unit(raw_normals[k, 0], raw_normals[k, 1], raw_normals[k, 2])
-            m_x, m_y, m_z = turned(pose, n_x, n_y, n_z)
+            m_x, m_y, m_z = rotate(pose, n_x, n_y, n_z)
             offset = centers[k, 0] * n_x + centers[k, 1] * n_y + centers[k, 2] * n_z
             v_x, v_y, v_z, v_offset = zero, zero, zero, zero
             for i in range(3):
@@ -198,7 +198,7 @@ def pane_hits_forward(real: type) -> Kernel:
 
     @kernel("pane_hits", real, "real2 real2 real3 real2 real1 real2 int2 real2 int2 real2 bool3 int2")
     def forward(
-        centers, normals, axes, half_sizes, intrinsics, mask, before, depth_before, index, depth_of, tiles, reaches,
+        centers, normals, axes, half_sizes, intrinsics, mask, before, depth_before, index, depth_of, tiles, extents,
     ):  # fmt: skip
         height, width = index.shape
         tile_columns = (width + TILE - 1) // TILE
@@ -229,10 +229,10 @@ def pane_hits_forward(real: type) -> Kernel:
         if hit >= 0 and (mask.size == 0 or mask[row, column] > zero):
             # Many threads may write here, all of them the same value.
             tiles[hit, tile_row, tile_column] = True
-            cuda.atomic.max(reaches, (hit, 0), np.int32(width - column))
-            cuda.atomic.max(reaches, (hit, 1), np.int32(height - row))
-            cuda.atomic.max(reaches, (hit, 2), np.int32(column + 1))
-            cuda.atomic.max(reaches, (hit, 3), np.int32(row + 1))
+            cuda.atomic.max(extents, (hit, 0), np.int32(width - column))
+            cuda.atomic.max(extents, (hit, 1), np.int32(height - row))
+            cuda.atomic.max(extents, (hit, 2), np.int32(column + 1))
+            cuda.atomic.max(extents, (hit, 3), np.int32(row + 1))
 
     return forward
 
@@ -241,17 +241,17 @@ THREADS = 128
 
 
 @cache
-def windows_of(real: type) -> Kernel:
+def pane_windows_kernel(real: type) -> Kernel:
     """Fills the left, top, right and bottom edge of the pixels that show each pane; all 0 if there are none."""
 
     @kernel("pane_windows", real, "int2 int int real2")
-    def fill(reaches, width, height, windows):
+    def fill(extents, width, height, windows):
         k = cuda.grid(1)
         if k < windows.shape[0]:
-            shown = reaches[k, 2] > 0
-            windows[k, 0] = real(np.int32(width - reaches[k, 0] if shown else 0))
-            windows[k, 1] = real(np.int32(height - reaches[k, 1] if shown else 0))
-            windows[k, 2], windows[k, 3] = real(reaches[k, 2]), real(reaches[k, 3])
+            shown = extents[k, 2] > 0
+            windows[k, 0] = real(np.int32(width - extents[k, 0] if shown else 0))
+            windows[k, 1] = real(np.int32(height - extents[k, 1] if shown else 0))
+            windows[k, 2], windows[k, 3] = real(extents[k, 2]), real(extents[k, 3])
 
     return fill
 
@@ -283,12 +283,12 @@ def blend_panes_gradients(
     return (*found, sums[:, :3].contiguous(), sums[:, 3].contiguous())
 
 
-def _shine(real: type) -> Scalar:
+def _pane_strength(real: type) -> Scalar:
     strength, _, ray_length = pane_maths(real)
     one, half = real(1.0), real(0.5)
 
     @inlined
-    def shine(row, column, k, normals, bases, intrinsics, law):
+    def pane_strength(row, column, k, normals, bases, intrinsics, law):
         """Strength before the mask, the ray's x and y, its product with the normal and its length."""
         x = (real(np.int32(column)) + half - intrinsics[2]) * (one / intrinsics[0])
         y = (real(np.int32(row)) + half - intrinsics[3]) / intrinsics[1]
@@ -296,13 +296,13 @@ def _shine(real: type) -> Scalar:
         raw = strength(law, bases[k], abs(along) / length)
         return raw, x, y, along, length
 
-    return shine
+    return pane_strength
 
 
 @cache
 def blend_panes_forward(real: type) -> Kernel:
     """Fills rgb, reflection and strength."""
-    shine, (mix, _) = _shine(real), mixing(real)
+    pane_strength, (blend_channel, _) = _pane_strength(real), build_blend_channel(real)
     zero, one = real(0.0), real(1.0)
 
     @kernel("blend_panes_forward", real, f"{INPUTS} real3 real3 real2")
@@ -318,14 +318,14 @@ def blend_panes_forward(real: type) -> Kernel:
         shown = 0 <= k < normals.shape[0] and marked > zero
         share, gain = zero, one
         if shown:
-            raw, _, _, _, _ = shine(row, column, k, normals, bases, intrinsics, law)
+            raw, _, _, _, _ = pane_strength(row, column, k, normals, bases, intrinsics, law)
             share = raw * marked
             gain = one + reflections[k, row, column, 3] if intensity else one
         strength[row, column] = share
         for d in range(3):
             behind, bright, mixed = transmission[row, column, d], zero, transmission[row, column, d]
             if shown:
-                mixed, bright = mix(behind, reflections[k, row, column, d], gain, share, linear)
+                mixed, bright = blend_channel(behind, reflections[k, row, column, d], gain, share, linear)
             rgb[row, column, d] = mixed if share > zero else behind
             reflection[row, column, d] = bright
 
@@ -337,7 +337,11 @@ def blend_panes_backward(real: type) -> Kernel:
     """Fills the gradients of transmission, mask and reflections, and each pixel's contribution [H, W, 4] to those of
     its pane's normal and base reflectance; all but the first start at zero.
     """
-    shine, strength_slopes, (_, unmix) = _shine(real), pane_maths(real).strength_slopes, mixing(real)
+    pane_strength, strength_derivatives, (_, blend_channel_gradient) = (
+        _pane_strength(real),
+        pane_maths(real).strength_derivatives,
+        build_blend_channel(real),
+    )
     zero, one, dazzling = real(0.0), real(1.0), real(DAZZLING)
 
     @kernel("blend_panes_backward", real, f"{INPUTS} real3 real3 real2 real3 real2 real4 real3")
@@ -354,12 +358,12 @@ def blend_panes_backward(real: type) -> Kernel:
             for d in range(3):
                 v_transmission[row, column, d] = v_rgb[row, column, d]
             return
-        raw, x, y, along, length = shine(row, column, k, normals, bases, intrinsics, law)
+        raw, x, y, along, length = pane_strength(row, column, k, normals, bases, intrinsics, law)
         share, v_share, v_gain = raw * marked, v_strength[row, column], zero
         gain = one + reflections[k, row, column, 3] if intensity else one
         for d in range(3):
             v_pixel = v_rgb[row, column, d]
-            v_behind, v_mirrored, by_gain, by_share = unmix(
+            v_behind, v_mirrored, by_gain, by_share = blend_channel_gradient(
                 transmission[row, column, d], reflections[k, row, column, d], gain, share, linear,
                 v_pixel if share > zero else zero, v_reflection[row, column, d],
             )  # fmt: skip
@@ -370,7 +374,7 @@ def blend_panes_backward(real: type) -> Kernel:
         v_reflections[k, row, column, 3] = v_gain if intensity else zero
         v_mask[row, column] = v_share * raw
         v_raw = v_share * marked if gain <= dazzling else zero
-        by_base, by_cosine = strength_slopes(law, bases[k], abs(along) / length)
+        by_base, by_cosine = strength_derivatives(law, bases[k], abs(along) / length)
         slope = v_raw * by_cosine / length
         slope = slope if along > zero else -slope
         shares[row, column, 0] = slope * x
@@ -381,12 +385,12 @@ def blend_panes_backward(real: type) -> Kernel:
     return backward
 
 
-def layer_slopes(
+def layer_derivatives(
     strength: Tensor, transmission: Tensor, reflection: Tensor, where: Tensor, *, linear: bool
 ) -> tuple[Tensor, Tensor]:
-    """As `glassplat.kernels.panes.cpu.layer_slopes`."""
+    """As `glassplat.kernels.panes.cpu.layer_derivatives`."""
     through, mirrored = torch.empty_like(strength), torch.empty_like(strength)
-    layer_slopes_kernel(REAL_OF[strength.dtype])(
+    layer_derivatives_kernel(REAL_OF[strength.dtype])(
         blocks_for(strength.numel(), THREADS), THREADS, strength, transmission, reflection, where, linear,
         through, mirrored,
     )  # fmt: skip
@@ -394,13 +398,13 @@ def layer_slopes(
 
 
 @cache
-def layer_slopes_kernel(real: type) -> Kernel:
+def layer_derivatives_kernel(real: type) -> Kernel:
     """Fills both images [H, W], one thread per pixel."""
-    linear_of, linear_slope, encoded, encoded_slope = color_space_maths(real)
+    linear_of, linear_derivative, encoded, encoded_derivative = color_space_maths(real)
     zero, one, third = real(0.0), real(1.0), real(1.0 / 3.0)
 
-    @kernel("layer_slopes", real, "real2 real3 real3 bool2 bool real2 real2")
-    def slopes(strength, transmission, reflection, where, linear, through, mirrored):
+    @kernel("layer_derivatives", real, "real2 real3 real3 bool2 bool real2 real2")
+    def derivatives(strength, transmission, reflection, where, linear, through, mirrored):
         height, width = strength.shape
         i = cuda.grid(1)
         if i >= height * width:
@@ -415,38 +419,44 @@ def layer_slopes_kernel(real: type) -> Kernel:
         if linear:
             lit, bright = linear_of(behind), linear_of(mirror_image)
             light = lit + share * (bright - lit)
-            slope = encoded_slope(light, encoded(light))
-            by_behind *= slope * linear_slope(behind, lit)
-            by_mirror_image *= slope * linear_slope(mirror_image, bright)
+            slope = encoded_derivative(light, encoded(light))
+            by_behind *= slope * linear_derivative(behind, lit)
+            by_mirror_image *= slope * linear_derivative(mirror_image, bright)
         through[row, x], mirrored[row, x] = by_behind, by_mirror_image
 
-    return slopes
+    return derivatives
 
 
-def slopes_at(slopes: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
-    """As `glassplat.kernels.panes.cpu.slopes_at`."""
+def sample_derivatives(derivatives: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
+    """As `glassplat.kernels.panes.cpu.sample_derivatives`."""
     found = torch.empty_like(depths)
-    slopes_under(REAL_OF[depths.dtype])(
-        blocks_for(depths.numel(), THREADS), THREADS, slopes, near, means2d.view(-1, 2), depths.view(-1), found.view(-1)
+    sample_derivatives_kernel(REAL_OF[depths.dtype])(
+        blocks_for(depths.numel(), THREADS),
+        THREADS,
+        derivatives,
+        near,
+        means2d.view(-1, 2),
+        depths.view(-1),
+        found.view(-1),
     )
     return found
 
 
 @cache
-def slopes_under(real: type) -> Kernel:
+def sample_derivatives_kernel(real: type) -> Kernel:
     """Fills the derivative at each centre, 1 in front of the surface; one thread per splat."""
     zero, one = real(0.0), real(1.0)
 
-    @kernel("slopes_at", real, "real2 real2 real2 real1 real1")
-    def fill(slopes, near, means2d, depths, found):
+    @kernel("sample_derivatives", real, "real2 real2 real2 real1 real1")
+    def fill(derivatives, near, means2d, depths, found):
         i = cuda.grid(1)
         if i >= depths.size:
             return
-        x, y, right, bottom = means2d[i, 0], means2d[i, 1], slopes.shape[1] - 1, slopes.shape[0] - 1
+        x, y, right, bottom = means2d[i, 0], means2d[i, 1], derivatives.shape[1] - 1, derivatives.shape[0] - 1
         # Neither comparison holds for NaN, which counts as 0.
         column = right if x >= real(np.int32(right)) else (np.int32(x) if x > zero else 0)
         row = bottom if y >= real(np.int32(bottom)) else (np.int32(y) if y > zero else 0)
-        found[i] = slopes[row, column] if depths[i] > near[row, column] else one
+        found[i] = derivatives[row, column] if depths[i] > near[row, column] else one
 
     return fill
 
@@ -454,12 +464,12 @@ def slopes_under(real: type) -> Kernel:
 def inside_panes(pane: Tensor, strength: Tensor) -> Tensor:
     """As `glassplat.kernels.panes.cpu.inside_panes`."""
     inside = torch.empty_like(strength)
-    inside_of(REAL_OF[strength.dtype])(blocks_for(pane.numel(), THREADS), THREADS, pane, strength, inside)
+    inside_panes_kernel(REAL_OF[strength.dtype])(blocks_for(pane.numel(), THREADS), THREADS, pane, strength, inside)
     return inside
 
 
 @cache
-def inside_of(real: type) -> Kernel:
+def inside_panes_kernel(real: type) -> Kernel:
     """Fills 1 where a pixel and its neighbours show the same pane, and 0 elsewhere; one thread per pixel."""
     zero, one = real(0.0), real(1.0)
 
@@ -483,22 +493,22 @@ def inside_of(real: type) -> Kernel:
 def gradient_conflict(
     transmission: Tensor, reflection: Tensor, hit: Tensor, strength: Tensor | None, cell: int
 ) -> tuple[Tensor, Tensor]:
-    """As `glassplat.kernels.panes.cpu.gradient_conflict`; the slopes are [2, H - 2, W - 2, 3]."""
+    """As `glassplat.kernels.panes.cpu.gradient_conflict`; the derivatives are [2, H - 2, W - 2, 3]."""
     height, width = hit.shape
-    slopes = transmission.new_empty(2, height - 2, width - 2, CHANNELS)
+    derivatives = transmission.new_empty(2, height - 2, width - 2, CHANNELS)
     sums = hit.new_empty(CHANNELS * -(-(height - 2) // cell) * -(-(width - 2) // cell))
     conflict_forward(REAL_OF[hit.dtype])(
-        len(sums), CELL_THREADS, transmission, reflection, hit, strength, cell, slopes, sums
+        len(sums), CELL_THREADS, transmission, reflection, hit, strength, cell, derivatives, sums
     )
-    return sums.sum() / conflict_count(height, width), slopes
+    return sums.sum() / conflict_count(height, width), derivatives
 
 
-def gradient_conflict_gradient(slopes: Tensor, v_mean: Tensor) -> Tensor:
+def gradient_conflict_gradient(derivatives: Tensor, v_mean: Tensor) -> Tensor:
     """As `glassplat.kernels.panes.cpu.gradient_conflict_gradient`."""
-    height, width = slopes.shape[1] + 2, slopes.shape[2] + 2
-    v_transmission = slopes.new_empty(height, width, CHANNELS)
-    conflict_backward(REAL_OF[slopes.dtype])(
-        blocks_for(v_transmission.numel(), THREADS), THREADS, slopes, v_mean.view(1), v_transmission
+    height, width = derivatives.shape[1] + 2, derivatives.shape[2] + 2
+    v_transmission = derivatives.new_empty(height, width, CHANNELS)
+    conflict_backward(REAL_OF[derivatives.dtype])(
+        blocks_for(v_transmission.numel(), THREADS), THREADS, derivatives, v_mean.view(1), v_transmission
     )
     return v_transmission
 
@@ -518,11 +528,11 @@ def sobel_at(image, y, x, d):
 
 @cache
 def conflict_forward(real: type) -> Kernel:
-    """Fills the sum of each cell and channel, and slopes [2, H - 2, W - 2, 3], its derivatives by the Sobel images."""
-    zero, one, darkest, counted = real(0.0), real(1.0), real(DARKEST), counting(real)
+    """Fills the sum of each cell and channel, and its derivatives [2, H - 2, W - 2, 3] by the Sobel images."""
+    zero, one, darkest, weighted_edges = real(0.0), real(1.0), real(DARKEST), build_edge_weighting(real)
 
     @kernel("gradient_conflict_forward", real, "real3 real3 real2 real2 int real4 real1")
-    def forward(transmission, reflection, hit, strength, cell, slopes, sums):
+    def forward(transmission, reflection, hit, strength, cell, derivatives, sums):
         edges = cuda.shared.array(CELL_THREADS, real)
         holds = cuda.shared.array(CELL_THREADS, real)
         fills = cuda.shared.array(CELL_THREADS, real)
@@ -552,26 +562,26 @@ def conflict_forward(real: type) -> Kernel:
                 fills[t] += fills[t + step]
             step //= 2
         cuda.syncthreads()
-        added, factor = counted(edges[0], holds[0], fills[0], strength.size > 0)
+        added, factor = weighted_edges(edges[0], holds[0], fills[0], strength.size > 0)
         if t == 0:
             sums[cuda.blockIdx.x] = added
         for i in range(t, rows * columns, CELL_THREADS):
             y, x = top + i // columns, left + i % columns
             r_x, r_y = sobel_at(reflection, y, x, d)
             weight = factor * hit[y, x]
-            slopes[0, y - 1, x - 1, d] = weight * r_x
-            slopes[1, y - 1, x - 1, d] = weight * r_y
+            derivatives[0, y - 1, x - 1, d] = weight * r_x
+            derivatives[1, y - 1, x - 1, d] = weight * r_y
 
     return forward
 
 
 @cache
 def conflict_backward(real: type) -> Kernel:
-    """Fills the gradient of the transmission [H, W, 3], by the transposed Sobel operators on the slopes."""
+    """Fills the gradient of the transmission [H, W, 3], by the transposed Sobel operators on the derivatives."""
     zero, one, two, count = real(0.0), real(1.0), real(2.0), real(CHANNELS)
 
     @kernel("gradient_conflict_backward", real, "real4 real1 real3")
-    def backward(slopes, v_mean, v_transmission):
+    def backward(derivatives, v_mean, v_transmission):
         height, width, i = v_transmission.shape[0], v_transmission.shape[1], cuda.grid(1)
         if i >= v_transmission.size:
             return
@@ -583,8 +593,8 @@ def conflict_backward(real: type) -> Kernel:
                 if 0 < y < height - 1 and 0 < x < width - 1:
                     across = two if down == 0 else one
                     along = two if right == 0 else one
-                    total -= real(np.int32(right)) * across * slopes[0, y - 1, x - 1, d]
-                    total -= real(np.int32(down)) * along * slopes[1, y - 1, x - 1, d]
+                    total -= real(np.int32(right)) * across * derivatives[0, y - 1, x - 1, d]
+                    total -= real(np.int32(down)) * along * derivatives[1, y - 1, x - 1, d]
         inner = real(np.int32(height - 2)) * real(np.int32(width - 2))
         v_transmission[row, column, d] = v_mean[0] / (count * inner) * total
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from glassplat.kernels import Fresnel
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
-from glassplat.kernels.maths.pane import DARKEST, MOST_HELD
+from glassplat.kernels.maths.pane import DARKEST, FULL_WEIGHT_RATIO
 from glassplat.kernels.records import BEHIND, DAZZLING, TILE, BlendedPanes, PaneHits, Panes
 
 
@@ -114,10 +114,10 @@ GREY = 0.5
 """Placeholder for strength and light of pixels that are left out; any value with finite derivatives works."""
 
 
-def layer_slopes(
+def layer_derivatives(
     strength: Tensor, transmission: Tensor, reflection: Tensor, where: Tensor, *, linear: bool
 ) -> tuple[Tensor, Tensor]:
-    """See `glassplat.kernels.panes.layer_slopes`; left-out pixels are computed too, to avoid a GPU synchronisation."""
+    """See `glassplat.kernels.panes.layer_derivatives`; computes left-out pixels, too, to avoid a synchronisation."""
     layers = (strength, transmission.mean(dim=-1), reflection.mean(dim=-1))
     share, *greys = (torch.where(where, layer.detach(), GREY) for layer in layers)
     with torch.enable_grad():
@@ -138,19 +138,19 @@ def gradient_conflict(
     reflection, weight = reflection.detach(), hit[1:-1, 1:-1, None]
     of_transmission, of_reflection = sobel(transmission), sobel(reflection)
     products = weight * (of_transmission[0] * of_reflection[0] + of_transmission[1] * of_reflection[1])
-    shared = in_cells(products, cell)
-    counted = torch.ones_like(shared)
+    shared = cell_sums(products, cell)
+    weight_of_cell = torch.ones_like(shared)
     if strength is not None:
         with torch.no_grad():
             light_t, light_r = (image[1:-1, 1:-1].clamp(DARKEST, 1) for image in (transmission, reflection))
             squares = of_reflection[0].square() + of_reflection[1].square()
-            held = in_cells(light_t * light_r * products, cell).abs()
-            full = in_cells(weight * strength[1:-1, 1:-1, None] * light_r.square() * squares, cell)
-            counted = torch.where(held > 0, (2 - held / (MOST_HELD * full)).clamp(0, 1), 1)
-    return (counted * shared.abs()).sum() / products.numel()
+            held = cell_sums(light_t * light_r * products, cell).abs()
+            full = cell_sums(weight * strength[1:-1, 1:-1, None] * light_r.square() * squares, cell)
+            weight_of_cell = torch.where(held > 0, (2 - held / (FULL_WEIGHT_RATIO * full)).clamp(0, 1), 1)
+    return (weight_of_cell * shared.abs()).sum() / products.numel()
 
 
-def in_cells(values: Tensor, cell: int) -> Tensor:
+def cell_sums(values: Tensor, cell: int) -> Tensor:
     """Sums of values [H, W, C] over square cells of `cell` pixels a side; the last ones of an axis may be smaller."""
     sums = torch.nn.functional.avg_pool2d(values.permute(2, 0, 1), cell, ceil_mode=True, divisor_override=1)
     return sums.permute(1, 2, 0)

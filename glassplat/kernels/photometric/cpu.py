@@ -44,9 +44,9 @@ PLANE = 32 * STRIDE
 ENTERED = 0  # One row of image, photograph, sum of squares and product,
 BLURRED = ENTERED + 4 * STRIDE  # a plane of each after the blur along the row,
 RESULTS = BLURRED + 4 * PLANE  # four rows of each after the blur down the columns,
-SLOPES = RESULTS + 4 * TOGETHER * STRIDE  # one row of similarity and three slopes,
-BLURRED_SLOPES = SLOPES + 4 * STRIDE  # and a plane of each slope after the blur along the row.
-SCRATCH = BLURRED_SLOPES + 3 * PLANE
+DERIVATIVES = RESULTS + 4 * TOGETHER * STRIDE  # one row of similarity and three derivatives,
+BLURRED_DERIVATIVES = DERIVATIVES + 4 * STRIDE  # and a plane of each slope after the blur along the row.
+SCRATCH = BLURRED_DERIVATIVES + 3 * PLANE
 
 
 def photometric(image: Tensor, target: Tensor, *, with_gradient: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -141,22 +141,22 @@ def _compare_row(real: type) -> Scalar:
                 scratch[at + 2 * TOGETHER * STRIDE + j],
                 scratch[at + 3 * TOGETHER * STRIDE + j],
             )
-            scratch[SLOPES + j] = by_mean
-            scratch[SLOPES + STRIDE + j] = by_squares
-            scratch[SLOPES + 2 * STRIDE + j] = by_product
-            scratch[SLOPES + 3 * STRIDE + j] = value
+            scratch[DERIVATIVES + j] = by_mean
+            scratch[DERIVATIVES + STRIDE + j] = by_squares
+            scratch[DERIVATIVES + 2 * STRIDE + j] = by_product
+            scratch[DERIVATIVES + 3 * STRIDE + j] = value
 
     return compare_row
 
 
-def _spread_slopes(real: type) -> Scalar:
+def _blur_derivatives(real: type) -> Scalar:
     blur, zero = ssim_maths(real).blur, real(0.0)
 
     @inlined
-    def spread_slopes(scratch, inside, left, rest, row):
-        """Blurs the row of slopes into row `row` of the planes; beyond the image, after `rest` columns, they are 0."""
+    def blur_derivatives(scratch, inside, left, rest, row):
+        """Blurs derivatives into row `row` of the planes; beyond the image, after `rest` columns, they are 0."""
         for plane in range(3):
-            at, to = SLOPES + (plane & 3) * STRIDE, BLURRED_SLOPES + (plane & 3) * PLANE + (row & 31) * STRIDE
+            at, to = DERIVATIVES + (plane & 3) * STRIDE, BLURRED_DERIVATIVES + (plane & 3) * PLANE + (row & 31) * STRIDE
             if inside:
                 for j in range(MARGIN if left == 0 else 0):
                     scratch[at + j] = zero
@@ -168,7 +168,7 @@ def _spread_slopes(real: type) -> Scalar:
                 for j in range(COLUMNS):
                     scratch[to + j] = zero
 
-    return spread_slopes
+    return blur_derivatives
 
 
 def _ssim_gradient_row(real: type) -> Scalar:
@@ -198,7 +198,7 @@ def _scroll(scratch, first, planes):
 @functools.cache
 def _forward(real: type) -> Kernel:
     enter, blur_down, compare_row = _enter(real), _blur_down(real), _compare_row(real)
-    spread_slopes, ssim_gradient_row, scroll = _spread_slopes(real), _ssim_gradient_row(real), _scroll
+    blur_derivatives, ssim_gradient_row, scroll = _blur_derivatives(real), _ssim_gradient_row(real), _scroll
     zero = real(0.0)
 
     @inlined
@@ -214,7 +214,7 @@ def _forward(real: type) -> Kernel:
         """Sum of the similarities of the row that was compared last."""
         total = zero
         for j in range(count):
-            total += scratch[SLOPES + 3 * STRIDE + MARGIN + j]
+            total += scratch[DERIVATIVES + 3 * STRIDE + MARGIN + j]
         return total
 
     @kernel("photometric_forward", real)
@@ -242,19 +242,19 @@ def _forward(real: type) -> Kernel:
                     if top <= y < bottom:
                         ssim += similarity(scratch, right - left)
                     if reach > 0:
-                        spread_slopes(scratch, inside, left, width - left, 2 * RADIUS + i)
+                        blur_derivatives(scratch, inside, left, width - left, 2 * RADIUS + i)
                 scroll(scratch, BLURRED, 4)
                 if reach == 0:
                     continue
                 for i in range(GROUP):
                     y = begin + i - 2 * RADIUS
                     if i % TOGETHER == 0 and top - TOGETHER < y < bottom:
-                        blur_down(scratch, BLURRED_SLOPES, i, 3, COLUMNS)
+                        blur_down(scratch, BLURRED_DERIVATIVES, i, 3, COLUMNS)
                     if top <= y < bottom:
                         ssim_gradient_row(
                             scratch, i, image[y, left:right], target[y, left:right], ssim_gradient[y, left:right]
                         )
-                scroll(scratch, BLURRED_SLOPES, 3)
+                scroll(scratch, BLURRED_DERIVATIVES, 3)
             sums[tile, 0], sums[tile, 1] = l1, ssim
 
     return forward

@@ -25,23 +25,23 @@ AREA, STRIP = WIDE * WIDE, WIDE * TILE
 
 
 def photometric(image: Tensor, target: Tensor, *, with_gradient: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean L1, mean similarity, and the similarity's slopes [3, H, W, 3] (empty unless requested).
+    """Mean L1, mean similarity, and the similarity's derivatives [3, H, W, 3] (empty unless requested).
 
     Slopes are the derivatives of each pixel's similarity by the blurred image, squares and product.
     """
     blocks = _blocks(image)
-    slopes = image.new_empty(3 if with_gradient else 0, *image.shape)
+    derivatives = image.new_empty(3 if with_gradient else 0, *image.shape)
     sums = image.new_empty(blocks, 2)
-    photometric_forward(REAL_OF[image.dtype])(blocks, PIXELS, image, target, slopes, sums)
+    photometric_forward(REAL_OF[image.dtype])(blocks, PIXELS, image, target, derivatives, sums)
     l1, ssim = (sums.sum(dim=0) / image.numel()).unbind()
-    return l1, ssim, slopes
+    return l1, ssim, derivatives
 
 
-def photometric_gradient(image: Tensor, target: Tensor, slopes: Tensor, v_l1: Tensor, v_ssim: Tensor) -> Tensor:
+def photometric_gradient(image: Tensor, target: Tensor, derivatives: Tensor, v_l1: Tensor, v_ssim: Tensor) -> Tensor:
     """Gradient of the image, given the results of the forward pass."""
     v_image = torch.empty_like(image)
     weights = torch.stack([v_l1, v_ssim]) / image.numel()
-    photometric_backward(REAL_OF[image.dtype])(_blocks(image), PIXELS, image, target, slopes, weights, v_image)
+    photometric_backward(REAL_OF[image.dtype])(_blocks(image), PIXELS, image, target, derivatives, weights, v_image)
     return v_image
 
 
@@ -50,26 +50,26 @@ def _blocks(image: Tensor) -> int:
 
 
 @inlined
-def place(block, width):
+def tile_origin(block, width):
     """Channel, first row and first column of a block's tile."""
     tile, columns = block // CHANNELS, (width + TILE - 1) // TILE
     return block % CHANNELS, tile // columns * TILE, tile % columns * TILE
 
 
 @inlined
-def around(i, top, left):
+def tile_pixel(i, top, left):
     """Row and column of the i-th pixel of a tile with its margin; it may lie outside of the image."""
     return top + i // WIDE - RADIUS, left + i % WIDE - RADIUS
 
 
 @cache
 def photometric_forward(real: type) -> Kernel:
-    """Fills slopes [3, H, W, 3], where they are not empty, and each block's sums of L1 and similarity."""
+    """Fills derivatives [3, H, W, 3], where they are not empty, and each block's sums of L1 and similarity."""
     blur, compare = ssim_maths(real)
     zero, white = real(0.0), real(255.0)
 
     @kernel("photometric_forward", real, "real3 byte3 real4 real2")
-    def forward(image, target, slopes, sums):
+    def forward(image, target, derivatives, sums):
         first = cuda.shared.array(AREA, real)
         second = cuda.shared.array(AREA, real)
         squares = cuda.shared.array(AREA, real)
@@ -79,9 +79,9 @@ def photometric_forward(real: type) -> Kernel:
         blurred_squares = cuda.shared.array(STRIP, real)
         blurred_products = cuda.shared.array(STRIP, real)
         height, width, t = image.shape[0], image.shape[1], cuda.threadIdx.x
-        channel, top, left = place(cuda.blockIdx.x, width)
+        channel, top, left = tile_origin(cuda.blockIdx.x, width)
         for i in range(t, AREA, PIXELS):
-            y, x = around(i, top, left)
+            y, x = tile_pixel(i, top, left)
             a, b = zero, zero
             if 0 <= y < height and 0 <= x < width:
                 a, b = image[y, x, channel], real(target[y, x, channel]) / white
@@ -105,10 +105,10 @@ def photometric_forward(real: type) -> Kernel:
                 blur(blurred_squares, t, TILE),
                 blur(blurred_products, t, TILE),
             )
-            if slopes.shape[0] > 0:
-                slopes[0, y, x, channel] = by_mean
-                slopes[1, y, x, channel] = by_squares
-                slopes[2, y, x, channel] = by_product
+            if derivatives.shape[0] > 0:
+                derivatives[0, y, x, channel] = by_mean
+                derivatives[1, y, x, channel] = by_squares
+                derivatives[2, y, x, channel] = by_product
         # Squares and products are not needed any more; their memory serves a tree reduction, whose order is fixed.
         squares[t], products[t] = difference, similarity
         step = PIXELS // 2
@@ -126,12 +126,12 @@ def photometric_forward(real: type) -> Kernel:
 
 @cache
 def photometric_backward(real: type) -> Kernel:
-    """Fills the gradient of the image from the slopes and the weights [2] of each pixel's L1 and similarity."""
+    """Fills the gradient of the image from the derivatives and the weights [2] of each pixel's L1 and similarity."""
     blur = ssim_maths(real).blur
     zero, two, white = real(0.0), real(2.0), real(255.0)
 
     @kernel("photometric_backward", real, "real3 byte3 real4 real1 real3")
-    def backward(image, target, slopes, weights, v_image):
+    def backward(image, target, derivatives, weights, v_image):
         by_mean = cuda.shared.array(AREA, real)
         by_squares = cuda.shared.array(AREA, real)
         by_product = cuda.shared.array(AREA, real)
@@ -139,14 +139,14 @@ def photometric_backward(real: type) -> Kernel:
         blurred_squares = cuda.shared.array(STRIP, real)
         blurred_product = cuda.shared.array(STRIP, real)
         height, width, t = image.shape[0], image.shape[1], cuda.threadIdx.x
-        channel, top, left = place(cuda.blockIdx.x, width)
+        channel, top, left = tile_origin(cuda.blockIdx.x, width)
         for i in range(t, AREA, PIXELS):
-            y, x = around(i, top, left)
+            y, x = tile_pixel(i, top, left)
             by_mean[i], by_squares[i], by_product[i] = zero, zero, zero
             if 0 <= y < height and 0 <= x < width:
-                by_mean[i] = slopes[0, y, x, channel]
-                by_squares[i] = slopes[1, y, x, channel]
-                by_product[i] = slopes[2, y, x, channel]
+                by_mean[i] = derivatives[0, y, x, channel]
+                by_squares[i] = derivatives[1, y, x, channel]
+                by_product[i] = derivatives[2, y, x, channel]
         cuda.syncthreads()
         for i in range(t, STRIP, PIXELS):
             at = i // TILE * WIDE + i % TILE

@@ -146,12 +146,12 @@ class _Project(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         *inputs, radii = ctx.saved_tensors
         # A gradient of the token means that the next projection has run in this backward pass.
-        known = None if gradients[6] is None else list(ctx.shared)
+        accumulated = None if gradients[6] is None else list(ctx.shared)
         ctx.shared.clear()
         found, cameras = kernels_for("project", radii.device).project_gradients(
             inputs, *ctx.size_and_degree,
             radii=radii, cotangents=_cotangents(gradients, radii), needs_camera=bool(ctx.needs_input_grad[5]),
-            known=known,
+            accumulated=accumulated,
         )  # fmt: skip
         pose_gradient, v_token = _pose_gradient(cameras, inputs[5]) if ctx.needs_input_grad[5] else None, None
         if ctx.needs_input_grad[9]:

@@ -48,10 +48,10 @@ from glassplat.kernels.project.disc_steps import discs
 from glassplat.kernels.project.steps import (
     CHUNK,
     LENS_VALUES,
+    build_cull,
+    build_project,
+    build_project_back,
     camera_sums,
-    culling,
-    projecting,
-    projecting_back,
     vec3,
     view_steps,
 )
@@ -92,7 +92,7 @@ def project_discs_gradients(
 @cache
 def project_discs_forward(real: type) -> Kernel:
     """Fills the fields of `ProjectedDiscs`; zeros where a disc is culled."""
-    fill_lenses, project, chunk_size = view_steps(real).fill_lenses, projecting(real, discs(real)), CHUNK
+    fill_lenses, project, chunk_size = view_steps(real).fill_lenses, build_project(real, discs(real)), CHUNK
 
     @kernel("project_discs_forward", real)
     def forward(
@@ -116,7 +116,7 @@ def project_discs_forward(real: type) -> Kernel:
 def _disc_backward(real: type) -> Scalar:
     """Fills the gradients, initially zero, of one disc from all cameras."""
     footprint, zero = discs(real), real(0.0)
-    shape, finish, project_back = footprint.shape, footprint.finish, projecting_back(real, footprint)
+    shape, finish, project_back = footprint.shape, footprint.finish, build_project_back(real, footprint)
 
     @inlined
     def disc_backward(
@@ -351,24 +351,24 @@ def project(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, n
 def project_gradients(
     inputs: Sequence[Tensor], width: int, height: int, degree: int,
     *, radii: Tensor, cotangents: Sequence[Tensor], needs_camera: bool,
-    known: list[Tensor] | None = None,
+    accumulated: list[Tensor] | None = None,
 ) -> tuple[list[Tensor], Tensor]:  # fmt: skip
     """Gradients of raw Gaussians and of each camera [C, 12]; `radii` are those of the forward pass.
 
-    Gradients of the Gaussians are added to those in `known`, in place.
+    Gradients of the Gaussians are added to those in `accumulated`, in place.
     """
     real = REAL_OF[inputs[0].dtype]
-    found = [torch.empty_like(tensor) for tensor in inputs[:5]] if known is None else known
+    found = [torch.empty_like(tensor) for tensor in inputs[:5]] if accumulated is None else accumulated
     cameras = torch.zeros(inputs[5].shape[0], 12, dtype=torch.float64)
     project_backward(real)(
         *(tensor.numpy() for tensor in inputs), real(width), real(height), degree,
-        *(tensor.numpy() for tensor in (radii, *cotangents)), needs_camera, known is None,
+        *(tensor.numpy() for tensor in (radii, *cotangents)), needs_camera, accumulated is None,
         *(tensor.numpy() for tensor in (*found, cameras)),
     )  # fmt: skip
     return found, cameras
 
 
-def listing(real: type) -> Callable[..., Any]:
+def build_list_candidates(real: type) -> Callable[..., Any]:
     """Builds the step that lists the Gaussians of a chunk that may be visible in a camera."""
     load_triples, may_show = load_triples_of(real), may_show_of(real)
 
@@ -400,7 +400,7 @@ def listing(real: type) -> Callable[..., Any]:
     return list_candidates
 
 
-def placing_listed(real: type) -> Callable[..., Any]:
+def build_place_listed(real: type) -> Callable[..., Any]:
     """Builds the step that fills all outputs but the colours, for the visible ones of the listed Gaussians."""
     place, half_extents = place_of(real), screen_maths(real).half_extents
     zero = real(0.0)
@@ -441,10 +441,10 @@ def placing_listed(real: type) -> Callable[..., Any]:
     return place_listed
 
 
-def coloring(real: type) -> Callable[..., Any]:
+def build_color_listed(real: type) -> Callable[..., Any]:
     """Builds the step that fills the colours of listed Gaussians; those with a non-finite colour are culled."""
     tabulate, color = color_steps(real)
-    cull, full = culling(real)[0], vector_kind(real, LANES).full
+    cull, full = build_cull(real)[0], vector_kind(real, LANES).full
     zero, half, largest = real(0.0), real(0.5), real(np.finfo(real).max)
 
     @inlined
@@ -479,7 +479,11 @@ def coloring(real: type) -> Callable[..., Any]:
 def project_forward(real: type) -> Kernel:
     """Fills means2d, conics, depths, opacities, colors and radii; zeros where a Gaussian is culled."""
     fill_lenses = view_steps(real).fill_lenses
-    list_candidates, place_listed, color_listed = listing(real), placing_listed(real), coloring(real)
+    list_candidates, place_listed, color_listed = (
+        build_list_candidates(real),
+        build_place_listed(real),
+        build_color_listed(real),
+    )
     zero, chunk_size = real(0.0), CHUNK
 
     @kernel("project_forward", real)

@@ -21,17 +21,17 @@ from glassplat.kernels.backend.cpu_vector import (
     minimum,
     row_loader,
     select,
+    split_triples,
     square_root,
     store,
     store_all,
-    thirds,
     times_power_of_2,
     transpose,
     vector_kind,
 )
-from glassplat.kernels.maths.harmonics import channel_with, color_gradient_with, harmonic_basis
+from glassplat.kernels.maths.harmonics import build_channel, build_color_gradient, harmonic_basis
 from glassplat.kernels.maths.projection import LOW_PASS, dot, scaled_sum, shape_maths, tangential
-from glassplat.kernels.project.steps import MOST_SQUARED_DEVIATIONS, place_gradients, pose, vec3, view_with
+from glassplat.kernels.project.steps import MOST_SQUARED_DEVIATIONS, build_view, place_gradients, pose, vec3
 
 LANES = 16
 COLUMNS = 48
@@ -68,7 +68,7 @@ def load_triples_of(real: type) -> Step:
     @inlined
     def load_triples(array, n):
         at = 3 * n
-        return thirds(load(array, at), load(array, at + LANES), load(array, at + 2 * LANES))
+        return split_triples(load(array, at), load(array, at + LANES), load(array, at + 2 * LANES))
 
     return load_triples
 
@@ -158,7 +158,7 @@ def views(real: type) -> Step:
     def held(tangent, low, high):
         return minimum(maximum(tangent, full(low)), full(high))
 
-    return view_with(real, held)
+    return build_view(real, held)
 
 
 def place_of(real: type) -> Step:
@@ -198,7 +198,7 @@ def channel_of(real: type) -> Step:
     def take(table, at, k, c):
         return load(table, at + (3 * k + c) * LANES)
 
-    return channel_with(take)
+    return build_channel(take)
 
 
 def color_steps(real: type) -> tuple[Step, Step]:
@@ -308,7 +308,7 @@ def color_gradient_of(real: type) -> Step:
         begin = at + 3 * k * LANES
         return load(table, begin) * g[0] + load(table, begin + LANES) * g[1] + load(table, begin + 2 * LANES) * g[2]
 
-    adjoint = color_gradient_with(real, put, v_basis)
+    adjoint = build_color_gradient(real, put, v_basis)
 
     @inlined
     def color_gradient(table, at, columns, degree, lens, c):

@@ -23,9 +23,9 @@ from glassplat.kernels.project.disc_steps import discs
 from glassplat.kernels.project.steps import (
     LENS_VALUES,
     Footprint,
+    build_project,
+    build_project_back,
     ellipsoids,
-    projecting,
-    projecting_back,
     vec3,
     view_steps,
 )
@@ -58,10 +58,10 @@ def project_discs(inputs: Sequence[Tensor], width: int, height: int, *, degree: 
 def project_gradients(
     inputs: Sequence[Tensor], width: int, height: int, degree: int,
     *, radii: Tensor, cotangents: Sequence[Tensor], needs_camera: bool,
-    known: list[Tensor] | None = None,
+    accumulated: list[Tensor] | None = None,
 ) -> tuple[list[Tensor], Tensor]:  # fmt: skip
     """As `glassplat.kernels.project.cpu.project_gradients`."""
-    found = _zeros_like(inputs[:5]) if known is None else known
+    found = _zeros_like(inputs[:5]) if accumulated is None else accumulated
     lens = _lenses(inputs[5], inputs[6], width, height)
     return _gradients(project_backward, inputs, lens, degree, (radii, *cotangents), needs_camera, found)
 
@@ -125,7 +125,7 @@ def camera_lenses(real: type) -> Kernel:
 @cache
 def project_forward(real: type) -> Kernel:
     """Fills means2d, conics, depths, opacities, colors and radii; zeros where an ellipsoid is culled."""
-    project_one, zero = projecting(real, ellipsoids(real)), real(0.0)
+    project_one, zero = build_project(real, ellipsoids(real)), real(0.0)
 
     @kernel(
         "project_forward",
@@ -148,7 +148,7 @@ def project_forward(real: type) -> Kernel:
 @cache
 def project_discs_forward(real: type) -> Kernel:
     """Fills the fields of `ProjectedDiscs`; zeros where a disc is culled."""
-    project_one = projecting(real, discs(real))
+    project_one = build_project(real, discs(real))
 
     @kernel(
         "project_discs_forward",
@@ -170,13 +170,13 @@ def project_discs_forward(real: type) -> Kernel:
     return forward
 
 
-def _back(real: type, footprint: Footprint) -> Scalar:
+def _backward_body(real: type, footprint: Footprint) -> Scalar:
     """Builds the body of a backward kernel: sums Gaussians' gradients over cameras, and cameras' over a block."""
     zero, threads, pose = real(0.0), THREADS, POSE
-    shape, finish, project_back = footprint.shape, footprint.finish, projecting_back(real, footprint)
+    shape, finish, project_back = footprint.shape, footprint.finish, build_project_back(real, footprint)
 
     @inlined
-    def back(
+    def backward_body(
         means, quats, log_scales, logit_opacities, inputs, lens, degree, seen, cotangents, needs_camera, found, partial
     ):  # fmt: skip
         block_sums = cuda.shared.array((threads, pose), np.float64)
@@ -211,13 +211,13 @@ def _back(real: type, footprint: Footprint) -> Scalar:
         if touched:
             finish(n, shaped, sums, g_means, g_quats, g_log_scales, g_logit_opacities)
 
-    return back
+    return backward_body
 
 
 @cache
 def project_backward(real: type) -> Kernel:
     """Adds to the gradients of ellipsoids, and fills each block's sums for each camera [blocks, C, 12]."""
-    back = _back(real, ellipsoids(real))
+    backward_body = _backward_body(real, ellipsoids(real))
 
     @kernel(
         "project_backward",
@@ -230,7 +230,7 @@ def project_backward(real: type) -> Kernel:
         g_means2d, g_conics, g_depths, g_opacities, g_colors, needs_camera,
         g_means, g_quats, g_log_scales, g_logit_opacities, g_sh, partial,
     ):  # fmt: skip
-        back(
+        backward_body(
             means, quats, log_scales, logit_opacities, (sh, cam_from_world, intrinsics), lens, degree, (radii, None),
             (g_means2d, g_conics, g_depths, g_opacities, g_colors), needs_camera,
             (g_means, g_quats, g_log_scales, g_logit_opacities, g_sh), partial,
@@ -242,7 +242,7 @@ def project_backward(real: type) -> Kernel:
 @cache
 def project_discs_backward(real: type) -> Kernel:
     """Fills the gradients, initially zero, of discs, and each block's sums for each camera [blocks, C, 12]."""
-    back = _back(real, discs(real))
+    backward_body = _backward_body(real, discs(real))
 
     @kernel(
         "project_discs_backward",
@@ -255,7 +255,7 @@ def project_discs_backward(real: type) -> Kernel:
         g_means2d, g_maps, g_depths, g_opacities, g_colors, g_normals, needs_camera,
         g_means, g_quats, g_log_scales, g_logit_opacities, g_sh, partial,
     ):  # fmt: skip
-        back(
+        backward_body(
             means, quats, log_scales, logit_opacities, (sh, cam_from_world, intrinsics), lens, degree, (radii, maps),
             (g_means2d, g_maps, g_depths, g_opacities, g_colors, g_normals), needs_camera,
             (g_means, g_quats, g_log_scales, g_logit_opacities, g_sh), partial,

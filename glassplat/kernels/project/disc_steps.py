@@ -8,8 +8,8 @@ import numpy as np
 
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
-from glassplat.kernels.maths.disc import MAP, MOST_LOG_SCALE, box, disc_maths, outline, reach
-from glassplat.kernels.maths.projection import along, blend, dot, scaled_sum, shape_maths
+from glassplat.kernels.maths.disc import MAP, MOST_LOG_SCALE, crossing_box, disc_maths, outline, reach
+from glassplat.kernels.maths.projection import dot, dot_products, linear_combination, scaled_sum, shape_maths
 from glassplat.kernels.project.steps import Footprint, pose
 
 
@@ -50,8 +50,8 @@ def cull(c, n, outputs):  # type: ignore[no-untyped-def]
 @inlined
 def tangents(rows, offset, mean, axes):  # type: ignore[no-untyped-def]
     """Both tangents and the centre in camera space."""
-    p = along(axes[0], rows[0], rows[1], rows[2])
-    q = along(axes[1], rows[0], rows[1], rows[2])
+    p = dot_products(axes[0], rows[0], rows[1], rows[2])
+    q = dot_products(axes[1], rows[0], rows[1], rows[2])
     m = dot(rows[0], mean) + offset[0], dot(rows[1], mean) + offset[1], dot(rows[2], mean) + offset[2]
     return p, q, m
 
@@ -61,14 +61,14 @@ ZERO, ONE = np.float32(0.0), np.float32(1.0)
 
 
 @inlined
-def towards(axis, mean, lens, c):  # type: ignore[no-untyped-def]
+def facing_sign(axis, mean, lens, c):  # type: ignore[no-untyped-def]
     """1 if a disc's axis points to the camera, else -1."""
     back = lens[c, 4] - mean[0], lens[c, 5] - mean[1], lens[c, 6] - mean[2]
     return -ONE if dot(back, axis) < ZERO else ONE
 
 
 def _place(real: type) -> Scalar:
-    crossed, faces, map_of, _ = disc_maths(real)
+    cross_products, is_not_edge_on, pixel_map, _ = disc_maths(real)
     is_finite = shape_maths(real).is_finite
     one, alpha_min = real(1.0), real(ALPHA_MIN)
 
@@ -78,11 +78,11 @@ def _place(real: type) -> Scalar:
         means2d, maps, depths, opacities, _, normals, centers, conics, radii = outputs
         row_x, row_y, row_z, offset = pose(cam_from_world, c)
         p, q, m = tangents((row_x, row_y, row_z), offset, mean, axes)
-        a, b, across = crossed(p, q, m)
-        if not (faces(across, m) and opacity > alpha_min and is_finite(m[2])):
+        a, b, across = cross_products(p, q, m)
+        if not (is_not_edge_on(across, m) and opacity > alpha_min and is_finite(m[2])):
             return
         fx, fy = intrinsics[c, 0], intrinsics[c, 1]
-        found = map_of(a, b, across, m, one / deviations[0], one / deviations[1], fx, fy)
+        found = pixel_map(a, b, across, m, one / deviations[0], one / deviations[1], fx, fy)
         total = abs(found[0]) + abs(found[1]) + abs(found[2]) + abs(found[3]) + abs(found[4]) + abs(found[5])
         if not is_finite(total):
             return
@@ -93,7 +93,7 @@ def _place(real: type) -> Scalar:
         x, y = u + real(dx), v + real(dy)
         left, right, top, bottom = x - real(wide), x + real(wide), y - real(high), y + real(high)
         if xx == 0.0:
-            reached = box(m, p, q, deviations, reach(opacity), np.float64(near), fx, fy)
+            reached = crossing_box(m, p, q, deviations, reach(opacity), np.float64(near), fx, fy)
             left, right = real(reached[0]) + intrinsics[c, 2], real(reached[1]) + intrinsics[c, 2]
             top, bottom = real(reached[2]) + intrinsics[c, 3], real(reached[3]) + intrinsics[c, 3]
         # Written so that NaN fails every comparison and the disc stays culled.
@@ -101,7 +101,7 @@ def _place(real: type) -> Scalar:
         down_window = bottom > windows[c, 1] and top < windows[c, 3]
         if not (across_window and down_window and is_finite(u) and is_finite(v)):
             return
-        side = towards(axes[2], mean, lens, c)
+        side = facing_sign(axes[2], mean, lens, c)
         means2d[c, n, 0], means2d[c, n, 1], depths[c, n], opacities[c, n] = u, v, m[2], opacity
         centers[c, n, 0], centers[c, n, 1], radii[c, n, 0], radii[c, n, 1] = x, y, real(wide), real(high)
         conics[c, n, 0], conics[c, n, 1], conics[c, n, 2] = real(xx), real(xy), real(yy)
@@ -114,13 +114,13 @@ def _place(real: type) -> Scalar:
 
 
 @inlined
-def six(array, c, n):  # type: ignore[no-untyped-def]
+def disc_map(array, c, n):  # type: ignore[no-untyped-def]
     """The map of a disc in a camera, or its gradient."""
     return array[c, n, 0], array[c, n, 1], array[c, n, 2], array[c, n, 3], array[c, n, 4], array[c, n, 5]
 
 
 def _place_gradient(real: type) -> Scalar:
-    crossed, _, _, map_gradient = disc_maths(real)
+    cross_products, _, _, map_gradient = disc_maths(real)
     one = real(1.0)
 
     @inlined
@@ -132,24 +132,33 @@ def _place_gradient(real: type) -> Scalar:
         row_x, row_y, row_z, offset = pose(cam_from_world, c)
         rows = row_x, row_y, row_z
         p, q, m = tangents(rows, offset, mean, axes)
-        across = crossed(p, q, m)[2]
+        across = cross_products(p, q, m)[2]
         fx, fy, inverse = intrinsics[c, 0], intrinsics[c, 1], one / m[2]
         g_p, g_q, g_m, g_u, g_v = map_gradient(
-            p, q, m, across, six(maps, c, n), one / deviations[0], one / deviations[1], fx, fy, six(g_maps, c, n)
+            p,
+            q,
+            m,
+            across,
+            disc_map(maps, c, n),
+            one / deviations[0],
+            one / deviations[1],
+            fx,
+            fy,
+            disc_map(g_maps, c, n),
         )
         g_x, g_y = g_means2d[c, n, 0] * fx * inverse, g_means2d[c, n, 1] * fy * inverse
         behind = (g_x * m[0] + g_y * m[1]) * inverse
         g_center = g_m[0] + g_x, g_m[1] + g_y, g_m[2] + g_depths[c, n] - behind
-        side = towards(axes[2], mean, lens, c)
+        side = facing_sign(axes[2], mean, lens, c)
         g_axes = (
             scaled_sum(g_p, row_x, row_y, row_z),
             scaled_sum(g_q, row_x, row_y, row_z),
             (side * g_normals[c, n, 0], side * g_normals[c, n, 1], side * g_normals[c, n, 2]),
         )
         g_rows = (
-            blend(g_p[0], axes[0], g_q[0], axes[1]),
-            blend(g_p[1], axes[0], g_q[1], axes[1]),
-            blend(g_p[2], axes[0], g_q[2], axes[1]),
+            linear_combination(g_p[0], axes[0], g_q[0], axes[1]),
+            linear_combination(g_p[1], axes[0], g_q[1], axes[1]),
+            linear_combination(g_p[2], axes[0], g_q[2], axes[1]),
         )
         return g_center, g_rows, g_axes, (g_u, g_v)
 

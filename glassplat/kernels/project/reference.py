@@ -135,10 +135,10 @@ def _visible(projected: Projected, gaussians: RawGaussians, cameras: CameraBatch
     usable = torch.cat(raw, dim=-1).isfinite().all(dim=-1) & norm.isfinite() & (norm > 0)
     visible = usable & (projected.depths > near) & projected.depths.isfinite()
     low, high = projected.means2d - projected.radii, projected.means2d + projected.radii
-    return visible & _wanted(low, high, gaussians, cameras) & (projected.radii > 0).all(dim=-1)
+    return visible & _in_window(low, high, gaussians, cameras) & (projected.radii > 0).all(dim=-1)
 
 
-def _wanted(low: Tensor, high: Tensor, gaussians: RawGaussians, cameras: CameraBatch) -> Tensor:
+def _in_window(low: Tensor, high: Tensor, gaussians: RawGaussians, cameras: CameraBatch) -> Tensor:
     """Mask [C, N] of Gaussians on the kept side of the clip plane with boxes that overlap the window."""
     windows = cameras.windows
     if windows is None:
@@ -241,13 +241,13 @@ def _visible_discs(projected: ProjectedDiscs, gaussians: RawGaussians, cameras: 
     usable &= (gaussians.log_scales.abs() <= MOST_LOG_SCALE).all(dim=-1)
     visible = usable & (projected.depths > near)
     visible = visible & projected.maps.isfinite().all(dim=-1) & projected.colors.isfinite().all(dim=-1)
-    visible = visible & projected.depths.isfinite() & _faces(gaussians, cameras)
+    visible = visible & projected.depths.isfinite() & _is_not_edge_on(gaussians, cameras)
     visible = visible & (projected.opacities > ALPHA_MIN)
     low, high = projected.outline_centers - projected.radii, projected.outline_centers + projected.radii
     crossing = (projected.outline_conics == 0).all(dim=-1, keepdim=True)
     lowest, highest = _crossing_boxes(gaussians, cameras, projected.opacities, near)
     low, high = torch.where(crossing, lowest, low), torch.where(crossing, highest, high)
-    return visible & _wanted(low, high, gaussians, cameras)
+    return visible & _in_window(low, high, gaussians, cameras)
 
 
 def _crossing_boxes(
@@ -278,7 +278,7 @@ def _crossing_boxes(
     return lowest.to(opacities.dtype), (torch.maximum(corners.amax(0), place + spot) + middle).to(opacities.dtype)
 
 
-def _faces(gaussians: RawGaussians, cameras: CameraBatch) -> Tensor:
+def _is_not_edge_on(gaussians: RawGaussians, cameras: CameraBatch) -> Tensor:
     """Mask [C, N] of discs that are not seen edge-on."""
     linear, offset = cameras.cam_from_world[:, :3, :3], cameras.cam_from_world[:, :3, 3]
     centers = gaussians.means @ linear.mT + offset[:, None]

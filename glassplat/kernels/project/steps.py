@@ -12,11 +12,11 @@ from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import ALPHA_MIN
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.maths.projection import (
-    along,
-    blend,
     clamp,
     dot,
+    dot_products,
     footprint,
+    linear_combination,
     scaled_sum,
     screen_maths,
     shape_maths,
@@ -62,7 +62,7 @@ class ViewSteps(NamedTuple):
 
 def view_steps(real: type) -> ViewSteps:
     """Builds the parts for `real`, np.float32 or np.float64."""
-    return ViewSteps(_shape(real), view_with(real, clamp), *_lenses(real))
+    return ViewSteps(_shape(real), build_view(real, clamp), *_lenses(real))
 
 
 def _shape(real: type) -> Callable[..., Any]:
@@ -93,7 +93,7 @@ def _lenses(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
     @inlined
     def skewed(row, row_z, tangent):
         """Length of a unit sphere's footprint in multiples of focal length over depth."""
-        w = blend(one, row, -tangent, row_z)
+        w = linear_combination(one, row, -tangent, row_z)
         return math.sqrt(dot(w, w))
 
     @inlined
@@ -124,7 +124,7 @@ def _lenses(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
     return fill_lenses, direction
 
 
-def view_with(real: type, clamped: Callable[..., Any]) -> Callable[..., Any]:
+def build_view(real: type, clamped: Callable[..., Any]) -> Callable[..., Any]:
     """Builds `view` for scalars or vectors, given the function that clamps them."""
     screen_covariance, one = screen_maths(real).screen_covariance, real(1.0)
 
@@ -136,7 +136,7 @@ def view_with(real: type, clamped: Callable[..., Any]) -> Callable[..., Any]:
         held_x, held_y = clamped(tangent_x, lens[c, 0], lens[c, 1]), clamped(tangent_y, lens[c, 2], lens[c, 3])
         scale_x, scale_y = intrinsics[c, 0] * inverse_depth, intrinsics[c, 1] * inverse_depth
         w_x, w_y = footprint(rows[0], rows[1], rows[2], scale_x, scale_y, held_x, held_y)
-        v_x, v_y = along(w_x, axes[0], axes[1], axes[2]), along(w_y, axes[0], axes[1], axes[2])
+        v_x, v_y = dot_products(w_x, axes[0], axes[1], axes[2]), dot_products(w_y, axes[0], axes[1], axes[2])
         return (tangent_x, tangent_y), (held_x, held_y), (w_x, w_y), (v_x, v_y), screen_covariance(v_x, v_y)
 
     return view
@@ -146,7 +146,7 @@ MOST_SQUARED_DEVIATIONS = 1.01 * 2.0 * math.log(1.0 / ALPHA_MIN)
 """Squared number of standard deviations at which even full opacity falls to `ALPHA_MIN`, plus one percent."""
 
 
-def placing(real: type) -> Callable[..., Any]:
+def build_place(real: type) -> Callable[..., Any]:
     """Builds `place` for ellipsoids: if one is visible in a camera, fills all its outputs but the colour."""
     view = view_steps(real).view
     half_extents = screen_maths(real).half_extents
@@ -178,7 +178,7 @@ def placing(real: type) -> Callable[..., Any]:
     return place
 
 
-def culling(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def build_cull(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Builds `cull`, which zeroes one ellipsoid in one camera, and `in_front`, a test of near and clip planes."""
     zero = real(0.0)
 
@@ -227,8 +227,8 @@ def place_gradients(real: type, free: Callable[..., Any] | None = None) -> Calla
         g_tangent_x, g_tangent_y = fx * g_mean2d[0] + g_held_x, fy * g_mean2d[1] + g_held_y
         g_log_depth = dot(gw_x, w_x) + dot(gw_y, w_y) + g_tangent_x * tangent[0] + g_tangent_y * tangent[1]
         g_position = inverse_depth * g_tangent_x, inverse_depth * g_tangent_y, g_depth - inverse_depth * g_log_depth
-        g_row_x, g_row_y = blend(scale_x, gw_x, zero, gw_x), blend(scale_y, gw_y, zero, gw_y)
-        g_row_z = blend(-scale_x * held[0], gw_x, -scale_y * held[1], gw_y)
+        g_row_x, g_row_y = linear_combination(scale_x, gw_x, zero, gw_x), linear_combination(scale_y, gw_y, zero, gw_y)
+        g_row_z = linear_combination(-scale_x * held[0], gw_x, -scale_y * held[1], gw_y)
         return g_position, (g_row_x, g_row_y, g_row_z), g_axes
 
     return place_gradient
@@ -243,7 +243,7 @@ def camera_sums(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
         for i in range(3):
             g_row = g_rows[0] if i == 0 else (g_rows[1] if i == 1 else g_rows[2])
             g_i = g_position[0] if i == 0 else (g_position[1] if i == 1 else g_position[2])
-            from_row = blend(one, g_row, g_i, mean)
+            from_row = linear_combination(one, g_row, g_i, mean)
             total[4 * i + 0] += np.float64(from_row[0])
             total[4 * i + 1] += np.float64(from_row[1])
             total[4 * i + 2] += np.float64(from_row[2])
@@ -308,14 +308,16 @@ class Footprint(NamedTuple):
 
 def ellipsoids(real: type) -> Footprint:
     """Builds the footprint of ellipsoids, for one at a time."""
-    culled = culling(real)[0]
+    culled = build_cull(real)[0]
 
     @inlined
     def cull(c, n, outputs):
         means2d, conics, depths, opacities, colors, radii = outputs
         culled(n, c, means2d, conics, depths, opacities, colors, radii)
 
-    return Footprint(view_steps(real).shape, cull, placing(real), _ellipsoid_gradient(real), _finish_ellipsoid(real))
+    return Footprint(
+        view_steps(real).shape, cull, build_place(real), _ellipsoid_gradient(real), _finish_ellipsoid(real)
+    )
 
 
 def _ellipsoid_gradient(real: type) -> Callable[..., Any]:
@@ -357,9 +359,9 @@ def _finish_ellipsoid(real: type) -> Callable[..., Any]:
         g_log_scales[n, 1] += dot(axes[1], g_axes[1])
         g_log_scales[n, 2] += dot(axes[2], g_axes[2])
         g_x, g_y, g_z = (
-            blend(dot(axes[0], x), g_axes[0], zero, x),
-            blend(dot(axes[1], y), g_axes[1], zero, y),
-            blend(dot(axes[2], z), g_axes[2], zero, z),
+            linear_combination(dot(axes[0], x), g_axes[0], zero, x),
+            linear_combination(dot(axes[1], y), g_axes[1], zero, y),
+            linear_combination(dot(axes[2], z), g_axes[2], zero, z),
         )
         g_w, g_i, g_j, g_k = unit_quat_gradient(quat, inverse_norm, g_x, g_y, g_z)
         g_quats[n, 0] += g_w
@@ -370,9 +372,9 @@ def _finish_ellipsoid(real: type) -> Callable[..., Any]:
     return finish
 
 
-def projecting(real: type, kind: Footprint) -> Callable[..., Any]:
+def build_project(real: type, kind: Footprint) -> Callable[..., Any]:
     """Builds the step that fills the outputs of one Gaussian in all cameras, zeros where it is culled."""
-    direction, in_front = view_steps(real).direction, culling(real)[1]
+    direction, in_front = view_steps(real).direction, build_cull(real)[1]
     shape, cull, place, *_ = kind
     is_finite, color = shape_maths(real).is_finite, color_maths(real).color
     zero, half = real(0.0), real(0.5)
@@ -406,7 +408,7 @@ def projecting(real: type, kind: Footprint) -> Callable[..., Any]:
     return project
 
 
-def projecting_back(real: type, kind: Footprint) -> Callable[..., Any]:
+def build_project_back(real: type, kind: Footprint) -> Callable[..., Any]:
     """Builds the step that adds one visible Gaussian's gradients to the inputs of `finish`, and to its camera's."""
     place_gradient, view_gradient, (add_place, add_view) = kind.place_gradient, view_gradients(real), camera_sums(real)
     zero, one = real(0.0), real(1.0)
@@ -421,16 +423,16 @@ def projecting_back(real: type, kind: Footprint) -> Callable[..., Any]:
             c, n, mean, shaped, cam_from_world, intrinsics, lens, maps, cotangents
         )
         row_x, row_y, row_z, _ = pose(cam_from_world, c)
-        g_mean = blend(one, g_mean, one, scaled_sum(g_center, row_x, row_y, row_z))
-        ga_x, ga_y = blend(one, ga_x, one, g_axes[0]), blend(one, ga_y, one, g_axes[1])
-        ga_z = blend(one, ga_z, one, g_axes[2])
+        g_mean = linear_combination(one, g_mean, one, scaled_sum(g_center, row_x, row_y, row_z))
+        ga_x, ga_y = linear_combination(one, ga_x, one, g_axes[0]), linear_combination(one, ga_y, one, g_axes[1])
+        ga_z = linear_combination(one, ga_z, one, g_axes[2])
         g_u, g_v, g_opacity = g_u + g_scales[0], g_v + g_scales[1], g_opacity + g_opacities[c, n]
         if needs_camera:
             add_place(total, g_rows, g_center, mean)
         g_color = g_colors[c, n, 0], g_colors[c, n, 1], g_colors[c, n, 2]
         if degree >= 0 and (g_color[0] != zero or g_color[1] != zero or g_color[2] != zero):
             g_view = view_gradient(sh, n, degree, mean, lens, c, g_color, g_sh)
-            g_mean = blend(one, g_mean, one, g_view)
+            g_mean = linear_combination(one, g_mean, one, g_view)
             if needs_camera:
                 add_view(total, cam_from_world, c, g_view)
         return g_mean, g_opacity, (ga_x, ga_y, ga_z), (g_u, g_v)

@@ -38,7 +38,7 @@ def shapes_of(gaussians: RawGaussians) -> Shapes:
     """
     usable = _usable(gaussians)
     # Placeholders: a NaN masked afterwards would still reach the gradients, as NaN times zero.
-    tensors = (torch.where(_over(usable, x), x, torch.ones_like(x)) for x in gaussians)
+    tensors = (torch.where(_expand_mask(usable, x), x, torch.ones_like(x)) for x in gaussians)
     means, quats, log_scales, logit_opacities, sh = tensors
     inverse = torch.exp(-log_scales)
     if log_scales.shape[1] == FLAT:
@@ -56,7 +56,7 @@ def _usable(gaussians: RawGaussians) -> Tensor:
     return everything.isfinite().all(dim=1) & norm.isfinite() & (norm > 0) & sized
 
 
-def _over(mask: Tensor, tensor: Tensor) -> Tensor:
+def _expand_mask(mask: Tensor, tensor: Tensor) -> Tensor:
     return mask.reshape(mask.shape + (1,) * (tensor.dim() - 1))
 
 
@@ -153,7 +153,7 @@ class _Trace(torch.autograd.Function):
         tensors = [tensor.detach().contiguous() for tensor in inputs]
         ctx.options = {"flat": flat, "degree": degree, "near": near}
         outputs: tuple[Tensor, ...] = kernels_for("trace", tensors[0].device).trace(
-            tensors[:4], tensors[4:], bvh, **ctx.options, learning=any(ctx.needs_input_grad)
+            tensors[:4], tensors[4:], bvh, **ctx.options, needs_gradients=any(ctx.needs_input_grad)
         )
         ctx.save_for_backward(*tensors, *bvh, *outputs)
         ctx.mark_non_differentiable(outputs[3])

@@ -60,7 +60,7 @@ def _half_widths(real: type, flat: bool) -> Scalar:
     return half_widths
 
 
-def leaf_fitting(real: type, flat: bool) -> Scalar:
+def build_fit_leaf(real: type, flat: bool) -> Scalar:
     """Builds the step that fits the empty box at position k of a leaf to a Gaussian that rays can hit."""
     zero, nowhere, half_widths = real(0.0), real("inf"), _half_widths(real, flat)
 
@@ -92,9 +92,9 @@ def hilbert_codes(points: Tensor) -> Tensor:
     What is not finite comes last.
     """
     cells, finite = curve_cells(points)
-    places = torch.empty(len(points), dtype=torch.int64)
-    hilbert_places(REAL_OF[points.dtype])(cells.numpy(), places.numpy())
-    return torch.where(finite, places, torch.iinfo(torch.int64).max)
+    positions = torch.empty(len(points), dtype=torch.int64)
+    hilbert_positions(REAL_OF[points.dtype])(cells.numpy(), positions.numpy())
+    return torch.where(finite, positions, torch.iinfo(torch.int64).max)
 
 
 def curve_cells(points: Tensor) -> tuple[Tensor, Tensor]:
@@ -146,7 +146,7 @@ def hilbert_axes(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def curve_place(x, y, z):  # type: ignore[no-untyped-def]
+def curve_position(x, y, z):  # type: ignore[no-untyped-def]
     """Position of a cell along the curve."""
     x, y, z = hilbert_axes(x, y, z)
     place = np.int64(0)
@@ -157,15 +157,15 @@ def curve_place(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @cache
-def hilbert_places(real: type) -> Kernel:
+def hilbert_positions(real: type) -> Kernel:
     """Fills the positions of cells along the curve."""
 
-    @kernel("hilbert_places", real)
-    def fill(cells: NDArray[Any], places: NDArray[Any]) -> None:
-        count = places.size
+    @kernel("hilbert_positions", real)
+    def fill(cells: NDArray[Any], positions: NDArray[Any]) -> None:
+        count = positions.size
         for chunk in prange((count + CHUNK - 1) // CHUNK):
             for i in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-                places[i] = curve_place(cells[i, 0], cells[i, 1], cells[i, 2])
+                positions[i] = curve_position(cells[i, 0], cells[i, 1], cells[i, 2])
 
     return fill
 

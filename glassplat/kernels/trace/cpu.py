@@ -28,7 +28,7 @@ from glassplat.kernels.maths.disc import ray_hit_maths
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.records import REAL_OF, Bvh, Shapes
 from glassplat.kernels.trace import reach
-from glassplat.kernels.trace.bvh import hilbert_codes, leaf_fitting, level_offsets
+from glassplat.kernels.trace.bvh import build_fit_leaf, hilbert_codes, level_offsets
 from glassplat.kernels.trace.cpu_traversal import arrays_of, next_hits_maths, packed_leaves
 from glassplat.kernels.trace.steps import (
     CHUNK,
@@ -60,7 +60,7 @@ def build_bvh(shapes: Shapes, *, flat: bool) -> Bvh:
 @cache
 def fit_boxes(real: type, flat: bool) -> Kernel:
     """Fills the boxes of all nodes."""
-    nowhere, fit_leaf = real("inf"), leaf_fitting(real, flat)
+    nowhere, fit_leaf = real("inf"), build_fit_leaf(real, flat)
 
     @kernel("fit_boxes_discs" if flat else "fit_boxes_ellipsoids", real)
     def fit(means, frames, extents, order, offsets, boxes):
@@ -106,14 +106,14 @@ def trace_gradients(
     real, count = REAL_OF[means.dtype], means.shape[0]
     hit_offsets = torch.cat([hits.new_zeros(1, dtype=torch.int64), hits.cumsum(0)])
     # Zeros: if the second kernel rounds differently and finds fewer hits, the remaining indices must be valid.
-    met = torch.zeros(int(hit_offsets[-1]), dtype=torch.int32)
+    hit_ids = torch.zeros(int(hit_offsets[-1]), dtype=torch.int32)
     num_blocks = -(-hits.shape[0] // GRADIENT_BLOCK)
     distinct = torch.zeros(num_blocks, dtype=torch.int64)
     places = np.full((numba.get_num_threads(), 2, count), -1, np.int32)
     inputs = tuple(tensor.numpy() for tensor in (*shapes[:3], *rays))
     trace_collect(real, flat)(
         packed_leaves(shapes, bvh[0]), *inputs[3:], *arrays_of(bvh), real(near), kept.numpy(), hit_offsets.numpy(),
-        places, met.numpy(), distinct.numpy(),
+        places, hit_ids.numpy(), distinct.numpy(),
     )  # fmt: skip
     row_offsets = torch.cat([distinct.new_zeros(1), distinct.cumsum(0)])
     num_rows = int(row_offsets[-1])
@@ -123,7 +123,7 @@ def trace_gradients(
     v_rays = tuple(torch.zeros_like(ray) for ray in rays)
     places[...] = -1
     trace_backward(real, flat)(
-        *inputs, sh.numpy(), degree, hit_offsets.numpy(), met.numpy(), row_offsets.numpy(), places,
+        *inputs, sh.numpy(), degree, hit_offsets.numpy(), hit_ids.numpy(), row_offsets.numpy(), places,
         *(tensor.numpy() for tensor in (*outputs[:3], *cotangents)),
         owners.numpy(), rows, sh_rows, *(tensor.numpy() for tensor in v_rays),
     )  # fmt: skip
@@ -145,11 +145,11 @@ def _sum_rows(
 
 @cache
 def trace_collect(real: type, flat: bool) -> Kernel:
-    """Fills `met`, the Gaussians hit by each ray, nearest first, and the number of distinct ones in each block."""
+    """Fills `hit_ids`, the Gaussians hit by each ray, nearest first, and the number of distinct ones in each block."""
     next_hits, ray = next_hits_maths(real, flat), ray_reader(real)
 
     @kernel("trace_collect_discs" if flat else "trace_collect_ellipsoids", real)
-    def collect(leaves, origins, directions, order, boxes, offsets, near, kept, hit_offsets, places, met, distinct):
+    def collect(leaves, origins, directions, order, boxes, offsets, near, kept, hit_offsets, places, hit_ids, distinct):
         count, num_blocks = origins.shape[0], distinct.size
         stride = even_stride(num_blocks)
         for task in prange(num_blocks):
@@ -164,20 +164,20 @@ def trace_collect(real: type, flat: bool) -> Kernel:
                 begin, end = hit_offsets[r], hit_offsets[r + 1]
                 if end - begin <= kept.shape[1]:
                     for k in range(end - begin):
-                        met[begin + k] = kept[r // BLOCK, k, r % BLOCK]
+                        hit_ids[begin + k] = kept[r // BLOCK, k, r % BLOCK]
                 else:
                     o, d, inverse, _, _ = ray(origins, directions, r)
                     first, first_id, place = near, 2147483647, begin
                     while place < end:
-                        known = next_hits(
+                        num_found = next_hits(
                             o, d, inverse, leaves, order, boxes, offsets, first, first_id, LATER_CHUNK,
                             ts, ids, alphas, entries, squares, stack, waiting,
                         )  # fmt: skip
-                        for k in range(min(known, end - place)):
-                            met[place + k] = ids[k]
+                        for k in range(min(num_found, end - place)):
+                            hit_ids[place + k] = ids[k]
                         first, first_id, place = ts[LATER_CHUNK - 1], ids[LATER_CHUNK - 1], place + LATER_CHUNK
                 for place in range(begin, end):
-                    g = met[place]
+                    g = hit_ids[place]
                     if seen[g] != block:
                         seen[g] = block
                         different += 1
@@ -188,7 +188,7 @@ def trace_collect(real: type, flat: bool) -> Kernel:
 
 def _hit_gradients(real: type, flat: bool) -> Scalar:
     """Builds the step that adds one hit's gradients to its Gaussian's row and to its ray."""
-    meet_gradient, half, most = ray_hit_maths(real, flat).meet_gradient, real(0.5), real(ALPHA_MAX)
+    intersect_gradient, half, most = ray_hit_maths(real, flat).intersect_gradient, real(0.5), real(ALPHA_MAX)
     zero = real(0.0)
 
     @inlined
@@ -196,7 +196,7 @@ def _hit_gradients(real: type, flat: bool) -> Scalar:
         t, q, covered = hit
         v_covered = v_alpha if covered < most else zero
         row[OPACITY_AT] += v_covered * covered / opacity
-        v_o, v_d, v_frame = meet_gradient(offset, d, frame, t, q, v_t, -half * covered * v_covered)
+        v_o, v_d, v_frame = intersect_gradient(offset, d, frame, t, q, v_t, -half * covered * v_covered)
         for j in range(3):
             row[j] -= v_o[j]
             row[FRAME_AT + j] += v_frame[0][j]
@@ -212,12 +212,12 @@ def _hit_gradients(real: type, flat: bool) -> Scalar:
 def trace_backward(real: type, flat: bool) -> Kernel:
     """Fills each block's rows and their owners, and the gradients, initially zero, of the rays."""
     coverage, add_gradients = coverage_maths(real, blend_maths(real).exp2), _hit_gradients(real, flat)
-    meet, hit_color_gradient = ray_hit_maths(real, flat).meet, color_backward(real)
+    intersect, hit_color_gradient = ray_hit_maths(real, flat).intersect, color_backward(real)
     zero, half, one, nowhere = real(0.0), real(0.5), real(1.0), real("inf")
 
     @kernel("trace_backward_discs" if flat else "trace_backward_ellipsoids", real)
     def backward(
-        means, frames, opacities, origins, directions, sh, degree, hit_offsets, met, row_offsets, places,
+        means, frames, opacities, origins, directions, sh, degree, hit_offsets, hit_ids, row_offsets, places,
         colors, alphas, depths, v_colors, v_alphas, v_depths, owners, rows, sh_rows, v_origins, v_directions,
     ):  # fmt: skip
         count, num_blocks = origins.shape[0], row_offsets.size - 1
@@ -238,7 +238,7 @@ def trace_backward(real: type, flat: bool) -> Kernel:
                     behind += v_colors[r, j] * colors[r, j]
                 left, end, v_length = one, v_alphas[r] * (one - alphas[r]), zero
                 for place in range(hit_offsets[r], hit_offsets[r + 1]):
-                    g = met[place]
+                    g = hit_ids[place]
                     if seen[g] != block:
                         seen[g], own[g], owners[free] = block, free, g
                         rows[free] = zero
@@ -246,7 +246,7 @@ def trace_backward(real: type, flat: bool) -> Kernel:
                         free += 1
                     row = own[g]
                     offset, frame = shape_of(means, frames, g, o)
-                    t, q, squared = meet(offset, d, frame)
+                    t, q, squared = intersect(offset, d, frame)
                     # At a threshold, a hit of the search may be missed here because of different rounding.
                     if not t < nowhere:
                         continue
@@ -305,7 +305,7 @@ MOST_KEPT, KEPT_BYTES = 256, 2**27
 
 def trace(
     shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tensor],
-    *, flat: bool, degree: int, near: float, learning: bool,
+    *, flat: bool, degree: int, near: float, needs_gradients: bool,
 ) -> tuple[Tensor, ...]:  # fmt: skip
     """Fields of `Traced`, and each ray's nearest Gaussians [blocks, K, BLOCK] int32 for its gradients.
 
@@ -313,7 +313,7 @@ def trace(
     """
     origins = rays[0]
     count, real = origins.shape[0], REAL_OF[origins.dtype]
-    num_kept = min(MOST_KEPT, KEPT_BYTES // (4 * max(count, 1))) if learning else 0
+    num_kept = min(MOST_KEPT, KEPT_BYTES // (4 * max(count, 1))) if needs_gradients else 0
     outputs = (
         origins.new_empty(count, 3),
         origins.new_empty(count),
@@ -359,12 +359,12 @@ def trace_forward(real: type, flat: bool) -> Kernel:
                 left, blended = one, 0
                 first, first_id, most, ended = near, 2147483647, CHUNK, not usable
                 while not ended:
-                    known = next_hits(
+                    num_found = next_hits(
                         o, d, inverse, leaves, order, boxes, offsets, first, first_id, most,
                         ts, ids, found, entries, squares, stack, waiting,
                     )  # fmt: skip
-                    ended = known < most
-                    for k in range(known):
+                    ended = num_found < most
+                    for k in range(num_found):
                         after = left * (one - found[k])
                         if after < least:
                             ended = True

@@ -56,7 +56,7 @@ def _entry(real: type) -> Scalar:
     return enter
 
 
-def _lanes(real: type, flat: bool) -> Scalar:
+def _intersect_lanes(real: type, flat: bool) -> Scalar:
     """Builds the step that writes (t, squared |q|) of a ray and eight Gaussians, and returns possible hits, as bits.
 
     It vectorises the intersection of `maths/disc.py`.
@@ -75,7 +75,7 @@ def _lanes(real: type, flat: bool) -> Scalar:
         return load(leaves, at) - o[0], load(leaves, at + WIDTH) - o[1], load(leaves, at + 2 * WIDTH) - o[2]
 
     @inlined
-    def meet_discs(leaves, leaf, o, d, first, last, ts, squares):  # type: ignore[no-untyped-def]
+    def intersect_discs(leaves, leaf, o, d, first, last, ts, squares):  # type: ignore[no-untyped-def]
         at = leaf * LEAF
         x, y, z = offsets_of(leaves, at, o)
         distance, slope = row(leaves, at + 9 * WIDTH, x, y, z, d)
@@ -90,7 +90,7 @@ def _lanes(real: type, flat: bool) -> Scalar:
         return bits_of(facing & (t >= first) & (t <= last) & (squared <= farthest))
 
     @inlined
-    def meet_ellipsoids(leaves, leaf, o, d, first, last, ts, squares):  # type: ignore[no-untyped-def]
+    def intersect_ellipsoids(leaves, leaf, o, d, first, last, ts, squares):  # type: ignore[no-untyped-def]
         at = leaf * LEAF
         x, y, z = offsets_of(leaves, at, o)
         e0, f0 = row(leaves, at + 3 * WIDTH, x, y, z, d)
@@ -107,7 +107,7 @@ def _lanes(real: type, flat: bool) -> Scalar:
         store(squares, 0, squared)
         return bits_of((length > zero) & (t >= first) & (t <= last) & (squared <= farthest))
 
-    return meet_discs if flat else meet_ellipsoids
+    return intersect_discs if flat else intersect_ellipsoids
 
 
 @cache
@@ -145,7 +145,7 @@ def packed_leaves(shapes: Sequence[Tensor], order: Tensor) -> NDArray[Any]:
 
 def next_hits_maths(real: type, flat: bool) -> Scalar:
     """Builds `next_hits`, which fills (ts, ids, alphas) with up to `most` next hits of a ray; returns their number."""
-    enter, meet = _entry(real), _lanes(real, flat)
+    enter, intersect = _entry(real), _intersect_lanes(real, flat)
     coverage = coverage_maths(real, blend_maths(real).exp2)
     zero, nowhere, sooner = real(0.0), real("inf"), real(1.0 - SLACK)
 
@@ -165,11 +165,11 @@ def next_hits_maths(real: type, flat: bool) -> Scalar:
                 continue
             level, node = stack[top] & ((1 << LEVEL_BITS) - 1), stack[top] >> LEVEL_BITS
             if level > 0:
-                met = enter(boxes, node, o, inverse, first, farthest, entries)
+                hit_bits = enter(boxes, node, o, inverse, first, farthest, entries)
                 child, begin = (node - offsets[level]) * WIDTH + offsets[level - 1], top
-                while met != 0:
-                    k = lowest_bit(met)
-                    met &= met - 1
+                while hit_bits != 0:
+                    k = lowest_bit(hit_bits)
+                    hit_bits &= hit_bits - 1
                     at, place = entries[k], top
                     # Nearest last, so that it is popped first.
                     while place > begin and waiting[place - 1] < at:
@@ -179,10 +179,10 @@ def next_hits_maths(real: type, flat: bool) -> Scalar:
                     top += 1
                 continue
             # Testing eight Gaussians takes hardly longer than testing boxes around them.
-            met = meet(leaves, node, o, d, first, farthest, entries, squares)
-            while met != 0:
-                k = lowest_bit(met)
-                met &= met - 1
+            hit_bits = intersect(leaves, node, o, d, first, farthest, entries, squares)
+            while hit_bits != 0:
+                k = lowest_bit(hit_bits)
+                hit_bits &= hit_bits - 1
                 t, g = entries[k], order[node * WIDTH + k]
                 if not (t > first or g > first_id):
                     continue

@@ -28,7 +28,7 @@ from glassplat.kernels.maths.fast_maths import exp2_maths
 from glassplat.kernels.maths.harmonics import MAX_DEGREE, color_maths
 from glassplat.kernels.records import REAL_OF, Bvh, Shapes
 from glassplat.kernels.trace import reach
-from glassplat.kernels.trace.bvh import curve_cells, curve_place, leaf_fitting, level_offsets
+from glassplat.kernels.trace.bvh import build_fit_leaf, curve_cells, curve_position, level_offsets
 from glassplat.kernels.trace.steps import (
     CHUNK,
     CONTRIBUTION_AT,
@@ -78,20 +78,20 @@ def _on_device(numbers: list[int], device: torch.device) -> Tensor:
 def hilbert_codes(points: Tensor) -> Tensor:
     """As `glassplat.kernels.trace.bvh.hilbert_codes`."""
     cells, finite = curve_cells(points)
-    places = torch.empty(len(points), dtype=torch.int64, device=points.device)
-    hilbert_places()(blocks_for(len(points), THREADS), THREADS, cells, places)
-    return torch.where(finite, places, torch.iinfo(torch.int64).max)
+    positions = torch.empty(len(points), dtype=torch.int64, device=points.device)
+    hilbert_positions()(blocks_for(len(points), THREADS), THREADS, cells, positions)
+    return torch.where(finite, positions, torch.iinfo(torch.int64).max)
 
 
 @cache
-def hilbert_places(key: type = np.int64) -> Kernel:
+def hilbert_positions(key: type = np.int64) -> Kernel:
     """Fills the positions of cells along the curve."""
 
-    @kernel("hilbert_places", key, "long2 long1")
-    def fill(cells, places):
+    @kernel("hilbert_positions", key, "long2 long1")
+    def fill(cells, positions):
         i = cuda.grid(1)
-        if i < places.size:
-            places[i] = curve_place(cells[i, 0], cells[i, 1], cells[i, 2])
+        if i < positions.size:
+            positions[i] = curve_position(cells[i, 0], cells[i, 1], cells[i, 2])
 
     return fill
 
@@ -99,7 +99,7 @@ def hilbert_places(key: type = np.int64) -> Kernel:
 @cache
 def fit_leaves(real: type, flat: bool) -> Kernel:
     """Fills the boxes of the leaves, one thread per Gaussian and per unused position."""
-    nowhere, fit_leaf = real("inf"), leaf_fitting(real, flat)
+    nowhere, fit_leaf = real("inf"), build_fit_leaf(real, flat)
 
     @kernel("fit_leaves_discs" if flat else "fit_leaves_ellipsoids", real, "real2 real3 real1 int1 real3")
     def fit(means, frames, extents, order, boxes):
@@ -157,7 +157,7 @@ def enter(boxes, at, o, inverse, first, last):
 
 def next_hits_maths(real: type, flat: bool) -> Scalar:
     """Builds `next_hits`, which fills (ts, ids, alphas) with a ray's next hits and returns their number."""
-    meet, coverage = ray_hit_maths(real, flat).meet, coverage_maths(real, exp2_maths(real))
+    intersect, coverage = ray_hit_maths(real, flat).intersect, coverage_maths(real, exp2_maths(real))
     zero, nowhere, sooner, later = real(0.0), real("inf"), real(1.0 - SLACK), real(1.0 + SLACK)
 
     @inlined
@@ -193,7 +193,7 @@ def next_hits_maths(real: type, flat: bool) -> Scalar:
                     continue
                 g = order[child + k]
                 offset, frame = shape_of(means, frames, g, o)
-                t, _, squared = meet(offset, d, frame)
+                t, _, squared = intersect(offset, d, frame)
                 if not (t > first or (t == first and g > first_id)):
                     continue
                 if not (t < farthest or (t == farthest and g < farthest_id)):
@@ -218,13 +218,13 @@ class Hits(NamedTuple):
     """Hits of rays, ray by ray, nearest first.
 
     offsets [R + 1] int64: start of each ray's hits.
-    met, rays [H] int32: the Gaussian and the ray of a hit.
+    hit_ids, rays [H] int32: the Gaussian and the ray of a hit.
     alphas, weights [H]: its coverage and its blending weight.
     v_squares [H]: gradient of the loss with respect to its squared distance in standard deviations.
     """
 
     offsets: Tensor
-    met: Tensor
+    hit_ids: Tensor
     rays: Tensor
     alphas: Tensor
     weights: Tensor
@@ -235,7 +235,7 @@ class Hits(NamedTuple):
 def trace_ray_gradients(real: type, flat: bool) -> Kernel:
     """Fills rays, weights and v_squares of hits, and the gradients of origins and directions, zero without hits."""
     ray, hit_color_gradient = ray_reader(real), color_backward(real)
-    meet, meet_gradient = ray_hit_maths(real, flat)
+    intersect, intersect_gradient = ray_hit_maths(real, flat)
     zero, half, one, most, nowhere = real(0.0), real(0.5), real(1.0), real(ALPHA_MAX), real("inf")
 
     @kernel(
@@ -245,7 +245,7 @@ def trace_ray_gradients(real: type, flat: bool) -> Kernel:
         "real2 real1 real1 real2 real1 real1 real2 real2",
     )
     def ray_gradients(
-        means, frames, sh, origins, directions, degree, starts, met, hit_rays, met_alphas, weights, v_squares,
+        means, frames, sh, origins, directions, degree, starts, hit_ids, hit_rays, hit_alphas, weights, v_squares,
         colors, alphas, depths, v_colors, v_alphas, v_depths, v_origins, v_directions,
     ):  # fmt: skip
         # Never read, and removed by the compiler.
@@ -262,9 +262,9 @@ def trace_ray_gradients(real: type, flat: bool) -> Kernel:
         left, end, v_length = one, v_alphas[r] * (one - alphas[r]), zero
         by_origin, by_direction, by_unit = (zero, zero, zero), (zero, zero, zero), (zero, zero, zero)
         for place in range(starts[r], starts[r + 1]):
-            g, alpha = met[place], met_alphas[place]
+            g, alpha = hit_ids[place], hit_alphas[place]
             offset, frame = shape_of(means, frames, g, o)
-            t, q, _ = meet(offset, d, frame)
+            t, q, _ = intersect(offset, d, frame)
             weight, value, v_squared = alpha * left, zero, zero
             # At the threshold, differently fused operations may find a disc edge-on.
             if t < nowhere:
@@ -277,7 +277,7 @@ def trace_ray_gradients(real: type, flat: bool) -> Kernel:
                     v_squared = -half * alpha * (left * value + (end - behind) / (one - alpha))
                 v_t = weight * v_depths[r]
                 v_length += v_t * t
-                v_o, v_d, _ = meet_gradient(offset, d, frame, t, q, v_t * length, v_squared)
+                v_o, v_d, _ = intersect_gradient(offset, d, frame, t, q, v_t * length, v_squared)
                 by_origin = by_origin[0] + v_o[0], by_origin[1] + v_o[1], by_origin[2] + v_o[2]
                 by_direction = by_direction[0] + v_d[0], by_direction[1] + v_d[1], by_direction[2] + v_d[2]
             hit_rays[place], weights[place], v_squares[place] = r, weight, v_squared
@@ -295,19 +295,19 @@ def trace_ray_gradients(real: type, flat: bool) -> Kernel:
 def trace_gaussian_gradients(real: type, flat: bool) -> Kernel:
     """Fills the gradients, initially zero, of Gaussians that rays hit, one block of one warp for each."""
     ray, hit_color_gradient = ray_reader(real), color_backward(real)
-    meet, meet_gradient = ray_hit_maths(real, flat)
+    intersect, intersect_gradient = ray_hit_maths(real, flat)
     zero, two, nowhere = real(0.0), real(2.0), real("inf")
 
     @inlined
     def fill(row, offset, d, frame, length, weight, v_depth, v_squared, opacity):
         """Fills a row with one hit's gradients of mean, frame and opacity, and its contributions."""
-        t, q, _ = meet(offset, d, frame)
+        t, q, _ = intersect(offset, d, frame)
         if not t < nowhere:
             for j in range(GEOMETRY):
                 row[j] = zero
             return
         # Tuples are indexed only by constants, because a variable index compiles to a switch.
-        v_o, _, v_frame = meet_gradient(offset, d, frame, t, q, weight * v_depth * length, v_squared)
+        v_o, _, v_frame = intersect_gradient(offset, d, frame, t, q, weight * v_depth * length, v_squared)
         row[0], row[1], row[2] = -v_o[0], -v_o[1], -v_o[2]
         row[FRAME_AT], row[FRAME_AT + 1], row[FRAME_AT + 2] = v_frame[0]
         row[FRAME_AT + 3], row[FRAME_AT + 4], row[FRAME_AT + 5] = v_frame[1]
@@ -373,13 +373,13 @@ def trace_gaussian_gradients(real: type, flat: bool) -> Kernel:
 
 def trace(
     shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tensor],
-    *, flat: bool, degree: int, near: float, learning: bool,
+    *, flat: bool, degree: int, near: float, needs_gradients: bool,
 ) -> tuple[Tensor, ...]:  # fmt: skip
     """As `glassplat.kernels.trace.cpu.trace`, but stores hits as [K, R], along with their coverage."""
     origins = rays[0]
     count = origins.shape[0]
     bytes_of_hits = (4 + origins.element_size()) * max(count, 1)
-    num_kept = min(MOST_KEPT, KEPT_BYTES // bytes_of_hits) if learning else 0
+    num_kept = min(MOST_KEPT, KEPT_BYTES // bytes_of_hits) if needs_gradients else 0
     outputs = (
         origins.new_empty(count, 3),
         origins.new_empty(count),
@@ -405,13 +405,13 @@ def trace_gradients(
     hits = Hits(offsets, *whose, *(means.new_empty(total) for _ in range(3)))
     # No colours: only the Gaussians hit and their coverage.
     collect = _search(shapes, rays, bvh, flat)
-    collect(-1, near, hits.offsets, hits.met, hits.alphas, *outputs[4:], None, None, None, None)
+    collect(-1, near, hits.offsets, hits.hit_ids, hits.alphas, *outputs[4:], None, None, None, None)
     v_rays = [torch.zeros_like(ray) for ray in rays]
     means_and_frames, saved = shapes[:2], (*outputs[:3], *cotangents)
     trace_ray_gradients(real, flat)(
         blocks_for(num_rays, THREADS), THREADS, *means_and_frames, sh, *rays, degree, *hits, *saved, *v_rays
     )
-    by_gaussian, order = torch.sort(hits.met, stable=True)
+    by_gaussian, order = torch.sort(hits.hit_ids, stable=True)
     starts = torch.searchsorted(by_gaussian, torch.arange(count + 1, dtype=torch.int32, device=means.device))
     found = tuple(torch.zeros_like(tensor) for tensor in shapes)
     v_contributions = means.new_zeros(count, 2)
@@ -454,8 +454,8 @@ def trace_forward(real: type, flat: bool) -> Kernel:
         "real2 real1 real1 int1",
     )
     def forward(
-        means, frames, opacities, sh, origins, directions, order, boxes, offsets, degree, near, starts, met, met_alphas,
-        kept, kept_alphas, colors, alphas, depths, hits,
+        means, frames, opacities, sh, origins, directions, order, boxes, offsets, degree, near, starts,
+        hit_ids, hit_alphas, kept, kept_alphas, colors, alphas, depths, hits,
     ):  # fmt: skip
         ts, found, ids = cuda.local.array(CHUNK, real), cuda.local.array(CHUNK, real), cuda.local.array(CHUNK, np.int32)
         stack, waiting = cuda.local.array(STACK, np.int32), cuda.local.array(STACK, real)
@@ -464,26 +464,26 @@ def trace_forward(real: type, flat: bool) -> Kernel:
             return
         if starts.size > 0 and starts[r + 1] - starts[r] <= kept.shape[0]:
             for k in range(starts[r + 1] - starts[r]):
-                met[starts[r] + k], met_alphas[starts[r] + k] = kept[k, r], kept_alphas[k, r]
+                hit_ids[starts[r] + k], hit_alphas[starts[r] + k] = kept[k, r], kept_alphas[k, r]
             return
         o, d, inverse, length, usable = ray(origins, directions, r)
         x, y, z = d[0] / length, d[1] / length, d[2] / length
         red = green = blue = depth = zero
         left, blended = one, 0
-        first, first_id, known = near, 2147483647, CHUNK
-        while usable and known == CHUNK:
-            known = next_hits(
+        first, first_id, num_found = near, 2147483647, CHUNK
+        while usable and num_found == CHUNK:
+            num_found = next_hits(
                 o, d, inverse, means, frames, opacities, order, boxes, offsets, first, first_id,
                 ts, ids, found, stack, waiting,
             )  # fmt: skip
-            for k in range(known):
+            for k in range(num_found):
                 after = left * (one - found[k])
                 if after < least:
-                    known = 0
+                    num_found = 0
                     break
                 g, weight = ids[k], found[k] * left
                 if starts.size > 0:
-                    met[starts[r] + blended], met_alphas[starts[r] + blended] = g, found[k]
+                    hit_ids[starts[r] + blended], hit_alphas[starts[r] + blended] = g, found[k]
                 elif blended < kept.shape[0]:
                     kept[blended, r], kept_alphas[blended, r] = g, found[k]
                 if degree >= 0:

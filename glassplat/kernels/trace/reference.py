@@ -50,7 +50,7 @@ def trace(
         length = rays.directions.square().sum(-1)
         seen = rays.origins.isfinite().all(dim=1) & length.isfinite() & (length > 0)
     origins, directions = (torch.where(seen[:, None], x, torch.ones_like(x)) for x in rays)
-    hits = _meet(shapes, origins, directions, flat, near)
+    hits = _intersect(shapes, origins, directions, flat, near)
     valid = seen[:, None] & (hits.alpha > 0)
     alpha = torch.where(valid, hits.alpha, torch.zeros_like(hits.alpha))
     order = torch.argsort(torch.where(valid, hits.t.detach(), torch.inf), dim=1, stable=True)
@@ -71,7 +71,7 @@ def trace(
     return Traced((weights[..., None] * colors).sum(1), alphas, (weights * t).sum(1), blended.sum(1, dtype=torch.int32))
 
 
-def _meet(shapes: Shapes, origins: Tensor, directions: Tensor, flat: bool, near: float) -> _Hits:
+def _intersect(shapes: Shapes, origins: Tensor, directions: Tensor, flat: bool, near: float) -> _Hits:
     """Intersections of rays with Gaussians, and the coverage there."""
     offsets = shapes.means - origins[:, None]
     local_offset = torch.einsum("nij,rnj->rni", shapes.frames, offsets)
@@ -89,9 +89,9 @@ def _meet(shapes: Shapes, origins: Tensor, directions: Tensor, flat: bool, near:
         )
         q = t[..., None] * local_direction - local_offset
     squared = q.square().sum(-1)
-    met = facing & (t > near) & (squared <= MOST_DEVIATIONS**2)
-    coverage = shapes.opacities * torch.exp(-0.5 * torch.where(met, squared, torch.zeros_like(squared)))
-    alpha = torch.where(met & (coverage >= ALPHA_MIN), coverage.clamp(max=ALPHA_MAX), torch.zeros_like(coverage))
+    is_hit = facing & (t > near) & (squared <= MOST_DEVIATIONS**2)
+    coverage = shapes.opacities * torch.exp(-0.5 * torch.where(is_hit, squared, torch.zeros_like(squared)))
+    alpha = torch.where(is_hit & (coverage >= ALPHA_MIN), coverage.clamp(max=ALPHA_MAX), torch.zeros_like(coverage))
     return _Hits(t, alpha)
 
 

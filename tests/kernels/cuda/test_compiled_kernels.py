@@ -47,7 +47,7 @@ def test_every_operation_has_its_kernels() -> None:
     both_ways |= {"shade_environment", "surface_channels", "project_discs", "composite_discs"}
     expected = {f"{name}_{way}" for name in both_ways for way in ("forward", "backward")} | {"adam", "pane_hits"}
     expected |= traced | {"count_tiles", "order_counts", "list_spans", "emit_tiles", "list_pairs"}
-    expected |= {"hilbert_places", "fit_leaves", "fit_level"}
+    expected |= {"hilbert_positions", "fit_leaves", "fit_level"}
     assert all(any(name.startswith(want) for name in names) for want in expected)
 
 

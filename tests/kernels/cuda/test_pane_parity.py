@@ -71,8 +71,8 @@ def test_layer_slopes(linear: bool, dtype: torch.dtype) -> None:
     layers = [1.2 * draw(HEIGHT, WIDTH, 3, seed=seed).to(dtype).sigmoid() - 0.1 for seed in (2, 3)]
     where = draw(HEIGHT, WIDTH, seed=4) > 0
     own = (tensor.to(DEVICE) for tensor in (strength, *layers, where))
-    found = panes_operation.layer_slopes(*own, linear=linear)
-    for value, want in zip(found, panes_twin.layer_slopes(strength, *layers, where, linear=linear), strict=True):
+    found = panes_operation.layer_derivatives(*own, linear=linear)
+    for value, want in zip(found, panes_twin.layer_derivatives(strength, *layers, where, linear=linear), strict=True):
         close(value, want)
 
 
@@ -83,18 +83,21 @@ def test_slopes_at(dtype: torch.dtype) -> None:
     means, depths = 30 * draw(2, many(20, 2000), 2, seed=3).to(dtype), draw(2, many(20, 2000), seed=4).to(dtype)
     means[0, 0, 0], means[1, 1, 1], means[0, 2], means[1, 3] = torch.nan, torch.nan, torch.inf, -torch.inf
     given = slopes, near, means, depths
-    found, expected = panes_operation.slopes_at(*map(on_device, given)), panes_on_the_cpu.slopes_at(*given)
+    found, expected = (
+        panes_operation.sample_derivatives(*map(on_device, given)),
+        panes_on_the_cpu.sample_derivatives(*given),
+    )
     close(found, expected)
     assert 0.2 < float((expected == 1).double().mean()) < 0.8
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize(
-    ("size", "cell", "is_told"), [((many(4, 60), 5), 1, False), ((many(7, HEIGHT), many(8, WIDTH)), 4, True)]
+    ("size", "cell", "has_strength"), [((many(4, 60), 5), 1, False), ((many(7, HEIGHT), many(8, WIDTH)), 4, True)]
 )
-def test_gradient_conflict(size: tuple[int, int], cell: int, is_told: bool, dtype: torch.dtype) -> None:
+def test_gradient_conflict(size: tuple[int, int], cell: int, has_strength: bool, dtype: torch.dtype) -> None:
     images = pictures(*size, dtype)
-    strength = draw(*size, seed=7).to(dtype).sigmoid() if is_told else None
+    strength = draw(*size, seed=7).to(dtype).sigmoid() if has_strength else None
     transmission, own = images[0].requires_grad_(), on_device(images[0])
     found = panes_operation.gradient_conflict(own, *map(on_device, images[1:]), on_device(strength), cell=cell)
     expected = panes_twin.gradient_conflict(*images, strength, cell=cell)
