@@ -25,7 +25,7 @@ from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
-from glassplat.training.loop import differentiate, update
+from glassplat.training.loop import differentiate, update_parameters
 from glassplat.training.stage import Stage, TrainState
 
 WIDTH, HEIGHT, COUNT = 480, 360, 100_000
@@ -71,7 +71,7 @@ def step_work(scene: Scene, stage: Stage, view: View) -> Work:
 
     def work() -> None:
         result = differentiate(stage, state.scene, view, with_absgrad=True)
-        update(stage, state, result.gradients, iterations=1000)
+        update_parameters(stage, state, result.gradients, iterations=1000)
 
     return work
 

@@ -26,7 +26,7 @@ from glassplat.prepare.report_page import write_page
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes, name_labels
 from glassplat.scene.scene import Scene
-from glassplat.training.checkpoint import recorded
+from glassplat.training.checkpoint import read_progress
 
 FEW_POINTS, FEW_MASKS = 500, 3
 MASKS_LOOKED_AT = 16
@@ -147,7 +147,7 @@ def trained_part(directory: RunDirectory) -> Finding:
         scene, step = directory.latest_scene()
     except InputError as error:
         try:
-            reached = recorded(directory.checkpoint).step
+            reached = read_progress(directory.checkpoint).step
         except (FileNotFoundError, InputError):
             finding.problems.append(str(error))
             finding.next.append("the train command that began it, again")

@@ -23,7 +23,7 @@ from glassplat.methods.planar import fitted_planes
 from glassplat.model.run_directory import EVALUATED
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.render.planar import Planar, with_photographer
-from glassplat.training.checkpoint import recorded
+from glassplat.training.checkpoint import read_progress
 from glassplat.training.messages import Working
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ def cameras_of_test_views(stored: StoredRun, aligned: bool) -> str:
 def train_seconds(stored: StoredRun) -> float | None:
     """Training time from the checkpoint; None if there is no readable one, which evaluation does not need."""
     try:
-        return recorded(stored.directory.checkpoint).seconds
+        return read_progress(stored.directory.checkpoint).seconds
     except (FileNotFoundError, InputError):
         return None
 

@@ -87,27 +87,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run_guarded(arguments: list[str], *, is_program: bool) -> int:
     """Runs a command so that any failure ends in one readable message and an exit code; ranks exit at once."""
-    from glassplat.training.ranks import leave
+    from glassplat.training.ranks import exit_rank
 
     try:
         code = run_to_exit_code(arguments, is_program=is_program)
     except SystemExit as end:
         if is_program and end.code:
-            leave(USAGE_CODE)
+            exit_rank(USAGE_CODE)
         raise
     if is_program:
-        leave(code)
+        exit_rank(code)
     return code
 
 
 def run_to_exit_code(arguments: list[str], *, is_program: bool) -> int:
     """Runs a command and reports how it ended; returns the exit code."""
     from glassplat.cli import console
-    from glassplat.training.ranks import await_leader, leads, tell
+    from glassplat.training.ranks import await_leader, is_leader, report_failure
 
     console.plain_streams()
     is_training = arguments[:1] == ["train"]
-    if is_training and not leads():
+    if is_training and not is_leader():
         console.silence()
     command = None
     with console.raised_signals(is_program=is_program) as raised:
@@ -130,7 +130,7 @@ def run_to_exit_code(arguments: list[str], *, is_program: bool) -> int:
             with suppress(OSError):  # Fails if the output is full or closed.
                 console.complain(found.label, found.text)
             if is_training and not is_lost:
-                tell(*found)
+                report_failure(*found)
             await_leader()
             return found.code
     return 0

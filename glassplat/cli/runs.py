@@ -27,7 +27,7 @@ from glassplat.model.training import Listener, Training
 from glassplat.render.frame import Renderer
 from glassplat.scene.scene import Scene
 from glassplat.training.messages import Message
-from glassplat.training.ranks import leads
+from glassplat.training.ranks import is_leader
 from glassplat.training.stage import stage_starts
 from glassplat.viewer.server import Viewer
 
@@ -192,7 +192,7 @@ def shortcuts(asked: Train[Any]) -> str:
 @contextmanager
 def _viewer_listeners(asked: Train[Any], training: Training, dataset: Dataset, console: Console) -> Iterator[Listener]:
     """The viewer as a further listener, if requested; only on rank 0."""
-    if not asked.view or not leads():
+    if not asked.view or not is_leader():
         yield lambda message: None
         return
     from glassplat.model.watching import WatchedTraining

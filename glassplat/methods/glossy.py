@@ -13,7 +13,7 @@ import torch
 
 from glassplat.captures.dataset import Dataset
 from glassplat.methods import mirrors
-from glassplat.methods.splat import image_term, population_of
+from glassplat.methods.splat import image_term, strategy_of
 from glassplat.methods.splat_recipe import Primitive, SplatRecipe
 from glassplat.methods.surroundings import AddEnvironment, AddSurroundings, BeginReflections, StayMatte
 from glassplat.options import BLACK
@@ -23,8 +23,8 @@ from glassplat.render.traced import Traced, mirrored_contributions
 from glassplat.scene import logit
 from glassplat.scene.scene import Scene
 from glassplat.training import losses
-from glassplat.training.actions import Densify, GrowSh, Population, PruneIdle, ResetOpacity
-from glassplat.training.corrections import corrections_begun, corrections_learnt
+from glassplat.training.actions import DensificationStrategy, Densify, GrowSh, PruneIdle, ResetOpacity
+from glassplat.training.corrections import with_learned_corrections, with_neutral_corrections
 from glassplat.training.densify import as_discs
 from glassplat.training.options import PUBLISHED_ITERATIONS, GaussianRates, Intervals, Rate
 from glassplat.training.stage import Action, Every, Stage
@@ -35,10 +35,10 @@ if TYPE_CHECKING:
 
 def deferred_scene(recipe: DeferredRecipe, dataset: Dataset) -> Scene:
     """The initial scene: one Gaussian per point with almost no reflection, and no environment."""
-    primary = population_of(recipe).initial(dataset.points, recipe.sh_degree)
+    primary = strategy_of(recipe).initial_gaussians(dataset.points, recipe.sh_degree)
     strengths = torch.full((len(primary),), logit(recipe.first_strength), dtype=torch.float32)
     primary = replace(primary, channels={"logit_strength": strengths})
-    return corrections_begun(recipe, Scene(primary, dataset.extent), dataset)
+    return with_neutral_corrections(recipe, Scene(primary, dataset.extent), dataset)
 
 
 def deferred_renderer(recipe: DeferredRecipe) -> Deferred:
@@ -50,8 +50,8 @@ def deferred_stages(recipe: DeferredRecipe, seed: int, iterations: int = PUBLISH
     """Bootstrap, then joint training, which `Propagate` controls. A short run has no reflections."""
     short = iterations < recipe.least_iterations
     if short:
-        return corrections_learnt(recipe, _matte_stages(recipe, "ellipsoid", seed, iterations))
-    return corrections_learnt(recipe, _reflecting_stages(_bootstrapped(recipe, iterations)))
+        return with_learned_corrections(recipe, _matte_stages(recipe, "ellipsoid", seed, iterations))
+    return with_learned_corrections(recipe, _reflecting_stages(_bootstrapped(recipe, iterations)))
 
 
 LEAST_BOOTSTRAP = 300
@@ -71,20 +71,20 @@ def _bootstrapped(recipe: DeferredRecipe, iterations: int) -> DeferredRecipe:
 
 def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
     """Stages of a run long enough for normal propagation."""
-    population = population_of(recipe)
+    strategy = strategy_of(recipe)
     image, held = image_term(recipe.ssim_weight), recipe.view_dependence_weight
-    regular: tuple[Action, ...] = (GrowSh(Every(recipe.intervals.sh)), *population.resets)
+    regular: tuple[Action, ...] = (GrowSh(Every(recipe.intervals.sh)), *strategy.resets)
     # As in `splat`, where a scene has to look right before mirrors can be recognised.
     regular = regular if recipe.search.begin_found else ()
     bootstrap = Stage(
         name="1 bootstrap",
         share=recipe.bootstrap,
         renderer=Splat(recipe.background or BLACK, depth=False),
-        losses=(image, *population.terms),
+        losses=(image, *strategy.terms),
         rates=(_rates_of_splat(recipe) if recipe.search.begin_found else recipe.rates).of("primary", held),
-        actions=(*population.edits, *regular),
-        post_steps=population.post_steps,
-        densify_until=population.densify_until,
+        actions=(*strategy.edits, *regular),
+        post_steps=strategy.post_steps,
+        densify_until=strategy.densify_until,
     )
     propagate_at = Every(
         recipe.intervals.opacity, 0.0, recipe.schedule.stop, recipe.intervals.least, skip_multiples_of=3
@@ -100,23 +100,19 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         name="2 reflection",
         share=recipe.schedule.stop - recipe.bootstrap,
         renderer=renderer,
-        losses=(image, *guidance, *population.terms),
+        losses=(image, *guidance, *strategy.terms),
         rates=recipe.rates.of("primary", held) | recipe.reflection_rates.of(),
         actions=(
-            *_edits(recipe, population),
+            *_edits(recipe, strategy),
             # Before the resets, because it examines the visible scene even at steps of resets.
             _propagate(recipe, propagate_at, renderer),
             mirrors.GrowShAfterPropagation(Every(recipe.intervals.sh)),
-            *(
-                map(mirrors.ResetRaised.instead_of, population.resets)
-                if recipe.schedule.last_reset
-                else population.resets
-            ),
+            *(map(mirrors.ResetRaised.instead_of, strategy.resets) if recipe.schedule.last_reset else strategy.resets),
             mirrors.RefineEnvironment(doublings(recipe.first_texels, recipe.texels, recipe.bootstrap), recipe.texels),
         ),
-        post_steps=population.post_steps,
+        post_steps=strategy.post_steps,
         setup=first_reflections(recipe),
-        densify_until=population.densify_until,
+        densify_until=strategy.densify_until,
         # Without propagation, the consistency of normals is not needed (lab/glossy.md).
         until=mirrors.found_nothing,
     )
@@ -171,14 +167,14 @@ def _environment(recipe: DeferredRecipe) -> AddEnvironment:
     return AddEnvironment(min(recipe.first_texels, recipe.texels), recipe.region, recipe.find_region)
 
 
-def _edits(recipe: DeferredRecipe, population: Population) -> tuple[Action, ...]:
+def _edits(recipe: DeferredRecipe, strategy: DensificationStrategy) -> tuple[Action, ...]:
     """Actions that change the number of Gaussians, after the bootstrap."""
     if recipe.propagation_interval is None or recipe.strategy == "mcmc":
-        return population.edits
+        return strategy.edits
     slow = replace(recipe.densify, interval=recipe.propagation_interval)
     return tuple(
         mirrors.DensifyWhilePropagating(slow, regular=edit) if isinstance(edit, Densify) else edit
-        for edit in population.edits
+        for edit in strategy.edits
     )
 
 
@@ -241,7 +237,7 @@ def traced_renderer(recipe: TracedRecipe) -> Traced | Deferred:
 def traced_stages(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
     """Bootstrap, reflections with propagation, and joint training without it; a short run trains like `splat`."""
     if iterations < recipe.least_iterations:
-        return corrections_learnt(recipe, _matte_stages(recipe.distant(), recipe.primitive, seed, iterations))
+        return with_learned_corrections(recipe, _matte_stages(recipe.distant(), recipe.primitive, seed, iterations))
     known = recipe.distant().stages(seed, iterations)
     if recipe.harmonics_from_start:
         grow = GrowSh(Every(recipe.intervals.sh))

@@ -29,10 +29,10 @@ from glassplat.scene.camera import Camera, quat_product, rotation_from_quat, to_
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import Densify, GrowSh, ResetOpacity
-from glassplat.training.densify import Moments, forget
-from glassplat.training.losses import counted_pixels, residual
+from glassplat.training.densify import Moments, zero_moments
+from glassplat.training.losses import residual, valid_pixels
 from glassplat.training.options import MirrorSearch, NormalPropagation, PropagationSchedule, Rate
-from glassplat.training.stage import AtMoments, Clock, Every, TrainState
+from glassplat.training.stage import AtShares, Clock, Every, TrainState
 
 LEAST_SHOWN = 0.1
 """Minimum contribution of a visible Gaussian, in pixels over all views."""
@@ -97,7 +97,7 @@ def residual_spreads(scene: Scene, views: Sequence[View], renderer: Renderer) ->
     shown, squares = torch.zeros(2, count, device=device, dtype=torch.float32)
     sums = torch.zeros(count, 3, device=device, dtype=torch.float32)
     for view in views:
-        counted = counted_pixels(view, device).to(shown.dtype)
+        counted = valid_pixels(view, device).to(shown.dtype)
         weights = gather_pixels(scene, view.camera, counted[..., None])[:, 0]
         residuals = residual_sums(scene, view, renderer)
         shown += weights
@@ -262,7 +262,7 @@ def normals_propagated(
     log_scales = gaussians.log_scales + math.log(options.growth) * (grows[:, None] & _within_surface(gaussians))
     changed = {"logit_opacities": opacities, "logit_strength": strengths, "log_scales": log_scales}
     everything = torch.ones_like(grows)
-    return gaussians.with_tensors(changed), forget(moments, [f"primary.{name}" for name in changed], everything)
+    return gaussians.with_tensors(changed), zero_moments(moments, [f"primary.{name}" for name in changed], everything)
 
 
 @torch.no_grad()
@@ -276,7 +276,7 @@ def colors_disturbed(
     dull = gaussians.channels["logit_strength"] <= logit(options.sabotaged)
     sh = gaussians.sh.clone()
     sh[:, 0] += torch.where(dull[:, None], options.sabotage * (2 * unit - 1) / SH_ZERO, 0)
-    return gaussians.with_tensors({"sh": sh}), forget(moments, ["primary.sh"], dull)
+    return gaussians.with_tensors({"sh": sh}), zero_moments(moments, ["primary.sh"], dull)
 
 
 def _within_surface(gaussians: Gaussians) -> Tensor:
@@ -489,7 +489,7 @@ class DensifyWhilePropagating(Densify):
 
 
 @dataclass(frozen=True)
-class RefineEnvironment(AtMoments):
+class RefineEnvironment(AtShares):
     """Doubles the environment's resolution at certain times.
 
     Normals get gradients only within the texel that their reflection hits. Large texels initially let normals converge
@@ -508,7 +508,7 @@ class RefineEnvironment(AtMoments):
         environment = state.scene.environment
         if environment.size >= self.largest:
             return False
-        doublings = sum(round(moment * clock.iterations) == clock.step for moment in self.moments)
+        doublings = sum(round(moment * clock.iterations) == clock.step for moment in self.shares)
         finer = resize_environment(environment, min(2**doublings * environment.size, self.largest))
         state.scene = replace(state.scene, environment=finer)
         return True

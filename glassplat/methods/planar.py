@@ -12,7 +12,7 @@ from torch import Tensor
 
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import PointCloud
-from glassplat.methods.splat import image_term, population_of
+from glassplat.methods.splat import image_term, strategy_of
 from glassplat.options import BLACK, CLEAR_GLASS
 from glassplat.panes import PlaneFit, PlaneFitError, material
 from glassplat.panes.fit import fit_planes, with_mirrors
@@ -25,11 +25,11 @@ from glassplat.scene.gaussians import mirrored_gaussians
 from glassplat.scene.panes import Planes, coplanar_groups, name_labels
 from glassplat.scene.scene import Scene, glass_gaussians
 from glassplat.training import actions, losses
-from glassplat.training.corrections import corrections_begun, corrections_learnt, photographer_learnt
+from glassplat.training.corrections import with_learned_corrections, with_learned_photographer, with_neutral_corrections
 from glassplat.training.densify import NEIGHBOURS
 from glassplat.training.messages import Working
 from glassplat.training.options import PUBLISHED_ITERATIONS, Rate
-from glassplat.training.stage import AtMoments, Clock, Every, PostStep, Stage, TrainState, Work
+from glassplat.training.stage import AtShares, Clock, Every, PostStep, Stage, TrainState, Work
 
 if TYPE_CHECKING:
     from glassplat.methods.planar_recipe import PlanarRecipe
@@ -253,7 +253,7 @@ opacity reset. Repetitions would move real objects."""
 
 
 @dataclass(frozen=True)
-class TurnReflections(AtMoments):
+class TurnReflections(AtShares):
     """Moves Gaussians behind panes of glass that represent reflections to their true positions in front
     (lab/layers.md).
     """
@@ -277,10 +277,10 @@ LIT_AT, FILLED_AT = (0.4, 0.6), (0.5,)
 
 
 @dataclass(frozen=True)
-class LightLamps(AtMoments):
+class LightLamps(AtShares):
     """Removes images of lamps from behind glass, and makes the lamps as bright as their reflections."""
 
-    moments: tuple[float, ...] = LIT_AT
+    shares: tuple[float, ...] = LIT_AT
     name: str = "light lamps"
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
@@ -296,7 +296,7 @@ class LightLamps(AtMoments):
             return False
         log_gains = scene.primary.channels["log_intensity"] + lamps.gains.log()
         state.scene = replace(scene, primary=scene.primary.with_tensors({"log_intensity": log_gains}))
-        actions.keep_some(state, ~lamps.images)
+        actions.keep_gaussians(state, ~lamps.images)
         count, lit = int(lamps.images.sum()), lamps.gains > 1
         log.info(
             "%d Gaussians behind glass were images of lamps; %d of the lamps are brighter now", count, int(lit.sum())
@@ -305,10 +305,10 @@ class LightLamps(AtMoments):
 
 
 @dataclass(frozen=True)
-class FillUnseen(AtMoments):
+class FillUnseen(AtShares):
     """Adds Gaussians for reflections of objects that no photograph shows directly and the scene lacks."""
 
-    moments: tuple[float, ...] = FILLED_AT
+    shares: tuple[float, ...] = FILLED_AT
     name: str = "fill unseen"
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
@@ -318,10 +318,12 @@ class FillUnseen(AtMoments):
         for done, panes in enumerate(of_glass):
             yield Working(f"searching for what {name_panes(panes, 'pane')} can reflect", done, len(of_glass))
             places, color, cell = material.unseen_places(state.scene, panes, cameras)
-            if 0 < len(places) < actions.MOST_ADDED * len(state.scene.primary):
+            if 0 < len(places) < actions.MOST_ADDED_SHARE * len(state.scene.primary):
                 colors = (255 * color).round().to(torch.uint8).expand(len(places), 3)
                 cloud = PointCloud(places.cpu(), colors.cpu())
-                actions.add_primary(state, actions.seeds_of(state.scene.primary, cloud, opacity=0.7, size=0.7 * cell))
+                actions.add_primary_gaussians(
+                    state, actions.seed_gaussians(state.scene.primary, cloud, opacity=0.7, size=0.7 * cell)
+                )
                 added += len(places)
         if added:
             log.info("%d Gaussians added for reflections of unseen parts", added)
@@ -333,8 +335,8 @@ def turn_round(state: TrainState, virtual: Tensor, panes: Planes) -> int:
     count = int(virtual.sum())
     if count:
         turned = mirrored_gaussians(state.scene.primary.select(virtual), panes.centers[0], panes.normals[0])
-        actions.keep_some(state, ~virtual)
-        actions.add_primary(state, turned)
+        actions.keep_gaussians(state, ~virtual)
+        actions.add_primary_gaussians(state, turned)
     return count
 
 
@@ -354,8 +356,8 @@ def seed_reflection(state: TrainState, dataset: Dataset, panes: Planes) -> Work:
     if int(virtual.sum()) <= NEIGHBOURS:  # Too few to estimate their size.
         return False
     behind = replace(points, positions=points.positions[virtual], colors=points.colors[virtual])
-    seeds = mirrored_gaussians(actions.seeds_of(state.scene.primary, behind), panes.centers[0], panes.normals[0])
-    actions.add_primary(state, seeds)
+    seeds = mirrored_gaussians(actions.seed_gaussians(state.scene.primary, behind), panes.centers[0], panes.normals[0])
+    actions.add_primary_gaussians(state, seeds)
     log.info(
         "no photograph directly shows what is reflected by %s: %d points behind added as mirror images in front",
         name_panes(panes, "pane"),
@@ -383,8 +385,8 @@ def planar_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
         raise PlaneFitError(f"plane_fit.mirror_labels names pane {unknown[0]}; expected some of {name_labels(known)}")
     if dataset.measured_points:
         fitted_planes(dataset, None, recipe.plane_fit)
-    scene = Scene(population_of(recipe).initial(dataset.points, recipe.sh_degree), dataset.extent)
-    return corrections_begun(recipe, scene, dataset)
+    scene = Scene(strategy_of(recipe).initial_gaussians(dataset.points, recipe.sh_degree), dataset.extent)
+    return with_neutral_corrections(recipe, scene, dataset)
 
 
 def _lack_of_masks(dataset: Dataset) -> str:
@@ -410,7 +412,7 @@ def planar_renderer(recipe: PlanarRecipe) -> Planar:
 def planar_stages(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
     """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
     first, second, third = recipe.stage_shares
-    population = population_of(recipe)
+    strategy = strategy_of(recipe)
     setup = PaneSetup(
         recipe.plane_fit,
         recipe.glass_count,
@@ -424,15 +426,15 @@ def planar_stages(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_I
         name="1 initialisation",
         share=first,
         renderer=Splat(recipe.background or BLACK, depth=False),
-        losses=(image_term(recipe.ssim_weight), *population.terms),
+        losses=(image_term(recipe.ssim_weight), *strategy.terms),
         rates=recipe.rates.of("primary", recipe.view_dependence_weight),
-        actions=(*population.edits, actions.GrowSh(Every(recipe.intervals.sh)), *_early_resets(recipe, population)),
-        post_steps=population.post_steps,
-        densify_until=population.densify_until,
+        actions=(*strategy.edits, actions.GrowSh(Every(recipe.intervals.sh)), *_early_resets(recipe, strategy)),
+        post_steps=strategy.post_steps,
+        densify_until=strategy.densify_until,
     )
     stages: tuple[Stage, ...] = (initialisation, _adjustment(recipe, second, setup), _joint(recipe, third))
-    stages = photographer_learnt(recipe.photographer, stages, recipe.densify, seed)
-    return corrections_learnt(recipe, stages)
+    stages = with_learned_photographer(recipe.photographer, stages, recipe.densify, seed)
+    return with_learned_corrections(recipe, stages)
 
 
 JOINT_FACTOR = 0.1
@@ -454,21 +456,21 @@ def plane_rates(factor: float = 1.0) -> dict[str, Rate]:
 
 def _adjustment(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> Stage:
     """Stage 2: the reflection's gradient reaches the planes, not the Gaussians."""
-    population = population_of(recipe)
+    strategy = strategy_of(recipe)
     return Stage(
         name="2 plane adjustment",
         share=share,
         renderer=_training_renderer(recipe, "planes"),
-        losses=_joint_terms(recipe, population),
+        losses=_joint_terms(recipe, strategy),
         rates=_gaussian_rates(recipe) | plane_rates(),
         actions=(
-            *population.edits,
+            *strategy.edits,
             actions.GrowSh(Every(recipe.intervals.sh)),
             actions.Densify(recipe.densify, part="glass"),
             *_missing(recipe, recipe.stage_shares[0] / sum(recipe.stage_shares) + ADJUSTED_AFTER),
-            *_early_resets(recipe, population),
+            *_early_resets(recipe, strategy),
         ),
-        post_steps=(*_glass_post_steps(recipe), *population.post_steps),
+        post_steps=(*_glass_post_steps(recipe), *strategy.post_steps),
         setup=setup,
         densify_until=recipe.densify.stop,
     )
@@ -476,7 +478,7 @@ def _adjustment(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> Stage:
 
 def _joint(recipe: PlanarRecipe, share: float) -> Stage:
     """Stage 3: joint optimisation, with perturbed opacities and slowly moving planes."""
-    population = population_of(recipe)
+    strategy = strategy_of(recipe)
     perturb_at = Every(
         recipe.intervals.opacity, 0.0, recipe.perturbation.stop, recipe.intervals.least, skip_multiples_of=3
     )
@@ -484,22 +486,22 @@ def _joint(recipe: PlanarRecipe, share: float) -> Stage:
         name="3 joint optimisation",
         share=share,
         renderer=_training_renderer(recipe, "all"),
-        losses=_joint_terms(recipe, population),
+        losses=_joint_terms(recipe, strategy),
         rates=_gaussian_rates(recipe)
         | plane_rates(JOINT_FACTOR)
         | ({"primary.log_intensity": Rate(recipe.rates.intensity)} if recipe.intensity else {}),
         actions=(
             *_turns(recipe),
             *_missing(recipe, _joint_start(recipe) + JOINED_AFTER),
-            *population.edits,
+            *strategy.edits,
             actions.GrowSh(Every(recipe.intervals.sh)),
             actions.Densify(recipe.densify, part="glass"),
-            *population.resets,
+            *strategy.resets,
             *_clearing(recipe),
             *((FillUnseen(),) if recipe.seed_reflections else ()),
             actions.PerturbOpacity(perturb_at, recipe.perturbation.amplitude, recipe.perturbation.bounds),
         ),
-        post_steps=(*_glass_post_steps(recipe), *population.post_steps),
+        post_steps=(*_glass_post_steps(recipe), *strategy.post_steps),
         densify_until=recipe.densify.stop,
     )
 
@@ -514,16 +516,16 @@ def _glass_post_steps(recipe: PlanarRecipe) -> tuple[PostStep, ...]:
     return (glass_only_darkens,) if recipe.tint else ()
 
 
-def _joint_terms(recipe: PlanarRecipe, population: actions.Population) -> tuple[losses.LossTerm, ...]:
+def _joint_terms(recipe: PlanarRecipe, strategy: actions.DensificationStrategy) -> tuple[losses.LossTerm, ...]:
     glass = losses.weighted_terms(
-        losses.LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, losses.tint_departure)
+        losses.LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, losses.tint_prior)
     )
-    return (image_term(recipe.ssim_weight), *reflection_terms(recipe), *glass, *population.terms)
+    return (image_term(recipe.ssim_weight), *reflection_terms(recipe), *glass, *strategy.terms)
 
 
-def _early_resets(recipe: PlanarRecipe, population: actions.Population) -> tuple[actions.ResetOpacity, ...]:
+def _early_resets(recipe: PlanarRecipe, strategy: actions.DensificationStrategy) -> tuple[actions.ResetOpacity, ...]:
     """The opacity resets of the first two stages, if enabled."""
-    return population.resets if recipe.early_resets else ()
+    return strategy.resets if recipe.early_resets else ()
 
 
 def _turns(recipe: PlanarRecipe) -> tuple[TurnReflections | LightLamps, ...]:
@@ -573,12 +575,12 @@ def _training_renderer(recipe: PlanarRecipe, gradient: str) -> Planar:
 def reflection_terms(recipe: PlanarRecipe) -> tuple[losses.LossTerm, ...]:
     """The terms whose weight is not zero."""
     weights = recipe.weights
-    conflict = losses.reflection_left if recipe.conflict == "cells" else losses.gradient_conflict
-    reflectance = losses.ReflectanceDeparture(recipe.plane_fit.glass_reflectance)
+    conflict = losses.cell_gradient_conflict if recipe.conflict == "cells" else losses.gradient_conflict
+    reflectance = losses.ReflectancePrior(recipe.plane_fit.glass_reflectance)
     return losses.weighted_terms(
         losses.LossTerm("depth", weights.depth, losses.depth_deviation_loss),
         losses.LossTerm("conflict", weights.conflict, conflict),
         losses.LossTerm("mask", weights.mask, losses.mask_loss),
-        losses.LossTerm("intensity", weights.intensity, losses.intensity_departure),
+        losses.LossTerm("intensity", weights.intensity, losses.intensity_prior),
         losses.LossTerm("reflectance", weights.reflectance, reflectance),
     )

@@ -9,8 +9,8 @@ from glassplat.captures.dataset import Dataset
 from glassplat.options import BLACK
 from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
-from glassplat.training.actions import GrowSh, Population, SeedUnexplained, default_population, mcmc_population
-from glassplat.training.corrections import corrections_begun, corrections_learnt
+from glassplat.training.actions import DensificationStrategy, GrowSh, SeedUnexplained, default_strategy, mcmc_strategy
+from glassplat.training.corrections import with_learned_corrections, with_neutral_corrections
 from glassplat.training.densify import as_discs
 from glassplat.training.losses import LossTerm, PhotometricLoss, disc_normals, distortion
 from glassplat.training.options import PUBLISHED_ITERATIONS, MethodRecipe
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 def splat_scene(recipe: SplatRecipe, dataset: Dataset) -> Scene:
     """The initial scene: one Gaussian per point."""
-    first = population_of(recipe).initial(dataset.points, recipe.sh_degree)
+    first = strategy_of(recipe).initial_gaussians(dataset.points, recipe.sh_degree)
     scene = Scene(as_discs(first) if recipe.primitive == "disc" else first, dataset.extent)
-    return corrections_begun(recipe, scene, dataset)
+    return with_neutral_corrections(recipe, scene, dataset)
 
 
 def splat_renderer(recipe: SplatRecipe) -> Splat:
@@ -34,16 +34,16 @@ def splat_renderer(recipe: SplatRecipe) -> Splat:
 
 def splat_stages(recipe: SplatRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
     """One stage; for discs, a new one whenever one of their loss terms starts."""
-    population = population_of(recipe)
+    strategy = strategy_of(recipe)
     first = Stage(
         name="splat",
         share=1.0,
         renderer=_bare(recipe),
-        losses=(image_term(recipe.ssim_weight), *population.terms),
+        losses=(image_term(recipe.ssim_weight), *strategy.terms),
         rates=recipe.rates.of("primary", recipe.view_dependence_weight),
-        actions=(*_missing(recipe), *population.edits, GrowSh(Every(recipe.intervals.sh)), *population.resets),
-        post_steps=population.post_steps,
-        densify_until=population.densify_until,
+        actions=(*_missing(recipe), *strategy.edits, GrowSh(Every(recipe.intervals.sh)), *strategy.resets),
+        post_steps=strategy.post_steps,
+        densify_until=strategy.densify_until,
     )
     stages, began = [first], 0.0
     for start, term in terms_by_start(recipe.discs, iterations) if recipe.primitive == "disc" else ():
@@ -55,7 +55,7 @@ def splat_stages(recipe: SplatRecipe, seed: int, iterations: int = PUBLISHED_ITE
         stages.append(replace(last, name=name, renderer=_bare(recipe, normal=with_normals), losses=losses))
         began = start
     stages[-1] = replace(stages[-1], share=1 - began)
-    return corrections_learnt(recipe, tuple(stages))
+    return with_learned_corrections(recipe, tuple(stages))
 
 
 def _bare(recipe: SplatRecipe, *, normal: bool = False) -> Splat:
@@ -73,15 +73,15 @@ def _missing(recipe: SplatRecipe) -> tuple[SeedUnexplained, ...]:
     return tuple(SeedUnexplained((moment,), _bare(recipe)) for moment in SEED_AT if wanted)
 
 
-def population_of(recipe: MethodRecipe) -> Population:
+def strategy_of(recipe: MethodRecipe) -> DensificationStrategy:
     """Contribution of the recipe's strategy."""
     if recipe.strategy == "mcmc":
-        population = mcmc_population(recipe.mcmc, recipe.rates.of("primary")["primary.means"])
+        strategy = mcmc_strategy(recipe.mcmc, recipe.rates.of("primary")["primary.means"])
     else:
-        population = default_population(recipe.densify, recipe.intervals)
+        strategy = default_strategy(recipe.densify, recipe.intervals)
     if recipe.intervals.averaged_passes == 0:
-        return population
-    return replace(population, post_steps=(*population.post_steps, AverageLast(recipe.intervals.averaged_passes)))
+        return strategy
+    return replace(strategy, post_steps=(*strategy.post_steps, AverageLast(recipe.intervals.averaged_passes)))
 
 
 LEAST_DISTORTION_START = 400

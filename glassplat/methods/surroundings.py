@@ -19,7 +19,7 @@ from glassplat.scene import logit
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Environment
-from glassplat.training.densify import apply_edit, as_discs, forget, in_morton_order
+from glassplat.training.densify import apply_edit, as_discs, sort_by_morton_code, zero_moments
 from glassplat.training.messages import Working
 from glassplat.training.options import MirrorSearch, SurroundingsStart
 from glassplat.training.stage import TrainState
@@ -229,7 +229,7 @@ class AddSurroundings:
         parts = [part for part in self._parts(state, dataset, matte) if len(part)]
         # Nothing to copy if everything reflects.
         found = reduce(Gaussians.concat, parts or [self._in_box(state, dataset)])
-        ordered, _ = apply_edit(found, {}, in_morton_order(found.means), part="surroundings")
+        ordered, _ = apply_edit(found, {}, sort_by_morton_code(found.means), part="surroundings")
         state.scene = replace(state.scene, surroundings=ordered)
 
     def _parts(self, state: TrainState, dataset: Dataset, matte: Tensor) -> list[Gaussians]:
@@ -289,5 +289,5 @@ class BeginReflections:
                 primary = replace(primary, active_sh_degree=0)
             state.scene = replace(state.scene, primary=primary)
             names = [f"primary.{name}" for name in primary.tensors()]
-            state.optimizer.moments = forget(state.optimizer.moments, names, mirrors)
+            state.optimizer.moments = zero_moments(state.optimizer.moments, names, mirrors)
         return True

@@ -26,7 +26,7 @@ from glassplat.files.records import parse_json, read_json, read_text
 from glassplat.files.writing import check_folder, check_links, make_folder, remove_unfinished, write_text
 from glassplat.options import Downscale, Seed, Several, options_from_json
 from glassplat.training.messages import Message, StepDone, Working
-from glassplat.training.ranks import leads
+from glassplat.training.ranks import is_leader
 
 if TYPE_CHECKING:
     from glassplat.captures.dataset import Dataset
@@ -385,7 +385,7 @@ def check_output(directory: RunDirectory, *, resume: bool) -> None:
         NotADirectoryError: it is a file, or goes through one.
         PermissionError: the folder is not writable.
     """
-    if not leads():
+    if not is_leader():
         return  # Rank 0 may have started writing.
     check_folder(directory.path)
     check_links(directory.path, (*FILES, directory.checkpoint.name, directory.results.name, "point_cloud", "sparse"))

@@ -41,7 +41,7 @@ from glassplat.training.messages import (
     StepDone,
     Working,
 )
-from glassplat.training.ranks import Ranks, join
+from glassplat.training.ranks import Ranks, join_ranks
 from glassplat.training.stage import Stage, TrainState, check_length, stage_starts
 
 log = logging.getLogger("glassplat.training")
@@ -219,8 +219,8 @@ class Run:
         return with_gradients(self._messages())
 
     def _messages(self) -> Generator[Message, None, None]:
-        self._ranks.check_alike(traits(self.recipe, self._settings, self._dataset) | {"resume": self._resume})
-        yield from self._leading() if self._ranks.leads else self._following()
+        self._ranks.check_same_settings(traits(self.recipe, self._settings, self._dataset) | {"resume": self._resume})
+        yield from self._leading() if self._ranks.is_leader else self._following()
         self._ranks.exchange()  # Other ranks wait until the leader has written the scene.
 
     def _following(self) -> Generator[Message, None, None]:
@@ -273,7 +273,7 @@ class Run:
         if self._session is None or self.state is None:
             raise RuntimeError("nothing to save: the run has not started")
         self._session.save()
-        if self._ranks.leads:
+        if self._ranks.is_leader:
             self._export()
 
     def _restore(self) -> None:
@@ -405,7 +405,7 @@ class TrainingSession:
     ) -> Generator[Message, None, None]:
         """Trains to the end, or raises KeyboardInterrupt after the step of a stop request."""
         with stop_on_interrupt() as self._stop, photographs_read(dataset) as check_photographs:
-            self._ranks.asked = lambda: self._stop.requested
+            self._ranks.is_stop_requested = lambda: self._stop.requested
             messages = train(stages, dataset, self._state, iterations, ranks=self._ranks)
             starts = zip(stages, stage_starts(stages, iterations), strict=False)
             setups = {start for stage, start in starts if stage.setup is not None}
@@ -541,7 +541,7 @@ class Training:
         chosen = chosen_recipe(recipe)
         if type(chosen) in RECIPES.values():  # A custom recipe may hold anything.
             check_value(type(chosen), chosen, "")
-        self._ranks = join()
+        self._ranks = join_ranks()
         root = str(dataset.root.resolve())  # Later commands may be started in another folder.
         self.iterations, self._dataset = iterations, dataset
         self._settings = run_directory.RunSettings(
@@ -647,10 +647,10 @@ class Training:
         self._run.save()
 
     def _in_memory(self) -> Generator[Message, None, None]:
-        self._ranks.check_alike(traits(self.recipe, self._settings, self._dataset))
+        self._ranks.check_same_settings(traits(self.recipe, self._settings, self._dataset))
         if self._state is None:
             yield Working("preparing the first scene", 0, 1)
-            first = first_state(self.recipe, self._settings, self._dataset) if self._ranks.leads else None
+            first = first_state(self.recipe, self._settings, self._dataset) if self._ranks.is_leader else None
             self._state = self._ranks.broadcast(first, self._settings.device)
         yield from train(self._stages, self._dataset, self._state, self.iterations, ranks=self._ranks)
 

@@ -21,17 +21,17 @@ from glassplat.scene.scene import Scene
 from glassplat.training import densify, losses
 from glassplat.training.messages import Working
 from glassplat.training.options import DefaultDensify, Intervals, McmcDensify, Rate
-from glassplat.training.stage import Action, AtMoments, Clock, Every, PostStep, TrainState, Work
+from glassplat.training.stage import Action, AtShares, Clock, Every, PostStep, TrainState, Work
 
 log = logging.getLogger("glassplat.training")
 
-LARGE_ENOUGH = 250_000
+PUBLISHED_THRESHOLD_PIXELS = 250_000
 """Size of photographs, in pixels, above which the published densification thresholds apply (lab/gaussians.md)."""
 GAUSSIANS_PER_PIXEL = 0.5
 """Default cap of `McmcDensify`, in Gaussians per pixel; at 400x300, default densification ends near one."""
 GROWTH_SHARE = 1 / 300
 """Share of the run over which `McmcDensify` grows by its factor: 100 of the published 30,000 iterations."""
-LARGE_ARE_PRUNED = ("primary", "surroundings")
+PRUNE_LARGE_PARTS = ("primary", "surroundings")
 """Sets whose oversized Gaussians are removed; glass Gaussians may be as large as their pane."""
 MOST_GROWTH = 2.0
 """Largest factor of one relocation, however short the run."""
@@ -60,16 +60,16 @@ class GrowSh:
 
 
 def threshold_factor(dataset: Dataset) -> float:
-    """Factor on the densification threshold for small photographs; 1 from `LARGE_ENOUGH` on.
+    """Factor on the densification threshold for small photographs; 1 from `PUBLISHED_THRESHOLD_PIXELS` on.
 
     The published threshold was chosen for photographs of about a megapixel. The loss is a mean over pixels, so a
     Gaussian a few pixels wide has a larger gradient in a smaller image; at 400x300, there would be twice as many
     Gaussians as pixels (lab/gaussians.md).
     """
-    return max(1.0, math.sqrt(LARGE_ENOUGH / dataset.photograph_pixels))
+    return max(1.0, math.sqrt(PUBLISHED_THRESHOLD_PIXELS / dataset.photograph_pixels))
 
 
-def limit_of(densifier: DefaultDensify, dataset: Dataset) -> int | None:
+def densify_cap(densifier: DefaultDensify, dataset: Dataset) -> int | None:
     """Maximum number of Gaussians: the requested one, or one that suits the photographs."""
     if densifier.cap is not None or densifier.per_pixel == 0:
         return densifier.cap
@@ -104,7 +104,7 @@ class Densify:
         factor = threshold_factor(dataset) if self.densifier.adapt_to_size else 1.0
         densifier = replace(
             self.densifier,
-            cap=limit_of(self.densifier, dataset),
+            cap=densify_cap(self.densifier, dataset),
             gradient_threshold=self.densifier.gradient_threshold * factor,
             absgrad_threshold=self.densifier.absgrad_threshold * factor,
         )
@@ -116,13 +116,13 @@ class Densify:
             extent=state.scene.extent,
             generator=state.generator(self.name),
             part=self.part,
-            prune_large=self.part in LARGE_ARE_PRUNED and clock.progress > self.densifier.prune_large_start,
+            prune_large=self.part in PRUNE_LARGE_PARTS and clock.progress > self.densifier.prune_large_start,
         )
-        put_in_order(state, edited, moments, self.part)
+        replace_in_morton_order(state, edited, moments, self.part)
         return True
 
 
-FAINT_IN_AIR = 1e-4
+LEAST_MIDAIR_SHARE = 1e-4
 """Minimum contribution, as a share of a view's pixels, of a Gaussian in mid-air in front of a camera."""
 
 
@@ -130,8 +130,8 @@ FAINT_IN_AIR = 1e-4
 class PruneIdle:
     """Removes the Gaussians of one set that contribute almost nothing to any training view, or surround a camera. The
     former include Gaussians behind a pane whose reflection is now explained by the mirrored image. For those around a
-    camera see `fog_around`; Gaussians in mid-air in front of a camera must contribute to other views, see
-    `hangs_in_air`.
+    camera see `gaussians_around_cameras`; Gaussians in mid-air in front of a camera must contribute to other views, see
+    `floaters_near_cameras`.
 
     Attributes:
         densifier: holds the threshold and the times.
@@ -158,29 +158,31 @@ class PruneIdle:
         gaussians = state.scene.gaussian_sets().get(self.part)
         if gaussians is None:
             return False
-        most, largest_share = (torch.zeros_like(gaussians.logit_opacities) for _ in range(2))
+        largest, largest_share = (torch.zeros_like(gaussians.logit_opacities) for _ in range(2))
         for done, view in enumerate(dataset.train):
             yield Working("searching for unnecessary Gaussians", done, len(dataset.train))
-            added = self.measure(state.scene, view.camera)
-            most = torch.maximum(most, added)
-            largest_share = torch.maximum(largest_share, added / (view.camera.width * view.camera.height))
-        busy = most >= self.densifier.least_contribution
+            contribution = self.measure(state.scene, view.camera)
+            largest = torch.maximum(largest, contribution)
+            largest_share = torch.maximum(largest_share, contribution / (view.camera.width * view.camera.height))
+        contributing = largest >= self.densifier.least_contribution
         if self.part == "primary":
-            places = torch.stack([view.camera.center for view in dataset.train])
-            busy &= ~densify.fog_around(gaussians, places)
+            positions = torch.stack([view.camera.center for view in dataset.train])
+            contributing &= ~densify.gaussians_around_cameras(gaussians, positions)
             if dataset.measured_points:
-                hanging = densify.hangs_in_air(gaussians.means, places, dataset.points.positions)
-                busy &= ~hanging | (largest_share >= FAINT_IN_AIR)
+                floating = densify.floaters_near_cameras(gaussians.means, positions, dataset.points.positions)
+                contributing &= ~floating | (largest_share >= LEAST_MIDAIR_SHARE)
         # A scene without Gaussians is an error; surroundings that nothing reflects yet may still be needed.
-        if bool(busy.all()) or (self.part != "primary" and not bool(busy.any())):
+        if bool(contributing.all()) or (self.part != "primary" and not bool(contributing.any())):
             return False
-        keep_some(state, busy, self.part)
+        keep_gaussians(state, contributing, self.part)
         return True
 
 
-def put_in_order(state: TrainState, gaussians: Gaussians, moments: densify.Moments, part: str = "primary") -> None:
+def replace_in_morton_order(
+    state: TrainState, gaussians: Gaussians, moments: densify.Moments, part: str = "primary"
+) -> None:
     """Replaces a part of the scene and its moments, sorted in Morton order."""
-    order = densify.in_morton_order(gaussians.means)
+    order = densify.sort_by_morton_code(gaussians.means)
     ordered, moments = densify.apply_edit(gaussians, moments, order, part=part)
     state.scene = state.scene.with_gaussians(part, ordered)
     # An empty set has no parameters.
@@ -189,14 +191,14 @@ def put_in_order(state: TrainState, gaussians: Gaussians, moments: densify.Momen
     state.means = {}  # The rows have changed, even if their number has not.
 
 
-def cap_of(densifier: McmcDensify, dataset: Dataset) -> int:
+def mcmc_cap(densifier: McmcDensify, dataset: Dataset) -> int:
     """The cap: the requested number of Gaussians, or one that suits the photographs."""
     if densifier.cap is not None:
         return densifier.cap
     return round(GAUSSIANS_PER_PIXEL * dataset.photograph_pixels)
 
 
-def growth_of(densifier: McmcDensify, iterations: int) -> float:
+def growth_per_relocation(densifier: McmcDensify, iterations: int) -> float:
     """Growth factor per relocation, such that any run reaches its cap after the same share."""
     factor: float = densifier.growth ** (densifier.interval / (GROWTH_SHARE * iterations))
     return min(factor, MOST_GROWTH)
@@ -215,15 +217,15 @@ class Relocate:
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state` if necessary."""
-        densifier = replace(self.densifier, growth=growth_of(self.densifier, clock.iterations))
+        densifier = replace(self.densifier, growth=growth_per_relocation(self.densifier, clock.iterations))
         edited, moments = densify.relocate_and_grow(
             densifier,
             state.scene.primary,
             state.optimizer.moments,
-            cap=cap_of(self.densifier, dataset),
+            cap=mcmc_cap(self.densifier, dataset),
             generator=state.generator(self.name),
         )
-        put_in_order(state, edited, moments)
+        replace_in_morton_order(state, edited, moments)
         # MCMC does not use screen gradients, but the statistics no longer match the rows.
         state.statistics.pop("primary", None)
         return True
@@ -310,12 +312,12 @@ class PerturbOpacity:
             generator=state.generator(self.name),
         )
         state.scene = replace(state.scene, primary=perturbed)
-        state.optimizer.moments = densify.forget(state.optimizer.moments, ("primary.logit_opacities",), selected)
+        state.optimizer.moments = densify.zero_moments(state.optimizer.moments, ("primary.logit_opacities",), selected)
         return bool(selected.any())
 
 
 @dataclass(frozen=True)
-class Population:
+class DensificationStrategy:
     """Contribution of a strategy to every stage of a recipe.
 
     Attributes:
@@ -338,7 +340,7 @@ class Population:
     densify_until: float = 0.0
     cap: int | None = None
 
-    def initial(self, points: PointCloud, sh_degree: int) -> Gaussians:
+    def initial_gaussians(self, points: PointCloud, sh_degree: int) -> Gaussians:
         """Initial primary Gaussians, one per point; with a cap, a random subset that is the same in every run."""
         if self.cap and len(points) > self.cap:
             log.info("The first Gaussians are %d of the %d points, as many as the cap allows", self.cap, len(points))
@@ -348,18 +350,18 @@ class Population:
         return densify.gaussians_from_points(points, sh_degree=sh_degree, opacity=self.opacity, spread=self.spread)
 
 
-def default_population(densifier: DefaultDensify, intervals: Intervals) -> Population:
+def default_strategy(densifier: DefaultDensify, intervals: Intervals) -> DensificationStrategy:
     """3DGS: clone, split, prune and reset opacities; finally remove Gaussians that contribute to no view."""
     reset = ResetOpacity(Every(intervals.opacity, 0.0, intervals.reset_stop, intervals.least, only_multiples_of=3))
     edits = (Densify(densifier), PruneIdle(densifier))
-    return Population(edits=edits, resets=(reset,), densify_until=densifier.stop, cap=densifier.cap)
+    return DensificationStrategy(edits=edits, resets=(reset,), densify_until=densifier.stop, cap=densifier.cap)
 
 
 MCMC_OPACITY = 0.5
 """Opacity of the initial Gaussians with `mcmc`."""
 
 
-def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:
+def mcmc_strategy(densifier: McmcDensify, means_rate: Rate) -> DensificationStrategy:
     """3DGS-MCMC: relocate, add, add noise, and regularise opacities and scales; opacities are never reset.
 
     The regularisers are those of TR-Gaussians, Eq. 20. They act on Gaussians that a step's view shows directly, and
@@ -368,14 +370,14 @@ def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:
     show would fade and drift.
     """
 
-    def reaching(term: losses.LossFunction) -> losses.LossFunction:
-        return losses.of_all(term) if densifier.reach == "all" else term
+    def regulariser(term: losses.LossFunction) -> losses.LossFunction:
+        return losses.over_all_gaussians(term) if densifier.reach == "all" else term
 
     terms = losses.weighted_terms(
-        losses.LossTerm("opacity", densifier.opacity_weight, reaching(losses.mean_opacity)),
-        losses.LossTerm("scale", densifier.scale_weight, reaching(losses.mean_scale)),
+        losses.LossTerm("opacity", densifier.opacity_weight, regulariser(losses.mean_opacity)),
+        losses.LossTerm("scale", densifier.scale_weight, regulariser(losses.mean_scale)),
     )
-    return Population(
+    return DensificationStrategy(
         opacity=MCMC_OPACITY,
         spread=densifier.initial_spread,
         edits=(Relocate(densifier),),
@@ -385,23 +387,23 @@ def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:
     )
 
 
-UNEXPLAINED = 0.1
-"""Mean residual over a window of `WINDOW` of the width, sRGB, above which something is missing, not just detail."""
-WINDOW = 0.03
-CELLS = 96
+LEAST_UNEXPLAINED = 0.1
+"""Mean residual over a window of `RESIDUAL_WINDOW` of the width, sRGB, above which more than detail is missing."""
+RESIDUAL_WINDOW = 0.03
+GRID_CELLS = 96
 """Grid cells along the longest side of the searched box."""
-MOST_LOOKED_AT = 100
+MOST_SEARCHED_PHOTOGRAPHS = 100
 """Maximum number of photographs used for the search."""
-FEWEST_AGREEING, LEAST_AGREEING, MOST_SPREAD, MOST_ALIKE = 5, 0.7, 0.08, 0.98
+FEWEST_AGREEING_VIEWS, LEAST_AGREEING_SHARE, MOST_COLOR_DEVIATION, MOST_MEAN_DIRECTION = 5, 0.7, 0.08, 0.98
 """Minimum number of photographs with a residual at a cell; their minimum share of all that see it directly; maximum
 standard deviation of its colour; and maximum length of the mean viewing direction, 1 if all are equal."""
 
-MOST_ADDED = 0.05
+MOST_ADDED_SHARE = 0.05
 """Maximum share of Gaussians to add; if more is missing, the scene has hardly been learned yet."""
 
 
 @dataclass(frozen=True)
-class SeedUnexplained(AtMoments):
+class SeedUnexplained(AtShares):
     """Adds Gaussians where several photographs agree on an object that the scene lacks.
 
     Densification only moves and copies existing Gaussians. A textureless object in open space, such as a lamp, has no
@@ -416,16 +418,18 @@ class SeedUnexplained(AtMoments):
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
         """Edits `state` if necessary, and yields its progress."""
-        cloud, size = yield from unexplained_places(state.scene, dataset.train, self.renderer)
+        cloud, size = yield from unexplained_positions(state.scene, dataset.train, self.renderer)
         primary = state.scene.primary
-        if not 0 < len(cloud) < MOST_ADDED * len(primary):
+        if not 0 < len(cloud) < MOST_ADDED_SHARE * len(primary):
             return False
-        add_primary(state, seeds_of(primary, cloud, opacity=0.5, size=size))
+        add_primary_gaussians(state, seed_gaussians(primary, cloud, opacity=0.5, size=size))
         log.info("Gaussians added where photographs agree on a missing object: %d", len(cloud))
         return True
 
 
-def seeds_of(primary: Gaussians, points: PointCloud, *, opacity: float = 0.1, size: float | None = None) -> Gaussians:
+def seed_gaussians(
+    primary: Gaussians, points: PointCloud, *, opacity: float = 0.1, size: float | None = None
+) -> Gaussians:
     """Gaussians from points, like the primary ones; other channels get the median of these.
 
     Args:
@@ -443,15 +447,15 @@ def seeds_of(primary: Gaussians, points: PointCloud, *, opacity: float = 0.1, si
     return replace(seeds, active_sh_degree=primary.active_sh_degree, channels=channels)
 
 
-def add_primary(state: TrainState, seeds: Gaussians) -> None:
+def add_primary_gaussians(state: TrainState, seeds: Gaussians) -> None:
     """Adds Gaussians to the primary ones, whose moments and statistics are kept."""
     primary, state.optimizer.moments = densify.append(state.scene.primary, state.optimizer.moments, seeds)
     state.scene = replace(state.scene, primary=primary)
     if "primary" in state.statistics:
-        state.statistics["primary"] = state.statistics["primary"].with_new(len(seeds))
+        state.statistics["primary"] = state.statistics["primary"].with_empty_rows(len(seeds))
 
 
-def keep_some(state: TrainState, kept: Tensor, part: str = "primary") -> None:
+def keep_gaussians(state: TrainState, kept: Tensor, part: str = "primary") -> None:
     """Removes the Gaussians where `kept` [N] is false; moments and statistics of the others are kept. Otherwise, a
     removal at the step of a densification would cancel it (lab/gaussians.md).
     """
@@ -465,7 +469,7 @@ def keep_some(state: TrainState, kept: Tensor, part: str = "primary") -> None:
 
 
 @torch.no_grad()
-def unexplained_places(
+def unexplained_positions(
     scene: Scene, views: Sequence[View], renderer: Renderer
 ) -> Generator[Working, None, tuple[PointCloud, float]]:
     """Positions where photographs agree on something that the scene lacks, and the size of Gaussians there.
@@ -473,41 +477,45 @@ def unexplained_places(
     The search uses a grid around the cameras. Panes count as opaque, because their reflections would be found behind
     them.
     """
-    views = evenly(views, MOST_LOOKED_AT)
+    views = evenly(views, MOST_SEARCHED_PHOTOGRAPHS)
     device = scene.primary.means.device
-    places, cell = grid_around([view.camera for view in views], scene.extent)
-    places = places.to(device)
-    looking, agreeing = places.new_zeros(2, len(places))
-    colors, squares, sides = places.new_zeros(3, len(places), 3)
+    positions, cell = grid_around_cameras([view.camera for view in views], scene.extent)
+    positions = positions.to(device)
+    seeing_views, agreeing_views = positions.new_zeros(2, len(positions))
+    color_sums, square_sums, direction_sums = positions.new_zeros(3, len(positions), 3)
     for done, view in enumerate(views):
         yield Working("searching for missing objects", done, len(views))
         camera = view.camera.to(device)
-        rows = in_image(places, camera).nonzero()[:, 0]
-        here = places[rows]
-        pixels = nearest_pixels(camera.project(here)[0], camera)
+        rows = in_image(positions, camera).nonzero()[:, 0]
+        in_view = positions[rows]
+        pixels = nearest_pixels(camera.project(in_view)[0], camera)
         frame = renderer(scene, camera)
-        looks = losses.counted_pixels(view, device)
+        visible = losses.valid_pixels(view, device)
         if (strength := frame.layers.get("strength")) is not None:
-            looks = looks & (strength <= 0)
-        looks = looks[pixels]
-        looks &= ~crosses_pane(here, scene.planes, camera.center)
-        missing = _missing_pixels(losses.residual(frame, view, scene))[pixels] & looks
+            visible = visible & (strength <= 0)
+        visible = visible[pixels]
+        visible &= ~crosses_pane(in_view, scene.planes, camera.center)
+        missing = _missing_pixels(losses.residual(frame, view, scene))[pixels] & visible
         photographed = scene.exposures.apply_inverse(to_device(view.photo, device)[pixels].float() / 255, view.name)
         color = photographed.clamp(0, 1) * missing[:, None]
-        looking[rows] += looks
-        agreeing[rows] += missing
-        colors[rows] += color
-        squares[rows] += color.square()
-        sides[rows] += torch.nn.functional.normalize(camera.center - here, dim=1) * missing[:, None]
-    mean = colors / agreeing.clamp(min=1)[:, None]
-    spread = (squares / agreeing.clamp(min=1)[:, None] - mean.square()).clamp(min=0).mean(dim=1).sqrt()
-    found = (agreeing >= FEWEST_AGREEING) & (agreeing >= LEAST_AGREEING * looking) & (spread < MOST_SPREAD)
-    found &= sides.norm(dim=1) < MOST_ALIKE * agreeing
-    cloud = PointCloud(places[found].cpu(), (255 * mean[found]).round().to(torch.uint8).cpu())
+        seeing_views[rows] += visible
+        agreeing_views[rows] += missing
+        color_sums[rows] += color
+        square_sums[rows] += color.square()
+        direction_sums[rows] += torch.nn.functional.normalize(camera.center - in_view, dim=1) * missing[:, None]
+    mean = color_sums / agreeing_views.clamp(min=1)[:, None]
+    spread = (square_sums / agreeing_views.clamp(min=1)[:, None] - mean.square()).clamp(min=0).mean(dim=1).sqrt()
+    found = (
+        (agreeing_views >= FEWEST_AGREEING_VIEWS)
+        & (agreeing_views >= LEAST_AGREEING_SHARE * seeing_views)
+        & (spread < MOST_COLOR_DEVIATION)
+    )
+    found &= direction_sums.norm(dim=1) < MOST_MEAN_DIRECTION * agreeing_views
+    cloud = PointCloud(positions[found].cpu(), (255 * mean[found]).round().to(torch.uint8).cpu())
     return cloud, 0.6 * cell
 
 
-def grid_around(cameras: Sequence[Camera], extent: float) -> tuple[Tensor, float]:
+def grid_around_cameras(cameras: Sequence[Camera], extent: float) -> tuple[Tensor, float]:
     """[P, 3] centres of the cells of a grid over a box around the cameras, one extent larger, and a cell's side.
 
     Its axes are those of the first camera, so that the result does not depend on the orientation of the world.
@@ -515,7 +523,7 @@ def grid_around(cameras: Sequence[Camera], extent: float) -> tuple[Tensor, float
     axes = cameras[0].cam_from_world[:3, :3].cpu()
     centers = torch.stack([camera.center.cpu() for camera in cameras]) @ axes.T
     low, high = centers.amin(dim=0) - extent, centers.amax(dim=0) + extent
-    cell = float((high - low).amax()) / CELLS
+    cell = float((high - low).amax()) / GRID_CELLS
     numbers = ((high - low) / cell).round().clamp(min=1).int().tolist()
     along = [
         start + cell * (torch.arange(number, dtype=torch.float32) + 0.5)
@@ -526,6 +534,6 @@ def grid_around(cameras: Sequence[Camera], extent: float) -> tuple[Tensor, float
 
 def _missing_pixels(error: Tensor) -> Tensor:
     """[H, W] bool: pixels of a residual [H, W, 3] in which more than detail is missing."""
-    reach = max(round(WINDOW / 2 * error.shape[1]), 1)
+    reach = max(round(RESIDUAL_WINDOW / 2 * error.shape[1]), 1)
     mean = window_means(error, torch.ones_like(error[..., 0]), reach)
-    return mean.abs().mean(dim=-1) > UNEXPLAINED
+    return mean.abs().mean(dim=-1) > LEAST_UNEXPLAINED

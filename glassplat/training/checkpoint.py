@@ -50,7 +50,7 @@ PLANE_SHAPES: dict[str, tuple[int, ...] | None] = {
     "tangents": (3,),
     "half_sizes": (2,),
 }
-FURTHER_PLANE_SHAPES: dict[str, tuple[int, ...] | None] = {"log_transmittances": (3,)}
+OPTIONAL_PLANE_SHAPES: dict[str, tuple[int, ...] | None] = {"log_transmittances": (3,)}
 """Tensor of tinted panes."""
 SCALE_SHAPES = [(DISC_SCALES,), (DISC_SCALES + 1,)]
 SH_SHAPES = [(count, 3) for count in (0, 1, 4, 9, 16)]
@@ -106,31 +106,31 @@ def load_checkpoint(
         InputError: the file is truncated, not a checkpoint of glassplat, or one of another run.
         FileNotFoundError: the file does not exist.
     """
-    with opened_checkpoint(path) as file:
+    with open_checkpoint(path) as file:
         state = restored_state(file.header, file.tensors())
-    check_belongs(state, path, method=method, seed=seed, iterations=iterations)
+    check_same_run(state, path, method=method, seed=seed, iterations=iterations)
     return state
 
 
-class Recorded(NamedTuple):
+class CheckpointProgress(NamedTuple):
     """Step of a checkpoint, and the training time up to it in seconds."""
 
     step: int
     seconds: float
 
 
-def recorded(path: Path) -> Recorded:
+def read_progress(path: Path) -> CheckpointProgress:
     """Step and training time of a checkpoint; fast, because only the header is read.
 
     Raises:
         InputError: the file is truncated, or not a checkpoint of glassplat.
         FileNotFoundError: the file does not exist.
     """
-    with opened_checkpoint(path) as file:
-        return Recorded(int(file.header["step"]), float(file.header["seconds"]))
+    with open_checkpoint(path) as file:
+        return CheckpointProgress(int(file.header["step"]), float(file.header["seconds"]))
 
 
-def check_belongs(
+def check_same_run(
     state: TrainState, path: Path, *, method: str | None, seed: int | None, iterations: int | None
 ) -> None:
     """Refuses the checkpoint of another run.
@@ -148,7 +148,7 @@ def check_belongs(
 
 
 @contextmanager
-def opened_checkpoint(path: Path) -> Iterator[TensorsFile]:
+def open_checkpoint(path: Path) -> Iterator[TensorsFile]:
     """An open checkpoint with a checked header; errors in its contents name the file."""
     if not os.path.isfile(path):
         raise FileNotFoundError(f"no checkpoint at {path}; expected the file that training writes there")
@@ -170,13 +170,13 @@ def restored_state(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     check_types(tensors)
     with input_checked():
         scene = restored_scene(header, tensors)
-    first, second = under(tensors, "first/"), under(tensors, "second/")
+    first, second = tensors_with_prefix(tensors, "first/"), tensors_with_prefix(tensors, "second/")
     if not first.keys() == second.keys() <= header["updates"].keys():
         raise InputError("not every parameter that was stepped has both moments and a count of its updates")
     check_like(second, first, "the second moments")
-    lost = sorted(first.keys() - scene.parameters().keys())
-    if lost:
-        raise InputError(f"it has moments of {', '.join(lost)}, but no such parameters")
+    unknown = sorted(first.keys() - scene.parameters().keys())
+    if unknown:
+        raise InputError(f"it has moments of {', '.join(unknown)}, but no such parameters")
     return TrainState(
         scene=scene,
         method=header["method"],
@@ -190,8 +190,8 @@ def restored_state(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
             paused=dict(header["paused"]),
             raised_rates=dict(header["raised_rates"]),
         ),
-        statistics=restored_statistics(under(tensors, "statistics/"), scene),
-        means=under(tensors, "means/"),
+        statistics=restored_statistics(tensors_with_prefix(tensors, "statistics/"), scene),
+        means=tensors_with_prefix(tensors, "means/"),
     )
 
 
@@ -206,26 +206,28 @@ def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     if "scene/glass/logit_mark" not in tensors:
         raise InputError("the glass has no logit_mark")
     sets = {
-        part: restored_gaussians(under(tensors, f"scene/{part}/"), part, degree)
+        part: restored_gaussians(tensors_with_prefix(tensors, f"scene/{part}/"), part, degree)
         for part, degree in header["active_sh_degree"].items()
     }
-    planes = under(tensors, "scene/planes/")
-    further = {name: shape for name, shape in FURTHER_PLANE_SHAPES.items() if name in planes}
-    check_shapes(planes, PLANE_SHAPES | further, "planes")
-    distant = under(tensors, "scene/environment/")
-    check_shapes(distant, {"raw": None} if distant else {}, "environment")
-    environment = Environment(**(distant or empty.environment.tensors()), region=header["region"])
-    exposed = under(tensors, "scene/exposures/")
-    check_shapes(exposed, {"affine": (3, 4)} if exposed else {}, "exposures")
-    moved = under(tensors, "scene/poses/")
-    check_shapes(moved, {"twists": (6,)} if moved else {}, "poses")
+    planes = tensors_with_prefix(tensors, "scene/planes/")
+    optional = {name: shape for name, shape in OPTIONAL_PLANE_SHAPES.items() if name in planes}
+    check_shapes(planes, PLANE_SHAPES | optional, "planes")
+    environment_tensors = tensors_with_prefix(tensors, "scene/environment/")
+    check_shapes(environment_tensors, {"raw": None} if environment_tensors else {}, "environment")
+    environment = Environment(**(environment_tensors or empty.environment.tensors()), region=header["region"])
+    exposure_tensors = tensors_with_prefix(tensors, "scene/exposures/")
+    check_shapes(exposure_tensors, {"affine": (3, 4)} if exposure_tensors else {}, "exposures")
+    pose_tensors = tensors_with_prefix(tensors, "scene/poses/")
+    check_shapes(pose_tensors, {"twists": (6,)} if pose_tensors else {}, "poses")
     return Scene(
-        poses=PoseCorrections(moved["twists"], tuple(header["corrected"])) if moved else empty.poses,
+        poses=PoseCorrections(pose_tensors["twists"], tuple(header["corrected"])) if pose_tensors else empty.poses,
         extent=header["extent"],
         planes=Planes(**planes, labels=header["labels"], mirrors=header["mirrors"]),
         environment=environment,
         up=direction(header["up"], "the header"),
-        exposures=Exposures(exposed["affine"], tuple(header["photographs"])) if exposed else empty.exposures,
+        exposures=Exposures(exposure_tensors["affine"], tuple(header["photographs"]))
+        if exposure_tensors
+        else empty.exposures,
         **sets,
     )
 
@@ -250,7 +252,7 @@ def restored_statistics(tensors: Mapping[str, Tensor], scene: Scene) -> dict[str
         if gaussians is None:
             raise InputError(f"it holds statistics of {part}; expected those of {', '.join(scene.gaussian_sets())}")
         expected = vars(ScreenStatistics.zeros(len(gaussians)))
-        known = under(tensors, f"{part}/")
+        known = tensors_with_prefix(tensors, f"{part}/")
         check_like(known, expected, f"the statistics of {part}")
         if known.keys() != expected.keys():
             raise InputError(f"the statistics of {part} are {sorted(known)}; expected {sorted(expected)}")
@@ -268,24 +270,24 @@ def check_types(tensors: Mapping[str, Tensor]) -> None:
             raise InputError(f"{name} holds {tensor.dtype}, other tensors {first.dtype}; expected one precision")
 
 
-def check_shapes(tensors: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...] | None], of: str) -> None:
+def check_shapes(tensors: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...] | None], owner: str) -> None:
     """Raises InputError unless the names are as expected and rows have the given shapes (None for any)."""
     if tensors.keys() != shapes.keys():
-        raise InputError(f"{of} has the tensors {sorted(tensors)}; expected {sorted(shapes)}")
+        raise InputError(f"{owner} has the tensors {sorted(tensors)}; expected {sorted(shapes)}")
     for name, shape in shapes.items():
         found = tuple(tensors[name].shape)
         if shape is not None and (not found or found[1:] != shape):
-            raise InputError(f"{name} of {of} has shape {list(found)}; expected rows of {list(shape)}")
+            raise InputError(f"{name} of {owner} has shape {list(found)}; expected rows of {list(shape)}")
 
 
-def check_like(tensors: Mapping[str, Tensor], examples: Mapping[str, Tensor], of: str) -> None:
+def check_like(tensors: Mapping[str, Tensor], examples: Mapping[str, Tensor], owner: str) -> None:
     """Raises InputError unless each tensor has the shape of the example of the same name."""
     for name, tensor in tensors.items():
         if name not in examples or tensor.shape != examples[name].shape:
             expected = list(examples[name].shape) if name in examples else "none of that name"
-            raise InputError(f"{name} of {of} has shape {list(tensor.shape)}; expected {expected}")
+            raise InputError(f"{name} of {owner} has shape {list(tensor.shape)}; expected {expected}")
 
 
-def under(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+def tensors_with_prefix(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """The tensors whose names have a prefix, without the prefix."""
     return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}

@@ -20,31 +20,31 @@ from glassplat.scene.panes import Planes, rectangle_offsets
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import Densify
 from glassplat.training.options import DefaultDensify, MethodRecipe, Photographer, Rate
-from glassplat.training.stage import Clock, Setup, Stage, TrainState, Work, carried_out
+from glassplat.training.stage import Clock, Setup, Stage, TrainState, Work, run_edit
 
-END_SHARE = 0.1
+FINAL_RATE_SHARE = 0.1
 """Learning rate at the end of the run, as a share of that at the start."""
 CORRECTIONS: dict[str, type[PerPhotograph]] = {"exposures": Exposures, "poses": PoseCorrections}
 """Corrections of photographs, by part of the scene."""
 
 
-def _rates(recipe: MethodRecipe) -> dict[str, float]:
+def _correction_rates(recipe: MethodRecipe) -> dict[str, float]:
     """Initial learning rates, by part of the scene, of the corrections that are learned."""
     rates = {"exposures": recipe.exposure.rate, "poses": recipe.poses.rate}
     return {part: rate for part, rate in rates.items() if rate}
 
 
-def corrections_begun(recipe: MethodRecipe, scene: Scene, dataset: Dataset) -> Scene:
+def with_neutral_corrections(recipe: MethodRecipe, scene: Scene, dataset: Dataset) -> Scene:
     """The initial scene, with neutral corrections."""
     names = tuple(view.name for view in dataset.train)
-    begun: dict[str, Any] = {part: CORRECTIONS[part].neutral(names) for part in _rates(recipe)}
-    return replace(scene, **begun)
+    neutral: dict[str, Any] = {part: CORRECTIONS[part].neutral(names) for part in _correction_rates(recipe)}
+    return replace(scene, **neutral)
 
 
-def corrections_learnt(recipe: MethodRecipe, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+def with_learned_corrections(recipe: MethodRecipe, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
     """The stages with learning of the corrections added."""
-    for part, start in _rates(recipe).items():
-        rate = {f"{part}.{CORRECTIONS[part].TENSOR}": Rate(start, start * END_SHARE)}
+    for part, start in _correction_rates(recipe).items():
+        rate = {f"{part}.{CORRECTIONS[part].TENSOR}": Rate(start, start * FINAL_RATE_SHARE)}
         # Before post-steps that average over steps.
         stages = tuple(replace(s, rates={**s.rates, **rate}, post_steps=(Center(part), *s.post_steps)) for s in stages)
     return stages
@@ -79,7 +79,7 @@ SPREAD = 0.2
 OPACITY = 0.05
 
 
-def first_photographer(
+def initial_photographer(
     planes: Planes, cameras: Sequence[Camera], *, count: int, sh_degree: int, seed: int
 ) -> Gaussians:
     """A faint grey cloud behind the camera, with constant density in the logarithm of the distance.
@@ -102,7 +102,7 @@ def first_photographer(
     # Behind the camera; near the face, all around it.
     directions[:, 2] = -directions[:, 2].abs()
     device = planes.centers.device
-    found = Gaussians(
+    cloud = Gaussians(
         means=radii[:, None] * directions,
         quats=torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float32).repeat(count, 1),
         log_scales=torch.log(SPREAD * radii)[:, None].repeat(1, 3),
@@ -110,7 +110,7 @@ def first_photographer(
         sh=torch.zeros(count, (sh_degree + 1) ** 2, 3, dtype=torch.float32),
         active_sh_degree=0,
     )
-    return found.to(device)
+    return cloud.to(device)
 
 
 def distance_to_panes(planes: Planes, cameras: Sequence[Camera]) -> float:
@@ -139,17 +139,17 @@ class AddPhotographer:
     def __call__(self, state: TrainState, dataset: Dataset) -> Work:
         """Edits `state`, and yields its progress."""
         if self.after is not None:
-            yield from carried_out(self.after(state, dataset))
+            yield from run_edit(self.after(state, dataset))
         cameras = [view.camera for view in dataset.train]
-        body = first_photographer(
+        photographer = initial_photographer(
             state.scene.planes, cameras, count=self.options.count, sh_degree=self.options.sh_degree, seed=self.seed
         )
         up = estimate_up(cameras) if self.options.upright else None
-        state.scene = replace(state.scene, photographer=body, up=up)
+        state.scene = replace(state.scene, photographer=photographer, up=up)
         return True
 
 
-def photographer_learnt(
+def with_learned_photographer(
     options: Photographer, stages: tuple[Stage, ...], densify: DefaultDensify, seed: int
 ) -> tuple[Stage, ...]:
     """The stages with the photographer rendered and learned in all that have panes."""
@@ -157,11 +157,11 @@ def photographer_learnt(
         return stages
     first = next(number for number, stage in enumerate(stages) if isinstance(stage.renderer, Planar))
     setup = AddPhotographer(options, seed, after=stages[first].setup)
-    learning = [_learning(options, stage, densify) for stage in stages[first:]]
+    learning = [_with_photographer(options, stage, densify) for stage in stages[first:]]
     return (*stages[:first], replace(learning[0], setup=setup), *learning[1:])
 
 
-def _learning(options: Photographer, stage: Stage, densify: DefaultDensify) -> Stage:
+def _with_photographer(options: Photographer, stage: Stage, densify: DefaultDensify) -> Stage:
     assert isinstance(stage.renderer, Planar)
     return replace(
         stage,

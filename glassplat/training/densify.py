@@ -61,7 +61,7 @@ def gaussians_from_points(
     if not spread > 0:
         raise ValueError(f"spread is {spread}; expected a positive share of the distance between points")
     # In float64, to avoid rounding of the cloud's size.
-    order = in_morton_order(points.positions.double()).source
+    order = sort_by_morton_code(points.positions.double()).source
     means = points.positions[order]
     count, device = len(points), means.device
     sh = torch.zeros(count, (sh_degree + 1) ** 2, 3, device=device, dtype=torch.float32)
@@ -89,16 +89,16 @@ def _spacing(means: Tensor) -> Tensor:
     """[P] float64 mean distance to the nearest other points, with a floor; 1 for a single point."""
     positions = means.double().numpy()
     neighbours = min(NEIGHBOURS, len(positions) - 1)
-    size = float(np.linalg.norm(positions.max(axis=0) - positions.min(axis=0))) or 1.0
+    extent = float(np.linalg.norm(positions.max(axis=0) - positions.min(axis=0))) or 1.0
     if neighbours == 0:
-        return torch.full((1,), size, dtype=torch.float64)
+        return torch.full((1,), extent, dtype=torch.float64)
     from scipy.spatial import cKDTree
 
     distances, _ = cKDTree(positions).query(positions, k=neighbours + 1)
-    return torch.from_numpy(np.maximum(distances[:, 1:].mean(axis=1), SMALLEST_SCALE * size))
+    return torch.from_numpy(np.maximum(distances[:, 1:].mean(axis=1), SMALLEST_SCALE * extent))
 
 
-def in_morton_order(means: Tensor) -> Edit:
+def sort_by_morton_code(means: Tensor) -> Edit:
     """The edit that sorts Gaussians at `means` [N, 3] into Morton order; equal positions keep their order.
 
     A tile of an image fetches Gaussians that are close in space, so cache lines and wide loads are used better.
@@ -135,7 +135,7 @@ class Edit:
     def __len__(self) -> int:
         return self.source.shape[0]
 
-    def result(self, gaussians: Gaussians, name: str) -> Tensor:
+    def edited_tensor(self, gaussians: Gaussians, name: str) -> Tensor:
         """The tensor `name` of the new set, without making the rest of it."""
         return self.replaced[name] if name in self.replaced else gaussians.tensors()[name][self.source]
 
@@ -159,28 +159,30 @@ def clone(count: int, index: Tensor) -> Edit:
     return Edit(source, torch.arange(source.shape[0], device=index.device) >= count)
 
 
-THICK_FOG = 0.1
+LEAST_OBSTRUCTING_OPACITY = 0.1
 """Opacity of a Gaussian at a camera's position above which it is removed."""
 
 
 @torch.no_grad()
-def fog_around(gaussians: Gaussians, places: Tensor) -> Tensor:
+def gaussians_around_cameras(gaussians: Gaussians, positions: Tensor) -> Tensor:
     """[N] bool: Gaussians that would obstruct the view from one of the positions [P, 3].
 
     A Gaussian is drawn if its centre is in front of the camera. One that surrounds the cameras is therefore drawn in
     some views and not in others: it may be visible to two cameras only in a pane, and cover the whole image of a
     third. Discs have no volume and are never selected.
     """
-    hiding = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+    obstructing = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     if gaussians.are_discs:
-        return hiding
-    reach = math.sqrt(-2 * math.log(THICK_FOG)) * gaussians.log_scales.amax(dim=1).exp()
-    for place in places.to(gaussians.means):
-        near = ((place - gaussians.means).norm(dim=1) < reach).nonzero().squeeze(1)
-        offset = (place - gaussians.means[near])[:, None] @ rotation_from_quat(gaussians.quats[near])
+        return obstructing
+    reach = math.sqrt(-2 * math.log(LEAST_OBSTRUCTING_OPACITY)) * gaussians.log_scales.amax(dim=1).exp()
+    for position in positions.to(gaussians.means):
+        near = ((position - gaussians.means).norm(dim=1) < reach).nonzero().squeeze(1)
+        offset = (position - gaussians.means[near])[:, None] @ rotation_from_quat(gaussians.quats[near])
         squared = (offset.squeeze(1) / gaussians.log_scales[near].exp()).square().sum(dim=1)
-        hiding[near] |= torch.sigmoid(gaussians.logit_opacities[near]) * torch.exp(-squared / 2) > THICK_FOG
-    return hiding
+        obstructing[near] |= (
+            torch.sigmoid(gaussians.logit_opacities[near]) * torch.exp(-squared / 2) > LEAST_OBSTRUCTING_OPACITY
+        )
+    return obstructing
 
 
 FREE_SHARE, SURFACE_POINTS = 0.15, 3
@@ -188,7 +190,7 @@ FREE_SHARE, SURFACE_POINTS = 0.15, 3
 
 
 @torch.no_grad()
-def hangs_in_air(means: Tensor, places: Tensor, points: Tensor) -> Tensor:
+def floaters_near_cameras(means: Tensor, positions: Tensor, points: Tensor) -> Tensor:
     """[N] bool: means [N, 3] so close to one of the cameras at [P, 3] that no surface can be there.
 
     A small Gaussian on the camera path is a few pixels wide in distant views, where it explains noise, and covers the
@@ -196,17 +198,17 @@ def hangs_in_air(means: Tensor, places: Tensor, points: Tensor) -> Tensor:
 
     Args:
         means: centres of Gaussians.
-        places: positions of cameras.
+        positions: positions of cameras.
         points: [M, 3] SfM points; with fewer than three, nothing is selected.
     """
-    hanging = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+    floating = torch.zeros(len(means), dtype=torch.bool, device=means.device)
     if len(points) < SURFACE_POINTS:
-        return hanging
+        return floating
     points = points.to(means)
-    for place in places.to(means):
-        nearest = (points - place).norm(dim=1).topk(SURFACE_POINTS, largest=False).values[-1]
-        hanging |= (means - place).norm(dim=1) < FREE_SHARE * nearest
-    return hanging
+    for position in positions.to(means):
+        nearest = (points - position).norm(dim=1).topk(SURFACE_POINTS, largest=False).values[-1]
+        floating |= (means - position).norm(dim=1) < FREE_SHARE * nearest
+    return floating
 
 
 CHILDREN = 2
@@ -256,15 +258,17 @@ def apply_edit(
         edit: what to do.
         part: the scene part that `gaussians` is, first half of the names in `moments`.
     """
-    edited = gaussians.with_tensors({name: edit.result(gaussians, name) for name in gaussians.tensors()})
+    edited = gaussians.with_tensors({name: edit.edited_tensor(gaussians, name) for name in gaussians.tensors()})
 
-    def moved(moment: Tensor) -> Tensor:
+    def edited_rows(moment: Tensor) -> Tensor:
         rows = moment[edit.source]
         rows[edit.fresh] = 0
         return rows
 
     owned = {f"{part}.{name}" for name in gaussians.tensors()}
-    return edited, {name: (moved(m), moved(v)) if name in owned else (m, v) for name, (m, v) in moments.items()}
+    return edited, {
+        name: (edited_rows(m), edited_rows(v)) if name in owned else (m, v) for name, (m, v) in moments.items()
+    }
 
 
 @torch.no_grad()
@@ -291,7 +295,9 @@ def append(
 
 
 @torch.no_grad()
-def forget(moments: Moments, names: Collection[str], rows: Tensor | None = None) -> dict[str, tuple[Tensor, Tensor]]:
+def zero_moments(
+    moments: Moments, names: Collection[str], rows: Tensor | None = None
+) -> dict[str, tuple[Tensor, Tensor]]:
     """The moments with those of some parameters zeroed, because their values were replaced.
 
     Args:
@@ -339,7 +345,7 @@ class ScreenStatistics:
         """The rows where `kept` [N] is true."""
         return ScreenStatistics(*(sums[:, kept] for sums in self.sums))
 
-    def with_new(self, count: int) -> ScreenStatistics:
+    def with_empty_rows(self, count: int) -> ScreenStatistics:
         """The rows, followed by `count` empty ones."""
         return ScreenStatistics(*(torch.nn.functional.pad(sums, (0, count)) for sums in self.sums))
 
@@ -348,7 +354,7 @@ class ScreenStatistics:
         add_views(self.sums, views)
 
     @torch.no_grad()
-    def add_in_space(self, means_gradient: Tensor, met: Tensor) -> None:
+    def add_traced(self, means_gradient: Tensor, ray_weights: Tensor) -> None:
         """Adds a training step with ray tracing, in place (EnvGS, Section 5.1).
 
         The gradient times half the distance corresponds to a screen gradient in normalised device coordinates; without
@@ -356,10 +362,10 @@ class ScreenStatistics:
 
         Args:
             means_gradient: [N, 3] gradient of one view's loss with respect to the centres.
-            met: [N, 2] contributions to the rays: the sums of blending weights, and of weights times distances in world
-                units.
+            ray_weights: [N, 2] contributions to the rays: the sums of blending weights, and of weights times distances
+                in world units.
         """
-        weights, products = met.unbind(dim=1)
+        weights, products = ray_weights.unbind(dim=1)
         norms = means_gradient.norm(dim=-1)
         equivalents = 0.5 * torch.where(weights > 0, products / weights, 0) * norms
         self.gradient_sum.add_(equivalents)
@@ -371,7 +377,7 @@ class ScreenStatistics:
         """All sums, in the form that the kernel takes."""
         return Sums(self.gradient_sum, self.absgrad_sum, self.view_count)
 
-    def include(self, other: ScreenStatistics) -> None:
+    def merge(self, other: ScreenStatistics) -> None:
         """Adds statistics of the same Gaussians from other views, in place."""
         for total, added in zip(self.sums, other.sums, strict=True):
             total += added
@@ -425,12 +431,12 @@ def densify(
             f"statistics hold {statistics.view_count.shape[1]} columns for {len(gaussians)} Gaussians; "
             "start new statistics whenever the set has changed"
         )
-    grown = _growth(options, gaussians, statistics, extent=extent, generator=generator)
-    superfluous = _superfluous(options, gaussians, grown, extent=extent, prune_large=prune_large)
-    return apply_edit(gaussians, moments, grown.then(keep(~superfluous)), part=part)
+    grown = _growth_edit(options, gaussians, statistics, extent=extent, generator=generator)
+    pruned = _select_to_prune(options, gaussians, grown, extent=extent, prune_large=prune_large)
+    return apply_edit(gaussians, moments, grown.then(keep(~pruned)), part=part)
 
 
-def _growth(
+def _growth_edit(
     options: DefaultDensify,
     gaussians: Gaussians,
     statistics: ScreenStatistics,
@@ -439,37 +445,37 @@ def _growth(
     generator: torch.Generator,
 ) -> Edit:
     large = gaussians.log_scales.amax(dim=1) > math.log(options.dense_fraction * extent)
-    needs = statistics.mean_gradient / options.gradient_threshold
+    scores = statistics.mean_gradient / options.gradient_threshold
     if options.split_by == "absgrad":
-        needs = torch.where(large, statistics.mean_absgrad / options.absgrad_threshold, needs)
-    chosen = _within_cap(options, needs)
-    halved = split(gaussians, (chosen & large).nonzero().squeeze(1), generator=generator)
+        scores = torch.where(large, statistics.mean_absgrad / options.absgrad_threshold, scores)
+    chosen = _select_to_grow(options, scores)
+    after_split = split(gaussians, (chosen & large).nonzero().squeeze(1), generator=generator)
     # Unsplit rows moved forward by the number of split rows before them.
     row_after_split = (~(chosen & large)).cumsum(dim=0) - 1
-    return halved.then(clone(len(halved), row_after_split[chosen & ~large]))
+    return after_split.then(clone(len(after_split), row_after_split[chosen & ~large]))
 
 
-def _within_cap(options: DefaultDensify, need: Tensor) -> Tensor:
+def _select_to_grow(options: DefaultDensify, scores: Tensor) -> Tensor:
     """[N] bool: Gaussians to clone or split, whose need is at least 1; with a cap, those with the largest need."""
-    chosen = need >= 1
+    chosen = scores >= 1
     if options.cap is None:
         return chosen
-    room = max(options.cap - need.shape[0], 0)
-    order = torch.where(chosen, need, -1).argsort(descending=True, stable=True)
-    within = torch.zeros_like(chosen)
-    within[order[:room]] = True
-    return chosen & within
+    room = max(options.cap - scores.shape[0], 0)
+    order = torch.where(chosen, scores, -1).argsort(descending=True, stable=True)
+    selected = torch.zeros_like(chosen)
+    selected[order[:room]] = True
+    return chosen & selected
 
 
-def _superfluous(
+def _select_to_prune(
     options: DefaultDensify, gaussians: Gaussians, edit: Edit, *, extent: float, prune_large: bool
 ) -> Tensor:
     """[M] bool: which Gaussians of the edited set to remove."""
-    superfluous = torch.sigmoid(edit.result(gaussians, "logit_opacities")) < options.prune_opacity
+    pruned = torch.sigmoid(edit.edited_tensor(gaussians, "logit_opacities")) < options.prune_opacity
     if prune_large:
-        longest = edit.result(gaussians, "log_scales").amax(dim=1)
-        superfluous |= longest > math.log(options.prune_scale_fraction * extent)
-    return superfluous
+        longest = edit.edited_tensor(gaussians, "log_scales").amax(dim=1)
+        pruned |= longest > math.log(options.prune_scale_fraction * extent)
+    return pruned
 
 
 @torch.no_grad()
@@ -480,7 +486,7 @@ def reset_opacity(
     that the photographs support grow back; the other Gaussians are pruned.
     """
     lowered = gaussians.logit_opacities.clamp(max=logit(ceiling))
-    return gaussians.with_tensors({"logit_opacities": lowered}), forget(moments, (f"{part}.logit_opacities",))
+    return gaussians.with_tensors({"logit_opacities": lowered}), zero_moments(moments, (f"{part}.logit_opacities",))
 
 
 DEAD_OPACITY = 0.005
@@ -509,32 +515,32 @@ def relocate_and_grow(
         cap: maximum number of Gaussians; a larger set does not shrink.
         generator: source of randomness, on the device of `gaussians`.
     """
-    relocated, moments = apply_edit(gaussians, moments, relocation(options, gaussians, generator))
-    return apply_edit(relocated, moments, addition(options, relocated, cap, generator))
+    relocated, moments = apply_edit(gaussians, moments, relocate(options, gaussians, generator))
+    return apply_edit(relocated, moments, grow(options, relocated, cap, generator))
 
 
-def relocation(options: McmcDensify, gaussians: Gaussians, generator: torch.Generator) -> Edit:
+def relocate(options: McmcDensify, gaussians: Gaussians, generator: torch.Generator) -> Edit:
     """Moves every dead Gaussian onto a live one, drawn with a probability proportional to its opacity.
 
     Without live ones, nothing moves; if more than `MOST_COPIES` would share a position, the surplus stays dead.
     """
-    live = _live(gaussians)
+    live = _is_live(gaussians)
     dead = (~live).nonzero().squeeze(1)
-    targets = drawn_by_opacity(gaussians, live, dead.shape[0], generator)
+    targets = sample_by_opacity(gaussians, live, dead.shape[0], generator)
     fits = rank_among_equals(targets) < MOST_COPIES - 1
     source = torch.arange(len(gaussians), device=dead.device)
     source[dead[: targets.shape[0]][fits]] = targets[fits]
-    return shared_among_copies(gaussians, source)
+    return share_among_copies(gaussians, source)
 
 
-def addition(options: McmcDensify, gaussians: Gaussians, cap: int, generator: torch.Generator) -> Edit:
+def grow(options: McmcDensify, gaussians: Gaussians, cap: int, generator: torch.Generator) -> Edit:
     """Appends new Gaussians up to the growth factor and the cap, placed as relocated ones are."""
     count = len(gaussians)
     # Rounded up, so that small sets can grow.
     room = max(min(cap, math.ceil(options.growth * count)) - count, 0)
-    targets = drawn_by_opacity(gaussians, _live(gaussians), room, generator)
+    targets = sample_by_opacity(gaussians, _is_live(gaussians), room, generator)
     targets = targets[rank_among_equals(targets) < MOST_COPIES - 1]
-    return shared_among_copies(gaussians, torch.cat([torch.arange(count, device=targets.device), targets]))
+    return share_among_copies(gaussians, torch.cat([torch.arange(count, device=targets.device), targets]))
 
 
 @torch.no_grad()
@@ -554,8 +560,8 @@ def sgld_noise(
         extent: radius of the capture in world units.
         generator: source of randomness, on the device of `gaussians`.
     """
-    shape, kind = gaussians.means.shape, gaussians.means.dtype
-    unit = torch.randn(shape, generator=generator, dtype=kind, device=gaussians.means.device)
+    shape, dtype = gaussians.means.shape, gaussians.means.dtype
+    unit = torch.randn(shape, generator=generator, dtype=dtype, device=gaussians.means.device)
     rotations = rotation_from_quat(gaussians.quats)
     variances = gaussians.deviations.square()
     along_axes = (rotations.transpose(1, 2) @ unit[..., None]).squeeze(-1) * variances
@@ -566,12 +572,12 @@ def sgld_noise(
     return options.noise_rate * rate * gate[:, None] * directions
 
 
-def _live(gaussians: Gaussians) -> Tensor:
+def _is_live(gaussians: Gaussians) -> Tensor:
     """[N] bool: Gaussians that are opaque enough to stay."""
     return torch.sigmoid(gaussians.logit_opacities) > DEAD_OPACITY
 
 
-def drawn_by_opacity(gaussians: Gaussians, live: Tensor, count: int, generator: torch.Generator) -> Tensor:
+def sample_by_opacity(gaussians: Gaussians, live: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """[count] rows drawn with replacement, in proportion to their opacity; none at all if `live` [N] is all false."""
     rows = live.nonzero().squeeze(1)
     if not rows.shape[0]:
@@ -591,7 +597,7 @@ def rank_among_equals(values: Tensor) -> Tensor:
     return ranks
 
 
-def shared_among_copies(gaussians: Gaussians, source: Tensor) -> Edit:
+def share_among_copies(gaussians: Gaussians, source: Tensor) -> Edit:
     """The edit in which new rows copy the rows `source` [M], and copies of a row share its contribution."""
     copies = torch.bincount(source, minlength=len(gaussians))[source]
     shared = copies > 1

@@ -21,7 +21,7 @@ from glassplat.scene.scene import Scene
 from glassplat.training.densify import ScreenStatistics
 from glassplat.training.messages import ActionDone, Message, StageEntered, StepDone
 from glassplat.training.ranks import Ranks
-from glassplat.training.stage import Clock, Stage, TrainState, carried_out, decay_tensor, rate_tensor, stage_starts
+from glassplat.training.stage import Clock, Stage, TrainState, decay_tensor, rate_tensor, run_edit, stage_starts
 
 
 class TrainingDivergedError(FloatingPointError):
@@ -32,15 +32,15 @@ class NoGaussiansError(TrainingDivergedError):
     """There are no Gaussians, or none that a view shows."""
 
 
-ENTERED = "set up"
+ENTERED_STAGE = "set up"
 """Key of `TrainState.records`: the stage last set up, or entered early, by its scheduled first step."""
-WHERE_TO_LOOK = (
+CAMERA_ADVICE = (
     "Expected cameras that look at the points: check their poses and focal lengths, and whether the points are those "
     "of this capture; photographs of a few pixels (--downscale) or high learning rates end like this too"
 )
 
 
-class Differentiated(NamedTuple):
+class ViewGradients(NamedTuple):
     """Losses of a view and their gradients. Screen passes have those of the centres and of `absgrad`, ray-traced
     passes those of `contributions`. `visible` is that of the frame.
     """
@@ -52,7 +52,7 @@ class Differentiated(NamedTuple):
     visible: Tensor | None
 
 
-class Step(NamedTuple):
+class StepGradients(NamedTuple):
     """Losses, gradients and statistics of all views of a step, from all ranks.
 
     Attributes:
@@ -92,32 +92,32 @@ def train(
         RankLostError: another rank has ended; the state is that after the last `StepDone`, or `ActionDone` after it.
     """
     ranks = ranks or Ranks()
-    check_population(state)
+    check_has_gaussians(state)
     visibility = VisibilityCheck(len(dataset.train))
     starts, is_early = stage_starts(stages, iterations), False
     for stage, start, end in zip(stages, starts, starts[1:], strict=False):
         if state.step >= end:
             continue
-        is_new = state.records.get(ENTERED) != start
+        is_new = state.records.get(ENTERED_STAGE) != start
         if state.step == start or (is_early and is_new):
             if is_new and (is_early or stage.setup is not None):
                 state.is_whole = False
                 if stage.setup is not None:
-                    yield from carried_out(stage.setup(state, with_corrected_cameras(dataset, state.scene)))
-                state.records[ENTERED] = start
+                    yield from run_edit(stage.setup(state, with_corrected_cameras(dataset, state.scene)))
+                state.records[ENTERED_STAGE] = start
                 state.is_whole = True
-                ranks.settle(state)
+                ranks.synchronise(state)
             yield StageEntered(state.step, stage.name, counts_of(state.scene))
         while state.step < end and not stage.is_over(state):
-            coming = scheduled_views(dataset, state, (1 + dataset.memory.ahead) * ranks.batch)
-            for view in coming[ranks.rank :: ranks.count]:
+            upcoming = scheduled_views(dataset, state, (1 + dataset.memory.ahead) * ranks.batch)
+            for view in upcoming[ranks.rank :: ranks.count]:
                 view.read_ahead()
             views = scheduled_views(dataset, state, min(ranks.batch, end - state.step))
-            yield from advance(stage, dataset, state, iterations, views, ranks, visibility)
+            yield from run_step(stage, dataset, state, iterations, views, ranks, visibility)
         is_early = state.step < end
 
 
-def advance(
+def run_step(
     stage: Stage,
     dataset: Dataset,
     state: TrainState,
@@ -127,12 +127,12 @@ def advance(
     visibility: VisibilityCheck,
 ) -> Iterator[Message]:
     """One optimisation step of a batch of views, and the actions due after it."""
-    found = step_of(stage, state, views, ranks, with_absgrad=state.step < stage.densify_until * iterations)
-    visibility.note(found.visible, state.step, len(views))
+    found = differentiate_step(stage, state, views, ranks, with_absgrad=state.step < stage.densify_until * iterations)
+    visibility.record(found.visible, state.step, len(views))
     state.is_whole = False
-    update(stage, state, found.gradients, iterations, views=len(views))
+    update_parameters(stage, state, found.gradients, iterations, views=len(views))
     for part, added in found.statistics.items():
-        statistics_of(state.statistics, part, added.view_count.shape[1], added.view_count.device).include(added)
+        statistics_of(state.statistics, part, added.view_count.shape[1], added.view_count.device).merge(added)
     clocks = [
         Clock(step + 1, iterations, len(dataset.train), batch=len(views))
         for step in range(state.step, state.step + len(views))
@@ -143,9 +143,9 @@ def advance(
     due = [(clock, action) for clock, action in itertools.product(clocks, stage.actions) if action.due(clock)]
     done = []
     for clock, action in due:
-        if (yield from carried_out(action.apply(state, with_corrected_cameras(dataset, state.scene), clock))):
+        if (yield from run_edit(action.apply(state, with_corrected_cameras(dataset, state.scene), clock))):
             done.append(action)
-    check_population(state)
+    check_has_gaussians(state)
     state.is_whole = True
     losses = mean_losses(found.losses)
     names = ", ".join(view.name for view in views)
@@ -154,20 +154,22 @@ def advance(
         yield ActionDone(state.step, action.name, counts_of(state.scene))
     if due:
         # Even if nothing was done: another rank may have rounded differently.
-        ranks.settle(state)
+        ranks.synchronise(state)
 
 
-def step_of(stage: Stage, state: TrainState, views: Sequence[View], ranks: Ranks, *, with_absgrad: bool) -> Step:
+def differentiate_step(
+    stage: Stage, state: TrainState, views: Sequence[View], ranks: Ranks, *, with_absgrad: bool
+) -> StepGradients:
     """Differentiate the views of a step, each rank its own; the scene is not changed yet."""
     own = views[ranks.rank :: ranks.count]
     results = [differentiate(stage, state.scene, view, with_absgrad=with_absgrad) for view in own]
     if len(views) == ranks.count == 1:
         check_losses(results[0].losses, state.step + 1, views[0])
-        collect(state.statistics, results[0], views[0])
-        return Step([results[0].losses], results[0].gradients, {}, results[0].visible)
+        collect_statistics(state.statistics, results[0], views[0])
+        return StepGradients([results[0].losses], results[0].gradients, {}, results[0].visible)
     statistics: dict[str, ScreenStatistics] = {}
     for view, result in zip(own, results, strict=True):
-        collect(statistics, result, view)
+        collect_statistics(statistics, result, view)
     exchanged = ranks.exchange((list(statistics), [(r.losses, set(r.gradients), r.visible is None) for r in results]))
     # Rank r renders the views r, r + count, ...
     of_views = [exchanged[i % ranks.count][1][i // ranks.count] for i in range(len(views))]
@@ -175,35 +177,37 @@ def step_of(stage: Stage, state: TrainState, views: Sequence[View], ranks: Ranks
         check_losses(losses, state.step + number, view)
     parts = dict.fromkeys(part for known, _ in exchanged for part in known)
     names = [name for name in state.scene.parameters() if any(name in learning for _, learning, _ in of_views)]
-    step = totals(state.scene, results, {part: statistics.get(part) for part in parts}, names, ranks)
+    step = sum_over_ranks(state.scene, results, {part: statistics.get(part) for part in parts}, names, ranks)
     gradients = {name: gradient / len(views) for name, gradient in step.gradients.items()}
     is_known = not any(unknown for _, _, unknown in of_views)
-    return Step([losses for losses, _, _ in of_views], gradients, step.statistics, step.visible if is_known else None)
+    return StepGradients(
+        [losses for losses, _, _ in of_views], gradients, step.statistics, step.visible if is_known else None
+    )
 
 
-def totals(
+def sum_over_ranks(
     scene: Scene,
-    results: Sequence[Differentiated],
+    results: Sequence[ViewGradients],
     statistics: Mapping[str, ScreenStatistics | None],
     names: Sequence[str],
     ranks: Ranks,
-) -> Step:
+) -> StepGradients:
     """Sums over all ranks of the gradients and statistics of the named parameters and parts."""
     parameters, sets = scene.parameters(), scene.gaussian_sets()
-    gradients = [sum_of([r.gradients[n] for r in results if n in r.gradients], parameters[n]) for n in names]
+    gradients = [sum_gradients([r.gradients[n] for r in results if n in r.gradients], parameters[n]) for n in names]
     empty = {part: ScreenStatistics.zeros(len(sets[part]), device=sets[part].means.device) for part in statistics}
     known = [of_part or empty[part] for part, of_part in statistics.items()]
     shown = torch.zeros_like(scene.primary.logit_opacities)
     for result in results:
         shown = shown if result.visible is None else torch.maximum(shown, result.visible.to(shown.dtype))
     sums = ranks.sum_tensors([*gradients, *(total for one in known for total in one.sums)])
-    (shown,) = ranks.largest([shown])
+    (shown,) = ranks.max_tensors([shown])
     of_parts = iter(sums[len(names) :])
     found = {part: ScreenStatistics(next(of_parts), next(of_parts), next(of_parts)) for part in statistics}
-    return Step([], dict(zip(names, sums[: len(names)], strict=True)), found, shown > 0)
+    return StepGradients([], dict(zip(names, sums[: len(names)], strict=True)), found, shown > 0)
 
 
-def sum_of(gradients: Sequence[Tensor], parameter: Tensor) -> Tensor:
+def sum_gradients(gradients: Sequence[Tensor], parameter: Tensor) -> Tensor:
     """Sum of a parameter's gradients over views, possibly none."""
     return sum(gradients[1:], gradients[0]) if gradients else torch.zeros_like(parameter)
 
@@ -224,12 +228,12 @@ def check_losses(losses: Mapping[str, float], step: int, view: View) -> None:
             )
 
 
-def check_population(state: TrainState) -> None:
+def check_has_gaussians(state: TrainState) -> None:
     """Ends training when there is nothing left to train."""
     if not len(state.scene.primary):
         raise NoGaussiansError(
             f"no Gaussians are left after step {state.step}: all have become transparent, or lie where no view shows "
-            f"them. {WHERE_TO_LOOK}"
+            f"them. {CAMERA_ADVICE}"
         )
 
 
@@ -241,10 +245,10 @@ class VisibilityCheck:
     """
 
     def __init__(self, views: int) -> None:
-        self._views, self._watched, self._pass = views, 0, -1
-        self._seen: Tensor | bool = False
+        self._views, self._recorded, self._pass = views, 0, -1
+        self._is_any_visible: Tensor | bool = False
 
-    def note(self, visible: Tensor | None, step: int, count: int = 1) -> None:
+    def record(self, visible: Tensor | None, step: int, count: int = 1) -> None:
         """Records what the views of a step showed.
 
         Args:
@@ -256,30 +260,30 @@ class VisibilityCheck:
             NoGaussiansError: no view of a whole pass showed any.
         """
         if step // self._views != self._pass:
-            self._watched, self._seen, self._pass = 0, False, step // self._views
-        self._watched += count
-        self._seen = self._seen | (True if visible is None else visible.any())
-        if self._watched >= self._views and not bool(self._seen):
+            self._recorded, self._is_any_visible, self._pass = 0, False, step // self._views
+        self._recorded += count
+        self._is_any_visible = self._is_any_visible | (True if visible is None else visible.any())
+        if self._recorded >= self._views and not bool(self._is_any_visible):
             raise NoGaussiansError(
-                f"none of the {self._views} training views shows a Gaussian, up to step {step + count}. {WHERE_TO_LOOK}"
+                f"none of the {self._views} training views shows a Gaussian, up to step {step + count}. {CAMERA_ADVICE}"
             )
 
 
 def scheduled_views(dataset: Dataset, state: TrainState, count: int) -> list[View]:
     """The views of this step: every view once per pass, in a new random order for each pass."""
-    places = (divmod(step, len(dataset.train)) for step in range(state.step, state.step + count))
-    return [dataset.train[order_of_views(len(dataset.train), state.seed, n)[position]] for n, position in places]
+    positions = (divmod(step, len(dataset.train)) for step in range(state.step, state.step + count))
+    return [dataset.train[view_order(len(dataset.train), state.seed, n)[position]] for n, position in positions]
 
 
 @lru_cache(maxsize=8)
-def order_of_views(count: int, seed: int, number: int) -> list[int]:
+def view_order(count: int, seed: int, number: int) -> list[int]:
     """Random order of the views in a pass."""
     generator = torch.Generator().manual_seed(seed * 1_000_003 + number)
     order: list[int] = torch.randperm(count, generator=generator).tolist()
     return order
 
 
-def differentiate(stage: Stage, scene: Scene, view: View, *, with_absgrad: bool) -> Differentiated:
+def differentiate(stage: Stage, scene: Scene, view: View, *, with_absgrad: bool) -> ViewGradients:
     """Renders a view; returns the weighted losses and the gradients of all learned parameters.
 
     Gradients of passes are included only `with_absgrad`.
@@ -290,7 +294,7 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, with_absgrad: bool)
         if name in stage.rates and tensor.numel() > 0
     }
     learning = scene.with_parameters(leaves)
-    view = seen_from(view, learning)
+    view = with_corrected_pose(view, learning)
     frame = stage.renderer(learning, view.camera, with_absgrad=with_absgrad)
     terms, weights = loss_terms(stage, frame, view, learning)
     tracked = [record for record in frame.screen if record.means2d.requires_grad and record.means2d.numel() > 0]
@@ -299,17 +303,17 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, with_absgrad: bool)
     # Of their sum, not of the terms with weights as `grad_outputs`, for which PyTorch imports SymPy.
     sums = [values.sum()] if values.requires_grad else []
     inputs = ([*leaves.values()], centers, absgrads, [record.contributions for record in frame.space])
-    found = iter(torch.autograd.grad(sums, [*itertools.chain(*inputs)], allow_unused=True))
-    v_leaves, v_centers, v_absgrads, v_met = ([*itertools.islice(found, len(some))] for some in inputs)
+    gradient = iter(torch.autograd.grad(sums, [*itertools.chain(*inputs)], allow_unused=True))
+    v_leaves, v_centers, v_absgrads, v_contributions = ([*itertools.islice(gradient, len(some))] for some in inputs)
     gradients = {name: g for name, g in zip(leaves, v_leaves, strict=True) if g is not None}
     passes = zip(tracked, v_centers, v_absgrads, strict=True)
     screen = [(record, v_means, v) for record, v_means, v in passes if v_means is not None and v is not None]
-    space = [(record, met) for record, met in zip(frame.space, v_met, strict=True) if met is not None]
+    space = [(record, v) for record, v in zip(frame.space, v_contributions, strict=True) if v is not None]
     losses = dict(zip(terms, values.tolist(), strict=True))
-    return Differentiated(losses, gradients, screen, space, frame.visible)
+    return ViewGradients(losses, gradients, screen, space, frame.visible)
 
 
-def seen_from(view: View, scene: Scene) -> View:
+def with_corrected_pose(view: View, scene: Scene) -> View:
     """The view with its camera pose corrected by the scene; differentiable."""
     camera = scene.poses.correct(view.camera, view.name, scene.extent)
     return view if camera is view.camera else view.with_camera(camera)
@@ -327,7 +331,7 @@ def loss_terms(stage: Stage, frame: Frame, view: View, scene: Scene) -> tuple[di
     return terms, constant(weights, frame.rgb.dtype, frame.rgb.device)
 
 
-def update(
+def update_parameters(
     stage: Stage, state: TrainState, gradients: Mapping[str, Tensor], iterations: int, *, views: int = 1
 ) -> None:
     """Steps the optimiser at the stage's learning rates, with gradients averaged over the batch."""
@@ -339,20 +343,20 @@ def update(
     state.optimizer.step(parameters, gradients, rates, decays=decays, views=views)
 
 
-def collect(statistics: dict[str, ScreenStatistics], result: Differentiated, view: View) -> None:
+def collect_statistics(statistics: dict[str, ScreenStatistics], result: ViewGradients, view: View) -> None:
     """Adds a view's screen gradients, and those of ray-traced Gaussians, to the densification statistics."""
     size = view.camera.width, view.camera.height
     for record, v_means, v_absgrad in result.screen:
         known = statistics_of(statistics, record.part, v_means.shape[1], v_means.device)
-        known.add(Views(v_means, v_absgrad, counted_radii(record, view), *size, record.weight, record.direct))
-    for traced, met in result.space:
+        known.add(Views(v_means, v_absgrad, valid_radii(record, view), *size, record.weight, record.direct))
+    for traced, v_contributions in result.space:
         gradient = result.gradients.get(f"{traced.part}.means")
         if gradient is not None:
             known = statistics_of(statistics, traced.part, gradient.shape[0], gradient.device)
-            known.add_in_space(gradient, met)
+            known.add_traced(gradient, v_contributions)
 
 
-def counted_radii(record: ScreenPass, view: View) -> Tensor:
+def valid_radii(record: ScreenPass, view: View) -> Tensor:
     """The radii [C, N, 2] of a pass, 0 if the centre is on an ignored pixel."""
     if view.ignored is None:
         return record.radii

@@ -75,7 +75,7 @@ def mean_scale(frame: Frame, view: View, scene: Scene) -> Tensor:
     return _direct_mean(scene.primary.log_scales, torch.exp, frame) / scene.extent
 
 
-def of_all(term: LossFunction) -> LossFunction:
+def over_all_gaussians(term: LossFunction) -> LossFunction:
     """The same term over all Gaussians instead of those in view."""
     return lambda frame, view, scene: term(replace(frame, direct=None), view, scene)
 
@@ -177,7 +177,7 @@ def gradient_conflict(frame: Frame, view: View, scene: Scene) -> Tensor:
     return _size_factor(inside) * shared_edges(layers["without_panes"], layers["reflection"], inside)
 
 
-def reflection_left(frame: Frame, view: View, scene: Scene) -> Tensor:
+def cell_gradient_conflict(frame: Frame, view: View, scene: Scene) -> Tensor:
     """L_c in cells: edges of the reflection that remain in the transmission, limited to what panes could have left.
 
     Pixel by pixel, three fifths of L_c are edges that coincide by chance. If a true edge behind the glass coincides
@@ -198,12 +198,12 @@ def _size_factor(inside: Tensor) -> float:
     return float((inside.numel() / PAPER_PIXELS) ** SIZE_POWER)
 
 
-def _where_counted(errors: Tensor, view: View) -> Tensor:
+def _without_ignored(errors: Tensor, view: View) -> Tensor:
     """Errors [H, W] that are 0 where the view ignores pixels."""
     return errors if view.ignored is None else errors.masked_fill(to_device(view.ignored, errors.device), 0)
 
 
-def counted_pixels(view: View, device: torch.device) -> Tensor:
+def valid_pixels(view: View, device: torch.device) -> Tensor:
     """[H, W] bool: pixels that the view does not ignore."""
     if view.ignored is None:
         return torch.ones(view.camera.height, view.camera.width, dtype=torch.bool, device=device)
@@ -225,10 +225,10 @@ def mask_loss(frame: Frame, view: View, scene: Scene) -> Tensor | None:
         return None
     annotated = to_device(view.pane_labels > 0, frame.rgb.device).to(frame.rgb.dtype)
     wrong = (frame.layers["mask"] - annotated).abs()
-    return _where_counted(wrong, view).mean()
+    return _without_ignored(wrong, view).mean()
 
 
-def intensity_departure(frame: Frame, view: View, scene: Scene) -> Tensor:
+def intensity_prior(frame: Frame, view: View, scene: Scene) -> Tensor:
     """Mean square of log a(u) over the Gaussians: deviation of reflections from the brightness of what they reflect.
 
     A dim reflection of a bright object looks like a bright one in a pane of lower R0. Photographs hardly distinguish
@@ -238,7 +238,7 @@ def intensity_departure(frame: Frame, view: View, scene: Scene) -> Tensor:
 
 
 @dataclass(frozen=True)
-class ReflectanceDeparture:
+class ReflectancePrior:
     """Deviation of R0 from the expected one of glass (not in the paper).
 
     A dark object reflected by a pane of high R0 looks like a bright one and a low R0. Photographs that show the object
@@ -263,7 +263,7 @@ class ReflectanceDeparture:
         return (~planes.are_mirrors * shares * (logits - logit(self.reflectance)).square()).sum()
 
 
-def tint_departure(frame: Frame, view: View, scene: Scene) -> Tensor | None:
+def tint_prior(frame: Frame, view: View, scene: Scene) -> Tensor | None:
     """Mean squared logarithm of the panes' transmittances: deviation from clear glass (not in the paper).
 
     If objects are only visible through a pane, its tint and their colours cannot be distinguished.
@@ -302,18 +302,18 @@ class MonocularNormals:
     term.
     """
 
-    _lacking: set[str] = field(default_factory=set, init=False, repr=False, compare=False)
+    _without_normals: set[str] = field(default_factory=set, init=False, repr=False, compare=False)
 
     def __call__(self, frame: Frame, view: View, scene: Scene) -> Tensor | None:
         """Loss of a view; None if there are no normals for its photograph."""
         normals = view.normals
         if normals is None:
             folders = view.image_path.parents[: len(PurePosixPath(view.name).parts) + 1]
-            if view.name not in self._lacking and any((folder / FOLDER).is_dir() for folder in folders):
+            if view.name not in self._without_normals and any((folder / FOLDER).is_dir() for folder in folders):
                 log.warning("no normals for %s in the folder %r next to it: it is learned without", view.name, FOLDER)
-            self._lacking.add(view.name)
+            self._without_normals.add(view.name)
             return None
         estimated = in_world(to_device(normals, frame.rgb.device).to(frame.rgb), view.camera)
         known = (estimated.square().sum(-1) > 0) & (frame.layers["alpha"].detach() > 0.5)
         blended = torch.nn.functional.normalize(frame.layers["normal"], dim=-1)
-        return _where_counted(known * (1 - (blended * estimated).sum(-1)), view).mean()
+        return _without_ignored(known * (1 - (blended * estimated).sum(-1)), view).mean()

@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 
     from glassplat.training.stage import TrainState
 
-LONGEST_WAIT = timedelta(minutes=10)
+COLLECTIVE_TIMEOUT = timedelta(minutes=10)
 """Timeout for a live rank: it may save a large scene, compile kernels, or be paused in the viewer. Dead ranks are
 noticed at once."""
-LAST_WAIT = 15.0
+TERMINATION_TIMEOUT = 15.0
 """Seconds for which a terminated process waits for the others: it has to save before `torchrun` kills it after 30."""
-LOST = (
+LOST_MESSAGE = (
     "another process of the run has ended unexpectedly, or its machine does not respond ({}); repeat the command with "
     "--resume to continue from the last checkpoint"
 )
@@ -46,16 +46,16 @@ def is_launched() -> bool:
     return "TORCHELASTIC_RUN_ID" in os.environ and int(os.environ.get("WORLD_SIZE", "1")) > 1
 
 
-def leads() -> bool:
+def is_leader() -> bool:
     """Return whether this process writes and reports: it is the only one, or rank 0."""
     return not is_launched() or os.environ.get("RANK", "0") == "0"
 
 
-class Said(NamedTuple):
+class RankReport(NamedTuple):
     """Contribution of a rank to an exchange: its value, whether it was asked to end, or its failure."""
 
     value: Any = None
-    is_asked: bool = False
+    is_stop_requested: bool = False
     failure: tuple[str, str, int] | None = None
 
 
@@ -66,25 +66,25 @@ class Ranks:
         rank: number of this process.
         count: number of processes.
         batch: views per step, of which rank r renders r, r + count, ...; by default one per rank.
-        asked: returns whether this process was asked to end.
+        is_stop_requested: returns whether this process was asked to end.
     """
 
     def __init__(self, rank: int = 0, count: int = 1, batch: int | None = None) -> None:
         self.rank, self.count = rank, count
         self.batch = count if batch is None else batch
-        self.asked: Callable[[], bool] = lambda: False
+        self.is_stop_requested: Callable[[], bool] = lambda: False
         self._is_ending = False
         self._thread = ThreadPoolExecutor(1)
 
     @property
-    def leads(self) -> bool:
+    def is_leader(self) -> bool:
         """Return whether this is the process that writes."""
         return self.rank == 0
 
     @property
     def is_ending(self) -> bool:
         """Return whether any process was asked to end; the same on all ranks after an exchange."""
-        return self.asked() if self.count == 1 else self._is_ending
+        return self.is_stop_requested() if self.count == 1 else self._is_ending
 
     def exchange(self, value: Any = None) -> list[Any]:
         """The values of all ranks, in their order.
@@ -94,43 +94,43 @@ class Ranks:
         """
         if self.count == 1:
             return [value]
-        said = self._gather(Said(value, self.asked()))
-        failed = next((rank for rank, one in enumerate(said) if one.failure is not None), None)
+        reports = self._gather(RankReport(value, self.is_stop_requested()))
+        failed = next((rank for rank, one in enumerate(reports) if one.failure is not None), None)
         if failed is not None:
-            _hold_termination()
-            label, text, code = said[failed].failure
+            _block_termination()
+            label, text, code = reports[failed].failure
             raise RankLostError(f"rank {failed}: {text}", (label, f"rank {failed}: {text}", code))
-        self._is_ending = any(one.is_asked for one in said)
-        return [one.value for one in said]
+        self._is_ending = any(one.is_stop_requested for one in reports)
+        return [one.value for one in reports]
 
-    def _gather(self, said: Said) -> list[Any]:
+    def _gather(self, report: RankReport) -> list[Any]:
         import torch.distributed as dist
 
-        everything: list[Any] = [None] * self.count
-        with _others_needed():
-            self._waited_for(lambda: dist.all_gather_object(everything, said))
-        return everything
+        reports: list[Any] = [None] * self.count
+        with _rank_lost_errors():
+            self._wait_for(lambda: dist.all_gather_object(reports, report))
+        return reports
 
-    def _waited_for(self, call: Callable[[], object]) -> None:
+    def _wait_for(self, call: Callable[[], object]) -> None:
         """Runs a collective call in a thread, because Python handles no signals inside of it.
 
         Raises:
-            RuntimeError: this process was asked to end, and the others did not respond within `LAST_WAIT`.
+            RuntimeError: this process was asked to end, and the others did not respond within `TERMINATION_TIMEOUT`.
         """
-        asked_at = None
-        waiting = self._thread.submit(call)
-        while not wait([waiting], LAST_WAIT / 10).done:
-            if asked_at is None and self.asked():
-                asked_at = time.monotonic()
-            if asked_at is not None and time.monotonic() - asked_at > LAST_WAIT:
+        requested_at = None
+        future = self._thread.submit(call)
+        while not wait([future], TERMINATION_TIMEOUT / 10).done:
+            if requested_at is None and self.is_stop_requested():
+                requested_at = time.monotonic()
+            if requested_at is not None and time.monotonic() - requested_at > TERMINATION_TIMEOUT:
                 raise RuntimeError("no answer since this process was asked to stop")
-        waiting.result()
+        future.result()
 
     def sum_tensors(self, tensors: Sequence[Tensor]) -> list[Tensor]:
         """Sums over all ranks of tensors of one type and device; to be called after an exchange."""
         return self._reduce(tensors, "SUM")
 
-    def largest(self, tensors: Sequence[Tensor]) -> list[Tensor]:
+    def max_tensors(self, tensors: Sequence[Tensor]) -> list[Tensor]:
         """Maxima over all ranks of tensors of one type and device; to be called after an exchange."""
         return self._reduce(tensors, "MAX")
 
@@ -142,9 +142,9 @@ class Ranks:
 
         # One message instead of dozens, each with its own latency.
         flat = torch.cat([tensor.detach().reshape(-1) for tensor in tensors])
-        with _others_needed():
+        with _rank_lost_errors():
             reduce = partial(dist.all_reduce, flat, getattr(dist.ReduceOp, operation))
-            reduce() if flat.is_cuda else self._waited_for(reduce)
+            reduce() if flat.is_cuda else self._wait_for(reduce)
         parts = flat.split([tensor.numel() for tensor in tensors])
         return [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)]
 
@@ -154,33 +154,33 @@ class Ranks:
             import torch.distributed as dist
 
             self.exchange()
-            sent = [state.to("cpu") if self.leads and state is not None else None]
-            with _others_needed():
+            sent = [state.to("cpu") if self.is_leader and state is not None else None]
+            with _rank_lost_errors():
                 dist.broadcast_object_list(sent, src=0)
-            if not self.leads and sent[0] is not None:
+            if not self.is_leader and sent[0] is not None:
                 state = sent[0].to(device)
         assert state is not None
         return state
 
-    def settle(self, state: TrainState) -> None:
+    def synchronise(self, state: TrainState) -> None:
         """Ensures that all ranks have bit-identical states after an edit, if necessary by copying the leader's.
 
         All draw the same random numbers, but different machines round differently, and some GPU sums are not
         deterministic.
         """
-        if self.count > 1 and len(set(self.exchange(fingerprint(state)))) > 1:
+        if self.count > 1 and len(set(self.exchange(state_checksum(state)))) > 1:
             vars(state).update(vars(self.broadcast(state, str(state.scene.primary.means.device))))
 
-    def check_alike(self, traits: Mapping[str, object]) -> None:
+    def check_same_settings(self, settings: Mapping[str, object]) -> None:
         """Refuses ranks that were started with different settings.
 
         Args:
-            traits: values that have to agree, by name.
+            settings: values that have to agree, by name.
 
         Raises:
             InputError: a value differs; the message names it and the rank.
         """
-        first, *others = self.exchange(dict(traits))
+        first, *others = self.exchange(dict(settings))
         for rank, other in enumerate(others, 1):
             for name in first.keys() | other.keys():
                 if first.get(name) != other.get(name):
@@ -190,23 +190,26 @@ class Ranks:
                     )
 
 
-def fingerprint(state: TrainState) -> int:
+def state_checksum(state: TrainState) -> int:
     """A checksum of all parameters, moments and records."""
     import torch
 
     tensors = state.scene.parameters() | {f"mean {name}": mean for name, mean in state.means.items()}
     for name, (first, second) in state.optimizer.moments.items():
         tensors |= {f"first {name}": first, f"second {name}": second}
-    whole = {2: torch.int16, 4: torch.int32, 8: torch.int64}
+    integer_types = {2: torch.int16, 4: torch.int32, 8: torch.int64}
     sums = {
-        name: (tuple(t.shape), int(t.detach().contiguous().view(whole[t.element_size()]).sum(dtype=torch.int64)))
+        name: (
+            tuple(t.shape),
+            int(t.detach().contiguous().view(integer_types[t.element_size()]).sum(dtype=torch.int64)),
+        )
         for name, t in tensors.items()
     }
     optimizer = state.optimizer
     return zlib.crc32(repr((sums, state.records, optimizer.paused, optimizer.raised_rates, optimizer.updates)).encode())
 
 
-def join() -> Ranks:
+def join_ranks() -> Ranks:
     """The processes started by `torchrun`; only this one without it.
 
     Each uses the GPU of its local rank, or on the CPU as many threads as PyTorch.
@@ -219,14 +222,14 @@ def join() -> Ranks:
     import torch.distributed as dist
 
     if not dist.is_initialized():
-        _take_gpu()
-        _take_threads()
-        with _others_needed():
-            dist.init_process_group(_backend(), timeout=LONGEST_WAIT)
+        _select_gpu()
+        _set_numba_threads()
+        with _rank_lost_errors():
+            dist.init_process_group(_backend(), timeout=COLLECTIVE_TIMEOUT)
     return Ranks(dist.get_rank(), dist.get_world_size())
 
 
-def tell(label: str, text: str, code: int) -> None:
+def report_failure(label: str, text: str, code: int) -> None:
     """Reports a failure to the other ranks in the next exchange; waits until the leader has ended.
 
     It does nothing in a single process. The leader returns at once.
@@ -234,22 +237,22 @@ def tell(label: str, text: str, code: int) -> None:
     if not is_launched():
         return
     with suppress(RankLostError):
-        ranks = join()
-        ranks._gather(Said(failure=(label, text, code)))
+        ranks = join_ranks()
+        ranks._gather(RankReport(failure=(label, text, code)))
     await_leader()
 
 
 def await_leader() -> None:
     """Waits until the leader has ended, because `torchrun` soon kills all ranks after the first one ends."""
-    if leads():
+    if is_leader():
         return
     with suppress(RankLostError):
-        ranks = join()
+        ranks = join_ranks()
         while True:
-            ranks._gather(Said())
+            ranks._gather(RankReport())
 
 
-def leave(code: int) -> None:
+def exit_rank(code: int) -> None:
     """Ends the process immediately if it is one of several; else does nothing.
 
     Python's cleanup is skipped: PyTorch sometimes aborts when connections close while another rank still communicates.
@@ -262,18 +265,18 @@ def leave(code: int) -> None:
 
 
 @contextmanager
-def _others_needed() -> Iterator[None]:
+def _rank_lost_errors() -> Iterator[None]:
     """Turns PyTorch's error about a lost rank into a RankLostError."""
     try:
         yield
     except (RuntimeError, ValueError) as error:
         if isinstance(error, RankLostError | InputError):
             raise
-        _hold_termination()
-        raise RankLostError(LOST.format(str(error).partition("\n")[0][:LONGEST_QUOTE])) from error
+        _block_termination()
+        raise RankLostError(LOST_MESSAGE.format(str(error).partition("\n")[0][:LONGEST_QUOTE])) from error
 
 
-def _hold_termination() -> None:
+def _block_termination() -> None:
     """Lets the process save and report before it ends: `torchrun` waits 30 seconds after SIGTERM."""
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
@@ -286,7 +289,7 @@ def _backend() -> str:
     return "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and dist.is_nccl_available() else "gloo"
 
 
-def _take_threads() -> None:
+def _set_numba_threads() -> None:
     """Gives Numba as many threads as PyTorch, because `torchrun` sets only OpenMP's."""
     import numba
     import torch
@@ -295,7 +298,7 @@ def _take_threads() -> None:
         numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
 
 
-def _take_gpu() -> None:
+def _select_gpu() -> None:
     """Makes only the GPU of this rank visible; to be called before CUDA is initialised."""
     number = int(os.environ.get("LOCAL_RANK", "0"))
     known = os.environ.get("CUDA_VISIBLE_DEVICES")

@@ -63,7 +63,7 @@ class Optimizer:
         average over as many views as before (Malladi et al. 2022, "On the SDEs and Scaling Rules for Adaptive Gradient
         Algorithms").
         """
-        learning = [name for name in gradients if parameters[name].numel() > 0 and not self._waits(name, views)]
+        learning = [name for name in gradients if parameters[name].numel() > 0 and not self._is_paused(name, views)]
         known = decays or {}
         updates = [
             self._update(name, parameters[name], gradients[name], rates[name], known.get(name), views)
@@ -81,7 +81,7 @@ class Optimizer:
         lr = rate if factor == 1 else rate * factor
         return Update(parameter, gradient, *moments, lr=lr, step=self.updates[name] / views, decay=decay)
 
-    def _waits(self, name: str, views: int) -> bool:
+    def _is_paused(self, name: str, views: int) -> bool:
         """Return whether a parameter is paused; counts the views of the step."""
         left = self.paused.get(name, 0)
         if left:
@@ -103,7 +103,7 @@ def rate_tensor(rate: Rate, parameter: Tensor, progress: float, extent: float, i
     value = rate.at(progress, extent, iterations)
     if rate.rest is None:
         return value
-    return _columns(value, value * rate.rest, parameter.shape[1:], parameter.dtype, parameter.device)
+    return _column_values(value, value * rate.rest, parameter.shape[1:], parameter.dtype, parameter.device)
 
 
 def decay_tensor(rate: Rate, parameter: Tensor) -> Tensor | None:
@@ -111,12 +111,12 @@ def decay_tensor(rate: Rate, parameter: Tensor) -> Tensor | None:
     if not rate.penalty or not parameter.numel():
         return None
     rest = 2 * rate.penalty / len(parameter)
-    return _columns(0.0, rest, parameter.shape[1:], parameter.dtype, parameter.device)
+    return _column_values(0.0, rest, parameter.shape[1:], parameter.dtype, parameter.device)
 
 
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)
-def _columns(constant: float, rest: float, shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
+def _column_values(constant: float, rest: float, shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
     """One number per column of SH coefficients [N, K, 3]: one value for the constant coefficient, another for the
     rest.
 
@@ -237,14 +237,14 @@ class Every:
         return not self.only_multiples_of or count % self.only_multiples_of == 0
 
 
-MOST_TRIED = 1000
+MOST_TRIED_LENGTHS = 1000
 """Lengths to try in the search for one in which every stage has a step."""
 
 Work = Generator[Working, None, bool]
 """An edit that yields its progress, and returns whether there was anything to edit."""
 
 
-def carried_out(edit: Work | bool | None) -> Work:
+def run_edit(edit: Work | bool | None) -> Work:
     """Carries out an edit of the state, which may yield progress or return at once."""
     return (yield from edit) if isinstance(edit, Generator) else bool(edit)
 
@@ -267,18 +267,18 @@ class Action(Protocol):
 
 
 @dataclass(frozen=True)
-class AtMoments:
+class AtShares:
     """Base class of actions that are due a few times in a run.
 
     Attributes:
-        moments: shares of the run at which to act.
+        shares: shares of the run at which to act.
     """
 
-    moments: tuple[float, ...]
+    shares: tuple[float, ...]
 
     def due(self, clock: Clock) -> bool:
         """Return whether to act after this step."""
-        return clock.is_at(self.moments)
+        return clock.is_at(self.shares)
 
 
 class PostStep(Protocol):
@@ -357,27 +357,27 @@ def check_length(stages: tuple[Stage, ...], iterations: int) -> None:
     Raises:
         InputError: the message names the stage and the required number of iterations.
     """
-    missed = missed_stages(stages, iterations)
+    missed = stages_without_step(stages, iterations)
     if not missed:
         return
     name, share = missed[0].name, missed[0].share / sum(stage.share for stage in stages)
     if share <= 0:
         raise InputError(f"the stage {name!r} has no share of the run, but later stages depend on it")
-    likely = itertools.islice(itertools.count(max(iterations, math.ceil(0.5 / share))), MOST_TRIED)
-    enough = next((length for length in likely if not missed_stages(stages, length)), math.ceil(2 / share))
+    lengths = itertools.islice(itertools.count(max(iterations, math.ceil(0.5 / share))), MOST_TRIED_LENGTHS)
+    enough = next((length for length in lengths if not stages_without_step(stages, length)), math.ceil(2 / share))
     raise InputError(f"{iterations} iterations are too few for the stage {name!r}; expected at least {enough}")
 
 
-def missed_stages(stages: tuple[Stage, ...], iterations: int) -> list[Stage]:
+def stages_without_step(stages: tuple[Stage, ...], iterations: int) -> list[Stage]:
     """The stages without a step, except for those with neither a share nor a setup."""
     starts = stage_starts(stages, iterations)
     spans = zip(stages, starts[:-1], starts[1:], strict=True)
     return [stage for stage, start, end in spans if start >= end and (stage.share > 0 or stage.setup is not None)]
 
 
-LONGEST_SHARE = 0.1
+MOST_AVERAGED_SHARE = 0.1
 """Maximum share of the run to average over, because short runs still change much during their last pass."""
-STEPS = "averaged steps"
+AVERAGED_STEPS = "averaged steps"
 
 
 @dataclass(frozen=True)
@@ -395,17 +395,17 @@ class AverageLast:
 
     def __call__(self, state: TrainState, clock: Clock, visible: Tensor | None) -> None:
         """Edits `state`; the mean restarts if the set of Gaussians changes."""
-        length = min(round(self.passes * clock.views), int(LONGEST_SHARE * clock.iterations))
+        length = min(round(self.passes * clock.views), int(MOST_AVERAGED_SHARE * clock.iterations))
         if clock.step <= clock.iterations - length:
             return
         parameters = state.scene.parameters()
         shapes, known = ({name: t.shape for name, t in tensors.items()} for tensors in (parameters, state.means))
-        if shapes != known or STEPS not in state.records:
+        if shapes != known or AVERAGED_STEPS not in state.records:
             state.means = {name: tensor.detach().clone() for name, tensor in parameters.items()}
-            state.records[STEPS] = 0
-        state.records[STEPS] += 1
+            state.records[AVERAGED_STEPS] = 0
+        state.records[AVERAGED_STEPS] += 1
         for name, tensor in parameters.items():
-            state.means[name].lerp_(tensor.detach(), 1 / state.records[STEPS])
+            state.means[name].lerp_(tensor.detach(), 1 / state.records[AVERAGED_STEPS])
         if clock.step == clock.iterations:
             state.scene, state.means = state.scene.with_parameters(state.means), {}
-            del state.records[STEPS]
+            del state.records[AVERAGED_STEPS]

@@ -9,7 +9,7 @@ import pytest
 from glassplat.cli.main import main
 from glassplat.cli.train import LEAST_ITERATIONS
 from glassplat.methods.planar_recipe import PlanarRecipe
-from glassplat.training.stage import missed_stages
+from glassplat.training.stage import stages_without_step
 
 
 def test_a_demo_too_short_for_its_stages_leaves_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -19,8 +19,8 @@ def test_a_demo_too_short_for_its_stages_leaves_no_folder(tmp_path: Path, capsys
 
 
 def test_the_shortest_demo_has_room_for_all_stages() -> None:
-    assert not missed_stages(PlanarRecipe().stages(0, LEAST_ITERATIONS), LEAST_ITERATIONS)
-    assert missed_stages(PlanarRecipe().stages(0, LEAST_ITERATIONS - 1), LEAST_ITERATIONS - 1)
+    assert not stages_without_step(PlanarRecipe().stages(0, LEAST_ITERATIONS), LEAST_ITERATIONS)
+    assert stages_without_step(PlanarRecipe().stages(0, LEAST_ITERATIONS - 1), LEAST_ITERATIONS - 1)
 
 
 @pytest.mark.parametrize("name", ["splat", "planar"])

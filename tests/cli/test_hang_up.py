@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from glassplat.cli.main import main
-from glassplat.training.checkpoint import recorded
+from glassplat.training.checkpoint import read_progress
 from tests.training.tiny_capture import write_tiny_capture
 
 LENGTH = 10**6
@@ -42,7 +42,7 @@ def test_a_terminal_that_closes_costs_nothing(tmp_path: Path) -> None:
         read_until(mine, b"loss")
         os.close(mine)
         assert process.wait(60) == 128 + signal.SIGHUP
-    assert recorded(tmp_path / "run" / "checkpoint.safetensors").seconds > 0
+    assert read_progress(tmp_path / "run" / "checkpoint.safetensors").seconds > 0
     assert not list((tmp_path / "run").glob(".*.tmp*"))
 
 

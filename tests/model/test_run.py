@@ -36,7 +36,7 @@ from glassplat.model.training import Record, Run, TrainingSession
 from glassplat.panes import PlaneFitError
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
-from glassplat.training.checkpoint import load_checkpoint, recorded, save_checkpoint
+from glassplat.training.checkpoint import load_checkpoint, read_progress, save_checkpoint
 from glassplat.training.messages import CheckpointWritten, Message, RunBegun, StepDone, Working
 from glassplat.training.ranks import Ranks
 from glassplat.training.stage import Clock, TrainState
@@ -320,14 +320,14 @@ def test_the_log_has_every_tenth_step_once(tmp_path: Path) -> None:
 def test_the_training_time_is_read_without_the_tensors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     state = run(tmp_path)
     monkeypatch.setattr("glassplat.training.checkpoint.restored_state", None)
-    assert recorded(RunDirectory(tmp_path).checkpoint).seconds == state.seconds > 0
+    assert read_progress(RunDirectory(tmp_path).checkpoint).seconds == state.seconds > 0
 
 
 @pytest.mark.parametrize("content", [b"", b"no checkpoint at all"])
 def test_the_time_of_a_broken_checkpoint_is_not_guessed(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "broken").write_bytes(content)
     with pytest.raises(InputError, match="truncated or not a checkpoint"):
-        recorded(tmp_path / "broken")
+        read_progress(tmp_path / "broken")
 
 
 def test_the_exported_scene_is_the_trained_one(tmp_path: Path) -> None:
@@ -368,7 +368,7 @@ class Following(Ranks):
     """As the ranks look from one that does not lead, which is alone all the same."""
 
     @property
-    def leads(self) -> bool:
+    def is_leader(self) -> bool:
         return False
 
 

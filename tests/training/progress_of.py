@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from glassplat.training.messages import Working
-from glassplat.training.stage import Work, carried_out
+from glassplat.training.stage import Work, run_edit
 
 
 def followed(edit: Work | bool | None) -> tuple[list[Working], bool]:
     """What an edit tells on the way, and whether there was anything to edit."""
-    messages, work = [], carried_out(edit)
+    messages, work = [], run_edit(edit)
     while True:
         try:
             messages.append(next(work))

@@ -25,7 +25,7 @@ from glassplat.training import ranks
 from glassplat.training.checkpoint import save_checkpoint
 from glassplat.training.loop import train
 from glassplat.training.messages import Message, StepDone
-from glassplat.training.ranks import Ranks, join
+from glassplat.training.ranks import Ranks, join_ranks
 from glassplat.training.stage import Stage, TrainState
 from tests.training.test_trainer import planar_stages
 from tests.training.tiny_capture import tiny_capture
@@ -148,7 +148,7 @@ def torchrun(count: int, *arguments: str, timeout: float = LONGEST) -> subproces
 def main() -> None:
     """Trains as one of the ranks, once for each `NAME:ITERATIONS`: processes that start take longer than this."""
     *trainings, root = sys.argv[1:]
-    ranks = join()
+    ranks = join_ranks()
     for training in trainings:
         name, iterations = training.split(":")
         state, messages = trained(name, ranks, int(iterations))

@@ -23,8 +23,13 @@ from glassplat.scene.corrections import Exposures
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene, glass_gaussians, without_glass
-from glassplat.training.actions import Densify, PruneIdle, SeedUnexplained, limit_of, unexplained_places
-from glassplat.training.densify import ScreenStatistics, fog_around, gaussians_from_points, hangs_in_air
+from glassplat.training.actions import Densify, PruneIdle, SeedUnexplained, densify_cap, unexplained_positions
+from glassplat.training.densify import (
+    ScreenStatistics,
+    floaters_near_cameras,
+    gaussians_around_cameras,
+    gaussians_from_points,
+)
 from glassplat.training.options import DefaultDensify
 from glassplat.training.stage import Clock, TrainState
 from tests.panes.test_material import CountedElements
@@ -85,8 +90,8 @@ def one_gaussian(
 )
 def test_fog_is_what_is_opaque_where_a_camera_stands(gaussian: Gaussians, expected: bool) -> None:
     far, here = torch.tensor([[9.0, 9.0, 9.0]]), torch.zeros(1, 3)
-    assert fog_around(gaussian, torch.cat([far, here])).tolist() == [expected]
-    assert not fog_around(gaussian, far).any()
+    assert gaussians_around_cameras(gaussian, torch.cat([far, here])).tolist() == [expected]
+    assert not gaussians_around_cameras(gaussian, far).any()
 
 
 def test_no_gaussian_stays_around_a_camera_though_others_see_it() -> None:
@@ -109,8 +114,8 @@ def test_what_is_nearer_to_a_camera_than_any_surface_hangs_in_the_air() -> None:
     places = torch.tensor([[0.0, 0.0, 0.0], [0.0, 9.0, 0.0]])
     # One point before the first camera is wrong.
     points = torch.tensor([[0.0, 0.0, 0.01], [0.0, 0.1, 2.0], [0.1, 0.0, 2.0], [0.0, 0.0, 30.0]])
-    assert hangs_in_air(means, places, points).tolist() == [True, False, False]
-    assert not hangs_in_air(means, places, points[:2]).any()
+    assert floaters_near_cameras(means, places, points).tolist() == [True, False, False]
+    assert not floaters_near_cameras(means, places, points[:2]).any()
 
 
 @pytest.mark.parametrize(
@@ -155,7 +160,7 @@ def test_idle_gaussians_are_looked_for_at_the_moments_that_were_asked_for() -> N
 def test_photographs_limit_the_number_of_gaussians(densifier: DefaultDensify, limit: float | None) -> None:
     capture = tiny_capture()
     pixels = sum(view.camera.width * view.camera.height for view in capture.train)
-    assert limit_of(densifier, capture) == (densifier.cap if limit is None else round(limit * pixels))
+    assert densify_cap(densifier, capture) == (densifier.cap if limit is None else round(limit * pixels))
 
 
 def test_a_set_grows_to_its_limit_and_no_further() -> None:
@@ -222,7 +227,7 @@ def test_a_thing_without_points_is_found_where_the_photographs_of_it_meet() -> N
 
 def missing_in(scene: Scene, views: Sequence[View], renderer: Renderer) -> torch.Tensor:
     """[P, 3] places of what views show and a scene lacks."""
-    search = unexplained_places(scene, views, renderer)
+    search = unexplained_positions(scene, views, renderer)
     while True:
         try:
             next(search)

@@ -15,7 +15,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from glassplat.errors import InputError
-from glassplat.training.checkpoint import load_checkpoint, recorded, save_checkpoint
+from glassplat.training.checkpoint import load_checkpoint, read_progress, save_checkpoint
 from glassplat.training.densify import ScreenStatistics
 from glassplat.training.stage import Optimizer, TrainState
 from tests.files.test_tensors_file import no_file_beyond
@@ -142,7 +142,7 @@ NEEDED = ["step", "seed", "seconds", "extent", "labels", "active_sh_degree", "up
 def test_what_lacks_in_the_header_is_named(checkpoint: Path, key: str) -> None:
     rewrite(checkpoint, lambda header, _: header.pop(key))
     with pytest.raises(InputError, match=f"the header of .* has no {key}; expected"):
-        recorded(checkpoint)
+        read_progress(checkpoint)
 
 
 TENSORS: list[tuple[str, Any, str]] = [

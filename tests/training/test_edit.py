@@ -7,7 +7,7 @@ import torch
 
 from glassplat.scene.camera import rotation_from_quat
 from glassplat.scene.gaussians import Gaussians
-from glassplat.training.densify import Edit, append, apply_edit, clone, forget, keep, split
+from glassplat.training.densify import Edit, append, apply_edit, clone, keep, split, zero_moments
 
 
 def make_gaussians(count: int, seed: int = 0) -> Gaussians:
@@ -126,12 +126,12 @@ def test_append_names_the_tensors_that_differ() -> None:
 def test_forget_zeroes_only_what_was_replaced() -> None:
     gaussians = make_gaussians(3)
     original = make_moments(gaussians)
-    moments = forget(original, ("primary.sh",), torch.tensor([False, True, False]))
+    moments = zero_moments(original, ("primary.sh",), torch.tensor([False, True, False]))
     assert not moments["primary.sh"][0][1].any()
     assert torch.equal(moments["primary.sh"][0][[0, 2]], original["primary.sh"][0][[0, 2]])
     assert torch.equal(moments["primary.means"][1], original["primary.means"][1])
     assert original["primary.sh"][0][1].any()
-    assert not forget(original, ("primary.sh",))["primary.sh"][1].any()
+    assert not zero_moments(original, ("primary.sh",))["primary.sh"][1].any()
 
 
 @pytest.mark.parametrize("count", [0, 1])
@@ -158,7 +158,7 @@ def test_children_of_discs_lie_in_their_plane() -> None:
         sh=torch.zeros(50, 1, 3),
     )
     edit = split(discs, torch.arange(50), generator=torch.Generator().manual_seed(0))
-    means = edit.result(discs, "means")
+    means = edit.edited_tensor(discs, "means")
     normal = rotation_from_quat(discs.quats)[0, :, 2]
-    assert edit.result(discs, "log_scales").shape == (100, 2)
+    assert edit.edited_tensor(discs, "log_scales").shape == (100, 2)
     assert float((means @ normal).abs().max()) < 1e-5 < 0.3 < float(means.norm(dim=1).mean())

@@ -15,8 +15,8 @@ from glassplat.training.actions import AddNoise
 from glassplat.training.densify import (
     MOST_COPIES,
     rank_among_equals,
+    relocate,
     relocate_and_grow,
-    relocation,
     sgld_noise,
     shared_contribution,
 )
@@ -99,7 +99,7 @@ def test_the_dead_end_up_where_the_live_are_and_share_their_contribution() -> No
 
 def test_live_ones_are_drawn_in_proportion_to_their_opacity() -> None:
     opacities = [0.8, 0.2] * 100 + [0.001] * 1000
-    edit = relocation(OPTIONS, make_gaussians(opacities), rng())
+    edit = relocate(OPTIONS, make_gaussians(opacities), rng())
     moved = edit.source[200:]
     assert (moved < 200).all()
     assert (moved % 2 == 0).float().mean().item() == pytest.approx(0.8, abs=0.04)

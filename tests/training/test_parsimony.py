@@ -13,7 +13,7 @@ from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.render.frame import Frame
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
-from glassplat.training.loop import update
+from glassplat.training.loop import update_parameters
 from glassplat.training.losses import mean_opacity, mean_scale
 from glassplat.training.options import GaussianRates, Rate
 from glassplat.training.stage import TrainState, decay_tensor
@@ -97,6 +97,6 @@ def test_a_step_takes_off_what_no_photograph_asks_for() -> None:
     state = TrainState(scene_of([0.5, 0.5], scale=0.3), seed=0)
     state.scene = replace(state.scene, primary=state.scene.primary.with_tensors({"sh": torch.full((2, 9, 3), 0.2)}))
     before = state.scene.primary.sh.clone()
-    update(stage, state, {"primary.sh": torch.zeros_like(before)}, iterations=100)
+    update_parameters(stage, state, {"primary.sh": torch.zeros_like(before)}, iterations=100)
     assert bool((state.scene.primary.sh[:, 1:] < before[:, 1:]).all())
     assert torch.equal(state.scene.primary.sh[:, :1], before[:, :1])

@@ -14,7 +14,7 @@ from glassplat.files.scene_folder import read_scene, write_scene
 from glassplat.methods.recipe import RECIPES
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
-from glassplat.training.corrections import Center, corrections_begun
+from glassplat.training.corrections import Center, with_neutral_corrections
 from glassplat.training.loop import train
 from glassplat.training.options import PhotoExposure
 from glassplat.training.stage import TrainState
@@ -36,7 +36,7 @@ def darkened(dataset: Dataset) -> Dataset:
 
 def trained(recipe: SplatRecipe, steps: int = 240) -> TrainState:
     dataset = darkened(tiny_capture())
-    scene = corrections_begun(recipe, replace(true_scene(), planes=type(true_scene().planes).empty()), dataset)
+    scene = with_neutral_corrections(recipe, replace(true_scene(), planes=type(true_scene().planes).empty()), dataset)
     state = TrainState(scene, 0)
     frozen = tuple(
         replace(

@@ -20,12 +20,12 @@ from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import Densify
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
-from glassplat.training.corrections import AddPhotographer, distance_to_panes, first_photographer
+from glassplat.training.corrections import AddPhotographer, distance_to_panes, initial_photographer
 from glassplat.training.densify import ScreenStatistics
 from glassplat.training.loop import train
 from glassplat.training.messages import StepDone
 from glassplat.training.options import Photographer
-from glassplat.training.stage import Clock, Stage, TrainState, carried_out
+from glassplat.training.stage import Clock, Stage, TrainState, run_edit
 from tests.render.test_photographer import body
 from tests.render.tiny_scene import in_single_precision, joined, pane
 from tests.training.tiny_capture import tiny_capture, true_scene
@@ -66,7 +66,7 @@ def peopled_scene(planes: Planes = MIRROR) -> Scene:
 
 def begun(options: Photographer = LEARNED, scene: Scene | None = None) -> TrainState:
     state = TrainState(scene or true_scene(), 0)
-    for _ in carried_out(AddPhotographer(options, 0, None)(state, tiny_capture())):
+    for _ in run_edit(AddPhotographer(options, 0, None)(state, tiny_capture())):
         pass
     return state
 
@@ -76,11 +76,11 @@ def test_the_first_cloud_is_behind_the_camera_within_reach_of_the_panes() -> Non
     planes = true_scene().planes
     distance = distance_to_panes(planes, cameras)
     assert 2.3 < distance < 2.6
-    cloud = first_photographer(planes, cameras, count=300, sh_degree=0, seed=1)
+    cloud = initial_photographer(planes, cameras, count=300, sh_degree=0, seed=1)
     assert bool((cloud.means[:, 2] < 0).all())
     radii = cloud.means.norm(dim=1) / distance
     assert 0.02 < float(radii.min()) < 0.05 and 0.5 < float(radii.max()) <= 0.601
-    again = first_photographer(planes, cameras, count=300, sh_degree=0, seed=1)
+    again = initial_photographer(planes, cameras, count=300, sh_degree=0, seed=1)
     assert torch.equal(again.means, cloud.means)
 
 

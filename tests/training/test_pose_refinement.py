@@ -29,7 +29,7 @@ from glassplat.scene.camera import Camera
 from glassplat.scene.corrections import Exposures, PoseCorrections, moved_camera
 from glassplat.scene.scene import Scene
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
-from glassplat.training.corrections import Center, corrections_begun
+from glassplat.training.corrections import Center, with_neutral_corrections
 from glassplat.training.densify import as_discs
 from glassplat.training.loop import train
 from glassplat.training.options import PoseRefinement
@@ -121,7 +121,7 @@ def test_a_view_keeps_its_photograph_when_its_camera_moves() -> None:
 def test_a_camera_that_is_off_finds_its_place() -> None:
     dataset = shaken(tiny_capture())
     recipe = SplatRecipe(poses=REFINED)
-    scene = corrections_begun(recipe, true_scene(), dataset)
+    scene = with_neutral_corrections(recipe, true_scene(), dataset)
     stages = tuple(
         replace(s, renderer=Planar(), rates={"poses.twists": s.rates["poses.twists"]}, actions=(), post_steps=())
         for s in recipe.stages(0)

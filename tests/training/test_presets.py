@@ -18,15 +18,15 @@ from glassplat.methods.mirrors import ENDED, DensifyWhilePropagating, Propagate,
 from glassplat.methods.planar import PaneSetup
 from glassplat.methods.planar_recipe import PlanarRecipe, ReflectionWeights
 from glassplat.methods.recipe import RECIPES, recipe_of, recipe_to_json
-from glassplat.methods.splat import population_of
+from glassplat.methods.splat import strategy_of
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.render.planar import Planar
 from glassplat.scene.scene import Scene
-from glassplat.training.actions import AddNoise, Densify, PerturbOpacity, Relocate, ResetOpacity, mcmc_population
+from glassplat.training.actions import AddNoise, Densify, PerturbOpacity, Relocate, ResetOpacity, mcmc_strategy
 from glassplat.training.loop import differentiate, train
 from glassplat.training.messages import ActionDone, StepDone
 from glassplat.training.options import DefaultDensify, McmcDensify, PropagationSchedule, Rate, SurroundingsStart
-from glassplat.training.stage import AtMoments, Clock, Stage, TrainState, stage_starts
+from glassplat.training.stage import AtShares, Clock, Stage, TrainState, stage_starts
 from tests.render.test_seen_panes import CAMERA, vitrine
 from tests.training.progress_of import finished
 from tests.training.test_default import edited, make_gaussians, seen
@@ -65,8 +65,8 @@ def test_what_is_due_at_a_moment_is_an_action_of_the_stage_then(method: str, ite
     starts = stage_starts(stages, iterations)
     planned, acting = set(), set()
     for stage, start, end in zip(stages, starts, starts[1:], strict=False):
-        for action in (action for action in stage.actions if isinstance(action, AtMoments)):
-            steps = {round(moment * iterations) for moment in action.moments}
+        for action in (action for action in stage.actions if isinstance(action, AtShares)):
+            steps = {round(moment * iterations) for moment in action.shares}
             planned |= {(action.name, step) for step in steps}
             acting |= {(action.name, step) for step in steps if start < step <= end}
     assert acting == planned
@@ -139,7 +139,7 @@ def test_a_short_run_of_a_preset_learns(method: str, strategy: Any) -> None:
 def planeless(recipe: PlanarRecipe) -> Scene:
     """The first scene of a recipe, without the trial fit that the few points of the tiny capture do not do for."""
     dataset = tiny_capture()
-    return Scene(population_of(recipe).initial(dataset.points, recipe.sh_degree), dataset.extent)
+    return Scene(strategy_of(recipe).initial_gaussians(dataset.points, recipe.sh_degree), dataset.extent)
 
 
 def moments(stages: tuple[Stage, ...], kind: type, iterations: int) -> list[list[int]]:
@@ -206,7 +206,7 @@ def test_noise_and_regularisers_of_mcmc_can_reach_everything() -> None:
     for reach, expected in (("all", torch.ones(len(scene.primary), dtype=torch.bool)), ("shown", frame.direct)):
         raw = scene.primary.logit_opacities.clone().requires_grad_()
         learning = scene.with_parameters({"primary.logit_opacities": raw})
-        opacity, _ = mcmc_population(replace(options, reach=reach), Rate(1e-3)).terms
+        opacity, _ = mcmc_strategy(replace(options, reach=reach), Rate(1e-3)).terms
         (gradient,) = torch.autograd.grad(opacity.function(frame, view, learning), raw)
         assert torch.equal(gradient != 0, expected)
 

@@ -23,7 +23,7 @@ from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.training.actions import PruneIdle
 from glassplat.training.checkpoint import load_checkpoint
 from glassplat.training.messages import ActionDone, Message, StepDone, Working
-from glassplat.training.ranks import LONGEST_WAIT, Ranks
+from glassplat.training.ranks import COLLECTIVE_TIMEOUT, Ranks
 from glassplat.training.stage import Clock, Optimizer, TrainState
 from tests.training.rank_process import (
     LONGEST,
@@ -168,13 +168,13 @@ def test_no_action_is_missed_where_steps_go_over_its_moment(count: int) -> None:
 
 
 def test_a_test_gives_up_before_a_rank_does() -> None:
-    assert timedelta(seconds=LONGEST) < LONGEST_WAIT
+    assert timedelta(seconds=LONGEST) < COLLECTIVE_TIMEOUT
 
 
 def test_ranks_compare_whatever_an_action_found(monkeypatch: pytest.MonkeyPatch) -> None:
     """Comparing needs them all, and what one finds another may not, where numbers are rounded differently."""
     settled: list[int] = []
-    monkeypatch.setattr(Ranks, "settle", lambda self, state: settled.append(state.step))
+    monkeypatch.setattr(Ranks, "synchronise", lambda self, state: settled.append(state.step))
     trained("splat", Ranks(), 60)
     usually = settled.copy()
     settled.clear()

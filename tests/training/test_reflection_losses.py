@@ -19,13 +19,13 @@ from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
 from glassplat.training.losses import (
     LossFunction,
-    ReflectanceDeparture,
+    ReflectancePrior,
+    cell_gradient_conflict,
     depth_deviation_loss,
     gradient_conflict,
-    intensity_departure,
+    intensity_prior,
     mask_loss,
-    reflection_left,
-    tint_departure,
+    tint_prior,
 )
 
 
@@ -50,10 +50,12 @@ ALL = torch.zeros(8, 9, dtype=torch.int32)
 EVEN = torch.full((8, 9), 0.1)
 
 
-BOTH = pytest.mark.parametrize("term", [gradient_conflict, reflection_left])
+BOTH = pytest.mark.parametrize("term", [gradient_conflict, cell_gradient_conflict])
 
 
-@pytest.mark.parametrize(("term", "transmission"), [(gradient_conflict, STEP), (reflection_left, FLAT + 0.05 * STEP)])
+@pytest.mark.parametrize(
+    ("term", "transmission"), [(gradient_conflict, STEP), (cell_gradient_conflict, FLAT + 0.05 * STEP)]
+)
 def test_gradient_conflict_counts_shared_edges_on_panes_only(term: LossFunction, transmission: Tensor) -> None:
     assert conflict(transmission, STEP, ALL, EVEN, term) > 0
     assert conflict(transmission, FLAT, ALL, EVEN, term) == 0
@@ -78,7 +80,7 @@ def left_in(own: float, held: float, gain: float = 1.0) -> float:
     transmission = srgb_from_linear(0.2 + 0.5 * own * texture + 0.1 * held * linear_from_srgb(room)).requires_grad_()
     layers = {"without_panes": transmission, "reflection": gain * room, "strength": strength}
     frame = frame_with(**layers, pane=torch.zeros(96, 128, dtype=torch.int32))
-    loss = reflection_left(frame, SimpleNamespace(), SimpleNamespace())  # type: ignore[arg-type]
+    loss = cell_gradient_conflict(frame, SimpleNamespace(), SimpleNamespace())  # type: ignore[arg-type]
     (gradient,) = torch.autograd.grad(loss, transmission)
     return float(gradient.norm())
 
@@ -160,7 +162,7 @@ def test_whoever_stands_before_a_pane_leaves_no_hole_in_it() -> None:
 def test_reflections_depart_from_what_they_mirror_as_much_darker_as_brighter() -> None:
     def departure(intensity: float) -> float:
         primary = SimpleNamespace(channels={"log_intensity": torch.tensor([0.0, intensity]).log1p()})
-        return float(intensity_departure(frame_with(), SimpleNamespace(), SimpleNamespace(primary=primary)))
+        return float(intensity_prior(frame_with(), SimpleNamespace(), SimpleNamespace(primary=primary)))
 
     assert departure(0.0) == 0
     assert abs(departure(1.0) - departure(-0.5)) < 1e-6
@@ -180,7 +182,7 @@ def test_depth_deviation_loss_does_not_depend_on_the_unit_of_length() -> None:
 
 def test_the_tint_term_is_zero_for_clear_glass_and_its_mean_square_otherwise() -> None:
     def term(planes: Planes) -> Tensor | None:
-        return tint_departure(frame_with(), cast(View, None), Scene(Gaussians.empty(), 1.0, planes=planes))
+        return tint_prior(frame_with(), cast(View, None), Scene(Gaussians.empty(), 1.0, planes=planes))
 
     clear = Planes.rectangle((0, 0, 0), (0, 0, 1), (1, 1))
     assert term(clear) is None
@@ -196,7 +198,7 @@ def test_glass_is_held_to_what_is_expected_of_it_by_its_share_of_the_image_and_m
     planes = Planes(places, places, logits, places.roll(1, 0), torch.ones(3, 2), labels=(1, 2, 3), mirrors=(3,))
     pane = torch.full((4, 5), -1, dtype=torch.int32)
     pane[0], pane[1:3], pane[3] = 0, 1, 2
-    departure = ReflectanceDeparture(0.1)
+    departure = ReflectancePrior(0.1)
     term = departure(frame_with(pane=pane), cast(View, None), Scene(Gaussians.empty(), 1.0, planes=planes))
     assert term is not None
     expected = math.log(0.1 / 0.9)

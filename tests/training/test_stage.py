@@ -13,7 +13,7 @@ from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.training.messages import Working
 from glassplat.training.options import Rate
-from glassplat.training.stage import Clock, Every, Work, check_length, missed_stages, stage_starts
+from glassplat.training.stage import Clock, Every, Work, check_length, stage_starts, stages_without_step
 from tests.training.progress_of import followed
 
 
@@ -63,14 +63,14 @@ def test_short_runs_raise_the_rates_that_say_so() -> None:
 def test_a_run_has_room_for_every_stage_from_the_length_that_is_asked_for(recipe: Any) -> None:
     stages = recipe.stages(seed=0)
     for iterations in range(1, 40):
-        if not missed_stages(stages, iterations):
+        if not stages_without_step(stages, iterations):
             check_length(stages, iterations)
             continue
         with pytest.raises(InputError, match=f"^{iterations} iterations are too few") as caught:
             check_length(stages, iterations)
         least = int(str(caught.value).rpartition(" ")[2])
         check_length(stages, least)
-        assert all(missed_stages(stages, shorter) for shorter in range(iterations, least))
+        assert all(stages_without_step(stages, shorter) for shorter in range(iterations, least))
 
 
 def test_a_stage_without_a_share_is_missed_only_for_what_it_begins_with() -> None:

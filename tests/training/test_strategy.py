@@ -16,7 +16,15 @@ from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.recipe import recipe_from_json, recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.scene.scene import Scene
-from glassplat.training.actions import AddNoise, Densify, Relocate, ResetOpacity, cap_of, growth_of, threshold_factor
+from glassplat.training.actions import (
+    AddNoise,
+    Densify,
+    Relocate,
+    ResetOpacity,
+    growth_per_relocation,
+    mcmc_cap,
+    threshold_factor,
+)
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import differentiate, train
 from glassplat.training.losses import PhotometricLoss
@@ -172,15 +180,15 @@ def test_the_strategy_decides_how_the_first_gaussians_look() -> None:
 
 def test_the_default_cap_follows_the_photographs() -> None:
     camera = tiny_capture().train[0].camera
-    assert cap_of(McmcDensify(), tiny_capture()) == round(camera.width * camera.height / 2)
-    assert cap_of(McmcDensify(cap=7), tiny_capture()) == 7
+    assert mcmc_cap(McmcDensify(), tiny_capture()) == round(camera.width * camera.height / 2)
+    assert mcmc_cap(McmcDensify(cap=7), tiny_capture()) == 7
 
 
 def test_one_small_photograph_among_large_ones_changes_no_threshold() -> None:
     capture = tiny_capture()
     first, *others = capture.train
     mixed = replace(capture, train=(first.with_camera(first.camera.resize(4, 3)), *others))
-    assert cap_of(McmcDensify(), mixed) == cap_of(McmcDensify(), capture)
+    assert mcmc_cap(McmcDensify(), mixed) == mcmc_cap(McmcDensify(), capture)
     assert threshold_factor(mixed) == threshold_factor(capture)
 
 
@@ -190,15 +198,15 @@ def test_the_cap_is_reached_at_the_same_share_of_any_run(iterations: int) -> Non
     action = Relocate(options)
     for step in range(1, iterations + 1):
         if action.due(Clock(step, iterations, views=10)):
-            count *= growth_of(options, iterations)
+            count *= growth_per_relocation(options, iterations)
         if count >= 60_000:
             break
     assert step / iterations == pytest.approx(0.17, abs=0.02)
 
 
 def test_one_relocation_at_most_doubles_the_set() -> None:
-    assert growth_of(McmcDensify(), 30_000) == pytest.approx(1.05)
-    assert growth_of(McmcDensify(), 500) == 2.0
+    assert growth_per_relocation(McmcDensify(), 30_000) == pytest.approx(1.05)
+    assert growth_per_relocation(McmcDensify(), 500) == 2.0
 
 
 def test_relocation_keeps_its_share_of_the_run() -> None:

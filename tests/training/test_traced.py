@@ -198,7 +198,7 @@ def test_gradients_in_space_count_by_half_the_distance() -> None:
     statistics = ScreenStatistics.zeros(3)
     gradient = torch.tensor([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     for _ in range(2):
-        statistics.add_in_space(gradient, torch.tensor([[0.5, 1.0], [0.0, 0.0], [3.0, 12.0]]))
+        statistics.add_traced(gradient, torch.tensor([[0.5, 1.0], [0.0, 0.0], [3.0, 12.0]]))
     assert statistics.mean_gradient.tolist() == [5.0, 0.0, 2.0]
     assert statistics.view_count.tolist() == [[2.0, 0.0, 2.0]] * 2
 

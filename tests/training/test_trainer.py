@@ -18,7 +18,7 @@ from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.scene.scene import Scene
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.densify import ScreenStatistics, gaussians_from_points
-from glassplat.training.loop import TrainingDivergedError, collect, differentiate, train
+from glassplat.training.loop import TrainingDivergedError, collect_statistics, differentiate, train
 from glassplat.training.losses import LossTerm, PhotometricLoss
 from glassplat.training.messages import ActionDone, StageEntered, StepDone
 from glassplat.training.stage import Stage, TrainState
@@ -122,7 +122,7 @@ def statistics_of_views(views: Sequence[View]) -> dict[str, ScreenStatistics]:
     place_true_planes(state, None)
     found: dict[str, ScreenStatistics] = {}
     for view in views:
-        collect(found, differentiate(planar_stages()[-1], state.scene, view, with_absgrad=True), view)
+        collect_statistics(found, differentiate(planar_stages()[-1], state.scene, view, with_absgrad=True), view)
     return found
 
 

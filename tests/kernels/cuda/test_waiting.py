@@ -18,7 +18,7 @@ from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import constant
 from glassplat.scene.scene import Scene
-from glassplat.training.loop import collect, differentiate, update
+from glassplat.training.loop import collect_statistics, differentiate, update_parameters
 from glassplat.training.stage import TrainState
 from tests.kernels.cuda.waiting import KERNEL_WAITS, Waits, as_on_a_gpu
 from tests.training.tiny_capture import tiny_capture, true_scene
@@ -41,8 +41,8 @@ def step(recipe: PlanarRecipe | SplatRecipe, stage: int, scene: Scene, view: Vie
         waits.places.clear()
         with waits:
             result = differentiate(chosen, state.scene, view, with_absgrad=True)
-            update(chosen, state, result.gradients, iterations=100)
-            collect(state.statistics, result, view)
+            update_parameters(chosen, state, result.gradients, iterations=100)
+            collect_statistics(state.statistics, result, view)
     return waits.places
 
 
