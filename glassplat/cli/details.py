@@ -17,7 +17,7 @@ from glassplat.errors import InputError, input_checked
 from glassplat.files.records import read_json
 from glassplat.files.scene_folder import read_scene, read_splats
 from glassplat.files.sidecars import read_planes
-from glassplat.methods.planar import fitted_planes
+from glassplat.methods.planar import capture_planes
 from glassplat.model.model import CAMERAS, EXPORTED, PLANES
 from glassplat.model.run_directory import RunDirectory, RunSettings
 from glassplat.panes import PlaneFit, PlaneFitError
@@ -60,7 +60,7 @@ def write_capture_page(path: Path, target: Path) -> None:
     """Writes the report of a prepared capture, with its marked panes."""
     dataset = load_dataset(path)
     marked = bool(dataset.pane_labels) or dataset.planes is not None
-    write_page(path, target, fitted_planes(dataset, None, PlaneFit()) if marked else None)
+    write_page(path, target, capture_planes(dataset, None, PlaneFit()) if marked else None)
 
 
 def _describe_panes(path: Path, dataset: Dataset) -> Finding:
@@ -97,7 +97,7 @@ def _behind(path: Path, dataset: Dataset) -> Finding:
     if not dataset.pane_labels and dataset.planes is None:
         return finding
     try:
-        planes = fitted_planes(dataset, None, PlaneFit())
+        planes = capture_planes(dataset, None, PlaneFit())
     except PlaneFitError as error:
         finding.problems.append(str(error))
         finding.next.append(f"glassplat annotate {shell_word(path)}    marks panes by their corners instead")

@@ -19,7 +19,7 @@ from glassplat.evaluate import evaluate as scoring
 from glassplat.evaluate.metrics import PLANE_COLUMNS, format_value, missing_reasons, shown_metrics
 from glassplat.evaluate.report import Report
 from glassplat.files.writing import check_links, write_text
-from glassplat.methods.planar import fitted_planes
+from glassplat.methods.planar import capture_planes
 from glassplat.model.run_directory import EVALUATED
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.render.planar import Planar, with_photographer
@@ -57,7 +57,7 @@ def _marked_regions(dataset: Dataset) -> scoring.PaneRegions:
         raise InputError(f"{dataset.root} has no pane masks; use --panes rendered, or add masks")
     try:
         # The margin of rectangles is only for training, which must not crop a pane.
-        return scoring.marked_regions(fitted_planes(dataset, None, PlaneFit(margin=1.0)))
+        return scoring.marked_regions(capture_planes(dataset, None, PlaneFit(margin=1.0)))
     except PlaneFitError as error:
         raise InputError(
             f"the masks of {dataset.root} do not determine a plane: {error}. Use --panes rendered"

@@ -15,7 +15,7 @@ from glassplat.captures.dataset import Dataset
 from glassplat.methods import mirrors
 from glassplat.methods.splat import image_term, strategy_of
 from glassplat.methods.splat_recipe import Primitive, SplatRecipe
-from glassplat.methods.surroundings import AddEnvironment, AddSurroundings, BeginReflections, StayMatte
+from glassplat.methods.surroundings import AddEnvironment, AddSurroundings, BeginReflections, SkipReflections
 from glassplat.options import BLACK
 from glassplat.render.deferred import INVISIBLE, Deferred
 from glassplat.render.splat import Splat
@@ -51,14 +51,14 @@ def deferred_stages(recipe: DeferredRecipe, seed: int, iterations: int = PUBLISH
     short = iterations < recipe.least_iterations
     if short:
         return with_learned_corrections(recipe, _matte_stages(recipe, "ellipsoid", seed, iterations))
-    return with_learned_corrections(recipe, _reflecting_stages(_bootstrapped(recipe, iterations)))
+    return with_learned_corrections(recipe, _reflection_stages(_with_sufficient_bootstrap(recipe, iterations)))
 
 
 LEAST_BOOTSTRAP = 300
 """Minimum number of steps before mirrors can be distinguished from unlearned parts."""
 
 
-def _bootstrapped(recipe: DeferredRecipe, iterations: int) -> DeferredRecipe:
+def _with_sufficient_bootstrap(recipe: DeferredRecipe, iterations: int) -> DeferredRecipe:
     """The recipe with a bootstrap of at least `LEAST_BOOTSTRAP` steps, if there is time before `schedule.stop`.
 
     A mirror ball at 700 iterations has 7.7 dB after a bootstrap of 42 steps, 21.4 after 262, and 21.9 with `splat`.
@@ -69,10 +69,10 @@ def _bootstrapped(recipe: DeferredRecipe, iterations: int) -> DeferredRecipe:
     return replace(recipe, bootstrap=max(recipe.bootstrap, least))
 
 
-def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
+def _reflection_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
     """Stages of a run long enough for normal propagation."""
     strategy = strategy_of(recipe)
-    image, held = image_term(recipe.ssim_weight), recipe.view_dependence_weight
+    image, view_dependence = image_term(recipe.ssim_weight), recipe.view_dependence_weight
     regular: tuple[Action, ...] = (GrowSh(Every(recipe.intervals.sh)), *strategy.resets)
     # As in `splat`, where a scene has to look right before mirrors can be recognised.
     regular = regular if recipe.search.begin_found else ()
@@ -81,7 +81,7 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         share=recipe.bootstrap,
         renderer=Splat(recipe.background or BLACK, depth=False),
         losses=(image, *strategy.terms),
-        rates=(_rates_of_splat(recipe) if recipe.search.begin_found else recipe.rates).of("primary", held),
+        rates=(_rates_of_splat(recipe) if recipe.search.begin_found else recipe.rates).of("primary", view_dependence),
         actions=(*strategy.edits, *regular),
         post_steps=strategy.post_steps,
         densify_until=strategy.densify_until,
@@ -101,17 +101,19 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         share=recipe.schedule.stop - recipe.bootstrap,
         renderer=renderer,
         losses=(image, *guidance, *strategy.terms),
-        rates=recipe.rates.of("primary", held) | recipe.reflection_rates.of(),
+        rates=recipe.rates.of("primary", view_dependence) | recipe.reflection_rates.of(),
         actions=(
-            *_edits(recipe, strategy),
+            *_edit_actions(recipe, strategy),
             # Before the resets, because it examines the visible scene even at steps of resets.
-            _propagate(recipe, propagate_at, renderer),
+            _propagate_action(recipe, propagate_at, renderer),
             mirrors.GrowShAfterPropagation(Every(recipe.intervals.sh)),
-            *(map(mirrors.ResetRaised.instead_of, strategy.resets) if recipe.schedule.last_reset else strategy.resets),
-            mirrors.RefineEnvironment(doublings(recipe.first_texels, recipe.texels, recipe.bootstrap), recipe.texels),
+            *(map(mirrors.ResetRaised.replacing, strategy.resets) if recipe.schedule.last_reset else strategy.resets),
+            mirrors.RefineEnvironment(
+                doubling_shares(recipe.first_texels, recipe.texels, recipe.bootstrap), recipe.texels
+            ),
         ),
         post_steps=strategy.post_steps,
-        setup=first_reflections(recipe),
+        setup=reflection_setup(recipe),
         densify_until=strategy.densify_until,
         # Without propagation, the consistency of normals is not needed (lab/glossy.md).
         until=mirrors.found_nothing,
@@ -144,7 +146,9 @@ def _matte_stages(recipe: DeferredRecipe, primitive: Primitive, seed: int, itera
         mcmc=recipe.mcmc,
     )
     first, *later = (replace(stage, name=f"as {stage.name}") for stage in plain.stages(seed, iterations))
-    return replace(first, setup=StayMatte(iterations, recipe.least_iterations, _environment(recipe))), *later
+    return replace(
+        first, setup=SkipReflections(iterations, recipe.least_iterations, _environment_setup(recipe))
+    ), *later
 
 
 def _rates_of_splat(recipe: DeferredRecipe) -> GaussianRates:
@@ -156,18 +160,18 @@ def _rates_of_splat(recipe: DeferredRecipe) -> GaussianRates:
     )
 
 
-def first_reflections(recipe: DeferredRecipe) -> BeginReflections:
+def reflection_setup(recipe: DeferredRecipe) -> BeginReflections:
     """Setup that starts reflections."""
-    seen_by = Splat(recipe.background or BLACK, depth=False)
-    return BeginReflections(_environment(recipe), None, recipe.search, seen_by, harmonics_wait=True)
+    renderer = Splat(recipe.background or BLACK, depth=False)
+    return BeginReflections(_environment_setup(recipe), None, recipe.search, renderer, reset_sh_degree=True)
 
 
-def _environment(recipe: DeferredRecipe) -> AddEnvironment:
+def _environment_setup(recipe: DeferredRecipe) -> AddEnvironment:
     """Setup that adds the environment."""
     return AddEnvironment(min(recipe.first_texels, recipe.texels), recipe.region, recipe.find_region)
 
 
-def _edits(recipe: DeferredRecipe, strategy: DensificationStrategy) -> tuple[Action, ...]:
+def _edit_actions(recipe: DeferredRecipe, strategy: DensificationStrategy) -> tuple[Action, ...]:
     """Actions that change the number of Gaussians, after the bootstrap."""
     if recipe.propagation_interval is None or recipe.strategy == "mcmc":
         return strategy.edits
@@ -178,7 +182,7 @@ def _edits(recipe: DeferredRecipe, strategy: DensificationStrategy) -> tuple[Act
     )
 
 
-def _propagate(recipe: DeferredRecipe, when: Every, renderer: Deferred) -> mirrors.Propagate:
+def _propagate_action(recipe: DeferredRecipe, when: Every, renderer: Deferred) -> mirrors.Propagate:
     return mirrors.Propagate(
         when,
         recipe.propagation,
@@ -203,17 +207,17 @@ def _matte_rates(recipe: DeferredRecipe) -> dict[str, Rate]:
 
 FIRST_DOUBLING, LAST_DOUBLING = 0.45, 0.65
 """Shares of the run of the first and last doubling of the environment's resolution."""
-LEAST_WAIT = 0.1
+LEAST_DOUBLING_DELAY = 0.1
 """Minimum delay of the first doubling, as a share of the run after the bootstrap."""
 
 
-def doublings(first_texels: int, texels: int, bootstrap: float) -> tuple[float, ...]:
+def doubling_shares(first_texels: int, texels: int, bootstrap: float) -> tuple[float, ...]:
     """Evenly spaced shares of the run at which the edge length doubles until it reaches the final one.
 
     They are delayed by a long bootstrap, in which there is no environment.
     """
     count = max(math.ceil(math.log2(texels / first_texels)), 0)
-    first = max(FIRST_DOUBLING, bootstrap + LEAST_WAIT * (1 - bootstrap))
+    first = max(FIRST_DOUBLING, bootstrap + LEAST_DOUBLING_DELAY * (1 - bootstrap))
     last = max(LAST_DOUBLING, first)
     return tuple(first + (last - first) * number / max(count - 1, 1) for number in range(count))
 
@@ -252,13 +256,13 @@ def traced_stages(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHED_I
         refinement = replace(refinement, losses=distant.losses, renderer=distant.renderer)
     if recipe.mirrors == "environment":
         return bootstrap, distant, refinement
-    setup = first_reflections(recipe.distant())
-    around = AddSurroundings(recipe.surroundings.start, recipe.surroundings.sh_degree)
-    setup = replace(setup, surroundings=around, harmonics_wait=not recipe.harmonics_from_start)
+    setup = reflection_setup(recipe.distant())
+    surroundings = AddSurroundings(recipe.surroundings.start, recipe.surroundings.sh_degree)
+    setup = replace(setup, surroundings=surroundings, reset_sh_degree=not recipe.harmonics_from_start)
     if recipe.mirrors == "surroundings":
         setup = replace(setup, environment=replace(setup.environment, texels=0))
-    near = replace(_tracing(recipe, distant), setup=setup)
-    return bootstrap, near, _tracing(recipe, refinement)
+    near = replace(_traced_stage(recipe, distant), setup=setup)
+    return bootstrap, near, _traced_stage(recipe, refinement)
 
 
 def _with_normal_terms(recipe: TracedRecipe, bootstrap: Stage, reflecting: Stage) -> Stage:
@@ -267,7 +271,7 @@ def _with_normal_terms(recipe: TracedRecipe, bootstrap: Stage, reflecting: Stage
     return replace(bootstrap, renderer=Splat(recipe.background or BLACK), losses=(*bootstrap.losses, *terms))
 
 
-def _tracing(recipe: TracedRecipe, stage: Stage) -> Stage:
+def _traced_stage(recipe: TracedRecipe, stage: Stage) -> Stage:
     """A stage of `deferred` with ray-traced reflections."""
     stage = _with_renderer(recipe, stage)
     return replace(

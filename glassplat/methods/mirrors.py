@@ -39,7 +39,7 @@ LEAST_SHOWN = 0.1
 
 
 @dataclass(frozen=True)
-class Search:
+class ReflectionMeasure:
     """Search for reflective Gaussians in the views, within the region.
 
     A Gaussian's residual in a view is the difference between photograph and render, averaged over its pixels with its
@@ -57,7 +57,7 @@ class Search:
     spread: float = 0.04
 
     @torch.no_grad()
-    def reflective(self, scene: Scene, views: Sequence[View]) -> float:
+    def reflective_share(self, scene: Scene, views: Sequence[View]) -> float:
         """Reflected share of the visible scene: the mean strength."""
         shown = sum(
             (contributions(scene, view.camera) for view in evenly(views, self.views)),
@@ -66,7 +66,7 @@ class Search:
         return mean_in_region(scene, shown, torch.sigmoid(scene.primary.channels["logit_strength"]))
 
     @torch.no_grad()
-    def turning(self, scene: Scene, views: Sequence[View], renderer: Renderer) -> float:
+    def view_dependent_share(self, scene: Scene, views: Sequence[View], renderer: Renderer) -> float:
         """Share of the visible scene that does not reflect, although its residual is view-dependent."""
         shown, spreads = residual_spreads(scene, evenly(views, self.views), renderer)
         reflects = scene.primary.channels["logit_strength"] > logit(self.strength)
@@ -124,7 +124,7 @@ def residual_sums(scene: Scene, view: View, renderer: Renderer) -> Tensor:
 
 COLOR_NEIGHBOURS, NORMAL_NEIGHBOURS = 16, 4
 """Number of neighbours, including itself, over which spreads and normals are averaged."""
-FACING = 1e-3
+LEAST_NORMAL_LENGTH = 1e-3
 """Minimum length of a sum of normals, in pixels, for a direction."""
 
 
@@ -148,34 +148,34 @@ def mirror_lookalikes(
     seen = shown > LEAST_SHOWN
     rows = seen.nonzero().squeeze(1)
     variances = torch.zeros_like(spreads)
-    near = neighbours(scene.primary.means[rows], COLOR_NEIGHBOURS)
-    weights, values = shown[rows][near], spreads[rows].square()[near]
+    neighbours = nearest_neighbours(scene.primary.means[rows], COLOR_NEIGHBOURS)
+    weights, values = shown[rows][neighbours], spreads[rows].square()[neighbours]
     variances[rows] = (weights * values).sum(1) / weights.sum(1)
     return seen, seen & (variances > options.spread**2) & in_region(scene)
 
 
 @torch.no_grad()
-def made_mirrors(options: MirrorSearch, scene: Scene, views: Sequence[View], chosen: Tensor) -> Gaussians:
+def turn_into_mirrors(options: MirrorSearch, scene: Scene, views: Sequence[View], chosen: Tensor) -> Gaussians:
     """The primary Gaussians with the chosen [N] ones turned into mirrors, with normals from the views
-    (`seen_normals`).
+    (`normals_from_views`).
 
     Their constant colours stay, and view-dependent ones are removed: reflections will explain these.
     """
     gaussians = scene.primary
-    looked_at = evenly(views, options.views)
-    normals = seen_normals(scene, looked_at, options.estimated_normals)
-    turned = chosen & (normals.norm(dim=1) > FACING)
-    rows = turned.nonzero().squeeze(1)
-    near = neighbours(gaussians.means[rows], NORMAL_NEIGHBOURS)
-    normals[rows] = normals[rows][near].sum(1)
-    quats, log_scales = facing(gaussians, normalize(normals, dim=1), math.log(options.flatness))
+    chosen_views = evenly(views, options.views)
+    normals = normals_from_views(scene, chosen_views, options.estimated_normals)
+    rotated = chosen & (normals.norm(dim=1) > LEAST_NORMAL_LENGTH)
+    rows = rotated.nonzero().squeeze(1)
+    neighbours = nearest_neighbours(gaussians.means[rows], NORMAL_NEIGHBOURS)
+    normals[rows] = normals[rows][neighbours].sum(1)
+    quats, log_scales = rotate_to_normals(gaussians, normalize(normals, dim=1), math.log(options.flatness))
     sh = gaussians.sh.clone()
     sh[chosen, 1:] = 0
     strengths, opacities = gaussians.channels["logit_strength"], gaussians.logit_opacities
     return gaussians.with_tensors(
         {
-            "quats": torch.where(turned[:, None], quats, gaussians.quats),
-            "log_scales": torch.where(turned[:, None], log_scales, gaussians.log_scales),
+            "quats": torch.where(rotated[:, None], quats, gaussians.quats),
+            "log_scales": torch.where(rotated[:, None], log_scales, gaussians.log_scales),
             "logit_strength": strengths.masked_fill(chosen, logit(options.strength)),
             "logit_opacities": torch.where(chosen, opacities.clamp(min=logit(options.least_opacity)), opacities),
             "sh": sh,
@@ -183,7 +183,7 @@ def made_mirrors(options: MirrorSearch, scene: Scene, views: Sequence[View], cho
     )
 
 
-def neighbours(points: Tensor, count: int) -> Tensor:
+def nearest_neighbours(points: Tensor, count: int) -> Tensor:
     """[N, count] rows of the nearest neighbours of points [N, 3], starting with itself; fewer if there are fewer
     points.
     """
@@ -191,12 +191,12 @@ def neighbours(points: Tensor, count: int) -> Tensor:
         return torch.zeros(0, 1, dtype=torch.int64, device=points.device)
     from scipy.spatial import cKDTree  # Slow to import, and rarely needed.
 
-    places = points.detach().cpu().numpy()
-    _, rows = cKDTree(places).query(places, k=range(1, min(count, len(places)) + 1), workers=-1)
+    positions = points.detach().cpu().numpy()
+    _, rows = cKDTree(positions).query(positions, k=range(1, min(count, len(positions)) + 1), workers=-1)
     return torch.from_numpy(rows).to(points.device)
 
 
-def seen_normals(scene: Scene, views: Sequence[View], estimated: bool = False) -> Tensor:
+def normals_from_views(scene: Scene, views: Sequence[View], estimated: bool = False) -> Tensor:
     """[N, 3] normals of the depth maps, summed over the pixels of each primary Gaussian, world axes.
 
     Weighted by the cosine of the viewing angle.
@@ -210,20 +210,20 @@ def seen_normals(scene: Scene, views: Sequence[View], estimated: bool = False) -
     for view in views:
         camera = view.camera.to(normals.device)
         known = estimated_normals(view) if estimated else None
-        image = slopes_of_depths(scene, camera) if known is None else to_device(known, normals.device)
+        image = depth_map_normals(scene, camera) if known is None else to_device(known, normals.device)
         cosines = -(image * normalize(view_directions(camera), dim=-1)).sum(-1, keepdim=True)
         normals += gather_pixels(scene, camera, image * cosines.clamp(min=0))
     return normals
 
 
-def slopes_of_depths(scene: Scene, camera: Camera) -> Tensor:
+def depth_map_normals(scene: Scene, camera: Camera) -> Tensor:
     """[H, W, 3] normals of a camera's depth map, world axes; zero where unreliable."""
     surface = blend_surface(scene, camera, background=(0.0, 0.0, 0.0))
     cells, trusted = depth_normals(surface.depth, surface.alpha, camera)
-    return _whole_size(cells * trusted[..., None], cell_side(camera), surface.depth.shape)
+    return _upsample_cells(cells * trusted[..., None], cell_side(camera), surface.depth.shape)
 
 
-def _whole_size(cells: Tensor, side: int, size: Sequence[int]) -> Tensor:
+def _upsample_cells(cells: Tensor, side: int, size: Sequence[int]) -> Tensor:
     """[H, W, 3] unit vectors interpolated between cells [h, w, 3] of several pixels; zero where these are."""
     height, width = (side * count for count in cells.shape[:2])
     large = interpolate(cells.permute(2, 0, 1)[None], (height, width), mode="bilinear")[0].permute(1, 2, 0)
@@ -232,7 +232,7 @@ def _whole_size(cells: Tensor, side: int, size: Sequence[int]) -> Tensor:
     return image
 
 
-def facing(gaussians: Gaussians, normals: Tensor, log_flatness: float) -> tuple[Tensor, Tensor]:
+def rotate_to_normals(gaussians: Gaussians, normals: Tensor, log_flatness: float) -> tuple[Tensor, Tensor]:
     """Orientations [N, 4] and log scales of Gaussians, rotated by the smallest angle to the given normals [N, 3].
 
     Ellipsoids become flat.
@@ -252,34 +252,34 @@ def facing(gaussians: Gaussians, normals: Tensor, log_flatness: float) -> tuple[
 
 
 @torch.no_grad()
-def normals_propagated(
+def propagate_normals(
     options: NormalPropagation, gaussians: Gaussians, moments: Moments
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
     """Raises opacities and strengths, and grows reflective Gaussians; moments of changed values are zeroed."""
     opacities = gaussians.logit_opacities.clamp(min=logit(options.least_opacity))
     strengths = gaussians.channels["logit_strength"].clamp(min=logit(options.least_strength))
     grows = strengths >= logit(options.reflective)
-    log_scales = gaussians.log_scales + math.log(options.growth) * (grows[:, None] & _within_surface(gaussians))
+    log_scales = gaussians.log_scales + math.log(options.growth) * (grows[:, None] & _surface_axes(gaussians))
     changed = {"logit_opacities": opacities, "logit_strength": strengths, "log_scales": log_scales}
     everything = torch.ones_like(grows)
     return gaussians.with_tensors(changed), zero_moments(moments, [f"primary.{name}" for name in changed], everything)
 
 
 @torch.no_grad()
-def colors_disturbed(
+def sabotage_colors(
     options: NormalPropagation, gaussians: Gaussians, moments: Moments, generator: torch.Generator
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
     """Adds noise to the constant colours of non-reflective Gaussians, so that these cannot explain reflections."""
     if options.sabotage == 0:
         return gaussians, dict(moments)
     unit = torch.rand(gaussians.sh[:, 0].shape, generator=generator, device=gaussians.sh.device, dtype=torch.float32)
-    dull = gaussians.channels["logit_strength"] <= logit(options.sabotaged)
+    matte = gaussians.channels["logit_strength"] <= logit(options.sabotaged)
     sh = gaussians.sh.clone()
-    sh[:, 0] += torch.where(dull[:, None], options.sabotage * (2 * unit - 1) / SH_ZERO, 0)
-    return gaussians.with_tensors({"sh": sh}), zero_moments(moments, ["primary.sh"], dull)
+    sh[:, 0] += torch.where(matte[:, None], options.sabotage * (2 * unit - 1) / SH_ZERO, 0)
+    return gaussians.with_tensors({"sh": sh}), zero_moments(moments, ["primary.sh"], matte)
 
 
-def _within_surface(gaussians: Gaussians) -> Tensor:
+def _surface_axes(gaussians: Gaussians) -> Tensor:
     """[N, 3] bool, or [N, 2] for discs: axes within the surface; all but the shortest, or both of a disc."""
     if gaussians.are_discs:
         return torch.ones_like(gaussians.log_scales, dtype=torch.bool)
@@ -288,30 +288,35 @@ def _within_surface(gaussians: Gaussians) -> Tensor:
 
 log = logging.getLogger("glassplat.training")
 
-ENDED, MOST, GREW, TURNS = "propagation ended", "most reflective", "reflective grew", "turns with the view"
+PROPAGATION_ENDED, MOST_REFLECTIVE, LAST_GROWTH, VIEW_DEPENDENT = (
+    "propagation ended",
+    "most reflective",
+    "reflective grew",
+    "turns with the view",
+)
 """Keys of `TrainState.records`: step of the end, largest reflected share, step of its last growth, and the
 view-dependent, non-reflective share."""
-RAISED, LOWERED = "opacities raised", "opacities lowered"
+OPACITIES_RAISED, OPACITIES_LOWERED = "opacities raised", "opacities lowered"
 """Further keys: the last step of each."""
-GROWTH = 0.01
+LEAST_GROWTH = 0.01
 """Minimum increase of the reflected share that counts as growth; not a ratio, which would let the noise of a matte
 scene count forever."""
-FOUND = 0.03
+LEAST_REFLECTIVE = 0.03
 """Reflected share above which something reflective has been found."""
-LOOKS_REFLECTIVE = 0.16
+LEAST_VIEW_DEPENDENT = 0.16
 """View-dependent share below which propagation costs more than it gains: two metal eggs with 0.07 lost 1.3 dB at 7000
 iterations, a mirror ball with 0.30 gained (lab/glossy.md)."""
 NOTHING_FOUND = "step %d: little or nothing reflective was found, so normal propagation stops%s; %s"
 AS_SPLAT = ", and the rest of the run uses the learning rates of splat"
-MATTE = (
+MATTE_ADVICE = (
     "at most %.0f %% of the visible scene changes with the viewing direction. If something reflects anyway, "
     "give its location with --region X Y Z RADIUS"
 )
-EMPTY = (
+EMPTY_ADVICE = (
     "no Gaussian lies in the sphere outside which nothing reflects, of radius %.3g around (%.3g, %.3g, %.3g). "
     "--region X Y Z RADIUS sets another one, in the units of the capture's poses"
 )
-OVERLOOKED = (
+OVERLOOKED_ADVICE = (
     "but %.0f %% of the visible scene changes with the viewing direction. More --iterations give propagation "
     "more time, and --region X Y Z RADIUS tells where something reflects"
 )
@@ -330,7 +335,7 @@ class Propagate:
         renderer: renderer of the stage, whose frames have a layer `base`.
         matte_rates: factors on learning rates after the end if nothing reflective was found, by dotted parameter name;
             evaluated for the length of the run.
-        search: measures the amount of reflection.
+        measure: measures the amount of reflection.
         raises_rates_found: apply them even if something was found.
     """
 
@@ -339,51 +344,51 @@ class Propagate:
     schedule: PropagationSchedule
     renderer: Renderer
     matte_rates: Mapping[str, Rate] = field(default_factory=dict)
-    search: Search = field(default_factory=Search)
+    measure: ReflectionMeasure = field(default_factory=ReflectionMeasure)
     raises_rates_found: bool = False
     name: str = "propagate normals"
 
     def due(self, clock: Clock) -> bool:
         """Return whether to act after this step."""
-        return replace(self.when, skip_multiples_of=None).due(clock) or clock.step == self._last(clock)
+        return replace(self.when, skip_multiples_of=None).due(clock) or clock.step == self._last_step(clock)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state`, until propagation has ended."""
-        if has_ended(state):
+        if propagation_has_ended(state):
             return False
-        if clock.step < min(self._first(clock), self._last(clock)):
+        if clock.step < min(self._first_step(clock), self._last_step(clock)):
             return False
-        if clock.step >= self._last(clock) or self._settles(state, dataset, clock):
-            self._end(state, dataset, clock)
+        if clock.step >= self._last_step(clock) or self._has_settled(state, dataset, clock):
+            self._end_propagation(state, dataset, clock)
             return False
         if not self.when.due(clock):
             return False
-        primary, moments = normals_propagated(self.propagation, state.scene.primary, state.optimizer.moments)
-        primary, moments = colors_disturbed(self.propagation, primary, moments, state.generator(self.name))
+        primary, moments = propagate_normals(self.propagation, state.scene.primary, state.optimizer.moments)
+        primary, moments = sabotage_colors(self.propagation, primary, moments, state.generator(self.name))
         state.scene, state.optimizer.moments = replace(state.scene, primary=primary), moments
         state.optimizer.paused["primary.logit_opacities"] = self.schedule.pause
-        state.records[RAISED] = clock.step
+        state.records[OPACITIES_RAISED] = clock.step
         return True
 
-    def _first(self, clock: Clock) -> int:
+    def _first_step(self, clock: Clock) -> int:
         """The first step reserved for a reset.
 
         Before it, remains of random points would be made opaque, and hide the surfaces.
         """
         return self.when.interval(clock) * (self.when.skip_multiples_of or 1)
 
-    def _last(self, clock: Clock) -> int:
+    def _last_step(self, clock: Clock) -> int:
         """The latest step at which it ends."""
         return round(self.schedule.stop * clock.iterations)
 
-    def _settles(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+    def _has_settled(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Return whether reflection has stopped growing for long enough; updates the records."""
         if self.schedule.end == "fixed":
             return False
-        share = self.search.reflective(state.scene, dataset.train)
-        if GREW not in state.records or share > state.records[MOST] + GROWTH:
-            state.records |= {MOST: share, GREW: clock.step}
-        waited = (clock.step - state.records[GREW]) / self.when.interval(clock)
+        share = self.measure.reflective_share(state.scene, dataset.train)
+        if LAST_GROWTH not in state.records or share > state.records[MOST_REFLECTIVE] + LEAST_GROWTH:
+            state.records |= {MOST_REFLECTIVE: share, LAST_GROWTH: clock.step}
+        waited = (clock.step - state.records[LAST_GROWTH]) / self.when.interval(clock)
         return waited >= self.schedule.patience or self._looks_matte(state, dataset, clock)
 
     def _looks_matte(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
@@ -392,23 +397,23 @@ class Propagate:
         This is checked before opacities are first raised, and one interval after a reset. At other times, floaters are
         view-dependent.
         """
-        if state.records[MOST] >= FOUND:
+        if state.records[MOST_REFLECTIVE] >= LEAST_REFLECTIVE:
             return False
-        if TURNS not in state.records or clock.step % self._first(clock) == self.when.interval(clock):
-            state.records[TURNS] = self.search.turning(state.scene, dataset.train, self.renderer)
-        return state.records[TURNS] < LOOKS_REFLECTIVE
+        if VIEW_DEPENDENT not in state.records or clock.step % self._first_step(clock) == self.when.interval(clock):
+            state.records[VIEW_DEPENDENT] = self.measure.view_dependent_share(state.scene, dataset.train, self.renderer)
+        return state.records[VIEW_DEPENDENT] < LEAST_VIEW_DEPENDENT
 
-    def _end(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
+    def _end_propagation(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
         """Records the end, and logs what was found."""
-        state.records[ENDED] = clock.step
-        share = max(self.search.reflective(state.scene, dataset.train), state.records.get(MOST, 0.0))
-        state.records[MOST] = share
-        if share < FOUND or self.raises_rates_found:
+        state.records[PROPAGATION_ENDED] = clock.step
+        share = max(self.measure.reflective_share(state.scene, dataset.train), state.records.get(MOST_REFLECTIVE, 0.0))
+        state.records[MOST_REFLECTIVE] = share
+        if share < LEAST_REFLECTIVE or self.raises_rates_found:
             # Faster, if there are no normals to corrupt.
             state.optimizer.raised_rates = {
                 name: rate.at(0.0, 1.0, clock.iterations) for name, rate in self.matte_rates.items()
             }
-        if share >= FOUND:
+        if share >= LEAST_REFLECTIVE:
             log.info(
                 "step %d: normal propagation has ended, %.0f %% of the visible scene is reflection",
                 clock.step,
@@ -418,12 +423,14 @@ class Propagate:
         region = state.scene.environment.region
         if region is not None and not bool(in_region(state.scene).any()):
             *center, radius = region
-            advice = EMPTY % (radius, *center)
+            advice = EMPTY_ADVICE % (radius, *center)
         else:
-            turns = state.records.get(TURNS)
-            if turns is None:
-                turns = self.search.turning(state.scene, dataset.train, self.renderer)
-            advice = (MATTE if turns < LOOKS_REFLECTIVE else OVERLOOKED) % (100 * turns)
+            view_dependent = state.records.get(VIEW_DEPENDENT)
+            if view_dependent is None:
+                view_dependent = self.measure.view_dependent_share(state.scene, dataset.train, self.renderer)
+            advice = (MATTE_ADVICE if view_dependent < LEAST_VIEW_DEPENDENT else OVERLOOKED_ADVICE) % (
+                100 * view_dependent
+            )
         log.warning(NOTHING_FOUND, clock.step, AS_SPLAT if self.matte_rates else "", advice)
 
 
@@ -433,7 +440,7 @@ class GrowShAfterPropagation(GrowSh):
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state` after propagation."""
-        return has_ended(state) and super().apply(state, dataset, clock)
+        return propagation_has_ended(state) and super().apply(state, dataset, clock)
 
 
 @dataclass(frozen=True)
@@ -452,19 +459,19 @@ class ResetRaised(ResetOpacity):
     regular: Every = field(kw_only=True)
 
     @staticmethod
-    def instead_of(reset: ResetOpacity) -> ResetRaised:
+    def replacing(reset: ResetOpacity) -> ResetRaised:
         """The action that replaces regular resets, at the same times and their continuation."""
         return ResetRaised(replace(reset.when, stop=1.0), reset.ceiling, regular=reset.when)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state` if opacities have been raised and there is time to recover."""
-        raised = state.records.get(RAISED, 0) > state.records.get(LOWERED, 0)
-        wanted = raised if has_ended(state) else self.regular.due(clock)
+        raised = state.records.get(OPACITIES_RAISED, 0) > state.records.get(OPACITIES_LOWERED, 0)
+        wanted = raised if propagation_has_ended(state) else self.regular.due(clock)
         # Opacities recover within the steps between two resets.
         recovery = self.when.interval(clock) * (self.when.only_multiples_of or 1)
         if not wanted or clock.step + recovery > clock.iterations:
             return False
-        state.records[LOWERED] = clock.step
+        state.records[OPACITIES_LOWERED] = clock.step
         return super().apply(state, dataset, clock)
 
 
@@ -484,8 +491,8 @@ class DensifyWhilePropagating(Densify):
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state`, if due in the current phase."""
-        turn: Densify = self.regular if has_ended(state) else Densify(self.densifier, self.part)
-        return turn.due(clock) and turn.apply(state, dataset, clock)
+        densify: Densify = self.regular if propagation_has_ended(state) else Densify(self.densifier, self.part)
+        return densify.due(clock) and densify.apply(state, dataset, clock)
 
 
 @dataclass(frozen=True)
@@ -514,11 +521,11 @@ class RefineEnvironment(AtShares):
         return True
 
 
-def has_ended(state: TrainState) -> bool:
+def propagation_has_ended(state: TrainState) -> bool:
     """Return whether propagation has ended."""
-    return ENDED in state.records
+    return PROPAGATION_ENDED in state.records
 
 
 def found_nothing(state: TrainState) -> bool:
     """Return whether propagation has ended, and nothing reflects."""
-    return has_ended(state) and state.records[MOST] < FOUND
+    return propagation_has_ended(state) and state.records[MOST_REFLECTIVE] < LEAST_REFLECTIVE

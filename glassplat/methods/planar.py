@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("glassplat.training")
 
-LEAST_WITHIN = 0.25
+LEAST_INSIDE_SHARE = 0.25
 """Minimum share of a pane's marked pixels inside the rectangle of planes.json."""
 LEAST_COVERAGE = 0.5
 """Share of the reflection covered by Gaussians below which photographs do not show the room directly."""
@@ -68,17 +68,17 @@ class PaneSetup:
     def __call__(self, state: TrainState, dataset: Dataset) -> Work:
         """Edits `state`, and yields its progress."""
         yield Working("fitting planes to the masks", 0, 1)
-        scene = self._with_glass(state.scene, fitted_planes(dataset, state.scene.primary.means, self.fit))
+        scene = self._with_glass(state.scene, capture_planes(dataset, state.scene.primary.means, self.fit))
         if self.detect_mirrors or self.fit.mirror_labels:
             # The search for mirrors aligns them.
-            scene = self._with_glass(scene, (yield from self._with_mirrors_found(scene, dataset)))
+            scene = self._with_glass(scene, (yield from self._find_mirrors(scene, dataset)))
         planes = scene.planes if self.fixed_mirrors else replace(scene.planes, mirrors=())
         state.scene = replace(scene, planes=planes.that_may_tint() if self.tint else planes)
         state.statistics.clear()
-        for mirrors in surfaces(planes, mirrors=True):
+        for mirrors in coplanar_panes(planes, mirrors=True):
             yield Working(f"moving Gaussians from behind {name_panes(mirrors, 'mirror')} to the front", 0, 1)
-            turn_virtual_scene_round(state, dataset, mirrors)
-        for panes in surfaces(planes, mirrors=False) if self.seed_reflections else ():
+            mirror_virtual_gaussians(state, dataset, mirrors)
+        for panes in coplanar_panes(planes, mirrors=False) if self.seed_reflections else ():
             yield from seed_reflection(state, dataset, panes)
         return True
 
@@ -86,18 +86,18 @@ class PaneSetup:
         """The scene with these planes, and glass on them."""
         return replace(scene, planes=planes, glass=glass_gaussians(planes, count=self.glass_count, seed=self.seed))
 
-    def _with_mirrors_found(self, scene: Scene, dataset: Dataset) -> Generator[Working, None, Planes]:
+    def _find_mirrors(self, scene: Scene, dataset: Dataset) -> Generator[Working, None, Planes]:
         """The scene's planes with detected mirrors marked and aligned.
 
         If `fit` names mirrors, only these are; planes of planes.json are as stated there.
         """
         given = Planes.empty() if dataset.planes is None else dataset.planes
-        untold = [label for label in scene.planes.labels if label not in given.labels]
-        judged = yield from judged_panes(scene, dataset, untold)
-        alike = mirrors_among(scene.planes, judged)
-        mirrors = tuple(dict.fromkeys((*given.mirrors, *(self.fit.mirror_labels or alike))))
+        fitted = [label for label in scene.planes.labels if label not in given.labels]
+        candidates = yield from mirror_candidates(scene, dataset, fitted)
+        detected = detected_mirrors(scene.planes, candidates)
+        mirrors = tuple(dict.fromkeys((*given.mirrors, *(self.fit.mirror_labels or detected))))
         log.info("mirrors among the panes: %s", name_labels(mirrors) or "none")
-        aligned = [judged[label].pane for label in alike if label in mirrors]
+        aligned = [candidates[label].pane for label in detected if label in mirrors]
         return with_mirrors(with_poses_of(scene.planes, aligned), mirrors, self.fit.mirror_reflectance)
 
 
@@ -110,14 +110,14 @@ def with_poses_of(planes: Planes, panes: Sequence[Planes]) -> Planes:
     return replace(planes, centers=centers, raw_normals=normals)
 
 
-def glass_only_darkens(state: TrainState, clock: Clock, visible: Tensor | None) -> None:
+def clamp_transmittances(state: TrainState, clock: Clock, visible: Tensor | None) -> None:
     """Clamps log transmittances at 0: glass does not add light."""
     logarithms = state.scene.planes.log_transmittances
     if logarithms is not None:
         logarithms.detach().clamp_(max=0)
 
 
-def fitted_planes(dataset: Dataset, centers: Tensor | None, fit: PlaneFit) -> Planes:
+def capture_planes(dataset: Dataset, centers: Tensor | None, fit: PlaneFit) -> Planes:
     """The planes of all panes: those of planes.json, and others fitted to masks.
 
     Args:
@@ -128,14 +128,14 @@ def fitted_planes(dataset: Dataset, centers: Tensor | None, fit: PlaneFit) -> Pl
     Raises:
         PlaneFitError: the masks do not determine a plane.
     """
-    given = Planes.empty() if dataset.planes is None else _as_given(dataset.planes, fit)
+    given = Planes.empty() if dataset.planes is None else _prepare_given_planes(dataset.planes, fit)
     labels = [label for label in dataset.pane_labels if label not in given.labels]
     shown = [(view.name, view.camera, view.pane_labels) for view in dataset.train if view.pane_labels is not None]
     if dataset.planes is not None:
-        _check_given(dataset.planes, [(camera, seen) for _, camera, seen in shown])
+        _check_given_planes(dataset.planes, [(camera, seen) for _, camera, seen in shown])
     if not labels and len(given):
         return given if centers is None else given.to(centers.device)
-    _check_marked(labels, [seen for _, _, seen in shown], dataset)
+    _check_training_masks(labels, [seen for _, _, seen in shown], dataset)
     points = dataset.points.positions
     fitted = fit_planes(
         points if centers is None else centers,
@@ -150,24 +150,24 @@ def fitted_planes(dataset: Dataset, centers: Tensor | None, fit: PlaneFit) -> Pl
     return fitted if not len(given) else given.to(fitted.centers.device).concat(fitted)
 
 
-def _check_given(planes: Planes, shown: Sequence[tuple[Camera, Tensor]]) -> None:
+def _check_given_planes(planes: Planes, masks: Sequence[tuple[Camera, Tensor]]) -> None:
     """Raises PlaneFitError if a plane of planes.json contradicts its masks."""
     for row, label in enumerate(planes.labels):
-        marked = within = 0
-        for camera, labels in shown:
+        marked = inside = 0
+        for camera, labels in masks:
             pixels = labels == label
             if (count := int(pixels.sum())) > 0:
                 hits = nearest_hits(panes_in_camera(planes.select([row]), camera), camera)
-                marked, within = marked + count, within + int((pixels & (hits.pane == 0)).sum())
-        if within < LEAST_WITHIN * marked:
+                marked, inside = marked + count, inside + int((pixels & (hits.pane == 0)).sum())
+        if inside < LEAST_INSIDE_SHARE * marked:
             raise PlaneFitError(
-                f"planes.json and the masks disagree about the position of pane {label}: {within / marked:.0%} of the "
+                f"planes.json and the masks disagree about the position of pane {label}: {inside / marked:.0%} of the "
                 "pixels that show it lie in the rectangle of the file. Were the poses estimated anew? Mark it again, "
                 "or remove it from the file"
             )
 
 
-def _check_marked(labels: Sequence[int], masks: Sequence[Tensor], dataset: Dataset) -> None:
+def _check_training_masks(labels: Sequence[int], masks: Sequence[Tensor], dataset: Dataset) -> None:
     """Raises PlaneFitError if only test photographs mark a pane."""
     for label in labels:
         if any(bool((mask == label).any()) for mask in masks):
@@ -180,41 +180,41 @@ def _check_marked(labels: Sequence[int], masks: Sequence[Tensor], dataset: Datas
             )
 
 
-def _as_given(planes: Planes, fit: PlaneFit) -> Planes:
+def _prepare_given_planes(planes: Planes, fit: PlaneFit) -> Planes:
     """Given rectangles with the margin of fitted ones, marked mirrors, and the initial R0."""
     is_clear = (planes.base_reflectances - CLEAR_GLASS).abs() < 1e-5
-    begun = torch.full_like(planes.logit_reflectances, logit(fit.glass_reflectance))
-    logits = torch.where(is_clear, begun, planes.logit_reflectances)
+    initial = torch.full_like(planes.logit_reflectances, logit(fit.glass_reflectance))
+    logits = torch.where(is_clear, initial, planes.logit_reflectances)
     mirrors = tuple(dict.fromkeys((*planes.mirrors, *fit.mirror_labels)))
     log.info("from the capture's planes.json: %s", ", ".join(f"pane {label}" for label in planes.labels))
-    found = replace(planes, logit_reflectances=logits, half_sizes=fit.margin * planes.half_sizes)
-    return with_mirrors(found, mirrors, fit.mirror_reflectance)
+    prepared = replace(planes, logit_reflectances=logits, half_sizes=fit.margin * planes.half_sizes)
+    return with_mirrors(prepared, mirrors, fit.mirror_reflectance)
 
 
-def judged_panes(
+def mirror_candidates(
     scene: Scene, dataset: Dataset, labels: Sequence[int]
-) -> Generator[Working, None, dict[int, material.JudgedPane]]:
+) -> Generator[Working, None, dict[int, material.MirrorCandidate]]:
     """Mirror score of each pane, by label."""
     photographs = material.photographs_of(scene, dataset.train) if labels else []
-    judged = {}
+    candidates = {}
     for done, label in enumerate(labels):
         yield Working("detecting mirrors", done, len(labels))
-        judged[label] = material.judged_pane(scene, label, photographs)
-    return judged
+        candidates[label] = material.mirror_candidate(scene, label, photographs)
+    return candidates
 
 
-def mirrors_among(planes: Planes, judged: Mapping[int, material.JudgedPane]) -> list[int]:
+def detected_mirrors(planes: Planes, candidates: Mapping[int, material.MirrorCandidate]) -> list[int]:
     """Labels of the panes that are mirrors; between panes of glass in the same plane, only if unambiguous."""
-    alike = {label for label, found in judged.items() if found.is_mirror}
-    rows = [row for row, label in enumerate(planes.labels) if label in judged]
+    mirrors = {label for label, found in candidates.items() if found.is_mirror}
+    rows = [row for row, label in enumerate(planes.labels) if label in candidates]
     for group in coplanar_groups(planes, rows):
         labels = {planes.labels[row] for row in group}
-        if any(judged[label].is_known for label in labels - alike):
-            alike -= {label for label in labels if judged[label].like.slope < material.SURE_SLOPE}
-    return [label for label in judged if label in alike]
+        if any(candidates[label].is_known for label in labels - mirrors):
+            mirrors -= {label for label in labels if candidates[label].like.slope < material.SURE_SLOPE}
+    return [label for label in candidates if label in mirrors]
 
 
-def surfaces(planes: Planes, *, mirrors: bool) -> list[Planes]:
+def coplanar_panes(planes: Planes, *, mirrors: bool) -> list[Planes]:
     """The mirrors, or the other panes, grouped by plane.
 
     Reflections of a glass front lie behind all of its panes, and most views show them through neighbouring ones.
@@ -228,7 +228,7 @@ def name_panes(panes: Planes, kind: str) -> str:
     return f"{kind}{'s' if len(panes) > 1 else ''} {name_labels(panes.labels)}"
 
 
-def reflects_little(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Work:
+def is_reflection_uncovered(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Work:
     """Return whether Gaussians cover almost nothing of the reflections of panes; False if no view shows any."""
     covered, whole = 0.0, 0
     for done, camera in enumerate(cameras):
@@ -238,12 +238,12 @@ def reflects_little(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> W
     return covered < LEAST_COVERAGE * whole
 
 
-def turn_virtual_scene_round(state: TrainState, dataset: Dataset, mirrors: Planes) -> None:
+def mirror_virtual_gaussians(state: TrainState, dataset: Dataset, mirrors: Planes) -> None:
     """Moves Gaussians of the first stage from behind a mirror, or several in one plane, to their true positions in
     front.
     """
     virtual = material.virtual_points(state.scene.primary.means, mirrors, [view.camera for view in dataset.train])
-    if moved := turn_round(state, virtual, mirrors):
+    if moved := mirror_gaussians(state, virtual, mirrors):
         log.info("%d Gaussians behind %s moved to the front", moved, name_panes(mirrors, "mirror"))
 
 
@@ -263,16 +263,16 @@ class TurnReflections(AtShares):
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
         """Edits `state` if necessary, and yields its progress."""
         cameras = [view.camera for view in dataset.train]
-        of_glass, moved = surfaces(state.scene.planes, mirrors=False), 0
-        for done, panes in enumerate(of_glass):
-            yield Working(f"searching behind {name_panes(panes, 'pane')} for reflections", done, len(of_glass))
-            moved += turn_round(state, material.reflections_behind(state.scene, panes, cameras), panes)
+        glass_panes, moved = coplanar_panes(state.scene.planes, mirrors=False), 0
+        for done, panes in enumerate(glass_panes):
+            yield Working(f"searching behind {name_panes(panes, 'pane')} for reflections", done, len(glass_panes))
+            moved += mirror_gaussians(state, material.reflections_behind(state.scene, panes, cameras), panes)
         if moved:
             log.info("%d Gaussians behind glass moved to the front", moved)
         return moved > 0
 
 
-LIT_AT, FILLED_AT = (0.4, 0.6), (0.5,)
+LAMP_SEARCH_AT, FILL_UNSEEN_AT = (0.4, 0.6), (0.5,)
 """Shares of a run of the search for lamps, and of filling parts that no view shows."""
 
 
@@ -280,7 +280,7 @@ LIT_AT, FILLED_AT = (0.4, 0.6), (0.5,)
 class LightLamps(AtShares):
     """Removes images of lamps from behind glass, and makes the lamps as bright as their reflections."""
 
-    shares: tuple[float, ...] = LIT_AT
+    shares: tuple[float, ...] = LAMP_SEARCH_AT
     name: str = "light lamps"
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
@@ -308,35 +308,35 @@ class LightLamps(AtShares):
 class FillUnseen(AtShares):
     """Adds Gaussians for reflections of objects that no photograph shows directly and the scene lacks."""
 
-    shares: tuple[float, ...] = FILLED_AT
+    shares: tuple[float, ...] = FILL_UNSEEN_AT
     name: str = "fill unseen"
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
         """Edits `state` if necessary, and yields its progress."""
         cameras, added = [view.camera for view in dataset.train], 0
-        of_glass = surfaces(state.scene.planes, mirrors=False)
-        for done, panes in enumerate(of_glass):
-            yield Working(f"searching for what {name_panes(panes, 'pane')} can reflect", done, len(of_glass))
-            places, color, cell = material.unseen_places(state.scene, panes, cameras)
-            if 0 < len(places) < actions.MOST_ADDED_SHARE * len(state.scene.primary):
-                colors = (255 * color).round().to(torch.uint8).expand(len(places), 3)
-                cloud = PointCloud(places.cpu(), colors.cpu())
+        glass_panes = coplanar_panes(state.scene.planes, mirrors=False)
+        for done, panes in enumerate(glass_panes):
+            yield Working(f"searching for what {name_panes(panes, 'pane')} can reflect", done, len(glass_panes))
+            positions, color, cell = material.unseen_places(state.scene, panes, cameras)
+            if 0 < len(positions) < actions.MOST_ADDED_SHARE * len(state.scene.primary):
+                colors = (255 * color).round().to(torch.uint8).expand(len(positions), 3)
+                cloud = PointCloud(positions.cpu(), colors.cpu())
                 actions.add_primary_gaussians(
                     state, actions.seed_gaussians(state.scene.primary, cloud, opacity=0.7, size=0.7 * cell)
                 )
-                added += len(places)
+                added += len(positions)
         if added:
             log.info("%d Gaussians added for reflections of unseen parts", added)
         return added > 0
 
 
-def turn_round(state: TrainState, virtual: Tensor, panes: Planes) -> int:
+def mirror_gaussians(state: TrainState, virtual: Tensor, panes: Planes) -> int:
     """Mirrors some primary Gaussians at coplanar panes; returns their number."""
     count = int(virtual.sum())
     if count:
-        turned = mirrored_gaussians(state.scene.primary.select(virtual), panes.centers[0], panes.normals[0])
+        mirrored = mirrored_gaussians(state.scene.primary.select(virtual), panes.centers[0], panes.normals[0])
         actions.keep_gaussians(state, ~virtual)
-        actions.add_primary_gaussians(state, turned)
+        actions.add_primary_gaussians(state, mirrored)
     return count
 
 
@@ -348,7 +348,7 @@ def seed_reflection(state: TrainState, dataset: Dataset, panes: Planes) -> Work:
     """
     cameras = [view.camera for view in dataset.train]
     # The coverage is expensive, so it is checked last.
-    if not dataset.measured_points or not (yield from reflects_little(state.scene, panes, cameras)):
+    if not dataset.measured_points or not (yield from is_reflection_uncovered(state.scene, panes, cameras)):
         return False
     points = dataset.points
     device = panes.centers.device
@@ -376,7 +376,7 @@ def planar_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
     """
     if not dataset.pane_labels and dataset.planes is None:
         raise PlaneFitError(
-            f"{_lack_of_masks(dataset)}, and planar needs to know the panes: expected masks of 3 to "
+            f"{_missing_masks_message(dataset)}, and planar needs to know the panes: expected masks of 3 to "
             f"10 photographs in {dataset.root / 'panes'}, named <photograph's name>.png, each pixel the label 1, "
             "2, ... of a pane, or 0 (`glassplat annotate` writes them). `glassplat train splat` needs none"
         )
@@ -384,12 +384,12 @@ def planar_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
     if unknown := [label for label in recipe.plane_fit.mirror_labels if label not in known]:
         raise PlaneFitError(f"plane_fit.mirror_labels names pane {unknown[0]}; expected some of {name_labels(known)}")
     if dataset.measured_points:
-        fitted_planes(dataset, None, recipe.plane_fit)
+        capture_planes(dataset, None, recipe.plane_fit)
     scene = Scene(strategy_of(recipe).initial_gaussians(dataset.points, recipe.sh_degree), dataset.extent)
     return with_neutral_corrections(recipe, scene, dataset)
 
 
-def _lack_of_masks(dataset: Dataset) -> str:
+def _missing_masks_message(dataset: Dataset) -> str:
     count = sum(view.is_annotated for view in (*dataset.train, *dataset.test))
     return (
         f"none of the {count} masks of {dataset.root} names a pane"
@@ -432,12 +432,12 @@ def planar_stages(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_I
         post_steps=strategy.post_steps,
         densify_until=strategy.densify_until,
     )
-    stages: tuple[Stage, ...] = (initialisation, _adjustment(recipe, second, setup), _joint(recipe, third))
+    stages: tuple[Stage, ...] = (initialisation, _adjustment_stage(recipe, second, setup), _joint_stage(recipe, third))
     stages = with_learned_photographer(recipe.photographer, stages, recipe.densify, seed)
     return with_learned_corrections(recipe, stages)
 
 
-JOINT_FACTOR = 0.1
+JOINT_RATE_FACTOR = 0.1
 """Factor on the learning rates of plane poses in stage 3 (paper)."""
 
 
@@ -454,20 +454,20 @@ def plane_rates(factor: float = 1.0) -> dict[str, Rate]:
     }
 
 
-def _adjustment(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> Stage:
+def _adjustment_stage(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> Stage:
     """Stage 2: the reflection's gradient reaches the planes, not the Gaussians."""
     strategy = strategy_of(recipe)
     return Stage(
         name="2 plane adjustment",
         share=share,
         renderer=_training_renderer(recipe, "planes"),
-        losses=_joint_terms(recipe, strategy),
+        losses=_reflection_stage_terms(recipe, strategy),
         rates=_gaussian_rates(recipe) | plane_rates(),
         actions=(
             *strategy.edits,
             actions.GrowSh(Every(recipe.intervals.sh)),
             actions.Densify(recipe.densify, part="glass"),
-            *_missing(recipe, recipe.stage_shares[0] / sum(recipe.stage_shares) + ADJUSTED_AFTER),
+            *_seed_actions(recipe, recipe.stage_shares[0] / sum(recipe.stage_shares) + SEED_AFTER_ADJUSTMENT),
             *_early_resets(recipe, strategy),
         ),
         post_steps=(*_glass_post_steps(recipe), *strategy.post_steps),
@@ -476,7 +476,7 @@ def _adjustment(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> Stage:
     )
 
 
-def _joint(recipe: PlanarRecipe, share: float) -> Stage:
+def _joint_stage(recipe: PlanarRecipe, share: float) -> Stage:
     """Stage 3: joint optimisation, with perturbed opacities and slowly moving planes."""
     strategy = strategy_of(recipe)
     perturb_at = Every(
@@ -486,18 +486,18 @@ def _joint(recipe: PlanarRecipe, share: float) -> Stage:
         name="3 joint optimisation",
         share=share,
         renderer=_training_renderer(recipe, "all"),
-        losses=_joint_terms(recipe, strategy),
+        losses=_reflection_stage_terms(recipe, strategy),
         rates=_gaussian_rates(recipe)
-        | plane_rates(JOINT_FACTOR)
+        | plane_rates(JOINT_RATE_FACTOR)
         | ({"primary.log_intensity": Rate(recipe.rates.intensity)} if recipe.intensity else {}),
         actions=(
-            *_turns(recipe),
-            *_missing(recipe, _joint_start(recipe) + JOINED_AFTER),
+            *_reflection_actions(recipe),
+            *_seed_actions(recipe, _joint_start(recipe) + SEED_AFTER_JOINT),
             *strategy.edits,
             actions.GrowSh(Every(recipe.intervals.sh)),
             actions.Densify(recipe.densify, part="glass"),
             *strategy.resets,
-            *_clearing(recipe),
+            *_mcmc_resets(recipe),
             *((FillUnseen(),) if recipe.seed_reflections else ()),
             actions.PerturbOpacity(perturb_at, recipe.perturbation.amplitude, recipe.perturbation.bounds),
         ),
@@ -513,10 +513,12 @@ def _gaussian_rates(recipe: PlanarRecipe) -> dict[str, Rate]:
 
 def _glass_post_steps(recipe: PlanarRecipe) -> tuple[PostStep, ...]:
     """Steps that clamp transmittances, before parameters are averaged."""
-    return (glass_only_darkens,) if recipe.tint else ()
+    return (clamp_transmittances,) if recipe.tint else ()
 
 
-def _joint_terms(recipe: PlanarRecipe, strategy: actions.DensificationStrategy) -> tuple[losses.LossTerm, ...]:
+def _reflection_stage_terms(
+    recipe: PlanarRecipe, strategy: actions.DensificationStrategy
+) -> tuple[losses.LossTerm, ...]:
     glass = losses.weighted_terms(
         losses.LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, losses.tint_prior)
     )
@@ -528,29 +530,29 @@ def _early_resets(recipe: PlanarRecipe, strategy: actions.DensificationStrategy)
     return strategy.resets if recipe.early_resets else ()
 
 
-def _turns(recipe: PlanarRecipe) -> tuple[TurnReflections | LightLamps, ...]:
+def _reflection_actions(recipe: PlanarRecipe) -> tuple[TurnReflections | LightLamps, ...]:
     """The actions on reflections and lamps behind glass, if enabled."""
     return (TurnReflections((_joint_start(recipe) + TURN_AFTER,)), LightLamps()) if recipe.turn_reflections else ()
 
 
-ADJUSTED_AFTER, JOINED_AFTER = 0.005, 0.003
+SEED_AFTER_ADJUSTMENT, SEED_AFTER_JOINT = 0.005, 0.003
 """Shares of a run after the start of plane adjustment and of joint optimisation at which missing objects are searched
 for: early, but with known panes, behind which nothing is added."""
 
 
-def _missing(recipe: PlanarRecipe, moment: float) -> tuple[actions.SeedUnexplained, ...]:
+def _seed_actions(recipe: PlanarRecipe, moment: float) -> tuple[actions.SeedUnexplained, ...]:
     """The search for missing objects, if enabled."""
     return (actions.SeedUnexplained((moment,), planar_renderer(recipe)),) if recipe.seed_unexplained else ()
 
 
-CLEARED_AFTER = 0.02
+MCMC_RESET_AFTER = 0.02
 """Share of a run after the start of joint optimisation at which `mcmc` resets opacities: after reflections behind
 glass were moved, which needs opaque Gaussians."""
 
 
-def _clearing(recipe: PlanarRecipe) -> tuple[actions.ResetOpacity, ...]:
+def _mcmc_resets(recipe: PlanarRecipe) -> tuple[actions.ResetOpacity, ...]:
     """The single reset of `mcmc`; `default` has its own."""
-    moment = _joint_start(recipe) + CLEARED_AFTER
+    moment = _joint_start(recipe) + MCMC_RESET_AFTER
     # A second one would be after the stop.
     once = Every(moment, stop=1.5 * moment)
     return (actions.ResetOpacity(once),) if recipe.strategy == "mcmc" and recipe.turn_reflections else ()

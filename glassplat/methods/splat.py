@@ -38,10 +38,10 @@ def splat_stages(recipe: SplatRecipe, seed: int, iterations: int = PUBLISHED_ITE
     first = Stage(
         name="splat",
         share=1.0,
-        renderer=_bare(recipe),
+        renderer=_training_renderer(recipe),
         losses=(image_term(recipe.ssim_weight), *strategy.terms),
         rates=recipe.rates.of("primary", recipe.view_dependence_weight),
-        actions=(*_missing(recipe), *strategy.edits, GrowSh(Every(recipe.intervals.sh)), *strategy.resets),
+        actions=(*_seed_actions(recipe), *strategy.edits, GrowSh(Every(recipe.intervals.sh)), *strategy.resets),
         post_steps=strategy.post_steps,
         densify_until=strategy.densify_until,
     )
@@ -52,13 +52,13 @@ def splat_stages(recipe: SplatRecipe, seed: int, iterations: int = PUBLISHED_ITE
         losses = (*last.losses, term)
         with_normals = any(known.function is disc_normals for known in losses)
         name = f"{last.name}, {term.name}"
-        stages.append(replace(last, name=name, renderer=_bare(recipe, normal=with_normals), losses=losses))
+        stages.append(replace(last, name=name, renderer=_training_renderer(recipe, normal=with_normals), losses=losses))
         began = start
     stages[-1] = replace(stages[-1], share=1 - began)
     return with_learned_corrections(recipe, tuple(stages))
 
 
-def _bare(recipe: SplatRecipe, *, normal: bool = False) -> Splat:
+def _training_renderer(recipe: SplatRecipe, *, normal: bool = False) -> Splat:
     """The renderer with only the layers that the losses need."""
     return Splat(recipe.background or BLACK, depth=False, normal=normal)
 
@@ -67,10 +67,10 @@ SEED_AT = (0.105, 0.203)
 """Shares of a run at which missing objects are searched for, as in `planar`."""
 
 
-def _missing(recipe: SplatRecipe) -> tuple[SeedUnexplained, ...]:
+def _seed_actions(recipe: SplatRecipe) -> tuple[SeedUnexplained, ...]:
     """The search for missing objects, if enabled."""
     wanted = recipe.seed_unexplained and recipe.primitive == "ellipsoid" and recipe.strategy == "default"
-    return tuple(SeedUnexplained((moment,), _bare(recipe)) for moment in SEED_AT if wanted)
+    return tuple(SeedUnexplained((moment,), _training_renderer(recipe)) for moment in SEED_AT if wanted)
 
 
 def strategy_of(recipe: MethodRecipe) -> DensificationStrategy:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import PointCloud
-from glassplat.methods.mirrors import made_mirrors, mirror_lookalikes
+from glassplat.methods.mirrors import mirror_lookalikes, turn_into_mirrors
 from glassplat.render.frame import Renderer
 from glassplat.scene import logit
 from glassplat.scene.camera import Camera
@@ -26,9 +26,9 @@ from glassplat.training.stage import TrainState
 
 LARGEST_MISS = 0.35
 """Maximum distance of an optical axis from the common point, as a share of the camera's distance."""
-SHARE = 0.6
+REGION_SHARE = 0.6
 """Radius of the region, as a share of the nearest camera's distance."""
-LARGER_PART, ROUNDS = 0.6, 10
+MAJORITY_SHARE, SELECTION_ROUNDS = 0.6, 10
 """Minimum share of cameras that look at it, and number of iterations of their selection."""
 
 
@@ -44,23 +44,25 @@ def reflective_region(cameras: Sequence[Camera]) -> tuple[float, float, float, f
     found = _common_point(centers, forward)
     if found is None:
         return None
-    ahead, misses = _seen_from(found, centers, forward)
+    ahead, misses = _axis_misses(found, centers, forward)
     if not bool(ahead.float().mean() > 0.9) or float(misses.mean()) > LARGEST_MISS:
-        for _ in range(ROUNDS):
+        for _ in range(SELECTION_ROUNDS):
             away = torch.where(ahead, misses, torch.inf)
-            kept = away.argsort()[: math.ceil(LARGER_PART * len(cameras))]
+            kept = away.argsort()[: math.ceil(MAJORITY_SHARE * len(cameras))]
             found = _common_point(centers[kept], forward[kept])
             if found is None:
                 return None
-            ahead, misses = _seen_from(found, centers, forward)
+            ahead, misses = _axis_misses(found, centers, forward)
         centers, ahead, misses = centers[kept], ahead[kept], misses[kept]
         if not bool(ahead.all()) or float(misses.mean()) > LARGEST_MISS / 2:
             return None
     x, y, z = found.tolist()
-    return x, y, z, SHARE * float((found - centers).norm(dim=1).min())
+    return x, y, z, REGION_SHARE * float((found - centers).norm(dim=1).min())
 
 
-def _seen_from(point: torch.Tensor, centers: torch.Tensor, forward: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _axis_misses(
+    point: torch.Tensor, centers: torch.Tensor, forward: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
     """[C] bool: point in front of each camera; and [C] distance of the axis from it, as a share of the camera's
     distance.
     """
@@ -82,7 +84,7 @@ MOST_CELLS = 32
 """Maximum number of cells along an edge of the box by default; that of the paper (EnvGS, Section 4.3)."""
 GAUSSIANS_PER_PIXEL = 0.5
 """Default number of Gaussians per pixel of a photograph."""
-NARROWEST = 1e-3
+LEAST_SIDE = 1e-3
 """Minimum side of the box, as a share of the largest, for coplanar points."""
 
 
@@ -97,7 +99,7 @@ def percentile_box(points: PointCloud, outside: float) -> tuple[Tensor, Tensor]:
     positions = points.positions.double()
     low, high = (positions.quantile(share, dim=0) for share in (outside, 1 - outside))
     middle, half = (low + high) / 2, (high - low) / 2
-    half = half.clamp(min=NARROWEST * max(float(half.max()), 1e-9))
+    half = half.clamp(min=LEAST_SIDE * max(float(half.max()), 1e-9))
     return (middle - half).float(), (middle + half).float()
 
 
@@ -193,7 +195,7 @@ class AddEnvironment:
 
 
 @dataclass(frozen=True)
-class StayMatte:
+class SkipReflections:
     """Warns that a run is too short for reflections; adds an environment that nothing reflects.
 
     Attributes:
@@ -226,22 +228,22 @@ class AddSurroundings:
 
     def __call__(self, state: TrainState, dataset: Dataset, matte: Tensor) -> None:
         """Edits `state`; `matte` [N] bool are the primary Gaussians that may be copied."""
-        parts = [part for part in self._parts(state, dataset, matte) if len(part)]
+        parts = [part for part in self._initial_sets(state, dataset, matte) if len(part)]
         # Nothing to copy if everything reflects.
-        found = reduce(Gaussians.concat, parts or [self._in_box(state, dataset)])
+        found = reduce(Gaussians.concat, parts or [self._gaussians_in_box(state, dataset)])
         ordered, _ = apply_edit(found, {}, sort_by_morton_code(found.means), part="surroundings")
         state.scene = replace(state.scene, surroundings=ordered)
 
-    def _parts(self, state: TrainState, dataset: Dataset, matte: Tensor) -> list[Gaussians]:
+    def _initial_sets(self, state: TrainState, dataset: Dataset, matte: Tensor) -> list[Gaussians]:
         """The set with the highest active SH degree, which the result has, comes first."""
         parts = []
         if self.start.source != "box":
             parts.append(copied_surroundings(state.scene.primary, matte, sh_degree=self.sh_degree))
         if self.start.source != "scene":
-            parts.append(self._in_box(state, dataset))
+            parts.append(self._gaussians_in_box(state, dataset))
         return parts
 
-    def _in_box(self, state: TrainState, dataset: Dataset) -> Gaussians:
+    def _gaussians_in_box(self, state: TrainState, dataset: Dataset) -> Gaussians:
         cells = self.start.cells or suitable_cells(dataset.photograph_pixels, self.start.per_cell)
         found = surroundings_in_box(
             percentile_box(dataset.points, self.start.outside),
@@ -263,7 +265,7 @@ class BeginReflections:
         surroundings: adds near surroundings; None if only the environment is reflected.
         mirrors: search for mirrors.
         renderer: renderer of the previous stage.
-        harmonics_wait: if mirrors were found, reset the SH degree to 0, because higher coefficients have learned their
+        reset_sh_degree: if mirrors were found, reset the SH degree to 0, because higher coefficients have learned their
             reflections.
     """
 
@@ -271,7 +273,7 @@ class BeginReflections:
     surroundings: AddSurroundings | None
     mirrors: MirrorSearch
     renderer: Renderer
-    harmonics_wait: bool = False
+    reset_sh_degree: bool = False
 
     def __call__(self, state: TrainState, dataset: Dataset) -> Generator[Working, None, bool]:
         """Edits `state`."""
@@ -284,8 +286,8 @@ class BeginReflections:
         if self.surroundings is not None:
             self.surroundings(state, dataset, seen & ~mirrors)
         if self.mirrors.begin_found:
-            primary = made_mirrors(self.mirrors, state.scene, dataset.train, mirrors)
-            if self.harmonics_wait and bool(mirrors.any()):
+            primary = turn_into_mirrors(self.mirrors, state.scene, dataset.train, mirrors)
+            if self.reset_sh_degree and bool(mirrors.any()):
                 primary = replace(primary, active_sh_degree=0)
             state.scene = replace(state.scene, primary=primary)
             names = [f"primary.{name}" for name in primary.tensors()]

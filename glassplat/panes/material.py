@@ -77,7 +77,7 @@ class Likeness(NamedTuple):
         return usual or (self.slope > SURE_SLOPE and self.correlation > SURE_CORRELATION)
 
 
-class JudgedPane(NamedTuple):
+class MirrorCandidate(NamedTuple):
     """A pane that may be a mirror.
 
     pane: a single plane, aligned to the photographs as if it were a mirror; like: its likeness to one there;
@@ -146,7 +146,7 @@ def reduced_photograph(scene: Scene, view: View) -> Photograph:
     return Photograph(camera.resize(size[1], size[0]), pixels, valid == 1, labels)
 
 
-def judged_pane(scene: Scene, label: int, photographs: Sequence[Photograph]) -> JudgedPane:
+def mirror_candidate(scene: Scene, label: int, photographs: Sequence[Photograph]) -> MirrorCandidate:
     """Likeness of a pane to a mirror, on the plane that maximises it.
 
     A mirror transmits nothing, so its photograph is the mirrored scene. Glass mostly shows objects behind it, which are
@@ -177,7 +177,7 @@ def judged_pane(scene: Scene, label: int, photographs: Sequence[Photograph]) -> 
         "pane %d: slope %.2f, correlation %.2f, of %.1f %% of it, on a plane %.2f degrees from the fitted one",
         label, *like, 100 * len(mirrored) / max(shown, 1), degrees_between(inner.planes.normals[0], pane.normals[0]),
     )  # fmt: skip
-    judged = JudgedPane(inner.planes, like, len(mirrored), shown)
+    judged = MirrorCandidate(inner.planes, like, len(mirrored), shown)
     if inner is not fitted and judged.is_mirror:
         inner = polished_pane(inner, telling)
     return judged._replace(pane=replace(inner.planes, half_sizes=pane.half_sizes))

@@ -14,13 +14,13 @@ from torch.nn.functional import normalize
 
 from glassplat.captures.view import CAMERA_FROM_PICTURE, FOLDER, View, normals_reader
 from glassplat.methods.mirrors import (
-    FACING,
-    facing,
-    made_mirrors,
+    LEAST_NORMAL_LENGTH,
     mirror_lookalikes,
-    neighbours,
+    nearest_neighbours,
+    normals_from_views,
     residual_spreads,
-    seen_normals,
+    rotate_to_normals,
+    turn_into_mirrors,
 )
 from glassplat.render.layers import contributions
 from glassplat.render.splat import Splat
@@ -120,9 +120,9 @@ def test_mirrors_are_looked_for_in_the_region_and_where_something_is_seen() -> N
 def test_depths_tell_which_way_a_surface_faces(discs: bool) -> None:
     scene = slope(discs=discs)
     with torch.no_grad():
-        sums = seen_normals(scene, views(0.0))[inner(scene)]
+        sums = normals_from_views(scene, views(0.0))[inner(scene)]
     # A disc that is seen edge-on covers no pixel, and some hide behind others.
-    told = sums.norm(dim=1) > FACING
+    told = sums.norm(dim=1) > LEAST_NORMAL_LENGTH
     normals = normalize(sums[told], dim=1)
     assert float(told.float().mean()) > 0.8
     assert float((normals @ true_normal()).mean()) > math.cos(math.radians(4))
@@ -131,7 +131,7 @@ def test_depths_tell_which_way_a_surface_faces(discs: bool) -> None:
 def test_a_surface_counts_by_the_cosine_at_which_it_is_seen() -> None:
     scene = slope()
     with torch.no_grad():
-        sums, pixels = seen_normals(scene, views(0.0)), contributions(scene, camera())
+        sums, pixels = normals_from_views(scene, views(0.0)), contributions(scene, camera())
     rays = normalize(scene.primary.means, dim=1)
     chosen = inner(scene) & (pixels > 1)
     expected = (pixels * -(rays @ true_normal()))[chosen]
@@ -147,7 +147,7 @@ def test_estimated_normals_say_it_before_depths_do(tmp_path: Path, estimated: bo
     (view,) = views(0.0)
     view = replace(view, read_normals=normals_reader(tmp_path / FOLDER / "0.npy", view.camera))
     chosen = inner(scene)
-    made = made_mirrors(replace(SEARCH, estimated_normals=estimated), scene, [view], chosen).select(chosen)
+    made = turn_into_mirrors(replace(SEARCH, estimated_normals=estimated), scene, [view], chosen).select(chosen)
     expected = elsewhere if estimated else true_normal()
     assert float((normal_axes(made) @ expected).abs().min()) > math.cos(math.radians(8))
 
@@ -155,7 +155,7 @@ def test_estimated_normals_say_it_before_depths_do(tmp_path: Path, estimated: bo
 def test_what_was_found_becomes_a_flat_mirror_and_nothing_else_changes() -> None:
     scene = slope()
     chosen = inner(scene) & (scene.primary.means[:, 0] < 0)
-    mirrors = made_mirrors(SEARCH, scene, views(0.0), chosen)
+    mirrors = turn_into_mirrors(SEARCH, scene, views(0.0), chosen)
     for name, tensor in mirrors.tensors().items():
         assert torch.equal(tensor[~chosen], scene.primary.tensors()[name][~chosen]), name
     found = mirrors.select(chosen)
@@ -171,7 +171,7 @@ def test_a_normal_is_turned_on_the_shortest_way() -> None:
     generator = torch.Generator().manual_seed(1)
     gaussians = slope().primary
     wanted = normalize(torch.randn(len(gaussians), 3, generator=generator), dim=1)
-    quats, _ = facing(gaussians, wanted, 0.0)
+    quats, _ = rotate_to_normals(gaussians, wanted, 0.0)
     before, after = rotation_from_quat(gaussians.quats)[..., 2], rotation_from_quat(quats)[..., 2]
     torch.testing.assert_close((after * wanted).sum(1).abs(), torch.ones(len(wanted)), atol=1e-5, rtol=0)
     # No further than from one line to the other.
@@ -183,14 +183,14 @@ def test_a_normal_that_is_right_or_opposite_stays() -> None:
     gaussians = slope().primary
     now = normal_axes(gaussians)
     for wanted in (now, -now):
-        quats, _ = facing(gaussians, wanted, 0.0)
+        quats, _ = rotate_to_normals(gaussians, wanted, 0.0)
         torch.testing.assert_close(rotation_from_quat(quats), rotation_from_quat(gaussians.quats), atol=1e-5, rtol=0)
 
 
 def test_discs_are_turned_and_keep_their_size() -> None:
     discs = slope(discs=True).primary
     wanted = true_normal().expand(len(discs), 3)
-    quats, log_scales = facing(discs, wanted, -1.0)
+    quats, log_scales = rotate_to_normals(discs, wanted, -1.0)
     assert torch.equal(log_scales, discs.log_scales)
     cosines = (rotation_from_quat(quats)[..., 2] * wanted).sum(1).abs()
     torch.testing.assert_close(cosines, torch.ones(len(discs)), atol=1e-5, rtol=0)
@@ -198,6 +198,6 @@ def test_discs_are_turned_and_keep_their_size() -> None:
 
 def test_each_point_is_its_own_first_neighbour() -> None:
     points = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [1.2, 0, 0]])
-    assert neighbours(points, 2).tolist() == [[0, 1], [1, 2], [2, 1]]
-    assert neighbours(points, 9).shape == (3, 3)
-    assert neighbours(points[:0], 4).shape[0] == 0
+    assert nearest_neighbours(points, 2).tolist() == [[0, 1], [1, 2], [2, 1]]
+    assert nearest_neighbours(points, 9).shape == (3, 3)
+    assert nearest_neighbours(points[:0], 4).shape[0] == 0

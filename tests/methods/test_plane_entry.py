@@ -14,15 +14,15 @@ from glassplat.methods import planar
 from glassplat.methods.planar import (
     PaneSetup,
     TurnReflections,
-    mirrors_among,
-    reflects_little,
+    coplanar_panes,
+    detected_mirrors,
+    is_reflection_uncovered,
+    mirror_virtual_gaussians,
     seed_reflection,
-    surfaces,
-    turn_virtual_scene_round,
 )
 from glassplat.panes import PlaneFit, material
 from glassplat.panes.fit import with_mirrors
-from glassplat.panes.material import JudgedPane, Likeness, mostly_reflections, reflections_behind, virtual_points
+from glassplat.panes.material import Likeness, MirrorCandidate, mostly_reflections, reflections_behind, virtual_points
 from glassplat.scene.camera import mirror_matrices
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
@@ -52,7 +52,7 @@ def mirrored(points: torch.Tensor) -> torch.Tensor:
 def test_what_is_behind_a_mirror_moves_to_its_front() -> None:
     scene = true_scene()
     state = state_of(scene)
-    turn_virtual_scene_round(state, tiny_capture(), PANE)
+    mirror_virtual_gaussians(state, tiny_capture(), PANE)
     means, before = state.scene.primary.means, scene.primary.means
     kept = (before[:, None] == means).all(dim=-1).any(dim=1)
     moved = int((~kept).sum())
@@ -78,7 +78,10 @@ def test_little_is_reflected_where_less_than_half_of_all_views_together_is_cover
 ) -> None:
     covered = iter([10.0, second])
     monkeypatch.setattr(material, "mirrored_coverage", lambda *_: (next(covered), 100))
-    assert finished(reflects_little(true_scene(), PANE, [view.camera for view in tiny_capture().train[:2]])) == expected
+    assert (
+        finished(is_reflection_uncovered(true_scene(), PANE, [view.camera for view in tiny_capture().train[:2]]))
+        == expected
+    )
 
 
 def test_a_capture_from_the_front_gets_the_mirrored_points() -> None:
@@ -109,10 +112,10 @@ def test_glass_lies_where_a_mirror_has_been_aligned(monkeypatch: pytest.MonkeyPa
     def judged(scene: Scene, dataset: Any, labels: Any) -> Any:
         yield from ()
         aligned = material.moved_pane(scene, torch.tensor([0.02, 0.01, 0.05])).planes
-        return {aligned.labels[0]: JudgedPane(aligned, Likeness(0.9, 0.9), 1000, 1000)}
+        return {aligned.labels[0]: MirrorCandidate(aligned, Likeness(0.9, 0.9), 1000, 1000)}
 
-    monkeypatch.setattr(planar, "judged_panes", judged)
-    monkeypatch.setattr(planar, "fitted_planes", lambda *_: PANE)
+    monkeypatch.setattr(planar, "mirror_candidates", judged)
+    monkeypatch.setattr(planar, "capture_planes", lambda *_: PANE)
     finished(PaneSetup(PlaneFit(), glass_count=50, seed=0)(state, tiny_capture()))
     planes, glass = state.scene.planes, state.scene.glass
     assert planes.mirrors == planes.labels
@@ -139,8 +142,8 @@ def test_panes_side_by_side_get_the_points_of_one() -> None:
     scene = true_scene()
     case = replace(scene, primary=scene.primary.select(scene.primary.means[:, 2] > 1.5))
     halves = split_in_two(PANE)
-    (front,) = surfaces(halves, mirrors=False)
-    assert surfaces(halves, mirrors=True) == []
+    (front,) = coplanar_panes(halves, mirrors=False)
+    assert coplanar_panes(halves, mirrors=True) == []
     whole, both = state_of(case), state_of(replace(case, planes=halves))
     assert finished(seed_reflection(whole, tiny_capture(), PANE)) and finished(
         seed_reflection(both, tiny_capture(), front)
@@ -155,10 +158,10 @@ def test_panes_side_by_side_get_the_points_of_one() -> None:
 
 def test_mirrors_and_glass_in_one_plane_are_apart() -> None:
     doors = with_mirrors(split_in_two(PANE), (2,), 0.99)
-    assert [panes.labels for panes in surfaces(doors, mirrors=True)] == [(2,)]
-    assert [panes.labels for panes in surfaces(doors, mirrors=False)] == [(1,)]
+    assert [panes.labels for panes in coplanar_panes(doors, mirrors=True)] == [(2,)]
+    assert [panes.labels for panes in coplanar_panes(doors, mirrors=False)] == [(1,)]
     mirrors = with_mirrors(split_in_two(PANE), (1, 2), 0.99)
-    assert [panes.labels for panes in surfaces(mirrors, mirrors=True)] == [(1, 2)]
+    assert [panes.labels for panes in coplanar_panes(mirrors, mirrors=True)] == [(1, 2)]
 
 
 def test_mirrors_are_named_and_start_at_their_reflectance() -> None:
@@ -254,9 +257,9 @@ def test_a_pane_of_a_glass_front_is_a_mirror_only_beyond_doubt(slope: float, exp
     one, other = pane(2.0, half=0.4), pane(2.0, half=0.4, label=2)
     beside = replace(other, centers=one.centers + one.axes()[0])
     planes = joined(one, beside)
-    glass = JudgedPane(one, Likeness(0.14, 0.2), 5000, 8000)
-    alike = JudgedPane(beside, Likeness(slope, 0.5), 5000, 8000)
-    assert mirrors_among(planes, {1: glass, 2: alike}) == expected
+    glass = MirrorCandidate(one, Likeness(0.14, 0.2), 5000, 8000)
+    alike = MirrorCandidate(beside, Likeness(slope, 0.5), 5000, 8000)
+    assert detected_mirrors(planes, {1: glass, 2: alike}) == expected
     unknown = glass._replace(compared=10)
-    assert mirrors_among(planes, {1: unknown, 2: alike}) == [2]
-    assert mirrors_among(planes, {2: alike}) == [2]
+    assert detected_mirrors(planes, {1: unknown, 2: alike}) == [2]
+    assert detected_mirrors(planes, {2: alike}) == [2]

@@ -42,7 +42,7 @@ def begun(
     search: MirrorSearch | None = None,
     *,
     near: bool = True,
-    harmonics_wait: bool = False,
+    reset_sh_degree: bool = False,
 ) -> tuple[TrainState, list[str]]:
     """A state in which reflections have begun, and what was told on the way."""
     state = TrainState(TracedRecipe(sh_degree=1).initialise(tiny_capture()), seed=0)
@@ -50,7 +50,7 @@ def begun(
     ones = {name: torch.ones_like(tensor) for name, tensor in state.scene.primary.tensors().items()}
     state.optimizer.moments = {f"primary.{name}": (tensor, tensor.clone()) for name, tensor in ones.items()}
     around = AddSurroundings(SurroundingsStart("scene"), 1) if near else None
-    setup = BeginReflections(AddEnvironment(2), around, search or MirrorSearch(), Splat(), harmonics_wait)
+    setup = BeginReflections(AddEnvironment(2), around, search or MirrorSearch(), Splat(), reset_sh_degree)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("glassplat.methods.surroundings.mirror_lookalikes", found)
         messages, _ = followed(setup(state, tiny_capture()))
@@ -105,7 +105,7 @@ def test_mirrors_are_searched_for_but_not_in_the_papers(kind: type[DeferredRecip
 def test_what_colors_have_learnt_of_mirrors_is_left_out_if_there_are_any(
     found: Found, begin_found: bool, degree: int
 ) -> None:
-    state, _ = begun(found, MirrorSearch(begin_found=begin_found), harmonics_wait=True)
+    state, _ = begun(found, MirrorSearch(begin_found=begin_found), reset_sh_degree=True)
     assert state.scene.primary.active_sh_degree == degree
     assert begun(found, MirrorSearch(begin_found=begin_found))[0].scene.primary.active_sh_degree == 1
 
@@ -113,5 +113,5 @@ def test_what_colors_have_learnt_of_mirrors_is_left_out_if_there_are_any(
 @pytest.mark.parametrize("recipe", [DeferredRecipe(), TracedRecipe()])
 def test_colors_wait_until_normals_have_spread(recipe: DeferredRecipe | TracedRecipe) -> None:
     stage = recipe.stages(0, 7000)[1]
-    assert isinstance(stage.setup, BeginReflections) and stage.setup.harmonics_wait
+    assert isinstance(stage.setup, BeginReflections) and stage.setup.reset_sh_degree
     assert any(isinstance(action, GrowShAfterPropagation) for action in stage.actions)

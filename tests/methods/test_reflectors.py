@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from glassplat.captures.view import View, evenly
-from glassplat.methods.mirrors import Search, in_region, residual_spreads
+from glassplat.methods.mirrors import ReflectionMeasure, in_region, residual_spreads
 from glassplat.render.deferred import Deferred
 from glassplat.render.layers import contributions
 from glassplat.scene import SH_ZERO, logit
@@ -48,7 +48,7 @@ def views(*left: float) -> list[View]:
 
 @pytest.mark.parametrize("strength", [1e-3, 0.1, 0.5, 0.9])
 def test_what_reflects_counts_by_its_strength_and_by_what_is_seen_of_it(strength: float) -> None:
-    share = Search().reflective(two_discs(strength=strength), views(0, 0))
+    share = ReflectionMeasure().reflective_share(two_discs(strength=strength), views(0, 0))
     assert share == pytest.approx((strength + 1e-3) / 2, abs=1e-3)
 
 
@@ -56,18 +56,18 @@ def test_what_lies_elsewhere_does_not_count() -> None:
     scene = two_discs(strength=0.9)
     scene = replace(scene, environment=replace(scene.environment, region=(-0.5, 0.0, 2.0, 0.3)))
     assert in_region(scene).tolist() == [True, False]
-    assert Search().reflective(scene, views(0)) == pytest.approx(0.9, abs=1e-3)
+    assert ReflectionMeasure().reflective_share(scene, views(0)) == pytest.approx(0.9, abs=1e-3)
     everywhere = replace(scene, environment=replace(scene.environment, region=None))
-    assert Search().reflective(everywhere, views(0)) == pytest.approx(0.45, abs=1e-3)
+    assert ReflectionMeasure().reflective_share(everywhere, views(0)) == pytest.approx(0.45, abs=1e-3)
     nowhere = replace(scene, environment=replace(scene.environment, region=(0.0, 0.0, 9.0, 0.3)))
-    assert Search().reflective(nowhere, views(0)) == 0.0
+    assert ReflectionMeasure().reflective_share(nowhere, views(0)) == 0.0
 
 
 def test_a_residual_that_is_the_same_in_all_views_does_not_turn() -> None:
     shown, spreads = residual_spreads(two_discs(), views(0.3, 0.3, 0.3, 0.3), Deferred())
     torch.testing.assert_close(shown, 4 * contributions(two_discs(), camera()))
     assert spreads.max() < 0.01
-    assert Search().turning(two_discs(), views(0.3, 0.3), Deferred()) == 0.0
+    assert ReflectionMeasure().view_dependent_share(two_discs(), views(0.3, 0.3), Deferred()) == 0.0
 
 
 def test_a_residual_that_turns_has_the_spread_of_the_photographs() -> None:
@@ -89,8 +89,8 @@ def test_what_views_ignore_says_nothing() -> None:
 
 def test_only_what_does_not_reflect_yet_can_be_overlooked() -> None:
     turning = views(0.3, -0.3, 0.3, -0.3)
-    assert Search().turning(two_discs(), turning, Deferred()) == pytest.approx(0.5, abs=1e-3)
-    assert Search().turning(two_discs(strength=0.9), turning, Deferred()) == 0.0
+    assert ReflectionMeasure().view_dependent_share(two_discs(), turning, Deferred()) == pytest.approx(0.5, abs=1e-3)
+    assert ReflectionMeasure().view_dependent_share(two_discs(strength=0.9), turning, Deferred()) == 0.0
 
 
 def test_views_are_taken_evenly() -> None:

@@ -21,8 +21,8 @@ from glassplat.panes.material import (
     Likeness,
     about_local_mean,
     degrees_between,
-    judged_pane,
     likeness,
+    mirror_candidate,
     photographs_of,
     reduced_photograph,
 )
@@ -59,7 +59,7 @@ def photographs(scene: Scene) -> list[View]:
 def mirror_labels(scene: Scene, views: Sequence[View]) -> tuple[int, ...]:
     """Labels of the panes that are mirrors."""
     photographed = photographs_of(scene, views)
-    judged = {label: judged_pane(scene, label, photographed) for label in scene.planes.labels}
+    judged = {label: mirror_candidate(scene, label, photographed) for label in scene.planes.labels}
     return tuple(label for label, found in judged.items() if found.is_mirror)
 
 
@@ -76,7 +76,7 @@ def test_glass_before_darkness_is_no_mirror() -> None:
     before = scene.primary.means[:, 2] < scene.planes.centers[0, 2]
     dark = replace(scene, primary=scene.primary.select(before))
     views = photographs(dark)
-    found = judged_pane(dark, 1, photographs_of(dark, views))
+    found = mirror_candidate(dark, 1, photographs_of(dark, views))
     assert found.like.correlation > MIRROR_CORRELATION
     assert found.like.slope == pytest.approx(0.15, abs=0.05)
     assert not found.is_mirror
@@ -100,7 +100,7 @@ def test_an_exposure_does_not_turn_a_mirror_into_glass() -> None:
 def test_a_pane_of_which_hardly_anything_is_known_stays_glass() -> None:
     """Of a glass front that mirrors what no photograph shows, some spots may well agree with it."""
     scene = scene_with(0.2)
-    found = judged_pane(scene, 1, photographs_of(scene, photographs(scene_with(0.995))))
+    found = mirror_candidate(scene, 1, photographs_of(scene, photographs(scene_with(0.995))))
     assert found.is_mirror and FEWEST_PIXELS <= found.compared <= found.shown
     assert not found._replace(shown=round(1.05 * found.compared / LEAST_SHARE)).is_mirror
     assert not found._replace(compared=FEWEST_PIXELS - 1).is_mirror
@@ -112,7 +112,7 @@ def test_a_mirror_is_found_and_put_right_where_its_fitted_plane_is_tilted() -> N
     tilt = torch.tensor([[math.tan(math.radians(2.0)), 0.0, 0.0]])
     tilted = replace(unknown, planes=replace(unknown.planes, raw_normals=unknown.planes.normals + tilt))
     before = degrees_between(tilted.planes.normals[0], true.planes.normals[0])
-    found = judged_pane(tilted, 1, photographs_of(tilted, photographs(true)))
+    found = mirror_candidate(tilted, 1, photographs_of(tilted, photographs(true)))
     assert before == pytest.approx(2.0, abs=0.01)
     assert found.is_mirror
     assert degrees_between(found.pane.normals[0], true.planes.normals[0]) < 0.2
@@ -122,7 +122,7 @@ def test_a_mirror_is_found_and_put_right_where_its_fitted_plane_is_tilted() -> N
 def test_a_mirror_stays_where_its_fitted_plane_is_right() -> None:
     """Aligning moves even a true plane a little, for hardly any gain."""
     unknown = scene_with(0.2)
-    found = judged_pane(unknown, 1, photographs_of(unknown, photographs(scene_with(0.995))))
+    found = mirror_candidate(unknown, 1, photographs_of(unknown, photographs(scene_with(0.995))))
     assert found.is_mirror
     assert torch.equal(found.pane.centers, unknown.planes.centers)
     torch.testing.assert_close(found.pane.normals, unknown.planes.normals)

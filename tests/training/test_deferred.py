@@ -13,7 +13,14 @@ import torch
 
 from glassplat.captures.view import View
 from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
-from glassplat.methods.mirrors import ENDED, RAISED, Propagate, RefineEnvironment, ResetRaised, Search
+from glassplat.methods.mirrors import (
+    OPACITIES_RAISED,
+    PROPAGATION_ENDED,
+    Propagate,
+    RefineEnvironment,
+    ReflectionMeasure,
+    ResetRaised,
+)
 from glassplat.methods.recipe import recipe_from_json, recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import RunDirectory, RunSettings
@@ -133,12 +140,12 @@ def test_propagation_and_resets_never_meet() -> None:
     ids=["no end", "before a regular reset", "nothing raised", "lowered", "after the last one", "late", "too late"],
 )
 def test_opacities_are_reset_once_after_propagation(raised: int, ended: int | None, resets: list[int]) -> None:
-    action = ResetRaised.instead_of(ResetOpacity(Every(0.1, stop=0.4, only_multiples_of=3)))
+    action = ResetRaised.replacing(ResetOpacity(Every(0.1, stop=0.4, only_multiples_of=3)))
     state, done = fresh_state(), []
     for step in range(1, 101):
         clock = Clock(step, 100, 5)
-        state.records |= {RAISED: step} if step == raised else {}
-        state.records |= {ENDED: step} if step == ended else {}
+        state.records |= {OPACITIES_RAISED: step} if step == raised else {}
+        state.records |= {PROPAGATION_ENDED: step} if step == ended else {}
         if action.due(clock) and action.apply(state, tiny_capture(), clock):
             done.append(step)
     assert done == resets
@@ -174,23 +181,23 @@ def test_raised_opacities_are_held_for_a_while() -> None:
 
 
 @dataclass(frozen=True)
-class Told(Search):
+class Told(ReflectionMeasure):
     """Finds what it is told, in this order."""
 
     reflects: tuple[float, ...] = ()
     turns: float = 0.0
     asked: list[int] = field(default_factory=list)
 
-    def reflective(self, scene: Scene, views: Sequence[View]) -> float:
+    def reflective_share(self, scene: Scene, views: Sequence[View]) -> float:
         self.asked.append(1)
         return self.reflects[min(len(self.asked), len(self.reflects)) - 1]
 
-    def turning(self, scene: Scene, views: Sequence[View], renderer: Deferred) -> float:
+    def view_dependent_share(self, scene: Scene, views: Sequence[View], renderer: Deferred) -> float:
         return self.turns
 
 
 def propagated(
-    search: Search,
+    search: ReflectionMeasure,
     schedule: PropagationSchedule,
     intervals: int = 10,
     *,
@@ -242,7 +249,7 @@ def test_propagation_ends_when_no_more_reflectors_are_found(
 ) -> None:
     schedule = PropagationSchedule(end=end, stop=0.9, patience=2)
     state, done = propagated(Told(reflects=tuple(shares), turns=turns), schedule)
-    assert state.records[ENDED] == ended
+    assert state.records[PROPAGATION_ENDED] == ended
     # From the first reset on, at the intervals that resets leave, until the end.
     assert done == [step for step in (40, 50, 70, 80) if step < ended]
 
@@ -276,7 +283,7 @@ def test_a_region_without_gaussians_is_named(caplog: pytest.LogCaptureFixture) -
     state = fresh_state()
     environment = Environment(torch.zeros(6, 1, 1, 3), region=(50.0, 0.0, 0.5, 2.0))
     state.scene = replace(state.scene, environment=environment)
-    propagated(Search(), PropagationSchedule(patience=2), state=state)
+    propagated(ReflectionMeasure(), PropagationSchedule(patience=2), state=state)
     (warning,) = [record.getMessage() for record in caplog.records]
     assert "uses the learning rates of splat" in warning
     assert "no Gaussian lies in the sphere outside which nothing reflects, of radius 2 around (50, 0, 0.5)" in warning
@@ -284,7 +291,7 @@ def test_a_region_without_gaussians_is_named(caplog: pytest.LogCaptureFixture) -
 
 def test_rates_that_stay_are_not_said_to_rise(caplog: pytest.LogCaptureFixture) -> None:
     schedule, told = PropagationSchedule(end="fixed", stop=0.5), Told(reflects=(0.0,))
-    action = Propagate(Every(0.1, stop=0.5), NormalPropagation(), schedule, Deferred(), search=told)
+    action = Propagate(Every(0.1, stop=0.5), NormalPropagation(), schedule, Deferred(), measure=told)
     action.apply(fresh_state(), tiny_capture(), Clock(50, 100, 5))
     assert "little or nothing reflective" in caplog.text and "the learning rates of splat" not in caplog.text
 
@@ -298,7 +305,7 @@ def test_where_something_reflects_the_rates_rise_if_that_is_asked_for(
         Told(reflects=(0.4,)), PropagationSchedule(patience=2), raises_rates_found=action.raises_rates_found
     )
     assert state.optimizer.raised_rates == ({"primary.sh": 3.0} if recipe.raise_rates_found else {})
-    assert state.records[ENDED] > 10
+    assert state.records[PROPAGATION_ENDED] > 10
 
 
 def test_where_nothing_reflects_the_rates_are_those_of_splat() -> None:
@@ -388,7 +395,7 @@ def test_a_reset_leaves_the_steps_to_recover(iterations: int, end: Literal["sett
         state.records = {}
         for clock, reset in moments:
             if clock.step >= ended:
-                state.records |= {ENDED: ended, RAISED: ended - 1}
+                state.records |= {PROPAGATION_ENDED: ended, OPACITIES_RAISED: ended - 1}
             if reset.apply(state, capture, clock):
                 done.append(clock.step)
         assert all(iterations - step >= 450 for step in done), ended
@@ -458,12 +465,14 @@ def test_the_shortest_run_refines_its_environment_in_full(iterations: int) -> No
 def test_propagation_ends_in_runs_of_any_length(iterations: int) -> None:
     schedule = PropagationSchedule(end="fixed", stop=0.61)
     state = fresh_state()
-    action = Propagate(Every(1 / 3, stop=0.61), NormalPropagation(), schedule, Deferred(), search=Told(reflects=(0.5,)))
+    action = Propagate(
+        Every(1 / 3, stop=0.61), NormalPropagation(), schedule, Deferred(), measure=Told(reflects=(0.5,))
+    )
     for step in range(1, iterations + 1):
         clock = Clock(step, iterations, 5)
         if action.due(clock):
             action.apply(state, tiny_capture(), clock)
-    assert state.records[ENDED] == pytest.approx(0.61 * iterations, abs=0.5)
+    assert state.records[PROPAGATION_ENDED] == pytest.approx(0.61 * iterations, abs=0.5)
 
 
 def test_the_recipe_survives_json() -> None:

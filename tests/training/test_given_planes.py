@@ -17,7 +17,7 @@ from glassplat.captures.view import PointCloud
 from glassplat.cli.main import main
 from glassplat.errors import InputError
 from glassplat.files.sidecars import read_planes, write_planes
-from glassplat.methods.planar import PaneSetup, fitted_planes
+from glassplat.methods.planar import PaneSetup, capture_planes
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.options import CLEAR_GLASS
 from glassplat.panes import PlaneFit, PlaneFitError
@@ -51,7 +51,7 @@ def test_a_run_without_masks_takes_the_rectangle(capture: Path, tmp_path: Path) 
 def test_hand_written_values_are_few(capture: Path) -> None:
     entry = {"label": 3, "center": [0, 0, 2], "normal": [0, 0, 1], "tangent": [1, 0, 0], "half_sizes": [0.5, 0.4]}
     (capture / "planes.json").write_text(json.dumps([entry]))
-    planes = fitted_planes(load_dataset(capture), None, PlaneFit())
+    planes = capture_planes(load_dataset(capture), None, PlaneFit())
     assert planes.labels == (3,) and planes.mirrors == ()
     assert float(planes.base_reflectances) == pytest.approx(CLEAR_GLASS)
 
@@ -60,7 +60,7 @@ def test_glass_of_unknown_reflectance_starts_where_the_options_say_and_known_gla
     dataset, fit = load_dataset(capture), PlaneFit(glass_reflectance=0.15)
     for given, expected in ((CLEAR_GLASS, 0.15), (0.3, 0.3)):
         logits = torch.logit(torch.tensor([given]))
-        planes = fitted_planes(replace(dataset, planes=replace(PANE, logit_reflectances=logits)), None, fit)
+        planes = capture_planes(replace(dataset, planes=replace(PANE, logit_reflectances=logits)), None, fit)
         assert float(planes.base_reflectances) == pytest.approx(expected)
 
 
@@ -69,7 +69,7 @@ def test_panes_that_only_masks_name_are_fitted_beside_it() -> None:
     points = torch.cat([tiny_capture().points.positions, pane_frame(PANE)])
     cloud = PointCloud(points, torch.zeros(len(points), 3, dtype=torch.uint8))
     dataset = replace(tiny_capture(), points=cloud, planes=other)
-    planes = fitted_planes(dataset, None, PlaneFit())
+    planes = capture_planes(dataset, None, PlaneFit())
     assert planes.labels == (1, 2)
     torch.testing.assert_close(planes.centers[1], other.centers[0])
     assert float((planes.normals[0] @ PANE.normals[0]).abs()) > 0.99
@@ -94,11 +94,11 @@ def test_a_rectangle_of_another_frame_is_refused(capture: Path) -> None:
 
 def test_a_rectangle_that_is_not_where_the_masks_show_the_pane_is_refused() -> None:
     dataset, aside = tiny_capture(), PANE.centers + 2 * PANE.half_sizes.max() * PANE.axes()[0]
-    assert len(fitted_planes(replace(dataset, planes=PANE), None, PlaneFit())) == 1
+    assert len(capture_planes(replace(dataset, planes=PANE), None, PlaneFit())) == 1
     with pytest.raises(PlaneFitError, match=r"disagree about the position of pane 1: \d+% of .* Mark it again"):
-        fitted_planes(replace(dataset, planes=replace(PANE, centers=aside)), None, PlaneFit())
+        capture_planes(replace(dataset, planes=replace(PANE, centers=aside)), None, PlaneFit())
     elsewhere = replace(PANE, centers=aside, labels=(2,))
-    assert fitted_planes(replace(dataset, planes=elsewhere, pane_labels=()), None, PlaneFit()).labels == (2,)
+    assert capture_planes(replace(dataset, planes=elsewhere, pane_labels=()), None, PlaneFit()).labels == (2,)
 
 
 def test_a_damaged_file_is_named(capture: Path) -> None:

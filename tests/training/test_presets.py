@@ -14,7 +14,7 @@ from glassplat.cli import main
 from glassplat.cli.train import SCENE
 from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.methods.glossy_recipes import DeferredRecipe
-from glassplat.methods.mirrors import ENDED, DensifyWhilePropagating, Propagate, ResetRaised
+from glassplat.methods.mirrors import PROPAGATION_ENDED, DensifyWhilePropagating, Propagate, ResetRaised
 from glassplat.methods.planar import PaneSetup
 from glassplat.methods.planar_recipe import PlanarRecipe, ReflectionWeights
 from glassplat.methods.recipe import RECIPES, recipe_of, recipe_to_json
@@ -332,7 +332,7 @@ def test_densification_waits_longer_while_normals_spread() -> None:
     (action,) = [a for a in recipe.stages(0)[1].actions if isinstance(a, DensifyWhilePropagating)]
 
     def acted(ended: bool) -> list[int]:
-        state = TrainState(true_scene(), seed=0, records={ENDED: 1} if ended else {})
+        state = TrainState(true_scene(), seed=0, records={PROPAGATION_ENDED: 1} if ended else {})
         steps = []
         for step in range(100, 1001, 100):
             state.statistics["primary"] = seen([0.0] * len(state.scene.primary))
