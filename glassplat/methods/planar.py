@@ -195,7 +195,7 @@ def mirror_candidates(
     scene: Scene, dataset: Dataset, labels: Sequence[int]
 ) -> Generator[Working, None, dict[int, material.MirrorCandidate]]:
     """Mirror score of each pane, by label."""
-    photographs = material.photographs_of(scene, dataset.train) if labels else []
+    photographs = material.reduced_photographs(scene, dataset.train) if labels else []
     candidates = {}
     for done, label in enumerate(labels):
         yield Working("detecting mirrors", done, len(labels))
@@ -210,7 +210,7 @@ def detected_mirrors(planes: Planes, candidates: Mapping[int, material.MirrorCan
     for group in coplanar_groups(planes, rows):
         labels = {planes.labels[row] for row in group}
         if any(candidates[label].is_known for label in labels - mirrors):
-            mirrors -= {label for label in labels if candidates[label].like.slope < material.SURE_SLOPE}
+            mirrors -= {label for label in labels if candidates[label].regression.slope < material.SURE_SLOPE}
     return [label for label in candidates if label in mirrors]
 
 
@@ -290,7 +290,7 @@ class LightLamps(AtShares):
         rows = [row for row, label in enumerate(scene.planes.labels) if label not in scene.planes.mirrors]
         if not rows:
             return False
-        photographs = material.photographs_of(scene, dataset.train)
+        photographs = material.reduced_photographs(scene, dataset.train)
         lamps = material.mirrored_lamps(scene, scene.planes.select(rows), photographs)
         if lamps is None:
             return False
@@ -317,7 +317,7 @@ class FillUnseen(AtShares):
         glass_panes = coplanar_panes(state.scene.planes, mirrors=False)
         for done, panes in enumerate(glass_panes):
             yield Working(f"searching for what {name_panes(panes, 'pane')} can reflect", done, len(glass_panes))
-            positions, color, cell = material.unseen_places(state.scene, panes, cameras)
+            positions, color, cell = material.unseen_positions(state.scene, panes, cameras)
             if 0 < len(positions) < actions.MOST_ADDED_SHARE * len(state.scene.primary):
                 colors = (255 * color).round().to(torch.uint8).expand(len(positions), 3)
                 cloud = PointCloud(positions.cpu(), colors.cpu())

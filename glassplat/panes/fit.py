@@ -14,7 +14,7 @@ from torch import Tensor
 
 from glassplat.panes import PlaneFit, PlaneFitError, masks, search
 from glassplat.panes.material import virtual_points
-from glassplat.panes.objective import MIDDLE, JointObjective, Objective, edge_matches, pane_rectangle
+from glassplat.panes.objective import MIDDLE_TOLERANCE, JointObjective, Objective, edge_matches, pane_rectangle
 from glassplat.scene import logit
 from glassplat.scene.camera import Camera, NumpyCamera
 from glassplat.scene.panes import Planes, connected_components, name_labels
@@ -22,38 +22,38 @@ from glassplat.scene.panes import Planes, connected_components, name_labels
 Array = NDArray[np.float64]
 log = logging.getLogger("glassplat.panes")
 
-LEAST_MEETING, LEAST_OF_MEDIAN = 0.3, 0.5
+LEAST_MATCHING, LEAST_OF_MEDIAN = 0.3, 0.5
 """Minimum share of a mask's outline that must meet the others, absolute and relative to the median over the masks."""
 EDGES_PER_VIEW = 100
 
 
 def report_masks(label: int, plane: masks.FramedPlanes, views: Sequence[masks.PaneView]) -> None:
     """Logs how well each mask of a pane fits the others on its plane, and warns of those that do not fit, by name."""
-    meeting, overlap = meeting_of_each(plane, views), masks.agreement_of_each(plane.planes, views)
-    shares = ["nothing to compare" if np.isnan(share) else f"{share:.0%}" for share in meeting]
+    matching, overlap = matching_outline_shares(plane, views), masks.agreement_per_view(plane.planes, views)
+    shares = ["nothing to compare" if np.isnan(share) else f"{share:.0%}" for share in matching]
     found = [f"{view.name} {share}" for view, share in zip(views, shares, strict=True)]
     areas = ", ".join(f"{name} ({area:.2f})" for name, area in zip(found, overlap, strict=True))
     log.debug("pane %d: outlines of the masks that meet those of the others (and overlap): %s", label, areas)
     log.info(
         "pane %d: %d masks, which overlap by %.2f to %.2f on its plane", label, len(views), min(overlap), max(overlap)
     )
-    odd = odd_ones(meeting).nonzero()[0]
-    if len(odd):
+    outliers = outlier_masks(matching).nonzero()[0]
+    if len(outliers):
         log.warning(
             "pane %d: %d of its %d masks do not fit the others, their outlines hardly meet on any plane: %s; "
             "check that each belongs to its photograph, and that label %d is the same flat pane in it",
-            label, len(odd), len(views), ", ".join(found[number] for number in odd), label,
+            label, len(outliers), len(views), ", ".join(found[number] for number in outliers), label,
         )  # fmt: skip
 
 
-def odd_ones(meeting: Array) -> NDArray[np.bool_]:
-    """[V] bool: masks that do not fit the others, from the shares of `meeting_of_each`; possibly all of them."""
-    known = meeting[~np.isnan(meeting)]
-    limit = max(LEAST_MEETING, LEAST_OF_MEDIAN * float(np.median(known))) if len(known) else 0.0
-    return np.asarray(meeting < limit)
+def outlier_masks(matching: Array) -> NDArray[np.bool_]:
+    """[V] bool: masks that do not fit the others, from `matching_outline_shares`; possibly all of them."""
+    known = matching[~np.isnan(matching)]
+    limit = max(LEAST_MATCHING, LEAST_OF_MEDIAN * float(np.median(known))) if len(known) else 0.0
+    return np.asarray(matching < limit)
 
 
-def meeting_of_each(plane: masks.FramedPlanes, views: Sequence[masks.PaneView]) -> Array:
+def matching_outline_shares(plane: masks.FramedPlanes, views: Sequence[masks.PaneView]) -> Array:
     """[V] share of each mask's outline that meets those of the others on one plane; NaN if nothing is compared.
 
     The overlap of areas does not identify wrong masks: masks of a pane from other positions overlap by half or more,
@@ -61,16 +61,16 @@ def meeting_of_each(plane: masks.FramedPlanes, views: Sequence[masks.PaneView]) 
     meets none of the others either, and none of them meets it.
     """
     views = [_without_shared_edges(view) for view in views]
-    tolerance = max(MIDDLE, *(1 / view.diagonal for view in views))
+    tolerance = max(MIDDLE_TOLERANCE, *(1 / view.diagonal for view in views))
     matches = edge_matches(plane.planes, views, edges_per_view=EDGES_PER_VIEW)
-    met = 1 / (1 + matches.residuals(plane.frames, tolerance)[0] ** 2)
-    compared = matches.compared[0] & ~np.isnan(met)
+    matching = 1 / (1 + matches.residuals(plane.frames, tolerance)[0] ** 2)
+    compared = matches.compared[0] & ~np.isnan(matching)
     shares = np.full(len(views), np.nan)
     for number in range(len(views)):
-        concerned = compared & (matches.sources == number)
-        concerned[number] |= compared[number]
-        if concerned.any():
-            shares[number] = met[concerned].mean()
+        used = compared & (matches.sources == number)
+        used[number] |= compared[number]
+        if used.any():
+            shares[number] = matching[used].mean()
     return shares
 
 
@@ -78,22 +78,22 @@ def _without_shared_edges(view: masks.PaneView) -> masks.PaneView:
     """The view without edges that other panes may occlude; distances next to other panes become NaN."""
     from scipy import ndimage
 
-    beside: NDArray[np.bool_] = ndimage.binary_dilation(view.hidden, iterations=2)
+    near_others: NDArray[np.bool_] = ndimage.binary_dilation(view.hidden, iterations=2)
     column, row = np.floor(view.edge).astype(np.int64).T
-    kept = ~beside[np.minimum(row, beside.shape[0] - 1), np.minimum(column, beside.shape[1] - 1)]
-    distance = np.where(beside, np.nan, view.distance)
+    kept = ~near_others[np.minimum(row, near_others.shape[0] - 1), np.minimum(column, near_others.shape[1] - 1)]
+    distance = np.where(near_others, np.nan, view.distance)
     return replace(view, edge=view.edge[kept], outward=view.outward[kept], distance=distance)
 
 
-LEAST_APART = 0.01
+LEAST_CAMERA_SPREAD = 0.01
 """Distance between annotated cameras below which no plane is fitted, in scene extents."""
-UNSURE, VERY_UNSURE = 2.5, 5.0
+UNCERTAIN_DEG, TOO_UNCERTAIN_DEG = 2.5, 5.0
 """Tilt uncertainties of a plane, in degrees, above which more masks are requested, and above which it is refused. For
 24 of 27 panes it is at most 1.5. Beyond, weak evidence misleads: a small mirror with 3.6, marked in four photographs
 from nearly the same position, was off by 29."""
 MOST_CONTRADICTION = 0.7
 """Value of `contradiction` above which a plane is refused."""
-MOST_LOSS = 0.04
+MOST_EXCESS = 0.04
 """Maximum excess of the `contradiction` of a plane shared with other panes over that of a pane's own. It is 0.03 for
 two well measured panes at an angle of 2 degrees, 0.05 at 3 degrees, and 0.03 where chance preferred a plane to the true
 one."""
@@ -103,7 +103,7 @@ MOST_CAMERAS = 100
 
 
 @dataclass(frozen=True)
-class _Pane:
+class _FittedRectangle:
     """One fitted pane, as NumPy arrays."""
 
     center: Array
@@ -131,9 +131,9 @@ def fit_planes(
     alone often prefers a wall or the floor. Points are optional, because further planes are drawn through the masks.
 
     Gaussians may mislead, so each pane is fitted to the measured points as well. Of the two planes, the one with better
-    support by masks and measured points is kept (`best_supported`). Panes of one front share a plane, fitted to the
-    masks of all (`JointObjective`), unless it fits one of them worse than its own. A pane that mirrors many points,
-    such as a mirror with ragged masks, is positioned by them (`plane_of_images`).
+    support by masks and measured points is kept (`highest_scoring_plane`). Panes of one front share a plane, fitted to
+    the masks of all (`JointObjective`), unless it fits one of them worse than its own. A pane that mirrors many points,
+    such as a mirror with ragged masks, is positioned by them (`plane_of_mirror_images`).
 
     Args:
         centers: [N, 3] centres of the primary Gaussians, or SfM points.
@@ -160,25 +160,25 @@ def fit_planes(
         raise PlaneFitError(
             f"none of the {len(annotations)} masks names a pane; expected pixels with labels 1, 2, ... in at least two"
         )
-    clouds = {"the points" if measured is None else "the Gaussians": _usable(centers)}
+    clouds = {"the points" if measured is None else "the Gaussians": _finite_points(centers)}
     if measured is not None:
-        clouds = {"the measured points": _usable(measured)} | clouds
+        clouds = {"the measured points": _finite_points(measured)} | clouds
     found = []
     for label in labels:
-        views = masks.pane_views(annotations, label, most=options.most_views, names=names)
-        with _advice(label, len(labels)):
-            found.append(_found_pane(label, clouds, views, extent=extent, options=options))
+        views = masks.pane_views(annotations, label, most_views=options.most_views, names=names)
+        with _with_advice(label, len(labels)):
+            found.append(_fit_pane(label, clouds, views, extent=extent, options=options))
     cameras = [camera for camera, _ in annotations] + [camera for _, camera in unmarked]
     cloud = next(iter(clouds.values()))
     panes = []
-    for pane in _in_one_plane(found, options.seed):
-        with _advice(pane.label, len(labels)):
-            panes.append(_finish(_placed_by_images(pane, cloud, cameras, options), options, unmarked))
-    return _planes(panes, labels, options).to(centers.device)
+    for pane in _share_planes(found, options.seed):
+        with _with_advice(pane.label, len(labels)):
+            panes.append(_finish_pane(_place_by_mirror_images(pane, cloud, cameras, options), options, unmarked))
+    return _to_planes(panes, labels, options).to(centers.device)
 
 
 @contextmanager
-def _advice(label: int, count: int) -> Iterator[None]:
+def _with_advice(label: int, count: int) -> Iterator[None]:
     """Adds advice to the error about a pane without a plane, if it is one of several."""
     try:
         yield
@@ -189,17 +189,17 @@ def _advice(label: int, count: int) -> Iterator[None]:
         raise PlaneFitError(f"{error}. {without}") from error
 
 
-def _usable(positions: Tensor) -> Array:
+def _finite_points(positions: Tensor) -> Array:
     points: Array = positions.detach().cpu().double().numpy()
     return points[np.isfinite(points).all(axis=1)]
 
 
-class _UndecidedError(ValueError):
+class _UndeterminedError(ValueError):
     """The masks of a pane do not determine its plane."""
 
 
 @dataclass(frozen=True)
-class _Found:
+class _PanePlane:
     """A pane and its plane, before its rectangle is fitted.
 
     Attributes:
@@ -217,33 +217,35 @@ class _Found:
     is_settled: bool = False
 
     @property
-    def has_few(self) -> bool:
+    def has_two_views(self) -> bool:
         """Return whether only two views show it."""
         return len(self.evidence.views) == 2
 
     @property
-    def is_open(self) -> bool:
+    def is_undetermined(self) -> bool:
         """Return whether its own masks do not determine its plane reliably."""
-        return isinstance(self.fault, _UndecidedError) or (self.has_few and self.fault is None and not self.is_settled)
+        return isinstance(self.fault, _UndeterminedError) or (
+            self.has_two_views and self.fault is None and not self.is_settled
+        )
 
 
-def _found_pane(
+def _fit_pane(
     label: int, clouds: Mapping[str, Array], views: Sequence[masks.PaneView], *, extent: float, options: PlaneFit
-) -> _Found:
+) -> _PanePlane:
     """The pane on the plane of its masks, or on that of the masks with gaps filled if these contradict it.
 
     Gaps between parts of a pane lie on its plane. But the edges of a post occluding it meet on a plane of their own,
     and may tilt the pane's plane towards that.
     """
     _check_views(label, views, extent)
-    found = _fitted_pane(label, clouds, views, extent=extent, options=options)
+    found = _fit_plane(label, clouds, views, extent=extent, options=options)
     filled = [masks.without_gaps(view) for view in views]
     if all(other is view for other, view in zip(filled, views, strict=True)):
         return found
-    whole = _fitted_pane(label, clouds, filled, extent=extent, options=options)
-    if whole.fault is not None or _tilt_degrees(whole.plane, whole.evidence) > UNSURE:
+    whole = _fit_plane(label, clouds, filled, extent=extent, options=options)
+    if whole.fault is not None or _tilt_degrees(whole.plane, whole.evidence) > UNCERTAIN_DEG:
         return found
-    if found.fault is None and _loss(whole, found.plane) <= MOST_LOSS:
+    if found.fault is None and _excess_contradiction(whole, found.plane) <= MOST_EXCESS:
         return found
     log.info(
         "pane %d: without the gaps of its masks, where it may be occluded, its plane is %.2f degrees away; "
@@ -252,9 +254,9 @@ def _found_pane(
     return whole
 
 
-def _fitted_pane(
+def _fit_plane(
     label: int, clouds: Mapping[str, Array], views: Sequence[masks.PaneView], *, extent: float, options: PlaneFit
-) -> _Found:
+) -> _PanePlane:
     """The pane on the plane that masks and the first cloud support best, of those fitted with each cloud."""
     objectives = {}
     for source, points in clouds.items():
@@ -265,68 +267,70 @@ def _fitted_pane(
     for source, objective in objectives.items():
         rng = np.random.default_rng((options.seed, label))
         plane = search.best_plane(objective, hypotheses=options.hypotheses, refine=options.refined, rng=rng)
-        fault = _fault(plane, objective, options)
-        sound += [search.Fit(source, plane)] if fault is None else []
-        faulty += [] if fault is None else [_Found(label, evidence, plane, fault)]
-    return _Found(label, evidence, search.best_supported(label, sound, evidence)) if sound else faulty[0]
+        fault = _find_fault(plane, objective, options)
+        sound += [search.PlaneCandidate(source, plane)] if fault is None else []
+        faulty += [] if fault is None else [_PanePlane(label, evidence, plane, fault)]
+    return _PanePlane(label, evidence, search.highest_scoring_plane(label, sound, evidence)) if sound else faulty[0]
 
 
-def _fault(plane: masks.FramedPlanes, objective: Objective, options: PlaneFit) -> ValueError | None:
+def _find_fault(plane: masks.FramedPlanes, objective: Objective, options: PlaneFit) -> ValueError | None:
     """The reason not to trust the plane of a pane; None if there is none."""
     try:
         _check_agreement(plane.planes, objective.views, options.least_agreement)
-        _check_outlines(plane, objective)
-        if (degrees := _tilt_degrees(plane, objective)) > VERY_UNSURE:
-            raise _UndecidedError(_left_open(degrees, objective))
+        _check_contradiction(plane, objective)
+        if (degrees := _tilt_degrees(plane, objective)) > TOO_UNCERTAIN_DEG:
+            raise _UndeterminedError(_tilt_message(degrees, objective))
     except ValueError as error:
         return error
     return None
 
 
-def _in_one_plane(found: Sequence[_Found], seed: int) -> list[_Found]:
+def _share_planes(found: Sequence[_PanePlane], seed: int) -> list[_PanePlane]:
     """The panes; those of one front share a plane, fitted to the masks of all.
 
     A pane whose plane is undetermined, because its outlines are few or cut off, may take that of another pane.
     """
     panes = {pane.label: pane for pane in found}
-    for labels in _neighbours(found):
-        joint = _joint([panes[label] for label in labels], seed)
+    for labels in _groups_in_one_surface(found):
+        joint = _fit_joint_plane([panes[label] for label in labels], seed)
         panes |= {pane.label: pane for pane in joint}
-    trusted = [pane for pane in panes.values() if pane.fault is None and not pane.has_few]
-    return [_choose_plane(pane, trusted) if pane.is_open else pane for pane in panes.values()]
+    trusted = [pane for pane in panes.values() if pane.fault is None and not pane.has_two_views]
+    return [_choose_plane(pane, trusted) if pane.is_undetermined else pane for pane in panes.values()]
 
 
-def _choose_plane(pane: _Found, trusted: Sequence[_Found]) -> _Found:
+def _choose_plane(pane: _PanePlane, trusted: Sequence[_PanePlane]) -> _PanePlane:
     """The pane on the best plane of another pane that fits about as well as its own; unchanged if there is none."""
-    losses = [_loss(pane, other.plane) for other in trusted]
-    if not losses or min(losses) > MOST_LOSS:
+    excesses = [_excess_contradiction(pane, other.plane) for other in trusted]
+    if not excesses or min(excesses) > MOST_EXCESS:
         return pane
-    other = trusted[int(np.argmin(losses))]
+    other = trusted[int(np.argmin(excesses))]
     reason = pane.fault or "two views alone leave it open"
     log.warning("pane %d gets the plane of pane %d, on which its masks meet: %s", pane.label, other.label, reason)
     return replace(pane, plane=other.plane, fault=None, is_settled=True)
 
 
-def _placed_by_images(pane: _Found, cloud: Array, cameras: Sequence[Camera], options: PlaneFit) -> _Found:
+def _place_by_mirror_images(pane: _PanePlane, cloud: Array, cameras: Sequence[Camera], options: PlaneFit) -> _PanePlane:
     """The pane on the plane that mirrors points seen through it onto others; unchanged if there is no clear one.
 
-    Its masks limit the loss on that plane as for a plane shared with other panes (`MOST_LOSS`).
+    Its masks limit the loss on that plane as for a plane shared with other panes (`MOST_EXCESS`).
     """
-    if pane.is_settled or not (pane.fault is None or pane.is_open):
+    if pane.is_settled or not (pane.fault is None or pane.is_undetermined):
         return pane
     try:
-        outlined = _pane(pane.plane.planes, pane.evidence.views, options.margin)
+        outlined = _fit_rectangle(pane.plane.planes, pane.evidence.views, options.margin)
     except ValueError:
         return pane
     some = cameras[:: -(-len(cameras) // MOST_CAMERAS)]
     some = [replace(camera, cam_from_world=camera.cam_from_world.float()) for camera in some]
-    panes = _planes([outlined], [pane.label], options)
+    panes = _to_planes([outlined], [pane.label], options)
     seen = virtual_points(torch.from_numpy(cloud).float(), panes, some).numpy()
-    images = search.plane_of_images(pane.plane.planes, outlined.center, cloud[seen], cloud[~seen], pane.evidence.extent)
+    images = search.plane_of_mirror_images(
+        pane.plane.planes, outlined.center, cloud[seen], cloud[~seen], pane.evidence.extent
+    )
     if images is None or not images.is_clear:
         return pane
     plane = masks.FramedPlanes(images.plane, pane.plane.frames)
-    if _loss(pane, plane) > MOST_LOSS:
+    if _excess_contradiction(pane, plane) > MOST_EXCESS:
         return pane
     log.info(
         "pane %d: %.0f points seen through it are mirror images of others on a plane %.2f degrees from that of its "
@@ -336,39 +340,39 @@ def _placed_by_images(pane: _Found, cloud: Array, cameras: Sequence[Camera], opt
     return replace(pane, plane=plane, fault=None, is_settled=True)
 
 
-def _loss(pane: _Found, plane: masks.FramedPlanes) -> float:
+def _excess_contradiction(pane: _PanePlane, plane: masks.FramedPlanes) -> float:
     """The excess of the `contradiction` of a plane over that of the pane's own plane."""
     return float((search.contradiction(plane, pane.evidence) - search.contradiction(pane.plane, pane.evidence))[0])
 
 
-def _neighbours(found: Sequence[_Found]) -> list[list[int]]:
+def _groups_in_one_surface(found: Sequence[_PanePlane]) -> list[list[int]]:
     """Groups of labels of panes with trusted planes that may lie in one surface, directly or through other panes."""
     panes = {pane.label: pane for pane in found if pane.fault is None}
 
     def may_share(one: int, other: int) -> bool:
         first, second = panes[one], panes[other]
-        return search.in_one_surface(first.plane, second.plane, (first.evidence, second.evidence))
+        return search.may_share_surface(first.plane, second.plane, (first.evidence, second.evidence))
 
     return [group for group in connected_components(list(panes), may_share) if len(group) > 1]
 
 
-def _joint(panes: Sequence[_Found], seed: int) -> list[_Found]:
+def _fit_joint_plane(panes: Sequence[_PanePlane], seed: int) -> list[_PanePlane]:
     """The panes that a joint plane fits about as well as their own planes, on that plane."""
     panes = list(panes)
     while len(panes) > 1:
         objective = JointObjective([pane.evidence for pane in panes])
         rng = np.random.default_rng((seed, *(pane.label for pane in panes)))
         plane = search.best_joint_plane(objective, masks.join_planes([pane.plane for pane in panes]), rng)
-        losses = [_loss(pane, plane) for pane in panes]
-        if max(losses) <= MOST_LOSS:
+        excesses = [_excess_contradiction(pane, plane) for pane in panes]
+        if max(excesses) <= MOST_EXCESS:
             labels, turned = name_labels(pane.label for pane in panes), max(search.angle(p.plane, plane) for p in panes)
             log.info("panes %s lie in one plane, within %.2f degrees", labels, np.degrees(turned))
             return [replace(pane, plane=plane, is_settled=True) for pane in panes]
-        del panes[int(np.argmax(losses))]
+        del panes[int(np.argmax(excesses))]
     return panes
 
 
-def _finish(pane: _Found, options: PlaneFit, unmarked: Sequence[tuple[str, Camera]]) -> _Pane:
+def _finish_pane(pane: _PanePlane, options: PlaneFit, unmarked: Sequence[tuple[str, Camera]]) -> _FittedRectangle:
     """The pane with its rectangle.
 
     Raises:
@@ -378,25 +382,25 @@ def _finish(pane: _Found, options: PlaneFit, unmarked: Sequence[tuple[str, Camer
     try:
         if pane.fault is not None:
             raise pane.fault
-        if not pane.is_settled and (reason := _reason_to_distrust(pane)):
-            worth_marking = _worth_marking(views, unmarked)
-            log.warning("pane %d: %s; annotate it from places farther apart%s", pane.label, reason, worth_marking)
+        if not pane.is_settled and (reason := _uncertainty_message(pane)):
+            photographs = _photographs_to_mark(views, unmarked)
+            log.warning("pane %d: %s; annotate it from places farther apart%s", pane.label, reason, photographs)
         report_masks(pane.label, pane.plane, views)
-        return _pane(pane.plane.planes, views, options.margin)
+        return _fit_rectangle(pane.plane.planes, views, options.margin)
     except ValueError as error:
         raise PlaneFitError(
             f"pane {pane.label}, annotated in {len(views)} views: {error}. Check that label {pane.label} is the "
             f"same flat pane in every mask, and annotate more views, from positions far apart, that show its "
-            f"whole outline inside the image, unoccluded{_worth_marking(views, unmarked)}"
+            f"whole outline inside the image, unoccluded{_photographs_to_mark(views, unmarked)}"
         ) from error
 
 
-def _reason_to_distrust(pane: _Found) -> str:
+def _uncertainty_message(pane: _PanePlane) -> str:
     """The reason to doubt a pane's own plane, for a message; empty if there is none."""
-    if pane.has_few:
+    if pane.has_two_views:
         return "two annotated views alone often leave its plane off by tens of degrees"
     degrees = _tilt_degrees(pane.plane, pane.evidence)
-    return f"{_left_open(degrees, pane.evidence)}, and may be off by far more" if degrees > UNSURE else ""
+    return f"{_tilt_message(degrees, pane.evidence)}, and may be off by far more" if degrees > UNCERTAIN_DEG else ""
 
 
 MOST_NAMED = 3
@@ -405,22 +409,22 @@ WELL_INSIDE = 0.2
 """Minimum distance of a pane's middle from the border of an image that shows it well, as a share of the sides."""
 
 
-def _worth_marking(views: Sequence[masks.PaneView], unmarked: Sequence[tuple[str, Camera]]) -> str:
+def _photographs_to_mark(views: Sequence[masks.PaneView], unmarked: Sequence[tuple[str, Camera]]) -> str:
     """Names of photographs without masks that should show the pane well from other positions, for a message."""
-    middle = _seen_middle(views)
+    middle = _triangulate_middle(views)
     centers = [view.center for view in views]
     names: list[str] = []
     cameras = [(name, NumpyCamera.from_camera(camera)) for name, camera in unmarked]
     held = [(name, camera.center) for name, camera in cameras if camera.contains(middle, margin=-WELL_INSIDE)]
     while held and len(names) < MOST_NAMED:
-        apart = [min(_turn(middle, center, other) for other in centers) for _, center in held]
+        apart = [min(_parallax_angle(middle, center, other) for other in centers) for _, center in held]
         name, center = held.pop(int(np.argmax(apart)))
         names.append(name)
         centers.append(center)
     return f": {', '.join(names)} should show it well" if names else ""
 
 
-def _seen_middle(views: Sequence[masks.PaneView]) -> Array:
+def _triangulate_middle(views: Sequence[masks.PaneView]) -> Array:
     """[3] the point closest, in least squares, to the rays through the middles of the masks."""
     system, right = np.zeros((3, 3)), np.zeros(3)
     for view in views:
@@ -431,7 +435,7 @@ def _seen_middle(views: Sequence[masks.PaneView]) -> Array:
     return np.asarray(np.linalg.lstsq(system, right, rcond=None)[0])
 
 
-def _turn(middle: Array, center: Array, other: Array) -> float:
+def _parallax_angle(middle: Array, center: Array, other: Array) -> float:
     """Angle in radians between the directions from a point to two cameras."""
     first, second = center - middle, other - middle
     return float(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second))
@@ -443,21 +447,21 @@ def _check_views(label: int, views: Sequence[masks.PaneView], extent: float) -> 
             f"pane {label} is annotated in {len(views)} view(s), but a plane can only be found from several "
             "views: annotate at least two more, from positions far apart"
         )
-    _check_places(label, views, extent)
-    _check_outline(label, views)
+    _check_camera_spread(label, views, extent)
+    _check_outline_in_views(label, views)
 
 
-def _check_places(label: int, views: Sequence[masks.PaneView], extent: float) -> None:
+def _check_camera_spread(label: int, views: Sequence[masks.PaneView], extent: float) -> None:
     centers = np.stack([view.center for view in views])
     apart = float(np.linalg.norm(centers - centers[0], axis=1).max())
-    if apart < LEAST_APART * extent:
+    if apart < LEAST_CAMERA_SPREAD * extent:
         raise PlaneFitError(
             f"pane {label}: its {len(views)} annotated views were taken at most {apart:.3g} apart in a capture "
             f"of radius {extent:.3g}: annotate views from farther apart"
         )
 
 
-def _check_outline(label: int, views: Sequence[masks.PaneView]) -> None:
+def _check_outline_in_views(label: int, views: Sequence[masks.PaneView]) -> None:
     showing = sum(len(view.edge) > 0 for view in views)
     if showing < 2:
         raise PlaneFitError(
@@ -466,21 +470,21 @@ def _check_outline(label: int, views: Sequence[masks.PaneView]) -> None:
         )
 
 
-def _check_outlines(found: masks.FramedPlanes, objective: Objective) -> None:
-    against = float(search.contradiction(found, objective)[0])
-    if against > MOST_CONTRADICTION:
+def _check_contradiction(found: masks.FramedPlanes, objective: Objective) -> None:
+    contradiction = float(search.contradiction(found, objective)[0])
+    if contradiction > MOST_CONTRADICTION:
         raise ValueError(
-            f"the outlines of its masks meet on no plane; on the best one {against:.2f} of the evidence "
+            f"the outlines of its masks meet on no plane; on the best one {contradiction:.2f} of the evidence "
             f"contradicts it, expected at most {MOST_CONTRADICTION}"
         )
 
 
 def _tilt_degrees(found: masks.FramedPlanes, objective: Objective) -> float:
     """Tilt uncertainty of a plane in degrees (see `search.tilt_uncertainty`)."""
-    return float(np.degrees(search.tilt_uncertainty(found, objective, MIDDLE)[0]))
+    return float(np.degrees(search.tilt_uncertainty(found, objective, MIDDLE_TOLERANCE)[0]))
 
 
-def _left_open(degrees: float, objective: Objective) -> str:
+def _tilt_message(degrees: float, objective: Objective) -> str:
     """Description of a plane with the given tilt uncertainty, for a message."""
     return (
         f"the masks determine the plane only to {min(degrees, 90):.0f} degrees: they show too little of its "
@@ -497,7 +501,7 @@ def _check_agreement(plane: masks.PlaneEquations, views: Sequence[masks.PaneView
         )
 
 
-def _pane(plane: masks.PlaneEquations, views: Sequence[masks.PaneView], margin: float) -> _Pane:
+def _fit_rectangle(plane: masks.PlaneEquations, views: Sequence[masks.PaneView], margin: float) -> _FittedRectangle:
     centers = np.stack([view.center for view in views])
     normal = plane.normals[0]
     if (np.sign(plane.distances(centers)[0])).sum() < 0:
@@ -505,7 +509,7 @@ def _pane(plane: masks.PlaneEquations, views: Sequence[masks.PaneView], margin: 
     axes = np.linalg.svd(normal[None])[2][1:]
     rectangle = pane_rectangle(plane, views, axes)
     foot = plane.normals[0] * plane.offsets[0]
-    return _Pane(
+    return _FittedRectangle(
         center=foot + rectangle.center @ axes,
         normal=normal,
         tangent=rectangle.axis @ axes,
@@ -513,7 +517,7 @@ def _pane(plane: masks.PlaneEquations, views: Sequence[masks.PaneView], margin: 
     )
 
 
-def _planes(panes: Sequence[_Pane], labels: Sequence[int], options: PlaneFit) -> Planes:
+def _to_planes(panes: Sequence[_FittedRectangle], labels: Sequence[int], options: PlaneFit) -> Planes:
     def stacked(rows: list[Array]) -> Tensor:
         return torch.tensor(np.stack(rows), dtype=torch.float32)
 

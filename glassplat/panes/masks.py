@@ -142,7 +142,7 @@ def random_planes(points: Array, count: int, rng: np.random.Generator) -> PlaneE
     return PlaneEquations(normals, np.einsum("hd,hd->h", normals, a[usable]))
 
 
-def support(planes: PlaneEquations, points: Array, *, distance: float) -> Array:
+def inlier_share(planes: PlaneEquations, points: Array, *, distance: float) -> Array:
     """[H] share of the points within `distance` of each plane."""
     near: Array = (np.abs(planes.distances(points)) <= distance).mean(axis=1)
     return near
@@ -150,7 +150,7 @@ def support(planes: PlaneEquations, points: Array, *, distance: float) -> Array:
 
 Mask = NDArray[np.bool_]
 
-THINNEST_PART = 0.005  # Half width below which a part of a mask is treated as an artefact, in image diagonals.
+LEAST_HALF_WIDTH = 0.005  # Half width below which a part of a mask is treated as an artefact, in image diagonals.
 
 EDGE_SMOOTHING = 0.005
 """Standard deviation of the Gaussian that smooths a mask to find the direction of its edge, in image diagonals."""
@@ -203,7 +203,7 @@ class PaneView:
         in_camera = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], axis=1)
         return in_camera @ self.cam_from_world[:3, :3]
 
-    def sight_limits(self, pixels: Array, outward: Array) -> Array:
+    def line_plane_normals(self, pixels: Array, outward: Array) -> Array:
         """[P, 3] unit normals, in world axes, of the planes through the camera centre and lines in the image.
 
         Args:
@@ -224,23 +224,23 @@ class PaneView:
         scale = 1 / np.where(depth > 0, depth, np.inf)
         x, y = fx * x * scale + cx, fy * y * scale + cy
         height, width = self.mask.shape
-        held = (depth > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        return np.stack([x, y], axis=-1).reshape(*points.shape[:-1], 2), held.reshape(points.shape[:-1])
+        inside = (depth > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        return np.stack([x, y], axis=-1).reshape(*points.shape[:-1], 2), inside.reshape(points.shape[:-1])
 
-    def covers(self, pixels: Array, held: Mask) -> Mask:
-        """[...] bool: pixel positions [..., 2] on the pane; false where `held` is false."""
-        return held & self._read(self.mask, pixels, held)
+    def covers(self, pixels: Array, inside: Mask) -> Mask:
+        """[...] bool: pixel positions [..., 2] on the pane; false where `inside` is false."""
+        return inside & self._sample(self.mask, pixels, inside)
 
-    def tells(self, pixels: Array, held: Mask) -> Mask:
-        """[...] bool: pixel positions [..., 2] that no other pane covers; false where `held` is false."""
-        return held & ~self._read(self.hidden, pixels, held)
+    def is_unoccluded(self, pixels: Array, inside: Mask) -> Mask:
+        """[...] bool: pixel positions [..., 2] that no other pane covers; false where `inside` is false."""
+        return inside & ~self._sample(self.hidden, pixels, inside)
 
-    def _read(self, image: Mask, pixels: Array, held: Mask) -> Mask:
-        """[...] values of an image at pixel positions [..., 2]; arbitrary where `held` is false."""
-        column, row = (np.where(held, pixels[..., axis], 0).astype(np.int64) for axis in (0, 1))
+    def _sample(self, image: Mask, pixels: Array, inside: Mask) -> Mask:
+        """[...] values of an image at pixel positions [..., 2]; arbitrary where `inside` is false."""
+        column, row = (np.where(inside, pixels[..., axis], 0).astype(np.int64) for axis in (0, 1))
         return image.ravel()[row * image.shape[1] + column]
 
-    def edge_distance(self, pixels: Array) -> Array:
+    def edge_distances(self, pixels: Array) -> Array:
         """[P] signed distance to the mask's edge at pixel positions [P, 2], interpolated."""
         centred = pixels[:, ::-1].T - 0.5
         from scipy import ndimage
@@ -248,7 +248,7 @@ class PaneView:
         sampled: Array = ndimage.map_coordinates(self.distance, centred, order=1, mode="nearest")
         return sampled
 
-    def grid(self, count: int) -> Array:
+    def pixel_grid(self, count: int) -> Array:
         """[P, 2] about `count` pixel positions spread evenly over the image."""
         height, width = self.mask.shape
         step = max(np.sqrt(height * width / count), 1.0)
@@ -287,13 +287,13 @@ def pane_view(camera: Camera, labels: Tensor, label: int, *, name: str = "") -> 
     mask = _without_slivers(image == label)
     edge = _edge_points(mask)
     return PaneView(
-        cam_from_world=_array(camera.cam_from_world),
+        cam_from_world=_to_numpy(camera.cam_from_world),
         intrinsics=np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
         mask=mask,
         hidden=~mask & (image != label) & (image != 0),
         distance=_signed_distance(mask),
         edge=edge,
-        outward=_outward(mask, edge),
+        outward=_outward_normals(mask, edge),
         name=name,
     )
 
@@ -302,13 +302,13 @@ WIDEST_GAP, LEAST_FILLED = 0.04, 0.01
 """Maximum width of gaps that are filled in a mask, in image diagonals, and their minimum share of the mask."""
 
 
-GAPS_SEEN_AT = 500
+GAP_DETECTION_DIAGONAL = 500
 """Diagonal in pixels to which a mask is subsampled to detect gaps; closing those of 12 megapixels takes ten seconds."""
 
 
 def without_gaps(view: PaneView) -> PaneView:
     """The view with narrow gaps in its mask filled, such as those of occluding objects; unchanged if it has none."""
-    step = max(int(view.diagonal / GAPS_SEEN_AT), 1)
+    step = max(int(view.diagonal / GAP_DETECTION_DIAGONAL), 1)
     coarse = view.mask[::step, ::step]
     if not _is_larger(_close_gaps(coarse), coarse):
         return view
@@ -316,7 +316,7 @@ def without_gaps(view: PaneView) -> PaneView:
     if not _is_larger(mask, view.mask):
         return view
     edge = _edge_points(mask)
-    return replace(view, mask=mask, distance=_signed_distance(mask), edge=edge, outward=_outward(mask, edge))
+    return replace(view, mask=mask, distance=_signed_distance(mask), edge=edge, outward=_outward_normals(mask, edge))
 
 
 def _is_larger(mask: Mask, other: Mask) -> bool:
@@ -328,15 +328,15 @@ def _close_gaps(mask: Mask) -> Mask:
     from scipy import ndimage
 
     reach = round(WIDEST_GAP / 2 * float(np.hypot(*mask.shape))) + 1
-    window = _window(mask, 2 * reach + 1)
-    padded = np.pad(mask[window], 2 * reach, mode="edge")
+    box = _bounding_box(mask, 2 * reach + 1)
+    padded = np.pad(mask[box], 2 * reach, mode="edge")
     widened = ndimage.distance_transform_edt(~padded) < reach
     closed = np.zeros_like(mask)
-    closed[window] = (ndimage.distance_transform_edt(widened) >= reach)[2 * reach : -2 * reach, 2 * reach : -2 * reach]
+    closed[box] = (ndimage.distance_transform_edt(widened) >= reach)[2 * reach : -2 * reach, 2 * reach : -2 * reach]
     return closed
 
 
-def _array(tensor: Tensor) -> Array:
+def _to_numpy(tensor: Tensor) -> Array:
     return tensor.detach().cpu().numpy().astype(np.float64)
 
 
@@ -347,14 +347,14 @@ def _without_slivers(mask: Mask) -> Mask:
     """
     from scipy import ndimage
 
-    window, kept = _window(mask, 1), np.zeros_like(mask)
-    parts, count = ndimage.label(mask[window])
+    box, kept = _bounding_box(mask, 1), np.zeros_like(mask)
+    parts, count = ndimage.label(mask[box])
     if count == 0:
         return mask
-    half_widths = ndimage.maximum(_signed_distance(mask[window]), parts, index=np.arange(count + 1))
-    wide = half_widths > THINNEST_PART * np.hypot(*mask.shape)
+    half_widths = ndimage.maximum(_signed_distance(mask[box]), parts, index=np.arange(count + 1))
+    wide = half_widths > LEAST_HALF_WIDTH * np.hypot(*mask.shape)
     wide[0] = False
-    kept[window] = wide[parts]
+    kept[box] = wide[parts]
     return kept
 
 
@@ -366,13 +366,13 @@ def _signed_distance(mask: Mask) -> Array:
     from scipy import ndimage
 
     distance: Array = 0.5 - ndimage.distance_transform_edt(~mask)
-    window = _window(mask, 1)  # Holds the nearest outside pixel of each pixel inside.
-    inside = ndimage.distance_transform_edt(mask[window])
-    distance[window] = np.where(mask[window], inside - 0.5, distance[window])
+    box = _bounding_box(mask, 1)  # Holds the nearest outside pixel of each pixel inside.
+    inside = ndimage.distance_transform_edt(mask[box])
+    distance[box] = np.where(mask[box], inside - 0.5, distance[box])
     return distance
 
 
-def _window(mask: Mask, margin: int) -> tuple[slice, slice]:
+def _bounding_box(mask: Mask, margin: int) -> tuple[slice, slice]:
     """Rows and columns of the bounding box of a mask, extended by a margin on every side; all if the mask is empty."""
     if not mask.any():
         return slice(None), slice(None)
@@ -386,58 +386,62 @@ def _window(mask: Mask, margin: int) -> tuple[slice, slice]:
 
 def _edge_points(mask: Mask) -> Array:
     row, column = np.nonzero(mask[:, 1:] != mask[:, :-1])
-    upright = np.stack([column + 1.0, row + 0.5], axis=1)
+    vertical = np.stack([column + 1.0, row + 0.5], axis=1)
     row, column = np.nonzero(mask[1:] != mask[:-1])
-    level = np.stack([column + 0.5, row + 1.0], axis=1)
-    return np.concatenate([upright, level])
+    horizontal = np.stack([column + 0.5, row + 1.0], axis=1)
+    return np.concatenate([vertical, horizontal])
 
 
-FARTHEST_SMOOTHED = 4.0
+SMOOTHING_RADIUS = 4.0
 """Radius in standard deviations at which the Gaussian that smooths a mask is truncated."""
 
 
-def _outward(mask: Mask, edge: Array) -> Array:
+def _outward_normals(mask: Mask, edge: Array) -> Array:
     """[E, 2] unit vectors along the negative gradient of the smoothed mask at its edge points."""
     from scipy import ndimage
 
     sigma = EDGE_SMOOTHING * np.hypot(*mask.shape)
-    window = _window(mask, 2 * int(FARTHEST_SMOOTHED * sigma + 2))
-    smooth = ndimage.gaussian_filter(mask[window].astype(np.float64), sigma, mode="nearest", truncate=FARTHEST_SMOOTHED)
-    places = edge[:, ::-1].T - 0.5 - np.array([[at.start or 0] for at in window])
-    slopes = [ndimage.map_coordinates(-np.gradient(smooth, axis=axis), places, order=1) for axis in (1, 0)]
-    outward = np.stack(slopes, axis=1)
+    box = _bounding_box(mask, 2 * int(SMOOTHING_RADIUS * sigma + 2))
+    smooth = ndimage.gaussian_filter(mask[box].astype(np.float64), sigma, mode="nearest", truncate=SMOOTHING_RADIUS)
+    positions = edge[:, ::-1].T - 0.5 - np.array([[at.start or 0] for at in box])
+    gradients = [ndimage.map_coordinates(-np.gradient(smooth, axis=axis), positions, order=1) for axis in (1, 0)]
+    outward = np.stack(gradients, axis=1)
     return outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), np.finfo(np.float64).tiny)
 
 
 def pane_views(
-    annotations: Sequence[tuple[Camera, Tensor]], label: int, *, most: int = 12, names: Sequence[str] | None = None
+    annotations: Sequence[tuple[Camera, Tensor]],
+    label: int,
+    *,
+    most_views: int = 12,
+    names: Sequence[str] | None = None,
 ) -> list[PaneView]:
     """Annotated views that show a pane, ignoring parts of it that are only a few pixels wide.
 
     Args:
         annotations: cameras and their label images [H, W].
         label: of the pane.
-        most: maximum number of views. If every photograph has a mask, views that show much of the pane from positions
-            far apart are sufficient.
+        most_views: maximum number of views. If every photograph has a mask, views that show much of the pane from
+            positions far apart are sufficient.
         names: of the photographs; annotations are numbered from 1 if None.
     """
-    centers = np.array([_array(camera.center) for camera, _ in annotations])
+    centers = np.array([_to_numpy(camera.center) for camera, _ in annotations])
     shares = np.array([float((labels == label).double().mean()) for _, labels in annotations])
-    chosen = _far_apart(centers, shares, most)
+    chosen = _select_far_apart(centers, shares, most_views)
     names = names or [f"annotation {number}" for number in range(1, len(annotations) + 1)]
     views = (pane_view(*annotations[index], label, name=names[index]) for index in sorted(chosen))
     return [view for view in views if view.mask.any()]
 
 
-def _far_apart(positions: Array, values: Array, count: int) -> list[int]:
+def _select_far_apart(positions: Array, values: Array, count: int) -> list[int]:
     """Up to `count` indices of positive values, greedily by value times distance from those already chosen."""
     chosen: list[int] = []
     distance = np.ones(len(values))
     while len(chosen) < min(count, int((values > 0).sum())):
         # Views from one position have distance zero; the small constant still selects the largest value among them.
-        worth = values * (distance + 1e-9)
-        worth[chosen] = 0
-        chosen.append(int(np.argmax(worth)))
+        scores = values * (distance + 1e-9)
+        scores[chosen] = 0
+        chosen.append(int(np.argmax(scores)))
         nearest = np.linalg.norm(positions - positions[chosen[-1]], axis=1)
         distance = nearest if len(chosen) == 1 else np.minimum(distance, nearest)
     return chosen
@@ -458,12 +462,12 @@ def plane_candidates(points: Array, views: Sequence[PaneView], *, band: float) -
         views: annotated views of the pane.
         band: half width of the band along the mask's edge, as a share of the image diagonal.
     """
-    votes, held_count = np.zeros(len(points)), np.zeros(len(points))
+    votes, inside_count = np.zeros(len(points)), np.zeros(len(points))
     for view in views:
-        pixels, held = view.project(points)
-        votes[held] += np.abs(view.edge_distance(pixels[held])) <= band * view.diagonal
-        held_count += held
-    return (votes >= min(2, len(views))) & (votes >= CANDIDATE_AGREEMENT * held_count)
+        pixels, inside = view.project(points)
+        votes[inside] += np.abs(view.edge_distances(pixels[inside])) <= band * view.diagonal
+        inside_count += inside
+    return (votes >= min(2, len(views))) & (votes >= CANDIDATE_AGREEMENT * inside_count)
 
 
 RAYS_PER_VIEW = 400
@@ -472,7 +476,7 @@ UNKNOWN_WEIGHT = 0.05
 """Weight of pixels that leave the other image; it penalises planes on which hardly anything can be compared."""
 
 
-def meet(planes: PlaneEquations, origin: Array, directions: Array) -> tuple[Array, Mask]:
+def intersect_rays(planes: PlaneEquations, origin: Array, directions: Array) -> tuple[Array, Mask]:
     """Intersections [H, P, 3] of rays with planes, and [H, P] bool: those in front of the origin.
 
     Args:
@@ -500,7 +504,7 @@ def mask_agreement(planes: PlaneEquations, views: Sequence[PaneView], *, pixels_
     return agreement
 
 
-def agreement_of_each(plane: PlaneEquations, views: Sequence[PaneView]) -> Array:
+def agreement_per_view(plane: PlaneEquations, views: Sequence[PaneView]) -> Array:
     """[V] agreement of the mask of each view with those of all others on one plane; as in `mask_agreement`."""
     both, either = (pairs[0] + pairs[0].T for pairs in _overlaps(plane, views, RAYS_PER_VIEW))
     agreement: Array = both.sum(axis=1) / np.maximum(either.sum(axis=1), 1)
@@ -511,8 +515,8 @@ def _overlaps(planes: PlaneEquations, views: Sequence[PaneView], pixels_per_view
     """Pixel counts of the intersection and the union of the masks of two views; [H, V, V], from and to."""
     seen = []
     for view in views:
-        pixels = view.grid(pixels_per_view)
-        seen.append(pixels[view.tells(pixels, np.ones(len(pixels), dtype=bool))])
+        pixels = view.pixel_grid(pixels_per_view)
+        seen.append(pixels[view.is_unoccluded(pixels, np.ones(len(pixels), dtype=bool))])
     rays = Rays(
         np.repeat(np.arange(len(views)), [len(pixels) for pixels in seen]),
         np.concatenate([view.directions(pixels) for view, pixels in zip(views, seen, strict=True)]),

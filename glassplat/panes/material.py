@@ -36,7 +36,7 @@ had correlations of 0.25 and 0.30, with slopes of 0.89 and 0.98. If a coplanar p
 one glass pane of a front had 0.42, measured on 16 % of its pixels."""
 LEAST_COVERAGE = 0.95
 """Coverage of the mirrored image above which a pixel counts: holes in a coarse first scene are not dark objects."""
-WINDOW = 0.15
+MEAN_WINDOW = 0.15
 """Side of the window whose mean is subtracted, to remove differences in brightness; as a share of the image width."""
 FEWEST_PIXELS, LEAST_SHARE = 200, 0.1
 """Minimum number and share of a pane's pixels whose mirrored image is covered, for a classification. A few percent of a
@@ -60,7 +60,7 @@ FEWEST_IN_VIEW = 100
 """Minimum number of compared pixels for a photograph to count."""
 
 
-class Likeness(NamedTuple):
+class MirrorRegression(NamedTuple):
     """Regression of a pane's photographs on the image mirrored by its plane, in linear radiance.
 
     slope: change of the photograph per change of the mirrored image; 1 for a mirror, about R0 for glass.
@@ -85,7 +85,7 @@ class MirrorCandidate(NamedTuple):
     """
 
     pane: Planes
-    like: Likeness
+    regression: MirrorRegression
     compared: int
     shown: int
 
@@ -97,7 +97,7 @@ class MirrorCandidate(NamedTuple):
     @property
     def is_mirror(self) -> bool:
         """Return whether it is a mirror; false if not enough is known."""
-        return self.is_known and self.like.is_mirror
+        return self.is_known and self.regression.is_mirror
 
 
 class Photograph(NamedTuple):
@@ -124,7 +124,7 @@ class ComparedPart(NamedTuple):
     pixels: Tensor
 
 
-def photographs_of(scene: Scene, views: Sequence[View]) -> list[Photograph]:
+def reduced_photographs(scene: Scene, views: Sequence[View]) -> list[Photograph]:
     """At most `MOST_PHOTOGRAPHS` of the views, evenly spread, none wider than `REDUCED_WIDTH`."""
     return [reduced_photograph(scene, view) for view in evenly(views, MOST_PHOTOGRAPHS)]
 
@@ -163,24 +163,25 @@ def mirror_candidate(scene: Scene, label: int, photographs: Sequence[Photograph]
     pane = replace(pane, centers=pane.centers.detach(), raw_normals=pane.normals.detach())
     fitted = replace(scene, planes=replace(pane, half_sizes=INNER_SHARE * pane.half_sizes))
     regions = [compared_region(fitted, photograph) for photograph in photographs]
-    telling = [
-        ComparedPart(photograph.camera, region, about_local_mean(photograph.pixels, region)[region])
+    parts = [
+        ComparedPart(photograph.camera, region, subtract_local_mean(photograph.pixels, region)[region])
         for photograph, region in zip(photographs, regions, strict=True)
         if int(region.sum()) >= FEWEST_IN_VIEW
     ]
-    inner = aligned_pane(fitted, telling) if telling else fitted
-    pairs = [compared_pixels(inner, photograph) for photograph in photographs]
+    aligned = align_pane(fitted, parts) if parts else fitted
+    pairs = [compared_pixels(aligned, photograph) for photograph in photographs]
     shown = sum(shown for _, _, shown in pairs)
     mirrored, photographed = torch.cat([pair[0] for pair in pairs]), torch.cat([pair[1] for pair in pairs])
-    like = likeness(mirrored, photographed)
+    regression = regress_on_mirrored(mirrored, photographed)
     log.debug(
         "pane %d: slope %.2f, correlation %.2f, of %.1f %% of it, on a plane %.2f degrees from the fitted one",
-        label, *like, 100 * len(mirrored) / max(shown, 1), degrees_between(inner.planes.normals[0], pane.normals[0]),
+        label, *regression, 100 * len(mirrored) / max(shown, 1),
+        degrees_between(aligned.planes.normals[0], pane.normals[0]),
     )  # fmt: skip
-    judged = MirrorCandidate(inner.planes, like, len(mirrored), shown)
-    if inner is not fitted and judged.is_mirror:
-        inner = polished_pane(inner, telling)
-    return judged._replace(pane=replace(inner.planes, half_sizes=pane.half_sizes))
+    candidate = MirrorCandidate(aligned.planes, regression, len(mirrored), shown)
+    if aligned is not fitted and candidate.is_mirror:
+        aligned = polish_pane(aligned, parts)
+    return candidate._replace(pane=replace(aligned.planes, half_sizes=pane.half_sizes))
 
 
 def degrees_between(normal: Tensor, other: Tensor) -> float:
@@ -189,7 +190,7 @@ def degrees_between(normal: Tensor, other: Tensor) -> float:
 
 
 @torch.no_grad()
-def pane_shown(scene: Scene, photograph: Photograph, mirrored: MirroredImage) -> Tensor:
+def pane_pixels(scene: Scene, photograph: Photograph, mirrored: MirroredImage) -> Tensor:
     """[H, W] bool: the valid pixels that show the inner part of the scene's only pane."""
     shown = mirrored.seen & photograph.valid
     return shown if photograph.labels is None else shown & (photograph.labels == scene.planes.labels[0])
@@ -197,9 +198,9 @@ def pane_shown(scene: Scene, photograph: Photograph, mirrored: MirroredImage) ->
 
 @torch.no_grad()
 def compared_region(scene: Scene, photograph: Photograph) -> Tensor:
-    """[H, W] bool: the pixels of `pane_shown` at which Gaussians cover the mirrored image."""
+    """[H, W] bool: the pixels of `pane_pixels` at which Gaussians cover the mirrored image."""
     mirrored = mirrored_image(scene, photograph.camera)
-    return pane_shown(scene, photograph, mirrored) & (mirrored.coverage > LEAST_COVERAGE)
+    return pane_pixels(scene, photograph, mirrored) & (mirrored.coverage > LEAST_COVERAGE)
 
 
 @torch.no_grad()
@@ -209,82 +210,82 @@ def compared_pixels(scene: Scene, photograph: Photograph) -> tuple[Tensor, Tenso
     Pixels whose mirrored image is not covered by Gaussians are counted, but not compared.
     """
     mirrored = mirrored_image(scene, photograph.camera)
-    shown = pane_shown(scene, photograph, mirrored)
+    shown = pane_pixels(scene, photograph, mirrored)
     region = shown & (mirrored.coverage > LEAST_COVERAGE)
     first, second = (
-        about_local_mean(linear_from_srgb(image), region)[region] for image in (mirrored.color, photograph.pixels)
+        subtract_local_mean(linear_from_srgb(image), region)[region] for image in (mirrored.color, photograph.pixels)
     )
     return first, second, int(shown.sum())
 
 
-def aligned_pane(scene: Scene, telling: Sequence[ComparedPart]) -> Scene:
+def align_pane(scene: Scene, parts: Sequence[ComparedPart]) -> Scene:
     """The scene with its only pane moved to where it is most like a mirror; unchanged if the gain is small.
 
     Args:
         scene: with one pane.
-        telling: parts of photographs to compare it with.
+        parts: parts of photographs to compare it with.
     """
-    offsets = tilted_best(scene, telling[:: max(1, len(telling) // TILT_PHOTOGRAPHS)])
-    moments, taken = (torch.zeros_like(offsets), torch.zeros_like(offsets)), 0
+    offsets = best_tilt(scene, parts[:: max(1, len(parts) // TILT_PHOTOGRAPHS)])
+    moments, steps = (torch.zeros_like(offsets), torch.zeros_like(offsets)), 0
     for step in range(ALIGN_STEPS):
         moving = offsets.clone().requires_grad_()
         # A stride coprime to the number of parts visits all of them, neighbours far apart.
-        like = agreement(moved_pane(scene, moving), telling[step * 7919 % len(telling)])
-        if not like.requires_grad:
+        regression = mirror_correlation(move_pane(scene, moving), parts[step * 7919 % len(parts)])
+        if not regression.requires_grad:
             continue
-        (slope,) = torch.autograd.grad(-like, moving)
-        taken += 1
+        (gradient,) = torch.autograd.grad(-regression, moving)
+        steps += 1
         # Not `torch.optim`: its first optimiser imports PyTorch's compiler, which takes longer than the alignment.
-        adam([Update(offsets, slope, *moments, ALIGN_RATE * (1 - step / ALIGN_STEPS), taken)], eps=1e-8)
-    aligned = moved_pane(scene, offsets)
-    return aligned if agrees_better(aligned, scene, telling) else scene
+        adam([Update(offsets, gradient, *moments, ALIGN_RATE * (1 - step / ALIGN_STEPS), steps)], eps=1e-8)
+    aligned = move_pane(scene, offsets)
+    return aligned if agrees_better(aligned, scene, parts) else scene
 
 
 @torch.no_grad()
-def polished_pane(scene: Scene, telling: Sequence[ComparedPart]) -> Scene:
+def polish_pane(scene: Scene, parts: Sequence[ComparedPart]) -> Scene:
     """The scene with its only pane moved to where photographs agree best nearby, by a search along one axis at a time.
 
     Gradient ascent, one photograph a step, leaves a mirror up to 2 % of the extent away from that optimum, and training
     recovers only a part of it.
     """
-    some = telling[:: max(1, len(telling) // POLISH_PHOTOGRAPHS)]
+    chosen = parts[:: max(1, len(parts) // POLISH_PHOTOGRAPHS)]
 
-    def agreed(offsets: Tensor) -> float:
-        return mean_agreements([moved_pane(scene, offsets)], some)[0]
+    def correlation(offsets: Tensor) -> float:
+        return mean_correlations([move_pane(scene, offsets)], chosen)[0]
 
     best = scene.primary.means.new_zeros(3)
-    most, axes = agreed(best), torch.eye(3, dtype=torch.float32).to(best)
+    most, axes = correlation(best), torch.eye(3, dtype=torch.float32).to(best)
     for step in POLISH_STEPS:
         for _ in range(POLISH_ROUNDS):
             before = most
             for change in step * torch.cat([axes, -axes]):
-                if (found := agreed(best + change)) > most:
+                if (found := correlation(best + change)) > most:
                     best, most = best + change, found
             if most == before:
                 break
-    return moved_pane(scene, best)
+    return move_pane(scene, best)
 
 
 @torch.no_grad()
-def agrees_better(aligned: Scene, fitted: Scene, telling: Sequence[ComparedPart]) -> bool:
+def agrees_better(aligned: Scene, fitted: Scene, parts: Sequence[ComparedPart]) -> bool:
     """Return whether photographs agree so much better with the aligned pane that the fitted plane must be wrong."""
-    found = mean_agreements([aligned, fitted], telling)
+    found = mean_correlations([aligned, fitted], parts)
     # On Fisher's scale, the step from 0.9 to 0.97 is about as large as that from 0.3 to 0.7.
     other, own = (math.atanh(max(-PERFECT, min(value, PERFECT))) for value in found)
     return other > LEAST_GAIN_OF_ALIGNING * own
 
 
 @torch.no_grad()
-def tilted_best(scene: Scene, telling: Sequence[ComparedPart]) -> Tensor:
-    """[3] offsets for `moved_pane`: the combination of `TILTS_DEG` that agrees best with photographs."""
+def best_tilt(scene: Scene, parts: Sequence[ComparedPart]) -> Tensor:
+    """[3] offsets for `move_pane`: the combination of `TILTS_DEG` that agrees best with photographs."""
     means = scene.primary.means
     tilts = [math.radians(degrees) for degrees in TILTS_DEG]
     candidates = [means.new_tensor([first, second, 0.0]) for first in tilts for second in tilts]
-    found = mean_agreements([moved_pane(scene, offsets) for offsets in candidates], telling)
+    found = mean_correlations([move_pane(scene, offsets) for offsets in candidates], parts)
     return candidates[found.index(max(found))]
 
 
-def moved_pane(scene: Scene, offsets: Tensor) -> Scene:
+def move_pane(scene: Scene, offsets: Tensor) -> Scene:
     """The scene with its only pane tilted and shifted.
 
     Args:
@@ -304,30 +305,30 @@ def moved_pane(scene: Scene, offsets: Tensor) -> Scene:
     )
 
 
-MIRRORING = Planar(BLACK, intensity=False, reflection_gradient="planes")
+MIRROR_RENDERER = Planar(BLACK, intensity=False, reflection_gradient="planes")
 """Renders the image mirrored by a pane."""
 
 
-def agreement(scene: Scene, part: ComparedPart, first: FirstPass | None = None) -> Tensor:
+def mirror_correlation(scene: Scene, part: ComparedPart, first: FirstPass | None = None) -> Tensor:
     """Correlation of the image mirrored by the scene's only pane with a part of a photograph.
 
     `first` is the direct view, if it has been rendered already.
     """
-    (mirrored,) = MIRRORING.reflections(scene, part.camera, (BLACK,), first)
-    one, other = about_local_mean(mirrored, part.region)[part.region], part.pixels
+    (mirrored,) = MIRROR_RENDERER.reflections(scene, part.camera, (BLACK,), first)
+    one, other = subtract_local_mean(mirrored, part.region)[part.region], part.pixels
     tiny = torch.finfo(one.dtype).tiny
     return (one * other).sum() / torch.sqrt(((one * one).sum() * (other * other).sum()).clamp(min=tiny))
 
 
 @torch.no_grad()
-def mean_agreements(scenes: Sequence[Scene], telling: Sequence[ComparedPart]) -> list[float]:
-    """Mean of `agreement` over at least one part of a photograph, for several scenes that differ only in their pane."""
+def mean_correlations(scenes: Sequence[Scene], parts: Sequence[ComparedPart]) -> list[float]:
+    """Means of `mirror_correlation` over one or more parts, for scenes that differ only in their pane."""
     sums = [0.0] * len(scenes)
-    for part in telling:
-        first = MIRRORING.first_pass(scenes[0], part.camera)
+    for part in parts:
+        first = MIRROR_RENDERER.first_pass(scenes[0], part.camera)
         for number, scene in enumerate(scenes):
-            sums[number] += float(agreement(scene, part, first))
-    return [total / len(telling) for total in sums]
+            sums[number] += float(mirror_correlation(scene, part, first))
+    return [total / len(parts) for total in sums]
 
 
 class MirroredImage(NamedTuple):
@@ -343,9 +344,9 @@ class MirroredImage(NamedTuple):
 
 def mirrored_image(scene: Scene, camera: Camera) -> MirroredImage:
     """Renders the reflection over black and over white; their difference is the part not covered."""
-    before_black, before_white = Planar(intensity=False).reflections(scene, camera, (BLACK, WHITE))
-    seen = before_white.amax(dim=-1) > 0
-    return MirroredImage(before_black, torch.where(seen, 1 - (before_white - before_black).mean(dim=-1), 0), seen)
+    over_black, over_white = Planar(intensity=False).reflections(scene, camera, (BLACK, WHITE))
+    seen = over_white.amax(dim=-1) > 0
+    return MirroredImage(over_black, torch.where(seen, 1 - (over_white - over_black).mean(dim=-1), 0), seen)
 
 
 @torch.no_grad()
@@ -355,19 +356,19 @@ def mirrored_coverage(scene: Scene, pane: Planes, camera: Camera) -> tuple[float
     return float(mirrored.coverage.sum()), int(mirrored.seen.sum())
 
 
-def about_local_mean(image: Tensor, region: Tensor) -> Tensor:
+def subtract_local_mean(image: Tensor, region: Tensor) -> Tensor:
     """An image [H, W, 3] minus its mean over the part of a square window that lies in the region [H, W]."""
-    reach = max(round(WINDOW * image.shape[1] / 2), 1)
+    reach = max(round(MEAN_WINDOW * image.shape[1] / 2), 1)
     return image - window_means(image, region, reach).to(image.dtype)
 
 
-def likeness(mirrored: Tensor, photographed: Tensor) -> Likeness:
+def regress_on_mirrored(mirrored: Tensor, photographed: Tensor) -> MirrorRegression:
     """Regression of photographed on mirrored values [P, 3], both minus their means."""
     covariance = (mirrored * photographed).sum()
     spread, target_spread = (mirrored * mirrored).sum(), (photographed * photographed).sum()
     tiny = torch.finfo(mirrored.dtype).tiny
     correlation = covariance / torch.sqrt((spread * target_spread).clamp(min=tiny))
-    return Likeness(float(covariance / spread.clamp(min=tiny)), float(correlation))
+    return MirrorRegression(float(covariance / spread.clamp(min=tiny)), float(correlation))
 
 
 MOST_SEEN_DIRECTLY = 0.5
@@ -396,19 +397,19 @@ def virtual_points(points: Tensor, mirrors: Planes, cameras: Sequence[Camera]) -
     return through > (1 - MOST_SEEN_DIRECTLY) * held
 
 
-HIDDEN = 1.1
+HIDDEN_DEPTH_RATIO = 1.1
 """Ratio of a Gaussian's depth to the mean depth of its pixel above which other surfaces should occlude it."""
-OPEN = 0.85
+EMPTY_DEPTH_RATIO = 0.85
 """Ratio of a position's depth to the mean depth of its pixel below which a view shows that the position is empty; above
 the inverse it is occluded."""
-OFTEN, ALWAYS = 0.5, 0.9
+OFTEN_HIDDEN, ALWAYS_HIDDEN = 0.5, 0.9
 """Minimum shares, of the views that show a Gaussian behind panes, in which it is hidden often, and almost always."""
-LEAST_STEADY, LEAST_CONFIRMED = 0.9, 0.4
+LEAST_ALWAYS_HIDDEN, LEAST_CONFIRMED = 0.9, 0.4
 """Minimum shares of possible reflections, at least one of which must be reached: always hidden ones among those often
 hidden, and ones whose mirrored positions lie on surfaces among those with mirrored positions in view. Each of ten glass
 fronts with reflections built behind them reached one (0.60 to 0.97, 0.12 to 1.00). Of six fronts with real objects
 behind them, many far away and of uncertain depth, none did (0.47 to 0.69, 0.02 to 0.25)."""
-FEWEST_LOOKED_AT, FAIRLY_STEADY = 0.1, 0.7
+FEWEST_IN_SOME_VIEW, MANY_ALWAYS_HIDDEN = 0.1, 0.7
 """Minimum shares, at least one of which must be reached for surfaces in front to confirm reflections: always hidden
 Gaussians with mirrored positions in view among all that are always hidden; and always hidden ones among those often
 hidden. A real front facing a street had 0.01, all of it confirmed, and 0.51. Of twelve fronts with reflections behind
@@ -436,39 +437,39 @@ def reflections_behind(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -
     means = scene.primary.means
     (mirror,) = mirror_matrices(panes.centers[:1], panes.normals[:1])
     images = means @ mirror[:3, :3].T + mirror[:3, 3]
-    shown, hidden, direct, vacant, before = means.new_zeros(5, len(means))
+    shown, hidden, direct_views, empty, occluded = means.new_zeros(5, len(means))
     for camera in (camera.to(means.device) for camera in cameras):
         depth = Splat()(scene, camera).layers["depth"]
         ratio, inside = relative_depths(means, camera, depth)
         surface = camera.center + (means - camera.center) / ratio[:, None]
         crossing = inside & crosses_pane(means, panes, camera.center) & crosses_pane(surface, panes, camera.center)
         shown += crossing
-        hidden += crossing & (ratio > HIDDEN)
+        hidden += crossing & (ratio > HIDDEN_DEPTH_RATIO)
         ratio, inside = relative_depths(images, camera, depth)
-        looking = inside & ~crosses_pane(images, panes, camera.center)
-        direct += looking
-        vacant += looking & (ratio < OPEN)
-        before += looking & (ratio > 1 / OPEN)
-    often = virtual_points(means, panes, cameras) & (hidden > OFTEN * shown) & (vacant <= 0.5 * direct)
-    always = often & (hidden > ALWAYS * shown)
-    looked_at = always & (direct > 0)
-    confirmed = looked_at & (vacant + before <= 0.5 * direct)
-    meant = torch.where(always.sum() >= FAIRLY_STEADY * often.sum(), always, looked_at)
-    return meant & mostly_reflections(often.sum(), always.sum(), looked_at.sum(), confirmed.sum())
+        in_view = inside & ~crosses_pane(images, panes, camera.center)
+        direct_views += in_view
+        empty += in_view & (ratio < EMPTY_DEPTH_RATIO)
+        occluded += in_view & (ratio > 1 / EMPTY_DEPTH_RATIO)
+    often = virtual_points(means, panes, cameras) & (hidden > OFTEN_HIDDEN * shown) & (empty <= 0.5 * direct_views)
+    always = often & (hidden > ALWAYS_HIDDEN * shown)
+    in_some_view = always & (direct_views > 0)
+    confirmed = in_some_view & (empty + occluded <= 0.5 * direct_views)
+    selected = torch.where(always.sum() >= MANY_ALWAYS_HIDDEN * often.sum(), always, in_some_view)
+    return selected & are_mostly_reflections(often.sum(), always.sum(), in_some_view.sum(), confirmed.sum())
 
 
-def mostly_reflections(often: Tensor, always: Tensor, looked_at: Tensor, confirmed: Tensor) -> Tensor:
+def are_mostly_reflections(often: Tensor, always: Tensor, in_some_view: Tensor, confirmed: Tensor) -> Tensor:
     """[] bool: Gaussians hidden behind a glass front are mostly its reflections. All arguments are counts of Gaussians.
 
     Args:
         often: hidden in most views.
         always: hidden in nearly all.
-        looked_at: those of them whose mirrored positions are in some view.
+        in_some_view: those of them whose mirrored positions are in some view.
         confirmed: those of these whose mirrored positions lie on surfaces.
     """
-    is_confirmed = (looked_at > 0) & (confirmed >= LEAST_CONFIRMED * looked_at)
-    is_known = (looked_at >= FEWEST_LOOKED_AT * always) | (always >= FAIRLY_STEADY * often)
-    return (always >= LEAST_STEADY * often) | (is_confirmed & is_known)
+    is_confirmed = (in_some_view > 0) & (confirmed >= LEAST_CONFIRMED * in_some_view)
+    is_known = (in_some_view >= FEWEST_IN_SOME_VIEW * always) | (always >= MANY_ALWAYS_HIDDEN * often)
+    return (always >= LEAST_ALWAYS_HIDDEN * often) | (is_confirmed & is_known)
 
 
 def relative_depths(points: Tensor, camera: Camera, depth: Tensor) -> tuple[Tensor, Tensor]:
@@ -525,20 +526,20 @@ def mirrored_lamps(scene: Scene, panes: Planes, photographs: Sequence[Photograph
         photographs: downscaled training views.
     """
     alone = replace(scene, planes=panes)
-    lamps = _lamps_among(alone, photographs)
+    lamps = _detect_lamps(alone, photographs)
     if not bool(lamps.any()):
         return None
     lit = [_lit_pixels(alone, lamps, photograph.camera) for photograph in photographs]
-    images = _images_of(alone, lit, photographs)
+    images = _lamp_images(alone, lit, photographs)
     if not bool(images.any()):
         return None
     dark = torch.full_like(scene.primary.logit_opacities, logit(1e-3))
     opacities = torch.where(images, torch.minimum(dark, scene.primary.logit_opacities), scene.primary.logit_opacities)
     without = replace(alone, primary=scene.primary.with_tensors({"logit_opacities": opacities}))
-    return Lamps(images, torch.where(lamps, _gains_of(without, lit, photographs), 1))
+    return Lamps(images, torch.where(lamps, _lamp_gains(without, lit, photographs), 1))
 
 
-def _lamps_among(scene: Scene, photographs: Sequence[Photograph]) -> Tensor:
+def _detect_lamps(scene: Scene, photographs: Sequence[Photograph]) -> Tensor:
     """[N] bool: Gaussians that are clipped where seen directly, and brighter than white where mirrored."""
     clipped, direct, bright, mirrored = scene.primary.means.new_zeros(4, len(scene.primary))
     for photograph in photographs:
@@ -547,9 +548,7 @@ def _lamps_among(scene: Scene, photographs: Sequence[Photograph]) -> Tensor:
         darkest = photograph.pixels.amin(dim=-1)
         shown = gather_pixels(scene, photograph.camera, torch.stack([past & (darkest > CLIPPED), past], dim=-1).float())
         enough = linear_from_srgb(darkest.clamp(0, 1)) > LEAST_GAIN * strength
-        there = gather_mirrored_pixels(
-            scene, photograph.camera, torch.stack([through & enough, through], dim=-1).float()
-        )
+        there = gather_mirrored_pixels(scene, photograph.camera, torch.stack([through & enough, through], dim=-1).float())
         clipped, direct = clipped + shown[:, 0], direct + shown[:, 1]
         bright, mirrored = bright + there[:, 0], mirrored + there[:, 1]
     enough_seen = (direct > FEWEST_SEEN) & (mirrored > FEWEST_SEEN)
@@ -573,7 +572,7 @@ def _lit_pixels(scene: Scene, lamps: Tensor, camera: Camera) -> LitPixels:
     return LitPixels(glass, glass & (frame.layers["reflection"].amin(dim=-1) > 0.5))
 
 
-def _images_of(scene: Scene, seen: Sequence[LitPixels], photographs: Sequence[Photograph]) -> Tensor:
+def _lamp_images(scene: Scene, seen: Sequence[LitPixels], photographs: Sequence[Photograph]) -> Tensor:
     """[N] bool: bright Gaussians behind the panes that are seen mostly where these mirror lamps."""
     means = scene.primary.means
     near, through = means.new_zeros(2, len(means))
@@ -587,9 +586,9 @@ def _images_of(scene: Scene, seen: Sequence[LitPixels], photographs: Sequence[Ph
     return bright & (through > FEWEST_SEEN) & (near > LAMP_SHARE * through)
 
 
-def _gains_of(scene: Scene, seen: Sequence[LitPixels], photographs: Sequence[Photograph]) -> Tensor:
+def _lamp_gains(scene: Scene, seen: Sequence[LitPixels], photographs: Sequence[Photograph]) -> Tensor:
     """[N] ratios of the radiance that photographs leave to reflections of lamps to the rendered one; 1 if unseen."""
-    left, had = scene.primary.means.new_zeros(2, len(scene.primary))
+    observed, rendered = scene.primary.means.new_zeros(2, len(scene.primary))
     for photograph, (_, lit) in zip(photographs, seen, strict=True):
         layers = Planar(nearest_only=True)(scene, photograph.camera).layers
         strength = layers["strength"].clamp(min=1e-2)[..., None]
@@ -597,29 +596,29 @@ def _gains_of(scene: Scene, seen: Sequence[LitPixels], photographs: Sequence[Pho
         radiance = (linear_from_srgb(photograph.pixels.clamp(0, 1)) - (1 - strength) * behind) / strength
         values = torch.stack([radiance.clamp(min=0), linear_from_srgb(layers["reflection"].clamp(min=0))]).mean(dim=-1)
         sums = gather_mirrored_pixels(scene, photograph.camera, (values * (lit & photograph.valid)).movedim(0, -1))
-        left, had = left + sums[:, 0], had + sums[:, 1]
-    gains = (left / had.clamp(min=1e-6)).clamp(1, MOST_GAIN)
-    return torch.where(had > 0, gains, 1)
+        observed, rendered = observed + sums[:, 0], rendered + sums[:, 1]
+    gains = (observed / rendered.clamp(min=1e-6)).clamp(1, MOST_GAIN)
+    return torch.where(rendered > 0, gains, 1)
 
 
-UNCOVERED = 0.5
+HOLE_COVERAGE = 0.5
 """Coverage of the mirrored image below which it counts as a hole."""
 HOLE_CAMERAS, RAYS_ACROSS, CELLS_ACROSS = 24, 40, 40
 """Number of cameras that find holes, of rays across an image, and of cells across the room, with one position each."""
-BEYOND = 0.05
+SHARE_BEYOND_ROOM = 0.05
 """Share of the Gaussians that are farther from the middle of the cameras than the end of the room."""
 
 
-class Unseen(NamedTuple):
+class UnseenPositions(NamedTuple):
     """Positions [P, 3] that panes mirror and no photograph shows, their likely colour [3], sRGB, and their spacing."""
 
-    places: Tensor
+    positions: Tensor
     color: Tensor
     cell: float
 
 
 @torch.no_grad()
-def unseen_places(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Unseen:
+def unseen_positions(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> UnseenPositions:
     """Positions at the end of the room that panes mirror and that no Gaussian covers.
 
     A pane always mirrors something. Where its image is dark for lack of Gaussians, the transmission is too bright.
@@ -633,22 +632,22 @@ def unseen_places(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Uns
     cameras = [camera.to(device) for camera in evenly(cameras, HOLE_CAMERAS)]
     middle = torch.stack([camera.center for camera in cameras]).mean(dim=0)
     away = (scene.primary.means - middle).norm(dim=1).sort().values
-    radius = away[int((1 - BEYOND) * (len(away) - 1))]
-    places, colors = [], [torch.zeros(0, 3, device=device, dtype=torch.float32)]
+    radius = away[int((1 - SHARE_BEYOND_ROOM) * (len(away) - 1))]
+    positions, colors = [], [torch.zeros(0, 3, device=device, dtype=torch.float32)]
     for camera in cameras:
         for row in range(len(panes)):
             pane = panes.select([row])
             image = mirrored_image(replace(scene, planes=pane), camera)
             colors.append(image.color[image.seen & (image.coverage > LEAST_COVERAGE)].clamp(0, 1))
-            places.append(_ends_of_rays(pane, camera, image.seen & (image.coverage < UNCOVERED), middle, radius))
-    found, known = torch.cat(places), torch.cat(colors)
+            positions.append(_ends_of_rays(pane, camera, image.seen & (image.coverage < HOLE_COVERAGE), middle, radius))
+    found, known = torch.cat(positions), torch.cat(colors)
     # In the axes of a camera, so that the result does not depend on the orientation of the world.
     size = 2 * radius / CELLS_ACROSS
     cells = ((found - middle) @ cameras[0].cam_from_world[:3, :3].T / size).floor().long()
     _, cell = torch.unique(cells, dim=0, return_inverse=True)
     first = torch.full_like(cell, len(found)).scatter_reduce_(0, cell, torch.arange(len(found), device=device), "amin")
     color = known.mean(dim=0) if len(known) else known.new_full((3,), 0.5)
-    return Unseen(found[first[first < len(found)]], color, float(size))
+    return UnseenPositions(found[first[first < len(found)]], color, float(size))
 
 
 def _ends_of_rays(pane: Planes, camera: Camera, hole: Tensor, middle: Tensor, radius: Tensor) -> Tensor:

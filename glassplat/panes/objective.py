@@ -26,10 +26,10 @@ from glassplat.panes.masks import (
     Rectangle,
     cameras_of,
     in_plane_axes,
+    inlier_share,
+    intersect_rays,
     mask_agreement,
-    meet,
     min_area_rectangle,
-    support,
 )
 
 Array = NDArray[np.float64]
@@ -48,15 +48,15 @@ class EdgeMatches:
             the pane. They are scaled so that an error of a pixel in both views weighs equally on all planes and pairs.
         shifts: [H, V, P] part of that distance caused by a frame, per world unit of its height.
         compared: [H, V, P] true if the edge point lands inside the image of another view. Other distances are 0.
-        turns: [H, P] deviation of the edge at point p from the directions of a rectangular pane's sides: the sine of
-            twice the angle.
+        misalignments: [H, P] deviation of the edge at point p from the directions of a rectangular pane's sides: the
+            sine of twice the angle.
         sources: [P] the view that edge point p comes from.
     """
 
     distances: Array
     shifts: Array
     compared: Mask
-    turns: Array
+    misalignments: Array
     sources: NDArray[np.int64]
 
     def residuals(self, frames: Array, tolerance: float) -> Array:
@@ -80,13 +80,15 @@ def edge_matches(planes: PlaneEquations, views: Sequence[PaneView], *, edges_per
     edges = Edges(
         np.repeat(np.arange(len(views)), [len(found) for found in points]),
         np.concatenate([view.directions(found) for view, found in zip(views, points, strict=True)]),
-        np.concatenate([view.sight_limits(*found) for view, *found in zip(views, points, across, strict=True)]),
+        np.concatenate([view.line_plane_normals(*found) for view, *found in zip(views, points, across, strict=True)]),
     )
     found = follow_edges(planes.normals, planes.offsets, cameras_of(views), edges, [view.distance for view in views])
-    return EdgeMatches(found.distances, found.shifts, found.compared, _turns(planes, found.outward), edges.sources)
+    return EdgeMatches(
+        found.distances, found.shifts, found.compared, _side_misalignments(planes, found.outward), edges.sources
+    )
 
 
-def _turns(planes: PlaneEquations, outward: Array) -> Array:
+def _side_misalignments(planes: PlaneEquations, outward: Array) -> Array:
     """[H, P] sine of twice the angle between directions in the plane and the nearest side of the pane.
 
     Its sign is relative to the dominant direction of the edges, whatever the axes of the plane: a sign that flips after
@@ -105,7 +107,7 @@ def _turns(planes: PlaneEquations, outward: Array) -> Array:
 
 NEAREST, FARTHEST = 0.05, 20.0
 """Minimum and maximum depth at which panes are searched for, in units of the distance between the annotated cameras."""
-MOST_OBLIQUE = 0.1
+LEAST_RAY_COSINE = 0.1
 """Cosine between a plane's normal and a ray through the mask below which a random plane is dropped."""
 
 
@@ -133,26 +135,26 @@ def planes_through_masks(views: Sequence[PaneView], count: int, rng: np.random.G
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     towards = -np.einsum("hd,hd->h", normals, rays) / np.linalg.norm(rays, axis=1)
     normals *= np.where(towards < 0, -1, 1)[:, None]
-    usable = np.abs(towards) > MOST_OBLIQUE
+    usable = np.abs(towards) > LEAST_RAY_COSINE
     points = centers[source] + depths[:, None] * rays
     return PlaneEquations(normals[usable], np.einsum("hd,hd->h", normals, points)[usable])
 
 
 def pane_centers(planes: PlaneEquations, views: Sequence[PaneView]) -> Array:
     """[H, 3] a point near the middle of the pane on each plane, from the middles of the masks."""
-    found, seen = np.zeros((len(planes), 3)), np.zeros(len(planes))
+    centers, weight_sums = np.zeros((len(planes), 3)), np.zeros(len(planes))
     for view in views:
-        points, hit = meet(planes, view.center, view.directions(view.middle))
+        points, hit = intersect_rays(planes, view.center, view.directions(view.middle))
         # A view at a grazing angle places the middle far away.
         rays = points[:, 0] - view.center
         squared = np.maximum(np.einsum("hd,hd->h", rays, rays), np.finfo(np.float64).tiny)
         weights = np.where(hit[:, 0], 1 / squared, 0)
-        found += weights[:, None] * points[:, 0]
-        seen += weights
-    return found / np.maximum(seen, np.finfo(np.float64).tiny)[:, None]
+        centers += weights[:, None] * points[:, 0]
+        weight_sums += weights
+    return centers / np.maximum(weight_sums, np.finfo(np.float64).tiny)[:, None]
 
 
-def planes_nearby(
+def sample_planes_nearby(
     planes: PlaneEquations, anchors: Array, count: int, *, tilt: float, shift: Array | float, rng: np.random.Generator
 ) -> PlaneEquations:
     """[H * (1 + count)] each plane followed by `count` random ones around it.
@@ -182,7 +184,7 @@ def move_planes(planes: PlaneEquations, anchors: Array, steps: Array) -> PlaneEq
     return PlaneEquations(tilted, np.einsum("hd,hd->h", tilted, feet) + steps[:, 2])
 
 
-COARSE, MIDDLE, FINE = 0.01, 0.004, 0.002
+COARSE_TOLERANCE, MIDDLE_TOLERANCE, FINE_TOLERANCE = 0.01, 0.004, 0.002
 """Distances between mask edges, in image diagonals, at which their loss is one half."""
 POINTS_WEIGHT = 0.1
 """Weight of the points on a plane relative to the mask edges; they decide where the edges are ambiguous."""
@@ -190,11 +192,11 @@ OUTLINE_WEIGHT, OUTLINE_TOLERANCE = 0.1, 0.2
 """Weight of a rectangular outline relative to the mask edges, and the sine at which its loss is one half."""
 USUAL_FRAME, FRAME_WEIGHT = 0.02, 0.01
 """Typical height of a frame above its glass in scene extents, and the weight of this prior relative to the edges."""
-EDGES = 600
+EDGE_POINTS = 600
 """Number of edge points over all views together."""
-WHOLE_PARTS = 4
-"""Number of coplanar panes up to which each has `EDGES` edge points; more panes share the same total."""
-PIXELS = 600
+FULLY_SAMPLED_PANES = 4
+"""Number of coplanar panes up to which each has `EDGE_POINTS` edge points; more panes share the same total."""
+OVERLAP_PIXELS = 600
 """Number of pixels mapped to compare masks, over all views together."""
 
 
@@ -235,27 +237,27 @@ class Objective:
     extent: float
     distance: float
 
-    def support(self, planes: PlaneEquations) -> Array:
+    def inlier_share(self, planes: PlaneEquations) -> Array:
         """[H] share of the points near each plane; 0 if there are no points."""
         if not len(self.points):
             return np.zeros(len(planes))
-        return support(planes, self.points, distance=self.distance)
+        return inlier_share(planes, self.points, distance=self.distance)
 
     def agreement(self, planes: PlaneEquations) -> Array:
         """[H] agreement of the masks on each plane (`mask_agreement`)."""
-        return mask_agreement(planes, self.views, pixels_per_view=max(PIXELS // len(self.views), 1))
+        return mask_agreement(planes, self.views, pixels_per_view=max(OVERLAP_PIXELS // len(self.views), 1))
 
     def anchors(self, planes: PlaneEquations) -> Array:
         """[H, 3] a point near the middle of the pane on each plane."""
         return pane_centers(planes, self.views)
 
-    def reach(self, planes: PlaneEquations) -> Array:
+    def camera_distance(self, planes: PlaneEquations) -> Array:
         """[H] median distance of the cameras from the middle of the pane."""
         centers = np.stack([view.center for view in self.views])
         away: Array = np.median(np.linalg.norm(self.anchors(planes)[:, None] - centers, axis=2), axis=1)
         return away
 
-    def terms(self, planes: FramedPlanes, tolerance: float, *, edges: int = EDGES) -> Terms:
+    def terms(self, planes: FramedPlanes, tolerance: float, *, edges: int = EDGE_POINTS) -> Terms:
         """The residuals of H planes.
 
         Args:
@@ -268,19 +270,20 @@ class Objective:
         matches = edge_matches(planes.planes, self.views, edges_per_view=max(edges // len(self.views), 1))
         hypotheses = len(planes)
         known = matches.compared.sum(axis=(1, 2))
-        unknown = UNKNOWN_WEIGHT * (matches.turns.shape[1] * (len(self.views) - 1) - known)
-        each = 1 / np.maximum(known + unknown, 1)
-        met = matches.residuals(planes.frames, tolerance).reshape(hypotheses, -1)
-        away = planes.planes.distances(self.points) / self.distance
+        unknown = UNKNOWN_WEIGHT * (matches.misalignments.shape[1] * (len(self.views) - 1) - known)
+        edge_weight = 1 / np.maximum(known + unknown, 1)
+        edge_residuals = matches.residuals(planes.frames, tolerance).reshape(hypotheses, -1)
+        point_residuals = planes.planes.distances(self.points) / self.distance
         frames = planes.frames[:, None] / (USUAL_FRAME * self.extent)
-        residuals = (met, matches.turns / OUTLINE_TOLERANCE, away, frames)
-        of_turns, of_points = OUTLINE_WEIGHT / matches.turns.shape[1], POINTS_WEIGHT / max(len(self.points), 1)
-        weights = (each, of_turns, of_points, FRAME_WEIGHT)
-        spread = [
+        residuals = (edge_residuals, matches.misalignments / OUTLINE_TOLERANCE, point_residuals, frames)
+        outline_weight = OUTLINE_WEIGHT / matches.misalignments.shape[1]
+        point_weight = POINTS_WEIGHT / max(len(self.points), 1)
+        weights = (edge_weight, outline_weight, point_weight, FRAME_WEIGHT)
+        weight_blocks = [
             np.broadcast_to(np.reshape(weight, (-1, 1)), block.shape)
             for weight, block in zip(weights, residuals, strict=True)
         ]
-        return Terms(np.concatenate(residuals, axis=1), np.concatenate(spread, axis=1), unknown * each)
+        return Terms(np.concatenate(residuals, axis=1), np.concatenate(weight_blocks, axis=1), unknown * edge_weight)
 
 
 @dataclass(frozen=True)
@@ -306,13 +309,13 @@ class JointObjective:
         """[H, 3] a point near the middle of all panes on each plane."""
         return self._mean([part.anchors(planes) for part in self.parts])
 
-    def reach(self, planes: PlaneEquations) -> Array:
+    def camera_distance(self, planes: PlaneEquations) -> Array:
         """[H] median distance of the cameras from the middle of a pane, averaged over the panes."""
-        return self._mean([part.reach(planes) for part in self.parts])
+        return self._mean([part.camera_distance(planes) for part in self.parts])
 
-    def terms(self, planes: FramedPlanes, tolerance: float, *, edges: int = EDGES) -> Terms:
+    def terms(self, planes: FramedPlanes, tolerance: float, *, edges: int = EDGE_POINTS) -> Terms:
         """The residuals of H planes, as `Objective.terms`; with `edges` points for each pane, or fewer for many."""
-        each = edges * min(len(self.parts), WHOLE_PARTS) // len(self.parts)
+        each = edges * min(len(self.parts), FULLY_SAMPLED_PANES) // len(self.parts)
         terms = [part.terms(planes, tolerance, edges=each) for part in self.parts]
         return Terms(
             np.concatenate([term.residuals for term in terms], axis=1),
@@ -326,10 +329,10 @@ class JointObjective:
 
 
 OUTLINE_PIXELS = 4000  # Number of pixels of each view; those of the mask are projected onto the plane.
-CELLS = 128  # Number of grid cells along the longer side of the map of the plane.
-GRAZING = 0.06  # Cosine to the normal below which a pixel covers too much of the plane to locate the pane's border.
+MAP_CELLS = 128  # Number of grid cells along the longer side of the map of the plane.
+GRAZING_COSINE = 0.06  # Cosine to the normal below which a pixel is too large on the plane to locate the border.
 SMALLEST_PART = 0.05  # Share of the largest connected part below which a part is an error in a mask.
-AGREEMENT = 0.34  # Minimum share, of the views of a point, that show the pane there; others may be occluded.
+LEAST_AGREEING_SHARE = 0.34  # Minimum share, of the views of a point, that show the pane there; others may be occluded.
 
 
 def pane_rectangle(plane: PlaneEquations, views: Sequence[PaneView], axes: Array) -> Rectangle:
@@ -348,38 +351,38 @@ def pane_rectangle(plane: PlaneEquations, views: Sequence[PaneView], axes: Array
         ValueError: no part of the plane shows the pane in enough views.
     """
     foot = plane.normals[0] * plane.offsets[0]
-    seen = np.concatenate([_pixels_on_plane(plane, view) for view in views])
-    seen = seen[_is_pane(seen, views, plane.normals[0])]
-    if len(seen) < 3:
-        raise ValueError(f"{len(seen)} mask pixels agree on where the pane is; expected at least three")
-    corners = (seen - foot) @ axes.T
+    points = np.concatenate([_pixels_on_plane(plane, view) for view in views])
+    points = points[_shows_pane(points, views, plane.normals[0])]
+    if len(points) < 3:
+        raise ValueError(f"{len(points)} mask pixels agree on where the pane is; expected at least three")
+    corners = (points - foot) @ axes.T
     low, high = corners.min(axis=0), corners.max(axis=0)
-    cell = (high - low).max() / CELLS
+    cell = (high - low).max() / MAP_CELLS
     u, v = (np.arange(a - cell, b + 2 * cell, cell) for a, b in zip(low, high, strict=True))
     grid = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1)
-    inside = _is_pane((foot + grid @ axes).reshape(-1, 3), views, plane.normals[0])
+    inside = _shows_pane((foot + grid @ axes).reshape(-1, 3), views, plane.normals[0])
     return min_area_rectangle(grid[_without_specks(inside.reshape(grid.shape[:2]))])
 
 
 def _pixels_on_plane(plane: PlaneEquations, view: PaneView) -> Array:
     """[P, 3] points of the plane that are seen through the pixels of a mask."""
-    pixels = view.grid(OUTLINE_PIXELS)
+    pixels = view.pixel_grid(OUTLINE_PIXELS)
     directions = view.directions(pixels[view.covers(pixels, np.ones(len(pixels), dtype=bool))])
-    points, hit = meet(plane, view.center, directions)
+    points, hit = intersect_rays(plane, view.center, directions)
     return points[0, hit[0]]
 
 
-def _is_pane(points: Array, views: Sequence[PaneView], normal: Array) -> Mask:
+def _shows_pane(points: Array, views: Sequence[PaneView], normal: Array) -> Mask:
     """[P] bool: points [P, 3] of the plane at which enough of the views that contain them show the pane."""
-    shown, held_count = np.zeros(len(points)), np.zeros(len(points))
+    shown, inside_count = np.zeros(len(points)), np.zeros(len(points))
     for view in views:
-        pixels, held = view.project(points)
+        pixels, inside = view.project(points)
         rays = points - view.center
-        held &= np.abs(rays @ normal) > GRAZING * np.linalg.norm(rays, axis=1)
-        held = view.tells(pixels, held)
-        shown += view.covers(pixels, held)
-        held_count += held
-    return (shown > 0) & (shown >= AGREEMENT * held_count)
+        inside &= np.abs(rays @ normal) > GRAZING_COSINE * np.linalg.norm(rays, axis=1)
+        inside = view.is_unoccluded(pixels, inside)
+        shown += view.covers(pixels, inside)
+        inside_count += inside
+    return (shown > 0) & (shown >= LEAST_AGREEING_SHARE * inside_count)
 
 
 def _without_specks(inside: Mask) -> Mask:

@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 from glassplat.kernels.plane_search import Field, sum_mirrored
 from glassplat.panes.masks import FramedPlanes, PlaneEquations, join_planes, random_planes
 from glassplat.panes.objective import (
-    COARSE,
-    EDGES,
-    FINE,
-    MIDDLE,
+    COARSE_TOLERANCE,
+    EDGE_POINTS,
+    FINE_TOLERANCE,
+    MIDDLE_TOLERANCE,
     USUAL_FRAME,
     JointObjective,
     Objective,
     Terms,
     move_planes,
-    planes_nearby,
     planes_through_masks,
+    sample_planes_nearby,
 )
 
 Array = NDArray[np.float64]
@@ -35,10 +35,10 @@ ITERATIONS = 15
 STEP = 3e-4
 """Step of the numerical derivative, a fraction of a pixel: in radians, distances of the cameras, scene extents."""
 SMALLEST_CURVATURE = 1e-12
-FIRST_DAMPING, EASE, STIFFEN = 1e-2, 0.3, 5.0
-NOTICEABLE = 0.01
+FIRST_DAMPING, DAMPING_DECREASE, DAMPING_INCREASE = 1e-2, 0.3, 5.0
+NOTICEABLE_CHANGE = 0.01
 """Change of the cost that counts as noticeable, as a share of its maximum."""
-SETTLED = 1e-4
+CONVERGED_CHANGE = 1e-4
 """Change of a parameter below which a plane has converged."""
 
 
@@ -65,15 +65,15 @@ def _minimise(planes: FramedPlanes, objective: Evidence, tolerance: float) -> Fr
     anchors, scales = objective.anchors(planes.planes), _scales(planes, objective)
     for _ in range(ITERATIONS):
         moving = planes.select(active)
-        cost, hessian, gradient = _quadratic(moving, objective, tolerance, anchors[active], scales[active])
+        cost, hessian, gradient = _gauss_newton(moving, objective, tolerance, anchors[active], scales[active])
         diagonal = np.einsum("hii->hi", hessian) + np.finfo(np.float64).eps
         damped = hessian + (damping[active, None] * diagonal)[:, None] * np.eye(4)
         steps = -np.linalg.solve(damped + SMALLEST_CURVATURE * np.eye(4), gradient[..., None])[..., 0]
-        tried = _step_planes(moving, anchors[active], steps * scales[active])
-        better = objective.terms(tried, tolerance).cost < cost
-        planes = _replace_planes(planes, active[better], tried.select(np.flatnonzero(better)))
-        damping[active] *= np.where(better, EASE, STIFFEN)
-        active = active[np.abs(steps).max(axis=1) > SETTLED]
+        moved = _step_planes(moving, anchors[active], steps * scales[active])
+        better = objective.terms(moved, tolerance).cost < cost
+        planes = _replace_planes(planes, active[better], moved.select(np.flatnonzero(better)))
+        damping[active] *= np.where(better, DAMPING_DECREASE, DAMPING_INCREASE)
+        active = active[np.abs(steps).max(axis=1) > CONVERGED_CHANGE]
         if not len(active):
             break
     return planes
@@ -82,20 +82,20 @@ def _minimise(planes: FramedPlanes, objective: Evidence, tolerance: float) -> Fr
 def _scales(planes: FramedPlanes, objective: Evidence) -> Array:
     """[H, 4] units of each plane's parameters: a radian for two tilts, a distance of the cameras, a scene extent."""
     ones = np.ones(len(planes))
-    return np.stack([ones, ones, objective.reach(planes.planes), objective.extent * ones], axis=1)
+    return np.stack([ones, ones, objective.camera_distance(planes.planes), objective.extent * ones], axis=1)
 
 
-def _quadratic(
+def _gauss_newton(
     planes: FramedPlanes, objective: Evidence, tolerance: float, anchors: Array, scales: Array
 ) -> tuple[Array, Array, Array]:
     """The cost [H] of planes, and its Gauss-Newton matrix [H, 4, 4] and gradient [H, 4] (halved)."""
-    here, moved_residuals = _nearby(planes, objective, tolerance, anchors, scales)
+    here, moved_residuals = _perturbed_terms(planes, objective, tolerance, anchors, scales)
     jacobian = (moved_residuals - here.residuals) / STEP
     weighted = jacobian * _loss_weights(here)
-    return here.cost, _products(weighted, jacobian), np.einsum("ahm,hm->ha", weighted, here.residuals)
+    return here.cost, _derivative_products(weighted, jacobian), np.einsum("ahm,hm->ha", weighted, here.residuals)
 
 
-def _nearby(
+def _perturbed_terms(
     planes: FramedPlanes, objective: Evidence, tolerance: float, anchors: Array, scales: Array
 ) -> tuple[Terms, Array]:
     """The terms of planes, and the residuals [4, H, M] after a small step along each axis."""
@@ -114,7 +114,7 @@ def _loss_weights(terms: Terms) -> Array:
     return weights
 
 
-def _products(first: Array, second: Array) -> Array:
+def _derivative_products(first: Array, second: Array) -> Array:
     """[H, 4, 4] sums of products of derivatives [4, H, M]."""
     found: Array = np.einsum("ahm,bhm->hab", first, second)
     return found
@@ -133,31 +133,31 @@ def _replace_planes(planes: FramedPlanes, index: NDArray[np.int64], others: Fram
 
 
 def tilt_uncertainty(planes: FramedPlanes, objective: Evidence, tolerance: float) -> Array:
-    """[H] angle in radians by which each plane can tilt before its cost changes by `NOTICEABLE`.
+    """[H] angle in radians by which each plane can tilt before its cost changes by `NOTICEABLE_CHANGE`.
 
     It follows from the Gauss-Newton matrix at the plane, where shift and frame height are free to adapt.
     """
     anchors, scales = objective.anchors(planes.planes), _scales(planes, objective)
-    here, residuals = _nearby(planes, objective, tolerance, anchors, scales)
+    here, residuals = _perturbed_terms(planes, objective, tolerance, anchors, scales)
     # Where an edge point enters or leaves an image, its residual jumps from or to zero, which is not a derivative.
     jacobian = np.where((residuals == 0) == (here.residuals == 0), residuals - here.residuals, 0) / STEP
-    hessian = _products(jacobian * _loss_weights(here), jacobian)
-    turns = np.linalg.inv(hessian + SMALLEST_CURVATURE * np.eye(4))[:, :2, :2]
-    widest: Array = np.sqrt(NOTICEABLE * np.linalg.eigvalsh(turns)[:, -1])
+    hessian = _derivative_products(jacobian * _loss_weights(here), jacobian)
+    tilt_covariance = np.linalg.inv(hessian + SMALLEST_CURVATURE * np.eye(4))[:, :2, :2]
+    widest: Array = np.sqrt(NOTICEABLE_CHANGE * np.linalg.eigvalsh(tilt_covariance)[:, -1])
     return widest
 
 
 AGREEMENT_WEIGHT = 0.1
 """Weight of the agreement of the masks relative to that of their edges, which account for frames."""
-POOL, LEAST_OF_BEST = 200, 0.5
+POOL_SIZE, LEAST_OF_BEST = 200, 0.5
 """Number of hypotheses with the best mask agreement whose edges are compared, and the share of the best agreement below
 which edges are not considered."""
-BY_AREAS, BY_EDGES, CHILDREN = 12, 6, 30
+KEPT_BY_AREAS, KEPT_BY_EDGES, SAMPLES_PER_PLANE = 12, 6, 30
 """Number of hypotheses that are kept for the agreement of masks, and for that of edges, and of the planes tried around
 each of them in each round."""
-ROUNDS = ((0.3, 0.1, 2 * COARSE), (0.1, 0.03, COARSE))
+SEARCH_ROUNDS = ((0.3, 0.1, 2 * COARSE_TOLERANCE), (0.1, 0.03, COARSE_TOLERANCE))
 """Spread of these (radians, distances of the cameras from the pane) and tolerance of the edges, for each round."""
-SHAKE = (0.03, 0.01, MIDDLE)
+PERTURBATION = (0.03, 0.01, MIDDLE_TOLERANCE)
 """The same for the last round, between two refinements."""
 MOST_STARTS = 6
 """Maximum number of planes from which the search for a joint plane starts."""
@@ -165,7 +165,7 @@ FRAME_SPREAD = 0.5
 """Standard deviation of the logarithm of the height of frames in each round."""
 COARSE_EDGES = 200
 """Number of edge points over all views together, while there are many hypotheses."""
-ONE_SURFACE, LARGEST_RISE = float(np.radians(8)), 0.05
+MOST_SURFACE_ANGLE, MOST_SURFACE_OFFSET = float(np.radians(8)), 0.05
 """Maximum angle between the planes of two panes, and distance of the one's middle from the other's plane in scene
 extents, for which a joint plane is tried."""
 HIGHEST_FRAME = 0.1
@@ -186,15 +186,19 @@ def best_plane(objective: Objective, *, hypotheses: int, refine: int, rng: np.ra
         rng: source of randomness.
     """
     beam = first_hypotheses(objective, hypotheses, rng)
-    for tilt, shift, tolerance in ROUNDS:
+    for tilt, shift, tolerance in SEARCH_ROUNDS:
         beam = _follow_beam(beam, objective, (tilt, shift), tolerance, rng)
     # If a pane is occluded in every mask, planes far behind impossibly high frames may fit better than its own.
-    beam = _possible(_best_planes(refine_planes(beam, objective, (COARSE, MIDDLE)), objective), objective)
-    tilt, shift, tolerance = SHAKE
-    shaken = _follow_beam(beam, objective, (tilt, shift), tolerance, rng)
-    best_first = np.argsort(contradiction(beam, objective, (COARSE, MIDDLE)), kind="stable")
-    leading = join_planes([beam.select(best_first[:refine]), shaken.select(np.arange(min(refine, len(shaken))))])
-    finished = _possible(_best_planes(refine_planes(leading, objective, (MIDDLE, FINE)), objective), objective)
+    beam = _with_possible_frames(
+        _best_planes(refine_planes(beam, objective, (COARSE_TOLERANCE, MIDDLE_TOLERANCE)), objective), objective
+    )
+    tilt, shift, tolerance = PERTURBATION
+    perturbed = _follow_beam(beam, objective, (tilt, shift), tolerance, rng)
+    best_first = np.argsort(contradiction(beam, objective, (COARSE_TOLERANCE, MIDDLE_TOLERANCE)), kind="stable")
+    leading = join_planes([beam.select(best_first[:refine]), perturbed.select(np.arange(min(refine, len(perturbed))))])
+    finished = _with_possible_frames(
+        _best_planes(refine_planes(leading, objective, (MIDDLE_TOLERANCE, FINE_TOLERANCE)), objective), objective
+    )
     return finished.select(np.array([np.argmin(contradiction(finished, objective))]))
 
 
@@ -208,15 +212,17 @@ def best_joint_plane(objective: JointObjective, starts: FramedPlanes, rng: np.ra
     """
     beam = starts
     if len(starts) > MOST_STARTS:
-        costs = contradiction(starts, objective, (COARSE,), edges=COARSE_EDGES)
+        costs = contradiction(starts, objective, (COARSE_TOLERANCE,), edges=COARSE_EDGES)
         beam = starts.select(np.argsort(costs, kind="stable")[:MOST_STARTS])
-    for tilt, shift, tolerance in (*ROUNDS[1:], SHAKE):
+    for tilt, shift, tolerance in (*SEARCH_ROUNDS[1:], PERTURBATION):
         beam = join_planes([beam, _follow_beam(beam, objective, (tilt, shift), tolerance, rng)])
-    finished = _possible(refine_planes(beam, objective, (COARSE, MIDDLE, FINE)), objective)
+    finished = _with_possible_frames(
+        refine_planes(beam, objective, (COARSE_TOLERANCE, MIDDLE_TOLERANCE, FINE_TOLERANCE)), objective
+    )
     return finished.select(np.array([np.argmin(contradiction(finished, objective))]))
 
 
-def in_one_surface(one: FramedPlanes, other: FramedPlanes, objectives: tuple[Objective, Objective]) -> bool:
+def may_share_surface(one: FramedPlanes, other: FramedPlanes, objectives: tuple[Objective, Objective]) -> bool:
     """Return whether two panes, whose planes were fitted separately, may lie in one surface.
 
     Args:
@@ -224,20 +230,20 @@ def in_one_surface(one: FramedPlanes, other: FramedPlanes, objectives: tuple[Obj
         other: plane of the second pane.
         objectives: evidence for each.
     """
-    if angle(one, other) > ONE_SURFACE:
+    if angle(one, other) > MOST_SURFACE_ANGLE:
         return False
     middles = [objective.anchors(plane.planes) for objective, plane in zip(objectives, (one, other), strict=True)]
     # One of the planes may be tilted about its own middle, and so miss the other's middle by far.
     rises = abs(one.planes.distances(middles[1])), abs(other.planes.distances(middles[0]))
-    return float(np.min(rises)) <= LARGEST_RISE * objectives[0].extent
+    return float(np.min(rises)) <= MOST_SURFACE_OFFSET * objectives[0].extent
 
 
 def contradiction(
     planes: FramedPlanes,
     objective: Evidence,
-    tolerances: tuple[float, ...] = (COARSE, MIDDLE, FINE),
+    tolerances: tuple[float, ...] = (COARSE_TOLERANCE, MIDDLE_TOLERANCE, FINE_TOLERANCE),
     *,
-    edges: int = EDGES,
+    edges: int = EDGE_POINTS,
 ) -> Array:
     """[H] evidence against planes: cost, averaged over tolerances, less mask agreement; no unit, near 0 on the pane."""
     costs = [objective.terms(planes, tolerance, edges=edges).cost for tolerance in tolerances]
@@ -254,15 +260,17 @@ def first_hypotheses(objective: Objective, count: int, rng: np.random.Generator)
     drawn = [planes_through_masks(objective.views, count, rng)]
     if len(objective.points) >= 3:
         through = random_planes(objective.points, count, rng)
-        drawn.append(through.select(np.argsort(-objective.support(through), kind="stable")[: count // 4]))
+        drawn.append(through.select(np.argsort(-objective.inlier_share(through), kind="stable")[: count // 4]))
     usual = USUAL_FRAME * objective.extent
     planes = join_planes([FramedPlanes(part, np.full(len(part), usual)) for part in drawn])
-    scores = objective.agreement(planes.planes) + AGREEMENT_WEIGHT * objective.support(planes.planes)
-    best_first = _best_planes(planes.select(np.argsort(-scores, kind="stable")[:POOL]), objective, least=BY_AREAS)
-    costs = contradiction(best_first, objective, (ROUNDS[0][2],), edges=COARSE_EDGES)
+    scores = objective.agreement(planes.planes) + AGREEMENT_WEIGHT * objective.inlier_share(planes.planes)
+    best_first = _best_planes(
+        planes.select(np.argsort(-scores, kind="stable")[:POOL_SIZE]), objective, least=KEPT_BY_AREAS
+    )
+    costs = contradiction(best_first, objective, (SEARCH_ROUNDS[0][2],), edges=COARSE_EDGES)
     by_edges = np.argsort(costs, kind="stable")
-    by_areas = np.arange(len(best_first))[:BY_AREAS]
-    return best_first.select(np.concatenate([by_areas, by_edges[by_edges >= BY_AREAS][:BY_EDGES]]))
+    by_areas = np.arange(len(best_first))[:KEPT_BY_AREAS]
+    return best_first.select(np.concatenate([by_areas, by_edges[by_edges >= KEPT_BY_AREAS][:KEPT_BY_EDGES]]))
 
 
 def _follow_beam(
@@ -270,17 +278,19 @@ def _follow_beam(
 ) -> FramedPlanes:
     """The best of the planes sampled around each plane of the beam, best first."""
     tilt, shift = spread
-    shifts = shift * objective.reach(beam.planes)
-    around = planes_nearby(beam.planes, objective.anchors(beam.planes), CHILDREN, tilt=tilt, shift=shifts, rng=rng)
-    factors = np.exp(FRAME_SPREAD * rng.standard_normal((len(beam), 1 + CHILDREN)))
+    shifts = shift * objective.camera_distance(beam.planes)
+    around = sample_planes_nearby(
+        beam.planes, objective.anchors(beam.planes), SAMPLES_PER_PLANE, tilt=tilt, shift=shifts, rng=rng
+    )
+    factors = np.exp(FRAME_SPREAD * rng.standard_normal((len(beam), 1 + SAMPLES_PER_PLANE)))
     factors[:, 0] = 1
     family = FramedPlanes(around, (beam.frames[:, None] * factors).ravel())
     costs = objective.terms(family, tolerance, edges=COARSE_EDGES).cost.reshape(factors.shape)
-    best = np.arange(len(beam)) * (1 + CHILDREN) + costs.argmin(axis=1)
+    best = np.arange(len(beam)) * (1 + SAMPLES_PER_PLANE) + costs.argmin(axis=1)
     return family.select(best[np.argsort(costs.min(axis=1), kind="stable")])
 
 
-def _possible(planes: FramedPlanes, objective: Evidence) -> FramedPlanes:
+def _with_possible_frames(planes: FramedPlanes, objective: Evidence) -> FramedPlanes:
     """The planes whose frames have a possible height; all planes if there are none."""
     kept = np.flatnonzero(_has_possible_frames(planes, objective))
     return planes.select(kept) if len(kept) else planes
@@ -305,7 +315,7 @@ def _best_planes(planes: FramedPlanes, objective: Evidence, *, least: int = 0) -
 log = logging.getLogger("glassplat.panes")
 
 
-class Fit(NamedTuple):
+class PlaneCandidate(NamedTuple):
     """A plane, and the name of the points that it was fitted to."""
 
     source: str
@@ -317,7 +327,7 @@ def score(plane: FramedPlanes, evidence: Objective) -> float:
     return 1 - float(contradiction(plane, evidence)[0])
 
 
-def best_supported(label: int, fits: Sequence[Fit], evidence: Objective) -> FramedPlanes:
+def highest_scoring_plane(label: int, fits: Sequence[PlaneCandidate], evidence: Objective) -> FramedPlanes:
     """The plane with the highest score, the first one of equals; logs all scores.
 
     Planes behind impossibly high frames count only if there are no others.
@@ -336,7 +346,7 @@ def best_supported(label: int, fits: Sequence[Fit], evidence: Objective) -> Fram
         verdict = "kept" if fit is fits[kept] else f"{apart:.2f} degrees from the one that is kept"
         log.debug(
             "pane %d: the plane fitted to %s scores %.3f, with %.0f %% of %d points along its edge on it; %s",
-            label, fit.source, found, 100 * evidence.support(fit.plane.planes)[0], len(evidence.points), verdict,
+            label, fit.source, found, 100 * evidence.inlier_share(fit.plane.planes)[0], len(evidence.points), verdict,
         )  # fmt: skip
     return fits[kept].plane
 
@@ -347,7 +357,7 @@ def angle(one: FramedPlanes, other: FramedPlanes) -> float:
     return float(np.arctan2(np.linalg.norm(np.cross(first, second)), abs(first @ second)))
 
 
-IMAGE_TURN, IMAGE_TURN_STEP = 15.0, 0.75
+IMAGE_TILT, IMAGE_TILT_STEP = 15.0, 0.75
 IMAGE_SHIFT, IMAGE_SHIFT_STEP = 0.06, 0.01
 """Ranges and steps of the search around the plane of the masks: two tilts in degrees, a shift in scene extents."""
 IMAGE_TOLERANCE = 0.01
@@ -361,7 +371,7 @@ MOST_IMAGES, MOST_CELLS = 500, 200
 HALVINGS = 4
 
 
-class Images(NamedTuple):
+class MirrorImages(NamedTuple):
     """The plane about which measured points are mirror images of others.
 
     Attributes:
@@ -383,7 +393,9 @@ class Images(NamedTuple):
         return elsewhere and self.pairs >= LEAST_IMAGES and self.peak >= LEAST_PEAK
 
 
-def plane_of_images(plane: PlaneEquations, middle: Array, behind: Array, others: Array, extent: float) -> Images | None:
+def plane_of_mirror_images(
+    plane: PlaneEquations, middle: Array, behind: Array, others: Array, extent: float
+) -> MirrorImages | None:
     """The plane near the first one of `plane` that maps most points seen through a pane onto others.
 
     Structure from motion places points on mirrored objects at their virtual positions. The true plane of a mirror maps
@@ -406,16 +418,16 @@ def plane_of_images(plane: PlaneEquations, middle: Array, behind: Array, others:
 
     behind = behind[np.random.default_rng(0).permutation(len(behind))[:MOST_IMAGES]]
     tolerance = IMAGE_TOLERANCE * extent
-    near = _closeness(others, tolerance)
-    turns = np.tan(np.radians(np.arange(-IMAGE_TURN, IMAGE_TURN + 1e-9, IMAGE_TURN_STEP)))
+    near = _proximity_field(others, tolerance)
+    turns = np.tan(np.radians(np.arange(-IMAGE_TILT, IMAGE_TILT + 1e-9, IMAGE_TILT_STEP)))
     shifts = extent * np.arange(-IMAGE_SHIFT, IMAGE_SHIFT + 1e-9, IMAGE_SHIFT_STEP)
 
-    def tried(steps: Array) -> PlaneEquations:
+    def moved_planes(steps: Array) -> PlaneEquations:
         index = np.zeros(len(steps), np.int64)
         return move_planes(plane.select(index), middle[None][index], steps)
 
     steps = np.stack(np.meshgrid(turns, turns, shifts, indexing="ij"), axis=-1)
-    planes = tried(steps.reshape(-1, 3))
+    planes = moved_planes(steps.reshape(-1, 3))
     counts = sum_mirrored(planes.normals, planes.offsets, behind, near).reshape(steps.shape[:3])
     best = steps[np.unravel_index(counts.argmax(), counts.shape)]
     tilts = np.arctan(steps[..., :2]) - np.arctan(best[:2])
@@ -424,21 +436,21 @@ def plane_of_images(plane: PlaneEquations, middle: Array, behind: Array, others:
     tree = cKDTree(others)
 
     def pairs(steps: Array) -> Array:
-        planes = tried(steps)
+        planes = moved_planes(steps)
         images = behind - 2 * planes.distances(behind)[..., None] * planes.normals[:, None]
         return np.asarray(np.exp(-0.5 * (tree.query(images)[0] / tolerance) ** 2).sum(axis=1))
 
-    size = np.array([np.radians(IMAGE_TURN_STEP), np.radians(IMAGE_TURN_STEP), extent * IMAGE_SHIFT_STEP])
+    size = np.array([np.radians(IMAGE_TILT_STEP), np.radians(IMAGE_TILT_STEP), extent * IMAGE_SHIFT_STEP])
     for _ in range(HALVINGS):
         size = size / 2
         around = best + size * (np.indices((3, 3, 3)).reshape(3, -1).T - 1)
         best = around[pairs(around).argmax()]
     found, before = pairs(np.stack([best, np.zeros(3)]))
     peak = counts.max() / max(elsewhere, np.finfo(np.float64).tiny)
-    return Images(tried(best[None]), float(found), float(before), float(peak))
+    return MirrorImages(moved_planes(best[None]), float(found), float(before), float(peak))
 
 
-def _closeness(points: Array, tolerance: float) -> Field:
+def _proximity_field(points: Array, tolerance: float) -> Field:
     """Proximity to the points, from 1 at a point to 0 far away; Gaussian, with the tolerance as standard deviation.
 
     The outermost points are left out.

@@ -13,9 +13,9 @@ from glassplat.panes.masks import (
     UNKNOWN_WEIGHT,
     PaneView,
     PlaneEquations,
-    agreement_of_each,
+    agreement_per_view,
+    intersect_rays,
     mask_agreement,
-    meet,
     pane_view,
 )
 from glassplat.panes.objective import edge_matches
@@ -63,7 +63,7 @@ def test_followed_edges_are_those_of_the_definition(views: list[PaneView], plane
     for number, view in enumerate(views):
         chosen = np.flatnonzero(matches.sources == number)
         thinned = slice(None, None, max(len(view.edge) // 40, 1))
-        points, hit = meet(planes, view.center, view.directions(view.edge[thinned]))
+        points, hit = intersect_rays(planes, view.center, view.directions(view.edge[thinned]))
         limits = view.sight_limits(view.edge[thinned], view.outward[thinned])
         outward = limits - (planes.normals @ limits.T)[..., None] * planes.normals[:, None]
         outward /= np.maximum(np.linalg.norm(outward, axis=2, keepdims=True), 1e-9)
@@ -77,7 +77,7 @@ def test_followed_edges_are_those_of_the_definition(views: list[PaneView], plane
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
                 doubt = target.diagonal * np.sqrt((1 + (own_size / size) ** 2) / 2)
                 shifts, most = (own_hidden - hidden) / (size * doubt), STEEPEST / (size * doubt)
-            distances = target.edge_distance(np.where(compared[..., None], landed, 0).reshape(-1, 2))
+            distances = target.edge_distances(np.where(compared[..., None], landed, 0).reshape(-1, 2))
             distances = distances.reshape(compared.shape) / doubt
             for name, expected in (("distances", distances), ("shifts", shifts)):
                 found = getattr(matches, name)[:, other, chosen]
@@ -117,7 +117,7 @@ def test_images_of_any_size_are_interpolated_up_to_their_rims(shape: tuple[int, 
     assert found.compared[0, 1].all() and not found.compared[0, 0].any()
     own, other = 2 * np.sqrt(1 + (places[:, 0] / 2) ** 2), np.sqrt(1 + places[:, 0] ** 2)
     doubt = np.hypot(*shape) * np.sqrt((1 + (own / other) ** 2) / 2)
-    expected = replace(pane_view(*scene_of([FRONT])[0], 1), distance=field).edge_distance(places) / doubt
+    expected = replace(pane_view(*scene_of([FRONT])[0], 1), distance=field).edge_distances(places) / doubt
     np.testing.assert_allclose(found.distances[0, 1], expected, rtol=1e-9, atol=1e-12)
 
 
@@ -126,13 +126,13 @@ def test_overlaps_are_those_of_the_definition(views: list[PaneView], planes: Pla
     for number, source in enumerate(views):
         pixels = source.grid(90)
         everywhere = np.ones(len(pixels), dtype=bool)
-        pixels = pixels[source.tells(pixels, everywhere)]
+        pixels = pixels[source.is_unoccluded(pixels, everywhere)]
         on_pane = source.covers(pixels, everywhere[: len(pixels)])
-        points, hit = meet(planes, source.center, source.directions(pixels))
+        points, hit = intersect_rays(planes, source.center, source.directions(pixels))
         for other, target in enumerate(views):
             if target is not source:
                 landed, held = target.project(points)
-                held = target.tells(landed, held & hit)
+                held = target.is_unoccluded(landed, held & hit)
                 covered = target.covers(landed, held)
                 both[number, other] = (covered & on_pane).sum(axis=1)
                 unknown, missed = (hit & on_pane & ~held).sum(axis=1), (on_pane & ~hit).sum(axis=1)
@@ -141,7 +141,7 @@ def test_overlaps_are_those_of_the_definition(views: list[PaneView], planes: Pla
     np.testing.assert_allclose(mask_agreement(planes, views, pixels_per_view=90), expected, rtol=1e-12)
     assert expected[0] > 0.9 and expected.min() < 0.05
     alone = mask_agreement(planes.select(np.arange(1)), views)
-    assert 0.9 < agreement_of_each(planes.select(np.arange(1)), views).mean() < 1.1 * alone[0]
+    assert 0.9 < agreement_per_view(planes.select(np.arange(1)), views).mean() < 1.1 * alone[0]
 
 
 def test_a_field_is_summed_over_mirror_images() -> None:
@@ -161,6 +161,6 @@ def test_a_field_is_summed_over_mirror_images() -> None:
 def test_threads_change_no_bit(views: list[PaneView], planes: PlaneEquations) -> None:
     def compute() -> list[torch.Tensor]:
         matches = edge_matches(planes, views, edges_per_view=40)
-        return [torch.from_numpy(found) for found in (matches.distances, matches.shifts, matches.turns)]
+        return [torch.from_numpy(found) for found in (matches.distances, matches.shifts, matches.misalignments)]
 
     assert_threads_change_no_bit(compute)

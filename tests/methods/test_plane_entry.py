@@ -22,7 +22,13 @@ from glassplat.methods.planar import (
 )
 from glassplat.panes import PlaneFit, material
 from glassplat.panes.fit import with_mirrors
-from glassplat.panes.material import Likeness, MirrorCandidate, mostly_reflections, reflections_behind, virtual_points
+from glassplat.panes.material import (
+    MirrorCandidate,
+    MirrorRegression,
+    are_mostly_reflections,
+    reflections_behind,
+    virtual_points,
+)
 from glassplat.scene.camera import mirror_matrices
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
@@ -111,8 +117,8 @@ def test_glass_lies_where_a_mirror_has_been_aligned(monkeypatch: pytest.MonkeyPa
 
     def judged(scene: Scene, dataset: Any, labels: Any) -> Any:
         yield from ()
-        aligned = material.moved_pane(scene, torch.tensor([0.02, 0.01, 0.05])).planes
-        return {aligned.labels[0]: MirrorCandidate(aligned, Likeness(0.9, 0.9), 1000, 1000)}
+        aligned = material.move_pane(scene, torch.tensor([0.02, 0.01, 0.05])).planes
+        return {aligned.labels[0]: MirrorCandidate(aligned, MirrorRegression(0.9, 0.9), 1000, 1000)}
 
     monkeypatch.setattr(planar, "mirror_candidates", judged)
     monkeypatch.setattr(planar, "capture_planes", lambda *_: PANE)
@@ -220,12 +226,12 @@ def test_nothing_is_turned_round_where_views_find_no_surface_in_its_place(monkey
         return (reflections_behind(scene, planes, cameras).nonzero().flatten() - len(wall(2.5))).tolist()
 
     assert found(solid(far), solid(other), solid(thing, -2.5)) == [0, 1]
-    monkeypatch.setattr(material, "LEAST_STEADY", 2.0)
+    monkeypatch.setattr(material, "LEAST_ALWAYS_HIDDEN", 2.0)
     assert found(solid(far), solid(other), solid(thing, -2.5)) == []
     mirrored = torch.tensor([[0.7, 0.0, 0.7]])
     assert found(solid(far), solid(other), solid(mirrored, -2.5)) == [0, 1]
     # No view looks where the far one would be: whether it is real can be told only if most is always hidden.
-    monkeypatch.setattr(material, "FAIRLY_STEADY", 2.0)
+    monkeypatch.setattr(material, "MANY_ALWAYS_HIDDEN", 2.0)
     assert found(solid(far), solid(other), solid(mirrored, -2.5)) == [1]
 
 
@@ -249,7 +255,7 @@ def test_a_front_mirrors_what_is_behind_it_if_it_is_always_hidden_or_confirmed_i
     often: int, always: int, looked_at: int, confirmed: int, expected: bool
 ) -> None:
     counts = map(torch.tensor, (often, always, looked_at, confirmed))
-    assert bool(mostly_reflections(*counts)) == expected
+    assert bool(are_mostly_reflections(*counts)) == expected
 
 
 @pytest.mark.parametrize(("slope", "expected"), [(0.42, []), (0.75, [2])])
@@ -257,8 +263,8 @@ def test_a_pane_of_a_glass_front_is_a_mirror_only_beyond_doubt(slope: float, exp
     one, other = pane(2.0, half=0.4), pane(2.0, half=0.4, label=2)
     beside = replace(other, centers=one.centers + one.axes()[0])
     planes = joined(one, beside)
-    glass = MirrorCandidate(one, Likeness(0.14, 0.2), 5000, 8000)
-    alike = MirrorCandidate(beside, Likeness(slope, 0.5), 5000, 8000)
+    glass = MirrorCandidate(one, MirrorRegression(0.14, 0.2), 5000, 8000)
+    alike = MirrorCandidate(beside, MirrorRegression(slope, 0.5), 5000, 8000)
     assert detected_mirrors(planes, {1: glass, 2: alike}) == expected
     unknown = glass._replace(compared=10)
     assert detected_mirrors(planes, {1: unknown, 2: alike}) == [2]

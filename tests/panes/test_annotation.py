@@ -33,7 +33,7 @@ def test_edge_runs_between_pixels_and_not_along_the_image_border() -> None:
 def test_signed_distance_is_zero_on_the_edge_and_exact_beside_it() -> None:
     view = pane_view(camera_at(0), labels_with(10, 50, 20, 60), 1)
     pixels = np.array([[20.0, 30.0], [23.0, 30.0], [15.5, 30.0], [40.0, 50.0], [40.0, 52.25]])
-    assert view.edge_distance(pixels) == pytest.approx([0, 3, -4.5, 0, -2.25])
+    assert view.edge_distances(pixels) == pytest.approx([0, 3, -4.5, 0, -2.25])
 
 
 def test_lines_of_another_label_are_not_a_pane() -> None:
@@ -69,7 +69,7 @@ def test_candidates_stay_on_the_edge_in_most_views() -> None:
 
 def test_many_annotations_are_thinned_to_views_far_apart() -> None:
     annotations = [(camera_at(0.1 * i), labels_with(10, 50, 20, 60)) for i in range(21)]
-    views = pane_views(annotations, 1, most=3)
+    views = pane_views(annotations, 1, most_views=3)
     assert sorted(view.center[0] for view in views) == pytest.approx([0.0, 1.0, 2.0])
 
 

@@ -21,7 +21,7 @@ def test_edges_meet_on_the_true_plane() -> None:
     matches = edge_matches(TRUTH, views, edges_per_view=100)
     assert matches.compared.sum() > 300
     assert np.abs(matches.distances[matches.compared]).max() < 1.5 * PIXEL
-    assert np.median(np.abs(matches.turns)) < 0.1
+    assert np.median(np.abs(matches.misalignments)) < 0.1
 
 
 def test_a_frame_explains_edges_that_do_not_meet() -> None:
@@ -74,5 +74,5 @@ def test_the_sign_of_turned_edges_does_not_hang_on_the_axes_of_the_plane() -> No
     # The axes of a plane turn by a right angle where its normal is nearest to another axis of the world.
     tilts = 1e-3 * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
     around = move_planes(TRUTH.select(np.zeros(5, dtype=np.int64)), np.tile(FRONT.center, (5, 1)), tilts)
-    turns = edge_matches(around, views, edges_per_view=100).turns
+    turns = edge_matches(around, views, edges_per_view=100).misalignments
     assert np.abs(turns - turns[0]).max() < 0.05 < np.abs(turns[0]).max()

@@ -10,7 +10,7 @@ import torch
 
 from glassplat.panes.fit import fit_planes
 from glassplat.panes.masks import PlaneEquations
-from glassplat.panes.search import Images, plane_of_images
+from glassplat.panes.search import MirrorImages, plane_of_mirror_images
 from glassplat.scene.camera import rotation_from_quat
 from tests.panes.pane_scene import EYES, FRONT, Pane, normal_error, offset_error, scene_of
 from tests.panes.test_hard_panes import EXTENT, QUICK, roughened
@@ -47,14 +47,14 @@ def turned(degrees: float, shift: float) -> PlaneEquations:
     return PlaneEquations(normal[None], np.array([normal @ FRONT.center + shift]))
 
 
-def searched(plane: PlaneEquations, behind: np.ndarray, others: np.ndarray) -> Images:
+def searched(plane: PlaneEquations, behind: np.ndarray, others: np.ndarray) -> MirrorImages:
     middle = FRONT.center + (plane.offsets[0] - plane.normals[0] @ FRONT.center) * plane.normals[0]
-    found = plane_of_images(plane, middle, behind, others, EXTENT)
+    found = plane_of_mirror_images(plane, middle, behind, others, EXTENT)
     assert found is not None
     return found
 
 
-def degrees_off(found: Images) -> float:
+def degrees_off(found: MirrorImages) -> float:
     return float(np.degrees(np.arccos(min(1, abs(found.plane.normals[0] @ FRONT.normal)))))
 
 
@@ -94,9 +94,9 @@ def test_neither_units_nor_the_frame_matter() -> None:
     turn = rotation_from_quat(torch.tensor([0.8, 0.3, -0.2, 0.5], dtype=torch.float64)).numpy()
     scale, middle = 40.0, FRONT.center + 0.05 * plane.normals[0]
     moved = PlaneEquations(plane.normals @ turn.T, scale * plane.offsets)
-    first = plane_of_images(plane, middle, behind, room, EXTENT)
+    first = plane_of_mirror_images(plane, middle, behind, room, EXTENT)
     elsewhere = [scale * points @ turn.T for points in (middle, behind, room)]
-    second = plane_of_images(moved, *elsewhere, scale * EXTENT)
+    second = plane_of_mirror_images(moved, *elsewhere, scale * EXTENT)
     assert first is not None
     assert second is not None
     apart = np.degrees(np.arccos(min(1, float(second.plane.normals[0] @ turn @ first.plane.normals[0]))))
@@ -107,8 +107,8 @@ def test_neither_units_nor_the_frame_matter() -> None:
 @pytest.mark.parametrize("few", [np.zeros((0, 3)), np.ones((5, 3))])
 def test_too_few_points_place_nothing(few: np.ndarray) -> None:
     room = before_the_pane(0)
-    assert plane_of_images(turned(0, 0), FRONT.center, few, room, EXTENT) is None
-    assert plane_of_images(turned(0, 0), FRONT.center, room, few, EXTENT) is None
+    assert plane_of_mirror_images(turned(0, 0), FRONT.center, few, room, EXTENT) is None
+    assert plane_of_mirror_images(turned(0, 0), FRONT.center, room, few, EXTENT) is None
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -13,7 +13,7 @@ from torch import Tensor
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import PointCloud, View
 from glassplat.methods.planar import FillUnseen, LightLamps
-from glassplat.panes.material import Photograph, _ends_of_rays, mirrored_image, mirrored_lamps, unseen_places
+from glassplat.panes.material import Photograph, _ends_of_rays, mirrored_image, mirrored_lamps, unseen_positions
 from glassplat.render.planar import Planar
 from glassplat.scene.camera import Camera, mirror_matrices
 from glassplat.scene.gaussians import Gaussians
@@ -118,11 +118,11 @@ def test_places_are_found_where_a_pane_mirrors_nothing_and_nowhere_else() -> Non
     half = wall(-3.0, 120)
     half = half.select(half.means[:, 0] < 0)
     empty, closed = scene_of(wall(4.0), half), scene_of(wall(4.0), wall(-3.0, 120))
-    found = unseen_places(empty, empty.planes, CAMERAS)
-    assert len(found.places) > 10
-    assert bool((found.places[:, 2] < 2).all()) and float((found.places[:, 0] > -0.5).float().mean()) == 1
+    found = unseen_positions(empty, empty.planes, CAMERAS)
+    assert len(found.positions) > 10
+    assert bool((found.positions[:, 2] < 2).all()) and float((found.positions[:, 0] > -0.5).float().mean()) == 1
     torch.testing.assert_close(found.color, torch.full((3,), 120 / 255), atol=0.02, rtol=0)
-    assert len(unseen_places(closed, closed.planes, CAMERAS).places) == 0
+    assert len(unseen_positions(closed, closed.planes, CAMERAS).positions) == 0
 
 
 def test_places_lie_at_the_end_of_the_room_where_the_mirrored_camera_sees_the_hole() -> None:
@@ -188,7 +188,7 @@ def test_what_a_pane_mirrors_unseen_is_filled_once() -> None:
     added = len(state.scene.primary) - len(scene.primary)
     for sums in state.statistics["primary"].sums:
         assert bool((sums[:, :-added] == 1).all()) and not bool(sums[:, -added:].any())
-    size = 0.7 * unseen_places(scene, scene.planes, CAMERAS).cell
+    size = 0.7 * unseen_positions(scene, scene.planes, CAMERAS).cell
     assert bool(torch.isclose(state.scene.primary.log_scales[-added:].exp(), torch.tensor(size)).all())
     assert added > 10 and not bool(state.optimizer.moments["primary.means"][0][-added:].any())
     images = [mirrored_image(one, CAMERAS[2]) for one in (scene, state.scene)]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from glassplat.panes import PlaneFit
-from glassplat.panes.fit import fit_planes, meeting_of_each, odd_ones
+from glassplat.panes.fit import fit_planes, matching_outline_shares, outlier_masks
 from glassplat.panes.masks import FramedPlanes, PlaneEquations, pane_views
 from tests.panes.pane_scene import EYES, FRONT, Annotations, Pane, frame_and_clutter, scene_of
 
@@ -49,10 +49,10 @@ def test_views_without_any_outline_say_nothing() -> None:
     (camera, labels), *others = scene_of([FRONT])
     views = pane_views([(camera, labels.new_ones(labels.shape)), *others], 1)
     plane = FramedPlanes(PlaneEquations(FRONT.normal[None], np.array([FRONT.normal @ FRONT.center])), np.zeros(1))
-    assert not odd_ones(meeting_of_each(plane, views)[1:]).any()
+    assert not outlier_masks(matching_outline_shares(plane, views)[1:]).any()
 
 
 def test_the_odd_ones_are_told_from_what_meets_nothing() -> None:
-    assert odd_ones(np.array([0.9, 0.1, np.nan, 0.8])).tolist() == [False, True, False, False]
-    assert odd_ones(np.array([0.2, 0.1, 0.1])).all()
-    assert not odd_ones(np.full(3, np.nan)).any()
+    assert outlier_masks(np.array([0.9, 0.1, np.nan, 0.8])).tolist() == [False, True, False, False]
+    assert outlier_masks(np.array([0.2, 0.1, 0.1])).all()
+    assert not outlier_masks(np.full(3, np.nan)).any()

@@ -15,16 +15,16 @@ from glassplat.captures.view import View
 from glassplat.panes.material import (
     FEWEST_PIXELS,
     LEAST_SHARE,
+    MEAN_WINDOW,
     MIRROR_CORRELATION,
     REDUCED_WIDTH,
-    WINDOW,
-    Likeness,
-    about_local_mean,
+    MirrorRegression,
     degrees_between,
-    likeness,
     mirror_candidate,
-    photographs_of,
     reduced_photograph,
+    reduced_photographs,
+    regress_on_mirrored,
+    subtract_local_mean,
 )
 from glassplat.render.layers import window_sums
 from glassplat.render.planar import Planar
@@ -58,7 +58,7 @@ def photographs(scene: Scene) -> list[View]:
 
 def mirror_labels(scene: Scene, views: Sequence[View]) -> tuple[int, ...]:
     """Labels of the panes that are mirrors."""
-    photographed = photographs_of(scene, views)
+    photographed = reduced_photographs(scene, views)
     judged = {label: mirror_candidate(scene, label, photographed) for label in scene.planes.labels}
     return tuple(label for label, found in judged.items() if found.is_mirror)
 
@@ -76,9 +76,9 @@ def test_glass_before_darkness_is_no_mirror() -> None:
     before = scene.primary.means[:, 2] < scene.planes.centers[0, 2]
     dark = replace(scene, primary=scene.primary.select(before))
     views = photographs(dark)
-    found = mirror_candidate(dark, 1, photographs_of(dark, views))
-    assert found.like.correlation > MIRROR_CORRELATION
-    assert found.like.slope == pytest.approx(0.15, abs=0.05)
+    found = mirror_candidate(dark, 1, reduced_photographs(dark, views))
+    assert found.regression.correlation > MIRROR_CORRELATION
+    assert found.regression.slope == pytest.approx(0.15, abs=0.05)
     assert not found.is_mirror
 
 
@@ -100,7 +100,7 @@ def test_an_exposure_does_not_turn_a_mirror_into_glass() -> None:
 def test_a_pane_of_which_hardly_anything_is_known_stays_glass() -> None:
     """Of a glass front that mirrors what no photograph shows, some spots may well agree with it."""
     scene = scene_with(0.2)
-    found = mirror_candidate(scene, 1, photographs_of(scene, photographs(scene_with(0.995))))
+    found = mirror_candidate(scene, 1, reduced_photographs(scene, photographs(scene_with(0.995))))
     assert found.is_mirror and FEWEST_PIXELS <= found.compared <= found.shown
     assert not found._replace(shown=round(1.05 * found.compared / LEAST_SHARE)).is_mirror
     assert not found._replace(compared=FEWEST_PIXELS - 1).is_mirror
@@ -112,7 +112,7 @@ def test_a_mirror_is_found_and_put_right_where_its_fitted_plane_is_tilted() -> N
     tilt = torch.tensor([[math.tan(math.radians(2.0)), 0.0, 0.0]])
     tilted = replace(unknown, planes=replace(unknown.planes, raw_normals=unknown.planes.normals + tilt))
     before = degrees_between(tilted.planes.normals[0], true.planes.normals[0])
-    found = mirror_candidate(tilted, 1, photographs_of(tilted, photographs(true)))
+    found = mirror_candidate(tilted, 1, reduced_photographs(tilted, photographs(true)))
     assert before == pytest.approx(2.0, abs=0.01)
     assert found.is_mirror
     assert degrees_between(found.pane.normals[0], true.planes.normals[0]) < 0.2
@@ -122,7 +122,7 @@ def test_a_mirror_is_found_and_put_right_where_its_fitted_plane_is_tilted() -> N
 def test_a_mirror_stays_where_its_fitted_plane_is_right() -> None:
     """Aligning moves even a true plane a little, for hardly any gain."""
     unknown = scene_with(0.2)
-    found = mirror_candidate(unknown, 1, photographs_of(unknown, photographs(scene_with(0.995))))
+    found = mirror_candidate(unknown, 1, reduced_photographs(unknown, photographs(scene_with(0.995))))
     assert found.is_mirror
     assert torch.equal(found.pane.centers, unknown.planes.centers)
     torch.testing.assert_close(found.pane.normals, unknown.planes.normals)
@@ -151,7 +151,7 @@ def test_a_view_without_a_mask_tells_as_well() -> None:
 
 def test_likeness_is_slope_and_correlation() -> None:
     mirrored = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) - 0.5
-    found = likeness(mirrored, 0.1 * mirrored)
+    found = regress_on_mirrored(mirrored, 0.1 * mirrored)
     assert found.slope == pytest.approx(0.1, abs=1e-4)
     assert found.correlation == pytest.approx(1.0, abs=1e-4)
     assert not found.is_mirror
@@ -162,7 +162,7 @@ def test_likeness_is_slope_and_correlation() -> None:
     [(0.46, 0.42, True), (0.89, 0.25, True), (0.50, 0.27, False), (0.30, 0.40, False), (0.89, 0.10, False)],
 )
 def test_a_slope_near_one_needs_less_correlation(slope: float, correlation: float, expected: bool) -> None:
-    assert Likeness(slope, correlation).is_mirror == expected
+    assert MirrorRegression(slope, correlation).is_mirror == expected
 
 
 def test_local_means_ignore_what_lies_outside_the_region() -> None:
@@ -170,12 +170,12 @@ def test_local_means_ignore_what_lies_outside_the_region() -> None:
     region = torch.zeros(20, 30, dtype=torch.bool)
     region[:, :15] = True
     image[:, 15:] = 100.0
-    torch.testing.assert_close(about_local_mean(image, region)[region], torch.zeros(300, 3), atol=1e-6, rtol=0)
+    torch.testing.assert_close(subtract_local_mean(image, region)[region], torch.zeros(300, 3), atol=1e-6, rtol=0)
 
 
 def mean_by_pooling(image: torch.Tensor, region: torch.Tensor) -> torch.Tensor:
     """The definition: every window by itself."""
-    side = 2 * max(round(WINDOW * image.shape[1] / 2), 1) + 1
+    side = 2 * max(round(MEAN_WINDOW * image.shape[1] / 2), 1) + 1
     inside = region.to(image.dtype)[..., None]
     stacked = torch.cat([image * inside, inside], dim=-1).permute(2, 0, 1)[None]
     sums = torch.nn.functional.avg_pool2d(stacked, side, stride=1, padding=side // 2)[0].permute(1, 2, 0)
@@ -188,7 +188,7 @@ def test_local_means_are_those_of_every_window_by_itself(size: tuple[int, int]) 
     image = torch.rand(*size, 3, generator=generator)
     region = torch.rand(size, generator=generator) < 0.3
     expected = image - mean_by_pooling(image, region)
-    torch.testing.assert_close(about_local_mean(image, region), expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(subtract_local_mean(image, region), expected, atol=1e-6, rtol=0)
 
 
 def test_a_large_window_is_no_more_work_than_a_small_one() -> None:

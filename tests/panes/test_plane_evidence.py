@@ -13,7 +13,7 @@ from glassplat.panes import PlaneFit
 from glassplat.panes.fit import fit_planes
 from glassplat.panes.masks import FramedPlanes, PlaneEquations, pane_views
 from glassplat.panes.objective import Objective
-from glassplat.panes.search import Fit, best_supported, first_hypotheses, score
+from glassplat.panes.search import PlaneCandidate, first_hypotheses, highest_scoring_plane, score
 from tests.panes.pane_scene import FRONT, Pane, camera_from, frame_and_clutter, label_image, normal_error, scene_of
 
 QUICK = PlaneFit(hypotheses=300, refined=2)
@@ -62,19 +62,19 @@ def test_gaussians_decide_where_measured_points_lead_to_no_plane(caplog: pytest.
 def test_the_better_plane_is_kept_in_either_order(degrees: float) -> None:
     views = pane_views(scene_of([FRONT]), 1)
     evidence = Objective(views, np.zeros((0, 3)), EXTENT, 0.01 * EXTENT)
-    fits = [Fit("one", framed(FRONT)), Fit("other", framed(turned(FRONT, degrees)))]
-    assert best_supported(1, fits, evidence) is fits[0].plane
-    assert best_supported(1, fits[::-1], evidence) is fits[0].plane
+    fits = [PlaneCandidate("one", framed(FRONT)), PlaneCandidate("other", framed(turned(FRONT, degrees)))]
+    assert highest_scoring_plane(1, fits, evidence) is fits[0].plane
+    assert highest_scoring_plane(1, fits[::-1], evidence) is fits[0].plane
 
 
 def test_a_plane_behind_an_impossible_frame_is_kept_only_where_there_is_no_other() -> None:
     views = pane_views(scene_of([FRONT]), 1)
     evidence = Objective(views, np.zeros((0, 3)), EXTENT, 0.01 * EXTENT)
     high = replace(framed(FRONT), frames=np.array([0.3 * EXTENT]))
-    fits = [Fit("one", high), Fit("other", framed(turned(FRONT, 40.0)))]
+    fits = [PlaneCandidate("one", high), PlaneCandidate("other", framed(turned(FRONT, 40.0)))]
     assert score(high, evidence) > score(fits[1].plane, evidence)
-    assert best_supported(1, fits, evidence) is fits[1].plane
-    assert best_supported(1, fits[:1], evidence) is high
+    assert highest_scoring_plane(1, fits, evidence) is fits[1].plane
+    assert highest_scoring_plane(1, fits[:1], evidence) is high
 
 
 def test_virtual_points_behind_a_mirror_do_not_speak_against_its_plane() -> None:
