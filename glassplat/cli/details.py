@@ -18,7 +18,7 @@ from glassplat.files.records import read_json
 from glassplat.files.scene_folder import read_scene, read_splats
 from glassplat.files.sidecars import read_planes
 from glassplat.methods.planar import capture_planes
-from glassplat.model.model import CAMERAS, EXPORTED, PLANES
+from glassplat.model.model import CAMERAS, EXPORT_STEM, PLANES
 from glassplat.model.run_directory import RunDirectory, RunSettings
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.material import virtual_points
@@ -123,7 +123,7 @@ def splats_part(path: Path) -> Finding:
         planes = read_planes(beside) if beside.is_file() else Planes.empty()
     finding = Finding()
     _describe_scene(Scene(gaussians, extent=1.0, planes=planes), finding)
-    if len(planes) and path.stem != EXPORTED:
+    if len(planes) and path.stem != EXPORT_STEM:
         finding.facts["panes"] += f", of {beside}"
     return finding
 

@@ -20,7 +20,7 @@ from glassplat.evaluate.metrics import PLANE_COLUMNS, format_value, missing_reas
 from glassplat.evaluate.report import Report
 from glassplat.files.writing import check_links, write_text
 from glassplat.methods.planar import capture_planes
-from glassplat.model.run_directory import EVALUATED
+from glassplat.model.run_directory import EVALUATION_FILES
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.render.planar import Planar, with_photographer
 from glassplat.training.checkpoint import read_progress
@@ -92,7 +92,7 @@ def evaluate_run(
         align: when to align test cameras first.
         show: receives the progress.
     """
-    check_links(stored.directory.path, (*EVALUATED, stored.directory.results.name))
+    check_links(stored.directory.path, (*EVALUATION_FILES, stored.directory.results.name))
     seconds, regions = train_seconds(stored), pane_regions(stored.dataset, panes)
     aligned = align == "always" or (align == "auto" and len(stored.scene.poses) > 0)
     if aligned:

@@ -192,7 +192,7 @@ def splat_finding(path: Path) -> Iterator[Finding]:
 def run_finding(path: Path) -> Iterator[Finding]:
     """The directory of a training run, or of a scene in that layout."""
     directory = RunDirectory(path)
-    if directory.imported.is_file():
+    if directory.import_record.is_file():
         yield Finding("a scene without a capture")
         yield import_held(DETAILS).imported_part(directory)
         return

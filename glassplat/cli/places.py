@@ -99,7 +99,7 @@ def _in_words(path: Path) -> str:
     if source.is_file():
         return f"{'a splat file' if source == path else 'an exported scene'} of {source.stat().st_size / 1e6:.1f} MB"
     directory = RunDirectory(path)
-    if directory.imported.is_file():
+    if directory.import_record.is_file():
         return "a scene without a capture"
     recipe, settings = directory.recipe(), directory.settings()
     return f"a {recipe.method} run of {settings.iterations} iterations on {settings.data}"

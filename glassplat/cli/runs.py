@@ -80,7 +80,7 @@ def open_run(
     scene = scene.to(chosen_device(device))
     dataset = capture_of(directory, recorded, data, downscale)
     directory.check_photographs(dataset)
-    if data is not None or not directory.imported.is_file():  # Without a capture, cameras are written corrected.
+    if data is not None or not directory.import_record.is_file():  # Without a capture, cameras are written corrected.
         dataset = with_corrected_cameras(dataset, scene)
     recipe = resolve_background(recorded, dataset)
     return StoredRun(directory, recipe, scene, recipe.renderer(), dataset, iterations)
@@ -90,7 +90,7 @@ def capture_of(
     directory: RunDirectory, recipe: Any, moved: Path | None = None, downscale: float | None = None
 ) -> Dataset:
     """The capture of a run, at its recorded or given location; only the cameras for a scene without a capture."""
-    if directory.imported.is_file() and moved is None:
+    if directory.import_record.is_file() and moved is None:
         return _without_photographs(directory)
     settings = directory.settings()
     data = Path(settings.data) if moved is None else moved
@@ -202,7 +202,7 @@ def _viewer_listeners(asked: Train[Any], training: Training, dataset: Dataset, c
         training, dataset, host=LOCAL, port=vacant_port(LOCAL), announce=lambda viewer: announce(viewer, console)
     )
     try:
-        yield watched.hear
+        yield watched.handle_message
     finally:
         watched.stop()
 

@@ -58,7 +58,7 @@ def writer_for(command: View, model: Model) -> FolderWriter | None:
 def photographs_of(run: Path) -> dict[str, Callable[[], Tensor]]:
     """Existing photographs of a run, by name."""
     directory = RunDirectory(run)
-    if not run.is_dir() or directory.imported.is_file():
+    if not run.is_dir() or directory.import_record.is_file():
         return {}
     try:
         dataset = capture_of(directory, directory.recipe())

@@ -103,7 +103,7 @@ def planar_renderer(stored: StoredRun) -> Planar:
     renderer = stored.renderer
     if isinstance(renderer, Planar) and len(stored.scene.planes):
         return replace(renderer, photographer="present")
-    data = "CAPTURE" if stored.directory.imported.is_file() else shell_word(stored.directory.settings().data)
+    data = "CAPTURE" if stored.directory.import_record.is_file() else shell_word(stored.directory.settings().data)
     raise InputError(
         f"{stored.directory.path} is a {stored.recipe.method} run without panes, which has no reflections; "
         f"train one with pane masks: glassplat train planar --data {data} --output RUN"
@@ -215,7 +215,7 @@ def write_files(command: Export, console: Console) -> None:
     if "html" in command.formats:
         with input_checked():
             check_panes(model.scene)
-    splats = {kind: command.output / f"{models.EXPORTED}.{kind}" for kind in SPLAT_WRITERS}
+    splats = {kind: command.output / f"{models.EXPORT_STEM}.{kind}" for kind in SPLAT_WRITERS}
     beside = [command.output / name for name in BESIDE_SPLATS]
     check_targets(command.output, [*beside, *splats.values()], [])
     is_again = claim_folder(command.output, "export", command.scene)
@@ -229,7 +229,7 @@ def write_files(command: Export, console: Console) -> None:
             write_splats(kind, splats[kind], model.scene.primary, **options)
         written.append(splats[kind])
         say(console, f"{splats[kind].stat().st_size / 1e6:.2f} MB -> {splats[kind]}")
-        if lost := models.left_out(model, kind):
+        if lost := models.unsaved_parts(model, kind):
             held = f"; {command.scene} holds everything" if command.edits == SceneEdits() else ""
             warn(console, f"{splats[kind].name} leaves out {', '.join(lost)}{held}")
     if "html" in command.formats:
@@ -292,7 +292,7 @@ def _write_page(command: Export, model: models.Model, console: Console) -> list[
 
 def _write_beside(command: Export, scene: Scene, console: Console) -> list[Path]:
     """Writes planes, glass and environment, if present; returns the written files."""
-    written = models.write_beside(command.output, scene)
+    written = models.write_companion_files(command.output, scene)
     if len(scene.planes):
         panes = count_noun(len(scene.planes), "pane")
         say(console, f"{panes} -> {command.output / models.PLANES}, their shape -> {models.GLASS}")

@@ -88,8 +88,8 @@ class Model:
         camera = self.cameras[name]
         width = min(NOTEBOOK_WIDTH, camera.width)
         small = camera.resize(width, max(1, round(width * camera.height / camera.width)))
-        picture = web_page.in_base64(web_page.jpeg(self.image(small), quality=90))
-        return f'<p>{text}</p><img src="data:image/jpeg;base64,{picture}" alt="{html.escape(name)}">'
+        encoded = web_page.in_base64(web_page.jpeg(self.image(small), quality=90))
+        return f'<p>{text}</p><img src="data:image/jpeg;base64,{encoded}" alt="{html.escape(name)}">'
 
     def show(self) -> Viewer:
         """Starts the viewer of `glassplat view`, at the `address` of the returned object, until its `stop()`.
@@ -226,8 +226,8 @@ class Model:
             InputError: no Gaussians would be left, or there are none.
         """
         centers = torch.stack([camera.center for camera in self.viewpoints.values()])
-        bare, found = clean_scene(self.scene, Floaters(self.scene.primary, centers), cleaning or Cleaning())
-        return self.with_scene(bare), found
+        cleaned, found = clean_scene(self.scene, Floaters(self.scene.primary, centers), cleaning or Cleaning())
+        return self.with_scene(cleaned), found
 
     def scale(self, factor: float) -> Model:
         """The model and its cameras in other units; it no longer matches the capture.
@@ -313,15 +313,15 @@ class Model:
                 `planar` nor `splat`, or the Gaussians are discs.
         """
         free = next(number for number in range(1, len(self.panes) + 2) if number not in self.panes)
-        tangent = self._level_direction(normal) if tangent is None else tangent
+        tangent = self._horizontal_direction(normal) if tangent is None else tangent
         pane = Planes.rectangle(center, normal, half_sizes, tangent=tangent, label=free if label is None else label)
         added = with_pane(self.scene, pane)
-        recipe = planar_of(self.recipe)
+        recipe = planar_recipe_for(self.recipe)
         recipe.renderer().check(added)
         model = replace(self, scene=added, recipe=recipe).with_reflectance(pane.labels[0], base_reflectance)
         return model.with_mirrors(*pane.labels) if base_reflectance == 1 else model
 
-    def _level_direction(self, normal: Sequence[float]) -> list[float] | None:
+    def _horizontal_direction(self, normal: Sequence[float]) -> list[float] | None:
         """[3] horizontal direction perpendicular to a normal; None if undetermined."""
         up = estimate_up([*self.cameras.values()]) if self.cameras else DEFAULT_UP
         across = np.asarray([*normal], np.float64)
@@ -369,7 +369,7 @@ def viewer_state(
     )
 
 
-def planar_of(recipe: Any) -> PlanarRecipe:
+def planar_recipe_for(recipe: Any) -> PlanarRecipe:
     """The `planar` recipe that renders a scene of another method with a pane.
 
     Raises:
@@ -384,7 +384,7 @@ def planar_of(recipe: Any) -> PlanarRecipe:
     )
 
 
-def by_name(cameras: Iterable[tuple[str, Camera]]) -> dict[str, Camera]:
+def name_cameras(cameras: Iterable[tuple[str, Camera]]) -> dict[str, Camera]:
     """Cameras by name; duplicates get a number."""
     named: dict[str, Camera] = {}
     for name, camera in cameras:
@@ -397,9 +397,9 @@ def by_name(cameras: Iterable[tuple[str, Camera]]) -> dict[str, Camera]:
 
 
 PLANES, GLASS, CAMERAS = "planes.json", "glass.ply", "cameras.json"
-EXPORTED = "scene"
+EXPORT_STEM = "scene"
 """File name, without suffix, of exported splats."""
-SETTINGS = "settings.json"
+SETTINGS_FILE = "settings.json"
 PANORAMA, ENVIRONMENT = "environment.png", "environment.json"
 
 
@@ -417,8 +417,10 @@ def save_model(model: Model, path: Path, *, overwrite: bool) -> Path:
         endings = ", ".join(f".{known}" for known in writing.OUTPUT_FORMATS)
         raise InputError(f"{path}: expected a name that ends in {endings}, or a folder's")
     names = (PLANES, GLASS, CAMERAS, *(() if model.scene.environment.is_empty else (ENVIRONMENT, PANORAMA)))
-    beside = [path.with_name(name) for name in names] if kind in writing.SPLAT_WRITERS else []
-    found = [] if overwrite else [str(target) for target in (path, *_foreign(model, beside)) if target.exists()]
+    companions = [path.with_name(name) for name in names] if kind in writing.SPLAT_WRITERS else []
+    found = (
+        [] if overwrite else [str(target) for target in (path, *_differing_files(model, companions)) if target.exists()]
+    )
     if found:
         raise FileExistsError(
             f"{first_names(found)} already exists; nothing was written. Choose another folder, or overwrite=True"
@@ -429,22 +431,22 @@ def save_model(model: Model, path: Path, *, overwrite: bool) -> Path:
         return path
     with input_checked():
         writing.write_splats(kind, path, model.scene.primary)
-    if lost := left_out(model, kind):
+    if lost := unsaved_parts(model, kind):
         log.warning("%s leaves out %s; a folder, saved without a suffix, holds everything", path, ", ".join(lost))
-    write_beside(path.parent, model.scene)
+    write_companion_files(path.parent, model.scene)
     if not len(model.scene.planes) and (path.parent / PLANES).exists():
         write_planes(path.parent / PLANES, model.scene.planes)  # Panes of a previous file must not be used.
     write_cameras(path.parent / CAMERAS, model.cameras.items())
     return path
 
 
-def _foreign(model: Model, beside: Sequence[Path]) -> list[Path]:
+def _differing_files(model: Model, companions: Sequence[Path]) -> list[Path]:
     """Existing files next to a splat file that differ from what the model would write."""
-    there = [target for target in beside if target.exists()]
+    there = [target for target in companions if target.exists()]
     if not there:
         return []
     with tempfile.TemporaryDirectory() as folder:
-        own = [*write_beside(Path(folder), model.scene), Path(folder) / CAMERAS]
+        own = [*write_companion_files(Path(folder), model.scene), Path(folder) / CAMERAS]
         write_cameras(own[-1], model.cameras.items())
         contents = {file.name: file.read_bytes() for file in own}
     if not len(model.scene.planes):  # Panes of an earlier model are removed; its glass stays, but is never read.
@@ -453,18 +455,18 @@ def _foreign(model: Model, beside: Sequence[Path]) -> list[Path]:
     return [target for target in there if not target.is_file() or target.read_bytes() != contents.get(target.name)]
 
 
-CHANNELED = ("ply", "glb")
+FORMATS_WITH_CHANNELS = ("ply", "glb")
 """Splat formats that can store channels."""
 
 
-def left_out(model: Model, kind: str) -> list[str]:
+def unsaved_parts(model: Model, kind: str) -> list[str]:
     """Parts of a model that neither the splat file nor the files next to it can store."""
     scene = model.scene
     own, read = (recipe.renderer().page_settings() for recipe in (model.recipe, recipe_of_splats(scene.primary)))
     names = read if len(scene.planes) else ("background",)
     lost = [f"{name}={own[name]}" for name in names if name in own and own[name] != read[name]]
     logs = scene.primary.channels.get("log_intensity")
-    if kind not in CHANNELED and len(scene.planes) and logs is not None and bool(logs.any()):
+    if kind not in FORMATS_WITH_CHANNELS and len(scene.planes) and logs is not None and bool(logs.any()):
         lost.append("the intensity of Gaussians in panes")
     if len(scene.surroundings) or not scene.environment.is_empty:
         lost.append("what shiny things mirror")
@@ -479,7 +481,7 @@ def save_page(model: Model, path: Path, title: str, *, sharing: web_page.Sharing
         web_page.write_page(path, model.scene, model.renderer, tuple(model.viewpoints.items()), title, sharing=sharing)
 
 
-def write_beside(folder: Path, scene: Scene) -> list[Path]:
+def write_companion_files(folder: Path, scene: Scene) -> list[Path]:
     """Writes planes, glass and environment, if present; returns the written files."""
     written = []
     if len(scene.planes):
@@ -521,11 +523,11 @@ def write_as_run(folder: Path, model: Model, source: Path | None) -> None:
     directory = RunDirectory(folder)
     directory.export(model.scene, step=0)
     write_cameras(folder / CAMERAS, model.cameras.items())
-    if source is not None and (source / SETTINGS).is_file():
-        writing.write_text(folder / SETTINGS, read_text(source / SETTINGS))
+    if source is not None and (source / SETTINGS_FILE).is_file():
+        writing.write_text(folder / SETTINGS_FILE, read_text(source / SETTINGS_FILE))
     else:
         file = None if source is None else str(source.resolve())
-        writing.write_text(directory.imported, json.dumps({"file": file}) + "\n")
+        writing.write_text(directory.import_record, json.dumps({"file": file}) + "\n")
     writing.write_text(folder / "recipe.json", recipe_to_json(model.recipe) + "\n")
 
 
@@ -550,10 +552,10 @@ def save_folder(model: Model, folder: Path, *, overwrite: bool = False) -> Path:
         raise FileExistsError(
             f"{folder} already exists and is not empty; nothing was written. Choose a new folder{more}"
         )
-    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as beside:
-        write_as_run(Path(beside) / "new", model, model.path)
-        folder.rename(Path(beside) / "old")
-        (Path(beside) / "new").rename(folder)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as temporary:
+        write_as_run(Path(temporary) / "new", model, model.path)
+        folder.rename(Path(temporary) / "old")
+        (Path(temporary) / "new").rename(folder)
     return folder
 
 
@@ -564,40 +566,40 @@ AXES: dict[str, tuple[int, int, int]] = {
 log = logging.getLogger(__name__)
 
 
-def extent_of(gaussians: Gaussians, cameras: NamedCameras) -> float:
+def scene_extent(gaussians: Gaussians, cameras: NamedCameras) -> float:
     """Extent of the scene as defined for training; with a single camera, that stored in the scene."""
     centers = torch.stack([camera.center for _, camera in cameras])
     radius = float((centers - centers.mean(0)).norm(dim=1).max())
     return EXTENT_MARGIN * (radius or web_page.bounding_ball(gaussians)[1])
 
 
-def _planes(file: Path, planes_file: Path | None) -> Planes:
-    beside = file.with_name("planes.json")
-    if planes_file is None and not beside.is_file():
+def _read_panes(file: Path, planes_file: Path | None) -> Planes:
+    companion = file.with_name("planes.json")
+    if planes_file is None and not companion.is_file():
         if file.with_name(GLASS).is_file():
             log.warning("%s no longer has panes: next to it is %s, but no %s", file, GLASS, PLANES)
         return Planes.empty()
-    if planes_file is None and file.stem != EXPORTED:
-        log.info("%s gets the panes of %s; move it to another folder if they are not its panes", file, beside)
-    return read_planes(planes_file or beside)
+    if planes_file is None and file.stem != EXPORT_STEM:
+        log.info("%s gets the panes of %s; move it to another folder if they are not its panes", file, companion)
+    return read_planes(planes_file or companion)
 
 
-def _glass(file: Path, planes: Planes, *, own: bool) -> Gaussians:
+def _read_glass(file: Path, planes: Planes, *, own: bool) -> Gaussians:
     """The glass stored next to the file, or an even sheet of Gaussians on each pane."""
-    beside = file.with_name("glass.ply")
-    if not len(planes) or not own or not beside.is_file():
+    companion = file.with_name("glass.ply")
+    if not len(planes) or not own or not companion.is_file():
         return covering_glass(planes)
-    glass, _ = select_drawable(read_gaussians(beside), beside)
+    glass, _ = select_drawable(read_gaussians(companion), companion)
     if "logit_mark" not in glass.channels:
-        raise InputError(f"{beside} has no property logit_mark; expected glass as `glassplat export` writes it")
+        raise InputError(f"{companion} has no property logit_mark; expected glass as `glassplat export` writes it")
     return glass
 
 
-def _cameras(file: Path, gaussians: Gaussians, up: Up) -> NamedCameras:
+def _read_or_place_cameras(file: Path, gaussians: Gaussians, up: Up) -> NamedCameras:
     if up not in AXES:
         raise InputError(f"up is {up!r}; expected one of {', '.join(AXES)}")
-    beside = file.with_name("cameras.json")
-    cameras = read_cameras(beside) if beside.is_file() else []
+    companion = file.with_name("cameras.json")
+    cameras = read_cameras(companion) if companion.is_file() else []
     return tuple(cameras or web_page.cameras_around(gaussians, torch.tensor(AXES[up], dtype=torch.float64)))
 
 
@@ -647,7 +649,7 @@ def _from_run(path: Path, device: DeviceName) -> Model:
         cameras = read_cameras(path / "cameras.json")
     if not cameras:
         raise InputError(f"{path / 'cameras.json'} lists no camera; expected those of the photographs")
-    return Model(scene.to(chosen_device(device)), recipe, by_name(cameras), path.resolve().name, path)
+    return Model(scene.to(chosen_device(device)), recipe, name_cameras(cameras), path.resolve().name, path)
 
 
 def _from_file(path: Path, device: DeviceName, planes_file: Path | None, up: Up) -> Model:
@@ -656,15 +658,15 @@ def _from_file(path: Path, device: DeviceName, planes_file: Path | None, up: Up)
         gaussians, lost = select_drawable(read_splats(path), path)
         if not len(gaussians):
             raise InputError(f"{path} holds no Gaussians; expected a trained splat")
-        planes = _planes(path, planes_file)
+        planes = _read_panes(path, planes_file)
         own = planes_file is None or writing.real_path(planes_file) == writing.real_path(path.with_name("planes.json"))
-        glass = _glass(path, planes, own=own)
-        cameras = _cameras(path, gaussians, up)
-        scene = Scene(with_intensity(gaussians), extent_of(gaussians, cameras), glass=glass, planes=planes)
+        glass = _read_glass(path, planes, own=own)
+        cameras = _read_or_place_cameras(path, gaussians, up)
+        scene = Scene(with_intensity(gaussians), scene_extent(gaussians, cameras), glass=glass, planes=planes)
     if lost:
         log.warning("%d Gaussians of %s are left out: they contain NaN or values too large to draw", lost, path)
     recipe = recipe_of_splats(scene.primary)
-    return Model(scene.to(chosen_device(device)), recipe, by_name(cameras), path.stem, path)
+    return Model(scene.to(chosen_device(device)), recipe, name_cameras(cameras), path.stem, path)
 
 
 def recipe_of_splats(gaussians: Gaussians) -> Any:

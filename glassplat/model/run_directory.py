@@ -35,13 +35,13 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("glassplat.training")
 
-NAME = "train.lock"
+LOCK_FILE = "train.lock"
 """The empty file remains; its lock ends with the process."""
-WITHOUT_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
+NO_LOCK_ERRORS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
 """Errors of file systems without locks."""
 
 
-def _is_near(recorded: Camera, camera: Camera, extent: float) -> bool:
+def _is_unmoved(recorded: Camera, camera: Camera, extent: float) -> bool:
     rounding = ROUNDING * float(camera.center.norm())
     return float((recorded.center - camera.center).norm()) <= MOST_MOVED * extent + rounding
 
@@ -53,7 +53,7 @@ def run_lock(folder: Path) -> Iterator[None]:
     Raises:
         InputError: another training process writes to it.
     """
-    lock = FileLock(folder / NAME, blocking=False, mode=0o666, thread_local=False)
+    lock = FileLock(folder / LOCK_FILE, blocking=False, mode=0o666, thread_local=False)
     try:
         lock.acquire()
     except Timeout as error:
@@ -62,7 +62,7 @@ def run_lock(folder: Path) -> Iterator[None]:
             "choose another --output"
         ) from error
     except OSError as error:
-        if error.errno not in WITHOUT_LOCKS:
+        if error.errno not in NO_LOCK_ERRORS:
             raise
         log.warning("%s cannot be locked (%s); make sure that no second training writes to it", folder, error.strerror)
     try:
@@ -77,7 +77,7 @@ def check_unlocked(folder: Path) -> None:
     Raises:
         InputError: another one does.
     """
-    if (folder / NAME).is_file():
+    if (folder / LOCK_FILE).is_file():
         with run_lock(folder):
             pass
 
@@ -107,14 +107,14 @@ class RunSettings:
     mask_polarity: Polarity = "auto"
 
 
-EVALUATED = ("per_view.json", "sheets", "uses.png", "index.html")
-FILES = ("recipe.json", "settings.json", "log.jsonl", "cameras.json", *EVALUATED)
+EVALUATION_FILES = ("per_view.json", "sheets", "uses.png", "index.html")
+RUN_FILES = ("recipe.json", "settings.json", "log.jsonl", "cameras.json", *EVALUATION_FILES)
 """Other files of a run."""
 MOST_MOVED = 0.02
 """Tolerance of camera positions, as a share of the scene's extent."""
 ROUNDING = 1e-5
 """Additional tolerance for single precision, as a share of the distance from the origin."""
-NUMBERED = re.compile(r"iteration_([0-9]{1,18})")
+ITERATION_FOLDER = re.compile(r"iteration_([0-9]{1,18})")
 """Name of a scene's folder; users may keep renamed copies."""
 
 
@@ -153,7 +153,7 @@ class RunDirectory:
         return self.path / "results.json"
 
     @property
-    def imported(self) -> Path:
+    def import_record(self) -> Path:
         """Path of the record of a scene's origin, for scenes that were not trained."""
         return self.path / "imported.json"
 
@@ -180,7 +180,7 @@ class RunDirectory:
         """
         if not self.path.exists():
             raise FileNotFoundError(f"{self.path} does not exist; expected what `glassplat train --output` wrote")
-        self._read("recipe.json")
+        self._read_file("recipe.json")
 
     def check_vacant(self) -> None:
         """Refuse to start a run that would overwrite something.
@@ -194,7 +194,7 @@ class RunDirectory:
             )
         if self.is_saved:
             raise InputError(f"{self.path} already holds a trained scene; choose another --output, or move it away")
-        found = [name for name in FILES if os.path.lexists(self.path / name)]
+        found = [name for name in RUN_FILES if os.path.lexists(self.path / name)]
         if found and not self.is_begun:
             raise InputError(
                 f"{self.path} holds {first_names(found)}, which is not from a run of this version and would be "
@@ -230,7 +230,7 @@ class RunDirectory:
         """Replaces the recorded settings."""
         write_text(self.path / "settings.json", json.dumps(dataclasses.asdict(settings), indent=2) + "\n")
 
-    def clear(self) -> None:
+    def remove_partial_files(self) -> None:
         """Removes partial files of a killed run; requires the lock.
 
         Other commands may be writing JSON and images here.
@@ -261,17 +261,17 @@ class RunDirectory:
         """The recorded recipe."""
         from glassplat.methods.recipe import recipe_from_json
 
-        return recipe_from_json(self._read("recipe.json"), str(self.path / "recipe.json"))
+        return recipe_from_json(self._read_file("recipe.json"), str(self.path / "recipe.json"))
 
-    def written_recipe(self) -> Any:
+    def recipe_as_written(self) -> Any:
         """The recorded options, as written."""
-        return parse_json(self._read("recipe.json"), "recipe.json")
+        return parse_json(self._read_file("recipe.json"), "recipe.json")
 
     def settings(self) -> RunSettings:
         """The recorded settings."""
         path = self.path / "settings.json"
         with input_checked():
-            written = parse_json(self._read(path.name), str(path))
+            written = parse_json(self._read_file(path.name), str(path))
         try:
             return options_from_json(RunSettings, written)
         except InputError as error:
@@ -289,7 +289,7 @@ class RunDirectory:
         recorded = self._cameras()
         cameras = {view.name: view.camera for view in (*dataset.train, *dataset.test)}
         return recorded.keys() == cameras.keys() and all(
-            _is_near(recorded[name], camera, dataset.extent)
+            _is_unmoved(recorded[name], camera, dataset.extent)
             and (recorded[name].width, recorded[name].height) == (camera.width, camera.height)
             for name, camera in cameras.items()
         )
@@ -298,7 +298,7 @@ class RunDirectory:
         """Refuse a capture in which most cameras have moved, since it has another world frame."""
         recorded = self._cameras()
         known = {v.name: v.camera for v in (*dataset.train, *dataset.test) if v.name in recorded}
-        moved = [name for name, camera in known.items() if not _is_near(recorded[name], camera, dataset.extent)]
+        moved = [name for name, camera in known.items() if not _is_unmoved(recorded[name], camera, dataset.extent)]
         if 2 * len(moved) > len(known):
             raise InputError(
                 f"{len(moved)} of {len(known)} cameras of {dataset.root} have moved since {self.path} was "
@@ -354,7 +354,7 @@ class RunDirectory:
         """The scene of the last saved iteration, and that iteration."""
         from glassplat.files.scene_folder import read_scene
 
-        named = {NUMBERED.fullmatch(folder.name): folder for folder in self.path.glob("point_cloud/*")}
+        named = {ITERATION_FOLDER.fullmatch(folder.name): folder for folder in self.path.glob("point_cloud/*")}
         folders = {int(match[1]): folder for match, folder in named.items() if match and folder.is_dir()}
         if not folders:
             raise InputError(
@@ -366,7 +366,7 @@ class RunDirectory:
         except (ValueError, FileNotFoundError) as error:
             raise InputError(f"the scene in {folders[step]} cannot be read: {error}") from error
 
-    def _read(self, name: str) -> str:
+    def _read_file(self, name: str) -> str:
         file = self.path / name
         if not file.is_file():
             raise InputError(
@@ -388,7 +388,9 @@ def check_output(directory: RunDirectory, *, resume: bool) -> None:
     if not is_leader():
         return  # Rank 0 may have started writing.
     check_folder(directory.path)
-    check_links(directory.path, (*FILES, directory.checkpoint.name, directory.results.name, "point_cloud", "sparse"))
+    check_links(
+        directory.path, (*RUN_FILES, directory.checkpoint.name, directory.results.name, "point_cloud", "sparse")
+    )
     check_unlocked(directory.path)
     if resume:
         directory.check_saved()

@@ -56,28 +56,28 @@ class StopRequest:
     """A request to stop the run after the current step.
 
     Attributes:
-        number: the signal; None without a request.
-        answer: handler of the signal before the run.
+        signal_number: the signal; None without a request.
+        handler: handler of the signal before the run.
     """
 
-    number: int | None = None
-    answer: Callable[[int, FrameType | None], Any] | int | None = None
+    signal_number: int | None = None
+    handler: Callable[[int, FrameType | None], Any] | int | None = None
 
     @property
     def requested(self) -> bool:
         """Return whether a stop was requested."""
-        return self.number is not None
+        return self.signal_number is not None
 
     def end(self) -> NoReturn:
         """Ends the run in the way of the signal, so that the caller can distinguish signals."""
-        if callable(self.answer) and self.number is not None:
-            self.answer(self.number, None)
+        if callable(self.handler) and self.signal_number is not None:
+            self.handler(self.signal_number, None)
         raise KeyboardInterrupt
 
 
-_asked: list[StopRequest] = []
+_stop_requests: list[StopRequest] = []
 """Requests of the active runs in the main thread; several may be iterated alternately."""
-_before: dict[int, Any] = {}
+_previous_handlers: dict[int, Any] = {}
 """Handlers of the signals before these runs."""
 
 
@@ -89,40 +89,40 @@ def stop_on_interrupt() -> Iterator[StopRequest]:
     """
     request = StopRequest()
     if threading.current_thread() is threading.main_thread():
-        _asked.append(request)
+        _stop_requests.append(request)
         for number in STOP_SIGNALS:
-            if (handler := signal.getsignal(number)) not in (None, signal.SIG_IGN, _ask):
-                _before[number] = handler
-                signal.signal(number, _ask)
+            if (handler := signal.getsignal(number)) not in (None, signal.SIG_IGN, _request_stop):
+                _previous_handlers[number] = handler
+                signal.signal(number, _request_stop)
     try:
         yield request
     finally:
-        if request in _asked:
-            _asked.remove(request)
-        if not _asked and threading.current_thread() is threading.main_thread():
-            _put_handlers_back()
+        if request in _stop_requests:
+            _stop_requests.remove(request)
+        if not _stop_requests and threading.current_thread() is threading.main_thread():
+            _restore_handlers()
 
 
-def _ask(number: int, frame: FrameType | None) -> None:
+def _request_stop(number: int, frame: FrameType | None) -> None:
     """Requests all runs to stop; interrupts if they were requested before.
 
     Under `torchrun`, which forwards signals of a scheduler, repeated signals are ignored.
     """
-    if not _asked:  # The last run ended in another thread, where handlers could not be restored.
-        is_own = signal.getsignal(number) is _ask
-        _put_handlers_back()
+    if not _stop_requests:  # The last run ended in another thread, where handlers could not be restored.
+        is_own = signal.getsignal(number) is _request_stop
+        _restore_handlers()
         if is_own:
             signal.raise_signal(number)
-    elif not all(request.requested for request in _asked):
-        for request in _asked:
-            request.number, request.answer = number, _before[number]
+    elif not all(request.requested for request in _stop_requests):
+        for request in _stop_requests:
+            request.signal_number, request.handler = number, _previous_handlers[number]
     elif "TORCHELASTIC_RUN_ID" not in os.environ:  # Also set if `torchrun` started a single process.
-        _asked[-1].end()
+        _stop_requests[-1].end()
 
 
-def _put_handlers_back() -> None:
-    for number, handler in _before.items():
-        if signal.getsignal(number) is _ask:
+def _restore_handlers() -> None:
+    for number, handler in _previous_handlers.items():
+        if signal.getsignal(number) is _request_stop:
             signal.signal(number, handler)
 
 
@@ -189,12 +189,12 @@ class Run:
         check_length(self._stages, settings.iterations)
         run_directory.check_output(directory, resume=resume)
         self._settings, self._directory, self._dataset = settings, directory, dataset
-        self._resume, self._every = resume, checkpoint_every
+        self._resume, self._checkpoint_every = resume, checkpoint_every
         self._ranks = ranks or Ranks()
         self._session: TrainingSession | None = None
         self.state: TrainState | None = None
 
-    def to_the_end(self, listen: Listener) -> TrainState:
+    def run_to_end(self, listen: Listener) -> TrainState:
         """Trains to the end or to an interrupt; re-raises exceptions of `listen` after saving."""
         messages = self.messages()
         for message in messages:
@@ -219,27 +219,29 @@ class Run:
         return with_gradients(self._messages())
 
     def _messages(self) -> Generator[Message, None, None]:
-        self._ranks.check_same_settings(traits(self.recipe, self._settings, self._dataset) | {"resume": self._resume})
-        yield from self._leading() if self._ranks.is_leader else self._following()
+        self._ranks.check_same_settings(
+            shared_settings(self.recipe, self._settings, self._dataset) | {"resume": self._resume}
+        )
+        yield from self._run_as_leader() if self._ranks.is_leader else self._run_as_follower()
         self._ranks.exchange()  # Other ranks wait until the leader has written the scene.
 
-    def _following(self) -> Generator[Message, None, None]:
+    def _run_as_follower(self) -> Generator[Message, None, None]:
         """Trains on a rank that does not write."""
         self.state = self._ranks.broadcast(self.state, self._settings.device)
         self._session = TrainingSession(self.state, self._ranks)
         with self._dataset.memory.spool_to(self._directory.path):
             yield from self._session.run_stages(self._stages, self._dataset, self._settings.iterations)
 
-    def _leading(self) -> Generator[Message, None, None]:
+    def _run_as_leader(self) -> Generator[Message, None, None]:
         directory, settings = self._directory, self._settings
         resume = self._resume or (self.state is not None and directory.checkpoint.is_file())
         state = None
         if not resume:
             yield Working("preparing the first scene", 0, 1)
-            state = first_state(self.recipe, settings, self._dataset)
+            state = initial_state(self.recipe, settings, self._dataset)
         make_folder(directory.path)
         with run_directory.run_lock(directory.path):
-            directory.clear()
+            directory.remove_partial_files()
             # Another process may have finished training here.
             anew = directory.is_begun and not resume
             if state is None:
@@ -249,8 +251,8 @@ class Run:
                 directory.begin(self.recipe, settings, self._dataset)
             self.state = self._ranks.broadcast(state, settings.device)
             with run_directory.open_log(directory.log, self.state.step) as log:
-                record = Record(directory.checkpoint, log, self._every, self._restore)
-                self._session = TrainingSession(self.state, self._ranks, record)
+                files = OutputFiles(directory.checkpoint, log, self._checkpoint_every, self._ensure_directory)
+                self._session = TrainingSession(self.state, self._ranks, files)
                 yield from self._session.deliver(RunBegun(self.state.step, settings.iterations, anew))
                 with self._dataset.memory.spool_to(directory.path):
                     yield from self._session.run_stages(self._stages, self._dataset, settings.iterations)
@@ -276,19 +278,19 @@ class Run:
         if self._ranks.is_leader:
             self._export()
 
-    def _restore(self) -> None:
+    def _ensure_directory(self) -> None:
         """Records again what is run where the directory was removed or renamed meanwhile, so that it is a run's."""
         if not (self._directory.path / "recipe.json").is_file():
             self._directory.begin(self.recipe, self._settings, self._dataset)
 
     def _export(self) -> None:
         assert self.state is not None
-        self._restore()
+        self._ensure_directory()
         self._directory.export(self.state.scene, self.state.step)
         self._directory.write_trained_cameras(self._dataset, self.state.scene)
 
 
-def first_state(recipe: Any, settings: run_directory.RunSettings, dataset: Dataset) -> TrainState:
+def initial_state(recipe: Any, settings: run_directory.RunSettings, dataset: Dataset) -> TrainState:
     """The initial state of a new run."""
     return TrainState(recipe.initialise(dataset), settings.seed, method=recipe.method).to(settings.device)
 
@@ -307,8 +309,8 @@ def resumed_state(
     has_moved = written.data != settings.data and directory.has_cameras_of(dataset)
     recorded = replace(written, device=settings.device, data=settings.data if has_moved else written.data)
     # Compared as written: `recipe()` gives what an earlier version did not have its present default.
-    if recorded != settings or directory.written_recipe() != json.loads(recipe_to_json(recipe)):
-        changes = differences(vars(recorded), vars(settings)) + changes_of_recipe(directory, recipe)
+    if recorded != settings or directory.recipe_as_written() != json.loads(recipe_to_json(recipe)):
+        changes = option_changes(vars(recorded), vars(settings)) + recipe_changes(directory, recipe)
         raise InputError(
             f"{directory.path} was started with other options: {first_names(changes)}; expected the same to resume it. "
             "Repeat the original options, with the version of glassplat that began it, or choose another --output"
@@ -329,7 +331,7 @@ def resumed_state(
     return state.to(settings.device)
 
 
-def traits(recipe: Any, settings: run_directory.RunSettings, dataset: Dataset) -> dict[str, object]:
+def shared_settings(recipe: Any, settings: run_directory.RunSettings, dataset: Dataset) -> dict[str, object]:
     """Options, versions and capture of a run, which must agree on all ranks; only the folder may differ."""
     views = (*dataset.train, *dataset.test)
     shapes = [(v.name, v.camera.intrinsics.tolist(), v.camera.cam_from_world.tolist(), v.is_annotated) for v in views]
@@ -343,31 +345,31 @@ def traits(recipe: Any, settings: run_directory.RunSettings, dataset: Dataset) -
         "device": settings.device.partition(":")[0],
         "method": recipe.method,
         **of_settings,
-        **dict(_values(json.loads(recipe_to_json(recipe)), "")),
+        **dict(_flatten_options(json.loads(recipe_to_json(recipe)), "")),
     }
 
 
-def changes_of_recipe(directory: run_directory.RunDirectory, recipe: Any) -> list[str]:
+def recipe_changes(directory: run_directory.RunDirectory, recipe: Any) -> list[str]:
     """The options of a recipe that differ from the recorded ones."""
     recorded = directory.recipe()
     if recorded.method != recipe.method:  # Options of different methods are not comparable.
-        return differences({"method": recorded.method}, {"method": recipe.method})
-    of_both = directory.written_recipe(), json.loads(recipe_to_json(recipe))
+        return option_changes({"method": recorded.method}, {"method": recipe.method})
+    of_both = directory.recipe_as_written(), json.loads(recipe_to_json(recipe))
     kind = type(recorded).__name__
-    return differences(*({"recipe": kind, **dict(_values(options, ""))} for options in of_both))
+    return option_changes(*({"recipe": kind, **dict(_flatten_options(options, ""))} for options in of_both))
 
 
-def differences(before: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
+def option_changes(before: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
     """The differing options, each with both values."""
     names = [name for name in dict.fromkeys((*before, *now)) if before.get(name, UNKNOWN) != now.get(name, UNKNOWN)]
     return [f"{name} was {before.get(name, UNKNOWN)} and is {now.get(name, UNKNOWN)}" for name in names]
 
 
-def _values(options: Any, name: str) -> Iterator[tuple[str, object]]:
+def _flatten_options(options: Any, name: str) -> Iterator[tuple[str, object]]:
     """All values of nested options by dotted name."""
     if isinstance(options, dict):
         for key, inner in options.items():
-            yield from _values(inner, f"{name}.{key}" if name else key)
+            yield from _flatten_options(inner, f"{name}.{key}" if name else key)
     else:
         yield name, options
 
@@ -376,28 +378,28 @@ UNKNOWN = "unknown"
 """Shown for options that a version does not have."""
 
 
-class Record(NamedTuple):
+class OutputFiles(NamedTuple):
     """Files that the leader writes during training: checkpoints at intervals, and the log.
 
-    Before a checkpoint, `restore` sees to it that its directory is that of a run.
+    Before a checkpoint, `ensure_directory` sees to it that its directory is that of a run.
     """
 
     checkpoint: Path
     log: run_directory.RunLog
     every: float
-    restore: Callable[[], None] = lambda: None
+    ensure_directory: Callable[[], None] = lambda: None
 
 
 class TrainingSession:
     """One session of a run: from its start or a checkpoint to its end or an interrupt."""
 
-    def __init__(self, state: TrainState, ranks: Ranks, record: Record | None = None) -> None:
-        self._state, self._ranks, self._record = state, ranks, record
+    def __init__(self, state: TrainState, ranks: Ranks, files: OutputFiles | None = None) -> None:
+        self._state, self._ranks, self._files = state, ranks, files
         self._seconds_before, self._started = state.seconds, time.perf_counter()
         self._compiled_before = compile_seconds()
-        self._saved = self._started
-        self._stepped: float | None = None  # The first step may compile kernels, and is not representative.
-        self._longest = self._writing = 0.0
+        self._last_save_time = self._started
+        self._last_step_time: float | None = None  # The first step may compile kernels, and is not representative.
+        self._longest_step = self._save_seconds = 0.0
         self._stop = StopRequest()
 
     def run_stages(
@@ -409,12 +411,12 @@ class TrainingSession:
             messages = train(stages, dataset, self._state, iterations, ranks=self._ranks)
             starts = zip(stages, stage_starts(stages, iterations), strict=False)
             setups = {start for stage, start in starts if stage.setup is not None}
-            for message in self._saved_where_it_fails(messages, check_photographs):
+            for message in self._save_on_failure(messages, check_photographs):
                 yield from self.deliver(message)
                 if isinstance(message, StepDone):
-                    yield from self._saved_in_time(message, iterations, setups)
+                    yield from self._save_if_due(message, iterations, setups)
 
-    def _saved_where_it_fails(self, messages: Iterator[Message], check: Callable[[], None]) -> Iterator[Message]:
+    def _save_on_failure(self, messages: Iterator[Message], check: Callable[[], None]) -> Iterator[Message]:
         """Forwards messages; if a rank is lost or a photograph cannot be read, it saves first."""
         begun = self._state.step
         try:
@@ -430,7 +432,7 @@ class TrainingSession:
             step = self._state.step
             raise InputError(f"{error}; step {step} is saved; fix that, then repeat with --resume") from error
 
-    def _saved_in_time(
+    def _save_if_due(
         self, message: StepDone, iterations: int, setups: Container[int] = ()
     ) -> Generator[Message, None, None]:
         """Writes a checkpoint if one is due, and ends training if a stop was requested.
@@ -438,30 +440,30 @@ class TrainingSession:
         One is also due before a setup, which may fail, for example because of masks.
         """
         is_last, is_ending = message.step == iterations, self._ranks.is_ending
-        is_time = self._record is not None and (message.step in setups or self._is_time(self._record.every))
-        if is_ending or is_last or is_time:
+        is_due = self._files is not None and (message.step in setups or self._is_checkpoint_due(self._files.every))
+        if is_ending or is_last or is_due:
             self.save()
             yield from self.deliver(CheckpointWritten(message.step))
         if is_ending and not is_last:
             self._stop.end()
-        self._stepped = time.perf_counter()
+        self._last_step_time = time.perf_counter()
 
-    def _is_time(self, every: float) -> bool:
+    def _is_checkpoint_due(self, every: float) -> bool:
         """Return whether a checkpoint after the next step would exceed the interval.
 
         The next step is assumed to take as long as the longest one so far, and the checkpoint as long as the last one;
         together at most half of the interval, so that checkpoints are at most twice as frequent.
         """
         now = time.perf_counter()
-        if self._stepped is not None:
-            self._longest = max(self._longest, now - self._stepped)
-        return now - self._saved + min(self._longest + self._writing, every / 2) >= every
+        if self._last_step_time is not None:
+            self._longest_step = max(self._longest_step, now - self._last_step_time)
+        return now - self._last_save_time + min(self._longest_step + self._save_seconds, every / 2) >= every
 
     def deliver(self, message: Message) -> Generator[Message, None, None]:
         """Forwards a message; if the consumer stops iterating, the state is saved first."""
         try:
-            if self._record is not None:
-                self._record.log.write(message)
+            if self._files is not None:
+                self._files.log.write(message)
             yield message
         except BaseException as error:
             if isinstance(message, StageEntered | StepDone | ActionDone):
@@ -477,13 +479,13 @@ class TrainingSession:
 
     def save(self) -> None:
         """Writes a checkpoint if this process is the leader; the state must be consistent."""
-        self._saved = time.perf_counter()  # Before writing, as later steps are not in it.
+        self._last_save_time = time.perf_counter()  # Before writing, as later steps are not in it.
         compiling = compile_seconds() - self._compiled_before
-        self._state.seconds = self._seconds_before + self._saved - self._started - compiling
-        if self._record is not None:
-            self._record.restore()
-            save_checkpoint(self._record.checkpoint, self._state)
-        self._writing = time.perf_counter() - self._saved
+        self._state.seconds = self._seconds_before + self._last_save_time - self._started - compiling
+        if self._files is not None:
+            self._files.ensure_directory()
+            save_checkpoint(self._files.checkpoint, self._state)
+        self._save_seconds = time.perf_counter() - self._last_save_time
 
 
 class Training:
@@ -587,10 +589,10 @@ class Training:
             listen: receives every message; its exceptions end the run after saving.
         """
         if self._run is not None:
-            self._run.to_the_end(listen or _nobody)
+            self._run.run_to_end(listen or _ignore_message)
         else:
             for message in self:
-                (listen or _nobody)(message)
+                (listen or _ignore_message)(message)
         return self.model
 
     @property
@@ -647,10 +649,10 @@ class Training:
         self._run.save()
 
     def _in_memory(self) -> Generator[Message, None, None]:
-        self._ranks.check_same_settings(traits(self.recipe, self._settings, self._dataset))
+        self._ranks.check_same_settings(shared_settings(self.recipe, self._settings, self._dataset))
         if self._state is None:
             yield Working("preparing the first scene", 0, 1)
-            first = first_state(self.recipe, self._settings, self._dataset) if self._ranks.is_leader else None
+            first = initial_state(self.recipe, self._settings, self._dataset) if self._ranks.is_leader else None
             self._state = self._ranks.broadcast(first, self._settings.device)
         yield from train(self._stages, self._dataset, self._state, self.iterations, ranks=self._ranks)
 
@@ -671,5 +673,5 @@ def chosen_recipe(recipe: str | Recipe) -> Any:
     return given
 
 
-def _nobody(message: Message) -> None:
+def _ignore_message(message: Message) -> None:
     """Ignores messages."""

@@ -25,7 +25,7 @@ from glassplat.viewer.drawing import ViewerState
 from glassplat.viewer.render_loop import DrawingShare, check_port
 from glassplat.viewer.server import Viewer
 
-NAME = re.compile(r"\w[\w .+-]{0,99}")
+VALID_NAME = re.compile(r"\w[\w .+-]{0,99}")
 LEAST_KEYFRAMES = 2
 
 
@@ -78,7 +78,7 @@ class FolderWriter:
         )
 
     def _path(self, name: str) -> Path:
-        if NAME.fullmatch(name.strip()) is None:
+        if VALID_NAME.fullmatch(name.strip()) is None:
             raise InputError(
                 f"{name[:100]!r} is not a valid name; expected one that begins with a letter or digit, then letters, "
                 "digits, spaces, dots, + and -, at most 100 of them"
@@ -105,7 +105,7 @@ class WatchedTraining:
         """Prepares the viewer, which starts after the first step.
 
         Args:
-            training: the training run; its messages have to be passed to `hear`.
+            training: the training run; its messages have to be passed to `handle_message`.
             dataset: data set with the photographs to show.
             host: address to listen on.
             port: port to listen on.
@@ -120,9 +120,9 @@ class WatchedTraining:
         self._viewer: Viewer | None = None
         self._share: DrawingShare | None = None
         self._refreshed = 0.0
-        self._is_paused, self._is_save_asked = False, False
+        self._is_paused, self._is_save_requested = False, False
 
-    def hear(self, message: Message) -> None:
+    def handle_message(self, message: Message) -> None:
         """Handles a message of the training run: draws, pauses and saves."""
         if not isinstance(message, StepDone):
             return
@@ -133,7 +133,7 @@ class WatchedTraining:
         if self._viewer.is_watched:
             self._update(self._viewer, message)
         self._share.draw()
-        self._obey(self._viewer, message)
+        self._handle_requests(self._viewer, message)
 
     def stop(self) -> None:
         """Stops the viewer."""
@@ -147,17 +147,17 @@ class WatchedTraining:
     def _update(self, viewer: Viewer, message: StepDone) -> None:
         """Shows the current scene, and requests new images at intervals."""
         scene = self._training.state.scene  # Not `model`, which would correct all cameras at every step.
-        viewer.change(scene, renderer_now(self._training.recipe, scene))
+        viewer.change(scene, current_renderer(self._training.recipe, scene))
         now = time.monotonic()
         if now - self._refreshed >= REFRESH_SECONDS and viewer.loop.expected_seconds() is None:
             self._refreshed = now
             viewer.refresh(self._status(message))
 
-    def _obey(self, viewer: Viewer, message: StepDone) -> None:
+    def _handle_requests(self, viewer: Viewer, message: StepDone) -> None:
         """Saves if requested, and waits while paused, drawing without a time limit."""
-        while self._is_save_asked or (self._is_paused and not self._training.is_stopping):
-            if self._is_save_asked:
-                self._is_save_asked = False
+        while self._is_save_requested or (self._is_paused and not self._training.is_stopping):
+            if self._is_save_requested:
+                self._is_save_requested = False
                 try:
                     self._training.save()
                     outcome = "saved"
@@ -178,10 +178,10 @@ class WatchedTraining:
             self._viewer.refresh("paused" if self._is_paused else "going on")
 
     def _save(self) -> None:
-        self._is_save_asked = True
+        self._is_save_requested = True
 
 
-def renderer_now(recipe: Any, scene: Scene) -> Renderer:
+def current_renderer(recipe: Any, scene: Scene) -> Renderer:
     """The recipe's renderer, or a plain one while the scene lacks the parts that it needs."""
     renderer: Renderer = recipe.renderer()
     try:

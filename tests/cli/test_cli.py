@@ -173,7 +173,7 @@ def test_a_full_gpu_is_explained(
     def full(*arguments: object, **options: object) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB.")
 
-    monkeypatch.setattr("glassplat.model.training.Run.to_the_end", full)
+    monkeypatch.setattr("glassplat.model.training.Run.run_to_end", full)
     assert train("splat", tmp_path / "run", "--iterations", "3") == 1
     said = " ".join(capsys.readouterr().err.split())
     assert "stopped: CUDA out of memory; " in said and "--downscale" in said and "--device cpu" in said

@@ -168,7 +168,7 @@ def test_a_finished_run_whose_scene_is_damaged_says_what_is_wrong(
     write_tiny_capture(tmp_path / "capture")
     run = tmp_path / "run"
     settings = RunSettings(str(tmp_path / "capture"), 12, seed=3)
-    Run(SplatRecipe(sh_degree=1), settings, RunDirectory(run), load_dataset(settings.data)).to_the_end(lambda _: None)
+    Run(SplatRecipe(sh_degree=1), settings, RunDirectory(run), load_dataset(settings.data)).run_to_end(lambda _: None)
     (run / "cameras.json").unlink()
     assert "cameras.json is missing" in told(run, capsys)["problems"][0]
     (scene,) = run.glob("point_cloud/*/point_cloud.ply")
@@ -194,7 +194,7 @@ def test_an_interrupted_run_says_its_step_and_the_command_that_goes_on(
 
     recipe, settings = SplatRecipe(sh_degree=1), RunSettings(str(tmp_path / "a capture"), 12, seed=3)
     with pytest.raises(KeyboardInterrupt):
-        Run(recipe, settings, RunDirectory(tmp_path / "run"), load_dataset(settings.data)).to_the_end(stop)
+        Run(recipe, settings, RunDirectory(tmp_path / "run"), load_dataset(settings.data)).run_to_end(stop)
     found = told(tmp_path / "run", capsys)
     assert "interrupted at step 5 of 12" in found["problems"]
     (command,) = (line for line in found["next"] if "--resume" in line)

@@ -18,7 +18,7 @@ from PIL import Image
 
 import glassplat
 from glassplat import Camera, Gaussians, InputError, Model, Planar, PlanarRecipe, Scene, SplatRecipe, View
-from glassplat.model.model import by_name
+from glassplat.model.model import name_cameras
 from glassplat.options import CLEAR_GLASS
 from glassplat.render.deferred import Deferred
 from glassplat.render.splat import Splat
@@ -261,7 +261,7 @@ def test_a_model_of_nothing_says_so() -> None:
 def test_cameras_of_one_name_are_all_kept() -> None:
     cameras = list(model().cameras.values())
     names = ("a", "a", "a #2", "b", "a")
-    assert list(by_name(zip(names, cameras, strict=False))) == ["a", "a #2", "a #2 #2", "b", "a #3"]
+    assert list(name_cameras(zip(names, cameras, strict=False))) == ["a", "a #2", "a #2 #2", "b", "a #3"]
 
 
 def test_a_model_without_cameras_is_saved_as_a_file_and_as_no_folder(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ from glassplat.methods.recipe import recipe_from_json, recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model import training
 from glassplat.model.run_directory import CHECKPOINT_SECONDS, RunDirectory, RunSettings
-from glassplat.model.training import Record, Run, TrainingSession
+from glassplat.model.training import OutputFiles, Run, TrainingSession
 from glassplat.panes import PlaneFitError
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
@@ -63,7 +63,7 @@ def run(
             signal.raise_signal(by)
 
     begun = Run(RECIPE, SETTINGS, RunDirectory(path), tiny_capture(), resume=resume, checkpoint_every=checkpoint_every)
-    return begun.to_the_end(listen)
+    return begun.run_to_end(listen)
 
 
 @cache
@@ -148,7 +148,7 @@ def test_nothing_is_lost_when_nobody_is_there_to_hear_it(gone: BaseException, as
 
     directory = RunDirectory(tmp_path)
     with pytest.raises(KeyboardInterrupt if asked and isinstance(gone, OSError) else type(gone)):
-        Run(RECIPE, SETTINGS, directory, tiny_capture(), resume=False).to_the_end(listen)
+        Run(RECIPE, SETTINGS, directory, tiny_capture(), resume=False).run_to_end(listen)
     assert load_checkpoint(directory.checkpoint).step == 7
     assert_same(run(tmp_path, resume=True).scene, whole())
 
@@ -177,7 +177,9 @@ def test_never_are_more_than_two_minutes_lost(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(training, "time", SimpleNamespace(perf_counter=lambda: now))
     monkeypatch.setattr(training, "save_checkpoint", write)
     log: Any = SimpleNamespace(write=lambda message: None)
-    session = TrainingSession(TrainState(true_scene(), 0), Ranks(), Record(Path("checkpoint"), log, CHECKPOINT_SECONDS))
+    session = TrainingSession(
+        TrainState(true_scene(), 0), Ranks(), OutputFiles(Path("checkpoint"), log, CHECKPOINT_SECONDS)
+    )
     for step in range(1, 300):
         now += 31.0 if step % 10 == 0 else 4.0
         list(session._saved_in_time(StepDone(step, "a", 0.0, {}, {}), 1000))
@@ -291,21 +293,21 @@ def test_two_trainings_do_not_share_a_folder(tmp_path: Path) -> None:
                     run(tmp_path, resume=resume)
                 refused.append(str(caught.value))
 
-    Run(RECIPE, SETTINGS, RunDirectory(tmp_path), tiny_capture(), resume=False).to_the_end(listen)
+    Run(RECIPE, SETTINGS, RunDirectory(tmp_path), tiny_capture(), resume=False).run_to_end(listen)
     assert len(refused) == 2 and all("another training is writing to" in text for text in refused)
 
 
 def test_a_run_too_short_for_its_stages_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     settings = replace(SETTINGS, iterations=6)
     with pytest.raises(InputError, match=r"6 iterations are too few for the stage '2 .*'; expected at least 8"):
-        Run(PlanarRecipe(), settings, RunDirectory(tmp_path / "run"), tiny_capture(), resume=False).to_the_end(print)
+        Run(PlanarRecipe(), settings, RunDirectory(tmp_path / "run"), tiny_capture(), resume=False).run_to_end(print)
     assert not (tmp_path / "run").exists()
 
 
 def test_a_scene_that_cannot_be_begun_leaves_no_folder(tmp_path: Path) -> None:
     bare = replace(tiny_capture(), pane_labels=())
     with pytest.raises(PlaneFitError, match="needs to know the panes"):
-        Run(PlanarRecipe(), SETTINGS, RunDirectory(tmp_path / "run"), bare, resume=False).to_the_end(print)
+        Run(PlanarRecipe(), SETTINGS, RunDirectory(tmp_path / "run"), bare, resume=False).run_to_end(print)
     assert not (tmp_path / "run").exists()
 
 
@@ -348,7 +350,7 @@ def test_a_broken_test_photograph_ends_a_run_at_the_start(tmp_path: Path) -> Non
         assert not isinstance(message, StepDone) or message.step < 2000, "the photograph was not found"
 
     with pytest.raises(InputError, match=path.name):
-        Run(RECIPE, RunSettings("", 10**6), RunDirectory(tmp_path / "run"), dataset, resume=False).to_the_end(listen)
+        Run(RECIPE, RunSettings("", 10**6), RunDirectory(tmp_path / "run"), dataset, resume=False).run_to_end(listen)
 
 
 def test_the_checkpoint_of_another_method_is_not_gone_on_with(tmp_path: Path) -> None:
@@ -374,7 +376,7 @@ class Following(Ranks):
 
 def test_a_rank_that_does_not_lead_saves_nothing(tmp_path: Path) -> None:
     following = Run(RECIPE, SETTINGS, RunDirectory(tmp_path / "run"), tiny_capture(), ranks=Following())
-    following.state = training.first_state(RECIPE, SETTINGS, tiny_capture())
+    following.state = training.initial_state(RECIPE, SETTINGS, tiny_capture())
     for message in following.messages():
         if isinstance(message, StepDone):
             following.save()
@@ -405,7 +407,7 @@ def test_a_photograph_that_cannot_be_read_any_more_costs_nothing(
     dataset = replace(tiny_capture(), train=tuple(map(guarded, tiny_capture().train)))
     hint = r"; step \d is saved; .* repeat with --resume" if kind is InputError else "$"
     with pytest.raises(kind, match=f"png cannot be read{hint}") as caught:
-        Run(RECIPE, SETTINGS, directory, dataset, checkpoint_every=math.inf).to_the_end(listen)
+        Run(RECIPE, SETTINGS, directory, dataset, checkpoint_every=math.inf).run_to_end(listen)
     step = load_checkpoint(directory.checkpoint).step
     assert step >= 5 and (kind is not InputError or f"step {step} is saved" in str(caught.value))
     assert_same(run(directory.path, resume=True).scene, whole())
@@ -425,9 +427,11 @@ class Unreadable:
 
 def test_a_state_in_the_middle_of_a_change_is_not_saved(tmp_path: Path) -> None:
     """The step is done, and the actions after it are not."""
-    record: Any = Record(tmp_path / "checkpoint.safetensors", SimpleNamespace(write=lambda message: None), math.inf)
+    record: Any = OutputFiles(
+        tmp_path / "checkpoint.safetensors", SimpleNamespace(write=lambda message: None), math.inf
+    )
     stages = tuple(replace(stage, actions=(Unreadable(),)) for stage in RECIPE.stages(seed=0, iterations=12))
-    state = training.first_state(RECIPE, SETTINGS, tiny_capture())
+    state = training.initial_state(RECIPE, SETTINGS, tiny_capture())
     with pytest.raises(InputError, match=r"^1\.png cannot be read$"):
         list(TrainingSession(state, Ranks(), record).run_stages(stages, tiny_capture(), 12))
     assert state.step == 5 and not record.checkpoint.exists()
@@ -449,7 +453,7 @@ def test_other_options_are_named_when_a_run_is_to_go_on(recipe: Any, settings: A
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, interrupt_at=5)
     with pytest.raises(InputError) as caught:
-        Run(recipe, settings, RunDirectory(tmp_path), tiny_capture(), resume=True).to_the_end(print)
+        Run(recipe, settings, RunDirectory(tmp_path), tiny_capture(), resume=True).run_to_end(print)
     assert f" was started with other options: {told}; expected the same to resume it. Repeat" in str(caught.value)
 
 
@@ -462,8 +466,8 @@ def test_a_run_goes_on_where_its_capture_has_moved_and_not_with_another(tmp_path
     pose[0, 3] += 0.1 * capture.extent
     other = replace(capture, train=(*others, last.with_camera(replace(last.camera, cam_from_world=pose))))
     with pytest.raises(InputError, match="data was tiny and is elsewhere"):
-        Run(RECIPE, moved, directory, other, resume=True).to_the_end(print)
-    assert Run(RECIPE, moved, directory, capture, resume=True).to_the_end(print).step == SETTINGS.iterations
+        Run(RECIPE, moved, directory, other, resume=True).run_to_end(print)
+    assert Run(RECIPE, moved, directory, capture, resume=True).run_to_end(print).step == SETTINGS.iterations
     assert directory.settings() == moved
 
 
@@ -484,7 +488,7 @@ def test_a_recipe_of_another_kind_is_named_when_a_run_is_to_go_on(tmp_path: Path
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, interrupt_at=5)
     with pytest.raises(InputError, match="options: recipe was SplatRecipe and is Own; expected the same"):
-        Run(Own(sh_degree=1), SETTINGS, RunDirectory(tmp_path), tiny_capture(), resume=True).to_the_end(print)
+        Run(Own(sh_degree=1), SETTINGS, RunDirectory(tmp_path), tiny_capture(), resume=True).run_to_end(print)
 
 
 def test_a_capture_of_other_photographs_is_not_gone_on_with(tmp_path: Path) -> None:
@@ -494,7 +498,7 @@ def test_a_capture_of_other_photographs_is_not_gone_on_with(tmp_path: Path) -> N
     before = RunDirectory(tmp_path).checkpoint.read_bytes()
     fewer = replace(tiny_capture(), train=tiny_capture().train[1:], test=tiny_capture().train[1:2])
     with pytest.raises(InputError, match=r"tiny is not the capture that .* was trained on: 0\.png only in the run"):
-        Run(RECIPE, SETTINGS, RunDirectory(tmp_path), fewer, resume=True).to_the_end(print)
+        Run(RECIPE, SETTINGS, RunDirectory(tmp_path), fewer, resume=True).run_to_end(print)
     assert RunDirectory(tmp_path).checkpoint.read_bytes() == before
 
 
@@ -539,5 +543,5 @@ def test_a_capture_whose_poses_were_found_again_is_not_gone_on_with(tmp_path: Pa
 
     other = replace(capture, train=tuple(view.with_camera(turned(view.camera)) for view in capture.train))
     with pytest.raises(InputError, match=r"cameras of tiny have moved since .*: 1\.png.*prepared again\?"):
-        Run(RECIPE, SETTINGS, RunDirectory(tmp_path), other, resume=True).to_the_end(print)
+        Run(RECIPE, SETTINGS, RunDirectory(tmp_path), other, resume=True).run_to_end(print)
     assert RunDirectory(tmp_path).checkpoint.read_bytes() == before

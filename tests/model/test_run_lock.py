@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from glassplat.errors import InputError
-from glassplat.model.run_directory import NAME, check_unlocked, run_lock
+from glassplat.model.run_directory import LOCK_FILE, check_unlocked, run_lock
 
 HOLD = """
 import sys
@@ -39,7 +39,7 @@ def test_a_killed_process_leaves_no_lock_behind(tmp_path: Path) -> None:
         with pytest.raises(InputError):
             check_unlocked(tmp_path)
         process.kill()
-    assert (tmp_path / NAME).is_file()
+    assert (tmp_path / LOCK_FILE).is_file()
     check_unlocked(tmp_path)
 
 

@@ -321,7 +321,7 @@ def test_where_nothing_reflects_the_rates_are_those_of_splat() -> None:
 
 def scene_after(recipe: Any, iterations: int, directory: Path) -> Scene:
     settings = RunSettings("tiny", iterations=iterations)
-    Run(recipe, settings, RunDirectory(directory), tiny_capture(), resume=False).to_the_end(lambda message: None)
+    Run(recipe, settings, RunDirectory(directory), tiny_capture(), resume=False).run_to_end(lambda message: None)
     return load_checkpoint(directory / "checkpoint.safetensors").scene
 
 

@@ -211,7 +211,7 @@ def test_a_run_leaves_the_refined_cameras(tmp_path: Path) -> None:
     directory = RunDirectory(tmp_path / "run")
     settings = RunSettings(str(tmp_path / "capture"), 30)
     recipe = SplatRecipe(poses=PoseRefinement(rate=1e-2))
-    state = Run(recipe, settings, directory, dataset, resume=False).to_the_end(lambda message: None)
+    state = Run(recipe, settings, directory, dataset, resume=False).run_to_end(lambda message: None)
     refined = with_corrected_cameras(dataset, state.scene)
     recorded = dict(read_cameras(directory.path / "cameras.json"))
     for before, after in zip(dataset.train, refined.train, strict=True):

@@ -24,7 +24,7 @@ from glassplat.cli.main import main
 from glassplat.methods.glossy_recipes import DeferredRecipe
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model import watching
-from glassplat.model.watching import WatchedTraining, renderer_now
+from glassplat.model.watching import WatchedTraining, current_renderer
 from glassplat.render.splat import Splat
 from glassplat.training.messages import Message
 from glassplat.viewer import gate
@@ -66,7 +66,7 @@ class Watch:
     def _listen(self, message: Message) -> None:
         if self.is_enough:
             raise EnoughError
-        self.watched.hear(message)
+        self.watched.handle_message(message)
 
 
 @contextmanager
@@ -184,7 +184,7 @@ def test_of_several_ranks_the_first_one_is_watched(rank: int, monkeypatch: pytes
     for name, value in (("TORCHELASTIC_RUN_ID", "test"), ("WORLD_SIZE", "2"), ("RANK", str(rank))):
         monkeypatch.setenv(name, value)
     begun: list[bool] = []
-    watched = SimpleNamespace(hear=print, stop=lambda: begun.append(False))
+    watched = SimpleNamespace(handle_message=print, stop=lambda: begun.append(False))
     monkeypatch.setattr(watching, "WatchedTraining", lambda *given, **options: begun.append(True) or watched)
     asked: Any = SimpleNamespace(view=True)
     nothing: Any = None
@@ -195,5 +195,5 @@ def test_of_several_ranks_the_first_one_is_watched(rank: int, monkeypatch: pytes
 
 def test_a_scene_that_lacks_what_its_method_mirrors_is_drawn_plainly() -> None:
     early = replace(model(), recipe=DeferredRecipe(background=(0.0, 0.0, 0.0)))
-    assert isinstance(renderer_now(early.recipe, early.scene), Splat)
-    assert renderer_now(model().recipe, model().scene) == model().renderer
+    assert isinstance(current_renderer(early.recipe, early.scene), Splat)
+    assert current_renderer(model().recipe, model().scene) == model().renderer
