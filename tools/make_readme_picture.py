@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from glassplat.cli.runs import open_run
-from glassplat.evaluate.evaluate import timed_render
+from glassplat.evaluate.evaluate import time_render
 from glassplat.evaluate.metrics import quantize
 from glassplat.evaluate.report import TITLE_HEIGHT, Panel, compose_sheet
 from glassplat.files.images import write_image
@@ -56,7 +56,7 @@ def main() -> None:
     view = next((v for v in stored.dataset.test if v.name == arguments.view), None)
     if view is None:
         raise SystemExit(f"no test view {arguments.view!r}; there are {[v.name for v in stored.dataset.test]}")
-    frame, _ = timed_render(stored.renderer, stored.scene, view)
+    frame, _ = time_render(stored.renderer, stored.scene, view)
     panels = [Panel("photograph", view.photo), Panel("render", quantize(frame.rgb))]
     for layer in (layer for layer in PARTS if layer in frame.layers):
         panels.append(Panel(PARTS[layer], quantize(layer_image(frame, layer))))

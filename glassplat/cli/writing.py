@@ -21,7 +21,7 @@ from glassplat.cli.places import SceneEdits, check_targets, chosen_views, claim_
 from glassplat.cli.progress import WorkProgress
 from glassplat.cli.runs import StoredRun, open_run, photographs_of, pictures_of
 from glassplat.errors import InputError, first_names, input_checked
-from glassplat.evaluate.evaluate import timed_render
+from glassplat.evaluate.evaluate import time_render
 from glassplat.evaluate.metrics import quantize
 from glassplat.files.images import write_image
 from glassplat.files.records import readable_name
@@ -63,7 +63,7 @@ def write_layers(command: Render, console: Console) -> None:
         )
     with WorkProgress(console) as progress:
         for view in track_progress("rendering", views, len(views), progress):
-            frame, _ = timed_render(renderer, scene, view)
+            frame, _ = time_render(renderer, scene, view)
             for layer in command.layers:
                 image = layer_image(frame, layer)
                 write_image(command.output / layer / paths[view.name], image)
@@ -90,7 +90,7 @@ def write_dereflected(command: Dereflect, console: Console) -> None:
 
 def dereflect_view(command: Dereflect, stored: StoredRun, renderer: Planar, view: View) -> Tensor:
     """The photograph of a view without its reflections, or a render instead."""
-    frame, _ = timed_render(renderer, stored.scene, view)
+    frame, _ = time_render(renderer, stored.scene, view)
     if command.source == "render":
         return quantize(frame.layers["without_panes"])
     # Not `view.photo`, which is kept in memory: a capture may be larger.

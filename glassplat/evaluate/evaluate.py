@@ -36,12 +36,12 @@ class PaneRegions(NamedTuple):
 
     Attributes:
         source: description of the region for readers of the metrics.
-        of: returns the pixels of panes [H, W] bool from a view, its frame and its truth, or why they are unknown.
+        find: returns the pixels of panes [H, W] bool from a view, its frame and its truth, or why they are unknown.
         planes: fitted to masks and measured points, independent of training; None if masks are not the source.
     """
 
     source: str
-    of: Callable[[View, Frame, TrueView | None], Tensor | str]
+    find: Callable[[View, Frame, TrueView | None], Tensor | str]
     planes: Planes | None = None
 
 
@@ -69,8 +69,8 @@ def marked_regions(planes: Planes) -> PaneRegions:
     return PaneRegions("masks, and in views without one the planes fitted to them", region, planes)
 
 
-STEPS = 40
-FIRST_STEP, LAST_STEP = 1.5e-3, 5e-5
+ALIGNMENT_STEPS = 40
+FIRST_RATE, LAST_RATE = 1.5e-3, 5e-5
 """First and last learning rate of the alignment, in radians and extents; it decays exponentially."""
 SSIM_SHARE = 0.2
 Listener = Callable[[int, int], None]
@@ -108,16 +108,16 @@ def aligned_camera(scene: Scene, renderer: Renderer, view: View) -> Camera:
         view: photograph and camera.
     """
     device = scene.primary.means.device
-    still = scene.with_parameters({name: tensor.detach() for name, tensor in scene.parameters().items()})
+    detached = scene.with_parameters({name: tensor.detach() for name, tensor in scene.parameters().items()})
     camera, photo = view.camera.to(device), view.photo.to(device)
-    exposures = still.exposures.interpolate(view.name)
+    exposures = detached.exposures.interpolate(view.name)
     twist = torch.zeros(6, device=device, requires_grad=True, dtype=torch.float32)
-    optimizer = torch.optim.Adam([twist], lr=FIRST_STEP, betas=(0.8, 0.95))
-    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST_STEP / FIRST_STEP) ** (1 / STEPS))
+    optimizer = torch.optim.Adam([twist], lr=FIRST_RATE, betas=(0.8, 0.95))
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST_RATE / FIRST_RATE) ** (1 / ALIGNMENT_STEPS))
     best, lowest = torch.zeros_like(twist), torch.inf
-    for _ in range(STEPS):
+    for _ in range(ALIGNMENT_STEPS):
         optimizer.zero_grad()
-        image = exposures.apply(renderer(still, moved_camera(camera, twist, scene.extent)).rgb, view.name)
+        image = exposures.apply(renderer(detached, moved_camera(camera, twist, scene.extent)).rgb, view.name)
         found = photometric(with_ignored_right(image, view), photo)
         loss = found.l1.lerp(1 - found.ssim, SSIM_SHARE)
         if (value := float(loss.detach())) < lowest:
@@ -249,16 +249,16 @@ def evaluate(
     # With a photographer, frames hold two images, with and without the photographer; rendering without is timed.
     timed = with_photographer(renderer, "absent") if len(scene.photographer) else renderer
     # The first frame may include compilation, so it is not counted.
-    timed_render(timed, scene, dataset.test[0])
+    time_render(timed, scene, dataset.test[0])
     measurements, learned = {}, scene.exposures.to("cpu")
     for view in dataset.test:
-        frame, seconds = timed_render(renderer, scene, view)
-        seconds = seconds if timed is renderer else timed_render(timed, scene, view)[1]
+        frame, seconds = time_render(renderer, scene, view)
+        seconds = seconds if timed is renderer else time_render(timed, scene, view)[1]
         true_view = truth.view(view.name, view.camera.width, view.camera.height) if truth else None
         if true_view is not None and view.ignored is not None:
             true_view = replace(true_view, labels=true_view.labels.masked_fill(view.ignored, 0))
         surface = true_surface(view)
-        pane = regions.of(view, frame, true_view)
+        pane = regions.find(view, frame, true_view)
         exposures = learned.interpolate(view.name)
         shown = in_photograph_colors(frame, exposures, view.name)
         measured = _measure(shown, seconds, view, pane, truth=(truth, true_view), surface=surface, lpips=lpips)
@@ -269,7 +269,7 @@ def evaluate(
     results = _description(scene, dataset)
     results["seconds_per_frame"] = statistics.median(m.seconds for m in measurements.values())
     results |= metrics.json_values({"peak_memory_mib": peak_memory_mib()})
-    results |= metrics.json_values(_means([m.metrics for m in measurements.values()]))
+    results |= metrics.json_values(_mean_metrics([m.metrics for m in measurements.values()]))
     results |= metrics.json_values(
         metrics.environment_metrics(metrics.learned_environment(scene), metrics.true_environment(dataset.root), lpips)
     )
@@ -280,7 +280,7 @@ def evaluate(
     return Evaluation(results, per_view)
 
 
-def timed_render(renderer: Renderer, scene: Scene, view: View) -> tuple[Frame, float]:
+def time_render(renderer: Renderer, scene: Scene, view: View) -> tuple[Frame, float]:
     """A frame without gradients, on the CPU, and the seconds it took.
 
     Raises:
@@ -326,10 +326,10 @@ def _measure(
         surface = surface and replace(surface, covered=surface.covered & counted)
     measured: dict[str, metrics.Outcome] = {
         "psnr": _counted_psnr(image, photo, counted),
-        "corrected_psnr": _counted_psnr(metrics.color_corrected(image, photo, region=counted), photo, counted),
+        "corrected_psnr": _counted_psnr(metrics.correct_colors(image, photo, region=counted), photo, counted),
         "right_half_psnr": _right_half_psnr(image, photo, counted),
-        "ssim": ALL_IGNORED if _too_few(counted) else metrics.ssim(image, photo),
-        "lpips": ALL_IGNORED if _too_few(counted) else _lpips(lpips, image, photo),
+        "ssim": ALL_IGNORED if _is_too_small(counted) else metrics.ssim(image, photo),
+        "lpips": ALL_IGNORED if _is_too_small(counted) else _lpips(lpips, image, photo),
         "pane_psnr": pane if isinstance(pane, str) else _region_psnr(image, photo, pane, TOO_FEW),
         "transmission_psnr": _transmission_psnr(frame, *truth),
         **metrics.surface_metrics(frame, photo, surface),
@@ -353,18 +353,18 @@ def _counted_psnr(image: Tensor, photo: Tensor, counted: Tensor | None) -> metri
 def _right_half_psnr(image: Tensor, photo: Tensor, counted: Tensor | None) -> metrics.Outcome:
     """PSNR of the right half after the colour transform fitted to the left half (as in NeRF in the Wild)."""
     middle = max(photo.shape[1] // 2, 1)
-    if counted is not None and _too_few(counted[:, :middle]):
+    if counted is not None and _is_too_small(counted[:, :middle]):
         return LEFT_IGNORED
-    corrected = metrics.color_corrected(image, photo, slice(0, middle), counted)
+    corrected = metrics.correct_colors(image, photo, slice(0, middle), counted)
     right = slice(min(middle, photo.shape[1] - 1), None)
     return _counted_psnr(corrected[:, right], photo[:, right], None if counted is None else counted[:, right])
 
 
 def _region_psnr(image: Tensor, target: Tensor, region: Tensor, reason: str) -> metrics.Outcome:
-    return reason if _too_few(region) else metrics.psnr(image, target, region)
+    return reason if _is_too_small(region) else metrics.psnr(image, target, region)
 
 
-def _too_few(region: Tensor | None) -> bool:
+def _is_too_small(region: Tensor | None) -> bool:
     """Return whether a region [H, W] is given that is too small for a metric."""
     return region is not None and int(region.sum()) < metrics.SMALLEST_REGION
 
@@ -373,7 +373,7 @@ def _transmission_psnr(frame: Frame, truth: GroundTruth | None, true_view: TrueV
     if true_view is None:
         return NO_TRUTH if truth is None else NO_VIEW_TRUTH
     pane = true_view.labels > 0
-    reason = TOO_FEW if _too_few(pane) else "the pane is a mirror, which transmits nothing"
+    reason = TOO_FEW if _is_too_small(pane) else "the pane is a mirror, which transmits nothing"
     image = frame.layers.get("transmission", frame.rgb)
     return _region_psnr(image, true_view.transmission, pane & (true_view.strength < MIRROR_STRENGTH), reason)
 
@@ -387,7 +387,7 @@ def _reflection_pixels(
     if true_view is None:
         return NO_TRUTH if truth is None else NO_VIEW_TRUTH
     pane = true_view.labels > 0
-    if _too_few(pane):
+    if _is_too_small(pane):
         return TOO_FEW
     return frame.layers["reflection"][pane], true_view.reflection[pane].to(torch.float32) / 255
 
@@ -406,7 +406,7 @@ def _add_reflection(measurements: Iterable[_Measurement]) -> float | None:
     return gain if pairs else None
 
 
-def _means(per_view: list[dict[str, metrics.Outcome]]) -> dict[str, metrics.Outcome]:
+def _mean_metrics(per_view: list[dict[str, metrics.Outcome]]) -> dict[str, metrics.Outcome]:
     """Mean of every metric over the views that have it and are not perfect, or all reasons why there is none."""
     means: dict[str, metrics.Outcome] = {}
     for name in per_view[0]:

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from glassplat.errors import input_checked
-from glassplat.evaluate.truth import NOTHING_KNOWN, GroundTruth, TruePlane, TrueSurface
+from glassplat.evaluate.truth import UNKNOWN_SURFACE, GroundTruth, TruePlane, TrueSurface
 from glassplat.files.sidecars import read_equirect
 from glassplat.kernels.photometric import photometric
 from glassplat.render.deferred import equirect_from_environment
@@ -194,9 +194,7 @@ def psnr(image: Tensor, target: Tensor, region: Tensor | None = None) -> float:
     return math.inf if mean_square == 0 else 10 * math.log10(255**2 / mean_square)
 
 
-def color_corrected(
-    image: Tensor, target: Tensor, columns: slice = slice(None), region: Tensor | None = None
-) -> Tensor:
+def correct_colors(image: Tensor, target: Tensor, columns: slice = slice(None), region: Tensor | None = None) -> Tensor:
     """The image [H, W, 3] after the affine colour transform that fits it to another one in least squares.
 
     Exposure and white balance of a test photograph are unknown; the remaining error is due to the scene.
@@ -208,7 +206,7 @@ def color_corrected(
         region: [H, W] bool, those of them that count; all if None.
     """
     _check_shapes(image, target)
-    source, wanted = (quantize(picture).to(torch.float64) / 255 for picture in (image, target))
+    source, wanted = (quantize(pixels).to(torch.float64) / 255 for pixels in (image, target))
     chosen = torch.ones(image.shape[:2], dtype=torch.bool) if region is None else region
     known = source[:, columns][chosen[:, columns]]
     known = torch.cat([known, torch.ones_like(known[:, :1])], dim=1)
@@ -268,7 +266,7 @@ def _check_shapes(image: Tensor, target: Tensor) -> None:
         raise ValueError(f"expected two images of one shape [..., 3], got {list(image.shape)} and {list(target.shape)}")
 
 
-ERRORS = ("normal_error_deg", "offset_error", "base_reflectance_error")
+PLANE_ERRORS = ("normal_error_deg", "offset_error", "base_reflectance_error")
 
 
 def plane_table(
@@ -299,12 +297,12 @@ def plane_table(
             "base_reflectance": planes.base_reflectances[index].item(),
         } | {name: values[index].tolist() for name, values in glass.items()}
         if label in true_planes:
-            entry |= _errors(entry, true_planes[label], extent)
+            entry |= _plane_errors(entry, true_planes[label], extent)
         else:
-            entry |= dict.fromkeys(ERRORS) | {f"{name}_reason": missing for name in ERRORS}
+            entry |= dict.fromkeys(PLANE_ERRORS) | {f"{name}_reason": missing for name in PLANE_ERRORS}
         if marked is not None and label in marked.labels:
             row = marked.labels.index(label)
-            turn, offset = _difference(entry, marked.centers[row].tolist(), marked.normals[row].tolist())
+            turn, offset = _plane_difference(entry, marked.centers[row].tolist(), marked.normals[row].tolist())
             entry |= {"normal_drift_deg": turn, "offset_drift": offset / extent}
         table.append(entry)
     return table
@@ -315,8 +313,8 @@ def missing_panes(planes: Planes, truth: GroundTruth | None) -> list[int]:
     return [] if truth is None else sorted({plane.label for plane in truth.planes} - set(planes.labels))
 
 
-def _errors(fitted: dict[str, Any], true: TruePlane, extent: float) -> dict[str, float]:
-    turn, offset = _difference(fitted, true.center, true.normal)
+def _plane_errors(fitted: dict[str, Any], true: TruePlane, extent: float) -> dict[str, float]:
+    turn, offset = _plane_difference(fitted, true.center, true.normal)
     return {
         "normal_error_deg": turn,
         "offset_error": offset / extent,
@@ -324,7 +322,7 @@ def _errors(fitted: dict[str, Any], true: TruePlane, extent: float) -> dict[str,
     }
 
 
-def _difference(fitted: dict[str, Any], center: Sequence[float], normal: Sequence[float]) -> tuple[float, float]:
+def _plane_difference(fitted: dict[str, Any], center: Sequence[float], normal: Sequence[float]) -> tuple[float, float]:
     """Angle between the normals in degrees, and the distance of the other plane's centre from the fitted plane."""
     own = torch.tensor(fitted["normal"], dtype=torch.float64)
     other = torch.tensor(normal, dtype=torch.float64)
@@ -341,8 +339,8 @@ NO_DIRECTION_DEG = 90.0
 NO_NORMALS, NO_STRENGTH = "the method renders no normals", "the method renders no strength"
 NO_TRUE_NORMALS = "there are no true normals for the photograph"
 NO_TRUE_STRENGTH = "there is no true strength for the photograph"
-UNCOVERED = f"fewer than {SMALLEST_REGION} pixels show a surface"
-UNREFLECTIVE = f"fewer than {SMALLEST_REGION} pixels reflect more than half"
+NO_SURFACE_PIXELS = f"fewer than {SMALLEST_REGION} pixels show a surface"
+NO_REFLECTIVE_PIXELS = f"fewer than {SMALLEST_REGION} pixels reflect more than half"
 
 
 def surface_metrics(frame: Frame, photo: Tensor, truth: TrueSurface | None) -> dict[str, Outcome]:
@@ -354,13 +352,13 @@ def surface_metrics(frame: Frame, photo: Tensor, truth: TrueSurface | None) -> d
         photo: [H, W, 3] uint8.
         truth: the true surface at the frame's size; None if unknown.
     """
-    truth = truth or NOTHING_KNOWN
+    truth = truth or UNKNOWN_SURFACE
     normal_errors = _normal_errors(frame, truth)
     return {
         "reflective_psnr": _reflective_psnr(frame, photo, truth),
-        "normal_error_deg": _mean(normal_errors, truth.covered, UNCOVERED),
-        "reflective_normal_error_deg": _mean(normal_errors, _reflective(truth), UNREFLECTIVE),
-        "strength_error": _mean(_strength_errors(frame, truth), truth.covered, UNCOVERED),
+        "normal_error_deg": _mean_error(normal_errors, truth.covered, NO_SURFACE_PIXELS),
+        "reflective_normal_error_deg": _mean_error(normal_errors, _reflective_region(truth), NO_REFLECTIVE_PIXELS),
+        "strength_error": _mean_error(_strength_errors(frame, truth), truth.covered, NO_SURFACE_PIXELS),
     }
 
 
@@ -374,10 +372,10 @@ def angular_errors_deg(vectors: Tensor, truth: Tensor) -> Tensor:
 
 
 def _reflective_psnr(frame: Frame, photo: Tensor, truth: TrueSurface) -> Outcome:
-    region = _reflective(truth)
+    region = _reflective_region(truth)
     if isinstance(region, str):
         return region
-    return psnr(frame.photographed, photo, region) if int(region.sum()) >= SMALLEST_REGION else UNREFLECTIVE
+    return psnr(frame.photographed, photo, region) if int(region.sum()) >= SMALLEST_REGION else NO_REFLECTIVE_PIXELS
 
 
 def _normal_errors(frame: Frame, truth: TrueSurface) -> Tensor | str:
@@ -395,11 +393,11 @@ def _strength_errors(frame: Frame, truth: TrueSurface) -> Tensor | str:
     return NO_STRENGTH if "mask" in frame.layers else (frame.layers["strength"] - truth.strength).abs()
 
 
-def _reflective(truth: TrueSurface) -> Tensor | str:
+def _reflective_region(truth: TrueSurface) -> Tensor | str:
     return NO_TRUE_STRENGTH if truth.strength is None else truth.covered & (truth.strength > REFLECTIVE)
 
 
-def _mean(errors: Tensor | str, region: Tensor | str, too_few: str) -> Outcome:
+def _mean_error(errors: Tensor | str, region: Tensor | str, too_few: str) -> Outcome:
     """Mean error over a region, or the first reason why there is none."""
     if isinstance(errors, str):
         return errors
@@ -439,7 +437,7 @@ class Lpips:
         if min(image.shape[:2]) < SMALLEST_SIDE:
             raise ValueError(f"LPIPS needs at least {SMALLEST_SIDE} pixels a side, got {list(image.shape[:2])}")
         with torch.no_grad():
-            return float(self.network(_batch(image), _batch(target)))
+            return float(self.network(_as_batch(image), _as_batch(target)))
 
 
 def load_lpips() -> Lpips | str:
@@ -454,11 +452,11 @@ def load_lpips() -> Lpips | str:
     except ImportError:
         return "pip install 'glassplat[lpips]'"
     except (OSError, RuntimeError) as error:  # torchvision of another build, or weights that are unavailable.
-        return _other_build() or f"torchmetrics cannot load it: {error}"
+        return _build_mismatch() or f"torchmetrics cannot load it: {error}"
     return Lpips(network)
 
 
-def _other_build() -> str | None:
+def _build_mismatch() -> str | None:
     """Reason and remedy if torchvision was built for another PyTorch; None otherwise."""
     try:
         importlib.import_module("torchvision")
@@ -474,7 +472,7 @@ def _other_build() -> str | None:
     return None
 
 
-def _batch(image: Tensor) -> Tensor:
+def _as_batch(image: Tensor) -> Tensor:
     """[1, 3, H, W] in [0, 1]."""
     pixels = image.detach().cpu()
     values = pixels.to(torch.float32) / 255 if pixels.dtype == torch.uint8 else pixels.to(torch.float32).clamp(0, 1)
@@ -541,7 +539,7 @@ def environment_psnr(learned: Tensor, truth: Tensor) -> tuple[float, float]:
     Raises:
         ValueError: a panorama is not twice as wide as high, or contains non-finite values.
     """
-    image, target, gain = _equalise(learned, truth)
+    image, target, gain = _match_energy(learned, truth)
     difference = quantize(image).to(torch.float64) - quantize(target).to(torch.float64)
     mean_square = _mean_over_sphere(difference.square())
     return math.inf if mean_square == 0 else 10 * math.log10(255**2 / mean_square), gain
@@ -557,11 +555,11 @@ def environment_lpips(learned: Tensor, truth: Tensor, lpips: Lpips | str) -> Out
     """
     if isinstance(lpips, str):
         return NO_LPIPS
-    image, target, _ = _equalise(learned, truth)
+    image, target, _ = _match_energy(learned, truth)
     return lpips(quantize(image), quantize(target))
 
 
-def _equalise(learned: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, float]:
+def _match_energy(learned: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, float]:
     """The learned map scaled to the energy of the true one, the true one at its size, and the factor (1 if black)."""
     image, target = _panorama(learned, "learned"), _panorama(truth, "true")
     target = _resize_panorama(target, image.shape[0])

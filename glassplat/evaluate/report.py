@@ -17,7 +17,7 @@ from torch import Tensor
 from glassplat.captures.dataset import Dataset
 from glassplat.evaluate import metrics
 from glassplat.evaluate.evaluate import EvaluatedView
-from glassplat.evaluate.truth import NOTHING_KNOWN, TrueSurface, TrueView
+from glassplat.evaluate.truth import UNKNOWN_SURFACE, TrueSurface, TrueView
 from glassplat.files.images import flat_image_names, write_image
 from glassplat.files.writing import write_text
 from glassplat.options import Blend
@@ -73,7 +73,7 @@ NARROWEST_PANEL, WIDEST_PANEL = 280, 640
 MARGIN, GAP = 16, 10
 CAPTION_HEIGHT, TITLE_HEIGHT = 24, 34
 CAPTION_SIZE, TITLE_SIZE = 15, 19
-BACKGROUND, TEXT, QUIET_TEXT = (22, 24, 28), (236, 236, 236), (160, 166, 174)
+BACKGROUND, TEXT, MUTED_TEXT = (22, 24, 28), (236, 236, 236), (160, 166, 174)
 SMALLEST_STRENGTH_SCALE = 0.05
 COLORED = ("transmission", "base", "reflection", "environment")
 COLUMNS = (*COLORED, "strength", "normal", "mask")
@@ -114,7 +114,7 @@ def comparison_sheet(
         title: set in large type; usually the view's name.
         subtitle: set in small type next to it; usually the metrics.
     """
-    rows: list[Row] = [_image_row(frame, photo), *_layer_rows(frame, truth, surface or NOTHING_KNOWN)]
+    rows: list[Row] = [_image_row(frame, photo), *_layer_rows(frame, truth, surface or UNKNOWN_SURFACE)]
     return compose_sheet([row for row in rows if any(row)], title, subtitle)
 
 
@@ -209,13 +209,13 @@ def _panel_size(width: int, height: int) -> tuple[int, int]:
 
 
 def _draw_panel(canvas: Image.Image, panel: Panel, corner: tuple[int, int], size: tuple[int, int]) -> None:
-    picture = Image.fromarray(metrics.quantize(panel.image).contiguous().numpy())
-    if picture.size != size:
-        grows = size[0] > picture.width
-        picture = picture.resize(size, Image.Resampling.NEAREST if grows else Image.Resampling.LANCZOS)
-    canvas.paste(picture, (corner[0], corner[1] + CAPTION_HEIGHT))
+    image = Image.fromarray(metrics.quantize(panel.image).contiguous().numpy())
+    if image.size != size:
+        grows = size[0] > image.width
+        image = image.resize(size, Image.Resampling.NEAREST if grows else Image.Resampling.LANCZOS)
+    canvas.paste(image, (corner[0], corner[1] + CAPTION_HEIGHT))
     font = ImageFont.load_default(CAPTION_SIZE)
-    ImageDraw.Draw(canvas).text((corner[0], corner[1] + 2), _one_line(panel.caption), fill=QUIET_TEXT, font=font)
+    ImageDraw.Draw(canvas).text((corner[0], corner[1] + 2), _one_line(panel.caption), fill=MUTED_TEXT, font=font)
 
 
 def _draw_title(draw: ImageDraw.ImageDraw, title: str, subtitle: str, width: int) -> None:
@@ -225,7 +225,7 @@ def _draw_title(draw: ImageDraw.ImageDraw, title: str, subtitle: str, width: int
     start = MARGIN + draw.textlength(title, font=title_font) + 2 * GAP
     # A narrow sheet has no room for the metrics; the overview page lists them anyway.
     if start + draw.textlength(subtitle, font=font) <= width - MARGIN:
-        draw.text((start, baseline), subtitle, fill=QUIET_TEXT, font=font, anchor="ls")
+        draw.text((start, baseline), subtitle, fill=MUTED_TEXT, font=font, anchor="ls")
 
 
 def _one_line(text: str) -> str:
@@ -238,7 +238,7 @@ SMALLEST_SHARE = 0.05
 """Minimum share of the image that must show a pane for a view to be included."""
 
 
-class Uses:
+class LayerUses:
     """Selects the views that show most of a pane, and draws them."""
 
     def __init__(self, blend: Blend) -> None:
@@ -260,7 +260,7 @@ class Uses:
         ]
         self._rows = sorted([*self._rows, (share, row)], key=lambda kept: -kept[0])[:MOST_VIEWS]
 
-    def picture(self) -> NDArray[np.uint8] | None:
+    def image(self) -> NDArray[np.uint8] | None:
         """Image [H, W, 3] of the views kept, one per row; None if no view shows a pane."""
         return compose_sheet([row for _, row in self._rows], "Uses of the layers", "") if self._rows else None
 
@@ -286,7 +286,7 @@ class Report:
         """
         self._folder = folder
         self._sheets = sheet_names([view.name for view in dataset.test])
-        self._uses = Uses(blend) if blend is not None else None
+        self._uses = LayerUses(blend) if blend is not None else None
 
     def add(self, evaluated: EvaluatedView) -> None:
         """Draws one view; called by `evaluate`."""
@@ -310,7 +310,7 @@ class Report:
             results: as `evaluate` returns them, with additions of the caller.
             per_view: as `evaluate` returns it.
         """
-        uses = self._uses.picture() if self._uses is not None else None
+        uses = self._uses.image() if self._uses is not None else None
         if uses is not None:
             write_image(self._folder / USES_FILE, uses)
         page = overview_page(results, per_view, self._sheets, uses=None if uses is None else USES_FILE)
@@ -337,7 +337,7 @@ def overview_page(
         f"<h1>{_escape(title)}</h1>",
         f'<p class="settings">{settings}</p>',
         _cards(results),
-        _missing(results),
+        _missing_metrics(results),
         _figure("uses", uses, "photographs without reflections, and panes as mirrors") if uses else "",
         _plane_table(results.get("planes") or []),
         _view_table(per_view, sheets),
@@ -362,7 +362,7 @@ def _cards(results: Mapping[str, Any]) -> str:
     return f'<div class="cards">{"".join(cards)}</div>'
 
 
-def _missing(results: Mapping[str, Any]) -> str:
+def _missing_metrics(results: Mapping[str, Any]) -> str:
     """Reasons for missing metrics."""
     known = metrics.shown_metrics(results)
     lines = [
@@ -375,13 +375,13 @@ def _missing(results: Mapping[str, Any]) -> str:
 def _meanings(results: Mapping[str, Any]) -> str:
     """Meanings of the numbers, at the end of the page."""
     planes = metrics.PLANE_COLUMNS if results.get("planes") else {}
-    parts = [f"<dl>{_defined(metrics.shown_metrics(results))}</dl>"]
+    parts = [f"<dl>{_definition_list(metrics.shown_metrics(results))}</dl>"]
     if planes:
-        parts.append(f"<p>Of each pane:</p><dl>{_defined(planes)}</dl>")
+        parts.append(f"<p>Of each pane:</p><dl>{_definition_list(planes)}</dl>")
     return f'<section class="meanings"><h2>What the numbers mean</h2>{"".join(parts)}</section>'
 
 
-def _defined(known: Mapping[str, metrics.Metric]) -> str:
+def _definition_list(known: Mapping[str, metrics.Metric]) -> str:
     return "".join(f"<dt>{_escape(m.label)}</dt><dd>{_escape(m.meaning)}</dd>" for m in known.values())
 
 

@@ -93,8 +93,9 @@ class GroundTruth:
         Raises:
             InputError: only some of the view's files exist, or a file is broken.
         """
-        in_folder, in_none = self._paths(Path(image_name).with_suffix("")), self._paths(Path(Path(image_name).stem))
-        paths = in_folder if any(path.is_file() for path in in_folder.values()) else in_none
+        in_folder = self._paths(Path(image_name).with_suffix(""))
+        without_folder = self._paths(Path(Path(image_name).stem))
+        paths = in_folder if any(path.is_file() for path in in_folder.values()) else without_folder
         missing = [str(path) for path in paths.values() if not path.is_file()]
         if len(missing) == len(paths):
             return None
@@ -166,10 +167,10 @@ def _resized_labels(labels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray
     return result
 
 
-NORMAL_MARK, STRENGTH_MARK = "_normal", "_strength"
-COVERED = 0.5
+NORMAL_SUFFIX, STRENGTH_SUFFIX = "_normal", "_strength"
+LEAST_COVERAGE = 0.5
 """Coverage above which a pixel shows the surface."""
-NEARLY_UNIT = 0.25
+MOST_LENGTH_DEVIATION = 0.25
 """Maximum deviation from 1 of the length of a stored vector that is a normal, and not the colour of a background."""
 
 
@@ -188,7 +189,7 @@ class TrueSurface:
     strength: Tensor | None
 
 
-NOTHING_KNOWN = TrueSurface(torch.zeros(0, 0, dtype=torch.bool), None, None)
+UNKNOWN_SURFACE = TrueSurface(torch.zeros(0, 0, dtype=torch.bool), None, None)
 
 
 def true_surface(view: View) -> TrueSurface | None:
@@ -200,11 +201,11 @@ def true_surface(view: View) -> TrueSurface | None:
         InputError: a file is not an image, or differs in size from the photograph.
     """
     size = (view.camera.width, view.camera.height)
-    vectors, strength = _read_beside(view, NORMAL_MARK), _read_beside(view, STRENGTH_MARK)
+    vectors, strength = _read_companion(view, NORMAL_SUFFIX), _read_companion(view, STRENGTH_SUFFIX)
     if vectors is None and strength is None:
         return None
     coverage = _coverage(view, vectors)
-    covered = torch.from_numpy(resize_by_area(coverage, *size) > COVERED)
+    covered = torch.from_numpy(resize_by_area(coverage, *size) > LEAST_COVERAGE)
     return TrueSurface(
         covered=covered,
         normals=None if vectors is None else _normals(vectors, coverage, size) * covered[..., None],
@@ -212,9 +213,9 @@ def true_surface(view: View) -> TrueSurface | None:
     )
 
 
-def _read_beside(view: View, mark: str) -> NDArray[np.float32] | None:
+def _read_companion(view: View, suffix: str) -> NDArray[np.float32] | None:
     """[H, W, C] in [0, 1] of the file next to a photograph; None if there is none."""
-    path = view.image_path.with_name(f"{view.image_path.stem}{mark}.png")
+    path = view.image_path.with_name(f"{view.image_path.stem}{suffix}.png")
     if not path.is_file():
         return None
     photo_size = image_size(view.image_path)
@@ -242,7 +243,7 @@ def _coverage(view: View, vectors: NDArray[np.float32] | None) -> NDArray[np.flo
     if vectors is None:
         return np.ones(photo.shape[:2], dtype=np.float32)
     lengths = np.linalg.norm(_decode_normals(vectors), axis=-1)
-    return (np.abs(lengths - 1) < NEARLY_UNIT).astype(np.float32)
+    return (np.abs(lengths - 1) < MOST_LENGTH_DEVIATION).astype(np.float32)
 
 
 def _normals(vectors: NDArray[np.float32], coverage: NDArray[np.float32], size: tuple[int, int]) -> Tensor:

@@ -320,7 +320,7 @@ def test_the_right_half_begins_in_the_middle(monkeypatch: pytest.MonkeyPatch) ->
     with torch.no_grad():
         almost = torch.round(Planar()(true_scene(), view.camera).rgb.clamp(0, 0.99) * 255 + 1).to(torch.uint8)
     almost[:, view.camera.width // 2 - 1] = 255
-    monkeypatch.setattr(glassplat.evaluate.metrics, "color_corrected", lambda image, *rest, **more: image)
+    monkeypatch.setattr(glassplat.evaluate.metrics, "correct_colors", lambda image, *rest, **more: image)
     spoilt = View.in_memory(view.name, view.camera, photo=almost)
     results = evaluate(true_scene(), Planar(), replace(dataset, test=(spoilt,))).results
     assert results["psnr"] < 40 < 45 < results["right_half_psnr"]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from glassplat.evaluate.metrics import color_corrected, psnr, quantize, reflection_gain, ssim
+from glassplat.evaluate.metrics import correct_colors, psnr, quantize, reflection_gain, ssim
 
 GENERATOR = torch.Generator().manual_seed(0)
 IMAGE = torch.rand(20, 30, 3, generator=GENERATOR)
@@ -91,12 +91,12 @@ def test_bad_arguments_are_refused() -> None:
 def test_a_photograph_of_another_exposure_is_met_after_correction() -> None:
     image = torch.rand(12, 20, 3, generator=torch.Generator().manual_seed(4)) * 0.5 + 0.2
     photo = image @ torch.tensor([[1.2, 0.0, 0.1], [0.0, 0.9, 0.0], [0.05, 0.0, 1.0]]) + 0.02
-    assert psnr(image, photo) < 30 < 45 < psnr(color_corrected(image, photo), photo)
-    assert psnr(color_corrected(image, photo, slice(0, 10)), photo) > 45
+    assert psnr(image, photo) < 30 < 45 < psnr(correct_colors(image, photo), photo)
+    assert psnr(correct_colors(image, photo, slice(0, 10)), photo) > 45
 
 
 def test_a_correction_from_one_colour_stays_finite() -> None:
     grey = torch.full((4, 4, 3), 0.5)
-    corrected = color_corrected(grey, grey + 0.1)
+    corrected = correct_colors(grey, grey + 0.1)
     assert bool(torch.isfinite(corrected).all())
     assert psnr(corrected, grey + 0.1) > 40

@@ -25,7 +25,7 @@ NOTHING_RENDERED = Frame(torch.zeros(0), {})
 def test_a_mask_says_where_the_pane_is() -> None:
     regions = marked_regions(pane(2.0, half=0.1))
     view = tiny_capture().train[0]
-    region = regions.of(view, NOTHING_RENDERED, None)
+    region = regions.find(view, NOTHING_RENDERED, None)
     assert isinstance(region, torch.Tensor)
     assert torch.equal(region, view.pane_labels > 0)
 
@@ -33,7 +33,7 @@ def test_a_mask_says_where_the_pane_is() -> None:
 def test_without_a_mask_the_fitted_plane_says_it() -> None:
     view = tiny_capture().train[1]
     assert view.pane_labels is None
-    region = marked_regions(true_scene().planes).of(view, NOTHING_RENDERED, None)
+    region = marked_regions(true_scene().planes).find(view, NOTHING_RENDERED, None)
     assert isinstance(region, torch.Tensor)
     assert torch.equal(region, shown_panes(true_scene().planes, view.camera)[0] > 0)
     assert 100 < int(region.sum()) < region.numel()
