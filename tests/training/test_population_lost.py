@@ -65,11 +65,11 @@ def test_only_whole_passes_are_judged() -> None:
     nothing, something = torch.zeros(3, dtype=torch.bool), torch.tensor([False, True, False])
     visibility = VisibilityCheck(3)
     for step, visible in ((1, nothing), (2, nothing), (3, nothing), (4, something), (5, nothing), (6, None)):
-        visibility.note(visible, step)
+        visibility.record(visible, step)
     for step in (7, 8, 9, 10):
-        visibility.note(nothing, step)
+        visibility.record(nothing, step)
     with pytest.raises(NoGaussiansError):
-        visibility.note(nothing, 11)
+        visibility.record(nothing, 11)
 
 
 def test_the_loss_of_the_last_gaussian_is_named_and_nothing_is_told_of_that_step() -> None:
