@@ -64,7 +64,7 @@ def test_followed_edges_are_those_of_the_definition(views: list[PaneView], plane
         chosen = np.flatnonzero(matches.sources == number)
         thinned = slice(None, None, max(len(view.edge) // 40, 1))
         points, hit = intersect_rays(planes, view.center, view.directions(view.edge[thinned]))
-        limits = view.sight_limits(view.edge[thinned], view.outward[thinned])
+        limits = view.line_plane_normals(view.edge[thinned], view.outward[thinned])
         outward = limits - (planes.normals @ limits.T)[..., None] * planes.normals[:, None]
         outward /= np.maximum(np.linalg.norm(outward, axis=2, keepdims=True), 1e-9)
         own_size, own_hidden = pixel_and_frame(planes, view, points, outward)
@@ -124,7 +124,7 @@ def test_images_of_any_size_are_interpolated_up_to_their_rims(shape: tuple[int, 
 def test_overlaps_are_those_of_the_definition(views: list[PaneView], planes: PlaneEquations) -> None:
     both, either = np.zeros((2, len(views), len(views), len(planes)))
     for number, source in enumerate(views):
-        pixels = source.grid(90)
+        pixels = source.pixel_grid(90)
         everywhere = np.ones(len(pixels), dtype=bool)
         pixels = pixels[source.is_unoccluded(pixels, everywhere)]
         on_pane = source.covers(pixels, everywhere[: len(pixels)])

@@ -49,7 +49,7 @@ def test_lines_of_another_label_are_not_a_pane() -> None:
 
 def test_rays_through_pixels_project_back_onto_them() -> None:
     view = pane_view(camera_at(1.5), labels_with(10, 50, 20, 60), 1)
-    pixels = view.grid(100)
+    pixels = view.pixel_grid(100)
     landed, held = view.project(view.center + 2.5 * view.directions(pixels))
     assert held.all()
     assert landed == pytest.approx(pixels)
