@@ -81,7 +81,7 @@ __all__ = [  # noqa: RUF022 - In the order of the documentation.
     "InputError",
 ]
 
-HOMES = {
+NAMES_BY_MODULE = {
     "captures.dataset": ("Dataset", "load_dataset"),
     "captures.view": ("PointCloud", "View"),
     "errors": ("InputError",),
@@ -110,12 +110,12 @@ HOMES = {
 
 def __getattr__(name: str) -> Any:
     """A public name, imported on first use."""
-    home = next((module for module, names in HOMES.items() if name in names), None)
-    if home is None:
+    module_name = next((module for module, names in NAMES_BY_MODULE.items() if name in names), None)
+    if module_name is None:
         raise AttributeError(f"module 'glassplat' has no attribute {name!r}; it has {', '.join(__all__)}")
     import importlib
 
-    globals()[name] = found = getattr(importlib.import_module(f"glassplat.{home}"), name)
+    globals()[name] = found = getattr(importlib.import_module(f"glassplat.{module_name}"), name)
     return found
 
 

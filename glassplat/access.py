@@ -16,10 +16,10 @@ import secrets
 from http import HTTPStatus
 from urllib.parse import parse_qs, urlsplit
 
-LOCAL = "127.0.0.1"
-LOCAL_NAMES = (LOCAL, "localhost", "[::1]")
+LOCALHOST = "127.0.0.1"
+LOCAL_NAMES = (LOCALHOST, "localhost", "[::1]")
 """Accepted names of the host, with any port, since SSH forwarding may use another port."""
-OPEN_THE_LINK = "open the address that the command printed, including its key"
+OPEN_LINK_HINT = "open the address that the command printed, including its key"
 
 
 class RefusedError(Exception):
@@ -37,7 +37,7 @@ class Access:
         key: secret part of the link.
     """
 
-    def __init__(self, host: str = LOCAL) -> None:
+    def __init__(self, host: str = LOCALHOST) -> None:
         """Makes a key; `host` is the address of the server."""
         self.key = secrets.token_urlsafe(16)
         self._is_local = is_local(host)
@@ -69,9 +69,9 @@ class Access:
         # Parsed by hand, because `http.cookies` rejects all cookies if another program set an invalid one.
         pairs = [cookie.partition("=") for cookie in cookies.split(";")]
         if not any(self._is_key(value.strip()) for name, _, value in pairs if name.strip() == cookie_name(host)):
-            raise RefusedError(HTTPStatus.FORBIDDEN, OPEN_THE_LINK)
+            raise RefusedError(HTTPStatus.FORBIDDEN, OPEN_LINK_HINT)
 
-    def entry(self, path: str, host: str) -> dict[str, str] | None:
+    def login_headers(self, path: str, host: str) -> dict[str, str] | None:
         """Headers of the answer to a first request, with the key in its path; None for any other path.
 
         Raises:

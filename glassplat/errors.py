@@ -27,7 +27,7 @@ class RankLostError(RuntimeError):
 
 
 @contextmanager
-def input_checked(where: object = None) -> Iterator[None]:
+def convert_to_input_error(where: object = None) -> Iterator[None]:
     """Turns the ValueError of a reader or an edit into an InputError.
 
     Args:
@@ -39,7 +39,7 @@ def input_checked(where: object = None) -> Iterator[None]:
         raise InputError(str(error) if where is None else f"{where}: {error}") from error
 
 
-def first_names(names: list[str], limit: int = 5) -> str:
+def join_names(names: list[str], limit: int = 5) -> str:
     """A list of names for a message, cut short after `limit`."""
     shown = ", ".join(names[:limit])
     return shown if len(names) <= limit else f"{shown} and {len(names) - limit} more"

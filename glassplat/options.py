@@ -19,7 +19,7 @@ import tyro
 
 from glassplat.errors import InputError
 
-MOST = 1_000_000_000
+LARGEST_COUNT = 1_000_000_000
 """Maximum of all counts: more than a machine holds, and small enough for every integer type."""
 
 
@@ -89,16 +89,16 @@ class Ascending:
 Finite = Annotated[float, Range()]
 """Any finite number."""
 Positive = Annotated[float, Range(above=0)]
-NotNegative = Annotated[float, Range(0)]
+NonNegative = Annotated[float, Range(0)]
 Share = Annotated[float, Range(0, 1)]
 """A share, from 0 to 1."""
 PositiveShare = Annotated[float, Range(above=0, high=1)]
-InnerShare = Annotated[float, Range(above=0, below=1)]
+OpenShare = Annotated[float, Range(above=0, below=1)]
 """A share stored as a logit, without 0 and 1."""
 LearningRate = Annotated[float, Range(0, 1)]
 """Learning rate of Adam, about the change of a raw parameter per step; 0 freezes it."""
-Count = Annotated[int, Range(0, MOST)]
-Several = Annotated[int, Range(1, MOST)]
+Count = Annotated[int, Range(0, LARGEST_COUNT)]
+PositiveCount = Annotated[int, Range(1, LARGEST_COUNT)]
 Downscale = Annotated[float, Range(1, 1000)]
 """Factor by which width and height of photographs are divided."""
 Seed = Annotated[int, Range(0, 2**32 - 1)]
@@ -123,8 +123,8 @@ Internal = Annotated[T, tyro.conf.Fixed, tyro.conf.Suppress]
 
 LONGEST_SHOWN = 80
 """Maximum length of a wrong value in messages."""
-UNIONS = (typing.Union, types.UnionType)
-PLAIN = {bool: "True or False", int: "a whole number", float: "a number", str: "a text", Path: "a path"}
+UNION_TYPES = (typing.Union, types.UnionType)
+SCALAR_NAMES = {bool: "True or False", int: "a whole number", float: "a number", str: "a text", Path: "a path"}
 """Types of single values, and their names in messages."""
 
 
@@ -145,7 +145,9 @@ def check_options(options: Any) -> None:
     try:
         check_value(type(options), options, "")
     except OptionError as error:
-        raise InputError(f"{as_typed(error.name)} is {short_repr(error.value)}; expected {error.expected}") from error
+        raise InputError(
+            f"{option_of_field(error.name)} is {short_repr(error.value)}; expected {error.expected}"
+        ) from error
 
 
 def options_from_json(kind: type, value: Any) -> Any:
@@ -157,7 +159,7 @@ def options_from_json(kind: type, value: Any) -> Any:
     return check_value(kind, value, "")
 
 
-def as_typed(name: str) -> str:
+def option_of_field(name: str) -> str:
     """The option of the command line that sets a field: `plane_fit.seed` is `--plane-fit.seed`."""
     return "--" + name.replace("_", "-")
 
@@ -174,7 +176,7 @@ def check_value(hint: Any, value: Any, name: str) -> Any:
         OptionError: the value is invalid.
     """
     hint, requirements = unwrap_annotation(hint)
-    result = _in_type(hint, value, name, requirements)
+    result = _convert_value(hint, value, name, requirements)
     for requirement in requirements:
         if result is not None and not requirement.allows(result):
             raise OptionError(name, value, expectation(hint, requirements))
@@ -192,14 +194,18 @@ def unwrap_annotation(hint: Any) -> tuple[Any, tuple[Requirement, ...]]:
 def expectation(hint: Any, requirements: tuple[Requirement, ...] = ()) -> str:
     """Expected value of this annotation, in words."""
     bounds = " and ".join(requirement.expected for requirement in requirements)
-    return f"{PLAIN[hint]} {bounds}".rstrip() if hint in PLAIN else ", ".join(filter(None, (_structure(hint), bounds)))
+    return (
+        f"{SCALAR_NAMES[hint]} {bounds}".rstrip()
+        if hint in SCALAR_NAMES
+        else ", ".join(filter(None, (_expected_structure(hint), bounds)))
+    )
 
 
-def _structure(hint: Any) -> str:
+def _expected_structure(hint: Any) -> str:
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Literal:
         return f"one of {', '.join(map(str, inner))}"
-    if origin in UNIONS:
+    if origin in UNION_TYPES:
         return " or ".join(
             "None" if option is type(None) else expectation(*unwrap_annotation(option)) for option in inner
         )
@@ -213,23 +219,25 @@ def _structure(hint: Any) -> str:
     return "an object with named values"
 
 
-def _in_type(hint: Any, value: Any, name: str, requirements: tuple[Requirement, ...]) -> Any:
+def _convert_value(hint: Any, value: Any, name: str, requirements: tuple[Requirement, ...]) -> Any:
     """The value converted to a type without metadata; requirements are for the message."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return _fields(type(value), {field.name: getattr(value, field.name) for field in fields(value)}, name)
+        return _convert_dataclass(
+            type(value), {field.name: getattr(value, field.name) for field in fields(value)}, name
+        )
     if dataclasses.is_dataclass(hint):
-        return _fields(typing.cast(type, hint), value, name)
+        return _convert_dataclass(typing.cast(type, hint), value, name)
     origin = typing.get_origin(hint)
-    if origin in UNIONS:
-        return _alternative(hint, value, name)
-    if origin in CONTAINERS:
-        return CONTAINERS[origin](hint, value, name)
-    if not _is_of(hint, value):
+    if origin in UNION_TYPES:
+        return _convert_union(hint, value, name)
+    if origin in CONVERTERS:
+        return CONVERTERS[origin](hint, value, name)
+    if not _has_type(hint, value):
         raise OptionError(name, value, expectation(hint, requirements))
     return hint(value) if hint in (float, Path) else value
 
 
-def _is_of(hint: Any, value: Any) -> bool:
+def _has_type(hint: Any, value: Any) -> bool:
     """Return whether a value has a type; integers are floats, too, but booleans and infinity are not."""
     if hint is float:
         return isinstance(value, (int, float)) and not isinstance(value, bool) and is_finite(value)
@@ -248,7 +256,7 @@ def is_finite(value: float) -> bool:
         return False
 
 
-def _fields(kind: type, value: Any, name: str) -> Any:
+def _convert_dataclass(kind: type, value: Any, name: str) -> Any:
     """An instance of a dataclass from its fields by name."""
     if not isinstance(value, Mapping):
         raise OptionError(name, value, "an object with named values")
@@ -257,30 +265,30 @@ def _fields(kind: type, value: Any, name: str) -> Any:
     unknown = sorted(map(str, set(value) - set(known)))
     if unknown:
         raise InputError(f"unknown fields {unknown} of {name or 'the options'}; there are {known}")
-    missing = [field.name for field in fields(kind) if _is_needed(field) and field.name not in value]
+    missing = [field.name for field in fields(kind) if _is_required(field) and field.name not in value]
     if missing:
         raise InputError(f"fields {missing} of {name or 'the options'} are missing")
     values = {
-        key: check_value(hints[key], value[key], inner_name(name, key, hints[key])) for key in known if key in value
+        key: check_value(hints[key], value[key], nested_name(name, key, hints[key])) for key in known if key in value
     }
-    made = kind(**values)
-    contradiction = made.contradiction() if hasattr(made, "contradiction") else None
+    instance = kind(**values)
+    contradiction = instance.contradiction() if hasattr(instance, "contradiction") else None
     if contradiction:
         raise InputError(contradiction)
-    return made
+    return instance
 
 
-def _is_needed(field: dataclasses.Field) -> bool:
+def _is_required(field: dataclasses.Field) -> bool:
     return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
 
 
-def inner_name(outer: str, field: str, hint: Any) -> str:
+def nested_name(outer: str, field: str, hint: Any) -> str:
     """Dotted name of a nested field; fields without a name on the command line add nothing."""
     nameless = any(getattr(data, "name", None) == "" for data in typing.get_args(hint)[1:])
     return outer if nameless else f"{outer}.{field}".removeprefix(".")
 
 
-def _alternative(hint: Any, value: Any, name: str) -> Any:
+def _convert_union(hint: Any, value: Any, name: str) -> Any:
     """The value converted to the first type of a union that accepts it."""
     if value is None and type(None) in typing.get_args(hint):
         return None
@@ -299,32 +307,36 @@ def _alternative(hint: Any, value: Any, name: str) -> Any:
     raise OptionError(name, value, expectation(hint))
 
 
-def _literal(hint: Any, value: Any, name: str) -> Any:
+def _convert_literal(hint: Any, value: Any, name: str) -> Any:
     choices = typing.get_args(hint)
     if not any(value == choice and type(value) is type(choice) for choice in choices):
         raise OptionError(name, value, f"one of {', '.join(map(str, choices))}")
     return value
 
 
-def _tuple(hint: Any, value: Any, name: str) -> tuple[Any, ...]:
+def _convert_tuple(hint: Any, value: Any, name: str) -> tuple[Any, ...]:
     inner = typing.get_args(hint)
     if not isinstance(value, (list, tuple)) or (inner[-1] is not ... and len(value) != len(inner)):
-        raise OptionError(name, value, _structure(hint))
+        raise OptionError(name, value, _expected_structure(hint))
     kinds = inner[:1] * len(value) if inner[-1] is ... else inner
     try:
         return tuple(check_value(kind, element, name) for kind, element in zip(kinds, value, strict=True))
     except OptionError as error:
-        raise OptionError(name, value, _structure(hint)) from error
+        raise OptionError(name, value, _expected_structure(hint)) from error
 
 
-def _dict(hint: Any, value: Any, name: str) -> dict[Any, Any]:
+def _convert_dict(hint: Any, value: Any, name: str) -> dict[Any, Any]:
     keys, values = typing.get_args(hint)
     if not isinstance(value, Mapping):
-        raise OptionError(name, value, _structure(hint))
+        raise OptionError(name, value, _expected_structure(hint))
     return {check_value(keys, key, name): check_value(values, element, name) for key, element in value.items()}
 
 
-CONTAINERS: dict[Any, Callable[[Any, Any, str], Any]] = {typing.Literal: _literal, tuple: _tuple, dict: _dict}
+CONVERTERS: dict[Any, Callable[[Any, Any, str], Any]] = {
+    typing.Literal: _convert_literal,
+    tuple: _convert_tuple,
+    dict: _convert_dict,
+}
 
 
 def short_repr(value: Any) -> str:
@@ -361,5 +373,5 @@ class Cleaning:
     """
 
     box: tuple[Finite, Finite, Finite, Finite, Finite, Finite] | None = None
-    isolated: NotNegative = 8.0
-    oversized: NotNegative = 1.0
+    isolated: NonNegative = 8.0
+    oversized: NonNegative = 1.0

@@ -44,5 +44,5 @@ def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
 
 def reference() -> str:
     """An entry for every public name of the package, in the order of `__all__`."""
-    homes = {name: module for module, names in glassplat.HOMES.items() for name in names}
+    homes = {name: module for module, names in glassplat.NAMES_BY_MODULE.items() for name in names}
     return "\n\n".join(f"::: glassplat.{homes[name]}.{name}" for name in glassplat.__all__)

@@ -19,7 +19,7 @@ from glassplat.captures.dataset import Dataset, dataset_of
 from glassplat.captures.files import read_poses, with_masks
 from glassplat.captures.masks import PANE_FOLDER, PLANES, mask_paths
 from glassplat.captures.view import PhotoFile, View
-from glassplat.errors import InputError, first_names
+from glassplat.errors import InputError, join_names
 from glassplat.files.images import files_below, image_size, is_hidden, leaves_folder, write_image
 from glassplat.files.records import read_json
 from glassplat.files.sidecars import planes_json, write_planes
@@ -202,7 +202,7 @@ def earlier_masks(root: Path) -> set[str]:
     others = sorted(seen - known)
     if others:
         raise InputError(
-            f"{folder} holds masks that were not made by `glassplat annotate` ({first_names(others)}), and the "
+            f"{folder} holds masks that were not made by `glassplat annotate` ({join_names(others)}), and the "
             "two kinds cannot be mixed: train with these masks, or move that folder away and mark the panes "
             "here"
         )

@@ -17,7 +17,7 @@ from threading import Thread
 from typing import Any
 from urllib.parse import urlsplit
 
-from glassplat.access import LOCAL, Access, RefusedError
+from glassplat.access import LOCALHOST, Access, RefusedError
 from glassplat.annotate.session import SHOWN, THUMBNAIL, ChangedElsewhereError, Session
 from glassplat.errors import InputError
 from glassplat.files.records import parse_json
@@ -49,7 +49,7 @@ class AnnotationServer(ThreadingHTTPServer):
         self.access = Access()
         self.is_finished = False
         try:
-            super().__init__((LOCAL, port), PageHandler)
+            super().__init__((LOCALHOST, port), PageHandler)
         except OSError as error:
             reason = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be used ({error.strerror})"
             raise InputError(f"port {port} {reason}; choose another with --port, or 0 for any that is free") from error
@@ -57,7 +57,7 @@ class AnnotationServer(ThreadingHTTPServer):
     @property
     def address(self) -> str:
         """Address to open in the browser."""
-        return f"http://{LOCAL}:{self.server_address[1]}/?key={self.access.key}"
+        return f"http://{LOCALHOST}:{self.server_address[1]}/?key={self.access.key}"
 
     def finish(self) -> None:
         """Stops serving; may be called from any thread."""
@@ -154,7 +154,7 @@ class PageHandler(BaseHTTPRequestHandler):
         return self.rfile.read(int(length)).decode("utf-8")
 
     def _send_page(self) -> None:
-        entry = self.server.access.entry(self.path, self._host)
+        entry = self.server.access.login_headers(self.path, self._host)
         if entry is not None:
             self._send(b"", "text/plain", HTTPStatus.OK, entry)
             return

@@ -32,7 +32,7 @@ from glassplat.annotate.results import capture_to_mark, grab_outlines, remove_re
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.masks import PANE_FOLDER, PLANES
 from glassplat.captures.view import View
-from glassplat.errors import InputError, first_names, input_checked
+from glassplat.errors import InputError, convert_to_input_error, join_names
 from glassplat.files.records import Field, Integer, ListOf, Text, check_fields
 from glassplat.files.writing import check_folder, check_links
 from glassplat.scene.camera import NumpyCamera
@@ -203,7 +203,7 @@ class Session:
         self._pictures: OrderedDict[tuple[int, int], bytes] = OrderedDict()
         self._versions: OrderedDict[str, Any] = OrderedDict()
         self._answers: dict[int, tuple[str, dict[str, Any]]] = {}
-        with input_checked():
+        with convert_to_input_error():
             self._document: Any = read_document(self.root)
         self._remember(self._document)
 
@@ -315,7 +315,7 @@ class Session:
             if not removed:
                 raise InputError("no pane is known yet; mark the same corners in two photographs")
             stays = f"; {PLANES} stays: it was not written here" if (self.root / PLANES).exists() else ""
-            told = f"no pane is marked; removed the earlier output: {first_names(removed)}{stays}"
+            told = f"no pane is marked; removed the earlier output: {join_names(removed)}{stays}"
             return {"masks": [], "planes": [], "told": told}
         written = write_results(self.root, self.views, self.cameras, solved)
         return {
@@ -429,9 +429,7 @@ def _crosses_itself(outline: Array) -> bool:
 def _places(camera: NumpyCamera, corners: Array) -> list[list[float] | None]:
     """Pixels of corners; None for those behind the camera."""
     places = np.round(camera.project(corners), 2).tolist()
-    return [
-        place if depth > 0 else None for place, depth in zip(places, camera.to_camera_axes(corners)[:, 2], strict=True)
-    ]
+    return [place if depth > 0 else None for place, depth in zip(places, camera.to_camera_axes(corners)[:, 2], strict=True)]
 
 
 def opened_session(root: Path) -> Session:

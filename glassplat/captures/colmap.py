@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from glassplat.captures.cameras import MODEL_OF_ID, PARAMETER_COUNTS, Lens, make_lens
 from glassplat.captures.capture import Capture, RawPoints, Shot
 from glassplat.captures.transforms import TRAIN, WHOLE
-from glassplat.errors import InputError, first_names, input_checked
+from glassplat.errors import InputError, convert_to_input_error, join_names
 from glassplat.files.images import files_below
 from glassplat.files.records import wrap_read_errors
 from glassplat.options import short_repr
@@ -75,7 +75,7 @@ def read_model(folder: Path) -> Model:
     points_path = next(filter(lexists, candidates), candidates[0])
     rows = _records_of(points_path) if lexists(points_path) else []
     table = np.array(rows, dtype=np.float64).reshape(-1, 6)
-    with input_checked(points_path):
+    with convert_to_input_error(points_path):
         return Model(lenses, images, RawPoints.from_arrays(table[:, :3], table[:, 3:]))
 
 
@@ -265,13 +265,11 @@ def _shots(root: Path, model: Model) -> tuple[Shot, ...]:
     if missing:
         raise InputError(
             f"{len(missing)} of the {len(model.images)} photographs of the COLMAP model are missing in {images}: "
-            f"{first_names(missing)}; copy them there, or remove them from the model"
+            f"{join_names(missing)}; copy them there, or remove them from the model"
         )
     orphans = sorted(image.name for image in model.images if image.camera_id not in model.lenses)
     if orphans:
-        raise InputError(
-            f"photographs whose camera is not in the COLMAP model: {first_names(orphans)}; export it again"
-        )
+        raise InputError(f"photographs whose camera is not in the COLMAP model: {join_names(orphans)}; export it again")
     return tuple(
         Shot(name, images / name, model.lenses[image.camera_id], pose_matrix(image))
         for name, image in zip(names, model.images, strict=True)
@@ -296,7 +294,7 @@ def _other_models(root: Path, used: Path) -> tuple[str, ...]:
     )
     if not others:
         return ()
-    return (f"{used} is used; there are more models in {sparse} ({first_names(others)}), which are ignored.",)
+    return (f"{used} is used; there are more models in {sparse} ({join_names(others)}), which are ignored.",)
 
 
 def _unread_frames(root: Path) -> tuple[str, ...]:
@@ -305,6 +303,6 @@ def _unread_frames(root: Path) -> tuple[str, ...]:
     if not unread:
         return ()
     return (
-        f"The COLMAP model of {root} is read, and not {first_names(unread)}: neither its poses, nor its split, nor its "
+        f"The COLMAP model of {root} is read, and not {join_names(unread)}: neither its poses, nor its split, nor its "
         "masks. Move one of them away.",
     )

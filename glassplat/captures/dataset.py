@@ -31,7 +31,7 @@ from glassplat.captures.view import (
     normals_paths,
     prepare_view,
 )
-from glassplat.errors import InputError, first_names, input_checked
+from glassplat.errors import InputError, convert_to_input_error, join_names
 from glassplat.files.images import is_transparent
 from glassplat.files.records import LARGEST_COORDINATE
 from glassplat.files.sidecars import read_planes
@@ -54,7 +54,7 @@ def given_planes(root: Path, cameras: Sequence[Camera]) -> Planes | None:
     path = root / PLANES
     if not lexists(path):
         return None
-    with input_checked():
+    with convert_to_input_error():
         planes = read_planes(path)
     for row, label in enumerate(planes.labels):
         places = rectangle_points(planes.select([row]))
@@ -202,7 +202,7 @@ def dataset_of(
     """Make a `Dataset`, as `load_dataset` does, from a capture that `read_capture` read."""
     check_downscale(downscale)
     root, capture, shots, masks = files.root, files.capture, files.shots, files.masks
-    with input_checked():
+    with convert_to_input_error():
         transparent = any(is_transparent(shot.image_path) for shot in shots)
     cut_out = transparent and capture.cut_out
     shown = background if transparent and not cut_out else None
@@ -345,7 +345,7 @@ def _view_warnings(prepared: list[PreparedView], background: Rgb | None) -> list
     if rescaled:
         warnings.append(
             f"{len(rescaled)} photographs are scaled copies of the calibrated ones; their intrinsics were scaled "
-            f"accordingly ({first_names(rescaled)})."
+            f"accordingly ({join_names(rescaled)})."
         )
     if background is not None:
         warnings.append(f"The photographs have transparent pixels; they are laid over sRGB {background}.")

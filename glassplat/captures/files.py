@@ -11,7 +11,7 @@ from pathlib import Path
 from glassplat.captures import colmap, mirror_nerf, transforms
 from glassplat.captures.capture import Capture, Loader, Shot
 from glassplat.captures.masks import IgnoredMask, MaskSet, Polarity, find_masks
-from glassplat.errors import InputError, UnknownFormatError, first_names
+from glassplat.errors import InputError, UnknownFormatError, join_names
 from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
 from glassplat.files.records import is_encodable, readable_name
 from glassplat.files.writing import check_capture_folder
@@ -72,7 +72,7 @@ def read_poses(root: Path | str) -> CaptureFiles:
     capture = _load_capture(root)
     shots = tuple(sorted((*capture.shots, *(capture.test_shots or ())), key=lambda shot: shot.name))
     if repeated := [name for name, count in Counter(shot.name for shot in shots).items() if count > 1]:
-        raise InputError(f"photographs that occur more than once: {first_names(repeated)}; keep one pose for each")
+        raise InputError(f"photographs that occur more than once: {join_names(repeated)}; keep one pose for each")
     return CaptureFiles(root, capture, shots, MaskSet({}), {}, "auto")
 
 
@@ -93,7 +93,7 @@ def _load_capture(root: Path) -> Capture:
             return capture
     looked_for = "; ".join(text for _, text in LOADERS)
     names = sorted(path.name for path in root.iterdir())
-    found = first_names(names, limit=8) or "nothing"
+    found = join_names(names, limit=8) or "nothing"
     message = f"{root} is not a readable capture. Looked for: {looked_for}. Found: {found}."
     if any(Path(name).suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) for name in names):
         message += f" Photographs become a capture by: glassplat prepare {shlex.quote(str(root))} --output CAPTURE"

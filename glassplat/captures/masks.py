@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from glassplat.errors import InputError, first_names, input_checked
+from glassplat.errors import InputError, convert_to_input_error, join_names
 from glassplat.files import images
 
 HIGHEST_LABEL = 64
@@ -83,7 +83,7 @@ def _read_shades(path: Path) -> NDArray[np.uint8]:
 
 def _open_mask(path: Path) -> Image.Image:
     """The mask; if any pixel is transparent, its opacity thresholded at one half as white and black."""
-    with input_checked():
+    with convert_to_input_error():
         image = images.open_image(path)
         opaque = None if image.mode in images.GREY_MODES_16 else images.opacity(image)
     image.info.pop("transparency", None)  # Pillow warns about some encodings of it.
@@ -136,7 +136,7 @@ def _check_black_and_white(counts: NDArray[np.int64], path: Path, lossy: bool) -
     grey = counts[tolerance + 1 : WHITE - tolerance]
     few = not lossy and 0 < np.count_nonzero(grey) < FEW_SHADES
     if few or grey.sum() > SOFT_SHARE * counts.sum():
-        present = first_names([str(value) for value in np.flatnonzero(counts)])
+        present = join_names([str(value) for value in np.flatnonzero(counts)])
         raise InputError(
             f"{path} holds the grey values {present}, which are neither pane labels (0..{HIGHEST_LABEL}) nor black and "
             "white (0 and 255); write 0 for no pane and 1..K for the panes"
@@ -209,7 +209,7 @@ class CutOut:
 
     def labels(self) -> NDArray[np.uint8]:
         """[H, W] 1 where a pixel is ignored."""
-        with input_checked():
+        with convert_to_input_error():
             pixels = images.read_image(self.path)
         return (
             (pixels[:, :, 3] < THRESHOLD).astype(np.uint8) if pixels.shape[2] == 4 else np.zeros_like(pixels[:, :, 0])
@@ -295,7 +295,7 @@ def _found_masks(
     if not (masks or named):
         raise InputError(_no_photograph(root / MASK_FOLDER, unmatched, photographs))
     belong = "1 mask belongs" if len(unmatched) == 1 else f"{len(unmatched)} masks belong"
-    return masks, (f"{belong} to no photograph ({first_names(sorted(unmatched))}).",)
+    return masks, (f"{belong} to no photograph ({join_names(sorted(unmatched))}).",)
 
 
 def _why_panes(root: Path, masks: Mapping[str, Path], *, marked: bool) -> str | None:
@@ -371,7 +371,7 @@ def _understood(
         )
     empty = sorted(name for name, present in found.items() if not present)
     if empty:
-        warnings.append(f"{len(empty)} masks mark no pane ({first_names(empty)}); these views count as seeing none.")
+        warnings.append(f"{len(empty)} masks mark no pane ({join_names(empty)}); these views count as seeing none.")
     return MaskSet(masks, tuple(labels), tuple(warnings))
 
 
@@ -406,7 +406,7 @@ def _match(
         owners = _owners(path.relative_to(folder), keys)
         if len(owners) > 1:
             raise InputError(
-                f"mask {path} could belong to {first_names(sorted(owners))}; call it "
+                f"mask {path} could belong to {join_names(sorted(owners))}; call it "
                 f"{mask_paths(photographs)[min(owners)]}, or after another of them"
             )
         if owners:
@@ -422,14 +422,14 @@ def _match(
         found[name].extend(mask for mask in beside(path) if normpath(mask) not in taken)
     for name, several in found.items():
         if len(several) > 1:
-            raise InputError(f"{name} has {len(several)} masks: {first_names([str(p) for p in several])}; keep one")
+            raise InputError(f"{name} has {len(several)} masks: {join_names([str(p) for p in several])}; keep one")
     return {name: found[name][0] for name in sorted(found) if found[name]}
 
 
 def _no_photograph(folder: Path, unmatched: list[str], photographs: Mapping[str, Path]) -> str:
     """Message about masks that belong to no photograph."""
     return (
-        f"{len(unmatched)} masks in {folder} match no photograph: {first_names(sorted(unmatched))}; name a mask "
+        f"{len(unmatched)} masks in {folder} match no photograph: {join_names(sorted(unmatched))}; name a mask "
         f"like its photograph, such as {mask_paths(photographs)[min(photographs)]}"
     )
 
@@ -497,8 +497,8 @@ def _check_same_kind(values: Mapping[str, MaskValues], paths: Mapping[str, Path]
     kinds = {kind: [str(paths[name]) for name, v in values.items() if v.kind == kind] for kind in ("labels", "binary")}
     if kinds["labels"] and kinds["binary"]:
         raise InputError(
-            f"some masks are label images ({first_names(kinds['labels'], 2)}) and others black and white "
-            f"({first_names(kinds['binary'], 2)}); write all of them with pane labels 1..K"
+            f"some masks are label images ({join_names(kinds['labels'], 2)}) and others black and white "
+            f"({join_names(kinds['binary'], 2)}); write all of them with pane labels 1..K"
         )
 
 

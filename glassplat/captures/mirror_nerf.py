@@ -27,7 +27,7 @@ import numpy as np
 from glassplat.captures import transforms
 from glassplat.captures.capture import Capture, RawPoints, Shot
 from glassplat.captures.masks import MASK_FOLDER, PANE_FOLDER, PaneMask, read_mask_at_threshold
-from glassplat.errors import InputError, first_names, input_checked
+from glassplat.errors import InputError, convert_to_input_error, join_names
 from glassplat.files.images import IMAGE_SUFFIXES, image_size
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ def _in_pixels_of(path: Path, intrinsics: tuple[float, float, float, float]) -> 
     The size at calibration is not stored. The principal point lies near the centre, so twice its position estimates
     that size; if this is close to the photograph's size, the principal point is used as it is.
     """
-    with input_checked():
+    with convert_to_input_error():
         width, height = image_size(path)
     fx, fy, cx, cy = intrinsics
     across, down = 2 * cx / width, 2 * cy / height
@@ -145,7 +145,7 @@ def _masks(root: Path, shots: tuple[Shot, ...]) -> dict[str, Path]:
     if not found:
         raise InputError(
             f"none of the {len(present)} files in {root / MASK_FOLDER} has the name of a photograph "
-            f"({first_names(sorted(present)) or 'the folder is empty'}); expected names such as "
+            f"({join_names(sorted(present)) or 'the folder is empty'}); expected names such as "
             f"{shots[0].image_path.name}"
         )
     return found

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from glassplat.captures.cameras import LARGEST_SIDE, Lens, make_lens, rigid_pose
 from glassplat.captures.capture import Capture, RawPoints, Shot
-from glassplat.errors import InputError, first_names, input_checked
+from glassplat.errors import InputError, convert_to_input_error, join_names
 from glassplat.files import records
 from glassplat.files.images import IMAGE_SUFFIXES, image_size
 from glassplat.files.ply_table import point_colors, read_table
@@ -97,7 +97,7 @@ def lens_from_settings(settings: Mapping[str, Any], image_path: Path, name: str)
     point: `cx`, `cy`, or the image centre. Size: `w`, `h`, or that of the image. Distortion: `k1` ... `k6`, `p1`, `p2`,
     as in OpenCV; or `distortion_params`, a list of k1 to k4, p1 and p2, which takes precedence.
     """
-    with input_checked():
+    with convert_to_input_error():
         found = records.check_fields(settings, LENS, f"the lens of {name}")
         width, height = _size(found, image_path)
         fx, fy = _focal_lengths(found, width, height, name)
@@ -174,7 +174,7 @@ FILE: dict[str, records.Field] = {
 
 def read_settings(path: Path) -> dict[str, Any]:
     """Contents of one file; checks that there are frames, each with a photograph and a matrix."""
-    with input_checked():
+    with convert_to_input_error():
         settings = records.read_json(path)
         frames = settings.get("frames") if isinstance(settings, dict) else None
         if not isinstance(frames, list) or not frames:
@@ -191,7 +191,7 @@ def shots_of(root: Path, settings: Settings, file_name: str) -> dict[str, Shot]:
     missing = [path.name for path in paths if not isfile(path)]
     if missing:
         raise InputError(
-            f"{len(missing)} of {len(paths)} photographs of {root / file_name} are missing: {first_names(missing)}; "
+            f"{len(missing)} of {len(paths)} photographs of {root / file_name} are missing: {join_names(missing)}; "
             "copy them to file_path, or delete their entries from `frames`"
         )
     shots = {}
@@ -260,18 +260,16 @@ def read_points(root: Path, settings: Settings) -> RawPoints | None:
     path = root / candidates[0]
     if not isfile(path):
         raise InputError(f"{path} is not a readable file; replace or remove it")
-    with input_checked():
+    with convert_to_input_error():
         columns = read_table(path).columns
     lacking = [axis for axis in "xyz" if axis not in columns]
     if lacking:
-        raise InputError(
-            f"{path} has no vertex property {first_names(lacking)}; expected a point cloud with x, y and z"
-        )
+        raise InputError(f"{path} has no vertex property {join_names(lacking)}; expected a point cloud with x, y and z")
     positions = np.stack([columns[axis] for axis in "xyz"], axis=1)
     colors = point_colors(columns)
     if colors is None:
         colors = np.full(positions.shape, GREY)
-    with input_checked(path):
+    with convert_to_input_error(path):
         return RawPoints.from_arrays(positions, colors) if len(positions) else None
 
 
@@ -342,7 +340,7 @@ def _mask_paths(root: Path, file: str, settings: Settings, shots: Mapping[str, S
     missing = [str(path) for path in paths.values() if not isfile(path)]
     if missing:
         raise InputError(
-            f"mask_path of {file} names {len(missing)} masks that are missing: {first_names(missing)}; copy them "
+            f"mask_path of {file} names {len(missing)} masks that are missing: {join_names(missing)}; copy them "
             "there, or delete the entries"
         )
     return paths
@@ -380,7 +378,7 @@ def _own_split(
     by_path = {_plain_path(name): shot for name, shot in shots.items()}
     unknown = sorted({*train_names, *test_names} - set(by_path))
     if unknown:
-        raise InputError(f"the split of {WHOLE} names photographs that have no frame: {first_names(unknown)}")
+        raise InputError(f"the split of {WHOLE} names photographs that have no frame: {join_names(unknown)}")
     test = tuple(by_path[name] for name in test_names)
     train = tuple(by_path[name] for name in train_names or by_path if name not in set(test_names))
     left_out = len(shots) - len(train) - len(test)

@@ -35,7 +35,7 @@ from torch import Tensor
 from glassplat.captures import cameras
 from glassplat.captures.capture import RawPoints, Shot
 from glassplat.captures.masks import IgnoredMask, PaneMask
-from glassplat.errors import InputError, input_checked
+from glassplat.errors import InputError, convert_to_input_error
 from glassplat.files.images import image_size, read_colors, read_image_float
 from glassplat.options import WHITE, Rgb
 from glassplat.scene.camera import Camera, to_device
@@ -403,7 +403,7 @@ class PhotoFile:
 
     def __call__(self) -> Tensor:
         """[H, W, 3] uint8 in the pixel grid of the view's camera."""
-        with input_checked():
+        with convert_to_input_error():
             pixels = read_colors(self.path)
         return torch.from_numpy(self.pixel_map.photo(_opaque(pixels, self.background)))
 
@@ -479,7 +479,7 @@ def prepare_view(
     Raises:
         InputError: unreadable file, inconsistent sizes, non-rigid pose, or lens that cannot be undistorted.
     """
-    with input_checked():
+    with convert_to_input_error():
         width, height = image_size(shot.image_path)
     lens = cameras.lens_for_image(shot.lens, (width, height), shot.name)
     pinhole, distorted = cameras.pinhole_of(lens)
@@ -520,7 +520,7 @@ def _reduced_size(pinhole: cameras.Pinhole, downscale: float, name: str) -> tupl
 
 def _mask_file(mask: IgnoredMask, size: tuple[int, int], pixel_map: cameras.PixelMap) -> MaskFile:
     """The mask at the photograph's size, which it must have up to an integer factor."""
-    with input_checked():
+    with convert_to_input_error():
         mask_size = image_size(mask.path)
     if not (_is_multiple(mask_size, size) or _is_multiple(size, mask_size)):
         raise InputError(
@@ -589,7 +589,7 @@ def normals_in_file(path: Path, camera: Camera) -> Tensor:
     Raises:
         InputError: the file cannot be read, or its aspect ratio differs from the camera's.
     """
-    with input_checked():
+    with convert_to_input_error():
         vectors = _vectors(path)
     height, width = vectors.shape[:2]
     if abs(width * camera.height - height * camera.width) > max(width, height, camera.width, camera.height):

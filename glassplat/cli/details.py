@@ -13,7 +13,7 @@ from glassplat.captures.files import CaptureFiles
 from glassplat.captures.view import evenly
 from glassplat.cli.console import count_noun, shell_word
 from glassplat.cli.info import FEW_VIEWS, Finding, describe_broken
-from glassplat.errors import InputError, input_checked
+from glassplat.errors import InputError, convert_to_input_error
 from glassplat.files.records import read_json
 from glassplat.files.scene_folder import read_scene, read_splats
 from glassplat.files.sidecars import read_planes
@@ -118,7 +118,7 @@ FAINT = 0.01
 def splats_part(path: Path) -> Finding:
     """Finding on a file of Gaussians, with the panes next to it, as `load` reads them."""
     beside = path.with_name(PLANES)
-    with input_checked():
+    with convert_to_input_error():
         gaussians = read_splats(path)
         planes = read_planes(beside) if beside.is_file() else Planes.empty()
     finding = Finding()

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from glassplat.captures.files import CaptureFiles, read_capture
 from glassplat.cli.console import count_noun, import_held, say, shell_word, warn
-from glassplat.errors import InputError, UnknownFormatError, first_names, input_checked
+from glassplat.errors import InputError, UnknownFormatError, convert_to_input_error, join_names
 from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES, files_below, is_hidden
 from glassplat.files.records import Text, check_fields, read_json
 from glassplat.files.writing import SCENE_FILE, SPLAT_SUFFIXES, check_folder, scene_source
@@ -120,7 +120,7 @@ def photographs_finding(path: Path) -> Iterator[Finding]:
     below = [one for one in files_below(path) if not is_hidden(one.relative_to(path))]
     found = sorted(one for one in below if is_photograph(one) and one.is_file())
     if not found:
-        names = first_names(sorted(one.name for one in path.iterdir()), 8) or "nothing"
+        names = join_names(sorted(one.name for one in path.iterdir()), 8) or "nothing"
         raise InputError(f"{path} is not a known kind of folder; expected {KINDS}; it holds {names}")
     masks = masks_below(path, found)
     found = [one for one in found if one not in masks]
@@ -137,7 +137,7 @@ def describe_broken(photographs: Sequence[Path], finding: Finding, least_side: i
     """Decodes photographs to find broken and small ones; returns the number of good ones."""
     if broken := broken_photographs(photographs, least_side):
         finding.problems.append(
-            f"{len(broken)} are broken, tiny or of a kind that cannot be read ({first_names(broken)}); replace or "
+            f"{len(broken)} are broken, tiny or of a kind that cannot be read ({join_names(broken)}); replace or "
             "remove them"
         )
     return len(broken)
@@ -167,7 +167,7 @@ def video_finding(path: Path) -> Iterator[Finding]:
 def preparation_finding(path: Path) -> Iterator[Finding]:
     """The folder of an interrupted preparation."""
     settings = path / "settings.json"
-    with input_checked():
+    with convert_to_input_error():
         given = read_json(settings)
         source = check_fields(given, {"input": Text()}, str(settings))["input"]
     output = str(path).removesuffix(".partial")

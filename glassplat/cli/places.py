@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from glassplat.cli.console import message_console, say
-from glassplat.errors import InputError, first_names, input_checked
+from glassplat.errors import InputError, convert_to_input_error, join_names
 from glassplat.files.records import read_json, readable_name, wrap_read_errors
 from glassplat.files.writing import LOADABLE, check_folder, make_folder, real_path, scene_source, write_text
 from glassplat.kernels.backend.devices import DeviceName
@@ -41,7 +41,7 @@ def check_claim(folder: Path, command: str) -> bool:
     found = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
     if found and _recorded_command(folder / RECORD) != command:
         raise InputError(
-            f"{folder} is not empty, and not from `glassplat {command}` (it holds {first_names(found)}); nothing was "
+            f"{folder} is not empty, and not from `glassplat {command}` (it holds {join_names(found)}); nothing was "
             "written. Choose a new folder for --output"
         )
     return bool(found)
@@ -107,7 +107,7 @@ def _in_words(path: Path) -> str:
 
 def check_file(path: Path) -> None:
     """Checks that a file can be read."""
-    with input_checked(), wrap_read_errors(path), path.open("rb"):
+    with convert_to_input_error(), wrap_read_errors(path), path.open("rb"):
         pass
 
 
@@ -175,7 +175,7 @@ class SceneEdits:
         if replace(self, surroundings=None) == SceneEdits():
             return scene
         self._check(scene)
-        with input_checked():
+        with convert_to_input_error():
             for label, reflectance in self.reflectance.items():
                 scene = with_reflectance(scene, label, reflectance)
             moved = {*self.tilt, *self.shift}

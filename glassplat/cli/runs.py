@@ -17,7 +17,7 @@ from glassplat.captures.view import GIGABYTE, PointCloud, View
 from glassplat.cli.console import count_noun, say, shell_word, warn
 from glassplat.cli.places import chosen_views
 from glassplat.cli.progress import Plan, TrainingProgress
-from glassplat.errors import InputError, input_checked
+from glassplat.errors import InputError, convert_to_input_error
 from glassplat.files.images import image_paths
 from glassplat.files.sidecars import read_cameras
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
@@ -75,7 +75,7 @@ def open_run(
     directory = RunDirectory(path)
     recorded = directory.recipe()
     scene, iterations = directory.latest_scene()
-    with input_checked():
+    with convert_to_input_error():
         recorded.renderer().check(scene)
     scene = scene.to(chosen_device(device))
     dataset = capture_of(directory, recorded, data, downscale)
@@ -108,7 +108,7 @@ def capture_of(
 
 def _without_photographs(directory: RunDirectory) -> Dataset:
     """The cameras of a scene without a capture, as views without photographs."""
-    with input_checked():
+    with convert_to_input_error():
         cameras = sorted(read_cameras(directory.path / "cameras.json"), key=lambda named: named[0])
 
     def no_photograph() -> Tensor:
@@ -196,10 +196,14 @@ def _viewer_listeners(asked: Train[Any], training: Training, dataset: Dataset, c
         yield lambda message: None
         return
     from glassplat.model.watching import WatchedTraining
-    from glassplat.viewer.render_loop import LOCAL, vacant_port
+    from glassplat.viewer.render_loop import LOCALHOST, vacant_port
 
     watched = WatchedTraining(
-        training, dataset, host=LOCAL, port=vacant_port(LOCAL), announce=lambda viewer: announce(viewer, console)
+        training,
+        dataset,
+        host=LOCALHOST,
+        port=vacant_port(LOCALHOST),
+        announce=lambda viewer: announce(viewer, console),
     )
     try:
         yield watched.handle_message

@@ -12,13 +12,13 @@ import tyro
 
 from glassplat.cli.console import Command
 from glassplat.cli.places import SceneEdits, SplatFile, Split, check_claim, check_file, check_scene, say_scene
-from glassplat.errors import InputError, input_checked
+from glassplat.errors import InputError, convert_to_input_error
 from glassplat.files.writing import GAUSSFORGE_SUFFIXES, OUTPUT_FORMATS, check_folder
 from glassplat.kernels.backend.devices import DeviceName
 from glassplat.model.run_directory import RunDirectory
 from glassplat.options import Cleaning, Downscale, Finite, Positive, Range
 from glassplat.publish.film import check_encoder
-from glassplat.viewer.render_loop import LOCAL, check_port
+from glassplat.viewer.render_loop import LOCALHOST, check_port
 
 PaneSource = Literal["auto", "truth", "masks", "rendered"]
 Align = Literal["auto", "always", "never"]
@@ -109,7 +109,7 @@ class View(Command):
 
     scene: tyro.conf.Positional[Path]
     port: Annotated[int, Range(0, 65535)] = 8080
-    host: str = LOCAL
+    host: str = LOCALHOST
     output: Path | None = None
     file: Annotated[SplatFile, tyro.conf.arg(name="")] = field(default_factory=SplatFile)
     edits: Annotated[SceneEdits, tyro.conf.arg(name="")] = field(default_factory=SceneEdits)
@@ -166,7 +166,7 @@ class Video(Command):
     def check(self) -> None:
         """Refuses everything that can be known to be wrong before it takes long."""
         try:
-            with input_checked():
+            with convert_to_input_error():
                 check_encoder(self.output, self.fps)
         except ImportError as error:
             raise InputError(

@@ -20,7 +20,7 @@ from glassplat.captures.files import CaptureFiles, read_capture
 from glassplat.captures.masks import Polarity
 from glassplat.cli.console import import_now, message_console, no_such, say
 from glassplat.cli.places import check_targets
-from glassplat.errors import InputError, input_checked
+from glassplat.errors import InputError, convert_to_input_error
 from glassplat.files.records import read_text
 from glassplat.files.writing import check_folder, real_path
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
@@ -28,7 +28,7 @@ from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.recipe import RECIPES, Preset, Recipe, recipe_from_json, recipe_of
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import CHECKPOINT_SECONDS, RunDirectory, RunSettings, check_output
-from glassplat.options import Downscale, Essential, Positive, Seed, Several
+from glassplat.options import Downscale, Essential, Positive, PositiveCount, Seed
 
 RecipeKind = TypeVar("RecipeKind", bound=Recipe)
 
@@ -57,7 +57,7 @@ class Train(Generic[RecipeKind]):
     recipe: Annotated[RecipeKind, tyro.conf.arg(name="")]
     data: Path
     output: Path
-    iterations: Several = 30_000
+    iterations: PositiveCount = 30_000
     downscale: Downscale = 1.0
     seed: Seed = 0
     device: DeviceName = "auto"
@@ -150,7 +150,7 @@ def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:
 
 def read_recipe(path: Path, arguments: Sequence[str]) -> Any:
     """The recipe in a file, checked against the method that the arguments name."""
-    with input_checked():
+    with convert_to_input_error():
         recipe = recipe_from_json(read_text(path), str(path))
     asked = asked_method(arguments) or recipe.method
     if asked != recipe.method:
@@ -221,7 +221,7 @@ class Demo:
     """
 
     output: Path = Path("runs/demo")
-    iterations: Several = 1500
+    iterations: PositiveCount = 1500
     seed: Seed = 0
     device: DeviceName = "auto"
 

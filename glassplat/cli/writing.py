@@ -20,7 +20,7 @@ from glassplat.cli.console import count_noun, say, shell_word, warn
 from glassplat.cli.places import SceneEdits, check_targets, chosen_views, claim_folder
 from glassplat.cli.progress import WorkProgress
 from glassplat.cli.runs import StoredRun, open_run, photographs_of, pictures_of
-from glassplat.errors import InputError, first_names, input_checked
+from glassplat.errors import InputError, convert_to_input_error, join_names
 from glassplat.evaluate.evaluate import time_render
 from glassplat.evaluate.metrics import quantize
 from glassplat.files.images import write_image
@@ -130,7 +130,7 @@ def film(command: Video, console: Console) -> None:
     model = model.with_scene(command.edits.apply(model.scene))
     cameras = _cameras(command, model)
     beside = 1 if command.layout == "wipe" else len(command.layers)
-    with input_checked():
+    with convert_to_input_error():
         check_size(command.output, beside * cameras[0].width, cameras[0].height)
     with WorkProgress(console) as progress, atomic_write(command.output) as temporary:
         pictures = track_progress("filming", _pictures(command, model, cameras), len(cameras), progress)
@@ -140,7 +140,7 @@ def film(command: Video, console: Console) -> None:
 
 def _cameras(command: Video, model: models.Model) -> list[Camera]:
     frames = max(2, round(command.seconds * command.fps))
-    with input_checked():
+    with convert_to_input_error():
         if command.keyframes is not None:
             cameras = interpolate_cameras([camera for _, camera in read_cameras(command.keyframes)], frames)
         elif command.path == "interpolate":
@@ -213,7 +213,7 @@ def write_files(command: Export, console: Console) -> None:
     model = command.file.open(command.scene, command.device)
     model = _chosen(command, model.with_scene(command.edits.apply(model.scene)))
     if "html" in command.formats:
-        with input_checked():
+        with convert_to_input_error():
             check_panes(model.scene)
     splats = {kind: command.output / f"{models.EXPORT_STEM}.{kind}" for kind in SPLAT_WRITERS}
     beside = [command.output / name for name in BESIDE_SPLATS]
@@ -225,7 +225,7 @@ def write_files(command: Export, console: Console) -> None:
     write_cameras(command.output / models.CAMERAS, model.cameras.items())
     for kind in (kind for kind in splats if kind in command.formats):
         options = {"version": command.spz_version} if kind == "spz" else {}
-        with input_checked():
+        with convert_to_input_error():
             write_splats(kind, splats[kind], model.scene.primary, **options)
         written.append(splats[kind])
         say(console, f"{splats[kind].stat().st_size / 1e6:.2f} MB -> {splats[kind]}")
@@ -263,7 +263,7 @@ def _remove_earlier(command: Export, targets: Sequence[Path], written: Sequence[
     for path in earlier:
         path.unlink()
     if earlier:
-        say(console, f"removed {first_names([path.name for path in earlier], len(earlier))} of the earlier run")
+        say(console, f"removed {join_names([path.name for path in earlier], len(earlier))} of the earlier run")
 
 
 def _chosen(command: Export, model: models.Model) -> models.Model:

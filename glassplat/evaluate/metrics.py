@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from glassplat.errors import input_checked
+from glassplat.errors import convert_to_input_error
 from glassplat.evaluate.truth import UNKNOWN_SURFACE, GroundTruth, TruePlane, TrueSurface
 from glassplat.files.sidecars import read_equirect
 from glassplat.kernels.photometric import photometric
@@ -194,7 +194,9 @@ def psnr(image: Tensor, target: Tensor, region: Tensor | None = None) -> float:
     return math.inf if mean_square == 0 else 10 * math.log10(255**2 / mean_square)
 
 
-def correct_colors(image: Tensor, target: Tensor, columns: slice = slice(None), region: Tensor | None = None) -> Tensor:
+def correct_colors(
+    image: Tensor, target: Tensor, columns: slice = slice(None), region: Tensor | None = None
+) -> Tensor:
     """The image [H, W, 3] after the affine colour transform that fits it to another one in least squares.
 
     Exposure and white balance of a test photograph are unknown; the remaining error is due to the scene.
@@ -503,7 +505,7 @@ def true_environment(capture: Path) -> Tensor | None:
     """
     for path in (capture / f"environment{suffix}" for suffix in (".exr", ".png")):
         if path.is_file():
-            with input_checked():
+            with convert_to_input_error():
                 return read_equirect(path)
     return None
 

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from glassplat.captures.cameras import LEAST_SHARE, area_resize
 from glassplat.captures.view import View
-from glassplat.errors import InputError, input_checked
+from glassplat.errors import InputError, convert_to_input_error
 from glassplat.files.images import image_size, read_colors, read_image, read_image_float, resize_by_area
 from glassplat.files.records import COORDINATE, Boolean, Field, Integer, ListOf, Number, check_fields, read_json
 from glassplat.options import short_repr
@@ -104,7 +104,7 @@ class GroundTruth:
                 f"ground truth for {image_name} is incomplete: {', '.join(missing)} missing; add or remove all"
             )
         size = (width, height)
-        with input_checked():
+        with convert_to_input_error():
             return TrueView(
                 transmission=torch.from_numpy(_resized_color(read_colors(paths["transmission"]), size)),
                 reflection=torch.from_numpy(_resized_color(read_colors(paths["reflection"]), size)),
@@ -139,7 +139,7 @@ def load_truth(folder: Path | None) -> GroundTruth | None:
     path = folder / "planes.json"
     if not path.is_file():
         return GroundTruth(folder, ())
-    with input_checked():
+    with convert_to_input_error():
         entries = read_json(path)
         if not isinstance(entries, list):
             raise ValueError(f"{path} holds {short_repr(entries)}; expected a list with one object per plane")
@@ -229,7 +229,7 @@ def _read_companion(view: View, suffix: str) -> NDArray[np.float32] | None:
 
 
 def _read_image(path: Path) -> NDArray[np.float32]:
-    with input_checked():
+    with convert_to_input_error():
         return read_image_float(path)
 
 

@@ -10,11 +10,11 @@ from glassplat.methods.splat_recipe import Primitive
 from glassplat.options import (
     ESSENTIAL,
     Finite,
-    InnerShare,
     Internal,
-    NotNegative,
+    NonNegative,
+    OpenShare,
     Positive,
-    Several,
+    PositiveCount,
     Share,
 )
 from glassplat.scene import SH_ZERO
@@ -74,20 +74,20 @@ class GlossyOptions(MethodRecipe):
     bootstrap: Share = 0.06
     texels: Annotated[Texels, ESSENTIAL] = 64
     first_texels: Texels = 16
-    first_strength: Internal[InnerShare] = 1e-3
+    first_strength: Internal[OpenShare] = 1e-3
     search: Internal[MirrorSearch] = field(default_factory=MirrorSearch)
     region: Annotated[tuple[Finite, Finite, Finite, Positive] | None, ESSENTIAL] = None
     find_region: Internal[bool] = True
-    outside_weight: NotNegative = 0.4
-    strength_weight: NotNegative = 0.005
-    consistency_weight: NotNegative = 0.3
-    monocular_weight: NotNegative = 0.5
+    outside_weight: NonNegative = 0.4
+    strength_weight: NonNegative = 0.005
+    consistency_weight: NonNegative = 0.3
+    monocular_weight: NonNegative = 0.5
     propagation: Internal[NormalPropagation] = field(default_factory=NormalPropagation)
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
-    least_iterations: Several = 6000
+    least_iterations: PositiveCount = 6000
     raise_rates_matte: Internal[bool] = True
     raise_rates_found: Internal[bool] = True
-    propagation_interval: Internal[Several | None] = None
+    propagation_interval: Internal[PositiveCount | None] = None
     rates: GaussianRates = field(default_factory=partial(GaussianRates, short_run_power=0.0))
     reflection_rates: Internal[ReflectionRates] = field(default_factory=ReflectionRates)
     intervals: Intervals = field(default_factory=lambda: Intervals(opacity=0.005, least=150))

@@ -10,9 +10,9 @@ from glassplat.options import (
     ESSENTIAL,
     Ascending,
     Blend,
-    InnerShare,
     Internal,
-    NotNegative,
+    NonNegative,
+    OpenShare,
     Positive,
     Range,
     Share,
@@ -41,11 +41,11 @@ class ReflectionWeights:
             photograph shows what is reflected.
     """
 
-    depth: NotNegative = 0.005
-    conflict: NotNegative = 0.2
-    mask: NotNegative = 0.5
-    intensity: NotNegative = 0.05
-    reflectance: NotNegative = 0.0002
+    depth: NonNegative = 0.005
+    conflict: NonNegative = 0.2
+    mask: NonNegative = 0.5
+    intensity: NonNegative = 0.05
+    reflectance: NonNegative = 0.0002
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Perturbation:
 
     amplitude: Share = 0.4
     stop: Internal[Share] = 0.8
-    bounds: Internal[Annotated[tuple[InnerShare, InnerShare], Ascending()]] = (0.01, 0.99)
+    bounds: Internal[Annotated[tuple[OpenShare, OpenShare], Ascending()]] = (0.01, 0.99)
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class PlanarRecipe(MethodRecipe):
 
     method = "planar"
     functions = "glassplat.methods.planar:planar"
-    view_dependence_weight: NotNegative = 0.02
+    view_dependence_weight: NonNegative = 0.02
     stage_shares: Internal[tuple[Positive, Positive, Positive]] = (0.1, 0.1, 0.8)
     fresnel: Internal[Fresnel] = "pane"
     intensity: Internal[bool] = True
@@ -119,7 +119,7 @@ class PlanarRecipe(MethodRecipe):
     turn_reflections: Internal[bool] = True
     seed_unexplained: Internal[bool] = True
     tint: bool = False
-    tint_weight: NotNegative = 0.01
+    tint_weight: NonNegative = 0.01
     glass_count: Annotated[int, Range(1, 1_000_000)] = 1000
     weights: ReflectionWeights = field(default_factory=ReflectionWeights)
     conflict: Internal[Literal["cells", "pixels"]] = "cells"

@@ -8,7 +8,7 @@ import logging
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
-from glassplat.errors import InputError, input_checked
+from glassplat.errors import InputError, convert_to_input_error
 from glassplat.files.records import parse_json
 from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
 from glassplat.methods.planar_recipe import PlanarRecipe
@@ -81,7 +81,7 @@ def recipe_from_json(text: str, where: str = "the recipe") -> Any:
         InputError: it is not a recipe, or was written by a version with other fields; the message names the wrong
             value.
     """
-    with input_checked():
+    with convert_to_input_error():
         fields = parse_json(text, where)
     method = fields.pop("method", None) if isinstance(fields, dict) else None
     if not isinstance(method, str) or method not in RECIPES:

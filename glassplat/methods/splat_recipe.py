@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from glassplat.options import ESSENTIAL, Internal, NotNegative, Share
+from glassplat.options import ESSENTIAL, Internal, NonNegative, Share
 from glassplat.training.options import (
     DefaultDensify,
     GaussianRates,
@@ -28,9 +28,9 @@ class DiscTerms:
         normal_start: share of the run after which it applies.
     """
 
-    distortion_weight: NotNegative = 100.0
+    distortion_weight: NonNegative = 100.0
     distortion_start: Share = 3_000 / 30_000
-    normal_weight: NotNegative = 0.05
+    normal_weight: NonNegative = 0.05
     normal_start: Share = 7_000 / 30_000
 
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from glassplat.captures.dataset import EXTENT_MARGIN, Dataset, check_dataset, with_corrected_cameras
-from glassplat.errors import InputError, first_names, input_checked
+from glassplat.errors import InputError, convert_to_input_error, join_names
 from glassplat.files import writing
 from glassplat.files.ply import read_gaussians, write_gaussians
 from glassplat.files.records import read_text
@@ -43,7 +43,7 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene, covering_glass, with_intensity, with_pane
 from glassplat.viewer.drawing import ERROR, ViewerState, Writer
-from glassplat.viewer.render_loop import LOCAL, vacant_port
+from glassplat.viewer.render_loop import LOCALHOST, vacant_port
 from glassplat.viewer.server import Viewer
 
 HIDDEN_LAYERS = ("alpha",)
@@ -97,7 +97,7 @@ class Model:
         Raises:
             InputError: viser is not installed.
         """
-        viewer = Viewer(viewer_state(replace(self, cameras=self.viewpoints), {}), LOCAL, vacant_port(LOCAL))
+        viewer = Viewer(viewer_state(replace(self, cameras=self.viewpoints), {}), LOCALHOST, vacant_port(LOCALHOST))
         viewer.start()
         return viewer
 
@@ -157,7 +157,7 @@ class Model:
             raise InputError(f"camera is {camera!r}; expected a Camera, or the name of one of `cameras`")
         if isinstance(camera, str):
             if camera not in self.cameras:
-                raise InputError(f"there is no camera {camera!r}; expected one of {first_names(list(self.cameras))}")
+                raise InputError(f"there is no camera {camera!r}; expected one of {join_names(list(self.cameras))}")
             camera = self.cameras[camera]
         return self.renderer.with_layers(layers)(self.scene, camera)
 
@@ -418,18 +418,16 @@ def save_model(model: Model, path: Path, *, overwrite: bool) -> Path:
         raise InputError(f"{path}: expected a name that ends in {endings}, or a folder's")
     names = (PLANES, GLASS, CAMERAS, *(() if model.scene.environment.is_empty else (ENVIRONMENT, PANORAMA)))
     companions = [path.with_name(name) for name in names] if kind in writing.SPLAT_WRITERS else []
-    found = (
-        [] if overwrite else [str(target) for target in (path, *_differing_files(model, companions)) if target.exists()]
-    )
+    found = [] if overwrite else [str(target) for target in (path, *_differing_files(model, companions)) if target.exists()]
     if found:
         raise FileExistsError(
-            f"{first_names(found)} already exists; nothing was written. Choose another folder, or overwrite=True"
+            f"{join_names(found)} already exists; nothing was written. Choose another folder, or overwrite=True"
         )
     writing.make_folder(path.parent)
     if kind not in writing.SPLAT_WRITERS:
         save_page(model, path, model.name or path.stem)
         return path
-    with input_checked():
+    with convert_to_input_error():
         writing.write_splats(kind, path, model.scene.primary)
     if lost := unsaved_parts(model, kind):
         log.warning("%s leaves out %s; a folder, saved without a suffix, holds everything", path, ", ".join(lost))
@@ -477,7 +475,7 @@ def unsaved_parts(model: Model, kind: str) -> list[str]:
 
 def save_page(model: Model, path: Path, title: str, *, sharing: web_page.Sharing = web_page.PRIVATE) -> None:
     """Writes the page that shows a model with live panes in any browser."""
-    with input_checked():
+    with convert_to_input_error():
         web_page.write_page(path, model.scene, model.renderer, tuple(model.viewpoints.items()), title, sharing=sharing)
 
 
@@ -644,7 +642,7 @@ def _from_run(path: Path, device: DeviceName) -> Model:
     directory = RunDirectory(path)
     recipe: Any = with_background(directory.recipe(), BLACK)  # Runs of earlier versions record none.
     scene, _ = directory.latest_scene()
-    with input_checked():
+    with convert_to_input_error():
         recipe.renderer().check(scene)
         cameras = read_cameras(path / "cameras.json")
     if not cameras:
@@ -654,7 +652,7 @@ def _from_run(path: Path, device: DeviceName) -> Model:
 
 def _from_file(path: Path, device: DeviceName, planes_file: Path | None, up: Up) -> Model:
     """A model from a splat file, on black, with the files that `export` writes next to it."""
-    with input_checked():
+    with convert_to_input_error():
         gaussians, lost = select_drawable(read_splats(path), path)
         if not len(gaussians):
             raise InputError(f"{path} holds no Gaussians; expected a trained splat")

@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Any, TextIO
 from filelock import FileLock, Timeout
 
 from glassplat.captures.masks import Polarity
-from glassplat.errors import InputError, first_names, input_checked
+from glassplat.errors import InputError, convert_to_input_error, join_names
 from glassplat.files.records import parse_json, read_json, read_text
 from glassplat.files.writing import check_folder, check_links, make_folder, remove_unfinished, write_text
-from glassplat.options import Downscale, Seed, Several, options_from_json
+from glassplat.options import Downscale, PositiveCount, Seed, options_from_json
 from glassplat.training.messages import Message, StepDone, Working
 from glassplat.training.ranks import is_leader
 
@@ -100,7 +100,7 @@ class RunSettings:
     """
 
     data: str
-    iterations: Several
+    iterations: PositiveCount
     downscale: Downscale = 1.0
     seed: Seed = 0
     device: str = "cpu"
@@ -197,7 +197,7 @@ class RunDirectory:
         found = [name for name in RUN_FILES if os.path.lexists(self.path / name)]
         if found and not self.is_begun:
             raise InputError(
-                f"{self.path} holds {first_names(found)}, which is not from a run of this version and would be "
+                f"{self.path} holds {join_names(found)}, which is not from a run of this version and would be "
                 "overwritten; choose another --output"
             )
 
@@ -270,7 +270,7 @@ class RunDirectory:
     def settings(self) -> RunSettings:
         """The recorded settings."""
         path = self.path / "settings.json"
-        with input_checked():
+        with convert_to_input_error():
             written = parse_json(self._read_file(path.name), str(path))
         try:
             return options_from_json(RunSettings, written)
@@ -302,7 +302,7 @@ class RunDirectory:
         if 2 * len(moved) > len(known):
             raise InputError(
                 f"{len(moved)} of {len(known)} cameras of {dataset.root} have moved since {self.path} was "
-                f"trained: {first_names(sorted(moved))}. Was the capture prepared again? Give the original "
+                f"trained: {join_names(sorted(moved))}. Was the capture prepared again? Give the original "
                 "capture to --data, or train again"
             )
 
@@ -328,7 +328,7 @@ class RunDirectory:
             self._check_poses(dataset)
             return
         only = [
-            f"{first_names(sorted(names))} only in {where}"
+            f"{join_names(sorted(names))} only in {where}"
             for names, where in ((trained - found, "the run"), (found - trained, "the capture"))
             if names
         ]
@@ -372,7 +372,7 @@ class RunDirectory:
             raise InputError(
                 f"{self.path} is not a run directory: no {name} in it; expected what `glassplat train --output` wrote"
             )
-        with input_checked():
+        with convert_to_input_error():
             return read_text(file)
 
 
@@ -388,9 +388,7 @@ def check_output(directory: RunDirectory, *, resume: bool) -> None:
     if not is_leader():
         return  # Rank 0 may have started writing.
     check_folder(directory.path)
-    check_links(
-        directory.path, (*RUN_FILES, directory.checkpoint.name, directory.results.name, "point_cloud", "sparse")
-    )
+    check_links(directory.path, (*RUN_FILES, directory.checkpoint.name, directory.results.name, "point_cloud", "sparse"))
     check_unlocked(directory.path)
     if resume:
         directory.check_saved()

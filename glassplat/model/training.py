@@ -22,7 +22,7 @@ import torch
 
 from glassplat import __version__
 from glassplat.captures.dataset import Dataset, check_dataset, photographs_read, with_corrected_cameras
-from glassplat.errors import InputError, RankLostError, first_names
+from glassplat.errors import InputError, RankLostError, join_names
 from glassplat.files.writing import make_folder
 from glassplat.kernels.backend.devices import DeviceName, chosen_device, compile_seconds
 from glassplat.methods.recipe import RECIPES, Recipe, recipe_to_json, resolve_background
@@ -312,7 +312,7 @@ def resumed_state(
     if recorded != settings or directory.recipe_as_written() != json.loads(recipe_to_json(recipe)):
         changes = option_changes(vars(recorded), vars(settings)) + recipe_changes(directory, recipe)
         raise InputError(
-            f"{directory.path} was started with other options: {first_names(changes)}; expected the same to resume it. "
+            f"{directory.path} was started with other options: {join_names(changes)}; expected the same to resume it. "
             "Repeat the original options, with the version of glassplat that began it, or choose another --output"
         )
     directory.check_photographs(dataset)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from glassplat.options import CLEAR_GLASS, ESSENTIAL, InnerShare, Internal, PaneLabel, PositiveShare, Range, Seed, Share
+from glassplat.options import CLEAR_GLASS, ESSENTIAL, Internal, OpenShare, PaneLabel, PositiveShare, Range, Seed, Share
 
 
 class PlaneFitError(ValueError):
@@ -32,8 +32,8 @@ class PlaneFit:
     """
 
     mirror_labels: Annotated[tuple[PaneLabel, ...], ESSENTIAL] = ()
-    glass_reflectance: InnerShare = CLEAR_GLASS
-    mirror_reflectance: Internal[InnerShare] = 0.999
+    glass_reflectance: OpenShare = CLEAR_GLASS
+    mirror_reflectance: Internal[OpenShare] = 0.999
     band: Internal[PositiveShare] = 20 / 1200
     inlier_distance: Internal[PositiveShare] = 0.01
     hypotheses: Internal[Annotated[int, Range(1, 1_000_000)]] = 4000

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
 
 from glassplat.captures.masks import IGNORE_FOLDER, MASK_FOLDER, MASK_MARK, PANE_FOLDER
-from glassplat.errors import InputError, first_names
+from glassplat.errors import InputError, join_names
 from glassplat.files import images
 from glassplat.files.records import readable_name, wrap_read_errors
 from glassplat.training.messages import Working
@@ -112,13 +112,13 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
         raise _refusal(broken, len(paths))
     twins = [f"{path.name} (as {found[contents].path.name})" for path, contents in same]
     if len(found) < FEWEST:
-        again = f", and duplicates of them ({first_names(twins)})" if twins else ""
+        again = f", and duplicates of them ({join_names(twins)})" if twins else ""
         raise InputError(
             f"{folder} holds too few photographs: {len(found)}{again}; expected at least {FEWEST}, better 30 or "
             "more, taken a step apart"
         )
     if twins:
-        listen(Note(f"Skipped duplicates: {first_names(twins)}."))
+        listen(Note(f"Skipped duplicates: {join_names(twins)}."))
     cut_out = [one.path for one in found.values() if one.transparent]
     if cut_out:
         listen(
@@ -146,7 +146,7 @@ def _refusal(broken: Mapping[str, InputError], count: int) -> InputError:
     if len(broken) == 1:
         return first
     return InputError(
-        f"{len(broken)} of {count} photographs cannot be used ({first_names(list(broken))}); replace or remove them. "
+        f"{len(broken)} of {count} photographs cannot be used ({join_names(list(broken))}); replace or remove them. "
         f"The first: {first}"
     )
 
@@ -193,7 +193,7 @@ def masks_below(folder: Path, paths: Sequence[Path]) -> set[Path]:
 
 
 def _names_below(folder: Path, paths: Sequence[Path]) -> str:
-    return first_names([readable_name(path.relative_to(folder)) for path in paths])
+    return join_names([readable_name(path.relative_to(folder)) for path in paths])
 
 
 def read_photograph(photograph: Photograph) -> NDArray[np.uint8]:
@@ -231,13 +231,13 @@ def _photograph_paths(folder: Path) -> list[Path]:
         kinds = "/".join(sorted(set(unreadable.values())))
         raise InputError(
             f"{len(unreadable)} photographs in {folder} are {kinds} files, which cannot be read "
-            f"({first_names(list(unreadable))}); save them as JPEG and remove these (a phone does so if its "
+            f"({join_names(list(unreadable))}); save them as JPEG and remove these (a phone does so if its "
             "camera is set to 'most compatible'). To read HEIC: pip install 'glassplat[heic]'"
         )
     suffixes = (*images.IMAGE_SUFFIXES, *(images.HEIF_SUFFIXES if images.can_read_heif() else ()))
     paths = [path for path in files if path.suffix.lower() in suffixes]
     if not paths:
-        found = first_names(sorted(path.name for path in files)) or "nothing"
+        found = join_names(sorted(path.name for path in files)) or "nothing"
         raise InputError(f"no photograph in {folder}; expected {', '.join(suffixes)} files, found {found}")
     return sorted(paths, key=lambda path: _numbers_as_such(path.relative_to(folder).as_posix()))
 

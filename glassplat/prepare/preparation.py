@@ -20,7 +20,7 @@ from filelock import FileLock, Timeout
 from glassplat import __version__
 from glassplat.captures.colmap_library import quiet_pycolmap
 from glassplat.captures.masks import IGNORE_FOLDER
-from glassplat.errors import InputError, first_names
+from glassplat.errors import InputError, join_names
 from glassplat.files import writing
 from glassplat.files.records import read_json, readable_name
 from glassplat.prepare.photographs import (
@@ -144,7 +144,7 @@ class Workplace:
         if set(changed) - {PHOTOGRAPHS}:
             raise InputError(
                 f"{self.folder} was started with another "
-                f"{first_names([key for key in changed if key != PHOTOGRAPHS])}; give the same "
+                f"{join_names([key for key in changed if key != PHOTOGRAPHS])}; give the same "
                 "to --resume, or start again with --force"
             )
         if not changed:
@@ -157,7 +157,7 @@ class Workplace:
         names = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
         raise InputError(
             f"photographs have changed since {self.folder} was started (added, removed or written again: "
-            f"{first_names(names)}); put them back to continue with --resume, or start again with --force"
+            f"{join_names(names)}); put them back to continue with --resume, or start again with --force"
         )
 
     def _check_output(self, force: bool) -> None:
@@ -168,7 +168,7 @@ class Workplace:
             return
         if RECORD not in found:
             raise InputError(
-                f"{self.output} is not empty, and not from `glassplat prepare` (it holds {first_names(found)}); "
+                f"{self.output} is not empty, and not from `glassplat prepare` (it holds {join_names(found)}); "
                 "nothing was written. Choose a new folder for --output"
             )
         if not force:
@@ -188,7 +188,7 @@ class Workplace:
         others += sorted(path.relative_to(self.output).as_posix() for path in added)
         if others:
             raise InputError(
-                f"{self.output} holds {first_names(others)}, which are not from `glassplat prepare` and would "
+                f"{self.output} holds {join_names(others)}, which are not from `glassplat prepare` and would "
                 "be removed by --force: move the folder away, or choose a new one for --output"
             )
 
@@ -253,7 +253,7 @@ class Report:
 
     def lines(self) -> list[str]:
         """Lines of the report for people."""
-        missing = f" (not: {first_names(list(self.missing), 8)})" if self.missing else ""
+        missing = f" (not: {join_names(list(self.missing), 8)})" if self.missing else ""
         return [
             f"{self.registered} of {self.photographs} photographs registered{missing}, with {self.attempt}",
             f"{self.points} points, each in {self.track_length:.1f} photographs on average, "
@@ -312,7 +312,7 @@ def _advice(figures: Report, missing: list[str], solution: Solution) -> list[str
     advice = []
     if missing:
         advice.append(
-            f"take more photographs around {first_names(missing, 3)}: in steps of half a metre, with two thirds "
+            f"take more photographs around {join_names(missing, 3)}: in steps of half a metre, with two thirds "
             f"overlap, and some that show the surroundings of the glass"
         )
     if len(figures.groups) > 1:

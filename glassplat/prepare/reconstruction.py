@@ -13,7 +13,7 @@ from PIL import Image
 from glassplat.captures import colmap_library as library
 from glassplat.captures.cameras import Lens, PixelMap, blank_share, make_lens, undistort
 from glassplat.captures.masks import IGNORE_FOLDER
-from glassplat.errors import InputError, first_names
+from glassplat.errors import InputError, join_names
 from glassplat.files.images import write_image
 from glassplat.prepare.colmap import (
     FeatureDatabase,
@@ -150,7 +150,7 @@ def _check_texture(database: FeatureDatabase) -> None:
     if 2 * len(poor) > len(counts):
         raise TooLittleShownError(
             f"{len(poor)} of {len(counts)} photographs have fewer than {FEWEST_FEATURES} features "
-            f"({first_names(poor)}): they are blurred, dark or without texture. Use more light, hold the camera still, "
+            f"({join_names(poor)}): they are blurred, dark or without texture. Use more light, hold the camera still, "
             "and include textured objects, such as the surroundings of the pane"
         )
 

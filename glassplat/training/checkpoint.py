@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from glassplat.errors import InputError, input_checked
+from glassplat.errors import InputError, convert_to_input_error
 from glassplat.files.records import DictOf, Field, Integer, ListOf, Nullable, Number, Optional, Text, check_fields
 from glassplat.files.scene_folder import DIRECTION, EXTENT, SH_DEGREE, direction
 from glassplat.files.sidecars import HIGHEST_LABEL, REGION, TensorsFile, open_tensors, write_tensors
@@ -168,7 +168,7 @@ def restored_state(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
         InputError: the tensors do not match the header or each other.
     """
     check_types(tensors)
-    with input_checked():
+    with convert_to_input_error():
         scene = restored_scene(header, tensors)
     first, second = tensors_with_prefix(tensors, "first/"), tensors_with_prefix(tensors, "second/")
     if not first.keys() == second.keys() <= header["updates"].keys():
@@ -225,9 +225,7 @@ def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
         planes=Planes(**planes, labels=header["labels"], mirrors=header["mirrors"]),
         environment=environment,
         up=direction(header["up"], "the header"),
-        exposures=Exposures(exposure_tensors["affine"], tuple(header["photographs"]))
-        if exposure_tensors
-        else empty.exposures,
+        exposures=Exposures(exposure_tensors["affine"], tuple(header["photographs"])) if exposure_tensors else empty.exposures,
         **sets,
     )
 

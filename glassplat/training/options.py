@@ -14,14 +14,14 @@ from glassplat.options import (
     Ascending,
     Color,
     Count,
-    InnerShare,
     Internal,
     LearningRate,
-    NotNegative,
+    NonNegative,
+    OpenShare,
     Positive,
+    PositiveCount,
     PositiveShare,
     Range,
-    Several,
     Share,
     ShDegree,
 )
@@ -159,7 +159,7 @@ class Intervals:
     """
 
     opacity: Internal[PositiveShare] = 1 / 30
-    least: Internal[Several] = 250
+    least: Internal[PositiveCount] = 250
     reset_stop: Internal[Share] = 0.45
     sh: Internal[PositiveShare] = 1 / 30
     averaged_passes: Annotated[float, Range(0, 1000)] = 1.0
@@ -204,7 +204,7 @@ class DefaultDensify:
     """
 
     split_by: Internal[Literal["absgrad", "gradient"]] = "absgrad"
-    interval: Internal[Several] = 100
+    interval: Internal[PositiveCount] = 100
     whole_passes: Internal[bool] = True
     adapt_to_size: Internal[bool] = True
     start: Internal[Share] = 500 / 30_000
@@ -216,8 +216,8 @@ class DefaultDensify:
     prune_large_start: Internal[Share] = 1.0
     prune_scale_fraction: Internal[Positive] = 0.1
     cap: Annotated[Count | None, ESSENTIAL] = None
-    per_pixel: NotNegative = 0.02
-    least_contribution: NotNegative = 0.2
+    per_pixel: NonNegative = 0.02
+    least_contribution: NonNegative = 0.2
     contribution_moments: Internal[Annotated[tuple[Share, ...], Ascending()]] = (0.5, 0.8, 1.0)
 
     @staticmethod
@@ -256,14 +256,14 @@ class McmcDensify:
     """
 
     cap: Annotated[Count | None, ESSENTIAL, tyro.conf.arg(aliases=("--cap",))] = None
-    interval: Internal[Several] = 100
+    interval: Internal[PositiveCount] = 100
     start: Internal[Share] = 500 / 30_000
     stop: Internal[Share] = 25_000 / 30_000
     growth: Internal[Annotated[float, Range(1, 100)]] = 1.05
-    noise_rate: NotNegative = 5e5
+    noise_rate: NonNegative = 5e5
     noise_units: Internal[Literal["extents", "world"]] = "extents"
-    opacity_weight: NotNegative = 0.01
-    scale_weight: NotNegative = 0.01
+    opacity_weight: NonNegative = 0.01
+    scale_weight: NonNegative = 0.01
     reach: Internal[Literal["shown", "all"]] = "shown"
     initial_spread: Internal[Positive] = 1.0
 
@@ -291,9 +291,9 @@ class MirrorSearch:
     begin_found: bool = True
     views: Annotated[int, Range(2, 1000)] = 24
     spread: Share = 0.03
-    strength: InnerShare = 0.73
-    least_opacity: InnerShare = 0.9
-    flatness: InnerShare = 0.37
+    strength: OpenShare = 0.73
+    least_opacity: OpenShare = 0.9
+    flatness: OpenShare = 0.37
     estimated_normals: bool = True
 
 
@@ -314,12 +314,12 @@ class NormalPropagation:
         sabotaged: Gaussians of at most this strength are disturbed (paper: 0.1; its code: 0.05).
     """
 
-    least_opacity: InnerShare = 0.9
-    least_strength: InnerShare = 1e-3
-    reflective: InnerShare = 0.02
+    least_opacity: OpenShare = 0.9
+    least_strength: OpenShare = 1e-3
+    reflective: OpenShare = 0.02
     growth: Annotated[float, Range(1, 100)] = 1.5
     sabotage: Share = 0.1
-    sabotaged: InnerShare = 0.05
+    sabotaged: OpenShare = 0.05
 
 
 @dataclass(frozen=True)
@@ -382,7 +382,7 @@ class PropagationSchedule:
 
     end: Internal[Literal["settled", "fixed"]] = "settled"
     stop: Share = 0.75
-    patience: Internal[Several] = 5
+    patience: Internal[PositiveCount] = 5
     pause: Internal[Count] = 100
     last_reset: Internal[bool] = True
 
@@ -404,7 +404,7 @@ class SurroundingsStart:
     cells: Annotated[int, Range(1, 256)] | None = None
     per_cell: Internal[Annotated[int, Range(1, 1000)]] = 5
     outside: Internal[Annotated[float, Range(0, 0.45)]] = 0.005
-    opacity: Internal[InnerShare] = 0.1
+    opacity: Internal[OpenShare] = 0.1
 
 
 @dataclass(frozen=True)
@@ -455,7 +455,7 @@ class MethodRecipe:
 
     sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
     ssim_weight: Share = 0.2
-    view_dependence_weight: NotNegative = 0.0
+    view_dependence_weight: NonNegative = 0.0
     background: Annotated[Color | None, ESSENTIAL] = None
     rates: GaussianRates = field(default_factory=GaussianRates)
     intervals: Intervals = field(default_factory=Intervals)

@@ -178,7 +178,7 @@ def check_request(access: Access, request: Request) -> Mapping[str, str] | None:
     access.check_host(hosts[0])
     if upgrades or origins:
         access.check_origin(origins[0] if origins else None, hosts[0])
-    entry = access.entry(request.path, hosts[0])
+    entry = access.login_headers(request.path, hosts[0])
     if entry is None:
         access.check_cookie("; ".join(request.headers.get_all("Cookie")), hosts[0])
     return entry

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from glassplat.errors import InputError
 
-LOCAL = "127.0.0.1"
+LOCALHOST = "127.0.0.1"
 FIRST_PORT, MOST_PORTS = 8080, 100
 
 

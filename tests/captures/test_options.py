@@ -14,14 +14,14 @@ from glassplat.options import (
     Ascending,
     Count,
     Finite,
-    InnerShare,
+    OpenShare,
     PaneLabel,
     Positive,
     Range,
     Share,
-    as_typed,
     check_options,
     expectation,
+    option_of_field,
     options_from_json,
     unwrap_annotation,
 )
@@ -44,7 +44,7 @@ class Outer:
     kind: Literal["a", "b"] = "a"
     by_label: dict[PaneLabel, Finite] = field(default_factory=dict)
     folder: Path = Path("x")
-    end_value: InnerShare = 0.5
+    end_value: OpenShare = 0.5
 
     def contradiction(self) -> str | None:
         return "--whole and --kind b do not fit" if self.whole and self.kind == "b" else None
@@ -155,7 +155,7 @@ def test_a_number_of_too_many_digits_to_print_is_refused() -> None:
 
 
 def test_options_are_named_by_the_fields_they_lie_in() -> None:
-    assert as_typed("plane_fit.mirror_labels") == "--plane-fit.mirror-labels"
+    assert option_of_field("plane_fit.mirror_labels") == "--plane-fit.mirror-labels"
     names = {name for name, _ in number_fields(Outer)}
     assert names == {"inner.rate", "inner.most", "color", "moments", "by_label", "end_value"}
 

@@ -7,14 +7,14 @@ import typing
 from collections.abc import Iterator
 from typing import Any
 
-from glassplat.options import inner_name, unwrap_annotation
+from glassplat.options import nested_name, unwrap_annotation
 
 
 def number_fields(kind: type, name: str = "") -> Iterator[tuple[str, Any]]:
     """Every option of a dataclass and of those in it that holds numbers: its name and the annotation of each number."""
     for field, hint in typing.get_type_hints(kind, include_extras=True).items():
         if typing.get_origin(hint) is not typing.ClassVar:
-            yield from _numbers(hint, inner_name(name, field, hint))
+            yield from _numbers(hint, nested_name(name, field, hint))
 
 
 def _numbers(hint: Any, name: str) -> Iterator[tuple[str, Any]]:

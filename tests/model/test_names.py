@@ -21,7 +21,7 @@ def test_importing_the_package_imports_none_of_the_libraries() -> None:
 
 
 def test_the_names_are_told_alike_in_all_three_places() -> None:
-    homed = {name: f"glassplat.{module}" for module, names in glassplat.HOMES.items() for name in names}
+    homed = {name: f"glassplat.{module}" for module, names in glassplat.NAMES_BY_MODULE.items() for name in names}
     tree = ast.parse(Path(glassplat.__file__).read_text())
     typed = {
         alias.name: node.module
