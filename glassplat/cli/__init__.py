@@ -1,5 +1,5 @@
 """The command line.
 
 Here, and in `annotate`, `prepare` and `viewer`, what the user can mend is an InputError, a ValueError of a file or an
-OSError of a path, whose message says how; `console.ending` prints it.
+OSError of a path, whose message says how; `console.classify_error` prints it.
 """

@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from glassplat.captures.colmap_library import quiet_pycolmap
-from glassplat.cli.console import Command, say, shell_word
+from glassplat.cli.console import Command, print_line, shell_word
 from glassplat.cli.progress import WorkProgress
 from glassplat.files.writing import check_capture_folder, real_path
 from glassplat.options import Range, Share
@@ -47,7 +47,7 @@ class Prepare:
     resume: bool = False
     force: bool = False
 
-    def ready(self) -> None:
+    def set_up(self) -> None:
         """Checks input and output, and that pycolmap is installed."""
         check_places(self._task())
         quiet_pycolmap()
@@ -76,14 +76,14 @@ class Prepare:
             self._has_finished.set()
         for line in report.lines():
             label = "advice" if line.startswith("advice: ") else ""
-            say(console, line.removeprefix("advice: "), label=label, style="yellow")
+            print_line(console, line.removeprefix("advice: "), label=label, style="yellow")
         from glassplat.prepare.report_page import write_page  # Imports PyTorch, which is not needed before.
 
         write_page(self._output, self._output / PAGE)
-        say(console, f"capture: {self._output}, report: {self._output / PAGE}")
-        say(console, f"next: glassplat annotate {shell_word(self._output)}")
+        print_line(console, f"capture: {self._output}, report: {self._output / PAGE}")
+        print_line(console, f"next: glassplat annotate {shell_word(self._output)}")
 
-    def left_behind(self) -> str:
+    def interrupt_message(self) -> str:
         """Message after an interrupt: the state on disk, and how to continue."""
         if self._has_finished.is_set():
             page = f"glassplat info {shell_word(self._output)} --page {shell_word(self._output / PAGE)}"
@@ -103,8 +103,8 @@ class Annotate(Command):
         open_browser: open the page in the browser (not over SSH).
     """
 
-    work = "serving:serve_marking"
-    left = "the marks are saved in {capture}: repeat the command to continue"
+    entry_point = "serving:serve_annotation"
+    interrupt_hint = "the marks are saved in {capture}: repeat the command to continue"
 
     capture: tyro.conf.Positional[Path]
     port: Annotated[int, Range(0, 65535)] = 8765

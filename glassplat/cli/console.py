@@ -68,7 +68,7 @@ def count_noun(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-def say(console: Console, text: object, *, label: str = "", style: str = "") -> None:
+def print_line(console: Console, text: object, *, label: str = "", style: str = "") -> None:
     """Prints a line verbatim. The terminal wraps it, so that commands in it can be copied as one line.
 
     Args:
@@ -82,19 +82,19 @@ def say(console: Console, text: object, *, label: str = "", style: str = "") -> 
     console.print(line, soft_wrap=True)
 
 
-def warn(console: Console, text: object) -> None:
+def print_warning(console: Console, text: object) -> None:
     """Prints a warning; the command continues."""
-    say(console, text, label="warning", style="yellow")
+    print_line(console, text, label="warning", style="yellow")
 
 
-def complain(label: Literal["error", "stopped", "failed"], text: object) -> None:
+def print_error(label: Literal["error", "stopped", "failed"], text: object) -> None:
     """Prints to standard error why a command, or one of its parts, ends.
 
     Args:
         label: `error` for wrong input, `stopped` for a failure while running, `failed` for a part that is skipped.
         text: what was expected, what was found, and what to do.
     """
-    say(message_console(stderr=True), text, label=label, style="red")
+    print_line(message_console(stderr=True), text, label=label, style="red")
 
 
 def printable(text: str) -> str:
@@ -102,7 +102,7 @@ def printable(text: str) -> str:
     return UNPRINTABLE.sub(lambda found: repr(found.group())[1:-1], text)
 
 
-def plain_streams() -> None:
+def make_streams_robust() -> None:
     """Makes output robust: closed streams are replaced, and characters missing from the encoding are escaped."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
@@ -112,18 +112,18 @@ def plain_streams() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
-def silence() -> None:
+def silence_output() -> None:
     """Discards all further output, as on ranks other than the leader, which prints for all."""
     sys.stdout = sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - Until the process ends.
 
 
 def drop_output() -> None:
     """Discards pending output after a broken pipe."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
+    null_device = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null_device, 1)
 
 
-class LogLines(logging.Handler):
+class LogPrinter(logging.Handler):
     """Prints log records among the lines of a command, above its progress bar; repeated lines once."""
 
     def __init__(self, console: Console) -> None:
@@ -138,19 +138,19 @@ class LogLines(logging.Handler):
             return
         self._shown.add(text)
         if record.levelno >= logging.WARNING:
-            warn(self._console, text)
+            print_warning(self._console, text)
         else:
-            say(self._console, text)
+            print_line(self._console, text)
 
 
 @contextmanager
-def heard_by(console: Console) -> Iterator[None]:
+def print_log_records(console: Console) -> Iterator[None]:
     """Prints log records of the package and warnings of libraries on a console, each as a line."""
 
     def show(message: Warning | str, *place: Any, **more: Any) -> None:
-        warn(console, message)
+        print_warning(console, message)
 
-    lines, root = LogLines(console), logging.getLogger()
+    lines, root = LogPrinter(console), logging.getLogger()
     if not root.handlers:
         root.addHandler(lines)
     logging.getLogger("glassplat").setLevel(logging.INFO)
@@ -162,12 +162,12 @@ def heard_by(console: Console) -> Iterator[None]:
         root.removeHandler(lines)
 
 
-WORDS = {
+SIGNAL_WORDS = {
     name: word
     for name, word in (("SIGINT", "interrupted"), ("SIGTERM", "terminated"), ("SIGHUP", "the terminal was closed"))
     if hasattr(signal, name)  # Windows has no SIGHUP.
 }
-CODE_OF_SIGNALS = 128
+SIGNAL_CODE_BASE = 128
 """Shells report a process that was killed by a signal as this plus the number of the signal."""
 
 
@@ -179,17 +179,17 @@ class Interrupted(KeyboardInterrupt):
     """
 
     def __init__(self, number: int) -> None:
-        super().__init__(WORDS[signal.Signals(number).name])
+        super().__init__(SIGNAL_WORDS[signal.Signals(number).name])
         self.number = number
 
 
-def code_of(stop: KeyboardInterrupt) -> int:
+def interrupt_code(stop: KeyboardInterrupt) -> int:
     """Exit code of an interrupt: 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP."""
-    return CODE_OF_SIGNALS + (stop.number if isinstance(stop, Interrupted) else signal.SIGINT)
+    return SIGNAL_CODE_BASE + (stop.number if isinstance(stop, Interrupted) else signal.SIGINT)
 
 
 @contextmanager
-def raised_signals(*, is_program: bool = False) -> Iterator[list[Interrupted]]:
+def raise_on_signals(*, is_program: bool = False) -> Iterator[list[Interrupted]]:
     """Turns signals into `Interrupted` exceptions, so that half-written files are removed.
 
     Yields the list of those raised, because an interrupted library may fail with an error of its own. If the process
@@ -201,12 +201,12 @@ def raised_signals(*, is_program: bool = False) -> Iterator[list[Interrupted]]:
         raised.append(Interrupted(number))
         raise raised[-1]
 
-    with _install_handlers(stop, afterwards=signal.SIG_DFL if is_program else None):
+    with _install_handlers(stop, handler_after=signal.SIG_DFL if is_program else None):
         yield raised
 
 
 @contextmanager
-def immediate_end() -> Iterator[None]:
+def exit_on_signals() -> Iterator[None]:
     """Ends the process with one line at the first signal, while libraries are being imported.
 
     Nothing has been written yet that would need cleanup. An exception would not work: a library may treat it as its
@@ -216,14 +216,14 @@ def immediate_end() -> Iterator[None]:
     def end(number: int, frame: FrameType | None) -> None:
         stop = Interrupted(number)
         os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, f"{stop}\n".encode())
-        os._exit(code_of(stop))
+        os._exit(interrupt_code(stop))
 
     with _install_handlers(end):
         yield
 
 
 @contextmanager
-def held_signals() -> Iterator[None]:
+def defer_signals() -> Iterator[None]:
     """Defers signals to the end of the context, for imports while something runs that needs an orderly shutdown."""
     held: list[int] = []
     with _install_handlers(lambda number, frame: held.append(number)):
@@ -233,36 +233,36 @@ def held_signals() -> Iterator[None]:
 
 
 @contextmanager
-def _install_handlers(answer: signal._HANDLER, afterwards: signal._HANDLER | None = None) -> Iterator[None]:
+def _install_handlers(handler_within: signal._HANDLER, handler_after: signal._HANDLER | None = None) -> Iterator[None]:
     """Installs signal handlers, except for signals that the process ignores, as under `nohup`.
 
     Args:
-        answer: handler in this context.
-        afterwards: handler after it; the previous one if None.
+        handler_within: handler in this context.
+        handler_after: handler after it; the previous one if None.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # Only the main thread can install handlers.
         return
-    numbers = [getattr(signal, name) for name in WORDS]
+    numbers = [getattr(signal, name) for name in SIGNAL_WORDS]
     before = {number: signal.getsignal(number) for number in numbers}
-    heard = [number for number, handler in before.items() if handler not in (signal.SIG_IGN, None)]
-    for number in heard:
-        signal.signal(number, answer)
+    handled = [number for number, handler in before.items() if handler not in (signal.SIG_IGN, None)]
+    for number in handled:
+        signal.signal(number, handler_within)
     try:
         yield
     finally:
-        for number in heard:
-            signal.signal(number, before[number] if afterwards is None else afterwards)
+        for number in handled:
+            signal.signal(number, before[number] if handler_after is None else handler_after)
 
 
 BAD_INPUT_CODE, FAILURE_CODE = 2, 1
-BAD_INPUT = ("glassplat.panes.PlaneFitError", "glassplat.kernels.backend.devices.CudaUnavailableError")
-FAILURES = ("glassplat.training.loop.TrainingDivergedError",)
-GPU_IS_FULL = ("torch.OutOfMemoryError",)
+BAD_INPUT_ERRORS = ("glassplat.panes.PlaneFitError", "glassplat.kernels.backend.devices.CudaUnavailableError")
+EXPECTED_FAILURES = ("glassplat.training.loop.TrainingDivergedError",)
+GPU_OUT_OF_MEMORY = ("torch.OutOfMemoryError",)
 """By name, because this module is loaded before PyTorch, and even if PyTorch cannot be loaded."""
 BAD_PATH = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 BAD_PATH_NUMBERS = (errno.ENAMETOOLONG, errno.ELOOP, errno.EROFS, errno.EINVAL)
-FULL = (errno.ENOSPC, errno.EDQUOT)
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 OUT_OF_MEMORY = (
     "can't allocate memory",
     "Cannot allocate memory",
@@ -272,7 +272,7 @@ OUT_OF_MEMORY = (
     "failed to map segment",
 )
 LONGEST_QUOTE = 300
-REMEDY = "smaller photographs (a larger --downscale in training) or fewer Gaussians need less"
+MEMORY_REMEDY = "smaller photographs (a larger --downscale in training) or fewer Gaussians need less"
 
 
 class Ending(NamedTuple):
@@ -283,18 +283,18 @@ class Ending(NamedTuple):
     code: int
 
 
-def ending(error: BaseException) -> Ending:
+def classify_error(error: BaseException) -> Ending:
     """Message and exit code for an error; the traceback of an unexpected one is saved to a file."""
     if isinstance(error, RankLostError):
-        said = error.ending or ("stopped", str(error), FAILURE_CODE)
-        return Ending("error" if said[0] == "error" else "stopped", *said[1:])
-    if isinstance(error, InputError) or is_one_of(error, BAD_INPUT):
+        reported = error.ending or ("stopped", str(error), FAILURE_CODE)
+        return Ending("error" if reported[0] == "error" else "stopped", *reported[1:])
+    if isinstance(error, InputError) or is_one_of(error, BAD_INPUT_ERRORS):
         return Ending("error", str(error), BAD_INPUT_CODE)
     if isinstance(error, OSError):
         bad_path = isinstance(error, BAD_PATH) or error.errno in BAD_PATH_NUMBERS
         label: Literal["error", "stopped"] = "error" if bad_path else "stopped"
-        return Ending(label, described_os_error(error), BAD_INPUT_CODE if bad_path else FAILURE_CODE)
-    return Ending("stopped", _failure(error), FAILURE_CODE)
+        return Ending(label, describe_os_error(error), BAD_INPUT_CODE if bad_path else FAILURE_CODE)
+    return Ending("stopped", _describe_failure(error), FAILURE_CODE)
 
 
 def is_one_of(error: BaseException, names: tuple[str, ...]) -> bool:
@@ -306,25 +306,26 @@ def is_one_of(error: BaseException, names: tuple[str, ...]) -> bool:
     return False
 
 
-def described_os_error(error: OSError) -> str:
+def describe_os_error(error: OSError) -> str:
     """An operating-system error in words: the path, the problem and the remedy."""
     if error.errno is None or error.strerror is None:
         return str(error)  # One of ours, with a complete message.
     subjects = [os.fsdecode(name) for name in (error.filename, error.filename2) if isinstance(name, str | bytes)]
     about = f"{' -> '.join(subjects)}: " if subjects else ""
-    remedy = "; free some space, then repeat the command" if error.errno in FULL else ""
+    remedy = "; free some space, then repeat the command" if error.errno in DISK_FULL else ""
     return f"{about}{error.strerror[:1].lower()}{error.strerror[1:]}{remedy}"
 
 
-def _failure(error: BaseException) -> str:
-    if is_one_of(error, FAILURES):
+def _describe_failure(error: BaseException) -> str:
+    if is_one_of(error, EXPECTED_FAILURES):
         return str(error)
-    if is_one_of(error, GPU_IS_FULL):
-        return f"{first_sentence(error)}; {REMEDY}, or use --device cpu; the last checkpoint stays"
+    if is_one_of(error, GPU_OUT_OF_MEMORY):
+        return f"{first_sentence(error)}; {MEMORY_REMEDY}, or use --device cpu; the last checkpoint stays"
     if is_out_of_memory(error):
-        return f"out of memory ({first_sentence(error) or 'an allocation failed'}); {REMEDY}; the last checkpoint stays"
-    said = first_sentence(error)
-    return f"unexpected error, {type(error).__name__}: {said}; {saved_traceback(error)}"
+        reason = first_sentence(error) or "an allocation failed"
+        return f"out of memory ({reason}); {MEMORY_REMEDY}; the last checkpoint stays"
+    sentence = first_sentence(error)
+    return f"unexpected error, {type(error).__name__}: {sentence}; {save_traceback(error)}"
 
 
 def is_out_of_memory(error: BaseException) -> bool:
@@ -342,7 +343,7 @@ def first_sentence(error: BaseException) -> str:
     return first if len(first) <= LONGEST_QUOTE else f"{first[:LONGEST_QUOTE]} ..."
 
 
-def saved_traceback(error: BaseException) -> str:
+def save_traceback(error: BaseException) -> str:
     """Writes the traceback to a temporary file; returns its location, or that of the error if this fails."""
     trace = "".join(traceback.format_exception(error))
     head = f"{versions()}\n{time.strftime('%Y-%m-%d %H:%M:%S %z')}\n{sys.argv}\n\n"
@@ -360,20 +361,20 @@ def saved_traceback(error: BaseException) -> str:
 def versions() -> str:
     """Versions of the package, its main dependencies, the system and the GPU in one line, without imports."""
     return (
-        f"glassplat {__version__}, Python {platform.python_version()}, PyTorch {_version('torch')}, "
-        f"Numba {_version('numba')}, {platform.system()} {platform.release()} {platform.machine()}, "
-        f"{os.cpu_count()} CPU cores, {_gpu()}"
+        f"glassplat {__version__}, Python {platform.python_version()}, PyTorch {_package_version('torch')}, "
+        f"Numba {_package_version('numba')}, {platform.system()} {platform.release()} {platform.machine()}, "
+        f"{os.cpu_count()} CPU cores, {_gpu_name()}"
     )
 
 
-def _version(package: str) -> str:
+def _package_version(package: str) -> str:
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return "missing"
 
 
-def _gpu() -> str:
+def _gpu_name() -> str:
     """The first NVIDIA GPU of the driver."""
     try:
         driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
@@ -394,19 +395,19 @@ def check_arguments(arguments: Sequence[str]) -> None:
             raise InputError(f"the value of {name} is empty (an unset shell variable?); expected a value")
 
 
-def similar(word: str, known: Iterable[str]) -> list[str]:
+def closest_words(word: str, known: Iterable[str]) -> list[str]:
     """The known word closest to a mistyped one, if any is close."""
     return difflib.get_close_matches(word, list(known), n=1, cutoff=0.7)
 
 
-def no_such(what: str, word: str, known: Iterable[str], command: str) -> str:
+def unknown_name_message(what: str, word: str, known: Iterable[str], command: str) -> str:
     """Message about an unknown command or method, with the closest one, all of them, and their help."""
-    meant = similar(word, known)
+    meant = closest_words(word, known)
     guess = f"did you mean {meant[0]}? There are" if meant else "expected one of"
     return f"there is no {what} {word!r}; {guess} {', '.join(known)}: see {command}"
 
 
-BOX = re.compile(r"\x1b\[[0-9;]*m|[│─╭╮╰╯]|-{5,}")
+BOX_DRAWING = re.compile(r"\x1b\[[0-9;]*m|[│─╭╮╰╯]|-{5,}")
 """Frames and colours of tyro's messages."""
 NUMBERS = {"INT": "whole number", "FLOAT": "number"}
 """Plain words for tyro's type names."""
@@ -415,49 +416,49 @@ NOT_A_NUMBER = re.compile(
 )
 
 
-def refused_options(said: str) -> str:
+def tyro_error_line(output: str) -> str:
     """tyro's error message as one line, without its box, title and pointer to the help."""
-    title, _, text = BOX.sub("", said).strip().partition("\n")
+    title, _, text = BOX_DRAWING.sub("", output).strip().partition("\n")
     text = " ".join(text.partition("For full helptext")[0].split()).removeprefix("Error parsing ")
     text = re.sub(r"\.? \(required\)", ";", text).rstrip(".;")
     return f"{text[:1].lower()}{text[1:]}" or title.strip()
 
 
-def wrong_number(said: str, arguments: Sequence[str]) -> str | None:
+def wrong_number_message(output: str, arguments: Sequence[str]) -> str | None:
     """A message on a wrong number that replaces tyro's: expected and given values; None for other errors."""
-    if (found := NOT_A_NUMBER.search(" ".join(BOX.sub("", said).split()))) is None:
+    if (found := NOT_A_NUMBER.search(" ".join(BOX_DRAWING.sub("", output).split()))) is None:
         return None
     names = found[1].split("/")
     place = max((at for at, word in enumerate(arguments) if word.partition("=")[0] in names), default=-1)
     option, _, value = arguments[place].partition("=") if place >= 0 else (names[0], "", "")
-    came = (
+    given = (
         [value] if value else list(itertools.takewhile(lambda word: not word.startswith("--"), arguments[place + 1 :]))
     )
-    expected = " or ".join(numbers_in_words(signs.strip("{} ")) for signs in found[2].split("|"))
-    return f"{option}: expected {expected}, not {' '.join(came)!r}"
+    expected = " or ".join(describe_number_types(types.strip("{} ")) for types in found[2].split("|"))
+    return f"{option}: expected {expected}, not {' '.join(given)!r}"
 
 
-def numbers_in_words(signs: str) -> str:
+def describe_number_types(types: str) -> str:
     """An option's value types in words, as in "3 numbers" for "FLOAT FLOAT FLOAT"."""
-    kinds = signs.split()
+    kinds = types.split()
     word = NUMBERS.get(kinds[0])
-    return signs if word is None else f"a {word}" if len(kinds) == 1 else count_noun(len(kinds), word)
+    return types if word is None else f"a {word}" if len(kinds) == 1 else count_noun(len(kinds), word)
 
 
-LINE = "loading PyTorch ..."
+LOADING_LINE = "loading PyTorch ..."
 """Shown in terminals only, until the import ends. The cursor is not hidden: Ctrl-C may end the process at once."""
 
 
-def import_now(module: str) -> Any:
+def import_pytorch_module(module: str) -> Any:
     """Imports a module that needs PyTorch, by its dotted name."""
-    with _without_garbage_collection(), _announce(message_console(stderr=True), module):
+    with _without_garbage_collection(), _show_loading_line(message_console(stderr=True), module):
         return importlib.import_module(module)
 
 
-def import_held(module: str) -> Any:
+def import_uninterrupted(module: str) -> Any:
     """The same with signals deferred, for imports during work, which must not be interrupted."""
-    with held_signals():
-        return import_now(module)
+    with defer_signals():
+        return import_pytorch_module(module)
 
 
 class Command:
@@ -468,35 +469,35 @@ class Command:
         left: what an interrupt leaves behind, and how to go on; fields of the command stand in braces.
     """
 
-    work: ClassVar[str]
-    left: ClassVar[str]
+    entry_point: ClassVar[str]
+    interrupt_hint: ClassVar[str]
 
     def check(self) -> None:
         """Refuses what can be refused before that takes long."""
         raise NotImplementedError
 
-    def ready(self) -> None:
+    def set_up(self) -> None:
         """Refuses what can be refused, and imports what works."""
         self.check()
-        import_now(f"glassplat.cli.{self.work.partition(':')[0]}")
+        import_pytorch_module(f"glassplat.cli.{self.entry_point.partition(':')[0]}")
 
     def run(self, console: Console) -> None:
         """Does the work."""
-        module, _, function = self.work.partition(":")
+        module, _, function = self.entry_point.partition(":")
         getattr(importlib.import_module(f"glassplat.cli.{module}"), function)(self, console)
 
-    def left_behind(self) -> str:
+    def interrupt_message(self) -> str:
         """Text after an interrupt: the state on disk, and how to go on."""
-        return self.left.format(**vars(self))
+        return self.interrupt_hint.format(**vars(self))
 
 
 @contextmanager
-def _announce(console: Console, module: str) -> Iterator[None]:
+def _show_loading_line(console: Console, module: str) -> Iterator[None]:
     """Shows the line during the import, in a terminal and if the module is not loaded yet."""
     if module in sys.modules or not console.is_interactive:
         yield
         return
-    console.print(LINE, end="", highlight=False)
+    console.print(LOADING_LINE, end="", highlight=False)
     try:
         yield
     finally:

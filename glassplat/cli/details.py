@@ -29,7 +29,7 @@ from glassplat.scene.scene import Scene
 from glassplat.training.checkpoint import read_progress
 
 FEW_POINTS, FEW_MASKS = 500, 3
-MASKS_LOOKED_AT = 16
+MASKS_SAMPLED = 16
 """Number of photographs in which the share of ignored pixels is measured."""
 
 
@@ -49,8 +49,8 @@ def remaining_parts(files: CaptureFiles) -> Iterator[Finding]:
     if dataset.measured_points and len(dataset.points) < FEW_POINTS:
         finding.problems.append(f"{len(dataset.points)} points only; more photographs with more overlap give more")
     yield finding
-    yield _describe_panes(files.root, dataset)
-    yield _behind(files.root, dataset)
+    yield _panes_part(files.root, dataset)
+    yield _planes_part(files.root, dataset)
     decoded = Finding()
     describe_broken([view.image_path for view in (*dataset.train, *dataset.test)], decoded, LEAST_SIDE)
     yield decoded
@@ -63,14 +63,14 @@ def write_capture_page(path: Path, target: Path) -> None:
     write_page(path, target, capture_planes(dataset, None, PlaneFit()) if marked else None)
 
 
-def _describe_panes(path: Path, dataset: Dataset) -> Finding:
+def _panes_part(path: Path, dataset: Dataset) -> Finding:
     """Marked panes, and the quality of the marks."""
     finding = Finding()
-    if ignoring := [view for view in (*dataset.train, *dataset.test) if view.read_ignored is not None]:
-        looked_at = [view.ignored for view in evenly(ignoring, MASKS_LOOKED_AT)]
-        shares = [float(ignored.double().mean()) for ignored in looked_at if ignored is not None]
+    if masked := [view for view in (*dataset.train, *dataset.test) if view.read_ignored is not None]:
+        sampled = [view.ignored for view in evenly(masked, MASKS_SAMPLED)]
+        shares = [float(ignored.double().mean()) for ignored in sampled if ignored is not None]
         finding.facts["ignored"] = (
-            f"about {sum(shares) / len(shares):.0%} of {count_noun(len(ignoring), 'photograph')}, by masks, "
+            f"about {sum(shares) / len(shares):.0%} of {count_noun(len(masked), 'photograph')}, by masks, "
             "transparency, or the lens"
         )
     if estimated := sum(view.read_normals is not None for view in dataset.train):
@@ -91,7 +91,7 @@ def _describe_panes(path: Path, dataset: Dataset) -> Finding:
     return finding
 
 
-def _behind(path: Path, dataset: Dataset) -> Finding:
+def _planes_part(path: Path, dataset: Dataset) -> Finding:
     """Finding on the marked panes: fitted planes and the points behind them; takes seconds."""
     finding = Finding()
     if not dataset.pane_labels and dataset.planes is None:
@@ -117,25 +117,25 @@ FAINT = 0.01
 
 def splats_part(path: Path) -> Finding:
     """Finding on a file of Gaussians, with the panes next to it, as `load` reads them."""
-    beside = path.with_name(PLANES)
+    planes_path = path.with_name(PLANES)
     with convert_to_input_error():
         gaussians = read_splats(path)
-        planes = read_planes(beside) if beside.is_file() else Planes.empty()
+        planes = read_planes(planes_path) if planes_path.is_file() else Planes.empty()
     finding = Finding()
     _describe_scene(Scene(gaussians, extent=1.0, planes=planes), finding)
     if len(planes) and path.stem != EXPORT_STEM:
-        finding.facts["panes"] += f", of {beside}"
+        finding.facts["panes"] += f", of {planes_path}"
     return finding
 
 
 def resume_command(directory: RunDirectory) -> str:
     """The command that continues an interrupted run."""
-    settings, usual = directory.settings(), RunSettings("", 1)
+    settings, defaults = directory.settings(), RunSettings("", 1)
     method, recipe = directory.recipe().method, shell_word(directory.path / "recipe.json")
     words = [f"glassplat train {method} --config {recipe} --data {shell_word(settings.data)}"]
     words += [f"--output {shell_word(directory.path)} --iterations {settings.iterations}"]
     for name in ("downscale", "seed", "mask_polarity"):
-        if getattr(settings, name) != getattr(usual, name):
+        if getattr(settings, name) != getattr(defaults, name):
             words.append(f"--{name.replace('_', '-')} {getattr(settings, name)}")
     return " ".join([*words, "--resume"])
 
@@ -171,7 +171,7 @@ def imported_part(directory: RunDirectory) -> Finding:
     """Finding on a scene in the layout of a run, but without a capture."""
     finding = Finding()
     _describe_scene(directory.latest_scene()[0], finding)
-    _suggest_looking(directory.path, finding)
+    _suggest_viewing(directory.path, finding)
     return finding
 
 
@@ -187,7 +187,7 @@ def scene_part(path: Path) -> Finding:
 
 
 def _describe_scene(scene: Scene, finding: Finding) -> None:
-    _look_at(scene.primary, finding)
+    _describe_gaussians(scene.primary, finding)
     finding.facts["Gaussians"] = scene.num_gaussians
     if scene.num_gaussians > len(scene.primary):
         sets = (f"{len(part)} {name}" for name, part in scene.gaussian_sets().items() if len(part))
@@ -205,7 +205,7 @@ def _describe_scene(scene: Scene, finding: Finding) -> None:
         finding.facts["environment"] = f"a cube map of {scene.environment.size} texels a side"
 
 
-def _look_at(gaussians: Gaussians, finding: Finding) -> None:
+def _describe_gaussians(gaussians: Gaussians, finding: Finding) -> None:
     """Number, colours, extent and problems of Gaussians."""
     finding.facts["Gaussians"] = len(gaussians)
     if not len(gaussians):
@@ -239,10 +239,10 @@ def _describe_results(directory: RunDirectory, finding: Finding) -> None:
             finding.facts["measured"] = ", ".join(measures)
         except (ValueError, TypeError, AttributeError):
             finding.problems.append(f"{directory.results} is damaged; evaluate it again")
-    _suggest_looking(path, finding)
+    _suggest_viewing(path, finding)
 
 
-def _suggest_looking(path: Path, finding: Finding) -> None:
+def _suggest_viewing(path: Path, finding: Finding) -> None:
     finding.next.append(f"glassplat view {shell_word(path)}    shows it in the browser")
     finding.next.append(
         f"glassplat export {shell_word(path)} --output PAGE    exports a web page and files for other programs"

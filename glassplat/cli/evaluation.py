@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from glassplat.captures.dataset import Dataset
-from glassplat.cli.console import say
+from glassplat.cli.console import print_line
 from glassplat.cli.progress import WorkProgress
 from glassplat.cli.runs import StoredRun, open_run
 from glassplat.errors import InputError
@@ -70,11 +70,11 @@ def evaluate_and_report(command: Evaluate, console: Console) -> None:
     with WorkProgress(console) as progress:
         results = evaluate_run(stored, command.panes, align=command.align, show=progress.show)
     print_results(console, results)
-    say(console, f"pictures: {stored.directory.path / 'index.html'}")
+    print_line(console, f"pictures: {stored.directory.path / 'index.html'}")
 
 
-UNMOVED = "as the capture has them"
-RENDERING = "rendering test views"
+UNCHANGED_CAMERAS = "as the capture has them"
+RENDERING_LABEL = "rendering test views"
 
 
 def evaluate_run(
@@ -111,9 +111,9 @@ def evaluate_run(
 
     def add(view: scoring.EvaluatedView) -> None:
         report.add(view)
-        show(Working(RENDERING, next(views), len(stored.dataset.test)))
+        show(Working(RENDERING_LABEL, next(views), len(stored.dataset.test)))
 
-    show(Working(RENDERING, 0, len(stored.dataset.test)))
+    show(Working(RENDERING_LABEL, 0, len(stored.dataset.test)))
     evaluation: scoring.Evaluation = scoring.evaluate(
         stored.scene, with_photographer(stored.renderer, "beside"), stored.dataset, regions=regions, listen=add
     )
@@ -137,7 +137,7 @@ def cameras_of_test_views(stored: StoredRun, aligned: bool) -> str:
     if aligned:
         return "aligned with their photographs"
     moved = stored.scene.poses.covers_any(view.name for view in stored.dataset.test)
-    return "moved like those of the neighbouring photographs, by name" if moved else UNMOVED
+    return "moved like those of the neighbouring photographs, by name" if moved else UNCHANGED_CAMERAS
 
 
 def train_seconds(stored: StoredRun) -> float | None:
@@ -151,8 +151,8 @@ def train_seconds(stored: StoredRun) -> float | None:
 def print_results(console: Console, *results: dict) -> None:
     """Prints the main metrics of one or several runs, side by side, and the reasons for missing values."""
     console.print(results_table(*results))
-    for line in notes(*results):
-        say(console, line)
+    for line in result_notes(*results):
+        print_line(console, line)
 
 
 def results_table(*results: dict) -> Table:
@@ -181,17 +181,17 @@ def plane_text(plane: dict) -> str:
     )
 
 
-def notes(*results: dict) -> list[str]:
+def result_notes(*results: dict) -> list[str]:
     """One line for each change to test views, and for each reason of missing metrics."""
     heads = [f"{result['method']}: " if len(results) > 1 else "" for result in results]
     changed = [
         f"{head}{name} of test views: {result[key]}"
         for head, result in zip(heads, results, strict=True)
-        for name, key, usual in (
-            ("cameras", "test_cameras", UNMOVED),
+        for name, key, default in (
+            ("cameras", "test_cameras", UNCHANGED_CAMERAS),
             ("exposures", "test_exposures", scoring.SCENE_COLORS),
         )
-        if result.get(key, usual) != usual
+        if result.get(key, default) != default
     ]
     return changed + [
         f"{head}no {', '.join(names)}: {reason}"

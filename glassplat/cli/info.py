@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 
 from glassplat.captures.files import CaptureFiles, read_capture
-from glassplat.cli.console import count_noun, import_held, say, shell_word, warn
+from glassplat.cli.console import count_noun, import_uninterrupted, print_line, print_warning, shell_word
 from glassplat.errors import InputError, UnknownFormatError, convert_to_input_error, join_names
 from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES, files_below, is_hidden
 from glassplat.files.records import Text, check_fields, read_json
@@ -33,7 +33,7 @@ KINDS = f"a capture, photographs, a video, a run, an exported scene, or a splat 
 """Kinds of paths."""
 FEW_VIEWS = 20
 """Recommended minimum number of photographs."""
-DETAILS = "glassplat.cli.details"
+DETAILS_MODULE = "glassplat.cli.details"
 """Imported only for paths that need PyTorch."""
 
 
@@ -86,7 +86,7 @@ def capture_finding(path: Path) -> Iterator[Finding]:
     """
     files = read_capture(path)
     yield _first_part(files)
-    yield from import_held(DETAILS).remaining_parts(files)
+    yield from import_uninterrupted(DETAILS_MODULE).remaining_parts(files)
 
 
 def _first_part(files: CaptureFiles) -> Finding:
@@ -171,9 +171,11 @@ def preparation_finding(path: Path) -> Iterator[Finding]:
         given = read_json(settings)
         source = check_fields(given, {"input": Text()}, str(settings))["input"]
     output = str(path).removesuffix(".partial")
-    usual = Preparation(Path(source), Path(output)).record()
-    others = {name: given[name] for name in usual if given.get(name, usual[name]) != usual[name] and name != "input"}
-    options = "".join(f" --{name} {shell_word(str(value))}" for name, value in others.items())
+    defaults = Preparation(Path(source), Path(output)).record()
+    changed = {
+        name: given[name] for name in defaults if given.get(name, defaults[name]) != defaults[name] and name != "input"
+    }
+    options = "".join(f" --{name} {shell_word(str(value))}" for name, value in changed.items())
     finding = Finding("an interrupted preparation", {"of": source})
     finding.problems.append("it is not finished")
     finding.next.append(f"glassplat prepare {shell_word(source)} --output {shell_word(output)}{options} --resume")
@@ -186,7 +188,7 @@ def splat_finding(path: Path) -> Iterator[Finding]:
     if (path.parent / SCENE_FILE).is_file():
         first.facts["next to it"] = ", ".join(sorted(one.name for one in path.parent.iterdir() if one != path))
     yield first
-    yield import_held(DETAILS).splats_part(path)
+    yield import_uninterrupted(DETAILS_MODULE).splats_part(path)
 
 
 def run_finding(path: Path) -> Iterator[Finding]:
@@ -194,7 +196,7 @@ def run_finding(path: Path) -> Iterator[Finding]:
     directory = RunDirectory(path)
     if directory.import_record.is_file():
         yield Finding("a scene without a capture")
-        yield import_held(DETAILS).imported_part(directory)
+        yield import_uninterrupted(DETAILS_MODULE).imported_part(directory)
         return
     recipe, settings = directory.recipe(), directory.settings()
     finding = Finding(f"a {recipe.method} run")
@@ -202,7 +204,7 @@ def run_finding(path: Path) -> Iterator[Finding]:
     if not os.path.isdir(settings.data):
         finding.problems.append(f"its capture is no longer at {settings.data}; give its new location with --data")
     yield finding
-    yield import_held(DETAILS).trained_part(directory)
+    yield import_uninterrupted(DETAILS_MODULE).trained_part(directory)
 
 
 def runs_finding(path: Path) -> Iterator[Finding]:
@@ -215,13 +217,13 @@ def runs_finding(path: Path) -> Iterator[Finding]:
 def scene_finding(path: Path) -> Iterator[Finding]:
     """A folder that a scene was exported to."""
     yield Finding("an exported scene", {"files": ", ".join(sorted(one.name for one in path.iterdir()))})
-    yield import_held(DETAILS).scene_part(path)
+    yield import_uninterrupted(DETAILS_MODULE).scene_part(path)
 
 
 def export_finding(path: Path) -> Iterator[Finding]:
     """A folder that `glassplat export` wrote."""
     yield Finding("an exported scene", {"files": ", ".join(sorted(one.name for one in path.iterdir()))})
-    yield import_held(DETAILS).splats_part(scene_source(path))
+    yield import_uninterrupted(DETAILS_MODULE).splats_part(scene_source(path))
     opened = [f"glassplat view {shell_word(path)}    shows it in the browser"]
     if (path / "index.html").is_file():
         opened.append(f"open {path / 'index.html'} in a browser, or share it: it needs no server")
@@ -242,7 +244,7 @@ class Info:
     json: bool = False
     page: Path | None = None
 
-    def ready(self) -> None:
+    def set_up(self) -> None:
         """Checks that the path is known, and that its report can be written."""
         finder_of(self.path)
         if self.page is None:
@@ -258,25 +260,25 @@ class Info:
         whole = Finding()
         for part in finder_of(self.path)(self.path):
             if not self.json:
-                self._tell_facts(part, console)
+                self._print_facts(part, console)
             whole.add(part)
         if self.page is not None:
-            import_held(DETAILS).write_capture_page(self.path, self.page)
+            import_uninterrupted(DETAILS_MODULE).write_capture_page(self.path, self.page)
         if self.json:
             console.file.write(json.dumps({"path": str(self.path), **whole.as_json()}, indent=1) + "\n")
             return
         for problem in whole.problems:
-            warn(console, problem)
+            print_warning(console, problem)
         for command in whole.next:
-            say(console, f"next: {command}")
+            print_line(console, f"next: {command}")
 
-    def _tell_facts(self, part: Finding, console: Console) -> None:
+    def _print_facts(self, part: Finding, console: Console) -> None:
         if part.kind:
-            say(console, f"{self.path}: {part.kind}")
+            print_line(console, f"{self.path}: {part.kind}")
         for name, fact in part.facts.items():
-            say(console, f"  {name}: {fact}")
+            print_line(console, f"  {name}: {fact}")
 
-    def left_behind(self) -> str:
+    def interrupt_message(self) -> str:
         """Message after an interrupt: nothing has changed."""
         return "nothing was changed"
 

@@ -1,7 +1,7 @@
 """The command line: `glassplat prepare | annotate | train | eval | render | dereflect | clean | export | info | demo`.
 
 A command's module is imported only when the command is chosen, so that the list of commands appears at once and Ctrl-C
-works from the start. PyTorch and the code that does the work are imported by the command's method `ready`, after its
+works from the start. PyTorch and the code that does the work are imported by the command's method `set_up`, after its
 options and paths were checked.
 """
 
@@ -18,12 +18,12 @@ from typing import Annotated, Any, NamedTuple, Union
 
 from glassplat.errors import InputError, RankLostError
 
-FAILURE_CODE, USAGE_CODE, INTERRUPTED_CODE, UNREAD_CODE = 1, 2, 130, 141
+FAILURE_CODE, USAGE_CODE, INTERRUPTED_CODE, BROKEN_PIPE_CODE = 1, 2, 130, 141
 """The last two are those that shells report after Ctrl-C or a closed pipe."""
 DESCRIPTION = "Gaussian splatting for scenes with window panes, showcases and mirrors."
 
 
-class Listed(NamedTuple):
+class CommandEntry(NamedTuple):
     """Entry of the list of commands: module in this package, class, and first sentence of its docstring."""
 
     module: str
@@ -32,32 +32,38 @@ class Listed(NamedTuple):
 
 
 COMMANDS = {
-    "prepare": Listed("capture", "Prepare", "Estimate the camera poses of photographs and write them as a capture."),
-    "annotate": Listed(
+    "prepare": CommandEntry(
+        "capture", "Prepare", "Estimate the camera poses of photographs and write them as a capture."
+    ),
+    "annotate": CommandEntry(
         "capture",
         "Annotate",
         "Mark the panes of a capture in the browser: their corners in a few photographs, and what occludes them.",
     ),
-    "train": Listed("train", "Train", "Train a scene from photographs."),
-    "eval": Listed("scene", "Evaluate", "Evaluate a run on its test views and write comparison sheets."),
-    "render": Listed("scene", "Render", "Render the layers of a run from its cameras, with original or edited panes."),
-    "dereflect": Listed(
+    "train": CommandEntry("train", "Train", "Train a scene from photographs."),
+    "eval": CommandEntry("scene", "Evaluate", "Evaluate a run on its test views and write comparison sheets."),
+    "render": CommandEntry(
+        "scene", "Render", "Render the layers of a run from its cameras, with original or edited panes."
+    ),
+    "dereflect": CommandEntry(
         "scene",
         "Dereflect",
         "Remove the reflections from the photographs of a planar run; writes one PNG per photograph.",
     ),
-    "clean": Listed("scene", "Clean", "Remove floaters from a scene and scale it to metres; writes a new scene."),
-    "view": Listed("scene", "View", "View a scene in the browser, layer by layer, with original or edited panes."),
-    "video": Listed(
+    "clean": CommandEntry("scene", "Clean", "Remove floaters from a scene and scale it to metres; writes a new scene."),
+    "view": CommandEntry(
+        "scene", "View", "View a scene in the browser, layer by layer, with original or edited panes."
+    ),
+    "video": CommandEntry(
         "scene", "Video", "Render a video along a camera path: one layer, several side by side, or a wipe between two."
     ),
-    "export": Listed(
+    "export": CommandEntry(
         "scene",
         "Export",
         "Export a scene to PLY, SPZ, GLB or a web page with live panes, along with its panes.",
     ),
-    "info": Listed("info", "Info", "Describe a folder or file, check it, and suggest the next step."),
-    "demo": Listed(
+    "info": CommandEntry("info", "Info", "Describe a folder or file, check it, and suggest the next step."),
+    "demo": CommandEntry(
         "train",
         "Demo",
         "Train planar and splat on the bundled shop window and compare them; continues an interrupted demo.",
@@ -105,14 +111,14 @@ def run_to_exit_code(arguments: list[str], *, is_program: bool) -> int:
     from glassplat.cli import console
     from glassplat.training.ranks import await_leader, is_leader, report_failure
 
-    console.plain_streams()
+    console.make_streams_robust()
     is_training = arguments[:1] == ["train"]
     if is_training and not is_leader():
-        console.silence()
+        console.silence_output()
     command = None
-    with console.raised_signals(is_program=is_program) as raised:
+    with console.raise_on_signals(is_program=is_program) as raised:
         try:
-            with console.immediate_end() if is_program else nullcontext():
+            with console.exit_on_signals() if is_program else nullcontext():
                 command = prepare_command(arguments)
             run(command)
         except KeyboardInterrupt as stop:
@@ -121,18 +127,18 @@ def run_to_exit_code(arguments: list[str], *, is_program: bool) -> int:
             raise
         except BrokenPipeError:
             console.drop_output()
-            return UNREAD_CODE
+            return BROKEN_PIPE_CODE
         except BaseException as error:  # noqa: BLE001 - The last guard against tracebacks.
             is_lost = isinstance(error, RankLostError)
             if raised and not is_lost:
                 return report_interrupt(raised[-1], command)
-            found = console.ending(error)
+            end = console.classify_error(error)
             with suppress(OSError):  # Fails if the output is full or closed.
-                console.complain(found.label, found.text)
+                console.print_error(end.label, end.text)
             if is_training and not is_lost:
-                report_failure(*found)
+                report_failure(*end)
             await_leader()
-            return found.code
+            return end.code
     return 0
 
 
@@ -144,7 +150,7 @@ def prepare_command(arguments: list[str]) -> Any:
         SystemExit: as in `parse_arguments`.
     """
     command = parse_arguments(arguments)
-    command.ready()
+    command.set_up()
     return command
 
 
@@ -157,7 +163,7 @@ def parse_arguments(arguments: list[str]) -> Any:
     """
     import tyro
 
-    from glassplat.cli.console import check_arguments, no_such, versions
+    from glassplat.cli.console import check_arguments, unknown_name_message, versions
     from glassplat.options import check_options
 
     if arguments[:1] == ["--version"]:
@@ -171,14 +177,14 @@ def parse_arguments(arguments: list[str]) -> Any:
         return command
     complete = name.startswith("--tyro-")
     if not complete and name not in ("-h", "--help"):
-        raise InputError(no_such("command", name, COMMANDS, "glassplat --help"))
+        raise InputError(unknown_name_message("command", name, COMMANDS, "glassplat --help"))
     # After the list of commands, nothing is run; only shell completion needs every option.
-    kinds = {known: command_line(known, [])[0] if complete else stub(known) for known in COMMANDS}
-    tyro.cli(overview(kinds), prog="glassplat", description=DESCRIPTION, args=arguments, config=settings())
+    kinds = {known: command_line(known, [])[0] if complete else command_stub(known) for known in COMMANDS}
+    tyro.cli(overview_type(kinds), prog="glassplat", description=DESCRIPTION, args=arguments, config=tyro_settings())
     raise SystemExit(USAGE_CODE)
 
 
-def settings() -> tuple[Any, ...]:
+def tyro_settings() -> tuple[Any, ...]:
     """Settings of tyro for all command lines."""
     import tyro
 
@@ -194,29 +200,29 @@ def parse_options(name: str, arguments: list[str]) -> Any:
     """
     import tyro
 
-    from glassplat.cli.console import refused_options, wrong_number
+    from glassplat.cli.console import tyro_error_line, wrong_number_message
 
     kind, options = command_line(name, arguments)
-    said = StringIO()
+    tyro_output = StringIO()
     try:
-        with redirect_stderr(said):
+        with redirect_stderr(tyro_output):
             command, unknown = tyro.cli(
-                kind, prog=f"glassplat {name}", args=options, config=settings(), return_unknown_args=True
+                kind, prog=f"glassplat {name}", args=options, config=tyro_settings(), return_unknown_args=True
             )
     except SystemExit as end:
         if not end.code:
             raise
-        wrong, _, others = refused_options(said.getvalue()).partition("Unrecognized options: ")
+        wrong, _, others = tyro_error_line(tyro_output.getvalue()).partition("Unrecognized options: ")
         unknown = others.split()
         if not unknown:
-            wrong = wrong_number(said.getvalue(), options) or wrong
-            raise InputError(f"{wrong}; {pointer(name, options)}") from None
+            wrong = wrong_number_message(tyro_output.getvalue(), options) or wrong
+            raise InputError(f"{wrong}; {help_pointer(name, options)}") from None
     if unknown:
-        raise InputError(unknown_option(name, options, unknown))
+        raise InputError(unknown_option_message(name, options, unknown))
     return command
 
 
-def pointer(name: str, options: list[str]) -> str:
+def help_pointer(name: str, options: list[str]) -> str:
     """Pointer to the list of all options of a command, or of the method that its options name."""
     if name == "train":
         from glassplat.cli.train import help_of_method
@@ -225,35 +231,35 @@ def pointer(name: str, options: list[str]) -> str:
     return f"all options: glassplat {name} --help"
 
 
-def unknown_option(name: str, options: list[str], unknown: list[str]) -> str:
+def unknown_option_message(name: str, options: list[str], unknown: list[str]) -> str:
     """Message about unknown arguments, with similar ones and the methods that have them."""
-    from glassplat.cli.console import similar
+    from glassplat.cli.console import closest_words
 
     option, command, methods = unknown[0].partition("=")[0], f"glassplat {name}", []
     if not option.startswith("-"):
-        return f"{command} takes no further argument {option!r}; {pointer(name, options)}"
+        return f"{command} takes no further argument {option!r}; {help_pointer(name, options)}"
     chosen = []
     if name == "train":
-        from glassplat.cli.train import RECIPES, asked_method
+        from glassplat.cli.train import RECIPES, named_method
 
-        chosen = [method for method in [asked_method(options)] if method]
-        methods = [method for method in RECIPES if [method] != chosen and option in listed_options(name, [method])]
-    known = listed_options(name, chosen)
-    meant = similar(option, known) or [other for other in known if option.strip("-") in other][:3]
+        chosen = [method for method in [named_method(options)] if method]
+        methods = [method for method in RECIPES if [method] != chosen and option in options_in_help(name, [method])]
+    known = options_in_help(name, chosen)
+    meant = closest_words(option, known) or [other for other in known if option.strip("-") in other][:3]
     guess = f"; did you mean {' or '.join(meant)}?" if meant else ""
     elsewhere = f"; it is an option of {' and '.join(methods)}" if methods else ""
-    return f"{' '.join([command, *chosen])} has no option {option}{elsewhere or guess}; {pointer(name, options)}"
+    return f"{' '.join([command, *chosen])} has no option {option}{elsewhere or guess}; {help_pointer(name, options)}"
 
 
-def listed_options(name: str, words: list[str]) -> list[str]:
+def options_in_help(name: str, words: list[str]) -> list[str]:
     """Options in the full help of a command, given its subcommand."""
     import tyro
 
     kind, arguments = command_line(name, [*words, "--help-advanced" if name == "train" else "--help"])
-    shown = StringIO()
-    with redirect_stdout(shown), suppress(SystemExit):
-        tyro.cli(kind, prog=f"glassplat {name}", args=arguments, config=settings())
-    return re.findall(r"(?<![\w`-])--[a-z0-9.-]+", re.sub(r"\x1b\[[0-9;]*m", "", shown.getvalue()))
+    tyro_output = StringIO()
+    with redirect_stdout(tyro_output), suppress(SystemExit):
+        tyro.cli(kind, prog=f"glassplat {name}", args=arguments, config=tyro_settings())
+    return re.findall(r"(?<![\w`-])--[a-z0-9.-]+", re.sub(r"\x1b\[[0-9;]*m", "", tyro_output.getvalue()))
 
 
 def command_line(name: str, options: list[str]) -> tuple[Any, list[str]]:
@@ -267,16 +273,16 @@ def command_line(name: str, options: list[str]) -> tuple[Any, list[str]]:
 
 def command_class(name: str) -> type:
     """The class of a command, from its module, which is imported now."""
-    listed = COMMANDS[name]
-    return getattr(importlib.import_module(f"glassplat.cli.{listed.module}"), listed.kind)
+    entry = COMMANDS[name]
+    return getattr(importlib.import_module(f"glassplat.cli.{entry.module}"), entry.kind)
 
 
-def stub(name: str) -> type:
+def command_stub(name: str) -> type:
     """Entry in the list of commands for one whose module is not imported."""
     return make_dataclass(COMMANDS[name].kind, [], namespace={"__doc__": COMMANDS[name].summary})
 
 
-def overview(kinds: Mapping[str, type]) -> type:
+def overview_type(kinds: Mapping[str, type]) -> type:
     """Options of `glassplat` itself: one of the commands, or the version."""
     import tyro
 
@@ -293,23 +299,23 @@ def overview(kinds: Mapping[str, type]) -> type:
 
 def run(command: Any) -> None:
     """Runs a command whose console also shows log records and warnings."""
-    from glassplat.cli.console import heard_by, message_console
+    from glassplat.cli.console import message_console, print_log_records
 
     is_for_programs = getattr(command, "json", False)  # The output is one JSON document, without log lines.
-    with heard_by(message_console(stderr=is_for_programs)):
+    with print_log_records(message_console(stderr=is_for_programs)):
         command.run(message_console())
 
 
 def report_interrupt(stop: KeyboardInterrupt, command: Any) -> int:
     """Prints what an interrupted command leaves behind, and how to continue."""
-    from glassplat.cli.console import code_of, drop_output, message_console, say
+    from glassplat.cli.console import drop_output, interrupt_code, message_console, print_line
 
-    left = "" if command is None else f"; {command.left_behind()}"
+    left = "" if command is None else f"; {command.interrupt_message()}"
     try:
-        say(message_console(stderr=True), f"{str(stop) or 'interrupted'}{left}")
+        print_line(message_console(stderr=True), f"{str(stop) or 'interrupted'}{left}")
     except OSError:  # The terminal may be closed.
         drop_output()
-    return code_of(stop)
+    return interrupt_code(stop)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from glassplat.cli.console import message_console, say
+from glassplat.cli.console import message_console, print_line
 from glassplat.errors import InputError, convert_to_input_error, join_names
 from glassplat.files.records import read_json, readable_name, wrap_read_errors
 from glassplat.files.writing import LOADABLE, check_folder, make_folder, real_path, scene_source, write_text
@@ -55,11 +55,11 @@ def check_targets(folder: Path, targets: Sequence[Path], photographs: Sequence[P
         targets: the files to write, in it, and folders that they go into.
         photographs: files that must never be overwritten.
     """
-    inside, kept = real_path(folder), {real_path(path) for path in photographs}
+    inside, protected = real_path(folder), {real_path(path) for path in photographs}
     for target in (folder / RECORD, *targets):
         real = real_path(target)
-        if real in kept or not real.is_relative_to(inside):
-            what = "is a photograph of the capture" if real in kept else f"leads out of {folder}, to {real}"
+        if real in protected or not real.is_relative_to(inside):
+            what = "is a photograph of the capture" if real in protected else f"leads out of {folder}, to {real}"
             raise InputError(f"{target} {what}; nothing was written. Choose a new folder for --output")
         if os.path.lexists(real) and not (os.path.isfile(real) or os.path.isdir(real)):
             raise InputError(
@@ -89,12 +89,12 @@ def check_scene(path: Path) -> None:
     RunDirectory(path).check_begun()
 
 
-def say_scene(path: Path) -> None:
+def print_scene(path: Path) -> None:
     """Prints the method and length of a run, or the size of a splat file, before it is loaded."""
-    say(message_console(), f"{path}: {_in_words(path)}")
+    print_line(message_console(), f"{path}: {_describe_scene(path)}")
 
 
-def _in_words(path: Path) -> str:
+def _describe_scene(path: Path) -> str:
     source = scene_source(path)
     if source.is_file():
         return f"{'a splat file' if source == path else 'an exported scene'} of {source.stat().st_size / 1e6:.1f} MB"
@@ -171,7 +171,7 @@ class SceneEdits:
         )
 
         if self.surroundings is not None:
-            scene = in_surroundings(scene, self.surroundings)
+            scene = replace_environment(scene, self.surroundings)
         if replace(self, surroundings=None) == SceneEdits():
             return scene
         self._check(scene)
@@ -197,7 +197,7 @@ class SceneEdits:
             raise InputError(f"panes {twice} have a --reflectance and are --as-mirror; give one of the two")
 
 
-def in_surroundings(scene: Scene, panorama: Path) -> Scene:
+def replace_environment(scene: Scene, panorama: Path) -> Scene:
     """The scene with another environment, at the resolution of its own, and without near surroundings."""
     from glassplat.files.sidecars import read_equirect
     from glassplat.render.deferred import environment_from_equirect

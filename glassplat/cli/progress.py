@@ -11,38 +11,38 @@ from dataclasses import dataclass
 from rich import progress
 from rich.console import Console
 
-from glassplat.cli.console import say, warn
+from glassplat.cli.console import print_line, print_warning
 from glassplat.prepare.photographs import Note
 from glassplat.training import messages
 
-FIRST_PAUSE, LONGEST_PAUSE = 1.0, 10.0
+FIRST_INTERVAL, LONGEST_INTERVAL = 1.0, 10.0
 """Seconds between two lines, at the start of a run and later."""
 SPEED_SECONDS = 60.0
 """Time window over which the speed is measured, for the remaining time."""
 LONG_WORK = 5.0
 """Longer work between two steps is excluded from the speed, as is all work at the start of a stage."""
 SMOOTHING = 0.98
-WIDE = 110
+WIDE_TERMINAL = 110
 """Minimum width of a terminal, in columns, for the last checkpoint in the bar."""
 FORECAST_STEPS, FORECAST_SECONDS = 10, 5.0
 """Steps and seconds before the duration of the run is estimated; the first step, which may compile, is excluded."""
 LONG_SECONDS = 600.0
 """For longer runs, the estimate suggests how to shorten them."""
-FREQUENT = ("densify", "grow")
+FREQUENT_ACTIONS = ("densify", "grow")
 """Prefixes of actions that are too frequent to be printed."""
 
 
 @dataclass
-class Standing:
-    """Progress of a training; `loss` is smoothed, `saved` the step of the last checkpoint, `left` the time left."""
+class ProgressState:
+    """Progress of a training: `loss` is smoothed, `saved_step` is the step of the last checkpoint."""
 
     iterations: int
     step: int = 0
     stage: str = ""
     loss: float = 0.0
     count: int = 0
-    saved: int | None = None
-    left: str = ""
+    saved_step: int | None = None
+    time_left: str = ""
 
 
 @dataclass(frozen=True)
@@ -77,38 +77,38 @@ class Plan:
         return self.work(step) - self.work(step - 1)
 
 
-class Pace:
+class SpeedEstimate:
     """Speed over the last minute, or since the last long work between steps, and the remaining time."""
 
     def __init__(self, plan: Plan, clock: Callable[[], float] = time.monotonic) -> None:
         self._plan, self._clock = plan, clock
-        self._passed: deque[tuple[float, int]] = deque()
-        self._is_forecast = self._has_worked = False
-        self._stepped = clock()
+        self._samples: deque[tuple[float, int]] = deque()
+        self._is_forecast = self._had_other_work = False
+        self._last_step_at = clock()
 
     def work(self) -> None:
         """Records that there was other work since the last step."""
-        self._has_worked = True
+        self._had_other_work = True
 
     def enter_stage(self) -> None:
         """Restarts the measurement: setup of a stage happens once, and its first step may compile."""
-        self._passed.clear()
+        self._samples.clear()
 
     def step(self, number: int) -> None:
         """Records a step, at intervals."""
         now = self._clock()
-        if self._has_worked and now - self._stepped >= LONG_WORK:
-            self._passed.clear()
-        self._stepped, self._has_worked = now, False
-        if not self._passed or now - self._passed[-1][0] >= FIRST_PAUSE:
-            self._passed.append((now, number))
-        while len(self._passed) > 2 and now - self._passed[1][0] > SPEED_SECONDS:
-            self._passed.popleft()
+        if self._had_other_work and now - self._last_step_at >= LONG_WORK:
+            self._samples.clear()
+        self._last_step_at, self._had_other_work = now, False
+        if not self._samples or now - self._samples[-1][0] >= FIRST_INTERVAL:
+            self._samples.append((now, number))
+        while len(self._samples) > 2 and now - self._samples[1][0] > SPEED_SECONDS:
+            self._samples.popleft()
 
     def seconds_left(self, number: int) -> float | None:
         """Seconds from a step to the end of the run; None if the speed is not known yet."""
         plan = self._plan
-        seconds, steps = self._since_first(number)
+        seconds, steps = self._elapsed(number)
         if not steps or seconds <= 0:
             return None
         speed = seconds / (plan.work(number) - plan.work(number - steps))
@@ -116,33 +116,33 @@ class Pace:
 
     def forecast(self, number: int) -> str | None:
         """Sentence on the duration of the run and ways to shorten it; once, as soon as it is known."""
-        seconds, steps = self._since_first(number)
+        seconds, steps = self._elapsed(number)
         if self._is_forecast or steps < FORECAST_STEPS or seconds < FORECAST_SECONDS:
             return None
         self._is_forecast = True
         return _forecast(self._plan, number, seconds / steps, self.seconds_left(number) or 0.0)
 
-    def _since_first(self, number: int) -> tuple[float, int]:
+    def _elapsed(self, number: int) -> tuple[float, int]:
         """Seconds and steps since the first recorded step."""
-        if not self._passed:
+        if not self._samples:
             return 0.0, 0
-        since, first = self._passed[0]
+        since, first = self._samples[0]
         return self._clock() - since, number - first
 
 
 def _forecast(plan: Plan, number: int, seconds: float, left: float) -> str:
     """The estimate, from the seconds per step and the remaining seconds."""
     later = [
-        f"{_brief(seconds * cost / plan.cost(number))} from step {end} on"
+        f"{_format_step_time(seconds * cost / plan.cost(number))} from step {end} on"
         for end, before, cost in zip(plan.ends, plan.costs, plan.costs[1:], strict=False)
         if end >= number and cost != before
     ]
-    steps = ", about ".join([f"{_brief(seconds)} a step", *later])
+    steps = ", about ".join([f"{_format_step_time(seconds)} a step", *later])
     shorter = f"; {plan.shortcuts}" if plan.shortcuts and left >= LONG_SECONDS else ""
-    return f"about {in_words(left)} for {plan.iterations - number} steps ({steps}){shorter}"
+    return f"about {format_duration(left)} for {plan.iterations - number} steps ({steps}){shorter}"
 
 
-def _brief(seconds: float) -> str:
+def _format_step_time(seconds: float) -> str:
     return f"{seconds:.2f} s" if seconds >= 0.1 else f"{1000 * seconds:.0f} ms"
 
 
@@ -150,8 +150,8 @@ class TrainingProgress:
     """Displays the messages of a run; a context manager, which closes the bar."""
 
     def __init__(self, console: Console, plan: Plan, clock: Callable[[], float] = time.monotonic) -> None:
-        self._console, self._standing = console, Standing(plan.iterations)
-        self._pace = Pace(plan, clock)
+        self._console, self._state = console, ProgressState(plan.iterations)
+        self._speed = SpeedEstimate(plan, clock)
         self._display: StepBar | StepLines = StepBar(console) if console.is_interactive else StepLines(console, clock)
 
     def __enter__(self) -> TrainingProgress:
@@ -163,41 +163,41 @@ class TrainingProgress:
 
     def show(self, message: messages.Message) -> None:
         """Displays a message of the run."""
-        standing = self._standing
+        state = self._state
         if isinstance(message, messages.RunBegun):
             self._begin(message)
         elif isinstance(message, messages.StageEntered):
-            standing.stage = message.stage
-            self._pace.enter_stage()
+            state.stage = message.stage
+            self._speed.enter_stage()
             counts = ", ".join(f"{number} {name}" for name, number in message.counts.items())
-            self._say(f"step {message.step}: stage {message.stage}, {counts}")
-        elif isinstance(message, messages.ActionDone) and not message.action.startswith(FREQUENT):
-            self._say(f"step {message.step}: {message.action}")
+            self._print_line(f"step {message.step}: stage {message.stage}, {counts}")
+        elif isinstance(message, messages.ActionDone) and not message.action.startswith(FREQUENT_ACTIONS):
+            self._print_line(f"step {message.step}: {message.action}")
         elif isinstance(message, messages.Working):
-            self._pace.work()
-            self._display.work(standing, message)
+            self._speed.work()
+            self._display.work(state, message)
         elif isinstance(message, messages.CheckpointWritten):
-            standing.saved = message.step
+            state.saved_step = message.step
         elif isinstance(message, messages.StepDone):
-            standing.step = message.step
-            standing.loss = _smoothed(standing.loss, message.loss)
-            standing.count = sum(count for part, count in message.counts.items() if part != "planes")
-            self._pace.step(message.step)
-            seconds = self._pace.seconds_left(message.step)
-            standing.left = "estimating the remaining time" if seconds is None else f"{in_words(seconds)} left"
-            if forecast := self._pace.forecast(message.step):
-                self._say(forecast)
-            self._display.step(standing)
+            state.step = message.step
+            state.loss = _smooth_loss(state.loss, message.loss)
+            state.count = sum(count for part, count in message.counts.items() if part != "planes")
+            self._speed.step(message.step)
+            seconds = self._speed.seconds_left(message.step)
+            state.time_left = "estimating the remaining time" if seconds is None else f"{format_duration(seconds)} left"
+            if forecast := self._speed.forecast(message.step):
+                self._print_line(forecast)
+            self._display.step(state)
 
     def _begin(self, message: messages.RunBegun) -> None:
         if message.anew:
-            warn(self._console, "replacing an earlier run in this folder, which was never saved")
+            print_warning(self._console, "replacing an earlier run in this folder, which was never saved")
         if message.step:
-            self._standing.step = message.step
-            self._say(f"continuing from step {message.step} of {message.iterations}")
+            self._state.step = message.step
+            self._print_line(f"continuing from step {message.step} of {message.iterations}")
 
-    def _say(self, text: str) -> None:
-        say(self._console, text)
+    def _print_line(self, text: str) -> None:
+        print_line(self._console, text)
 
 
 class StepBar:
@@ -216,30 +216,30 @@ class StepBar:
             progress.TimeElapsedColumn(),
             progress.TextColumn("{task.fields[left]}"),
         ]
-        if console.width >= WIDE:
+        if console.width >= WIDE_TERMINAL:
             columns.append(progress.TextColumn("{task.fields[saved]}"))
         self._bar = progress.Progress(*columns, console=console, refresh_per_second=4)
         self._begun = False
 
-    def step(self, standing: Standing) -> None:
+    def step(self, state: ProgressState) -> None:
         """Shows a step."""
         if not self._begun:
             # The speed is that of this session, not of the steps before it.
-            fields = {"loss": standing.loss, "count": standing.count, "left": standing.left, "saved": ""}
-            self._bar.add_task(standing.stage, total=standing.iterations, completed=standing.step - 1, **fields)  # type: ignore[arg-type]
+            fields = {"loss": state.loss, "count": state.count, "left": state.time_left, "saved": ""}
+            self._bar.add_task(state.stage, total=state.iterations, completed=state.step - 1, **fields)  # type: ignore[arg-type]
             self._bar.start()
             self._begun = True
-        saved = "" if standing.saved is None else f"saved at {standing.saved}"
-        fields = {"loss": standing.loss, "count": standing.count, "left": standing.left, "saved": saved}
+        saved = "" if state.saved_step is None else f"saved at {state.saved_step}"
+        fields = {"loss": state.loss, "count": state.count, "left": state.time_left, "saved": saved}
         task = self._bar.task_ids[0]
-        self._bar.update(task, description=standing.stage, completed=standing.step, **fields)  # type: ignore[arg-type]
+        self._bar.update(task, description=state.stage, completed=state.step, **fields)  # type: ignore[arg-type]
 
-    def work(self, standing: Standing, work: messages.Working) -> None:
+    def work(self, state: ProgressState, work: messages.Working) -> None:
         """Shows the work instead of the stage; before the first step as a line, without a bar."""
         if self._begun:
             self._bar.update(self._bar.task_ids[0], description=f"{work.what} {work.done}/{work.total}")
         elif work.done == 0:
-            say(self._bar.console, work.what)
+            print_line(self._bar.console, work.what)
 
     def stop(self) -> None:
         """Ends the display."""
@@ -252,38 +252,38 @@ class StepLines:
 
     def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
         self._console, self._clock = console, clock
-        self._pause, self._shown_at = FIRST_PAUSE, clock()
+        self._interval, self._shown_at = FIRST_INTERVAL, clock()
 
-    def step(self, standing: Standing) -> None:
+    def step(self, state: ProgressState) -> None:
         """Prints a step, if a line is due."""
-        if not self._is_time():
+        if not self._is_due():
             return
-        saved = "" if standing.saved is None else f", saved at step {standing.saved}"
-        say(
+        saved = "" if state.saved_step is None else f", saved at step {state.saved_step}"
+        print_line(
             self._console,
-            f"step {standing.step} of {standing.iterations}: loss {standing.loss:.4f}, {standing.count} Gaussians, "
-            f"{standing.left}{saved}",
+            f"step {state.step} of {state.iterations}: loss {state.loss:.4f}, {state.count} Gaussians, "
+            f"{state.time_left}{saved}",
         )
 
-    def work(self, standing: Standing, work: messages.Working) -> None:
+    def work(self, state: ProgressState, work: messages.Working) -> None:
         """Prints the work if a line is due, or if it consists of one part."""
         if work.total == 1:
-            say(self._console, f"step {standing.step}: {work.what}")
-        elif self._is_time():
-            say(self._console, f"step {standing.step}: {work.what}, {work.done} of {work.total} done")
+            print_line(self._console, f"step {state.step}: {work.what}")
+        elif self._is_due():
+            print_line(self._console, f"step {state.step}: {work.what}, {work.done} of {work.total} done")
 
     def stop(self) -> None:
         """Does nothing; lines need no cleanup."""
 
-    def _is_time(self) -> bool:
+    def _is_due(self) -> bool:
         now = self._clock()
-        if now - self._shown_at < self._pause:
+        if now - self._shown_at < self._interval:
             return False
-        self._shown_at, self._pause = now, min(2 * self._pause, LONGEST_PAUSE)
+        self._shown_at, self._interval = now, min(2 * self._interval, LONGEST_INTERVAL)
         return True
 
 
-def in_words(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """A duration, rounded to minutes or seconds."""
     minutes = round(seconds / 60)
     if minutes < 1:
@@ -292,11 +292,11 @@ def in_words(seconds: float) -> str:
     return f"{hours} h {minutes} min" if hours else f"{minutes} min"
 
 
-def _smoothed(known: float, loss: float) -> float:
+def _smooth_loss(known: float, loss: float) -> float:
     return SMOOTHING * known + (1 - SMOOTHING) * loss if known else loss
 
 
-PAUSE = 10.0
+LINE_INTERVAL = 10.0
 """Seconds between two lines on the same work."""
 
 
@@ -335,7 +335,7 @@ class WorkProgress:
     def show(self, message: messages.Working | Note) -> None:
         """Displays a message."""
         if isinstance(message, Note):
-            warn(self._console, message.text)
+            print_warning(self._console, message.text)
             self._what = ""
         elif self._bar is not None:
             self._show_bar(self._bar, message)
@@ -354,10 +354,10 @@ class WorkProgress:
         now = self._clock()
         if step.what != self._what:
             self._what, self._begun, self._shown, self._first = step.what, now, now, step.done
-            say(self._console, f"{step.what} ({step.total})")
-        elif now - self._shown >= PAUSE:
+            print_line(self._console, f"{step.what} ({step.total})")
+        elif now - self._shown >= LINE_INTERVAL:
             self._shown = now
             done, left = step.done - self._first, "estimating the remaining time"
             if done > 0:
-                left = f"{in_words((now - self._begun) / done * (step.total - step.done))} left"
-            say(self._console, f"{step.what}: {step.done} of {step.total}, {left}")
+                left = f"{format_duration((now - self._begun) / done * (step.total - step.done))} left"
+            print_line(self._console, f"{step.what}: {step.done} of {step.total}, {left}")

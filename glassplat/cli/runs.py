@@ -14,7 +14,7 @@ from torch import Tensor
 from glassplat.access import is_local
 from glassplat.captures.dataset import TEST_EVERY, Dataset, dataset_of, load_dataset, with_corrected_cameras
 from glassplat.captures.view import GIGABYTE, PointCloud, View
-from glassplat.cli.console import count_noun, say, shell_word, warn
+from glassplat.cli.console import count_noun, print_line, print_warning, shell_word
 from glassplat.cli.places import chosen_views
 from glassplat.cli.progress import Plan, TrainingProgress
 from glassplat.errors import InputError, convert_to_input_error
@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     from glassplat.cli.train import Train
 
 
-def announce(viewer: Viewer, console: Console) -> None:
+def print_address(viewer: Viewer, console: Console) -> None:
     """Prints the address of the viewer."""
-    say(console, viewer)
+    print_line(console, viewer)
     if is_local(viewer.host):
-        say(
+        print_line(
             console,
             f"from another machine: ssh -L {viewer.port}:localhost:{viewer.port} <this machine>, then the same address",
         )
@@ -73,25 +73,25 @@ def open_run(
         FileNotFoundError: the capture has moved.
     """
     directory = RunDirectory(path)
-    recorded = directory.recipe()
+    recorded_recipe = directory.recipe()
     scene, iterations = directory.latest_scene()
     with convert_to_input_error():
-        recorded.renderer().check(scene)
+        recorded_recipe.renderer().check(scene)
     scene = scene.to(chosen_device(device))
-    dataset = capture_of(directory, recorded, data, downscale)
+    dataset = load_run_dataset(directory, recorded_recipe, data, downscale)
     directory.check_photographs(dataset)
     if data is not None or not directory.import_record.is_file():  # Without a capture, cameras are written corrected.
         dataset = with_corrected_cameras(dataset, scene)
-    recipe = resolve_background(recorded, dataset)
+    recipe = resolve_background(recorded_recipe, dataset)
     return StoredRun(directory, recipe, scene, recipe.renderer(), dataset, iterations)
 
 
-def capture_of(
+def load_run_dataset(
     directory: RunDirectory, recipe: Any, moved: Path | None = None, downscale: float | None = None
 ) -> Dataset:
     """The capture of a run, at its recorded or given location; only the cameras for a scene without a capture."""
     if directory.import_record.is_file() and moved is None:
-        return _without_photographs(directory)
+        return _dataset_without_photographs(directory)
     settings = directory.settings()
     data = Path(settings.data) if moved is None else moved
     if moved is None and not data.is_dir():
@@ -106,7 +106,7 @@ def capture_of(
     )
 
 
-def _without_photographs(directory: RunDirectory) -> Dataset:
+def _dataset_without_photographs(directory: RunDirectory) -> Dataset:
     """The cameras of a scene without a capture, as views without photographs."""
     with convert_to_input_error():
         cameras = sorted(read_cameras(directory.path / "cameras.json"), key=lambda named: named[0])
@@ -121,47 +121,47 @@ def _without_photographs(directory: RunDirectory) -> Dataset:
     return Dataset(directory.path, train, test, points, extent=1.0)
 
 
-def pictures_of(dataset: Dataset) -> dict[str, Path]:
+def image_names(dataset: Dataset) -> dict[str, Path]:
     """File name of each view's image; independent of the chosen views."""
     return image_paths([view.name for view in chosen_views(dataset, "all")])
 
 
-def photographs_of(dataset: Dataset) -> list[Path]:
+def photograph_paths(dataset: Dataset) -> list[Path]:
     """The files of all photographs."""
     return [view.image_path for view in (*dataset.train, *dataset.test)]
 
 
-def train(asked: Train[Any], console: Console) -> None:
+def train(command: Train[Any], console: Console) -> None:
     """Trains, with a progress bar or lines."""
-    check_output(RunDirectory(asked.output), resume=asked.resume)
+    check_output(RunDirectory(command.output), resume=command.resume)
     dataset = dataset_of(
-        asked.files, downscale=asked.downscale, background=photo_background(asked.recipe), memory=asked.memory
+        command.files, downscale=command.downscale, background=photo_background(command.recipe), memory=command.memory
     )
-    describe(dataset, console)
+    print_summary(dataset, console)
     training = Training(
         dataset,
-        asked.recipe,
-        iterations=asked.iterations,
-        output=asked.output,
-        seed=asked.seed,
-        device=asked.device,
-        resume=asked.resume,
-        checkpoint_every=asked.checkpoint_every,
+        command.recipe,
+        iterations=command.iterations,
+        output=command.output,
+        seed=command.seed,
+        device=command.device,
+        resume=command.resume,
+        checkpoint_every=command.checkpoint_every,
     )
-    plan = plan_of(asked)
-    with TrainingProgress(console, plan) as progress, _viewer_listeners(asked, training, dataset, console) as watch:
+    plan = training_plan(command)
+    with TrainingProgress(console, plan) as progress, _viewer_listener(command, training, dataset, console) as watch:
 
         def listen(message: Message) -> None:
             progress.show(message)
             watch(message)
 
         scene = training.run(listen).scene
-    say(
+    print_line(
         console,
-        f"trained {asked.recipe.method} for {training.step} iterations in {training.seconds:.0f} s: "
-        f"{scene.num_gaussians} Gaussians, {count_noun(len(scene.planes), 'pane')} -> {asked.output}",
+        f"trained {command.recipe.method} for {training.step} iterations in {training.seconds:.0f} s: "
+        f"{scene.num_gaussians} Gaussians, {count_noun(len(scene.planes), 'pane')} -> {command.output}",
     )
-    say(console, f"next: glassplat eval {shell_word(asked.output)}")
+    print_line(console, f"next: glassplat eval {shell_word(command.output)}")
 
 
 STEP_COSTS = {"Planar": 2.6, "Deferred": 1.2, "Traced": 4.5}
@@ -170,29 +170,29 @@ USUAL_ITERATIONS = 7000
 """The recommended length of a run."""
 
 
-def plan_of(asked: Train[Any]) -> Plan:
+def training_plan(command: Train[Any]) -> Plan:
     """Lengths and typical costs of a run's stages, and ways to shorten it."""
-    stages = asked.recipe.stages(asked.seed, asked.iterations)
+    stages = command.recipe.stages(command.seed, command.iterations)
     costs = tuple(STEP_COSTS.get(type(stage.renderer).__name__, 1.0) for stage in stages)
-    return Plan(tuple(stage_starts(stages, asked.iterations)[1:]), costs, shortcuts(asked))
+    return Plan(tuple(stage_starts(stages, command.iterations)[1:]), costs, shortcuts(command))
 
 
-def shortcuts(asked: Train[Any]) -> str:
+def shortcuts(command: Train[Any]) -> str:
     """Ways to make a run shorter, as the end of a sentence."""
-    ways = [f"--downscale {2 * asked.downscale:g}, a quarter of the pixels"]
-    if asked.iterations > USUAL_ITERATIONS:
+    ways = [f"--downscale {2 * command.downscale:g}, a quarter of the pixels"]
+    if command.iterations > USUAL_ITERATIONS:
         ways.append(f"--iterations {USUAL_ITERATIONS}")
-    if asked.recipe.method == "traced":
+    if command.recipe.method == "traced":
         ways.append("--least-strength 0.1")
-    if asked.settings().device == "cpu":
+    if command.settings().device == "cpu":
         ways.append("an NVIDIA GPU")
     return f"shorter with {', or '.join(ways)}"
 
 
 @contextmanager
-def _viewer_listeners(asked: Train[Any], training: Training, dataset: Dataset, console: Console) -> Iterator[Listener]:
+def _viewer_listener(command: Train[Any], training: Training, dataset: Dataset, console: Console) -> Iterator[Listener]:
     """The viewer as a further listener, if requested; only on rank 0."""
-    if not asked.view or not is_leader():
+    if not command.view or not is_leader():
         yield lambda message: None
         return
     from glassplat.model.watching import WatchedTraining
@@ -203,7 +203,7 @@ def _viewer_listeners(asked: Train[Any], training: Training, dataset: Dataset, c
         dataset,
         host=LOCALHOST,
         port=vacant_port(LOCALHOST),
-        announce=lambda viewer: announce(viewer, console),
+        announce=lambda viewer: print_address(viewer, console),
     )
     try:
         yield watched.handle_message
@@ -211,11 +211,11 @@ def _viewer_listeners(asked: Train[Any], training: Training, dataset: Dataset, c
         watched.stop()
 
 
-def describe(dataset: Dataset, console: Console) -> None:
+def print_summary(dataset: Dataset, console: Console) -> None:
     """Prints a summary of the capture, with the loader's warnings."""
     annotated = sum(view.is_annotated for view in dataset.train)
     given = f", {len(dataset.planes)} in planes.json" if dataset.planes is not None else ""
-    say(
+    print_line(
         console,
         f"{dataset.root}: {len(dataset.train)} training and {len(dataset.test)} test views, "
         f"{len(dataset.points.positions)} points, {count_noun(annotated, 'annotated view')} with "
@@ -223,10 +223,10 @@ def describe(dataset: Dataset, console: Console) -> None:
     )
     needed, room = dataset.photograph_bytes, dataset.memory.budget
     if needed > room:
-        say(
+        print_line(
             console,
             f"the training photographs take {needed / GIGABYTE:.1f} GB: {room / GIGABYTE:.1f} GB stay in memory "
             "(--memory), the others are read in the background",
         )
     for warning in dataset.warnings:
-        warn(console, warning)
+        print_warning(console, warning)

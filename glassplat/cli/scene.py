@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from glassplat.cli.console import Command
-from glassplat.cli.places import SceneEdits, SplatFile, Split, check_claim, check_file, check_scene, say_scene
+from glassplat.cli.places import SceneEdits, SplatFile, Split, check_claim, check_file, check_scene, print_scene
 from glassplat.errors import InputError, convert_to_input_error
 from glassplat.files.writing import GAUSSFORGE_SUFFIXES, OUTPUT_FORMATS, check_folder
 from glassplat.kernels.backend.devices import DeviceName
@@ -40,8 +40,8 @@ class Evaluate(Command):
             runs that refined the cameras of training views.
     """
 
-    work = "evaluation:evaluate_and_report"
-    left = "{run_directory} itself is unchanged: repeat the command to evaluate it"
+    entry_point = "evaluation:evaluate_and_report"
+    interrupt_hint = "{run_directory} itself is unchanged: repeat the command to evaluate it"
 
     run_directory: tyro.conf.Positional[Path]
     device: DeviceName = "auto"
@@ -53,7 +53,7 @@ class Evaluate(Command):
         """Refuses what is no run."""
         RunDirectory(self.run_directory).check_begun()
         check_folder(self.run_directory)
-        say_scene(self.run_directory)
+        print_scene(self.run_directory)
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,8 @@ class Render(Command):
         data: location of the capture, if it has moved since training.
     """
 
-    work = "writing:write_layers"
-    left = "images already written to {output} are complete: repeat the command to write all of them"
+    entry_point = "writing:write_layers"
+    interrupt_hint = "images already written to {output} are complete: repeat the command to write all of them"
 
     run_directory: tyro.conf.Positional[Path]
     output: Path
@@ -86,7 +86,7 @@ class Render(Command):
         """Refuses what is no run, and an output that holds something else."""
         RunDirectory(self.run_directory).check_begun()
         check_claim(self.output, "render")
-        say_scene(self.run_directory)
+        print_scene(self.run_directory)
 
 
 @dataclass(frozen=True)
@@ -104,8 +104,8 @@ class View(Command):
         device: rendering device; auto uses an NVIDIA GPU if available.
     """
 
-    work = "serving:serve_viewer"
-    left = "everything saved in the browser is kept"
+    entry_point = "serving:serve_viewer"
+    interrupt_hint = "everything saved in the browser is kept"
 
     scene: tyro.conf.Positional[Path]
     port: Annotated[int, Range(0, 65535)] = 8080
@@ -122,7 +122,7 @@ class View(Command):
         if self.output is not None:
             check_folder(self.output)
         check_port(self.host, self.port)
-        say_scene(self.scene)
+        print_scene(self.scene)
 
 
 @dataclass(frozen=True)
@@ -146,8 +146,8 @@ class Video(Command):
         device: rendering device; auto uses an NVIDIA GPU if available.
     """
 
-    work = "writing:film"
-    left = "nothing was written: repeat the command"
+    entry_point = "writing:write_video"
+    interrupt_hint = "nothing was written: repeat the command"
 
     scene: tyro.conf.Positional[Path]
     output: Path
@@ -185,7 +185,7 @@ class Video(Command):
         self.file.check()
         if self.keyframes is not None:
             check_file(self.keyframes)
-        say_scene(self.scene)
+        print_scene(self.scene)
 
 
 if TYPE_CHECKING:
@@ -207,8 +207,8 @@ class Clean(Command):
         device: device to use; auto uses an NVIDIA GPU if available.
     """
 
-    work = "writing:write_clean"
-    left = "{scene} is as it was; remove {output} and repeat the command"
+    entry_point = "writing:write_clean"
+    interrupt_hint = "{scene} is as it was; remove {output} and repeat the command"
 
     scene: tyro.conf.Positional[Path]
     output: Path
@@ -226,7 +226,7 @@ class Clean(Command):
         check_folder(self.output)
         if os.path.lexists(self.output) and any(self.output.iterdir()):
             raise InputError(f"{self.output} is not empty; nothing was written. Choose a new folder for --output")
-        say_scene(self.scene)
+        print_scene(self.scene)
 
 
 @dataclass(frozen=True)
@@ -249,8 +249,8 @@ class Export(Command):
         device: rendering device; auto uses an NVIDIA GPU if available.
     """
 
-    work = "writing:write_files"
-    left = "files already written to {output} are complete: repeat the command to write all of them"
+    entry_point = "writing:write_files"
+    interrupt_hint = "files already written to {output} are complete: repeat the command to write all of them"
 
     scene: tyro.conf.Positional[Path]
     output: Path
@@ -275,7 +275,7 @@ class Export(Command):
         check_scene(self.scene)
         self.file.check()
         check_claim(self.output, "export")
-        say_scene(self.scene)
+        print_scene(self.scene)
 
 
 @dataclass(frozen=True)
@@ -292,8 +292,8 @@ class Dereflect(Command):
         data: location of the capture, if it has moved since training.
     """
 
-    work = "writing:write_dereflected"
-    left = "images already written to {output} are complete: repeat the command to write all of them"
+    entry_point = "writing:write_dereflected"
+    interrupt_hint = "images already written to {output} are complete: repeat the command to write all of them"
 
     run_directory: tyro.conf.Positional[Path]
     output: Path
@@ -307,4 +307,4 @@ class Dereflect(Command):
         """Refuses what is no run, and an output that holds something else."""
         RunDirectory(self.run_directory).check_begun()
         check_claim(self.output, "dereflect")
-        say_scene(self.run_directory)
+        print_scene(self.run_directory)

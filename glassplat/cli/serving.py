@@ -18,8 +18,8 @@ from torch import Tensor
 from glassplat.access import is_local
 from glassplat.annotate.server import AnnotationServer
 from glassplat.annotate.session import opened_session
-from glassplat.cli.console import say, shell_word
-from glassplat.cli.runs import announce, capture_of
+from glassplat.cli.console import print_line, shell_word
+from glassplat.cli.runs import load_run_dataset, print_address
 from glassplat.errors import InputError
 from glassplat.model.model import Model, viewer_state
 from glassplat.model.run_directory import RunDirectory
@@ -36,53 +36,53 @@ def serve_viewer(command: View, console: Console) -> None:
     model = command.file.open(command.scene, command.device)
     model = model.with_scene(command.edits.apply(model.scene))
     viewer = Viewer(
-        viewer_state(model, photographs_of(command.scene), writer_for(command, model)), command.host, command.port
+        viewer_state(model, photograph_readers(command.scene), make_writer(command, model)), command.host, command.port
     )
     viewer.start()
     try:
-        announce(viewer, console)
-        say(console, "Ctrl-C ends it")
+        print_address(viewer, console)
+        print_line(console, "Ctrl-C ends it")
         while True:
             time.sleep(3600)
     finally:
         viewer.stop()
 
 
-def writer_for(command: View, model: Model) -> FolderWriter | None:
+def make_writer(command: View, model: Model) -> FolderWriter | None:
     """Writer of edited scenes; with remote clients, writing must be requested explicitly."""
     if command.output is None and not is_local(command.host):
         return None
     return FolderWriter(model, command.output or Path(os.path.abspath(command.scene)).parent)
 
 
-def photographs_of(run: Path) -> dict[str, Callable[[], Tensor]]:
+def photograph_readers(run: Path) -> dict[str, Callable[[], Tensor]]:
     """Existing photographs of a run, by name."""
     directory = RunDirectory(run)
     if not run.is_dir() or directory.import_record.is_file():
         return {}
     try:
-        dataset = capture_of(directory, directory.recipe())
+        dataset = load_run_dataset(directory, directory.recipe())
     except (InputError, FileNotFoundError):
         return {}
     views = [view for view in (*dataset.train, *dataset.test) if view.image_path.is_file()]
     return {view.name: view.read_photo for view in views}
 
 
-def serve_marking(command: Annotate, console: Console) -> None:
+def serve_annotation(command: Annotate, console: Console) -> None:
     """Serves the page until it is closed or interrupted."""
     session = opened_session(command.capture)
-    with AnnotationServer(session, command.port) as server, ExitStack() as until_the_end:
+    with AnnotationServer(session, command.port) as server, ExitStack() as stack:
         port = server.server_address[1]
-        say(console, f"{len(session.views)} photographs; the page is at {server.address}")
-        say(console, f"over SSH, first: ssh -L {port}:127.0.0.1:{port} HOST; Ctrl-C ends, and nothing is lost")
+        print_line(console, f"{len(session.views)} photographs; the page is at {server.address}")
+        print_line(console, f"over SSH, first: ssh -L {port}:127.0.0.1:{port} HOST; Ctrl-C ends, and nothing is lost")
         if command.open_browser and has_screen():
-            until_the_end.enter_context(opened_in_browser(server.address, session.root))
+            stack.enter_context(open_in_browser(server.address, session.root))
         server.serve_forever(poll_interval=0.2)
-    say(console, f"next: glassplat train planar --data {shell_word(command.capture)} --output RUN")
+    print_line(console, f"next: glassplat train planar --data {shell_word(command.capture)} --output RUN")
 
 
 @contextmanager
-def opened_in_browser(address: str, folder: Path) -> Iterator[None]:
+def open_in_browser(address: str, folder: Path) -> Iterator[None]:
     """Open an address through a redirecting file that only this user can read.
 
     All users of a computer can see a browser's command line, and the address contains the key.

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from glassplat.captures.files import CaptureFiles, read_capture
 from glassplat.captures.masks import Polarity
-from glassplat.cli.console import import_now, message_console, no_such, say
+from glassplat.cli.console import import_pytorch_module, message_console, print_line, unknown_name_message
 from glassplat.cli.places import check_targets
 from glassplat.errors import InputError, convert_to_input_error
 from glassplat.files.records import read_text
@@ -69,7 +69,7 @@ class Train(Generic[RecipeKind]):
     config: Path | None = None
     view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
 
-    def ready(self) -> None:
+    def set_up(self) -> None:
         """Checks options, capture and output, prints a summary of the capture, and imports the training code."""
         if real_path(self.output) == real_path(self.data):
             raise InputError(f"{self.output} is the capture itself; choose another folder for --output")
@@ -77,8 +77,8 @@ class Train(Generic[RecipeKind]):
         if recipe.strategy != "mcmc" and recipe.mcmc.cap is not None:
             raise InputError("--cap belongs to --strategy mcmc; expected that strategy, or --densify.cap")
         check_output(RunDirectory(self.output), resume=self.resume)
-        say(message_console(), self.files)
-        import_now("glassplat.cli.runs")
+        print_line(message_console(), self.files)
+        import_pytorch_module("glassplat.cli.runs")
         self.recipe.renderer()  # Imports the method's modules before anything is written.
         from glassplat.training.stage import check_length
 
@@ -95,7 +95,7 @@ class Train(Generic[RecipeKind]):
 
         train(self, console)
 
-    def left_behind(self) -> str:
+    def interrupt_message(self) -> str:
         """Message after an interrupt: the state on disk, and how to continue."""
         if RunDirectory(self.output).checkpoint.is_file():
             return f"{self.output} holds a checkpoint: repeat the command with --resume to continue from it"
@@ -107,19 +107,19 @@ class Train(Generic[RecipeKind]):
         data = str(self.data.resolve())  # Later commands may be started in another folder.
         return RunSettings(data, self.iterations, self.downscale, self.seed, device, self.mask_polarity)
 
-    def resuming(self, begun: bool) -> Train:
+    def with_resume(self, begun: bool) -> Train:
         """The same run, resumed from its checkpoint if it has one."""
         return replace(self, resume=begun)
 
 
 PATH_OPTIONS = ("--data", "--output", "--config")
 HELP, FULL_HELP = ("-h", "--help"), "--help-advanced"
-POINTER = f"These are the most common options; {FULL_HELP} shows all of them."
+HELP_POINTER = f"These are the most common options; {FULL_HELP} shows all of them."
 
 
 def help_of_method(arguments: Sequence[str]) -> str:
     """Pointer to the full help of the method that the arguments name, instead of tyro's, which lists none."""
-    method = asked_method(arguments) or PlanarRecipe.method
+    method = named_method(arguments) or PlanarRecipe.method
     return f"all options of a method: glassplat train {method} {FULL_HELP}"
 
 
@@ -132,17 +132,17 @@ def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:
     """
     first = arguments[0] if arguments else "-"
     if first not in RECIPES and not first.startswith("-"):
-        raise InputError(no_such("method", first, RECIPES, "glassplat train --help"))
+        raise InputError(unknown_name_message("method", first, RECIPES, "glassplat train --help"))
     full = FULL_HELP in arguments
     # One that is none, parsing will refuse.
-    preset: Preset = "paper" if last_value(arguments, "--preset") == "paper" else "glassplat"
+    preset: Preset = "paper" if last_option_value(arguments, "--preset") == "paper" else "glassplat"
     recipes = [recipe_of(method, preset) for method in RECIPES]
-    if (config := last_value(arguments, "--config")) is not None:
+    if (config := last_option_value(arguments, "--config")) is not None:
         given = read_recipe(Path(config), arguments)
         recipes = [given if recipe.method == given.method else recipe for recipe in recipes]
     if not full and any(help_option in arguments for help_option in HELP):
-        note = POINTER if asked_method(arguments) else ""  # Once, not for each method of the list.
-        recipes = [in_brief(recipe, note) for recipe in recipes]
+        note = HELP_POINTER if named_method(arguments) else ""  # Once, not for each method of the list.
+        recipes = [hide_advanced_options(recipe, note) for recipe in recipes]
     choices = [Annotated[type(r), tyro.conf.subcommand(r.method, default=r)] for r in recipes]
     any_recipe: Any = functools.reduce(operator.or_, choices)
     return Train[any_recipe], ["--help" if argument == FULL_HELP else argument for argument in arguments]
@@ -152,19 +152,19 @@ def read_recipe(path: Path, arguments: Sequence[str]) -> Any:
     """The recipe in a file, checked against the method that the arguments name."""
     with convert_to_input_error():
         recipe = recipe_from_json(read_text(path), str(path))
-    asked = asked_method(arguments) or recipe.method
-    if asked != recipe.method:
-        raise InputError(f"{path} is a recipe of {recipe.method}; expected one of {asked}, or `train {recipe.method}`")
+    method = named_method(arguments) or recipe.method
+    if method != recipe.method:
+        raise InputError(f"{path} is a recipe of {recipe.method}; expected one of {method}, or `train {recipe.method}`")
     return recipe
 
 
-def asked_method(arguments: Sequence[str]) -> str | None:
+def named_method(arguments: Sequence[str]) -> str | None:
     """The first argument that is a method's name and not a path; None if there is none."""
     words = itertools.pairwise(["", *arguments])
     return next((word for before, word in words if word in RECIPES and before not in PATH_OPTIONS), None)
 
 
-def last_value(arguments: Sequence[str], option: str) -> str | None:
+def last_option_value(arguments: Sequence[str], option: str) -> str | None:
     """The last value of an option in the arguments; None if it is absent."""
     found = None
     for before, argument in itertools.pairwise(["", *arguments]):
@@ -175,13 +175,15 @@ def last_value(arguments: Sequence[str], option: str) -> str | None:
     return found
 
 
-def in_brief(options: Any, note: str = "") -> Any:
+def hide_advanced_options(options: Any, note: str = "") -> Any:
     """The same options as a type whose help shows only the essential ones, and a note."""
     kind, hints = type(options), typing.get_type_hints(type(options), include_extras=True)
     values = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
     fields: list[Any] = []
     for name, value in values.items():
-        values[name] = in_brief(value) if dataclasses.is_dataclass(value) and has_essentials(type(value)) else value
+        values[name] = (
+            hide_advanced_options(value) if dataclasses.is_dataclass(value) and has_essentials(type(value)) else value
+        )
         if values[name] is not value:
             fields.append((name, type(values[name]), dataclasses.field(default=values[name])))
         elif not is_essential(hints[name]):
@@ -225,7 +227,7 @@ class Demo:
     seed: Seed = 0
     device: DeviceName = "auto"
 
-    def ready(self) -> None:
+    def set_up(self) -> None:
         """Checks the output folder, and that the runs are long enough for the stages of `planar`."""
         check_folder(self.output)
         check_targets(self.output, self.folders, [])
@@ -242,16 +244,18 @@ class Demo:
         recipes: tuple[Recipe, ...] = (PlanarRecipe(), SplatRecipe())
         for recipe, folder in zip(recipes, self.folders, strict=True):
             run = Train(recipe, SCENE, folder, self.iterations, DEMO_DOWNSCALE, seed=self.seed, device=self.device)
-            run = run.resuming(RunDirectory(folder).checkpoint.is_file())
-            say(console, f"training {recipe.method}")
-            run.ready()
+            run = run.with_resume(RunDirectory(folder).checkpoint.is_file())
+            print_line(console, f"training {recipe.method}")
+            run.set_up()
             run.run(console)
         from glassplat.cli.evaluation import evaluate_run, print_results
         from glassplat.cli.runs import open_run
 
         print_results(console, *(evaluate_run(open_run(folder, self.device)) for folder in self.folders))
-        say(console, f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
+        print_line(
+            console, f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}"
+        )
 
-    def left_behind(self) -> str:
+    def interrupt_message(self) -> str:
         """Message after an interrupt: the state on disk, and how to continue."""
         return f"finished work stays in {self.output}: repeat the command to continue"

@@ -16,10 +16,10 @@ from rich.console import Console
 from torch import Tensor
 
 from glassplat.captures.view import View
-from glassplat.cli.console import count_noun, say, shell_word, warn
+from glassplat.cli.console import count_noun, print_line, print_warning, shell_word
 from glassplat.cli.places import SceneEdits, check_targets, chosen_views, claim_folder
 from glassplat.cli.progress import WorkProgress
-from glassplat.cli.runs import StoredRun, open_run, photographs_of, pictures_of
+from glassplat.cli.runs import StoredRun, image_names, open_run, photograph_paths
 from glassplat.errors import InputError, convert_to_input_error, join_names
 from glassplat.evaluate.evaluate import time_render
 from glassplat.evaluate.metrics import quantize
@@ -43,7 +43,7 @@ from glassplat.training.messages import Working
 if TYPE_CHECKING:
     from glassplat.cli.scene import Clean, Dereflect, Export, Render, Video
 
-Thing = TypeVar("Thing")
+Item = TypeVar("Item")
 
 
 def write_layers(command: Render, console: Console) -> None:
@@ -53,11 +53,11 @@ def write_layers(command: Render, console: Console) -> None:
     scene = command.edits.apply(stored.scene)
     renderer = stored.renderer.with_layers(command.layers)
     views = chosen_views(stored.dataset, command.split)
-    paths = pictures_of(stored.dataset)
+    paths = image_names(stored.dataset)
     targets = [command.output / layer / paths[view.name] for layer in command.layers for view in views]
-    check_targets(command.output, targets, photographs_of(stored.dataset))
+    check_targets(command.output, targets, photograph_paths(stored.dataset))
     if claim_folder(command.output, "render", command.run_directory):
-        say(
+        print_line(
             console,
             f"adding to {command.output}, which `glassplat render` wrote earlier; images of one name are replaced",
         )
@@ -68,7 +68,7 @@ def write_layers(command: Render, console: Console) -> None:
                 image = layer_image(frame, layer)
                 write_image(command.output / layer / paths[view.name], image)
     made = f"{count_noun(len(views), 'view')} x {count_noun(len(command.layers), 'layer')}"
-    say(console, f"{made} -> {command.output}")
+    print_line(console, f"{made} -> {command.output}")
 
 
 def write_dereflected(command: Dereflect, console: Console) -> None:
@@ -76,16 +76,18 @@ def write_dereflected(command: Dereflect, console: Console) -> None:
     stored = open_run(command.run_directory, command.device, command.data, command.downscale)
     renderer = planar_renderer(stored)
     views = chosen_views(stored.dataset, command.split)
-    paths = pictures_of(stored.dataset)
-    check_targets(command.output, [command.output / paths[view.name] for view in views], photographs_of(stored.dataset))
+    paths = image_names(stored.dataset)
+    check_targets(
+        command.output, [command.output / paths[view.name] for view in views], photograph_paths(stored.dataset)
+    )
     if claim_folder(command.output, "dereflect", command.run_directory):
-        say(console, f"replacing the images of an earlier run of this command in {command.output}")
+        print_line(console, f"replacing the images of an earlier run of this command in {command.output}")
     for warning in mirror_warnings(stored):
-        warn(console, warning)
+        print_warning(console, warning)
     with WorkProgress(console) as progress:
         for view in track_progress("taking reflections off", views, len(views), progress):
             write_image(command.output / paths[view.name], dereflect_view(command, stored, renderer, view))
-    say(console, f"{count_noun(len(views), 'image')} without reflections -> {command.output}")
+    print_line(console, f"{count_noun(len(views), 'image')} without reflections -> {command.output}")
 
 
 def dereflect_view(command: Dereflect, stored: StoredRun, renderer: Planar, view: View) -> Tensor:
@@ -123,22 +125,22 @@ WIPE_SPAN = 0.9
 """Share of the frame that the wipe covers, moving there and back."""
 
 
-def film(command: Video, console: Console) -> None:
+def write_video(command: Video, console: Console) -> None:
     """Renders the frames and encodes them one by one."""
     model = command.file.open(command.scene, command.device)
     check_layers(model.renderer, model.scene, command.layers, model.recipe.method)
     model = model.with_scene(command.edits.apply(model.scene))
-    cameras = _cameras(command, model)
-    beside = 1 if command.layout == "wipe" else len(command.layers)
+    cameras = _video_cameras(command, model)
+    columns = 1 if command.layout == "wipe" else len(command.layers)
     with convert_to_input_error():
-        check_size(command.output, beside * cameras[0].width, cameras[0].height)
+        check_size(command.output, columns * cameras[0].width, cameras[0].height)
     with WorkProgress(console) as progress, atomic_write(command.output) as temporary:
-        pictures = track_progress("filming", _pictures(command, model, cameras), len(cameras), progress)
-        write_film(temporary, pictures, count=len(cameras), fps=command.fps)
-    say(console, f"{len(cameras)} pictures, {command.output.stat().st_size / 1e6:.2f} MB -> {command.output}")
+        frames = track_progress("filming", _video_frames(command, model, cameras), len(cameras), progress)
+        write_film(temporary, frames, count=len(cameras), fps=command.fps)
+    print_line(console, f"{len(cameras)} pictures, {command.output.stat().st_size / 1e6:.2f} MB -> {command.output}")
 
 
-def _cameras(command: Video, model: models.Model) -> list[Camera]:
+def _video_cameras(command: Video, model: models.Model) -> list[Camera]:
     frames = max(2, round(command.seconds * command.fps))
     with convert_to_input_error():
         if command.keyframes is not None:
@@ -152,13 +154,13 @@ def _cameras(command: Video, model: models.Model) -> list[Camera]:
     return [fit_to_width(camera, command.width + command.width % 2) for camera in cameras]
 
 
-def _pictures(command: Video, model: models.Model, cameras: Sequence[Camera]) -> Iterator[NDArray[np.uint8]]:
+def _video_frames(command: Video, model: models.Model, cameras: Sequence[Camera]) -> Iterator[NDArray[np.uint8]]:
     """Frames, one per camera, rendered lazily."""
     renderer = model.renderer.with_layers(command.layers)
     for index, camera in enumerate(cameras):
         with torch.no_grad():
             frame = renderer(model.scene, camera)
-            shown = [_picture(layer_image(frame, layer)) for layer in command.layers]
+            shown = [_quantized_image(layer_image(frame, layer)) for layer in command.layers]
         if command.layout == "wipe":
             share = 0.5 + WIPE_SPAN / 2 * math.sin(2 * math.pi * index / len(cameras))
             yield wipe_pictures(shown[0], shown[1], share)
@@ -166,19 +168,19 @@ def _pictures(command: Video, model: models.Model, cameras: Sequence[Camera]) ->
             yield side_by_side(shown)
 
 
-def _picture(image: torch.Tensor) -> NDArray[np.uint8]:
+def _quantized_image(image: torch.Tensor) -> NDArray[np.uint8]:
     """A layer [H, W] or [H, W, 3] as an 8-bit image."""
     if image.dim() == 2:
         image = image[..., None].expand(-1, -1, 3)
-    picture: NDArray[np.uint8] = quantize(image).cpu().contiguous().numpy()
-    return picture
+    quantized: NDArray[np.uint8] = quantize(image).cpu().contiguous().numpy()
+    return quantized
 
 
-def track_progress(what: str, things: Iterable[Thing], total: int, progress: WorkProgress) -> Iterator[Thing]:
+def track_progress(what: str, items: Iterable[Item], total: int, progress: WorkProgress) -> Iterator[Item]:
     """Iterates over items while showing progress."""
     progress.show(Working(what, 0, total))
-    for number, thing in enumerate(things, start=1):
-        yield thing
+    for number, item in enumerate(items, start=1):
+        yield item
         progress.show(Working(what, number, total))
 
 
@@ -189,11 +191,13 @@ LARGEST_FACTOR = 1e6
 def write_clean(command: Clean, console: Console) -> None:
     """Writes the clean scene, and reports what was removed."""
     model = command.file.open(command.scene, command.device)
-    tidy, found = model.clean(command.rules)
+    cleaned, found = model.clean(command.rules)
     summary = ", ".join(f"{count} {rule}" for rule, count in found.items() if count) or "no floaters"
-    say(console, f"{len(tidy.scene.primary)} of {len(model.scene.primary)} Gaussians kept; found {summary}")
+    print_line(console, f"{len(cleaned.scene.primary)} of {len(model.scene.primary)} Gaussians kept; found {summary}")
     if found["outside"] > len(model.scene.primary) / 2:
-        warn(console, f"--box removes {found['outside']} Gaussians, more than half; is it in the scene's own units?")
+        print_warning(
+            console, f"--box removes {found['outside']} Gaussians, more than half; is it in the scene's own units?"
+        )
     if command.scale is not None:
         *points, metres = command.scale
         factor = metres / math.dist(points[:3], points[3:])
@@ -202,43 +206,43 @@ def write_clean(command: Clean, console: Console) -> None:
                 f"--scale makes the scene {factor:.3g} times as large; expected {1 / LARGEST_FACTOR:g} to "
                 f"{LARGEST_FACTOR:g}: give two places in the scene's own units, and their distance in metres"
             )
-        tidy = tidy.scale(factor)
-        say(console, f"one unit is now a metre; it was {factor:.4g} m")
-    tidy.save(command.output)
-    say(console, f"next: glassplat view {shell_word(command.output)}")
+        cleaned = cleaned.scale(factor)
+        print_line(console, f"one unit is now a metre; it was {factor:.4g} m")
+    cleaned.save(command.output)
+    print_line(console, f"next: glassplat view {shell_word(command.output)}")
 
 
 def write_files(command: Export, console: Console) -> None:
     """Writes the files, and removes those of an earlier run of the command that were not written again."""
     model = command.file.open(command.scene, command.device)
-    model = _chosen(command, model.with_scene(command.edits.apply(model.scene)))
+    model = _exported_model(command, model.with_scene(command.edits.apply(model.scene)))
     if "html" in command.formats:
         with convert_to_input_error():
             check_panes(model.scene)
     splats = {kind: command.output / f"{models.EXPORT_STEM}.{kind}" for kind in SPLAT_WRITERS}
-    beside = [command.output / name for name in BESIDE_SPLATS]
-    check_targets(command.output, [*beside, *splats.values()], [])
+    sidecars = [command.output / name for name in SIDECAR_FILES]
+    check_targets(command.output, [*sidecars, *splats.values()], [])
     is_again = claim_folder(command.output, "export", command.scene)
     if is_again:
-        say(console, f"replacing the files of an earlier run of this command in {command.output}")
-    written = [*_write_beside(command, model.scene, console), command.output / models.CAMERAS]
+        print_line(console, f"replacing the files of an earlier run of this command in {command.output}")
+    written = [*_write_sidecars(command, model.scene, console), command.output / models.CAMERAS]
     write_cameras(command.output / models.CAMERAS, model.cameras.items())
     for kind in (kind for kind in splats if kind in command.formats):
         options = {"version": command.spz_version} if kind == "spz" else {}
         with convert_to_input_error():
             write_splats(kind, splats[kind], model.scene.primary, **options)
         written.append(splats[kind])
-        say(console, f"{splats[kind].stat().st_size / 1e6:.2f} MB -> {splats[kind]}")
+        print_line(console, f"{splats[kind].stat().st_size / 1e6:.2f} MB -> {splats[kind]}")
         if lost := models.unsaved_parts(model, kind):
-            held = f"; {command.scene} holds everything" if command.edits == SceneEdits() else ""
-            warn(console, f"{splats[kind].name} leaves out {', '.join(lost)}{held}")
+            hint = f"; {command.scene} holds everything" if command.edits == SceneEdits() else ""
+            print_warning(console, f"{splats[kind].name} leaves out {', '.join(lost)}{hint}")
     if "html" in command.formats:
         written += _write_page(command, model, console)
     if is_again:
-        _remove_earlier(command, [*beside, *splats.values()], written, console)
+        _remove_earlier(command, [*sidecars, *splats.values()], written, console)
 
 
-BESIDE_SPLATS = (
+SIDECAR_FILES = (
     "index.html",
     PREVIEW,
     models.GLASS,
@@ -259,14 +263,14 @@ def _remove_earlier(command: Export, targets: Sequence[Path], written: Sequence[
     earlier = [path for path in targets if path not in written and os.path.lexists(path) and not path.is_dir()]
     if real_path(scene_source(command.scene)).parent == real_path(command.output):
         edited = command.edits != SceneEdits() or command.layer != "all"
-        earlier = [path for path in earlier if edited and path.name in BESIDE_SPLATS]
+        earlier = [path for path in earlier if edited and path.name in SIDECAR_FILES]
     for path in earlier:
         path.unlink()
     if earlier:
-        say(console, f"removed {join_names([path.name for path in earlier], len(earlier))} of the earlier run")
+        print_line(console, f"removed {join_names([path.name for path in earlier], len(earlier))} of the earlier run")
 
 
-def _chosen(command: Export, model: models.Model) -> models.Model:
+def _exported_model(command: Export, model: models.Model) -> models.Model:
     """The model, or its transmission as plain Gaussians without reflections."""
     if command.layer == "all":
         return model
@@ -279,23 +283,25 @@ def _write_page(command: Export, model: models.Model, console: Console) -> list[
     """Writes the page, and its preview if it has an address; returns the written files."""
     path = command.output / "index.html"
     if not fits(model.scene):
-        warn(console, f"a page holds {MOST_GAUSSIANS:,} Gaussians: this one shows those that cover the largest areas")
+        print_warning(
+            console, f"a page holds {MOST_GAUSSIANS:,} Gaussians: this one shows those that cover the largest areas"
+        )
     title, credit = readable_name(command.title or model.name), command.credit and readable_name(command.credit)
     models.save_page(model, path, title, sharing=Sharing(credit, command.url))
     written = [path]
     if command.url is not None:
         write_preview(command.output / PREVIEW, model.scene, model.renderer, tuple(model.cameras.items()))
         written.append(command.output / PREVIEW)
-    say(console, f"{path.stat().st_size / 1e6:.2f} MB, open it in a browser -> {path}")
+    print_line(console, f"{path.stat().st_size / 1e6:.2f} MB, open it in a browser -> {path}")
     return written
 
 
-def _write_beside(command: Export, scene: Scene, console: Console) -> list[Path]:
+def _write_sidecars(command: Export, scene: Scene, console: Console) -> list[Path]:
     """Writes planes, glass and environment, if present; returns the written files."""
     written = models.write_companion_files(command.output, scene)
     if len(scene.planes):
         panes = count_noun(len(scene.planes), "pane")
-        say(console, f"{panes} -> {command.output / models.PLANES}, their shape -> {models.GLASS}")
+        print_line(console, f"{panes} -> {command.output / models.PLANES}, their shape -> {models.GLASS}")
     if not scene.environment.is_empty:
-        say(console, f"its environment -> {command.output / models.ENVIRONMENT}, {models.PANORAMA}")
+        print_line(console, f"its environment -> {command.output / models.ENVIRONMENT}, {models.PANORAMA}")
     return written

@@ -117,7 +117,7 @@ NAME = re.compile(r"the traceback is in (\S+\.log)\. Please report it")
 
 def ended(work: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> int:
     """The exit code of a command that does this."""
-    monkeypatch.setattr(Evaluate, "ready", lambda self: None)
+    monkeypatch.setattr(Evaluate, "set_up", lambda self: None)
     monkeypatch.setattr(Evaluate, "run", lambda self, console: work())
     return main(["eval", "run"])
 
@@ -179,7 +179,7 @@ def test_a_report_that_fails_itself_is_one_line(
     def no_memory(error: BaseException) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("glassplat.cli.console.ending", no_memory)
+    monkeypatch.setattr("glassplat.cli.console.classify_error", no_memory)
     assert ended(raising(KeyError("x")), monkeypatch) == 1
     assert capsys.readouterr().err == "stopped: out of memory\n"
 
@@ -198,13 +198,13 @@ def test_a_library_that_cannot_be_loaded_is_one_line_too(
 
 def test_the_errors_known_by_name_are_those_of_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     # Known by name, so that they need no import; a class that is renamed would be taken for unforeseen.
-    from glassplat.cli.console import BAD_INPUT as BAD
-    from glassplat.cli.console import FAILURES as FAILED
-    from glassplat.cli.console import GPU_IS_FULL
+    from glassplat.cli.console import BAD_INPUT_ERRORS as BAD
+    from glassplat.cli.console import EXPECTED_FAILURES as FAILED
+    from glassplat.cli.console import GPU_OUT_OF_MEMORY
 
     kinds = (PlaneFitError, CudaUnavailableError, TrainingDivergedError)
     assert [*BAD, *FAILED] == [f"{kind.__module__}.{kind.__qualname__}" for kind in kinds]
-    assert hasattr(torch, GPU_IS_FULL[0].rpartition(".")[2])
+    assert hasattr(torch, GPU_OUT_OF_MEMORY[0].rpartition(".")[2])
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from glassplat.cli.console import message_console
-from glassplat.cli.evaluation import notes, plane_text, print_results
+from glassplat.cli.evaluation import plane_text, print_results, result_notes
 from glassplat.evaluate.evaluate import SCENE_COLORS
 
 NO_WEIGHTS = "no LPIPS weights in [folder]; get vgg.pth"
@@ -50,12 +50,12 @@ def test_numbers_have_their_units_and_a_dash_has_its_reason(capsys: pytest.Captu
 
 
 def test_several_runs_say_whose_number_is_missing(capsys: pytest.CaptureFixture[str]) -> None:
-    assert notes(PLANAR, SPLAT)[0] == f"planar: no lpips: {NO_WEIGHTS}"
+    assert result_notes(PLANAR, SPLAT)[0] == f"planar: no lpips: {NO_WEIGHTS}"
     said = shown(capsys, PLANAR, SPLAT)
     assert "31.23 dB" in said and "29.00 dB" in said
-    assert notes(SPLAT) == []
+    assert result_notes(SPLAT) == []
     aligned = SPLAT | {"test_cameras": "aligned with their photographs", "test_exposures": SCENE_COLORS}
-    assert notes(aligned) == ["cameras of test views: aligned with their photographs"]
+    assert result_notes(aligned) == ["cameras of test views: aligned with their photographs"]
 
 
 def test_the_errors_of_a_pane_say_of_what_they_are() -> None:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import pytest
 from rich.console import Console
 
-from glassplat.cli.console import LINE, import_now
+from glassplat.cli.console import LOADING_LINE, import_pytorch_module
 
 MODULE = "glassplat.cli.progress"
 
@@ -33,13 +33,13 @@ def shown(console: Console) -> str:
 def test_a_terminal_shows_a_line_that_is_gone_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, MODULE, raising=False)
     console = standard_error(monkeypatch, terminal())
-    assert import_now(MODULE).__name__ == MODULE
-    assert shown(console) == f"{LINE}\r\x1b[2K"
+    assert import_pytorch_module(MODULE).__name__ == MODULE
+    assert shown(console) == f"{LOADING_LINE}\r\x1b[2K"
 
 
 def test_what_is_there_is_not_announced(monkeypatch: pytest.MonkeyPatch) -> None:
     console = standard_error(monkeypatch, terminal())
-    assert import_now("glassplat.cli.console").LINE is LINE
+    assert import_pytorch_module("glassplat.cli.console").LINE is LOADING_LINE
     assert shown(console) == ""
 
 
@@ -49,14 +49,14 @@ def test_a_file_or_a_terminal_that_erases_nothing_gets_no_such_line(
 ) -> None:
     monkeypatch.delitem(sys.modules, MODULE, raising=False)
     console = standard_error(monkeypatch, make())
-    import_now(MODULE)
+    import_pytorch_module(MODULE)
     assert shown(console) == ""
 
 
 def test_the_line_is_gone_before_an_error_is_printed(monkeypatch: pytest.MonkeyPatch) -> None:
     console = standard_error(monkeypatch, terminal())
     with pytest.raises(ModuleNotFoundError):
-        import_now("glassplat.no_such_module")
+        import_pytorch_module("glassplat.no_such_module")
     assert shown(console).endswith("\x1b[2K")
 
 
@@ -67,5 +67,5 @@ def test_garbage_is_collected_afterwards_as_before(enabled: bool, monkeypatch: p
     for name in ("disable", "freeze", "enable"):
         monkeypatch.setattr(gc, name, lambda name=name: asked.append(name))
     with pytest.raises(ModuleNotFoundError):
-        import_now("glassplat.no_such_module")
+        import_pytorch_module("glassplat.no_such_module")
     assert asked == (["disable", "freeze", "enable"] if enabled else [])

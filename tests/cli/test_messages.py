@@ -10,7 +10,15 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from glassplat.cli.console import complain, heard_by, message_console, printable, say, shell_word, warn
+from glassplat.cli.console import (
+    message_console,
+    print_error,
+    print_line,
+    print_log_records,
+    print_warning,
+    printable,
+    shell_word,
+)
 
 AWKWARD = [
     "/data/[bold]/run",
@@ -30,10 +38,10 @@ AWKWARD = [
 
 @pytest.mark.parametrize("text", AWKWARD)
 def test_names_are_shown_as_they_are(text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    complain("error", text)
+    print_error("error", text)
     assert capsys.readouterr().err == f"error: {text}\n"
-    warn(message_console(), text)
-    say(message_console(), text)
+    print_warning(message_console(), text)
+    print_line(message_console(), text)
     message_console().print(text)
     assert capsys.readouterr().out == f"warning: {text}\n{text}\n{text}\n"
 
@@ -41,7 +49,7 @@ def test_names_are_shown_as_they_are(text: str, capsys: pytest.CaptureFixture[st
 @pytest.mark.parametrize("text", AWKWARD)
 def test_a_console_that_reads_markup_shows_them_too(text: str) -> None:
     file = io.StringIO()
-    say(Console(file=file), text)
+    print_line(Console(file=file), text)
     assert file.getvalue() == f"{text}\n"
 
 
@@ -57,14 +65,14 @@ def test_a_console_that_reads_markup_shows_them_too(text: str) -> None:
 )
 def test_what_no_terminal_should_get_is_written_out(text: str, shown: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert printable(text) == shown
-    complain("stopped", text)
+    print_error("stopped", text)
     assert "".join(capsys.readouterr().err.split()) == "".join(f"stopped: {shown}".split())
 
 
 def test_a_terminal_breaks_lines_itself() -> None:
     terminal = Console(file=io.StringIO(), force_terminal=True, color_system=None, width=20)
     command = "next: glassplat train planar --data /a/rather/long/path --output somewhere"
-    say(terminal, command)
+    print_line(terminal, command)
     assert terminal.file.getvalue() == command + "\n"
 
 
@@ -86,7 +94,7 @@ def test_what_is_logged_and_warned_of_is_a_line_each(
     monkeypatch.setattr(logging.getLogger(), "handlers", [])
     monkeypatch.setattr(logging.getLogger(), "level", logging.WARNING)
     package, library = logging.getLogger("glassplat.kernels"), logging.getLogger("somebody.else")
-    with heard_by(message_console()):
+    with print_log_records(message_console()):
         package.info("compiling [bold] for %s", "this :x: machine")
         package.warning("cannot keep [/x]")
         library.info("chatter")
@@ -106,7 +114,7 @@ def test_a_command_says_the_same_line_once(monkeypatch: pytest.MonkeyPatch, caps
     monkeypatch.setattr(logging.getLogger(), "handlers", [])
     panes = logging.getLogger("glassplat.panes")
     for _ in range(2):
-        with heard_by(message_console()):
+        with print_log_records(message_console()):
             panes.warning("pane %d: may be off", 1)
             panes.warning("pane %d: may be off", 2)
             panes.warning("pane %d: may be off", 1)

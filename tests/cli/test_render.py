@@ -106,7 +106,7 @@ def test_a_log_is_told_how_far_it_is(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(progress, "PAUSE", 0)
+    monkeypatch.setattr(progress, "LINE_INTERVAL", 0)
     name, *options = command.split()
     run = write_run(tmp_path / "run")
     assert main([name, str(run), "--output", str(tmp_path / "out"), *options]) == 0

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from glassplat.cli.console import Interrupted, held_signals, raised_signals
+from glassplat.cli.console import Interrupted, defer_signals, raise_on_signals
 from glassplat.cli.main import main
 from glassplat.cli.scene import Dereflect, Evaluate, Render
 from glassplat.cli.train import SCENE, Demo, Train
@@ -60,8 +60,8 @@ def ended(script: str) -> tuple[int, str, str]:
 
 def test_signals_that_are_held_are_answered_afterwards() -> None:
     done: list[str] = []
-    with raised_signals() as raised, pytest.raises(Interrupted, match="terminated"):
-        with held_signals():
+    with raise_on_signals() as raised, pytest.raises(Interrupted, match="terminated"):
+        with defer_signals():
             os.kill(os.getpid(), signal.SIGTERM)
             time.sleep(0.01)
             done.append("what must not break off")
@@ -120,7 +120,7 @@ def test_a_signal_while_running_says_what_is_left_and_removes_what_is_half_writt
             time.sleep(10)
 
     before = [signal.getsignal(getattr(signal, name)) for name in CODES]
-    monkeypatch.setattr(Evaluate, "ready", lambda self: None)
+    monkeypatch.setattr(Evaluate, "set_up", lambda self: None)
     monkeypatch.setattr(Evaluate, "run", work)
     assert main(["eval", "my_run"]) == CODES[number]
     said = capsys.readouterr().err
@@ -139,7 +139,7 @@ def test_an_interrupt_that_a_library_disguises_is_still_an_interrupt(
         except KeyboardInterrupt as stop:
             raise ImportError("Cannot import the C++ backend") from stop
 
-    monkeypatch.setattr(Evaluate, "ready", lambda self: None)
+    monkeypatch.setattr(Evaluate, "set_up", lambda self: None)
     monkeypatch.setattr(Evaluate, "run", work)
     assert main(["eval", "my_run"]) == 130
     assert capsys.readouterr().err.startswith("interrupted; ")
@@ -152,7 +152,7 @@ def test_a_signal_that_is_ignored_stays_ignored(monkeypatch: pytest.MonkeyPatch)
             os.kill(os.getpid(), getattr(signal, name))
         time.sleep(0.01)
 
-    monkeypatch.setattr(Evaluate, "ready", lambda self: None)
+    monkeypatch.setattr(Evaluate, "set_up", lambda self: None)
     monkeypatch.setattr(Evaluate, "run", work)
     before = {name: signal.signal(getattr(signal, name), signal.SIG_IGN) for name in ("SIGHUP", "SIGINT")}
     try:
@@ -164,7 +164,7 @@ def test_a_signal_that_is_ignored_stays_ignored(monkeypatch: pytest.MonkeyPatch)
 
 def test_a_command_can_run_in_another_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     codes: list[int] = []
-    monkeypatch.setattr(Evaluate, "ready", lambda self: None)
+    monkeypatch.setattr(Evaluate, "set_up", lambda self: None)
     monkeypatch.setattr(Evaluate, "run", lambda self, console: None)
     worker = threading.Thread(target=lambda: codes.append(main(["eval", "my_run"])))
     worker.start()
@@ -182,11 +182,11 @@ def test_each_command_says_what_it_leaves_behind(tmp_path: Path) -> None:
         Dereflect(run, output),
         Demo(output),
     ]
-    said = [command.left_behind() for command in commands]
+    said = [command.interrupt_message() for command in commands]
     assert all("repeat the command" in text for text in said)
     assert [str(run) in text or str(output) in text for text in said] == [False, True, True, True, True]
     assert "no checkpoint was written yet" in said[0] and "--resume" not in said[0]
     run.mkdir()
     train_checkpoint = run / "checkpoint.safetensors"
     train_checkpoint.write_bytes(b"")
-    assert "--resume" in train.left_behind()
+    assert "--resume" in train.interrupt_message()

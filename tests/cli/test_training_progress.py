@@ -14,8 +14,8 @@ from rich.console import Console
 
 from glassplat.cli import progress as training_progress
 from glassplat.cli.main import main
-from glassplat.cli.progress import FIRST_PAUSE, LONGEST_PAUSE, Plan, TrainingProgress, in_words
-from glassplat.cli.runs import STEP_COSTS, plan_of
+from glassplat.cli.progress import FIRST_INTERVAL, LONGEST_INTERVAL, Plan, TrainingProgress, format_duration
+from glassplat.cli.runs import STEP_COSTS, training_plan
 from glassplat.cli.train import SCENE, Train
 from glassplat.methods.recipe import RECIPES, recipe_of
 from glassplat.training.messages import (
@@ -61,9 +61,9 @@ def test_lines_come_soon_at_first_and_then_every_few_seconds() -> None:
     lines = lines_of([step(number) for number in range(1, 101)], 0.5)
     shown = [int(line.split()[1]) for line in lines if line.startswith("step")]
     pauses = [0.5 * (later - earlier) for earlier, later in pairwise(shown)]
-    assert shown[0] == 1 + FIRST_PAUSE / 0.5
-    assert pauses == [2.0, 4.0, 8.0, *[LONGEST_PAUSE] * 3]
-    left = in_words((1000 - shown[-1]) / 2)
+    assert shown[0] == 1 + FIRST_INTERVAL / 0.5
+    assert pauses == [2.0, 4.0, 8.0, *[LONGEST_INTERVAL] * 3]
+    left = format_duration((1000 - shown[-1]) / 2)
     assert lines[-1] == f"step {shown[-1]} of 1000: loss 0.2500, 1020 Gaussians, {left} left"
 
 
@@ -76,7 +76,7 @@ def test_a_terminal_that_redraws_nothing_gets_the_lines_of_a_file() -> None:
 def test_the_time_left_is_that_of_this_session_and_its_last_minute() -> None:
     lines = lines_of([RunBegun(899, 1000), *(step(number) for number in range(900, 1000))], 6.0)
     assert lines[0] == "continuing from step 899 of 1000"
-    assert lines[-1].endswith(f"{in_words(6 * (1000 - int(lines[-1].split()[1])))} left")
+    assert lines[-1].endswith(f"{format_duration(6 * (1000 - int(lines[-1].split()[1])))} left")
 
 
 def test_work_before_the_first_step_of_a_resumed_run_is_at_its_step() -> None:
@@ -94,7 +94,7 @@ def test_how_long_a_run_takes_is_said_once_and_counts_the_dearer_steps_to_come()
     plan = Plan((250, 1000), (1.0, 9.0), "shorter with an NVIDIA GPU")
     steps = [step(number) for number in range(1, 31)]
     forecasts = [line for line in lines_of(steps, 1.0, plan) if line.startswith("about")]
-    left = in_words(250 - 11 + 9 * 750)
+    left = format_duration(250 - 11 + 9 * 750)
     assert forecasts == [
         f"about {left} for 989 steps (1.00 s a step, about 9.00 s from step 250 on); shorter with an NVIDIA GPU"
     ]
@@ -109,8 +109,12 @@ def test_a_short_run_needs_no_advice() -> None:
 
 def test_the_time_left_of_a_cheap_stage_counts_what_the_next_one_costs() -> None:
     plan = Plan((250, 1000), (1.0, 9.0))
-    assert lines_of([step(number) for number in range(1, 31)], 1.0, plan)[-1].endswith(f"{in_words(224 + 6750)} left")
-    assert lines_of([step(number) for number in range(900, 931)], 9.0, plan)[-1].endswith(f"{in_words(9 * 70)} left")
+    assert lines_of([step(number) for number in range(1, 31)], 1.0, plan)[-1].endswith(
+        f"{format_duration(224 + 6750)} left"
+    )
+    assert lines_of([step(number) for number in range(900, 931)], 9.0, plan)[-1].endswith(
+        f"{format_duration(9 * 70)} left"
+    )
 
 
 def left_after(work: list[Message], seconds: float) -> str:
@@ -145,7 +149,7 @@ def test_what_recurs_between_steps_is_part_of_the_speed() -> None:
 @pytest.mark.parametrize("method", RECIPES)
 def test_every_method_has_a_plan(method: str, tmp_path: Path) -> None:
     run = Train(recipe_of(method), tmp_path, tmp_path / "run", 30_000, device="cpu")
-    plan = plan_of(run)
+    plan = training_plan(run)
     assert plan.iterations == 30_000
     assert max(plan.costs) == STEP_COSTS.get(method.title(), 1.0)
     assert "--downscale 2, a quarter of the pixels, or --iterations 7000" in plan.shortcuts
@@ -231,8 +235,8 @@ def test_a_closed_terminal_does_not_hide_why_a_run_ends() -> None:
 def test_a_training_into_a_file_says_how_it_goes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(training_progress, "FIRST_PAUSE", 0.0)
-    monkeypatch.setattr(training_progress, "LONGEST_PAUSE", 0.0)
+    monkeypatch.setattr(training_progress, "FIRST_INTERVAL", 0.0)
+    monkeypatch.setattr(training_progress, "LONGEST_INTERVAL", 0.0)
     capture = write_tiny_capture(tmp_path / "capture")
     options = ["--data", str(capture), "--output", str(tmp_path / "run"), "--iterations", "20"]
     assert main(["train", "splat", *options, "--checkpoint-every", "1e-9"]) == 0
@@ -250,4 +254,4 @@ def test_the_distance_of_checkpoints_is_positive(
 
 
 def test_durations_in_words() -> None:
-    assert (in_words(20), in_words(90), in_words(5400)) == ("20 s", "2 min", "1 h 30 min")
+    assert (format_duration(20), format_duration(90), format_duration(5400)) == ("20 s", "2 min", "1 h 30 min")

@@ -14,7 +14,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from glassplat.cli.console import described_os_error
+from glassplat.cli.console import describe_os_error
 from glassplat.files import sidecars
 from glassplat.files.sidecars import open_tensors, system_error, write_equirect, write_tensors
 
@@ -43,7 +43,7 @@ def no_file_beyond(size: int) -> Iterator[None]:
 def test_a_full_disk_is_known_by_its_number_whoever_says_so(said: str, number: int | None) -> None:
     error = system_error(said)
     assert (error.errno, error.filename) == (number, None) and said in str(error)
-    assert described_os_error(error).endswith("free some space, then repeat the command") == (number is not None)
+    assert describe_os_error(error).endswith("free some space, then repeat the command") == (number is not None)
 
 
 @pytest.mark.parametrize("name", ["a.safetensors", "a.exr"])

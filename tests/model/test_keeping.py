@@ -13,7 +13,7 @@ import glassplat
 from glassplat.access import is_local
 from glassplat.cli.main import main
 from glassplat.cli.scene import View
-from glassplat.cli.serving import writer_for
+from glassplat.cli.serving import make_writer
 from glassplat.errors import InputError
 from glassplat.files.sidecars import read_cameras
 from glassplat.model.watching import FolderWriter
@@ -73,10 +73,10 @@ def test_no_name_leads_out_of_the_folder(name: str, tmp_path: Path) -> None:
 def test_who_looks_from_another_machine_saves_nothing_unless_a_folder_is_named(tmp_path: Path) -> None:
     here = View(tmp_path / "scene")
     elsewhere = replace(here, host="0.0.0.0")
-    assert is_local(here.host) and writer_for(here, model()) is not None
-    assert writer_for(elsewhere, model()) is None
-    assert writer_for(replace(elsewhere, host="192.168.1.2"), model()) is None
-    assert writer_for(replace(elsewhere, output=tmp_path), model()) is not None
+    assert is_local(here.host) and make_writer(here, model()) is not None
+    assert make_writer(elsewhere, model()) is None
+    assert make_writer(replace(elsewhere, host="192.168.1.2"), model()) is None
+    assert make_writer(replace(elsewhere, output=tmp_path), model()) is not None
 
 
 def test_keyframes_are_what_a_film_is_made_of(tmp_path: Path) -> None:

@@ -188,7 +188,7 @@ def test_of_several_ranks_the_first_one_is_watched(rank: int, monkeypatch: pytes
     monkeypatch.setattr(watching, "WatchedTraining", lambda *given, **options: begun.append(True) or watched)
     asked: Any = SimpleNamespace(view=True)
     nothing: Any = None
-    with runs._viewer_listeners(asked, nothing, nothing, Console()):
+    with runs._viewer_listener(asked, nothing, nothing, Console()):
         pass
     assert begun == ([True, False] if rank == 0 else [])
 
