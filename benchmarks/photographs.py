@@ -24,8 +24,8 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from glassplat.captures.dataset import load_dataset, photographs_read
-from glassplat.captures.view import Memory, PointCloud, Source, Spool, View
+from glassplat.captures.dataset import load_dataset, read_photographs_in_background
+from glassplat.captures.view import DiskCache, PixelCache, PixelSource, PointCloud, View
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.training.loop import train
 from glassplat.training.messages import StepDone
@@ -36,12 +36,12 @@ POINTS = 5_000
 """Few, so that a step is as short as it may be."""
 
 
-class Waited(Memory):
+class Waited(PixelCache):
     """A memory that adds up the seconds for which training has waited; other threads may wait."""
 
     seconds = 0.0
 
-    def get(self, source: Source) -> Tensor:
+    def get(self, source: PixelSource) -> Tensor:
         """The pixels, as ever."""
         begun = time.perf_counter()
         found = super().get(source)
@@ -75,8 +75,8 @@ def write_capture(photographs: list[Path], count: int, distortion: float, folder
 
 def read_seconds(views: tuple[View, ...], folder: Path) -> tuple[float, float]:
     """Seconds of a core for a photograph: from its file, and from where undistorted and reduced ones are kept."""
-    spool, begun = Spool(folder), time.thread_time()
-    pixels = [(Source(view.read_photo), view.read_photo()) for view in views]
+    spool, begun = DiskCache(folder), time.thread_time()
+    pixels = [(PixelSource(view.read_photo), view.read_photo()) for view in views]
     read = time.thread_time()
     for source, photo in pixels:
         spool.put(source, photo)
@@ -101,7 +101,7 @@ def measure(folder: Path, memory: float, downscale: float, seconds: float) -> No
     state = TrainState(recipe.initialise(dataset), seed=0)
     begun, told = time.perf_counter(), 0
     first: tuple[int, float, float, float] | None = None
-    with known.spool_to(folder), photographs_read(dataset) as check:
+    with known.cache_on_disk(folder), read_photographs_in_background(dataset) as check:
         for message in train(recipe.stages(0), dataset, state, 1_000_000):
             check()
             if not isinstance(message, StepDone):

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from glassplat.captures.transforms import points_in_box
-from glassplat.captures.view import FOLDER
+from glassplat.captures.view import NORMALS_FOLDER
 from glassplat.files.ply_table import write_table
 from tools.estimated_normals import estimated_normals
 from tools.scene_draws import MATTE, Body, DrawnScene, draw_scene
@@ -315,7 +315,7 @@ def write_estimate(studio: Studio, pose: Array, stem: Path, error_deg: float, se
     in_camera = seen[..., :3] @ pose[:3, :3]
     normals = estimated_normals(in_camera, seen[..., 3], error_deg, np.random.default_rng(seed))
     encoded = np.concatenate([(normals + 1) / 2, normals.any(axis=-1, keepdims=True)], axis=-1)
-    folder = stem.parent / FOLDER
+    folder = stem.parent / NORMALS_FOLDER
     folder.mkdir(exist_ok=True)
     Image.fromarray(as_bytes(encoded)).save(folder / f"{stem.name}.png", optimize=True)
 

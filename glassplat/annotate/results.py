@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from glassplat.annotate.document import MarkedPane, depths, fill_polygon, seen_outline, with_strokes
 from glassplat.annotate.fit import PaneFit
-from glassplat.captures.dataset import Dataset, dataset_of
+from glassplat.captures.dataset import Dataset, make_dataset
 from glassplat.captures.files import read_poses, with_masks
 from glassplat.captures.masks import PANE_FOLDER, PLANES, mask_paths
 from glassplat.captures.view import PhotoFile, View
@@ -188,7 +188,7 @@ def capture_to_mark(root: Path) -> Dataset:
             f"the panes of {root} are marked by masks that were not made by `glassplat annotate`, and the two "
             "kinds cannot be mixed: train with these masks, or move them away and mark the panes here"
         )
-    return dataset_of(files)
+    return make_dataset(files)
 
 
 def earlier_masks(root: Path) -> set[str]:

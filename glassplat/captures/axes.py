@@ -75,8 +75,8 @@ def axes_evidence(views: Sequence[View], measured: Tensor | None) -> AxesEvidenc
 
 def evidence_of_points(cameras: Sequence[Camera], points: Tensor) -> AxesEvidence:
     """Evaluates the axes by measured points [P, 3], each of which was visible to some camera."""
-    some_cameras = [_double(camera) for camera in _spread(cameras, MOST_CAMERAS)]
-    some_points = points[_indices(len(points), MOST_POINTS)].double()
+    some_cameras = [_to_float64(camera) for camera in _sample_evenly(cameras, MOST_CAMERAS)]
+    some_points = points[_even_indices(len(points), MOST_POINTS)].double()
     return AxesEvidence(
         _share_of_points(some_cameras, some_points),
         _share_of_points([flip_axes(camera) for camera in some_cameras], some_points),
@@ -90,7 +90,7 @@ def evidence_of_masks(views: Sequence[View]) -> AxesEvidence | None:
     None if the views are inconclusive: no pane is visible in three of them, or the rays are parallel. At most 24 views
     are read.
     """
-    annotated = _spread([view for view in views if view.is_annotated], MOST_MASKS)
+    annotated = _sample_evenly([view for view in views if view.is_annotated], MOST_MASKS)
     shares = [
         (len(sightings), _share_of_masks(sightings), _share_of_masks([_flip_sighting(s) for s in sightings]))
         for sightings in _sightings(annotated).values()
@@ -113,17 +113,17 @@ def flip_axes(camera: Camera) -> Camera:
     return replace(camera, cam_from_world=turn @ camera.cam_from_world)
 
 
-def _double(camera: Camera) -> Camera:
+def _to_float64(camera: Camera) -> Camera:
     return replace(camera, cam_from_world=camera.cam_from_world.double())
 
 
-def _indices(count: int, most: int) -> Tensor:
+def _even_indices(count: int, most: int) -> Tensor:
     """Up to `most` evenly spread indices below `count`."""
     return torch.linspace(0, count - 1, min(count, most), dtype=torch.float32).round().long()
 
 
-def _spread(items: Sequence[Item], most: int) -> list[Item]:
-    return [items[int(index)] for index in _indices(len(items), most)]
+def _sample_evenly(items: Sequence[Item], most: int) -> list[Item]:
+    return [items[int(index)] for index in _even_indices(len(items), most)]
 
 
 def _share_of_points(cameras: Sequence[Camera], points: Tensor) -> float:
@@ -144,7 +144,7 @@ def _sightings(views: Sequence[View]) -> dict[int, list[_Sighting]]:
         for label in torch.unique(labels[labels > 0]).tolist():
             pixels = torch.nonzero(labels == label).flip(1).double() + 0.5
             box = torch.stack([pixels.amin(dim=0), pixels.amax(dim=0)])
-            found.setdefault(label, []).append(_Sighting(_double(view.camera), pixels.mean(dim=0), box))
+            found.setdefault(label, []).append(_Sighting(_to_float64(view.camera), pixels.mean(dim=0), box))
     return found
 
 
@@ -154,7 +154,7 @@ def _flip_sighting(sighting: _Sighting) -> _Sighting:
 
 def _share_of_masks(sightings: Sequence[_Sighting]) -> float | None:
     """Share of the views whose mask contains the pane's centre, in front of the camera; None if no rays cross."""
-    middle = _meeting_point(sightings)
+    middle = _intersect_rays(sightings)
     if middle is None:
         return None
     hits = 0
@@ -165,7 +165,7 @@ def _share_of_masks(sightings: Sequence[_Sighting]) -> float | None:
     return hits / len(sightings)
 
 
-def _meeting_point(sightings: Sequence[_Sighting]) -> Tensor | None:
+def _intersect_rays(sightings: Sequence[_Sighting]) -> Tensor | None:
     """[3] the least-squares intersection of the lines through the mask centres; it may lie behind the cameras."""
     projectors, targets = [], []
     for camera, middle, _ in sightings:

@@ -64,12 +64,12 @@ class ParameterCounts(NamedTuple):
 
     focal: int
     extra: int
-    middle: int = 2
+    principal_point: int = 2
 
     @property
     def total(self) -> int:
         """Number of all parameters."""
-        return self.focal + self.middle + self.extra
+        return self.focal + self.principal_point + self.extra
 
 
 PARAMETER_COUNTS = {
@@ -90,7 +90,7 @@ PARAMETER_COUNTS = {
     "SIMPLE_FISHEYE": ParameterCounts(1, 0),
     "FISHEYE": ParameterCounts(2, 0),
     "EUCM": ParameterCounts(2, 2),
-    "EQUIRECTANGULAR": ParameterCounts(0, 2, middle=0),
+    "EQUIRECTANGULAR": ParameterCounts(0, 2, principal_point=0),
 }
 """COLMAP's camera models, in the order of their ids in binary files."""
 MODEL_OF_ID = dict(enumerate(PARAMETER_COUNTS))
@@ -149,7 +149,7 @@ class Lens:
             scaled[0] *= (scale_x + scale_y) / 2
         elif counts.focal == 2:
             scaled[:2] = scaled[0] * scale_x, scaled[1] * scale_y
-        if counts.middle:
+        if counts.principal_point:
             middle = slice(counts.focal, counts.focal + 2)
             scaled[middle] = scaled[middle][0] * scale_x, scaled[middle][1] * scale_y
         return Lens(self.model, tuple(scaled), width, height)
@@ -178,27 +178,27 @@ class PixelMap:
     width: int
     height: int
 
-    def photo(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def map_photo(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Maps [H, W, 3] of the file to [height, width, 3]: bilinear undistortion, then area averaging."""
         if self.lens is not None:
             pixels = undistort(pixels, self.lens.as_colmap())
         return area_resize(pixels, self.width, self.height)
 
-    def labels(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def map_labels(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Maps [H, W] at the photograph's size to [height, width] by the nearest pixel; labels are not blended."""
         if self.lens is not None:
             labels = undistort(labels, self.lens.as_colmap(), "NEAREST_NEIGHBOR")
         return nearest_resize(labels, self.width, self.height)
 
-    def ignored(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def map_ignored(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Maps [H, W] at the photograph's size to [height, width]; 1 where any averaged pixel has a label."""
         if self.lens is not None:
             labels = undistort(labels, self.lens.as_colmap(), "NEAREST_NEIGHBOR")
         return self.reduce_labels(labels)
 
-    def blank(self) -> NDArray[np.uint8]:
+    def blank_mask(self) -> NDArray[np.uint8]:
         """[height, width], 1 where any averaged pixel lies outside the distorted photograph."""
-        return _blank_in(self)
+        return _cached_blank_mask(self)
 
     def reduce_labels(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Maps [H, W] at the undistorted size to [height, width]; 1 where any averaged pixel has a label."""
@@ -247,7 +247,7 @@ def _check_parameters(lens: Lens) -> None:
     longer, counts = max(size), PARAMETER_COUNTS[lens.model]
     bounds = [
         *[(SHORTEST_FOCAL * longer, LONGEST_FOCAL * longer)] * counts.focal,
-        *[(-FARTHEST_CENTER * longer, FARTHEST_CENTER * longer)] * counts.middle,
+        *[(-FARTHEST_CENTER * longer, FARTHEST_CENTER * longer)] * counts.principal_point,
         *[(-LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)] * counts.extra,
     ]
     for value, (least, most) in zip(lens.parameters, bounds, strict=True):
@@ -322,8 +322,8 @@ def blank_share(lens: Lens) -> float:
 
 
 @lru_cache(maxsize=8)
-def _blank_in(pixel_map: PixelMap) -> NDArray[np.uint8]:
-    """Cached `PixelMap.blank`: as slow as undistorting a photograph, and the same for all photographs of a lens."""
+def _cached_blank_mask(pixel_map: PixelMap) -> NDArray[np.uint8]:
+    """Cached `PixelMap.blank_mask`: as slow as undistorting a photograph, and the same for all of a lens."""
     shape = (pixel_map.height, pixel_map.width)
     return pixel_map.reduce_labels(blank_pixels(pixel_map.lens)) if pixel_map.lens else np.zeros(shape, np.uint8)
 
@@ -337,7 +337,7 @@ def _is_pinhole(model: str, parameters: tuple[float, ...]) -> bool:
     if model in PINHOLES:
         return True
     counts = PARAMETER_COUNTS[model]
-    return model in PERSPECTIVE and not any(parameters[counts.focal + counts.middle :])
+    return model in PERSPECTIVE and not any(parameters[counts.focal + counts.principal_point :])
 
 
 def undistort(pixels: NDArray[np.uint8], lens: Any, interpolation: Interpolation = "BILINEAR") -> NDArray[np.uint8]:

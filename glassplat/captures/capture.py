@@ -75,8 +75,8 @@ class Capture:
         warnings: full sentences.
         random_points: generator of points if `points` is None; None uses the default.
         masks: pane masks by name of the photograph if the format specifies them; None finds them by file name.
-        kept: masks whose black pixels are ignored, by name of the photograph, if the format names them.
-        cut_out: transparent pixels of photographs are ignored; otherwise they show a background.
+        keep_masks: masks whose black pixels are ignored, by name of the photograph, if the format names them.
+        ignores_transparent: transparent pixels of photographs are ignored; otherwise they show a background.
     """
 
     shots: tuple[Shot, ...]
@@ -86,8 +86,8 @@ class Capture:
     warnings: tuple[str, ...] = ()
     random_points: Callable[[], RawPoints] | None = None
     masks: Mapping[str, Path] | None = None
-    kept: Mapping[str, Path] | None = None
-    cut_out: bool = False
+    keep_masks: Mapping[str, Path] | None = None
+    ignores_transparent: bool = False
 
 
 Loader = Callable[[Path], Capture | None]

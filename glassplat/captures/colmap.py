@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from glassplat.captures.cameras import MODEL_OF_ID, PARAMETER_COUNTS, Lens, make_lens
 from glassplat.captures.capture import Capture, RawPoints, Shot
-from glassplat.captures.transforms import TRAIN, WHOLE
+from glassplat.captures.transforms import SINGLE_FILE, TRAIN_FILE
 from glassplat.errors import InputError, convert_to_input_error, join_names
 from glassplat.files.images import files_below
 from glassplat.files.records import wrap_read_errors
@@ -46,7 +46,7 @@ class ModelImage:
 
 
 @dataclass(frozen=True)
-class Model:
+class SparseModel:
     """A sparse reconstruction; `lenses` are keyed by camera id."""
 
     lenses: dict[int, Lens]
@@ -62,21 +62,21 @@ def model_suffix(folder: Path) -> str | None:
     return None
 
 
-def read_model(folder: Path) -> Model:
+def read_model(folder: Path) -> SparseModel:
     """Read cameras, images and points; points may be in the other format (binary or text), or missing."""
     suffix = model_suffix(folder)
     if suffix is None:
         raise InputError(f"no COLMAP model in {folder}; expected cameras and images as .bin or .txt")
-    lenses = _by_id(_records_of(folder / f"cameras{suffix}"), folder / f"cameras{suffix}")
-    images = tuple(_records_of(folder / f"images{suffix}"))
+    lenses = _by_id(_read_records(folder / f"cameras{suffix}"), folder / f"cameras{suffix}")
+    images = tuple(_read_records(folder / f"images{suffix}"))
     if not images:
         raise InputError(f"{folder / f'images{suffix}'} registers no photograph; expected a finished reconstruction")
     candidates = [folder / f"points3D{kind}" for kind in (suffix, ".bin", ".txt")]
     points_path = next(filter(lexists, candidates), candidates[0])
-    rows = _records_of(points_path) if lexists(points_path) else []
+    rows = _read_records(points_path) if lexists(points_path) else []
     table = np.array(rows, dtype=np.float64).reshape(-1, 6)
     with convert_to_input_error(points_path):
-        return Model(lenses, images, RawPoints.from_arrays(table[:, :3], table[:, 3:]))
+        return SparseModel(lenses, images, RawPoints.from_arrays(table[:, :3], table[:, 3:]))
 
 
 def pose_matrix(image: ModelImage) -> NDArray[np.float64]:
@@ -102,13 +102,13 @@ def _by_id(records: list[tuple[int, Any]], path: Path) -> dict[int, Any]:
     return found
 
 
-def _records_of(path: Path) -> list[Any]:
+def _read_records(path: Path) -> list[Any]:
     """All records in one file of a model; errors name the file."""
     binary, text = PARSERS[path.stem]
     try:
         with wrap_read_errors(path):
             if path.suffix == ".bin":
-                return list(binary(_Bytes(path.read_bytes())))
+                return list(binary(_ByteReader(path.read_bytes())))
             with path.open(encoding="utf-8-sig") as stream:
                 return list(text(stream))
     except FileNotFoundError as error:
@@ -125,7 +125,7 @@ def _records_of(path: Path) -> list[Any]:
         raise InputError(f"{path} is cut off or damaged ({error}); export the COLMAP model again") from error
 
 
-class _Bytes:
+class _ByteReader:
     """A cursor over a binary file."""
 
     def __init__(self, data: bytes) -> None:
@@ -150,7 +150,7 @@ class _Bytes:
         return self.data[start:end].decode()
 
 
-def _binary_cameras(data: _Bytes) -> Iterator[tuple[int, Lens]]:
+def _binary_cameras(data: _ByteReader) -> Iterator[tuple[int, Lens]]:
     (count,) = data.take("Q")
     for _ in range(count):
         camera_id, model_id, width, height = data.take("IiQQ")
@@ -161,7 +161,7 @@ def _binary_cameras(data: _Bytes) -> Iterator[tuple[int, Lens]]:
         yield camera_id, make_lens(model, list(parameters), (width, height))
 
 
-def _binary_images(data: _Bytes) -> Iterator[ModelImage]:
+def _binary_images(data: _ByteReader) -> Iterator[ModelImage]:
     (count,) = data.take("Q")
     for _ in range(count):
         values = data.take("I7dI")
@@ -171,7 +171,7 @@ def _binary_images(data: _Bytes) -> Iterator[ModelImage]:
         yield ModelImage(name, values[8], values[1:5], values[5:8])
 
 
-def _binary_points(data: _Bytes) -> Iterator[tuple[float, ...]]:
+def _binary_points(data: _ByteReader) -> Iterator[tuple[float, ...]]:
     (count,) = data.take("Q")
     for _ in range(count):
         values = data.take("Q3d3BdQ")
@@ -179,13 +179,13 @@ def _binary_points(data: _Bytes) -> Iterator[tuple[float, ...]]:
         yield values[1:7]
 
 
-def _records(stream: Iterator[str]) -> Iterator[str]:
+def _record_lines(stream: Iterator[str]) -> Iterator[str]:
     """Lines that are neither empty nor comments."""
     stripped = (line.strip() for line in stream)
     return (line for line in stripped if line and not line.startswith("#"))
 
 
-def _at_least(count: int, fields: list[str]) -> list[str]:
+def _require_fields(count: int, fields: list[str]) -> list[str]:
     """The fields of a line; checks their minimum number."""
     if len(fields) < count:
         line = " ".join(fields)
@@ -194,14 +194,14 @@ def _at_least(count: int, fields: list[str]) -> list[str]:
 
 
 def _text_cameras(stream: Iterator[str]) -> Iterator[tuple[int, Lens]]:
-    for line in _records(stream):
-        camera_id, model, width, height, *parameters = _at_least(4, line.split())
+    for line in _record_lines(stream):
+        camera_id, model, width, height, *parameters = _require_fields(4, line.split())
         yield int(camera_id), make_lens(model, [float(value) for value in parameters], (int(width), int(height)))
 
 
 def _text_images(stream: Iterator[str]) -> Iterator[ModelImage]:
-    for line in _records(stream):
-        fields = _at_least(10, line.split(maxsplit=9))
+    for line in _record_lines(stream):
+        fields = _require_fields(10, line.split(maxsplit=9))
         numbers = tuple(float(value) for value in fields[1:8])
         name = fields[9]
         _check_observations(next(stream, ""), name)
@@ -221,19 +221,19 @@ def _check_observations(line: str, name: str) -> None:
 
 
 def _text_points(stream: Iterator[str]) -> Iterator[tuple[float, ...]]:
-    for line in _records(stream):
-        _, x, y, z, red, green, blue = _at_least(7, line.split(maxsplit=7))[:7]
+    for line in _record_lines(stream):
+        _, x, y, z, red, green, blue = _require_fields(7, line.split(maxsplit=7))[:7]
         yield (float(x), float(y), float(z), float(int(red)), float(int(green)), float(int(blue)))
 
 
-PARSERS: dict[str, tuple[Callable[[_Bytes], Iterator[Any]], Callable[[Iterator[str]], Iterator[Any]]]] = {
+PARSERS: dict[str, tuple[Callable[[_ByteReader], Iterator[Any]], Callable[[Iterator[str]], Iterator[Any]]]] = {
     "cameras": (_binary_cameras, _text_cameras),
     "images": (_binary_images, _text_images),
     "points3D": (_binary_points, _text_points),
 }
 
 MODEL_FOLDERS = ("sparse/0", "sparse", ".")
-LOOKED_FOR = "a COLMAP model (cameras and images as .bin or .txt in sparse/0, sparse or the folder itself)"
+FORMAT_DESCRIPTION = "a COLMAP model (cameras and images as .bin or .txt in sparse/0, sparse or the folder itself)"
 
 
 def load_colmap(root: Path) -> Capture | None:
@@ -248,12 +248,12 @@ def load_colmap(root: Path) -> Capture | None:
         test_shots=None,
         points=model.points if len(model.points) else None,
         format_name="COLMAP",
-        warnings=(*_other_models(root, folder), *_unread_frames(root)),
-        cut_out=True,
+        warnings=(*_other_models_warning(root, folder), *_transforms_warning(root)),
+        ignores_transparent=True,
     )
 
 
-def _shots(root: Path, model: Model) -> tuple[Shot, ...]:
+def _shots(root: Path, model: SparseModel) -> tuple[Shot, ...]:
     """All registered images; the error for missing photographs counts them."""
     images = root / "images"
     if not images.is_dir():
@@ -284,7 +284,7 @@ def _names_on_disk(images: Path, names: list[str]) -> list[str]:
     return [name if isfile(images / name) else spelled.get(normalize("NFC", name), name) for name in names]
 
 
-def _other_models(root: Path, used: Path) -> tuple[str, ...]:
+def _other_models_warning(root: Path, used: Path) -> tuple[str, ...]:
     """Warning of further models: COLMAP splits what it cannot connect, and only one can be trained at a time."""
     sparse = root / "sparse"
     others = (
@@ -297,9 +297,9 @@ def _other_models(root: Path, used: Path) -> tuple[str, ...]:
     return (f"{used} is used; there are more models in {sparse} ({join_names(others)}), which are ignored.",)
 
 
-def _unread_frames(root: Path) -> tuple[str, ...]:
+def _transforms_warning(root: Path) -> tuple[str, ...]:
     """Warning if there is also a `transforms.json`, which may define another split."""
-    unread = [name for name in (WHOLE, TRAIN) if (root / name).is_file()]
+    unread = [name for name in (SINGLE_FILE, TRAIN_FILE) if (root / name).is_file()]
     if not unread:
         return ()
     return (

@@ -18,18 +18,18 @@ from glassplat.captures.axes import axes_evidence
 from glassplat.captures.cameras import blank_share
 from glassplat.captures.capture import Capture, Shot
 from glassplat.captures.files import CaptureFiles, read_capture
-from glassplat.captures.masks import IGNORE_FOLDER, MASK_FOLDER, PLANES, CutOut, Polarity, left_out_share
+from glassplat.captures.masks import IGNORE_FOLDER, MASK_FOLDER, PLANES, AlphaMask, Polarity, ignored_share
 from glassplat.captures.transforms import points_in_view
 from glassplat.captures.view import (
     GIGABYTE,
-    Memory,
+    PixelCache,
     PointCloud,
     PreparedView,
     View,
     ViewOptions,
-    evenly,
     normals_paths,
     prepare_view,
+    sample_evenly,
 )
 from glassplat.errors import InputError, convert_to_input_error, join_names
 from glassplat.files.images import is_transparent
@@ -44,7 +44,7 @@ SAMPLES = 9
 """Sample points along each side of a rectangle, for testing its visibility in the photographs."""
 
 
-def given_planes(root: Path, cameras: Sequence[Camera]) -> Planes | None:
+def read_capture_planes(root: Path, cameras: Sequence[Camera]) -> Planes | None:
     """The pane rectangles that a capture provides, in its own frame; None if there are none.
 
     Args:
@@ -57,8 +57,8 @@ def given_planes(root: Path, cameras: Sequence[Camera]) -> Planes | None:
     with convert_to_input_error():
         planes = read_planes(path)
     for row, label in enumerate(planes.labels):
-        places = rectangle_points(planes.select([row]))
-        if not any(_shows(camera, places) for camera in cameras):
+        points = rectangle_points(planes.select([row]))
+        if not any(_shows_any(camera, points) for camera in cameras):
             raise InputError(
                 f"no photograph shows pane {label} of {path}; expected a rectangle in the capture's own frame: mark it "
                 "again, or remove it from the file"
@@ -75,8 +75,8 @@ def rectangle_points(plane: Planes) -> torch.Tensor:
     return plane.centers[0] + u.reshape(-1, 1) * half_u * tangent + v.reshape(-1, 1) * half_v * bitangent
 
 
-def _shows(camera: Camera, places: torch.Tensor) -> bool:
-    pixels, depth = camera.project(places)
+def _shows_any(camera: Camera, points: torch.Tensor) -> bool:
+    pixels, depth = camera.project(points)
     size = pixels.new_tensor([camera.width, camera.height])
     return bool(((pixels >= 0).all(dim=1) & (pixels < size).all(dim=1) & (depth > 0)).any())
 
@@ -86,7 +86,7 @@ __all__ = ["Dataset", "PointCloud", "View", "load_dataset"]
 TEST_EVERY = 8
 EXTENT_MARGIN = 1.1
 FARTHEST_ORIGIN = 1e4
-SAME_PLACE = 1e-6
+SAME_POSITION = 1e-6
 """Share of the cameras' distance from the origin below which distances between them are rounding."""
 NERFSTUDIO_POINTS = "colmap/sparse/0/points3D.bin"
 """Path of the COLMAP model from which nerfstudio takes its poses."""
@@ -94,7 +94,7 @@ MUCH_BLANK = 0.01
 """Share of an undistorted photograph outside the field of view of its lens, above which a warning is given."""
 FEW_MASKS = 4
 """Photographs whose masks are decoded while a capture is loaded."""
-MUCH_LEFT_OUT = 0.7
+MUCH_IGNORED = 0.7
 """Ignored share of the photographs above which a warning is given."""
 LEAST_RADIUS = 1e-9
 """Smallest radius of the cameras, world units; the square of a smaller one is lost in float32."""
@@ -137,7 +137,7 @@ class Dataset:
     mask_polarity: Polarity = "auto"
 
     @property
-    def memory(self) -> Memory:
+    def memory(self) -> PixelCache:
         """Cache of the pixels of its views."""
         return self.train[0].memory
 
@@ -181,7 +181,7 @@ def load_dataset(
     """
     check_downscale(downscale)
     files = read_capture(root, mask_polarity=mask_polarity)
-    return dataset_of(files, downscale=downscale, background=background, memory=memory)
+    return make_dataset(files, downscale=downscale, background=background, memory=memory)
 
 
 def check_dataset(dataset: Dataset) -> None:
@@ -196,7 +196,7 @@ def check_downscale(downscale: float) -> None:
         raise InputError(f"downscale is {downscale}; expected a number of at least 1")
 
 
-def dataset_of(
+def make_dataset(
     files: CaptureFiles, *, downscale: float = 1.0, background: Rgb = WHITE, memory: float | None = None
 ) -> Dataset:
     """Make a `Dataset`, as `load_dataset` does, from a capture that `read_capture` read."""
@@ -204,22 +204,22 @@ def dataset_of(
     root, capture, shots, masks = files.root, files.capture, files.shots, files.masks
     with convert_to_input_error():
         transparent = any(is_transparent(shot.image_path) for shot in shots)
-    cut_out = transparent and capture.cut_out
-    shown = background if transparent and not cut_out else None
-    options = ViewOptions(downscale, None if cut_out else background)
+    ignores_transparent = transparent and capture.ignores_transparent
+    shown = background if transparent and not ignores_transparent else None
+    options = ViewOptions(downscale, None if ignores_transparent else background)
     normals = normals_paths({shot.name: shot.image_path for shot in shots})
     prepared = [
         prepare_view(
             shot,
             masks.masks.get(shot.name),
             options,
-            ignored=(*files.ignored.get(shot.name, ()), *([CutOut(shot.image_path)] if cut_out else ())),
+            ignored=(*files.ignored.get(shot.name, ()), *([AlphaMask(shot.image_path)] if ignores_transparent else ())),
             normals=normals.get(shot.name),
         )
         for shot in shots
     ]
-    train, test, split = _split_views(_in_one_memory([p.view for p in prepared], memory), capture)
-    points, point_warnings = _points(root, capture, train)
+    train, test, split = _split_views(_share_cache([p.view for p in prepared], memory), capture)
+    points, point_warnings = _points_and_warnings(root, capture, train)
     extent = _extent(train)
     measured = capture.points is not None
     _check_axes(train, points if measured else None, capture.format_name)
@@ -229,9 +229,9 @@ def dataset_of(
         *_view_warnings(prepared, shown),
         *_blank_warnings(shots),
         *_mask_warnings(files),
-        *(["Transparent pixels of the photographs are ignored."] if cut_out else ()),
+        *(["Transparent pixels of the photographs are ignored."] if ignores_transparent else ()),
         *point_warnings,
-        *_far_off(train, extent),
+        *_far_origin_warnings(train, extent),
     )
     truth = root / "gt"
     return Dataset(
@@ -246,16 +246,16 @@ def dataset_of(
         split=split,
         measured_points=measured,
         background=shown,
-        planes=given_planes(root, [view.camera for view in train]),
+        planes=read_capture_planes(root, [view.camera for view in train]),
         downscale=downscale,
         mask_polarity=files.mask_polarity,
     )
 
 
-def _in_one_memory(views: list[View], gigabytes: float | None) -> list[View]:
+def _share_cache(views: list[View], gigabytes: float | None) -> list[View]:
     """The views with one shared memory of the given budget; by default a share of the machine's memory."""
     largest = max((view.camera.width * view.camera.height for view in views), default=0)
-    shared = Memory(None if gigabytes is None else gigabytes * GIGABYTE, largest=largest)
+    shared = PixelCache(None if gigabytes is None else gigabytes * GIGABYTE, largest=largest)
     return [replace(view, memory=shared) for view in views]
 
 
@@ -293,12 +293,12 @@ def _extent(train: tuple[View, ...]) -> float:
     """1.1 x the largest distance of a training camera from their mean; world units."""
     centers = torch.stack([view.camera.center.double() for view in train])
     radius = float((centers - centers.mean(0)).norm(dim=1).max())
-    if radius <= max(SAME_PLACE * float(centers.norm(dim=1).max()), LEAST_RADIUS):
+    if radius <= max(SAME_POSITION * float(centers.norm(dim=1).max()), LEAST_RADIUS):
         raise InputError("all training cameras are at one point; expected photographs from different positions")
     return EXTENT_MARGIN * radius
 
 
-def _far_off(train: tuple[View, ...], extent: float) -> tuple[str, ...]:
+def _far_origin_warnings(train: tuple[View, ...], extent: float) -> tuple[str, ...]:
     """Warning if coordinates are too large for float32 to resolve the scene."""
     distance = float(train[0].camera.center.norm())
     if distance <= FARTHEST_ORIGIN * extent:
@@ -307,12 +307,12 @@ def _far_off(train: tuple[View, ...], extent: float) -> tuple[str, ...]:
     return (f"The cameras are {ratio:.0f} scene extents away from the origin; shift the capture to keep precision.",)
 
 
-def _points(root: Path, capture: Capture, train: tuple[View, ...]) -> tuple[PointCloud, list[str]]:
+def _points_and_warnings(root: Path, capture: Capture, train: tuple[View, ...]) -> tuple[PointCloud, list[str]]:
     """The capture's points, or random ones with a warning."""
     if capture.points is None:
         make = capture.random_points or (lambda: points_in_view([view.camera for view in train]))
         points = PointCloud.of(make())
-        unread = _unread_points(root / NERFSTUDIO_POINTS)
+        unread = _unread_points_advice(root / NERFSTUDIO_POINTS)
         return points, [
             f"The {capture.format_name} capture has no points; {len(points)} random points are used instead.{unread}"
         ]
@@ -327,7 +327,7 @@ def _points(root: Path, capture: Capture, train: tuple[View, ...]) -> tuple[Poin
     return kept, [f"{int((~usable).sum())} points are ignored: non-finite, or beyond {LARGEST_COORDINATE:g}."]
 
 
-def _unread_points(path: Path) -> str:
+def _unread_points_advice(path: Path) -> str:
     """Advice on the points of the COLMAP model in a nerfstudio capture; empty if there is no such model."""
     if not path.is_file():
         return ""
@@ -365,13 +365,13 @@ def _blank_warnings(shots: Sequence[Shot]) -> list[str]:
 
 def _mask_warnings(files: CaptureFiles) -> list[str]:
     """Warning if masks exclude most of the photographs; decodes only a few masks."""
-    names = evenly(sorted(files.ignored), FEW_MASKS)
-    shares = [left_out_share(files.ignored[name]) for name in names]
+    names = sample_evenly(sorted(files.ignored), FEW_MASKS)
+    shares = [ignored_share(files.ignored[name]) for name in names]
     share = sum(shares) / max(len(shares), 1) * len(files.ignored) / len(files.shots)
-    if share <= MUCH_LEFT_OUT:
+    if share <= MUCH_IGNORED:
         return []
     meaning = f"black in {MASK_FOLDER}/ is ignored, and white in {IGNORE_FOLDER}/; are the masks inverted?"
-    if all(shot.name in files.ignored and left_out_share(files.ignored[shot.name]) == 1 for shot in files.shots):
+    if all(shot.name in files.ignored and ignored_share(files.ignored[shot.name]) == 1 for shot in files.shots):
         raise InputError(f"masks exclude all pixels of all photographs of {files.root}: {meaning}")
     return [f"Masks exclude about {share:.0%} of the photographs: {meaning}"]
 
@@ -402,7 +402,7 @@ def detached_camera(camera: Camera) -> Camera:
 
 
 @contextmanager
-def photographs_read(dataset: Dataset) -> Iterator[Callable[[], None]]:
+def read_photographs_in_background(dataset: Dataset) -> Iterator[Callable[[], None]]:
     """Read photographs in a background thread while the context lasts, one after the other.
 
     Test photographs come first, to find unreadable ones before training ends, and are not kept. Training photographs
@@ -413,7 +413,7 @@ def photographs_read(dataset: Dataset) -> Iterator[Callable[[], None]]:
     """
     stop = Event()
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="photographs") as pool:
-        reading = pool.submit(_read_photographs, dataset, stop)
+        reading = pool.submit(_read_all_photographs, dataset, stop)
 
         def check() -> None:
             if reading.done():
@@ -425,7 +425,7 @@ def photographs_read(dataset: Dataset) -> Iterator[Callable[[], None]]:
             stop.set()
 
 
-def _read_photographs(dataset: Dataset, stop: Event) -> None:
+def _read_all_photographs(dataset: Dataset, stop: Event) -> None:
     for view in dataset.test:
         if stop.is_set():
             return

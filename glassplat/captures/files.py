@@ -17,9 +17,9 @@ from glassplat.files.records import is_encodable, readable_name
 from glassplat.files.writing import check_capture_folder
 
 LOADERS: tuple[tuple[Loader, str], ...] = (
-    (colmap.load_colmap, colmap.LOOKED_FOR),
-    (mirror_nerf.load_mirror_nerf, mirror_nerf.LOOKED_FOR),
-    (transforms.load_transforms, transforms.LOOKED_FOR),
+    (colmap.load_colmap, colmap.FORMAT_DESCRIPTION),
+    (mirror_nerf.load_mirror_nerf, mirror_nerf.FORMAT_DESCRIPTION),
+    (transforms.load_transforms, transforms.FORMAT_DESCRIPTION),
 )
 """Loaders in the order of trial, each with a description of its format for the message when none fits."""
 
@@ -80,7 +80,7 @@ def with_masks(files: CaptureFiles, mask_polarity: Polarity = "auto") -> Capture
     """Add the masks to a capture whose poses were read."""
     photographs = {shot.name: shot.image_path for shot in files.shots}
     capture = files.capture
-    found = find_masks(files.root, photographs, mask_polarity, panes=capture.masks, kept=capture.kept)
+    found = find_masks(files.root, photographs, mask_polarity, panes=capture.masks, keep_masks=capture.keep_masks)
     return replace(files, masks=found.panes, ignored=found.ignored, mask_polarity=mask_polarity)
 
 

@@ -74,11 +74,11 @@ def _read_shades(path: Path) -> NDArray[np.uint8]:
     """[H, W] grey values, or palette indices of labels shown in colours; transparency takes precedence."""
     image = _open_mask(path)
     if image.mode in images.GREY_MODES_16:
-        return _in_eight_bits(np.array(image), path)
+        return _to_eight_bits(np.array(image), path)
     if image.mode in ("1", "L", "LA"):
         return np.array(image.convert("L"))
     colors = np.array(image.convert("RGB"))
-    return _palette_shades(np.array(image), colors, path) if image.mode == "P" else _one_colour(colors, path)
+    return _palette_shades(np.array(image), colors, path) if image.mode == "P" else _single_colour_shades(colors, path)
 
 
 def _open_mask(path: Path) -> Image.Image:
@@ -90,7 +90,7 @@ def _open_mask(path: Path) -> Image.Image:
     return image if opaque is None else Image.fromarray(np.where(opaque < THRESHOLD, 0, WHITE).astype(np.uint8))
 
 
-def _in_eight_bits(values: NDArray[np.integer], path: Path) -> NDArray[np.uint8]:
+def _to_eight_bits(values: NDArray[np.integer], path: Path) -> NDArray[np.uint8]:
     """Labels unchanged, and sixteen-bit greys converted to eight bits."""
     most = int(values.max())
     if most <= WHITE:
@@ -119,7 +119,7 @@ def _palette_shades(indices: NDArray[np.uint8], colors: NDArray[np.uint8], path:
     return indices
 
 
-def _one_colour(pixels: NDArray[np.uint8], path: Path) -> NDArray[np.uint8]:
+def _single_colour_shades(pixels: NDArray[np.uint8], path: Path) -> NDArray[np.uint8]:
     """Grey values of an RGB mask: black against one colour."""
     bright = (pixels >= THRESHOLD).view(np.uint8)
     mixtures = bright[..., 0] << 2 | bright[..., 1] << 1 | bright[..., 2]  # As bytes: wider integers take gigabytes.
@@ -145,7 +145,7 @@ def _check_black_and_white(counts: NDArray[np.int64], path: Path, lossy: bool) -
 
 PANE_FOLDER, MASK_FOLDER, IGNORE_FOLDER = "panes", "masks", "ignore"
 PLANES = "planes.json"
-MASK_MARK = "_mask"
+MASK_SUFFIX = "_mask"
 FRAMED_BY_PANE = 0.8
 MOSTLY_PANE = 0.5
 
@@ -198,7 +198,7 @@ class KeepMask:
 
 
 @dataclass(frozen=True)
-class CutOut:
+class AlphaMask:
     """A photograph whose transparent pixels (opacity below one half) are ignored.
 
     Attributes:
@@ -216,11 +216,11 @@ class CutOut:
         )
 
 
-IgnoredMask = CutOut | KeepMask | PaneMask
+IgnoredMask = AlphaMask | KeepMask | PaneMask
 """A mask whose `labels()` are above zero on pixels to ignore."""
 
 
-def left_out_share(masks: Sequence[IgnoredMask]) -> float:
+def ignored_share(masks: Sequence[IgnoredMask]) -> float:
     """Largest share of a photograph that any one of its masks excludes."""
     return max(float((mask.labels() > 0).mean()) for mask in masks)
 
@@ -244,7 +244,7 @@ def find_masks(
     polarity: Polarity = "auto",
     *,
     panes: Mapping[str, Path] | None = None,
-    kept: Mapping[str, Path] | None = None,
+    keep_masks: Mapping[str, Path] | None = None,
 ) -> CaptureMasks:
     """Find and interpret the masks of a capture.
 
@@ -259,46 +259,48 @@ def find_masks(
         photographs: path of every photograph by name.
         polarity: which value of binary masks marks the pane.
         panes: pane masks specified by the format, white on the pane; `masks/` then holds pane masks only.
-        kept: masks of pixels to keep named by the format; they take precedence over those found by name.
+        keep_masks: masks of pixels to keep named by the format; they take precedence over those found by name.
     """
     ignored = find_ignored(root, photographs)
     if panes is not None:
         # The format assigns files to photographs, and thresholds greys at one half.
-        known = _understood(root, panes, "bright" if polarity == "auto" else polarity, read_mask_at_threshold)
-        return CaptureMasks(known, _join_masks(kept or {}, ignored))
-    paths = _match(root / PANE_FOLDER, photographs)
+        known = _interpret_masks(root, panes, "bright" if polarity == "auto" else polarity, read_mask_at_threshold)
+        return CaptureMasks(known, _join_masks(keep_masks or {}, ignored))
+    paths = _match_masks(root / PANE_FOLDER, photographs)
     if not paths and (root / PANE_FOLDER).is_dir():
         raise InputError(f"{root / PANE_FOLDER} holds no mask images; add masks, or remove the folder")
-    masks, warnings = _found_masks(root, photographs, {normpath(path) for path in (kept or {}).values()})
-    earlier = _why_panes(root, masks, marked=bool(paths))
+    masks, warnings = _find_keep_masks(root, photographs, {normpath(path) for path in (keep_masks or {}).values()})
+    earlier = _pane_masks_reason(root, masks, marked=bool(paths))
     if earlier is not None:
-        found = _understood(root, masks, polarity, read_mask_values)
+        found = _interpret_masks(root, masks, polarity, read_mask_values)
         renaming = f"{earlier} {next(iter(masks.values())).parent} is read as panes; rename it to {PANE_FOLDER}/."
         warnings = (renaming, *warnings)
-        return CaptureMasks(replace(found, warnings=(*warnings, *found.warnings)), _join_masks(kept or {}, ignored))
-    found = _understood(root, paths, polarity, read_mask_values) if paths else MaskSet({})
+        return CaptureMasks(
+            replace(found, warnings=(*warnings, *found.warnings)), _join_masks(keep_masks or {}, ignored)
+        )
+    found = _interpret_masks(root, paths, polarity, read_mask_values) if paths else MaskSet({})
     return CaptureMasks(
-        replace(found, warnings=(*found.warnings, *warnings)), _join_masks({**masks, **(kept or {})}, ignored)
+        replace(found, warnings=(*found.warnings, *warnings)), _join_masks({**masks, **(keep_masks or {})}, ignored)
     )
 
 
-def _found_masks(
+def _find_keep_masks(
     root: Path, photographs: Mapping[str, Path], named: Set[str]
 ) -> tuple[dict[str, Path], tuple[str, ...]]:
     """Masks in `masks/` and next to photographs, except those named by the format; a warning on unmatched ones."""
     unmatched: list[str] = []
-    masks = _match(root / MASK_FOLDER, photographs, beside=_beside, unmatched=unmatched, named=named)
+    masks = _match_masks(root / MASK_FOLDER, photographs, siblings=_sibling_masks, unmatched=unmatched, named=named)
     if not unmatched:
         if not (masks or named) and (root / MASK_FOLDER).is_dir():
             raise InputError(f"{root / MASK_FOLDER} holds no mask images; add masks, or remove the folder")
         return masks, ()
     if not (masks or named):
-        raise InputError(_no_photograph(root / MASK_FOLDER, unmatched, photographs))
+        raise InputError(_unmatched_message(root / MASK_FOLDER, unmatched, photographs))
     belong = "1 mask belongs" if len(unmatched) == 1 else f"{len(unmatched)} masks belong"
     return masks, (f"{belong} to no photograph ({join_names(sorted(unmatched))}).",)
 
 
-def _why_panes(root: Path, masks: Mapping[str, Path], *, marked: bool) -> str | None:
+def _pane_masks_reason(root: Path, masks: Mapping[str, Path], *, marked: bool) -> str | None:
     """Sentence on why masks in `masks/` are treated as pane masks; None if they are not."""
     highest = next((value for value in map(_highest_value, masks.values()) if value), 0)
     labels = 0 < highest <= HIGHEST_LABEL
@@ -328,13 +330,13 @@ def _brightness(path: Path) -> NDArray[np.uint8]:
     """[H, W] brightness of a mask, or its thresholded opacity if it has transparent pixels."""
     image = _open_mask(path)
     if image.mode in images.GREY_MODES_16:
-        return _in_eight_bits(np.array(image), path)
+        return _to_eight_bits(np.array(image), path)
     return np.array(image.convert("RGB")).max(axis=2)
 
 
-def _join_masks(kept: Mapping[str, Path], ignored: Mapping[str, PaneMask]) -> dict[str, tuple[IgnoredMask, ...]]:
+def _join_masks(keep_masks: Mapping[str, Path], ignored: Mapping[str, PaneMask]) -> dict[str, tuple[IgnoredMask, ...]]:
     """All masks of ignored pixels, by name of the photograph."""
-    joined: dict[str, tuple[IgnoredMask, ...]] = {name: (KeepMask(path),) for name, path in kept.items()}
+    joined: dict[str, tuple[IgnoredMask, ...]] = {name: (KeepMask(path),) for name, path in keep_masks.items()}
     for name, mask in ignored.items():
         joined[name] = (*joined.get(name, ()), mask)
     return joined
@@ -349,13 +351,15 @@ def find_ignored(root: Path, photographs: Mapping[str, Path]) -> Mapping[str, Pa
         root: the capture's folder.
         photographs: path of every photograph by name.
     """
-    found = {name: PaneMask(path, inverted=False) for name, path in _match(root / IGNORE_FOLDER, photographs).items()}
+    found = {
+        name: PaneMask(path, inverted=False) for name, path in _match_masks(root / IGNORE_FOLDER, photographs).items()
+    }
     for mask in found.values():
         mask.labels()
     return found
 
 
-def _understood(
+def _interpret_masks(
     root: Path, paths: Mapping[str, Path], polarity: Polarity, read: Callable[[Path], MaskValues]
 ) -> MaskSet:
     """Read all masks once, to decide kind, polarity and labels from the whole set."""
@@ -363,7 +367,7 @@ def _understood(
     _check_same_kind(values, paths)
     inverted, warnings = _decide_polarity(list(values.values()), polarity)
     masks = {name: PaneMask(path, inverted, read) for name, path in paths.items()}
-    found = {name: _present(_labels(mask_values, inverted)) for name, mask_values in values.items()}
+    found = {name: _present_labels(_labels(mask_values, inverted)) for name, mask_values in values.items()}
     labels = sorted(set().union(*found.values()))
     if not labels:
         raise InputError(
@@ -380,16 +384,16 @@ def _labels(values: MaskValues, inverted: bool) -> NDArray[np.uint8]:
     return (values.pixels == 0).astype(np.uint8) if inverted else values.pixels
 
 
-def _present(labels: NDArray[np.uint8]) -> set[int]:
+def _present_labels(labels: NDArray[np.uint8]) -> set[int]:
     """The labels above zero that are present."""
     return {int(label) for label in np.flatnonzero(np.bincount(labels.ravel())) if label > 0}
 
 
-def _match(
+def _match_masks(
     folder: Path,
     photographs: Mapping[str, Path],
     *,
-    beside: Callable[[Path], list[Path]] = lambda path: [],
+    siblings: Callable[[Path], list[Path]] = lambda path: [],
     unmatched: list[str] | None = None,
     named: Set[str] = frozenset(),
 ) -> dict[str, Path]:
@@ -399,7 +403,7 @@ def _match(
     """
     found: dict[str, list[Path]] = defaultdict(list)
     keys = _owners_by_key(photographs if folder.is_dir() else ())
-    strangers: list[str] = []
+    without_photograph: list[str] = []
     for path in _image_files(folder, keys[0]):
         if normpath(path) in named:
             continue
@@ -412,21 +416,21 @@ def _match(
         if owners:
             found[owners[0]].append(path)
         else:
-            strangers.append(path.relative_to(folder).as_posix())
-    if strangers and unmatched is None:
-        raise InputError(_no_photograph(folder, strangers, photographs))
+            without_photograph.append(path.relative_to(folder).as_posix())
+    if without_photograph and unmatched is None:
+        raise InputError(_unmatched_message(folder, without_photograph, photographs))
     if unmatched is not None:
-        unmatched.extend(strangers)
+        unmatched.extend(without_photograph)
     taken = {*named, *(normpath(path) for path in photographs.values())}
     for name, path in photographs.items():
-        found[name].extend(mask for mask in beside(path) if normpath(mask) not in taken)
+        found[name].extend(mask for mask in siblings(path) if normpath(mask) not in taken)
     for name, several in found.items():
         if len(several) > 1:
             raise InputError(f"{name} has {len(several)} masks: {join_names([str(p) for p in several])}; keep one")
     return {name: found[name][0] for name in sorted(found) if found[name]}
 
 
-def _no_photograph(folder: Path, unmatched: list[str], photographs: Mapping[str, Path]) -> str:
+def _unmatched_message(folder: Path, unmatched: list[str], photographs: Mapping[str, Path]) -> str:
     """Message about masks that belong to no photograph."""
     return (
         f"{len(unmatched)} masks in {folder} match no photograph: {join_names(sorted(unmatched))}; name a mask "
@@ -451,9 +455,9 @@ def _image_files(folder: Path, hidden: Container[str]) -> Iterator[Path]:
         yield path
 
 
-def _beside(photograph: Path) -> list[Path]:
+def _sibling_masks(photograph: Path) -> list[Path]:
     """Masks in the photograph's own folder."""
-    candidates = (photograph.with_name(f"{photograph.stem}{MASK_MARK}{suffix}") for suffix in images.IMAGE_SUFFIXES)
+    candidates = (photograph.with_name(f"{photograph.stem}{MASK_SUFFIX}{suffix}") for suffix in images.IMAGE_SUFFIXES)
     return [path for path in candidates if path.is_file()]
 
 
@@ -488,7 +492,7 @@ def _owners(relative: Path, keys: tuple[Owners, Owners, Owners]) -> list[str]:
     plain = relative.with_suffix("").as_posix()
     if plain in unique:
         return unique[plain]
-    spellings = relative.as_posix(), plain, plain.removesuffix(MASK_MARK)
+    spellings = relative.as_posix(), plain, plain.removesuffix(MASK_SUFFIX)
     return next((owners[key] for owners in others for key in spellings if key in owners), [])
 
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from glassplat.captures.axes import AxesEvidence
     from glassplat.captures.view import View
 
-LOOKED_FOR = f"a Mirror-NeRF scene ({transforms.TRAIN} and {MASK_FOLDER}/)"
+FORMAT_DESCRIPTION = f"a Mirror-NeRF scene ({transforms.TRAIN_FILE} and {MASK_FOLDER}/)"
 SYNTHETIC_MASK = "MirrorMask_"
 SAME_SIZE = 0.1
 """Relative deviation up to which twice the principal point counts as the size of the photograph."""
@@ -50,9 +50,9 @@ def load_mirror_nerf(root: Path) -> Capture | None:
     """
     if not _is_mirror_nerf(root):
         return None
-    settings = transforms.read_settings(root / transforms.TRAIN)
-    train = _shots(root, settings, transforms.TRAIN)
-    test_file = next((name for name in (transforms.TEST, transforms.VAL) if (root / name).is_file()), None)
+    settings = transforms.read_settings(root / transforms.TRAIN_FILE)
+    train = _shots(root, settings, transforms.TRAIN_FILE)
+    test_file = next((name for name in (transforms.TEST_FILE, transforms.VAL_FILE) if (root / name).is_file()), None)
     test = _shots(root, transforms.read_settings(root / test_file), test_file) if test_file else None
     tested = {shot.name for shot in test or ()}
     kept = tuple(shot for shot in train if shot.name not in tested)
@@ -64,28 +64,28 @@ def load_mirror_nerf(root: Path) -> Capture | None:
     masks = _masks(root, (*kept, *(test or ())))
     points = transforms.read_points(root, settings)
     capture = Capture(kept, test, points, "Mirror-NeRF", tuple(warnings), masks=masks)
-    return _with_fitting_axes(capture, _evidence(kept, masks, points))
+    return _correct_axes(capture, _axes_evidence(kept, masks, points))
 
 
 def _is_mirror_nerf(root: Path) -> bool:
     masks = root / MASK_FOLDER
-    if not (root / transforms.TRAIN).is_file() or not masks.is_dir():
+    if not (root / transforms.TRAIN_FILE).is_file() or not masks.is_dir():
         return False
     if next(masks.glob(f"{SYNTHETIC_MASK}*"), None) is not None:
         return True
     if (root / PANE_FOLDER).is_dir():
         return False
-    settings = transforms.read_settings(root / transforms.TRAIN)
+    settings = transforms.read_settings(root / transforms.TRAIN_FILE)
     return "fx" in settings or "intrinsics" in settings["frames"][0]
 
 
 def _shots(root: Path, settings: transforms.Settings, file_name: str) -> tuple[Shot, ...]:
     """The photographs of one split, with the intrinsics under the keys of `transforms.json`."""
-    frames = [_plain_frame(root, settings, frame) for frame in settings["frames"]]
-    return tuple(transforms.shots_of(root, {**settings, "frames": frames}, file_name).values())
+    frames = [_normalise_frame(root, settings, frame) for frame in settings["frames"]]
+    return tuple(transforms.make_shots(root, {**settings, "frames": frames}, file_name).values())
 
 
-def _plain_frame(root: Path, settings: transforms.Settings, frame: transforms.Settings) -> dict[str, Any]:
+def _normalise_frame(root: Path, settings: transforms.Settings, frame: transforms.Settings) -> dict[str, Any]:
     """One frame with the actual path of its photograph, and `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h` in its pixels."""
     path = transforms.image_path(root, frame)
     in_images = root / "images" / path.name
@@ -95,7 +95,7 @@ def _plain_frame(root: Path, settings: transforms.Settings, frame: transforms.Se
     intrinsics = _intrinsics({**settings, **frame}, path.name)
     if intrinsics is None or not path.is_file():
         return dict(frame)
-    return {**frame, **_in_pixels_of(path, intrinsics)}
+    return {**frame, **_scale_intrinsics(path, intrinsics)}
 
 
 def _intrinsics(settings: transforms.Settings, name: str) -> tuple[float, float, float, float] | None:
@@ -115,7 +115,7 @@ def _intrinsics(settings: transforms.Settings, name: str) -> tuple[float, float,
     return None
 
 
-def _in_pixels_of(path: Path, intrinsics: tuple[float, float, float, float]) -> dict[str, float]:
+def _scale_intrinsics(path: Path, intrinsics: tuple[float, float, float, float]) -> dict[str, float]:
     """Intrinsics in the pixels of a photograph that may have been reduced after calibration.
 
     The size at calibration is not stored. The principal point lies near the centre, so twice its position estimates
@@ -158,7 +158,7 @@ def _mask_names(photograph: Path) -> list[str]:
     return [photograph.name, *(stem + suffix for stem in stems for suffix in IMAGE_SUFFIXES)]
 
 
-def _evidence(shots: tuple[Shot, ...], masks: Mapping[str, Path], points: RawPoints | None) -> AxesEvidence | None:
+def _axes_evidence(shots: tuple[Shot, ...], masks: Mapping[str, Path], points: RawPoints | None) -> AxesEvidence | None:
     """Evidence for the axes of the poses, from some masks or else the points."""
     from glassplat.captures.axes import axes_evidence  # Needs PyTorch, unlike the other formats.
     from glassplat.captures.view import PointCloud
@@ -174,11 +174,11 @@ def _view(shot: Shot, mask: Path | None) -> View:
     return prepare_view(shot, pane_mask, ViewOptions()).view
 
 
-def _with_fitting_axes(capture: Capture, evidence: AxesEvidence | None) -> Capture:
+def _correct_axes(capture: Capture, evidence: AxesEvidence | None) -> Capture:
     """The capture in the axes that fit the evidence."""
     if evidence is None:
-        unsure = "The axes of the poses cannot be determined; OpenGL is assumed, as in the authors' reader."
-        return replace(capture, warnings=(*capture.warnings, unsure))
+        warning = "The axes of the poses cannot be determined; OpenGL is assumed, as in the authors' reader."
+        return replace(capture, warnings=(*capture.warnings, warning))
     if evidence.fits_neither:
         raise InputError(
             f"the {evidence.source} lie in front of the cameras neither with OpenGL nor with OpenCV axes (shares "
@@ -187,7 +187,7 @@ def _with_fitting_axes(capture: Capture, evidence: AxesEvidence | None) -> Captu
         )
     if not evidence.contradicts:
         return capture
-    turned = (
+    warning = (
         f"The poses are read in OpenCV axes: with OpenGL axes {evidence.as_read:.0%} of the {evidence.source} lie in "
         f"front of the cameras, with OpenCV axes {evidence.flipped:.0%}."
     )
@@ -195,7 +195,7 @@ def _with_fitting_axes(capture: Capture, evidence: AxesEvidence | None) -> Captu
         capture,
         shots=_flip_axes(capture.shots),
         test_shots=None if capture.test_shots is None else _flip_axes(capture.test_shots),
-        warnings=(*capture.warnings, turned),
+        warnings=(*capture.warnings, warning),
     )
 
 

@@ -47,7 +47,7 @@ def points_in_view(cameras: Sequence[Camera]) -> RawPoints:
     """Uniform points in a ball about the point that the cameras face; its radius is their median distance."""
     centers = np.stack([camera.center.double().numpy() for camera in cameras])
     forward = np.stack([camera.cam_from_world[2, :3].double().numpy() for camera in cameras])
-    target, radius = _ball(centers, forward)
+    target, radius = _focus_ball(centers, forward)
     generator = np.random.default_rng(SEED)
     directions = generator.normal(size=(SPHERE_COUNT, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -55,7 +55,7 @@ def points_in_view(cameras: Sequence[Camera]) -> RawPoints:
     return RawPoints.from_arrays(target + distances * directions, np.full((SPHERE_COUNT, 3), GREY))
 
 
-def _ball(centers: NDArray[np.float64], forward: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+def _focus_ball(centers: NDArray[np.float64], forward: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     """Centre and radius: at the crossing of the optical axes, or ahead of the cameras if the axes do not cross."""
     projectors = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     mean = projectors.mean(axis=0)
@@ -72,7 +72,7 @@ def _ball(centers: NDArray[np.float64], forward: NDArray[np.float64]) -> tuple[N
 FISHEYE = "OPENCV_FISHEYE"
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-LISTED = ("k1", "k2", "k3", "k4", "p1", "p2")
+DISTORTION_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Order of `distortion_params`, as in nerfstudio."""
 LENS: dict[str, records.Field] = {
     "camera_model": records.Optional(records.Choice((*PERSPECTIVE, FISHEYE))),
@@ -82,7 +82,7 @@ LENS: dict[str, records.Field] = {
     **dict.fromkeys(("camera_angle_x", "camera_angle_y"), records.Optional(records.Number(above=0, most=math.pi))),
     **dict.fromkeys(("cx", "cy"), records.Optional(records.Number())),
     **dict.fromkeys(COEFFICIENTS, records.Optional(records.Number(), default=0.0)),
-    "distortion_params": records.Optional(records.ListOf(records.Number(), len(LISTED))),
+    "distortion_params": records.Optional(records.ListOf(records.Number(), len(DISTORTION_PARAMS))),
 }
 
 
@@ -101,7 +101,7 @@ def lens_from_settings(settings: Mapping[str, Any], image_path: Path, name: str)
         found = records.check_fields(settings, LENS, f"the lens of {name}")
         width, height = _size(found, image_path)
         fx, fy = _focal_lengths(found, width, height, name)
-    found |= zip(LISTED, found["distortion_params"] or (), strict=False)
+    found |= zip(DISTORTION_PARAMS, found["distortion_params"] or (), strict=False)
     model = found["camera_model"] or (FISHEYE if found["is_fisheye"] else "OPENCV")
     middle = [half if at is None else at for at, half in ((found["cx"], width / 2), (found["cy"], height / 2))]
     if max(fx, fy) <= MOST_AS_SHARE or all(0 <= at <= 1 for at in middle):
@@ -185,7 +185,7 @@ def read_settings(path: Path) -> dict[str, Any]:
     return settings
 
 
-def shots_of(root: Path, settings: Settings, file_name: str) -> dict[str, Shot]:
+def make_shots(root: Path, settings: Settings, file_name: str) -> dict[str, Shot]:
     """All frames by their `file_path`; the error for missing photographs lists them."""
     paths = [image_path(root, frame) for frame in settings["frames"]]
     missing = [path.name for path in paths if not isfile(path)]
@@ -195,38 +195,38 @@ def shots_of(root: Path, settings: Settings, file_name: str) -> dict[str, Shot]:
             "copy them to file_path, or delete their entries from `frames`"
         )
     shots = {}
-    for frame, path, name in zip(settings["frames"], paths, _names(root, paths), strict=True):
-        lens = lens_from_settings(_of_frame(settings, frame), path, name)
+    for frame, path, name in zip(settings["frames"], paths, _photograph_names(root, paths), strict=True):
+        lens = lens_from_settings(_merge_frame_settings(settings, frame), path, name)
         if frame["file_path"] in shots:
             raise InputError(f"{root / file_name} has two frames for {frame['file_path']}; keep one")
         shots[frame["file_path"]] = Shot(name, path, lens, _cam_from_world(frame, name))
     return shots
 
 
-def _of_frame(settings: Settings, frame: Settings) -> Settings:
+def _merge_frame_settings(settings: Settings, frame: Settings) -> Settings:
     """Settings of a frame: its own override the file's, and its opening angle overrides the file's focal length."""
     lengths, angles = {"fl_x", "fl_y"}, {"camera_angle_x", "camera_angle_y"}
-    beaten = lengths | angles if angles & frame.keys() and not lengths & frame.keys() else set()
-    return {**{key: value for key, value in settings.items() if key not in beaten}, **frame}
+    overridden = lengths | angles if angles & frame.keys() and not lengths & frame.keys() else set()
+    return {**{key: value for key, value in settings.items() if key not in overridden}, **frame}
 
 
 def image_path(root: Path, frame: Settings) -> Path:
     """Path of the photograph of one frame; Blender omits the suffix."""
-    path = normpath(root / _plain_path(frame["file_path"]))
+    path = normpath(root / _normalise_path(frame["file_path"]))
     candidates = [path, *(path + suffix for suffix in IMAGE_SUFFIXES)]
     return Path(next((candidate for candidate in candidates if isfile(candidate)), path))
 
 
-def _names(root: Path, paths: Sequence[Path]) -> list[str]:
+def _photograph_names(root: Path, paths: Sequence[Path]) -> list[str]:
     """Names of the photographs; if they are ambiguous, relative to the folder that contains all of them."""
-    names = [_name(root, path) for path in paths]
+    names = [_photograph_name(root, path) for path in paths]
     if len(set(names)) == len(set(paths)):
         return names
     whole = [abspath(path) for path in paths]
     return [Path(path).relative_to(commonpath(map(dirname, whole))).as_posix() for path in whole]
 
 
-def _name(root: Path, path: Path) -> str:
+def _photograph_name(root: Path, path: Path) -> str:
     """Name of a photograph: its path relative to `images/` or the capture, or else its file name.
 
     Both paths may be relative, absolute, or contain links.
@@ -273,59 +273,59 @@ def read_points(root: Path, settings: Settings) -> RawPoints | None:
         return RawPoints.from_arrays(positions, colors) if len(positions) else None
 
 
-WHOLE = "transforms.json"
-TRAIN, VAL, TEST = (f"transforms_{part}.json" for part in ("train", "val", "test"))
-LOOKED_FOR = f"{WHOLE}, or {TRAIN} with or without {TEST} or {VAL}"
+SINGLE_FILE = "transforms.json"
+TRAIN_FILE, VAL_FILE, TEST_FILE = (f"transforms_{part}.json" for part in ("train", "val", "test"))
+FORMAT_DESCRIPTION = f"{SINGLE_FILE}, or {TRAIN_FILE} with or without {TEST_FILE} or {VAL_FILE}"
 
 
 def load_transforms(root: Path) -> Capture | None:
     """Read `transforms.json`, or the train and test files of a synthetic scene; None if there is neither."""
-    if (root / TRAIN).is_file():
+    if (root / TRAIN_FILE).is_file():
         return _load_split(root)
-    if (root / WHOLE).is_file():
+    if (root / SINGLE_FILE).is_file():
         return _load_whole(root)
     return None
 
 
 def _load_whole(root: Path) -> Capture:
     """Capture from one file for all photographs, which may define its own split."""
-    settings = read_settings(root / WHOLE)
-    shots = shots_of(root, settings, WHOLE)
-    train, test, warnings = _own_split(shots, settings)
+    settings = read_settings(root / SINGLE_FILE)
+    shots = make_shots(root, settings, SINGLE_FILE)
+    train, test, warnings = _listed_split(shots, settings)
     return Capture(
         shots=train,
         test_shots=test,
         points=read_points(root, settings),
-        format_name=WHOLE,
+        format_name=SINGLE_FILE,
         warnings=(*warnings, *_unused_priors(settings)),
-        kept=_mask_paths(root, WHOLE, settings, shots),
+        keep_masks=_mask_paths(root, SINGLE_FILE, settings, shots),
     )
 
 
 def _load_split(root: Path) -> Capture:
     """Capture from separate files for training and testing (or else validation), as in synthetic scenes."""
-    tested = TEST if (root / TEST).is_file() else VAL
-    files = {name: read_settings(root / name) for name in (TRAIN, tested) if (root / name).is_file()}
-    if VAL in files and not all(image_path(root, frame).is_file() for frame in files[VAL]["frames"]):
-        del files[VAL]  # Its photographs are often left out of a copy.
-    shots = {name: shots_of(root, settings, name) for name, settings in files.items()}
+    tested = TEST_FILE if (root / TEST_FILE).is_file() else VAL_FILE
+    files = {name: read_settings(root / name) for name in (TRAIN_FILE, tested) if (root / name).is_file()}
+    if VAL_FILE in files and not all(image_path(root, frame).is_file() for frame in files[VAL_FILE]["frames"]):
+        del files[VAL_FILE]  # Its photographs are often left out of a copy.
+    shots = {name: make_shots(root, settings, name) for name, settings in files.items()}
     kept: dict[str, Path] = {}
     for name, settings in files.items():
         kept |= _mask_paths(root, name, settings, shots[name])
-    also = {shot.image_path for shot in shots.get(VAL, {}).values()}
+    held_out = {shot.image_path for shot in shots.get(VAL_FILE, {}).values()}
     return Capture(
-        shots=tuple(shot for shot in shots[TRAIN].values() if shot.image_path not in also),
+        shots=tuple(shot for shot in shots[TRAIN_FILE].values() if shot.image_path not in held_out),
         test_shots=tuple(shots[tested].values()) if tested in shots else None,
-        points=read_points(root, files[TRAIN]),
-        format_name=TRAIN,
-        random_points=points_in_box if _is_blender(files[TRAIN]) else None,
-        warnings=(*_unused_priors(files[TRAIN]), *([UNTESTED] if VAL in shots else ())),
-        kept=kept,
+        points=read_points(root, files[TRAIN_FILE]),
+        format_name=TRAIN_FILE,
+        random_points=points_in_box if _is_blender(files[TRAIN_FILE]) else None,
+        warnings=(*_unused_priors(files[TRAIN_FILE]), *([NO_TEST_FILE_WARNING] if VAL_FILE in shots else ())),
+        keep_masks=kept,
     )
 
 
-UNTESTED = (
-    f"There is no {TEST}; the test views are those of {VAL}, and are not used for training. Move it away to "
+NO_TEST_FILE_WARNING = (
+    f"There is no {TEST_FILE}; the test views are those of {VAL_FILE}, and are not used for training. Move it away to "
     "continue a run that was started without it."
 )
 
@@ -333,7 +333,7 @@ UNTESTED = (
 def _mask_paths(root: Path, file: str, settings: Settings, shots: Mapping[str, Shot]) -> dict[str, Path]:
     """Masks named by the frames of a file, by name of the photograph."""
     paths = {
-        shots[frame["file_path"]].name: Path(normpath(root / _plain_path(frame["mask_path"])))
+        shots[frame["file_path"]].name: Path(normpath(root / _normalise_path(frame["mask_path"])))
         for frame in settings["frames"]
         if frame.get("mask_path")
     }
@@ -364,7 +364,7 @@ def _is_blender(settings: Settings) -> bool:
     return "camera_angle_x" in settings and "fl_x" not in settings and "w" not in settings
 
 
-def _own_split(
+def _listed_split(
     shots: Mapping[str, Shot], settings: Settings
 ) -> tuple[tuple[Shot, ...], tuple[Shot, ...] | None, list[str]]:
     """Training and test photographs as listed by nerfstudio, or all and None without a list; and warnings.
@@ -372,19 +372,19 @@ def _own_split(
     Without a training list, all photographs outside the test list are used; without a test list, none are tested.
     """
     listed = settings.get("train_filenames"), settings.get("test_filenames") or settings.get("val_filenames")
-    train_names, test_names = ([_plain_path(name) for name in names or ()] for names in listed)
+    train_names, test_names = ([_normalise_path(name) for name in names or ()] for names in listed)
     if not train_names and not test_names:
         return tuple(shots.values()), None, []
-    by_path = {_plain_path(name): shot for name, shot in shots.items()}
+    by_path = {_normalise_path(name): shot for name, shot in shots.items()}
     unknown = sorted({*train_names, *test_names} - set(by_path))
     if unknown:
-        raise InputError(f"the split of {WHOLE} names photographs that have no frame: {join_names(unknown)}")
+        raise InputError(f"the split of {SINGLE_FILE} names photographs that have no frame: {join_names(unknown)}")
     test = tuple(by_path[name] for name in test_names)
     train = tuple(by_path[name] for name in train_names or by_path if name not in set(test_names))
     left_out = len(shots) - len(train) - len(test)
     return train, test, [f"{left_out} photographs are in neither part of the split and ignored."] if left_out else []
 
 
-def _plain_path(name: str) -> str:
+def _normalise_path(name: str) -> str:
     """A normalised path: `./images/1.png` becomes `images/1.png`."""
     return normpath(name.replace("\\", "/"))

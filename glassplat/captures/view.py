@@ -44,9 +44,9 @@ LEAST_SIDE = 8
 """Smallest side of a reduced photograph, in pixels; smaller ones show neither pane edges nor details."""
 
 GIGABYTE = 1e9
-SHARE = 0.25
+MEMORY_SHARE = 0.25
 """Default share of the machine's memory for photographs."""
-UNKNOWN = 8 * GIGABYTE
+UNKNOWN_MEMORY = 8 * GIGABYTE
 """Assumed memory of a machine that does not report it."""
 MOST_AHEAD = 8
 """Maximum number of views read ahead: a step is rarely shorter than an eighth of the reading time."""
@@ -59,21 +59,21 @@ DISK_RATE = 2e8
 """Bytes per second of a slow disk."""
 DISK_RESERVE = 5 * GIGABYTE
 """Bytes of disk space that photographs leave free, because training writes there, too."""
-MEMBERSHIP, GROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
+CGROUP_FILE, CGROUP_FOLDER = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
 """Linux files that list the control groups of this process, and the folder of their limits."""
-LIMITS = {"": "memory.max", "memory": "memory.limit_in_bytes"}
+LIMIT_FILES = {"": "memory.max", "memory": "memory.limit_in_bytes"}
 """Names of the limit files by controller of a group: cgroup v2 has no controller name."""
 
 Item = TypeVar("Item")
 
 
-def evenly(items: Sequence[Item], most: int) -> list[Item]:
+def sample_evenly(items: Sequence[Item], most: int) -> list[Item]:
     """At most `most` of the items, evenly spread."""
     count = min(most, len(items))
     return [items[len(items) * number // count] for number in range(count)]
 
 
-class Source:
+class PixelSource:
     """Pixels that can be read again; sources with the same reader are equal.
 
     Attributes:
@@ -84,7 +84,7 @@ class Source:
         self._reader, self.is_mask = reader, is_mask
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Source) and self._reader is other._reader
+        return isinstance(other, PixelSource) and self._reader is other._reader
 
     def __hash__(self) -> int:
         return id(self._reader)
@@ -94,7 +94,7 @@ class Source:
         return self._reader() > 0 if self.is_mask else self._reader()
 
 
-class Spool:
+class DiskCache:
     """Disk cache of undistorted and reduced pixels, in an unnamed file that disappears with the process.
 
     If the disk is full or not writable, nothing more is stored, and photographs are read from their own files.
@@ -103,38 +103,38 @@ class Spool:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._file: IO[bytes] | None = None
-        self._places: dict[Source, tuple[int, tuple[int, ...], np.dtype[np.generic]]] = {}
+        self._entries: dict[PixelSource, tuple[int, tuple[int, ...], np.dtype[np.generic]]] = {}
         self._is_full = False
         self._lock = Lock()
 
-    def put(self, source: Source, pixels: Tensor) -> None:
+    def put(self, source: PixelSource, pixels: Tensor) -> None:
         """Stores the pixels of a source if there is room."""
         values = pixels.numpy()
         with self._lock:
-            if self._is_full or source in self._places:
+            if self._is_full or source in self._entries:
                 return
             try:
                 if shutil.disk_usage(self._folder).free < values.nbytes + DISK_RESERVE:
                     self._is_full = True
                     return
                 self._file = self._file or tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115
-                place = self._file.seek(0, os.SEEK_END)
+                offset = self._file.seek(0, os.SEEK_END)
                 self._file.write(values.tobytes())
                 self._file.flush()
             except OSError:
-                self._give_back()  # Under a quota, this space may be needed for a checkpoint.
+                self._release()  # Under a quota, this space may be needed for a checkpoint.
                 return
-            self._places[source] = place, values.shape, values.dtype
+            self._entries[source] = offset, values.shape, values.dtype
 
-    def get(self, source: Source) -> Tensor | None:
+    def get(self, source: PixelSource) -> Tensor | None:
         """The pixels of a source; None if they are not stored."""
         with self._lock:
-            if self._file is None or source not in self._places:
+            if self._file is None or source not in self._entries:
                 return None
-            place, shape, dtype = self._places[source]
+            offset, shape, dtype = self._entries[source]
             values = np.empty(shape, dtype)
             try:
-                self._file.seek(place)
+                self._file.seek(offset)
                 is_whole = self._file.readinto(values.reshape(-1).view(np.uint8)) == values.nbytes  # type: ignore[attr-defined]
             except OSError:
                 is_whole = False
@@ -143,10 +143,10 @@ class Spool:
     def close(self) -> None:
         """Releases the disk space."""
         with self._lock:
-            self._give_back()
+            self._release()
 
-    def _give_back(self) -> None:
-        self._places.clear()
+    def _release(self) -> None:
+        self._entries.clear()
         self._is_full = True
         file, self._file = self._file, None
         if file is not None:
@@ -154,7 +154,7 @@ class Spool:
                 file.close()
 
 
-class Memory:
+class PixelCache:
     """In-memory cache of pixels; thread-safe.
 
     Attributes:
@@ -173,25 +173,25 @@ class Memory:
         self._largest = largest
         view = max(largest * PIXEL_BYTES, 1)
         self.ahead = int(max(min(self.budget * AHEAD_SHARE / view - 1, MOST_AHEAD), 1))
-        self._room = self.budget - (self.ahead + 1) * view
-        self._passing_room = (self.ahead + 1) * view
-        self._resident: dict[Source, Tensor] = {}
-        self._passing: OrderedDict[Source, Tensor] = OrderedDict()
-        self._passing_bytes = 0
-        self._pending: dict[Source, Future[Tensor]] = {}
-        self._spool: Spool | None = None
+        self._free_bytes = self.budget - (self.ahead + 1) * view
+        self._transient_limit = (self.ahead + 1) * view
+        self._resident: dict[PixelSource, Tensor] = {}
+        self._transient: OrderedDict[PixelSource, Tensor] = OrderedDict()
+        self._transient_bytes = 0
+        self._pending: dict[PixelSource, Future[Tensor]] = {}
+        self._disk_cache: DiskCache | None = None
         self._lock = Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies, also in other processes, start empty and read pixels again."""
-        return partial(Memory, self.budget, largest=self._largest), ()
+        return partial(PixelCache, self.budget, largest=self._largest), ()
 
     @property
     def is_full(self) -> bool:
         """Return whether some pixels had to be kept temporarily, because there is no more room."""
-        return bool(self._passing)
+        return bool(self._transient)
 
-    def get(self, source: Source) -> Tensor:
+    def get(self, source: PixelSource) -> Tensor:
         """The pixels of a source, read now unless they are cached or being read.
 
         Raises:
@@ -206,7 +206,7 @@ class Memory:
             self._read(source, future)
         return future.result()
 
-    def read_ahead(self, source: Source) -> None:
+    def read_ahead(self, source: PixelSource) -> None:
         """Reads pixels in a background thread; after a failure, `get` reads them again and raises the error."""
         with self._lock:
             if source in self._pending or self._look_up(source) is not None:
@@ -215,25 +215,25 @@ class Memory:
         reading_threads().submit(self._read, source, future)
 
     @contextmanager
-    def spool_to(self, folder: Path) -> Iterator[None]:
+    def cache_on_disk(self, folder: Path) -> Iterator[None]:
         """Within the context, caches pixels on disk that were costly to read and do not fit in memory."""
-        self._spool = spool = Spool(folder)
+        self._disk_cache = disk_cache = DiskCache(folder)
         try:
             yield
         finally:
-            self._spool = None
-            spool.close()
+            self._disk_cache = None
+            disk_cache.close()
 
-    def _look_up(self, source: Source) -> Tensor | None:
-        if source in self._passing:
-            self._passing.move_to_end(source)
-        return self._resident.get(source, self._passing.get(source))
+    def _look_up(self, source: PixelSource) -> Tensor | None:
+        if source in self._transient:
+            self._transient.move_to_end(source)
+        return self._resident.get(source, self._transient.get(source))
 
     @torch.inference_mode(False)  # The first caller may not need gradients; a later one may.
-    def _read(self, source: Source, future: Future[Tensor]) -> None:
-        spool = self._spool
+    def _read(self, source: PixelSource, future: Future[Tensor]) -> None:
+        disk_cache = self._disk_cache
         try:
-            stored = None if spool is None else spool.get(source)
+            stored = None if disk_cache is None else disk_cache.get(source)
             begun = time.thread_time()
             pixels = source.read() if stored is None else stored
             is_costly = stored is None and time.thread_time() - begun > pixels.nbytes / DISK_RATE
@@ -244,23 +244,23 @@ class Memory:
             return
         with self._lock:
             del self._pending[source]
-            stays = self._keep(source, pixels)
+            stays = self._store(source, pixels)
         future.set_result(pixels)
-        if spool is not None and is_costly and not stays:
-            spool.put(source, pixels)
+        if disk_cache is not None and is_costly and not stays:
+            disk_cache.put(source, pixels)
 
-    def _keep(self, source: Source, pixels: Tensor) -> bool:
+    def _store(self, source: PixelSource, pixels: Tensor) -> bool:
         """Caches pixels; returns whether they stay permanently."""
         size = pixels.numel() * pixels.element_size()
-        if size <= self._room:
-            self._room -= size
+        if size <= self._free_bytes:
+            self._free_bytes -= size
             self._resident[source] = pixels
             return True
-        self._passing[source] = pixels
-        self._passing_bytes += size
-        while self._passing_bytes > self._passing_room and len(self._passing) > 1:
-            _, oldest = self._passing.popitem(last=False)
-            self._passing_bytes -= oldest.numel() * oldest.element_size()
+        self._transient[source] = pixels
+        self._transient_bytes += size
+        while self._transient_bytes > self._transient_limit and len(self._transient) > 1:
+            _, oldest = self._transient.popitem(last=False)
+            self._transient_bytes -= oldest.numel() * oldest.element_size()
         return False
 
 
@@ -272,7 +272,7 @@ def reading_threads() -> ThreadPoolExecutor:
 
 def default_budget() -> float:
     """Bytes for photographs per process: a share of the memory of the machine or its container."""
-    return SHARE * machine_memory() / max(int(os.environ.get("LOCAL_WORLD_SIZE", "1")), 1)
+    return MEMORY_SHARE * machine_memory() / max(int(os.environ.get("LOCAL_WORLD_SIZE", "1")), 1)
 
 
 def machine_memory() -> float:
@@ -280,7 +280,7 @@ def machine_memory() -> float:
     try:
         whole = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     except (AttributeError, ValueError, OSError):  # Not available on Windows.
-        whole = UNKNOWN
+        whole = UNKNOWN_MEMORY
     for path in memory_limits():
         with suppress(OSError, ValueError):  # No such file, or its limit is `max`.
             whole = min(whole, float(path.read_text()))
@@ -289,11 +289,11 @@ def machine_memory() -> float:
 
 def memory_limits() -> Iterator[Path]:
     """Limit files of this process's control group and of its parents, which in a container end at the root."""
-    lines = MEMBERSHIP.read_text(encoding="utf-8", errors="replace").splitlines() if MEMBERSHIP.is_file() else []
+    lines = CGROUP_FILE.read_text(encoding="utf-8", errors="replace").splitlines() if CGROUP_FILE.is_file() else []
     for _, controllers, name in (line.split(":", 2) for line in lines):
-        if controllers in LIMITS:
-            group = GROUPS / controllers / name.lstrip("/")
-            yield from (folder / LIMITS[controllers] for folder in (group, *group.parents))
+        if controllers in LIMIT_FILES:
+            group = CGROUP_FOLDER / controllers / name.lstrip("/")
+            yield from (folder / LIMIT_FILES[controllers] for folder in (group, *group.parents))
 
 
 @dataclass(frozen=True)
@@ -318,7 +318,7 @@ class View:
     read_pane_labels: Callable[[], Tensor] | None = None
     read_ignored: Callable[[], Tensor] | None = None
     read_normals: Callable[[], Tensor] | None = None
-    memory: Memory = field(default_factory=lambda: Memory(math.inf), repr=False, compare=False)
+    memory: PixelCache = field(default_factory=lambda: PixelCache(math.inf), repr=False, compare=False)
 
     def __repr__(self) -> str:
         return f"View({self.name!r}, {self.camera})"
@@ -330,17 +330,17 @@ class View:
         Raises:
             InputError: the file cannot be read; the message names it.
         """
-        return self.memory.get(Source(self.read_photo))
+        return self.memory.get(PixelSource(self.read_photo))
 
     @property
     def pane_labels(self) -> Tensor | None:
         """[H, W] uint8 pane label per pixel, 0 for no pane; None if the view is not annotated."""
-        return None if self.read_pane_labels is None else self.memory.get(Source(self.read_pane_labels))
+        return None if self.read_pane_labels is None else self.memory.get(PixelSource(self.read_pane_labels))
 
     @property
     def ignored(self) -> Tensor | None:
         """[H, W] bool, the pixels excluded from training and evaluation; None if there are none."""
-        return None if self.read_ignored is None else self.memory.get(Source(self.read_ignored, is_mask=True))
+        return None if self.read_ignored is None else self.memory.get(PixelSource(self.read_ignored, is_mask=True))
 
     @property
     def normals(self) -> Tensor | None:
@@ -349,15 +349,15 @@ class View:
         Raises:
             InputError: the file cannot be read, or its aspect ratio differs from the photograph's.
         """
-        return None if self.read_normals is None else self.memory.get(Source(self.read_normals))
+        return None if self.read_normals is None else self.memory.get(PixelSource(self.read_normals))
 
     def read_ahead(self) -> None:
         """Reads the pixels for training on this view in background threads."""
-        self.memory.read_ahead(Source(self.read_photo))
+        self.memory.read_ahead(PixelSource(self.read_photo))
         if self.read_pane_labels is not None:
-            self.memory.read_ahead(Source(self.read_pane_labels))
+            self.memory.read_ahead(PixelSource(self.read_pane_labels))
         if self.read_ignored is not None:
-            self.memory.read_ahead(Source(self.read_ignored, is_mask=True))
+            self.memory.read_ahead(PixelSource(self.read_ignored, is_mask=True))
 
     @property
     def is_annotated(self) -> bool:
@@ -382,11 +382,11 @@ class View:
             if given is not None and (getattr(given, "dtype", None) != torch.uint8 or given.shape != shape):
                 found = f"{given.dtype} {[*given.shape]}" if isinstance(given, Tensor) else f"a {type(given).__name__}"
                 raise ValueError(f"the pixels of {name} are {found}; expected a tensor of uint8 {[*shape]}")
-        labels = None if pane_labels is None else partial(_at_hand, pane_labels)
-        return View(name, camera, Path(name), partial(_at_hand, photo), labels)
+        labels = None if pane_labels is None else partial(_return_pixels, pane_labels)
+        return View(name, camera, Path(name), partial(_return_pixels, photo), labels)
 
 
-def _at_hand(pixels: Tensor) -> Tensor:
+def _return_pixels(pixels: Tensor) -> Tensor:
     return pixels
 
 
@@ -405,7 +405,7 @@ class PhotoFile:
         """[H, W, 3] uint8 in the pixel grid of the view's camera."""
         with convert_to_input_error():
             pixels = read_colors(self.path)
-        return torch.from_numpy(self.pixel_map.photo(_opaque(pixels, self.background)))
+        return torch.from_numpy(self.pixel_map.map_photo(_composite_over(pixels, self.background)))
 
 
 @dataclass(frozen=True)
@@ -418,11 +418,11 @@ class MaskFile:
 
     def __call__(self) -> Tensor:
         """[H, W] uint8 in the pixel grid of the view's camera."""
-        return torch.from_numpy(self.pixel_map.labels(cameras.nearest_resize(self.mask.labels(), *self.size)))
+        return torch.from_numpy(self.pixel_map.map_labels(cameras.nearest_resize(self.mask.labels(), *self.size)))
 
     def ignored(self) -> Tensor:
         """[H, W] uint8, above zero where a pixel of the view covers any labelled pixel."""
-        return torch.from_numpy(self.pixel_map.ignored(cameras.nearest_resize(self.mask.labels(), *self.size)))
+        return torch.from_numpy(self.pixel_map.map_ignored(cameras.nearest_resize(self.mask.labels(), *self.size)))
 
 
 @dataclass(frozen=True)
@@ -434,7 +434,7 @@ class IgnoredFiles:
 
     def __call__(self) -> Tensor:
         """[H, W] uint8, above zero where any mask is, or outside the photograph."""
-        blank = [] if self.blank is None else [torch.from_numpy(self.blank.blank())]
+        blank = [] if self.blank is None else [torch.from_numpy(self.blank.blank_mask())]
         return torch.stack([*blank, *(mask.ignored() for mask in self.masks)]).amax(dim=0)
 
 
@@ -539,7 +539,7 @@ def _is_multiple(large: tuple[int, int], small: tuple[int, int]) -> bool:
     )
 
 
-def _opaque(pixels: NDArray[np.uint8], background: Rgb | None) -> NDArray[np.uint8]:
+def _composite_over(pixels: NDArray[np.uint8], background: Rgb | None) -> NDArray[np.uint8]:
     """[H, W, 3] from grey, RGB or RGBA, composited over the background if there is one."""
     if pixels.shape[2] == 1:
         return np.repeat(pixels, 3, axis=2)
@@ -553,9 +553,9 @@ def _opaque(pixels: NDArray[np.uint8], background: Rgb | None) -> NDArray[np.uin
     return opaque
 
 
-FOLDER = "normals"
-SUFFIXES = (".png", ".npy")
-CAMERA_FROM_PICTURE = (1.0, -1.0, -1.0)
+NORMALS_FOLDER = "normals"
+NORMALS_SUFFIXES = (".png", ".npy")
+CAMERA_FROM_NORMAL_MAP = (1.0, -1.0, -1.0)
 """Signs that convert y up and z towards the camera to y down and z forward."""
 LEAST_LENGTH = 0.5
 """Shorter vectors, such as those of grey or black pixels, are not normals."""
@@ -568,20 +568,20 @@ def estimated_normals(view: View) -> Tensor | None:
         InputError: as `View.normals`.
     """
     normals = view.normals
-    return None if normals is None else in_world(normals, view.camera)
+    return None if normals is None else rotate_to_world(normals, view.camera)
 
 
-def in_world(normals: Tensor, camera: Camera) -> Tensor:
+def rotate_to_world(normals: Tensor, camera: Camera) -> Tensor:
     """Vectors [..., 3] rotated from camera to world axes; differentiable in the camera's pose."""
     return normals @ camera.cam_from_world[:3, :3].to(normals)
 
 
 def normals_reader(path: Path | None, camera: Camera) -> Callable[[], Tensor] | None:
     """Reader of a file of estimated normals, at a camera's size; None for None."""
-    return None if path is None else partial(normals_in_file, path, camera)
+    return None if path is None else partial(read_normals_file, path, camera)
 
 
-def normals_in_file(path: Path, camera: Camera) -> Tensor:
+def read_normals_file(path: Path, camera: Camera) -> Tensor:
     """[H, W, 3] unit normals in camera axes at a camera's size, zero where unknown.
 
     The file belongs to the undistorted photograph, like `View.photo`.
@@ -590,17 +590,19 @@ def normals_in_file(path: Path, camera: Camera) -> Tensor:
         InputError: the file cannot be read, or its aspect ratio differs from the camera's.
     """
     with convert_to_input_error():
-        vectors = _vectors(path)
+        vectors = _read_vectors(path)
     height, width = vectors.shape[:2]
     if abs(width * camera.height - height * camera.width) > max(width, height, camera.width, camera.height):
         raise InputError(
             f"{path} is {width}x{height} pixels, its photograph {camera.width}x{camera.height} here, without "
             "the distortion of its lens; expected the same proportions"
         )
-    in_picture = torch.from_numpy(vectors).permute(2, 0, 1)[None]
-    small = torch.nn.functional.interpolate(in_picture, (camera.height, camera.width), mode="area")[0].permute(1, 2, 0)
+    channels_first = torch.from_numpy(vectors).permute(2, 0, 1)[None]
+    small = torch.nn.functional.interpolate(channels_first, (camera.height, camera.width), mode="area")[0].permute(
+        1, 2, 0
+    )
     known = small.norm(dim=-1, keepdim=True) > LEAST_LENGTH
-    unit = torch.nn.functional.normalize(small, dim=-1) * torch.tensor(CAMERA_FROM_PICTURE, dtype=torch.float32)
+    unit = torch.nn.functional.normalize(small, dim=-1) * torch.tensor(CAMERA_FROM_NORMAL_MAP, dtype=torch.float32)
     return torch.where(known, unit, 0)
 
 
@@ -625,16 +627,18 @@ def normals_paths(photographs: Mapping[str, Path]) -> dict[str, Path]:
         places = [(base, whole), (base.parent, whole), (path.parent, alone)]
         if stems[path.stem] == 1:
             places += [(path.parent.parent, alone), (base, alone)]
-        folders = [(folder / FOLDER / one.parent, one) for folder, one in places if is_folder(folder / FOLDER)]
+        folders = [
+            (folder / NORMALS_FOLDER / one.parent, one) for folder, one in places if is_folder(folder / NORMALS_FOLDER)
+        ]
         names = [folder / stem for folder, one in folders for stem in (one.stem, one.name)]
-        files = (file.with_name(f"{file.name}{suffix}") for file in names for suffix in SUFFIXES)
+        files = (file.with_name(f"{file.name}{suffix}") for file in names for suffix in NORMALS_SUFFIXES)
         file = next(filter(Path.is_file, files), None)
         if file is not None:
             found[name] = file
     return found
 
 
-def _vectors(path: Path) -> NDArray[np.float32]:
+def _read_vectors(path: Path) -> NDArray[np.float32]:
     """[H, W, 3] as stored, with non-finite values set to zero."""
     if path.suffix == ".png":
         pixels = read_image_float(path)
@@ -685,7 +689,7 @@ class PointCloud:
         return PointCloud(torch.from_numpy(points.positions), torch.from_numpy(points.colors))
 
 
-def with_ignored_right(image: Tensor, view: View) -> Tensor:
+def copy_ignored_pixels(image: Tensor, view: View) -> Tensor:
     """An image [H, W, 3] with ignored pixels taken from the photograph: no error, no gradient."""
     if view.ignored is None:
         return image

@@ -8,9 +8,9 @@ from pathlib import Path
 import torch
 
 from glassplat.captures.cameras import LEAST_SIDE
-from glassplat.captures.dataset import Dataset, dataset_of, load_dataset
+from glassplat.captures.dataset import Dataset, load_dataset, make_dataset
 from glassplat.captures.files import CaptureFiles
-from glassplat.captures.view import evenly
+from glassplat.captures.view import sample_evenly
 from glassplat.cli.console import count_noun, shell_word
 from glassplat.cli.info import FEW_VIEWS, Finding, describe_broken
 from glassplat.errors import InputError, convert_to_input_error
@@ -35,7 +35,7 @@ MASKS_SAMPLED = 16
 
 def remaining_parts(files: CaptureFiles) -> Iterator[Finding]:
     """Findings on a capture beyond its list of files."""
-    dataset = dataset_of(files)
+    dataset = make_dataset(files)
     finding = Finding()
     sizes = sorted({f"{v.camera.width}x{v.camera.height}" for v in (*dataset.train, *dataset.test)})
     finding.facts["photographs"] = (
@@ -67,7 +67,7 @@ def _panes_part(path: Path, dataset: Dataset) -> Finding:
     """Marked panes, and the quality of the marks."""
     finding = Finding()
     if masked := [view for view in (*dataset.train, *dataset.test) if view.read_ignored is not None]:
-        sampled = [view.ignored for view in evenly(masked, MASKS_SAMPLED)]
+        sampled = [view.ignored for view in sample_evenly(masked, MASKS_SAMPLED)]
         shares = [float(ignored.double().mean()) for ignored in sampled if ignored is not None]
         finding.facts["ignored"] = (
             f"about {sum(shares) / len(shares):.0%} of {count_noun(len(masked), 'photograph')}, by masks, "

@@ -12,7 +12,7 @@ from rich.console import Console
 from torch import Tensor
 
 from glassplat.access import is_local
-from glassplat.captures.dataset import TEST_EVERY, Dataset, dataset_of, load_dataset, with_corrected_cameras
+from glassplat.captures.dataset import TEST_EVERY, Dataset, load_dataset, make_dataset, with_corrected_cameras
 from glassplat.captures.view import GIGABYTE, PointCloud, View
 from glassplat.cli.console import count_noun, print_line, print_warning, shell_word
 from glassplat.cli.places import chosen_views
@@ -134,7 +134,7 @@ def photograph_paths(dataset: Dataset) -> list[Path]:
 def train(command: Train[Any], console: Console) -> None:
     """Trains, with a progress bar or lines."""
     check_output(RunDirectory(command.output), resume=command.resume)
-    dataset = dataset_of(
+    dataset = make_dataset(
         command.files, downscale=command.downscale, background=photo_background(command.recipe), memory=command.memory
     )
     print_summary(dataset, console)

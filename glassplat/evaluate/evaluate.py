@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from glassplat.captures.dataset import Dataset, detached_camera
-from glassplat.captures.view import View, with_ignored_right
+from glassplat.captures.view import View, copy_ignored_pixels
 from glassplat.errors import InputError
 from glassplat.evaluate import metrics
 from glassplat.evaluate.truth import GroundTruth, TrueSurface, TrueView, load_truth, true_surface
@@ -118,7 +118,7 @@ def aligned_camera(scene: Scene, renderer: Renderer, view: View) -> Camera:
     for _ in range(ALIGNMENT_STEPS):
         optimizer.zero_grad()
         image = exposures.apply(renderer(detached, moved_camera(camera, twist, scene.extent)).rgb, view.name)
-        found = photometric(with_ignored_right(image, view), photo)
+        found = photometric(copy_ignored_pixels(image, view), photo)
         loss = found.l1.lerp(1 - found.ssim, SSIM_SHARE)
         if (value := float(loss.detach())) < lowest:
             best, lowest = twist.detach().clone(), value
@@ -321,7 +321,7 @@ def _measure(
     """Every metric of one view except the reflection's, which needs all views."""
     image, photo, counted = frame.photographed, view.photo, None if view.ignored is None else ~view.ignored
     if counted is not None:
-        image = with_ignored_right(image, view)
+        image = copy_ignored_pixels(image, view)
         pane = pane if isinstance(pane, str) else pane & counted
         surface = surface and replace(surface, covered=surface.covered & counted)
     measured: dict[str, metrics.Outcome] = {

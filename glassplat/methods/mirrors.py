@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
 from glassplat.captures.dataset import Dataset
-from glassplat.captures.view import View, estimated_normals, evenly
+from glassplat.captures.view import View, estimated_normals, sample_evenly
 from glassplat.render.deferred import blend_surface, cell_side, depth_normals, resize_environment, view_directions
 from glassplat.render.frame import Renderer
 from glassplat.render.layers import contributions, gather_pixels
@@ -60,7 +60,7 @@ class ReflectionMeasure:
     def reflective_share(self, scene: Scene, views: Sequence[View]) -> float:
         """Reflected share of the visible scene: the mean strength."""
         shown = sum(
-            (contributions(scene, view.camera) for view in evenly(views, self.views)),
+            (contributions(scene, view.camera) for view in sample_evenly(views, self.views)),
             torch.zeros((), dtype=torch.float32),
         )
         return mean_in_region(scene, shown, torch.sigmoid(scene.primary.channels["logit_strength"]))
@@ -68,7 +68,7 @@ class ReflectionMeasure:
     @torch.no_grad()
     def view_dependent_share(self, scene: Scene, views: Sequence[View], renderer: Renderer) -> float:
         """Share of the visible scene that does not reflect, although its residual is view-dependent."""
-        shown, spreads = residual_spreads(scene, evenly(views, self.views), renderer)
+        shown, spreads = residual_spreads(scene, sample_evenly(views, self.views), renderer)
         reflects = scene.primary.channels["logit_strength"] > logit(self.strength)
         return mean_in_region(scene, shown, ~reflects & (spreads > self.spread))
 
@@ -144,7 +144,7 @@ def mirror_lookalikes(
         renderer: draws the primary Gaussians.
     """
     plain = replace(scene, primary=replace(scene.primary, active_sh_degree=0))
-    shown, spreads = residual_spreads(plain, evenly(views, options.views), renderer)
+    shown, spreads = residual_spreads(plain, sample_evenly(views, options.views), renderer)
     seen = shown > LEAST_SHOWN
     rows = seen.nonzero().squeeze(1)
     variances = torch.zeros_like(spreads)
@@ -162,7 +162,7 @@ def turn_into_mirrors(options: MirrorSearch, scene: Scene, views: Sequence[View]
     Their constant colours stay, and view-dependent ones are removed: reflections will explain these.
     """
     gaussians = scene.primary
-    chosen_views = evenly(views, options.views)
+    chosen_views = sample_evenly(views, options.views)
     normals = normals_from_views(scene, chosen_views, options.estimated_normals)
     rotated = chosen & (normals.norm(dim=1) > LEAST_NORMAL_LENGTH)
     rows = rotated.nonzero().squeeze(1)
@@ -288,12 +288,7 @@ def _surface_axes(gaussians: Gaussians) -> Tensor:
 
 log = logging.getLogger("glassplat.training")
 
-PROPAGATION_ENDED, MOST_REFLECTIVE, LAST_GROWTH, VIEW_DEPENDENT = (
-    "propagation ended",
-    "most reflective",
-    "reflective grew",
-    "turns with the view",
-)
+PROPAGATION_ENDED, MOST_REFLECTIVE, LAST_GROWTH, VIEW_DEPENDENT = "propagation ended", "most reflective", "reflective grew", "turns with the view"
 """Keys of `TrainState.records`: step of the end, largest reflected share, step of its last growth, and the
 view-dependent, non-reflective share."""
 OPACITIES_RAISED, OPACITIES_LOWERED = "opacities raised", "opacities lowered"
@@ -428,9 +423,7 @@ class Propagate:
             view_dependent = state.records.get(VIEW_DEPENDENT)
             if view_dependent is None:
                 view_dependent = self.measure.view_dependent_share(state.scene, dataset.train, self.renderer)
-            advice = (MATTE_ADVICE if view_dependent < LEAST_VIEW_DEPENDENT else OVERLOOKED_ADVICE) % (
-                100 * view_dependent
-            )
+            advice = (MATTE_ADVICE if view_dependent < LEAST_VIEW_DEPENDENT else OVERLOOKED_ADVICE) % (100 * view_dependent)
         log.warning(NOTHING_FOUND, clock.step, AS_SPLAT if self.matte_rates else "", advice)
 
 

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, NoReturn
 import torch
 
 from glassplat import __version__
-from glassplat.captures.dataset import Dataset, check_dataset, photographs_read, with_corrected_cameras
+from glassplat.captures.dataset import Dataset, check_dataset, read_photographs_in_background, with_corrected_cameras
 from glassplat.errors import InputError, RankLostError, join_names
 from glassplat.files.writing import make_folder
 from glassplat.kernels.backend.devices import DeviceName, chosen_device, compile_seconds
@@ -219,9 +219,7 @@ class Run:
         return with_gradients(self._messages())
 
     def _messages(self) -> Generator[Message, None, None]:
-        self._ranks.check_same_settings(
-            shared_settings(self.recipe, self._settings, self._dataset) | {"resume": self._resume}
-        )
+        self._ranks.check_same_settings(shared_settings(self.recipe, self._settings, self._dataset) | {"resume": self._resume})
         yield from self._run_as_leader() if self._ranks.is_leader else self._run_as_follower()
         self._ranks.exchange()  # Other ranks wait until the leader has written the scene.
 
@@ -229,7 +227,7 @@ class Run:
         """Trains on a rank that does not write."""
         self.state = self._ranks.broadcast(self.state, self._settings.device)
         self._session = TrainingSession(self.state, self._ranks)
-        with self._dataset.memory.spool_to(self._directory.path):
+        with self._dataset.memory.cache_on_disk(self._directory.path):
             yield from self._session.run_stages(self._stages, self._dataset, self._settings.iterations)
 
     def _run_as_leader(self) -> Generator[Message, None, None]:
@@ -254,7 +252,7 @@ class Run:
                 files = OutputFiles(directory.checkpoint, log, self._checkpoint_every, self._ensure_directory)
                 self._session = TrainingSession(self.state, self._ranks, files)
                 yield from self._session.deliver(RunBegun(self.state.step, settings.iterations, anew))
-                with self._dataset.memory.spool_to(directory.path):
+                with self._dataset.memory.cache_on_disk(directory.path):
                     yield from self._session.run_stages(self._stages, self._dataset, settings.iterations)
             self._export()
 
@@ -406,7 +404,7 @@ class TrainingSession:
         self, stages: tuple[Stage, ...], dataset: Dataset, iterations: int
     ) -> Generator[Message, None, None]:
         """Trains to the end, or raises KeyboardInterrupt after the step of a stop request."""
-        with stop_on_interrupt() as self._stop, photographs_read(dataset) as check_photographs:
+        with stop_on_interrupt() as self._stop, read_photographs_in_background(dataset) as check_photographs:
             self._ranks.is_stop_requested = lambda: self._stop.requested
             messages = train(stages, dataset, self._state, iterations, ranks=self._ranks)
             starts = zip(stages, stage_starts(stages, iterations), strict=False)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from glassplat.captures.view import View, evenly
+from glassplat.captures.view import View, sample_evenly
 from glassplat.kernels.adam import Update, adam
 from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.render.layers import gather_mirrored_pixels, gather_pixels, window_means, window_sums
@@ -126,7 +126,7 @@ class ComparedPart(NamedTuple):
 
 def reduced_photographs(scene: Scene, views: Sequence[View]) -> list[Photograph]:
     """At most `MOST_PHOTOGRAPHS` of the views, evenly spread, none wider than `REDUCED_WIDTH`."""
-    return [reduced_photograph(scene, view) for view in evenly(views, MOST_PHOTOGRAPHS)]
+    return [reduced_photograph(scene, view) for view in sample_evenly(views, MOST_PHOTOGRAPHS)]
 
 
 def reduced_photograph(scene: Scene, view: View) -> Photograph:
@@ -631,7 +631,7 @@ def unseen_positions(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> 
         cameras: of the photographs; a subset of them is used.
     """
     device = scene.primary.means.device
-    cameras = [camera.to(device) for camera in evenly(cameras, HOLE_CAMERAS)]
+    cameras = [camera.to(device) for camera in sample_evenly(cameras, HOLE_CAMERAS)]
     middle = torch.stack([camera.center for camera in cameras]).mean(dim=0)
     away = (scene.primary.means - middle).norm(dim=1).sort().values
     radius = away[int((1 - SHARE_BEYOND_ROOM) * (len(away) - 1))]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
 
-from glassplat.captures.masks import IGNORE_FOLDER, MASK_FOLDER, MASK_MARK, PANE_FOLDER
+from glassplat.captures.masks import IGNORE_FOLDER, MASK_FOLDER, MASK_SUFFIX, PANE_FOLDER
 from glassplat.errors import InputError, join_names
 from glassplat.files import images
 from glassplat.files.records import readable_name, wrap_read_errors
@@ -182,8 +182,8 @@ def capture_names(paths: Sequence[Path], folder: Path) -> dict[Path, str]:
 def masks_among(paths: Sequence[Path]) -> list[Path]:
     """Files named as the mask of another file in their folder: `x_mask.png` of `x.jpg`."""
     plain = {path.with_suffix("") for path in paths}
-    named = [path for path in paths if path.stem.endswith(MASK_MARK)]
-    return [path for path in named if path.with_name(path.stem.removesuffix(MASK_MARK)) in plain]
+    named = [path for path in paths if path.stem.endswith(MASK_SUFFIX)]
+    return [path for path in named if path.with_name(path.stem.removesuffix(MASK_SUFFIX)) in plain]
 
 
 def masks_below(folder: Path, paths: Sequence[Path]) -> set[Path]:

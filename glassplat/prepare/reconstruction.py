@@ -178,7 +178,7 @@ def write_capture(solution: Solution, folder: Path, listen: Listener) -> None:
         if image.camera_id in wide:
             mask = (folder / IGNORE_FOLDER / photograph.name).with_suffix(".png")
             height, width = pixels.shape[:2]
-            write_image(mask, 255 * PixelMap(wide[image.camera_id], width, height).blank())
+            write_image(mask, 255 * PixelMap(wide[image.camera_id], width, height).blank_mask())
         image.name = photograph.name
     listen(Working("colouring points from the photographs", 0, len(images)))
     model.extract_colors_for_all_images(folder / "images")

@@ -11,7 +11,7 @@ from pathlib import PurePosixPath
 import torch
 from torch import Tensor
 
-from glassplat.captures.view import FOLDER, View, in_world, with_ignored_right
+from glassplat.captures.view import NORMALS_FOLDER, View, copy_ignored_pixels, rotate_to_world
 from glassplat.kernels.panes import gradient_conflict as shared_edges
 from glassplat.kernels.panes import inside_panes
 from glassplat.kernels.photometric import photometric
@@ -50,7 +50,7 @@ class PhotometricLoss:
 
     def __call__(self, frame: Frame, view: View, scene: Scene) -> Tensor:
         """Loss of a view, in the colours of its photograph; scalar. Ignored pixels have no error."""
-        image = with_ignored_right(scene.exposures.apply(frame.rgb, view.name), view)
+        image = copy_ignored_pixels(scene.exposures.apply(frame.rgb, view.name), view)
         found = photometric(image, to_device(view.photo, image.device))
         return found.l1.lerp(1 - found.ssim, self.ssim_weight)
 
@@ -309,11 +309,13 @@ class MonocularNormals:
         normals = view.normals
         if normals is None:
             folders = view.image_path.parents[: len(PurePosixPath(view.name).parts) + 1]
-            if view.name not in self._without_normals and any((folder / FOLDER).is_dir() for folder in folders):
-                log.warning("no normals for %s in the folder %r next to it: it is learned without", view.name, FOLDER)
+            if view.name not in self._without_normals and any((folder / NORMALS_FOLDER).is_dir() for folder in folders):
+                log.warning(
+                    "no normals for %s in the folder %r next to it: it is learned without", view.name, NORMALS_FOLDER
+                )
             self._without_normals.add(view.name)
             return None
-        estimated = in_world(to_device(normals, frame.rgb.device).to(frame.rgb), view.camera)
+        estimated = rotate_to_world(to_device(normals, frame.rgb.device).to(frame.rgb), view.camera)
         known = (estimated.square().sum(-1) > 0) & (frame.layers["alpha"].detach() > 0.5)
         blended = torch.nn.functional.normalize(frame.layers["normal"], dim=-1)
         return _without_ignored(known * (1 - (blended * estimated).sum(-1)), view).mean()

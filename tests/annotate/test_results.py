@@ -326,7 +326,7 @@ def test_masks_of_bent_photographs_are_bent_too(room: Path) -> None:
     labels[60:160, 80:220] = 1
     bent = in_photograph(view, labels)
     assert bent.shape == (220, 300)
-    back = reader.pixel_map.labels(bent)
+    back = reader.pixel_map.map_labels(bent)
     assert (back != labels).mean() < 0.02
 
 

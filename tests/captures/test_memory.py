@@ -16,7 +16,7 @@ import torch
 
 from glassplat.captures import view as view_module
 from glassplat.captures.dataset import load_dataset
-from glassplat.captures.view import MOST_AHEAD, Memory, Source, default_budget, machine_memory
+from glassplat.captures.view import MOST_AHEAD, PixelCache, PixelSource, default_budget, machine_memory
 from glassplat.errors import InputError
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.scene.scene import Scene
@@ -40,7 +40,7 @@ class Files:
 
     def __init__(self, count: int) -> None:
         self.times: Counter[int] = Counter()
-        self.sources = [Source(self._reader(number)) for number in range(count)]
+        self.sources = [PixelSource(self._reader(number)) for number in range(count)]
 
     def _reader(self, number: int):
         def read() -> torch.Tensor:
@@ -51,7 +51,7 @@ class Files:
 
 
 def test_what_fits_is_read_once() -> None:
-    files, memory = Files(10), Memory(math.inf, largest=SIZE)
+    files, memory = Files(10), PixelCache(math.inf, largest=SIZE)
     for _ in range(3):
         assert [int(memory.get(source)[0, 0]) for source in files.sources] == list(range(10))
     assert set(files.times.values()) == {1}
@@ -59,26 +59,26 @@ def test_what_fits_is_read_once() -> None:
 
 
 def test_a_share_stays_where_not_all_fits_and_memory_is_bounded() -> None:
-    files, memory = Files(100), Memory(60 * WHOLE, largest=SIZE)
+    files, memory = Files(100), PixelCache(60 * WHOLE, largest=SIZE)
     for _ in range(3):
         for source in files.sources:
             memory.get(source)
-        held = [*memory._resident.values(), *memory._passing.values()]
+        held = [*memory._resident.values(), *memory._transient.values()]
         assert sum(tensor.numel() for tensor in held) <= memory.budget
     assert memory.is_full
     assert sum(times == 1 for times in files.times.values()) >= 40
 
 
 def test_a_step_reads_what_it_needs_also_where_there_is_no_room() -> None:
-    files, memory = Files(4), Memory(1, largest=SIZE)
+    files, memory = Files(4), PixelCache(1, largest=SIZE)
     assert [int(memory.get(source)[0, 0]) for source in files.sources] == [0, 1, 2, 3]
     assert memory.get(files.sources[3]) is memory.get(files.sources[3])
-    assert len(memory._passing) <= 3
+    assert len(memory._transient) <= 3
     assert memory.ahead == 1
-    assert Memory(math.inf).ahead == MOST_AHEAD
+    assert PixelCache(math.inf).ahead == MOST_AHEAD
 
 
-def numbers(memory: Memory, files: Files) -> list[int]:
+def numbers(memory: PixelCache, files: Files) -> list[int]:
     return [int(memory.get(source)[0, 0]) for source in files.sources]
 
 
@@ -94,14 +94,14 @@ class Failing(io.BytesIO):
 
 @pytest.fixture
 def slow_files(monkeypatch: pytest.MonkeyPatch) -> Files:
-    """Files that cost more to read than a disk does, and more of them than `Memory(1)` holds."""
+    """Files that cost more to read than a disk does, and more of them than `PixelCache(1)` holds."""
     monkeypatch.setattr(view_module, "DISK_RATE", math.inf)
     return Files(20)
 
 
 def test_what_was_costly_and_has_no_room_is_read_once_and_then_from_disk(slow_files: Files, tmp_path: Path) -> None:
-    memory = Memory(1, largest=SIZE)
-    with memory.spool_to(tmp_path):
+    memory = PixelCache(1, largest=SIZE)
+    with memory.cache_on_disk(tmp_path):
         for _ in range(3):
             assert numbers(memory, slow_files) == list(range(20))
         assert not list(tmp_path.iterdir()) or os.name == "nt"
@@ -112,8 +112,8 @@ def test_what_was_costly_and_has_no_room_is_read_once_and_then_from_disk(slow_fi
 
 
 def test_masks_come_back_from_disk_as_they_were(slow_files: Files, tmp_path: Path) -> None:
-    memory, mask = Memory(1, largest=SIZE), Source(lambda: torch.arange(SIZE) % 3, is_mask=True)
-    with memory.spool_to(tmp_path):
+    memory, mask = PixelCache(1, largest=SIZE), PixelSource(lambda: torch.arange(SIZE) % 3, is_mask=True)
+    with memory.cache_on_disk(tmp_path):
         first = memory.get(mask)
         numbers(memory, slow_files)
         assert torch.equal(memory.get(mask), first)
@@ -124,8 +124,8 @@ def test_what_is_cheap_to_read_does_not_go_to_the_disk(
     slow_files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(view_module, "DISK_RATE", 1e-9)
-    memory = Memory(1, largest=SIZE)
-    with memory.spool_to(tmp_path):
+    memory = PixelCache(1, largest=SIZE)
+    with memory.cache_on_disk(tmp_path):
         for _ in range(2):
             numbers(memory, slow_files)
     assert set(slow_files.times.values()) == {2}
@@ -135,38 +135,38 @@ def test_what_is_cheap_to_read_does_not_go_to_the_disk(
 def test_a_disk_without_room_or_with_errors_costs_time_only(
     what: str, slow_files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    memory, folder = Memory(1, largest=SIZE), tmp_path
+    memory, folder = PixelCache(1, largest=SIZE), tmp_path
     if what == "full":
         monkeypatch.setattr(view_module, "DISK_RESERVE", math.inf)
     if what == "gone":
         folder = tmp_path / "nowhere"
-    with memory.spool_to(folder):
+    with memory.cache_on_disk(folder):
         assert numbers(memory, slow_files) == list(range(20))
         if what == "breaks":
-            memory._spool._file.close()
-            memory._spool._file = Failing()
+            memory._disk_cache._file.close()
+            memory._disk_cache._file = Failing()
         if what == "cut off":
-            memory._spool._file.truncate(WHOLE // 2)
+            memory._disk_cache._file.truncate(WHOLE // 2)
         assert numbers(memory, slow_files) == list(range(20))
     assert set(slow_files.times.values()) == {2}
 
 
 def test_a_disk_on_which_nothing_more_fits_gets_its_room_back(slow_files: Files, tmp_path: Path) -> None:
-    memory = Memory(1, largest=SIZE)
-    with memory.spool_to(tmp_path):
+    memory = PixelCache(1, largest=SIZE)
+    with memory.cache_on_disk(tmp_path):
         numbers(memory, slow_files)
-        spool = memory._spool
+        spool = memory._disk_cache
         assert len(spool._places) > 10
         spool._file.close()
         spool._file = Failing()
-        spool.put(Source(lambda: torch.zeros(SIZE)), torch.zeros(SIZE))
+        spool.put(PixelSource(lambda: torch.zeros(SIZE)), torch.zeros(SIZE))
         assert spool._file is None and not spool._places
         assert numbers(memory, slow_files) == list(range(20))
 
 
 def test_reading_ahead_saves_the_wait_and_two_who_ask_read_once() -> None:
-    files, memory, gate = Files(1), Memory(math.inf), Event()
-    slow = Source(lambda: gate.wait(30) and torch.zeros(1))
+    files, memory, gate = Files(1), PixelCache(math.inf), Event()
+    slow = PixelSource(lambda: gate.wait(30) and torch.zeros(1))
     memory.read_ahead(slow)
     asking = Thread(target=lambda: memory.get(slow))
     asking.start()
@@ -183,11 +183,11 @@ def test_what_cannot_be_read_is_an_error_where_it_is_asked_for_and_not_before() 
     def broken() -> torch.Tensor:
         raise InputError("cut off")
 
-    memory = Memory(math.inf)
+    memory = PixelCache(math.inf)
     for _ in range(2):
-        memory.read_ahead(Source(broken))
+        memory.read_ahead(PixelSource(broken))
         with pytest.raises(InputError, match="cut off"):
-            memory.get(Source(broken))
+            memory.get(PixelSource(broken))
 
 
 def test_another_reader_of_a_view_of_the_same_name_is_another_photograph(capture) -> None:
@@ -228,8 +228,8 @@ def test_a_container_or_a_job_may_take_less_than_the_machine_has(
         limit = "1000000\n" if inner == limited else "max\n" if number else "9223372036854771712\n"
         (tmp_path / folder / inner / name).write_text(limit)
     (tmp_path / "membership").write_text(f"3:cpuset:/other\n4:{folder}:/{group}\n")
-    monkeypatch.setattr("glassplat.captures.view.GROUPS", tmp_path)
-    monkeypatch.setattr("glassplat.captures.view.MEMBERSHIP", tmp_path / "membership")
+    monkeypatch.setattr("glassplat.captures.view.CGROUP_FOLDER", tmp_path)
+    monkeypatch.setattr("glassplat.captures.view.CGROUP_FILE", tmp_path / "membership")
     assert (machine_memory() == 1e6) == group.startswith(limited)
 
 
@@ -237,7 +237,7 @@ def trained_scene(root: Path, memory: float | None, folder: Path) -> Scene:
     dataset = load_dataset(root, memory=memory)
     recipe = SplatRecipe(sh_degree=0)
     state = TrainState(recipe.initialise(dataset), seed=0)
-    with dataset.memory.spool_to(folder):
+    with dataset.memory.cache_on_disk(folder):
         names = [m.view for m in train(recipe.stages(0), dataset, state, 20) if isinstance(m, StepDone)]
     assert len(names) == 20
     assert dataset.train[0].memory.is_full == (memory is not None)

@@ -11,7 +11,7 @@ from threading import Event
 import pytest
 import torch
 
-from glassplat.captures.dataset import Dataset, load_dataset, photographs_read
+from glassplat.captures.dataset import Dataset, load_dataset, read_photographs_in_background
 from glassplat.errors import InputError
 
 PATIENCE = 60
@@ -34,7 +34,7 @@ def test_a_photograph_that_is_cut_off_is_found(capture, part: str) -> None:
     data = load_dataset(capture.root)
     view = getattr(data, part)[-1]
     os.truncate(view.image_path, view.image_path.stat().st_size // 2)
-    with pytest.raises(InputError, match=view.name), photographs_read(data) as check:
+    with pytest.raises(InputError, match=view.name), read_photographs_in_background(data) as check:
         wait_for(check, lambda: False)
 
 
@@ -55,7 +55,7 @@ def counting(data: Dataset) -> tuple[Dataset, dict[str, int]]:
 def test_every_photograph_is_read_once_and_those_for_training_stay(capture) -> None:
     capture.write_colmap()
     data, times = counting(load_dataset(capture.root))
-    with photographs_read(data) as check:
+    with read_photographs_in_background(data) as check:
         wait_for(check, lambda: len(times) == len(data.train) + len(data.test))
     before = dict(times)
     assert list(times)[: len(data.test)] == [view.name for view in data.test]
@@ -75,6 +75,6 @@ def test_reading_ends_with_the_context(capture, monkeypatch: pytest.MonkeyPatch)
         return torch.zeros(24, 32, 3, dtype=torch.uint8)
 
     monkeypatch.setattr("glassplat.captures.dataset.Event", lambda: stop)
-    with photographs_read(replace(data, test=(replace(data.test[0], read_photo=slow), *data.test[1:]))):
+    with read_photographs_in_background(replace(data, test=(replace(data.test[0], read_photo=slow), *data.test[1:]))):
         assert begun.wait(PATIENCE)
     assert times == {}

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from glassplat.captures.view import CAMERA_FROM_PICTURE, FOLDER, View, normals_reader
+from glassplat.captures.view import CAMERA_FROM_NORMAL_MAP, NORMALS_FOLDER, View, normals_reader
 from glassplat.methods.mirrors import (
     LEAST_NORMAL_LENGTH,
     mirror_lookalikes,
@@ -141,11 +141,11 @@ def test_a_surface_counts_by_the_cosine_at_which_it_is_seen() -> None:
 @pytest.mark.parametrize("estimated", [True, False])
 def test_estimated_normals_say_it_before_depths_do(tmp_path: Path, estimated: bool) -> None:
     scene, elsewhere = slope(), torch.tensor([0.6, 0.0, -0.8])
-    (tmp_path / FOLDER).mkdir()
-    in_picture = (elsewhere * torch.tensor(CAMERA_FROM_PICTURE)).expand(SIZE, SIZE, 3)
-    np.save(tmp_path / FOLDER / "0.npy", in_picture.numpy())
+    (tmp_path / NORMALS_FOLDER).mkdir()
+    in_picture = (elsewhere * torch.tensor(CAMERA_FROM_NORMAL_MAP)).expand(SIZE, SIZE, 3)
+    np.save(tmp_path / NORMALS_FOLDER / "0.npy", in_picture.numpy())
     (view,) = views(0.0)
-    view = replace(view, read_normals=normals_reader(tmp_path / FOLDER / "0.npy", view.camera))
+    view = replace(view, read_normals=normals_reader(tmp_path / NORMALS_FOLDER / "0.npy", view.camera))
     chosen = inner(scene)
     made = turn_into_mirrors(replace(SEARCH, estimated_normals=estimated), scene, [view], chosen).select(chosen)
     expected = elsewhere if estimated else true_normal()

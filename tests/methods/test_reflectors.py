@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from glassplat.captures.view import View, evenly
+from glassplat.captures.view import View, sample_evenly
 from glassplat.methods.mirrors import ReflectionMeasure, in_region, residual_spreads
 from glassplat.render.deferred import Deferred
 from glassplat.render.layers import contributions
@@ -94,5 +94,5 @@ def test_only_what_does_not_reflect_yet_can_be_overlooked() -> None:
 
 
 def test_views_are_taken_evenly() -> None:
-    assert [view.name for view in evenly(views(*([0.0] * 9)), 3)] == ["0.png", "3.png", "6.png"]
-    assert len(evenly(views(0.0), 3)) == 1
+    assert [view.name for view in sample_evenly(views(*([0.0] * 9)), 3)] == ["0.png", "3.png", "6.png"]
+    assert len(sample_evenly(views(0.0), 3)) == 1

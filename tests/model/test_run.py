@@ -23,7 +23,7 @@ import pytest
 import torch
 
 from glassplat.captures.dataset import load_dataset
-from glassplat.captures.view import Memory, View
+from glassplat.captures.view import PixelCache, View
 from glassplat.errors import InputError
 from glassplat.files import writing
 from glassplat.methods.glossy_recipes import DeferredRecipe
@@ -388,7 +388,7 @@ def test_a_rank_that_does_not_lead_saves_nothing(tmp_path: Path) -> None:
 def test_a_photograph_that_cannot_be_read_any_more_costs_nothing(
     tmp_path: Path, kind: type[Exception], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    gone, memory = threading.Event(), Memory(0.0)
+    gone, memory = threading.Event(), PixelCache(0.0)
     monkeypatch.setattr("glassplat.captures.view.DISK_RATE", 1e-9)  # Nothing is worth a copy on disk, however busy.
 
     def guarded(view: View) -> View:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from glassplat.captures.view import View, _opaque
+from glassplat.captures.view import View, _composite_over
 from glassplat.render.frame import Frame
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
@@ -37,7 +37,7 @@ def test_a_residual_is_what_the_render_lacks_and_nothing_where_it_is_not_counted
 def test_a_render_over_the_background_of_a_transparent_photograph_is_without_loss() -> None:
     rgba = (torch.rand(16, 24, 4) * 255).to(torch.uint8)
     rgba[:, :12, 3] = 0
-    view = View.in_memory("a.png", CAMERA, photo=torch.from_numpy(_opaque(rgba.numpy(), (1.0, 1.0, 1.0))))
+    view = View.in_memory("a.png", CAMERA, photo=torch.from_numpy(_composite_over(rgba.numpy(), (1.0, 1.0, 1.0))))
     alpha = rgba[..., 3:] / 255
     rgb = (rgba[..., :3] / 255 * alpha + 1 - alpha).requires_grad_()
     loss = PhotometricLoss(0.0)(Frame(rgb), view, SCENE)
