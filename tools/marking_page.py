@@ -27,7 +27,7 @@ import numpy as np
 from PIL import Image
 
 from glassplat.annotate.server import AnnotationServer
-from glassplat.annotate.session import opened_session
+from glassplat.annotate.session import open_session
 from tools.browser import Browser
 
 Places = Sequence[Any] | np.ndarray
@@ -116,7 +116,7 @@ class MarkingPage:
 @contextmanager
 def marking_page(capture: Path, *, width: int = 1400, height: int = 900) -> Iterator[MarkingPage]:
     """The page of a capture, open in a browser."""
-    with AnnotationServer(opened_session(capture), 0) as server:
+    with AnnotationServer(open_session(capture), 0) as server:
         thread = Thread(target=server.serve_forever, args=(0.02,))
         thread.start()
         try:

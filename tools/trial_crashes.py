@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from glassplat.annotate.document import read_document
-from glassplat.annotate.session import ChangedElsewhereError, opened_session
+from glassplat.annotate.session import ChangedElsewhereError, open_session
 from tests.annotate.conftest import write_room
 from tests.prepare.conftest import copy_photographs
 from tests.training.tiny_capture import write_tiny_capture
@@ -287,7 +287,7 @@ def marks_fault(draw: random.Random, room: Path, logs: Sequence[Path]) -> str:
 
 def save_marks(room: Path, log: Path) -> None:
     """Adds pane after pane, each with a corner that no other has, and writes a line for each that is saved."""
-    session = opened_session(room)
+    session = open_session(room)
     with log.open("w") as lines:
         for number in range(20):
             place = float(100 * int(log.name[-1]) + number)

@@ -27,7 +27,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
 from glassplat.access import cookie_name
 from glassplat.annotate.server import AnnotationServer
-from glassplat.annotate.session import opened_session
+from glassplat.annotate.session import open_session
 from glassplat.files.images import write_image
 from glassplat.prepare.preparation import PAGE
 from glassplat.render.planar import Planar
@@ -138,7 +138,7 @@ def viewed() -> Iterator[Viewer]:
 @contextmanager
 def annotated(root: Path) -> Iterator[AnnotationServer]:
     """The page for marking, of a capture."""
-    with AnnotationServer(opened_session(root), 0) as server:
+    with AnnotationServer(open_session(root), 0) as server:
         thread = Thread(target=server.serve_forever, args=(0.02,))
         thread.start()
         try:

@@ -26,13 +26,13 @@ Material = Literal["glass", "mirror", "screen"]
 ANNOTATIONS = "annotations.json"
 LOCK = "annotations.lock"
 """An empty file that remains on systems that cannot lock folders."""
-MOST_PANES, MOST_CORNERS, MOST_STROKES, MOST_PLACES = 64, 32, 500, 20_000
+MOST_PANES, MOST_CORNERS, MOST_STROKES, MOST_STROKE_POINTS = 64, 32, 500, 20_000
 """Limits of one document: more than users mark, and small enough to process."""
 FARTHEST = 1e6
-PLACE = ListOf(Number(-FARTHEST, FARTHEST), 2)
+PIXEL = ListOf(Number(-FARTHEST, FARTHEST), 2)
 
 
-class Record(Field):
+class ObjectField(Field):
     """A JSON object with known keys, as a field of another one."""
 
     expected = "an object"
@@ -44,21 +44,21 @@ class Record(Field):
         return check_fields(value, self._fields, where)
 
 
-STROKE = Record(
+STROKE = ObjectField(
     {
         "kind": Choice(("polygon", "brush")),
         "effect": Choice(("cut", "keep")),
         "radius": Optional(Number(0.1, 10_000), default=10.0),
-        "points": ListOf(PLACE),
+        "points": ListOf(PIXEL),
     }
 )
-PANE = Record(
+PANE = ObjectField(
     {
         "label": Integer(1, MOST_PANES),
         "material": Choice(("glass", "mirror", "screen")),
         "shape": Choice(("rectangle", "polygon")),
-        "corners": ListOf(DictOf(PLACE)),
-        "edges": Optional(ListOf(DictOf(ListOf(PLACE, 2))), default=()),
+        "corners": ListOf(DictOf(PIXEL)),
+        "edges": Optional(ListOf(DictOf(ListOf(PIXEL, 2))), default=()),
         "strokes": Optional(DictOf(ListOf(STROKE)), default={}),
     }
 )
@@ -95,38 +95,38 @@ class MarkedPane:
 
     def marks(self, numbers: Mapping[str, int]) -> Marks:
         """Corners and edges by index of the view; marks in photographs that no longer exist are left out."""
-        corners = [_number_places(places, numbers) for places in self.corners]
-        edges = [_number_places(places, numbers) for places in self.edges[: len(corners)]]
+        corners = [_by_view_index(pixels, numbers) for pixels in self.corners]
+        edges = [_by_view_index(pixels, numbers) for pixels in self.edges[: len(corners)]]
         return Marks(corners, edges)
 
     def views(self) -> set[str]:
         """Names of the photographs with any mark of the pane."""
-        marked = {name for places in (*self.corners, *self.edges) for name in places}
+        marked = {name for pixels in (*self.corners, *self.edges) for name in pixels}
         return marked | {name for name, strokes in self.strokes.items() if strokes}
 
 
-def _number_places(places: Mapping[str, Any], numbers: Mapping[str, int]) -> dict[int, Any]:
-    return {numbers[name]: np.array(place, dtype=np.float64) for name, place in places.items() if name in numbers}
+def _by_view_index(pixels: Mapping[str, Any], numbers: Mapping[str, int]) -> dict[int, Any]:
+    return {numbers[name]: np.array(pixel, dtype=np.float64) for name, pixel in pixels.items() if name in numbers}
 
 
-def parsed_document(value: Any, where: str) -> tuple[MarkedPane, ...]:
+def parse_document(value: Any, where: str) -> tuple[MarkedPane, ...]:
     """The panes of a document, checked."""
-    panes = tuple(_pane(entry) for entry in check_fields(value, DOCUMENT, where)["panes"])
+    panes = tuple(_parse_pane(entry) for entry in check_fields(value, DOCUMENT, where)["panes"])
     labels = [pane.label for pane in panes]
     if len(set(labels)) != len(labels):
         raise ValueError(f"{where} has the labels {labels}; expected every label once")
     for pane in panes:
         strokes = [stroke for several in pane.strokes.values() for stroke in several]
-        places = sum(len(stroke.points) for stroke in strokes)
-        if len(pane.corners) > MOST_CORNERS or len(strokes) > MOST_STROKES or places > MOST_PLACES:
+        points = sum(len(stroke.points) for stroke in strokes)
+        if len(pane.corners) > MOST_CORNERS or len(strokes) > MOST_STROKES or points > MOST_STROKE_POINTS:
             raise ValueError(
-                f"pane {pane.label} of {where} has {len(pane.corners)} corners and {len(strokes)} strokes of {places} "
-                f"points; expected at most {MOST_CORNERS} and {MOST_STROKES}, of {MOST_PLACES} points"
+                f"pane {pane.label} of {where} has {len(pane.corners)} corners and {len(strokes)} strokes of {points} "
+                f"points; expected at most {MOST_CORNERS} and {MOST_STROKES}, of {MOST_STROKE_POINTS} points"
             )
     return panes
 
 
-def _pane(entry: Mapping[str, Any]) -> MarkedPane:
+def _parse_pane(entry: Mapping[str, Any]) -> MarkedPane:
     strokes = {name: tuple(Stroke(**stroke) for stroke in several) for name, several in entry["strokes"].items()}
     return MarkedPane(
         entry["label"], entry["material"], entry["shape"], entry["corners"], entry["edges"], strokes=strokes
@@ -139,11 +139,11 @@ def read_document(folder: Path) -> Any:
     if not path.exists():
         return {"version": 1, "panes": []}
     value = read_json(path)
-    parsed_document(value, str(path))
+    parse_document(value, str(path))
     return value
 
 
-def version_of(value: Any) -> str:
+def document_version(value: Any) -> str:
     """Digest of the contents of a document."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:24]
 
@@ -180,15 +180,15 @@ FARTHEST_OUTSIDE = 1e5
 """Range in pixels to which the points of brush strokes are clamped."""
 
 
-def seen_outline(camera: NumpyCamera, corners: Array) -> Array:
+def project_outline(camera: NumpyCamera, corners: Array) -> Array:
     """[P, 2] the projected outline of a polygon [K, 3], clipped at the near plane; empty if it is behind the camera.
 
     Clipped ends lie far outside the photograph, at most 1 / `NEAR` focal lengths, which keeps edges straight.
     """
-    return camera.pixels(_before_camera(camera.to_camera_axes(corners)))
+    return camera.pixels(_clip_near(camera.to_camera_axes(corners)))
 
 
-def _before_camera(points: Array) -> Array:
+def _clip_near(points: Array) -> Array:
     """[P, 3] a polygon clipped at the near plane (Sutherland and Hodgman's algorithm)."""
     near = NEAR * float(np.abs(points).max())
     kept: list[Array] = []
@@ -206,30 +206,30 @@ def fill_polygon(outline: Array, size: tuple[int, int]) -> Mask:
     if len(outline) < 3:
         return np.zeros((height, width), dtype=bool)
     y, x = np.arange(height) + 0.5, np.arange(width) + 0.5
-    turns = np.zeros((height, width + 1), dtype=np.int16)  # Winding numbers: crossings per row, then summed along it.
+    winding = np.zeros((height, width + 1), dtype=np.int16)  # Winding numbers: crossings per row, then summed along it.
     for one, other in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         low, high = sorted((one[1], other[1]))
         rows = np.flatnonzero((y >= low) & (y < high))
         if not len(rows):
             continue
         crossing = one[0] + (y[rows] - one[1]) / (other[1] - one[1]) * (other[0] - one[0])
-        turns[rows, np.searchsorted(x, crossing)] += 1 if other[1] > one[1] else -1
-    np.cumsum(turns, axis=1, out=turns)
-    return turns[:, :width] != 0
+        winding[rows, np.searchsorted(x, crossing)] += 1 if other[1] > one[1] else -1
+    np.cumsum(winding, axis=1, out=winding)
+    return winding[:, :width] != 0
 
 
-def depths(camera: NumpyCamera, corners: Array, rows: slice, columns: slice) -> Array:
+def plane_depths(camera: NumpyCamera, corners: Array, rows: slice, columns: slice) -> Array:
     """Camera z at which each pixel's ray in a window intersects the plane of a polygon; infinite if it does not."""
     center = corners.mean(axis=0)
     normal = np.linalg.svd(corners - center)[2][2]
     x, y = np.meshgrid(np.arange(columns.start, columns.stop) + 0.5, np.arange(rows.start, rows.stop) + 0.5)
     rays = camera.rays(np.stack([x, y], axis=-1))
-    slopes = rays @ normal
-    away = float((center - camera.center) @ normal) / np.where(np.abs(slopes) < 1e-9, 1e-9, slopes)
-    return np.where(away > 0, away * (rays @ camera.rotation[2]), np.inf)
+    cosines = rays @ normal
+    distances = float((center - camera.center) @ normal) / np.where(np.abs(cosines) < 1e-9, 1e-9, cosines)
+    return np.where(distances > 0, distances * (rays @ camera.rotation[2]), np.inf)
 
 
-def with_strokes(mask: Mask, strokes: Sequence[Stroke]) -> Mask:
+def apply_strokes(mask: Mask, strokes: Sequence[Stroke]) -> Mask:
     """A mask after its strokes: cut removes pixels, keep restores those of the original mask."""
     found = mask.copy()
     for stroke in strokes:
@@ -240,14 +240,14 @@ def with_strokes(mask: Mask, strokes: Sequence[Stroke]) -> Mask:
 
 def rasterise_stroke(stroke: Stroke, size: tuple[int, int]) -> Mask:
     """[H, W] the pixels that a stroke covers."""
-    places = np.array(stroke.points, dtype=np.float64).reshape(-1, 2)
+    points = np.array(stroke.points, dtype=np.float64).reshape(-1, 2)
     if stroke.kind == "polygon":
-        return fill_polygon(places, size)
-    picture = Image.new("1", size)
-    pencil = ImageDraw.Draw(picture)
-    path = [tuple(place) for place in np.clip(places, -FARTHEST_OUTSIDE, FARTHEST_OUTSIDE)]
+        return fill_polygon(points, size)
+    image = Image.new("1", size)
+    draw = ImageDraw.Draw(image)
+    path = [tuple(point) for point in np.clip(points, -FARTHEST_OUTSIDE, FARTHEST_OUTSIDE)]
     if len(path) > 1:
-        pencil.line(path, fill=1, width=max(1, round(2 * stroke.radius)), joint="curve")
+        draw.line(path, fill=1, width=max(1, round(2 * stroke.radius)), joint="curve")
     for x, y in path:
-        pencil.ellipse((x - stroke.radius, y - stroke.radius, x + stroke.radius, y + stroke.radius), fill=1)
-    return np.array(picture)
+        draw.ellipse((x - stroke.radius, y - stroke.radius, x + stroke.radius, y + stroke.radius), fill=1)
+    return np.array(image)

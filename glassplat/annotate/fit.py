@@ -28,7 +28,7 @@ class RectanglePane:
     half_sizes: Array
 
     @property
-    def freedom(self) -> int:
+    def num_parameters(self) -> int:
         """Three for rotation, three for translation, two for the sides."""
         return 8
 
@@ -39,7 +39,7 @@ class RectanglePane:
     def apply_step(self, step: Array) -> RectanglePane:
         """The shape after a step: translation in units of the longer half side, logarithmic factors of the sides."""
         return RectanglePane(
-            axes=_turn_axes(self.axes, step[:3]),
+            axes=_rotate_axes(self.axes, step[:3]),
             center=self.center + self.half_sizes.max() * step[3:6] @ self.axes,
             half_sizes=self.half_sizes * np.exp(np.clip(step[6:8], -1, 1)),
         )
@@ -52,26 +52,26 @@ class PolygonPane:
     axes: Array
     """[3, 3] rows: two directions in the plane, and its normal."""
     center: Array
-    places: Array
+    plane_corners: Array
     """[K, 2] corners along the first two axes, from the centre."""
 
     @property
-    def freedom(self) -> int:
+    def num_parameters(self) -> int:
         """Two for the tilt, one for translation along the normal, two for each corner."""
-        return 3 + 2 * len(self.places)
+        return 3 + 2 * len(self.plane_corners)
 
     def corners(self) -> Array:
         """[K, 3]."""
-        return np.asarray(self.center + self.places @ self.axes[:2])
+        return np.asarray(self.center + self.plane_corners @ self.axes[:2])
 
     def apply_step(self, step: Array) -> PolygonPane:
         """The shape after a step; lengths are in units of the largest distance of a corner from the centre."""
-        reach = float(np.linalg.norm(self.places, axis=1).max())
+        reach = float(np.linalg.norm(self.plane_corners, axis=1).max())
         return replace(
             self,
-            axes=_turn_axes(self.axes, np.append(step[:2], 0.0)),
+            axes=_rotate_axes(self.axes, np.append(step[:2], 0.0)),
             center=self.center + reach * step[2] * self.axes[2],
-            places=self.places + reach * step[3:].reshape(-1, 2),
+            plane_corners=self.plane_corners + reach * step[3:].reshape(-1, 2),
         )
 
 
@@ -91,7 +91,7 @@ def polygon_pane(corners: Array) -> PolygonPane:
 
 def rectangle_pane(polygon: PolygonPane) -> RectanglePane:
     """A rectangle fitted to a polygon of four corners, which may be far from rectangular."""
-    a, b, c, d = polygon.places
+    a, b, c, d = polygon.plane_corners
     along, across = (b - a + c - d) / 2, (d - a + c - b) / 2
     # The direction that best fits both pairs of sides, with the second pair rotated back by 90 degrees.
     turn = 1.0 if along[0] * across[1] - along[1] * across[0] > 0 else -1.0
@@ -99,11 +99,11 @@ def rectangle_pane(polygon: PolygonPane) -> RectanglePane:
     first = direction / np.linalg.norm(direction)
     second = turn * np.array([-first[1], first[0]])
     axes = np.stack([first @ polygon.axes[:2], second @ polygon.axes[:2], turn * polygon.axes[2]])
-    half_sizes = np.maximum([along @ first / 2, across @ second / 2], 1e-3 * np.abs(polygon.places).max())
-    return RectanglePane(axes, polygon.center + polygon.places.mean(axis=0) @ polygon.axes[:2], half_sizes)
+    half_sizes = np.maximum([along @ first / 2, across @ second / 2], 1e-3 * np.abs(polygon.plane_corners).max())
+    return RectanglePane(axes, polygon.center + polygon.plane_corners.mean(axis=0) @ polygon.axes[:2], half_sizes)
 
 
-def _turn_axes(axes: Array, angles: Array) -> Array:
+def _rotate_axes(axes: Array, angles: Array) -> Array:
     """Axes rotated about themselves by a rotation vector, in radians."""
     from scipy.spatial.transform import Rotation
 
@@ -184,34 +184,34 @@ def fit_pane(marks: Marks, cameras: Sequence[NumpyCamera], shape: Shape) -> Pane
     Raises:
         TooFewMarksError: too few corners are known from two positions; the message names the missing marks.
     """
-    fits = [_fit_from(marks, cameras, start) for start in _starts(marks, cameras, shape)]
+    fits = [_fit_from(marks, cameras, start) for start in _initial_outlines(marks, cameras, shape)]
     _, fitted = min(fits, key=lambda fit: fit[0])
-    away = mark_residuals(marks, cameras, fitted)
+    residuals = mark_residuals(marks, cameras, fitted)
     jacobian = _jacobian(marks, cameras, fitted)
-    spread = max(1.0, float(np.sqrt((away**2).sum() / max(len(away) - fitted.freedom, 1))))
-    pixels = [(view, float(np.linalg.norm(away))) for view, away in _distances(marks, cameras, fitted)]
+    spread = max(1.0, float(np.sqrt((residuals**2).sum() / max(len(residuals) - fitted.num_parameters, 1))))
+    pixels = [(view, float(np.linalg.norm(offset))) for view, offset in _mark_offsets(marks, cameras, fitted)]
     largest = {view: max(one for number, one in pixels if number == view) for view in marks.views()}
     error = float(np.sqrt(np.mean([one**2 for _, one in pixels])))
     return PaneFit(fitted, error, largest, jacobian.T @ jacobian / spread**2)
 
 
-def _fit_from(marks: Marks, cameras: Sequence[NumpyCamera], begun: PaneShape) -> tuple[float, PaneShape]:
+def _fit_from(marks: Marks, cameras: Sequence[NumpyCamera], start: PaneShape) -> tuple[float, PaneShape]:
     """The robust cost and the shape of a fit that starts at the given shape."""
     from scipy.optimize import least_squares
 
     def residuals(step: Array) -> Array:
-        return mark_residuals(marks, cameras, begun.apply_step(step))
+        return mark_residuals(marks, cameras, start.apply_step(step))
 
-    step, cost = np.zeros(begun.freedom), np.inf
+    step, cost = np.zeros(start.num_parameters), np.inf
     for loss in ("soft_l1", "cauchy"):  # Cauchy first would stay at a poor start, where all marks are outliers.
         found = least_squares(residuals, step, loss=loss, f_scale=OUTLIER, x_scale="jac", max_nfev=100)
         step, cost = found.x, float(found.cost)
-    return cost, begun.apply_step(step)
+    return cost, start.apply_step(step)
 
 
 def mark_residuals(marks: Marks, cameras: Sequence[NumpyCamera], shape: PaneShape) -> Array:
     """[R] residuals of all marks, in accuracies: two for a corner, one for each pixel on an edge."""
-    parts = [away / (ACCURACY * cameras[view].diagonal) for view, away in _distances(marks, cameras, shape)]
+    parts = [offset / (ACCURACY * cameras[view].diagonal) for view, offset in _mark_offsets(marks, cameras, shape)]
     return np.concatenate(parts)
 
 
@@ -222,7 +222,7 @@ def corner_information(camera: NumpyCamera, shape: PaneShape) -> Array:
         [{0: pixel} if seen else {} for pixel, seen in zip(camera.project(shape.corners()), held, strict=True)]
     )
     if not held.any():
-        return np.zeros((shape.freedom, shape.freedom))
+        return np.zeros((shape.num_parameters, shape.num_parameters))
     jacobian = _jacobian(marks, [camera], shape)
     return jacobian.T @ jacobian
 
@@ -230,7 +230,7 @@ def corner_information(camera: NumpyCamera, shape: PaneShape) -> Array:
 def _jacobian(marks: Marks, cameras: Sequence[NumpyCamera], shape: PaneShape) -> Array:
     """[R, F] by central differences."""
     columns = []
-    for axis in np.eye(shape.freedom):
+    for axis in np.eye(shape.num_parameters):
         ahead, behind = (
             mark_residuals(marks, cameras, shape.apply_step(sign * DERIVATIVE_STEP * axis)) for sign in (1.0, -1.0)
         )
@@ -238,27 +238,27 @@ def _jacobian(marks: Marks, cameras: Sequence[NumpyCamera], shape: PaneShape) ->
     return np.stack(columns, axis=1)
 
 
-def _distances(marks: Marks, cameras: Sequence[NumpyCamera], shape: PaneShape) -> list[tuple[int, Array]]:
+def _mark_offsets(marks: Marks, cameras: Sequence[NumpyCamera], shape: PaneShape) -> list[tuple[int, Array]]:
     """The view and the residual of each mark, in pixels: [2] of a corner, [2] perpendicular to an edge."""
     corners = shape.corners()
     found = []
-    for number, places in enumerate(marks.corners):
-        found += [(view, cameras[view].project(corners[number]) - place) for view, place in places.items()]
-    for number, places in enumerate(marks.edges):
+    for number, pixels in enumerate(marks.corners):
+        found += [(view, cameras[view].project(corners[number]) - pixel) for view, pixel in pixels.items()]
+    for number, pixels in enumerate(marks.edges):
         ends = corners[[number, (number + 1) % len(corners)]]
-        found += [(view, _across(cameras[view].project(ends), place)) for view, place in places.items()]
+        found += [(view, _distances_from_line(cameras[view].project(ends), pixel)) for view, pixel in pixels.items()]
     return found
 
 
-def _across(line: Array, places: Array) -> Array:
+def _distances_from_line(line: Array, pixels: Array) -> Array:
     """[2] distances of two pixels from the line through two others."""
     along = line[1] - line[0]
     length = max(float(np.hypot(*along)), 1e-9)
-    away = places - line[0]
-    return np.asarray((along[0] * away[:, 1] - along[1] * away[:, 0]) / length)
+    offset = pixels - line[0]
+    return np.asarray((along[0] * offset[:, 1] - along[1] * offset[:, 0]) / length)
 
 
-def _starts(marks: Marks, cameras: Sequence[NumpyCamera], shape: Shape) -> list[PaneShape]:
+def _initial_outlines(marks: Marks, cameras: Sequence[NumpyCamera], shape: Shape) -> list[PaneShape]:
     """Initial outlines, at least one.
 
     An edge or a corner marked in one view only does not constrain the plane, only the extent of the pane. Therefore,
@@ -267,99 +267,99 @@ def _starts(marks: Marks, cameras: Sequence[NumpyCamera], shape: Shape) -> list[
     Raises:
         TooFewMarksError: the marks do not determine the plane.
     """
-    starts = [polygon_pane(_first_corners(marks, cameras))]
-    firm, loose = _seen_again(marks.edges)
-    if loose:
-        pane = fit_pane(replace(marks, edges=firm), cameras, shape).shape
-        starts.append(polygon_pane(_cut_by_edges(marks, cameras, pane, loose)))
-    firm, loose = _seen_again(marks.corners)
-    if loose:
+    starts = [polygon_pane(_initial_corners(marks, cameras))]
+    repeated, single = _split_single_marks(marks.edges)
+    if single:
+        pane = fit_pane(replace(marks, edges=repeated), cameras, shape).shape
+        starts.append(polygon_pane(_move_edges(marks, cameras, pane, single)))
+    repeated, single = _split_single_marks(marks.corners)
+    if single:
         with suppress(ValueError):  # Without these corners, or with a wrong one, the fit may be degenerate.
-            pane = fit_pane(replace(marks, corners=firm), cameras, shape).shape
-            starts.append(polygon_pane(_stretched_to_corners(marks, cameras, pane, loose)))
+            pane = fit_pane(replace(marks, corners=repeated), cameras, shape).shape
+            starts.append(polygon_pane(_stretch_to_corners(marks, cameras, pane, single)))
     return [rectangle_pane(start) if shape == "rectangle" and len(marks.corners) == 4 else start for start in starts]
 
 
-def _seen_again(marks: Sequence[Mapping[int, Array]]) -> tuple[list[Mapping[int, Array]], list[int]]:
+def _split_single_marks(marks: Sequence[Mapping[int, Array]]) -> tuple[list[Mapping[int, Array]], list[int]]:
     """Marks of corners or edges, without those marked in one view only, and the indices of the latter."""
-    loose = [number for number, places in enumerate(marks) if len(places) == 1]
-    return [{} if number in loose else places for number, places in enumerate(marks)], loose
+    single = [number for number, pixels in enumerate(marks) if len(pixels) == 1]
+    return [{} if number in single else pixels for number, pixels in enumerate(marks)], single
 
 
-def _stretched_to_corners(marks: Marks, cameras: Sequence[NumpyCamera], pane: PaneShape, loose: Sequence[int]) -> Array:
+def _stretch_to_corners(marks: Marks, cameras: Sequence[NumpyCamera], pane: PaneShape, single: Sequence[int]) -> Array:
     """[K, 3] the corners of a pane, some of them moved to their marks in a single view.
 
     Of four corners, the opposite one is fixed, and the adjacent ones keep the directions of their sides.
     """
     corners = pane.corners()
-    for number in loose:
-        place = _on_plane(marks, number, cameras, corners.mean(axis=0), pane.axes[2])
-        if place is None:
+    for number in single:
+        point = _corner_on_plane(marks, number, cameras, corners.mean(axis=0), pane.axes[2])
+        if point is None:
             continue
         if len(corners) == 4:
             before, after, across = number - 1, (number + 1) % 4, corners[number - 2]
             sides = np.stack([corners[before] - across, corners[after] - across], axis=1)
-            shares = np.linalg.lstsq(sides, place - across, rcond=None)[0]
+            shares = np.linalg.lstsq(sides, point - across, rcond=None)[0]
             corners[before], corners[after] = across + shares[0] * sides[:, 0], across + shares[1] * sides[:, 1]
-        corners[number] = place
+        corners[number] = point
     return corners
 
 
-def _cut_by_edges(marks: Marks, cameras: Sequence[NumpyCamera], pane: PaneShape, loose: Sequence[int]) -> Array:
+def _move_edges(marks: Marks, cameras: Sequence[NumpyCamera], pane: PaneShape, single: Sequence[int]) -> Array:
     """[K, 3] the corners of a pane, some edges of which are moved to their marks in a single view."""
     corners = pane.corners()
-    for number in loose:
-        corners = _cut_at(corners, number, _line_on_plane(marks.edges[number], cameras, pane))
+    for number in single:
+        corners = _move_edge(corners, number, _edge_on_plane(marks.edges[number], cameras, pane))
     return corners
 
 
-def _cut_at(corners: Array, edge: int, line: tuple[Array, Array] | None) -> Array:
+def _move_edge(corners: Array, edge: int, line: tuple[Array, Array] | None) -> Array:
     """[K, 3] an outline with one edge moved to a line in its plane."""
     around = [corners[(edge + step) % len(corners)] for step in (-1, 0, 1, 2)]
-    first, second = (_meeting(line, (around[before], around[before + 1])) for before in (0, 2))
+    first, second = (_intersect_lines(line, (around[before], around[before + 1])) for before in (0, 2))
     found = corners.copy()
     if first is not None and second is not None:
         found[edge], found[(edge + 1) % len(corners)] = first, second
     return found
 
 
-def _line_on_plane(
-    places: Mapping[int, Array], cameras: Sequence[NumpyCamera], pane: PaneShape
+def _edge_on_plane(
+    pixels: Mapping[int, Array], cameras: Sequence[NumpyCamera], pane: PaneShape
 ) -> tuple[Array, Array] | None:
     """Intersections of an edge's two sight lines, seen in one view, with a pane's plane; None if they diverge."""
-    ((view, ends),) = places.items()
+    ((view, ends),) = pixels.items()
     rays, normal, center = cameras[view].rays(np.asarray(ends)), pane.axes[2], cameras[view].center
-    heights, slopes = (pane.corners().mean(axis=0) - center) @ normal, rays @ normal
-    if (slopes * heights <= 1e-3 * abs(heights)).any():
+    heights, cosines = (pane.corners().mean(axis=0) - center) @ normal, rays @ normal
+    if (cosines * heights <= 1e-3 * abs(heights)).any():
         return None
-    first, second = center + rays * (heights / slopes)[:, None]
+    first, second = center + rays * (heights / cosines)[:, None]
     return first, second
 
 
-def _first_corners(marks: Marks, cameras: Sequence[NumpyCamera]) -> Array:
+def _initial_corners(marks: Marks, cameras: Sequence[NumpyCamera]) -> Array:
     """[K, 3] all corners: triangulated, intersected from two edges or with the plane of the others, or completed.
 
     Raises:
         TooFewMarksError: fewer than three are known from two positions.
     """
-    lines = [_edge_line(places, cameras) for places in marks.edges] + [None] * (len(marks.corners) - len(marks.edges))
+    lines = [_edge_line(pixels, cameras) for pixels in marks.edges] + [None] * (len(marks.corners) - len(marks.edges))
     known = [
-        _triangulate(places, cameras) if len(places) > 1 else _meeting(lines[number - 1], lines[number])
-        for number, places in enumerate(marks.corners)
+        _triangulate(pixels, cameras) if len(pixels) > 1 else _intersect_lines(lines[number - 1], lines[number])
+        for number, pixels in enumerate(marks.corners)
     ]
     points = [point for point in known if point is not None]
     spanning = points + [point for line in lines if line is not None for point in line]
     if len(spanning) < 3:
-        raise TooFewMarksError(_missing(marks, len(points)))
+        raise TooFewMarksError(_missing_marks_message(marks, len(points)))
     plane = polygon_pane(np.stack(spanning))
     completed = [
-        point if point is not None else _on_plane(marks, number, cameras, plane.center, plane.axes[2])
+        point if point is not None else _corner_on_plane(marks, number, cameras, plane.center, plane.axes[2])
         for number, point in enumerate(known)
     ]
-    return np.stack(_with_line_ends(completed, lines))
+    return np.stack(_complete_corners(completed, lines))
 
 
-def _missing(marks: Marks, known: int) -> str:
+def _missing_marks_message(marks: Marks, known: int) -> str:
     views = marks.views()
     if len(views) < 2:
         return "mark the same corners in a second photograph, taken from another position"
@@ -370,29 +370,29 @@ def _missing(marks: Marks, known: int) -> str:
     )
 
 
-def _triangulate(places: Mapping[int, Array], cameras: Sequence[NumpyCamera]) -> Array | None:
+def _triangulate(pixels: Mapping[int, Array], cameras: Sequence[NumpyCamera]) -> Array | None:
     """[3] the point nearest to all sight lines; None if they are too close to parallel."""
-    centers = np.stack([cameras[view].center for view in places])
-    rays = np.stack([cameras[view].rays(np.asarray(place)) for view, place in places.items()])
+    centers = np.stack([cameras[view].center for view in pixels])
+    rays = np.stack([cameras[view].rays(np.asarray(pixel)) for view, pixel in pixels.items()])
     if np.arccos(np.clip((rays @ rays.T).min(), -1, 1)) < LEAST_PARALLAX:
         return None
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     return np.linalg.solve(across.sum(axis=0), np.einsum("vij,vj->i", across, centers))
 
 
-def _edge_line(places: Mapping[int, Array], cameras: Sequence[NumpyCamera]) -> tuple[Array, Array] | None:
+def _edge_line(pixels: Mapping[int, Array], cameras: Sequence[NumpyCamera]) -> tuple[Array, Array] | None:
     """Two points on the intersection of an edge's planes of sight, at the marks of the first view, or None."""
-    if len(places) < 2:
+    if len(pixels) < 2:
         return None
-    rays = {view: cameras[view].rays(np.asarray(place)) for view, place in places.items()}
+    rays = {view: cameras[view].rays(np.asarray(pixel)) for view, pixel in pixels.items()}
     normals = np.stack([np.cross(*ends) for ends in rays.values()])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     _, sizes, axes = np.linalg.svd(normals)
     if len(normals) < 2 or sizes[1] < LEAST_PARALLAX * sizes[0]:
         return None
-    offsets = np.array([normal @ cameras[view].center for normal, view in zip(normals, places, strict=True)])
+    offsets = np.array([normal @ cameras[view].center for normal, view in zip(normals, pixels, strict=True)])
     point, direction = np.linalg.lstsq(normals, offsets, rcond=1e-9)[0], axes[2]
-    view = next(iter(places))
+    view = next(iter(pixels))
     first, second = (_nearest_on_line(point, direction, cameras[view].center, ray) for ray in rays[view])
     return first, second
 
@@ -404,7 +404,7 @@ def _nearest_on_line(point: Array, direction: Array, center: Array, ray: Array) 
     return np.asarray(point + direction * (direction @ across @ (center - point)) / max(along, 1e-12))
 
 
-def _meeting(before: tuple[Array, Array] | None, after: tuple[Array, Array] | None) -> Array | None:
+def _intersect_lines(before: tuple[Array, Array] | None, after: tuple[Array, Array] | None) -> Array | None:
     """[3] the midpoint between the closest points of two lines; None if one is missing or they are parallel."""
     if before is None or after is None:
         return None
@@ -417,17 +417,19 @@ def _meeting(before: tuple[Array, Array] | None, after: tuple[Array, Array] | No
     return np.asarray((first + second) / 2)
 
 
-def _on_plane(marks: Marks, number: int, cameras: Sequence[NumpyCamera], center: Array, normal: Array) -> Array | None:
+def _corner_on_plane(
+    marks: Marks, number: int, cameras: Sequence[NumpyCamera], center: Array, normal: Array
+) -> Array | None:
     """[3] intersection of a corner's first usable sight line with the plane of the others; None if there is none."""
-    for view, place in marks.corners[number].items():
-        ray = cameras[view].rays(np.asarray(place))
-        slope = ray @ normal
-        if abs(slope) > 1e-3:
-            return np.asarray(cameras[view].center + ray * ((center - cameras[view].center) @ normal) / slope)
+    for view, pixel in marks.corners[number].items():
+        ray = cameras[view].rays(np.asarray(pixel))
+        cosine = ray @ normal
+        if abs(cosine) > 1e-3:
+            return np.asarray(cameras[view].center + ray * ((center - cameras[view].center) @ normal) / cosine)
     return None
 
 
-def _with_line_ends(corners: list[Array | None], lines: Sequence) -> list[Array]:
+def _complete_corners(corners: list[Array | None], lines: Sequence) -> list[Array]:
     """All corners; unknown ones become ends of a marked edge, or the fourth corner of a parallelogram.
 
     Raises:

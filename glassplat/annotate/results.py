@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from glassplat.annotate.document import MarkedPane, depths, fill_polygon, seen_outline, with_strokes
+from glassplat.annotate.document import MarkedPane, apply_strokes, fill_polygon, plane_depths, project_outline
 from glassplat.annotate.fit import PaneFit
 from glassplat.captures.dataset import Dataset, make_dataset
 from glassplat.captures.files import read_poses, with_masks
@@ -32,12 +32,12 @@ from glassplat.scene.panes import Planes
 
 Array = NDArray[np.float64]
 
-LONGEST = 480
+LONGEST_SIDE = 480
 """Maximum width and height, in pixels, of the segmented part of a photograph; more takes seconds."""
 MARGIN = 0.25
 """Margin around an outline from which the background is learned, as a share of the outline's size."""
-ROUNDS = 5
-SMALLEST = 0.01
+GRABCUT_ROUNDS = 5
+SMALLEST_PIECE = 0.01
 """Minimum area of a piece, as a share of the outline's area."""
 
 
@@ -51,10 +51,10 @@ def grab_outlines(photo: NDArray[np.uint8], outline: Array) -> list[Array]:
     Returns:
         [Q, 2] pixels of each piece; the rough outline itself if its inside does not differ from its surroundings.
     """
-    cv2 = _opencv()
+    cv2 = _import_opencv()
     low, high = _window(outline, photo.shape[1], photo.shape[0])
     part = photo[low[1] : high[1], low[0] : high[0]]
-    scale = min(1.0, LONGEST / max(part.shape[:2]))
+    scale = min(1.0, LONGEST_SIDE / max(part.shape[:2]))
     small = cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     factor = np.array([small.shape[1], small.shape[0]]) / (high - low)
     inside = fill_polygon((outline - low) * factor, (small.shape[1], small.shape[0]))
@@ -63,7 +63,7 @@ def grab_outlines(photo: NDArray[np.uint8], outline: Array) -> list[Array]:
     if inside.all():
         return [outline]
     found = _foreground(cv2, np.ascontiguousarray(small[:, :, ::-1]), inside)
-    return [piece / factor + low for piece in _pieces(cv2, found, SMALLEST * inside.sum())] or [outline]
+    return [piece / factor + low for piece in _pieces(cv2, found, SMALLEST_PIECE * inside.sum())] or [outline]
 
 
 def _window(outline: Array, width: int, height: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -80,7 +80,7 @@ def _foreground(cv2: Any, colors: NDArray[np.uint8], inside: NDArray[np.bool_]) 
     cv2.setRNGSeed(0)  # Makes the result deterministic.
     mask = np.where(inside, cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8)
     models = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.grabCut(colors, mask, None, *models, ROUNDS, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(colors, mask, None, *models, GRABCUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
     return np.asarray(((mask == cv2.GC_PR_FGD) | (mask == cv2.GC_FGD)).astype(np.uint8))
 
 
@@ -92,7 +92,7 @@ def _pieces(cv2: Any, found: NDArray[np.uint8], least: float) -> list[Array]:
     return [one / 2 + 0.25 for one in smooth if len(one) > 2 and cv2.contourArea(one) / 4 >= least]
 
 
-def _opencv() -> Any:
+def _import_opencv() -> Any:
     try:
         return importlib.import_module("cv2")
     except ImportError as error:
@@ -100,21 +100,21 @@ def _opencv() -> Any:
 
 
 Labels = NDArray[np.uint8]
-Solved = Sequence[tuple[MarkedPane, PaneFit]]
+FittedPanes = Sequence[tuple[MarkedPane, PaneFit]]
 
 RECORD = "annotated.json"
 """Record in the folder of masks of the masks and planes written here, which may be replaced."""
 MIRROR_REFLECTANCE = 0.999
 
 
-def write_results(root: Path, views: Sequence[View], cameras: Sequence[NumpyCamera], panes: Solved) -> list[str]:
+def write_results(root: Path, views: Sequence[View], cameras: Sequence[NumpyCamera], panes: FittedPanes) -> list[str]:
     """Writes a mask for every photograph with a mark, and all planes; returns the masks' names.
 
     A mask shows the visible part of every pane, including panes not marked in its photograph.
     """
     folder = root / PANE_FOLDER
     earlier = earlier_masks(root)
-    planes = planes_of(panes, cameras)
+    planes = planes_from_panes(panes, cameras)
     _check_planes(root)
     marked = set().union(*(pane.views() for pane, _ in panes))
     paths = mask_paths(view.name for view in views)
@@ -122,10 +122,10 @@ def write_results(root: Path, views: Sequence[View], cameras: Sequence[NumpyCame
     new = {paths[view.name].as_posix() for view, _ in shown}
     # Written first: after an interrupt, all files are known to be ours.
     _write_record(
-        folder, earlier | new, [*_made_here(folder)[1], hashlib.sha256(planes_json(planes).encode()).hexdigest()]
+        folder, earlier | new, [*_read_record(folder)[1], hashlib.sha256(planes_json(planes).encode()).hexdigest()]
     )
     for view, camera in shown:
-        write_image(folder / paths[view.name], in_photograph(view, pane_labels(view.name, camera, panes)))
+        write_image(folder / paths[view.name], resample_to_photograph(view, pane_labels(view.name, camera, panes)))
     for name in earlier - new:
         (folder / name).unlink(missing_ok=True)
     write_planes(root / PLANES, planes)
@@ -135,7 +135,7 @@ def write_results(root: Path, views: Sequence[View], cameras: Sequence[NumpyCame
 
 def _check_planes(root: Path) -> None:
     """Refuse to replace planes not written here; earlier versions did not record theirs."""
-    masks, digests = _made_here(root / PANE_FOLDER)
+    masks, digests = _read_record(root / PANE_FOLDER)
     written = file_digest(root / PLANES)
     if written and written not in digests and (digests or not masks):
         raise InputError(
@@ -147,7 +147,7 @@ def _check_planes(root: Path) -> None:
 def remove_results(root: Path) -> list[str]:
     """Removes only the masks and planes written here; returns their names in the capture."""
     folder = root / PANE_FOLDER
-    masks, digests = [folder / name for name in sorted(earlier_masks(root))], _made_here(folder)[1]
+    masks, digests = [folder / name for name in sorted(earlier_masks(root))], _read_record(folder)[1]
     ours = [*([root / PLANES] if file_digest(root / PLANES) in digests else ()), *masks]
     removed = [path for path in ours if path.is_file()]
     for path in (*removed, folder / RECORD):  # The record last: after an interrupt, the rest is known to be ours.
@@ -164,7 +164,7 @@ def _write_record(folder: Path, masks: Set[str], digests: Sequence[str]) -> None
     write_text(folder / RECORD, json.dumps({"masks": sorted(masks), "planes": " ".join(digests)}, indent=1))
 
 
-def _made_here(folder: Path) -> tuple[set[str], list[str]]:
+def _read_record(folder: Path) -> tuple[set[str], list[str]]:
     """Recorded masks of a folder and digests of planes; earlier versions recorded only a list of masks."""
     try:
         record = read_json(folder / RECORD)
@@ -174,7 +174,7 @@ def _made_here(folder: Path) -> tuple[set[str], list[str]]:
         return set(), []
 
 
-def capture_to_mark(root: Path) -> Dataset:
+def load_capture_to_annotate(root: Path) -> Dataset:
     """Loads a capture whose panes are unmarked or marked here.
 
     Masks written here are not read, because they may be incomplete after an interrupt, or show no pane.
@@ -196,7 +196,7 @@ def earlier_masks(root: Path) -> set[str]:
     folder = root / PANE_FOLDER
     if not folder.is_dir():
         return set()
-    known, _ = _made_here(folder)
+    known, _ = _read_record(folder)
     found = [path.relative_to(folder) for path in files_below(folder) if path.is_file()]
     seen = {path.as_posix() for path in found if not is_hidden(path) and path.name != RECORD}
     others = sorted(seen - known)
@@ -209,27 +209,27 @@ def earlier_masks(root: Path) -> set[str]:
     return {name for name in known if not leaves_folder(name)}
 
 
-def pane_labels(name: str, camera: NumpyCamera, panes: Solved) -> Labels:
+def pane_labels(name: str, camera: NumpyCamera, panes: FittedPanes) -> Labels:
     """[H, W] label of the nearest pane at each pixel of a view, without marked occluders."""
     width, height = int(camera.size[0]), int(camera.size[1])
     labels, nearest = np.zeros((height, width), dtype=np.uint8), np.full((height, width), np.inf)
     for pane, fit in panes:
         corners = fit.shape.corners()
-        outline = fill_polygon(seen_outline(camera, corners), (width, height))
+        outline = fill_polygon(project_outline(camera, corners), (width, height))
         down, across = np.flatnonzero(outline.any(axis=1)), np.flatnonzero(outline.any(axis=0))
         if not len(down):
             continue
         window = slice(down[0], down[-1] + 1), slice(across[0], across[-1] + 1)
-        depth = np.where(outline[window], depths(camera, corners, *window), np.inf)
+        depth = np.where(outline[window], plane_depths(camera, corners, *window), np.inf)
         first = depth < nearest[window]
         strokes = pane.strokes.get(name, ())
-        shown = (with_strokes(outline, strokes) if strokes else outline)[window]
+        shown = (apply_strokes(outline, strokes) if strokes else outline)[window]
         labels[window][first] = np.where(shown, pane.label, labels[window])[first]
         nearest[window] = np.minimum(nearest[window], np.where(shown, depth, np.inf))
     return labels
 
 
-def in_photograph(view: View, labels: Labels) -> Labels:
+def resample_to_photograph(view: View, labels: Labels) -> Labels:
     """[H, W] labels resampled from the view to the pixels of its photograph's file, which may have lens distortion."""
     reader = view.read_photo
     if not isinstance(reader, PhotoFile):
@@ -251,9 +251,9 @@ def in_photograph(view: View, labels: Labels) -> Labels:
     return found
 
 
-def planes_of(panes: Solved, cameras: Sequence[NumpyCamera]) -> Planes:
+def planes_from_panes(panes: FittedPanes, cameras: Sequence[NumpyCamera]) -> Planes:
     """The minimum-area rectangle around each outline, with the normal towards most cameras."""
-    rows = [_rectangle(fit, cameras) for _, fit in panes]
+    rows = [_bounding_rectangle(fit, cameras) for _, fit in panes]
     centers, normals, tangents, half_sizes = (
         torch.tensor(np.stack(column), dtype=torch.float32) for column in zip(*rows, strict=True)
     )
@@ -270,11 +270,11 @@ def planes_of(panes: Solved, cameras: Sequence[NumpyCamera]) -> Planes:
     )
 
 
-def _rectangle(fit: PaneFit, cameras: Sequence[NumpyCamera]) -> tuple[NDArray[np.float64], ...]:
+def _bounding_rectangle(fit: PaneFit, cameras: Sequence[NumpyCamera]) -> tuple[NDArray[np.float64], ...]:
     """Centre, normal, tangent and half sizes."""
     corners, axes = fit.shape.corners(), fit.shape.axes
     middle = corners.mean(axis=0)
-    flat = min_area_rectangle((corners - middle) @ axes[:2].T)
+    rectangle = min_area_rectangle((corners - middle) @ axes[:2].T)
     facing = np.sign([(camera.center - middle) @ axes[2] for camera in cameras]).sum()
     normal = axes[2] if facing >= 0 else -axes[2]
-    return middle + flat.center @ axes[:2], normal, flat.axis @ axes[:2], flat.half_sizes
+    return middle + rectangle.center @ axes[:2], normal, rectangle.axis @ axes[:2], rectangle.half_sizes

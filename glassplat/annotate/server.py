@@ -18,7 +18,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from glassplat.access import LOCALHOST, Access, RefusedError
-from glassplat.annotate.session import SHOWN, THUMBNAIL, ChangedElsewhereError, Session
+from glassplat.annotate.session import PHOTOGRAPH_SIDE, THUMBNAIL_SIDE, ChangedElsewhereError, Session
 from glassplat.errors import InputError
 from glassplat.files.records import parse_json
 
@@ -78,16 +78,16 @@ class PageHandler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Sends the page, its files, photographs, and the description of the capture."""
-        self._answer(self._get)
+        self._respond(self._get)
 
     def do_POST(self) -> None:
         """Handles a changed document, a rough outline, and the requests to write results and to stop."""
-        self._answer(self._post)
+        self._respond(self._post)
 
     def log_message(self, format: str, *values: Any) -> None:
         """Suppresses request logs."""
 
-    def _answer(self, work: Callable[[], None]) -> None:
+    def _respond(self, work: Callable[[], None]) -> None:
         try:
             self.__dict__.pop("_path", None)  # A connection may serve several requests.
             self.server.access.check_host(self._host)
@@ -96,7 +96,7 @@ class PageHandler(BaseHTTPRequestHandler):
             self.close_connection = True
             self._send_json({"error": str(refused)}, refused.status)
         except ChangedElsewhereError as error:
-            self._send_json({"error": str(error), **error.answer}, HTTPStatus.CONFLICT)
+            self._send_json({"error": str(error), **error.response}, HTTPStatus.CONFLICT)
         except (ValueError, OSError) as error:
             self._send_json({"error": str(error)}, HTTPStatus.BAD_REQUEST)
 
@@ -112,9 +112,9 @@ class PageHandler(BaseHTTPRequestHandler):
         elif path == "/capture":
             self._send_json(self.server.session.describe())
         elif path.startswith("/photo/"):
-            self._send_picture(path.removeprefix("/photo/"), SHOWN)
+            self._send_photograph(path.removeprefix("/photo/"), PHOTOGRAPH_SIDE)
         elif path.startswith("/thumbnail/"):
-            self._send_picture(path.removeprefix("/thumbnail/"), THUMBNAIL)
+            self._send_photograph(path.removeprefix("/thumbnail/"), THUMBNAIL_SIDE)
         else:
             raise RefusedError(HTTPStatus.NOT_FOUND, "there is no such page")
 
@@ -154,18 +154,18 @@ class PageHandler(BaseHTTPRequestHandler):
         return self.rfile.read(int(length)).decode("utf-8")
 
     def _send_page(self) -> None:
-        entry = self.server.access.login_headers(self.path, self._host)
-        if entry is not None:
-            self._send(b"", "text/plain", HTTPStatus.OK, entry)
+        login_headers = self.server.access.login_headers(self.path, self._host)
+        if login_headers is not None:
+            self._send(b"", "text/plain", HTTPStatus.OK, login_headers)
             return
         self._check_key()
         self._send((resources.files("glassplat.annotate") / "page" / "index.html").read_bytes(), "text/html")
 
-    def _send_picture(self, number: str, longest: int) -> None:
+    def _send_photograph(self, number: str, longest: int) -> None:
         if not number.isdecimal() or len(number) > 9 or int(number) >= len(self.server.session.views):
             raise RefusedError(HTTPStatus.NOT_FOUND, "there is no such view")
-        picture = self.server.session.picture(int(number), longest)
-        self._send(picture, "image/jpeg")
+        jpeg = self.server.session.photograph_jpeg(int(number), longest)
+        self._send(jpeg, "image/jpeg")
 
     def _send_json(self, value: Any, status: HTTPStatus = HTTPStatus.OK) -> None:
         self._send(json.dumps(value).encode(), "application/json", status)

@@ -17,18 +17,18 @@ from PIL import Image
 from glassplat.annotate.document import (
     ANNOTATIONS,
     MOST_PANES,
-    PLACE,
+    PIXEL,
     MarkedPane,
+    document_version,
     fill_polygon,
     lock_folder,
-    parsed_document,
+    parse_document,
+    project_outline,
     read_document,
-    seen_outline,
-    version_of,
     write_document,
 )
 from glassplat.annotate.fit import Marks, PaneFit, TooFewMarksError, corner_information, fit_pane, tilt_deviation
-from glassplat.annotate.results import capture_to_mark, grab_outlines, remove_results, write_results
+from glassplat.annotate.results import grab_outlines, load_capture_to_annotate, remove_results, write_results
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.masks import PANE_FOLDER, PLANES
 from glassplat.captures.view import View
@@ -43,10 +43,10 @@ WANTED_ANGLE = np.radians(25)
 """Angle between sight lines of two photographs on a pane; a larger one adds little and changes the look of corners."""
 MARGIN = 0.1
 LEAST_CORNERS = 3
-OFFERED = 3
+MOST_SUGGESTED = 3
 
 
-def settling_views(fit: PaneFit, cameras: Sequence[NumpyCamera], marked: Collection[int]) -> list[tuple[int, float]]:
+def informative_views(fit: PaneFit, cameras: Sequence[NumpyCamera], marked: Collection[int]) -> list[tuple[int, float]]:
     """Views whose corners, if marked, would make a plane most certain, with the resulting uncertainty in degrees."""
     corners = fit.shape.corners()
     found = []
@@ -54,7 +54,7 @@ def settling_views(fit: PaneFit, cameras: Sequence[NumpyCamera], marked: Collect
         if number in marked or camera.contains(corners, MARGIN).sum() < min(LEAST_CORNERS, len(corners)):
             continue
         found.append((number, tilt_deviation(fit.information + corner_information(camera, fit.shape))))
-    return sorted(found, key=lambda pair: pair[1])[:OFFERED]
+    return sorted(found, key=lambda pair: pair[1])[:MOST_SUGGESTED]
 
 
 def second_views(outline: Array, view: int, cameras: Sequence[NumpyCamera], points: Array) -> list[int]:
@@ -70,10 +70,10 @@ def second_views(outline: Array, view: int, cameras: Sequence[NumpyCamera], poin
     if not len(through):
         through = points[held] if held.any() else points
     if not len(through):
-        return [number for number in range(len(cameras)) if number != view][:OFFERED]
-    worth = {number: _worth(through, camera, other) for number, other in enumerate(cameras) if number != view}
-    best = sorted(worth, key=lambda number: -worth[number])
-    return [number for number in best if worth[number] > 0][:OFFERED]
+        return [number for number in range(len(cameras)) if number != view][:MOST_SUGGESTED]
+    scores = {number: _view_score(through, camera, other) for number, other in enumerate(cameras) if number != view}
+    best = sorted(scores, key=lambda number: -scores[number])
+    return [number for number in best if scores[number] > 0][:MOST_SUGGESTED]
 
 
 def first_view(cameras: Sequence[NumpyCamera], points: Array) -> int:
@@ -81,7 +81,7 @@ def first_view(cameras: Sequence[NumpyCamera], points: Array) -> int:
     return int(np.argmax([camera.contains(points).sum() for camera in cameras])) if len(points) else 0
 
 
-def _worth(points: Array, camera: NumpyCamera, other: NumpyCamera) -> float:
+def _view_score(points: Array, camera: NumpyCamera, other: NumpyCamera) -> float:
     """Share of the points inside another view, times the median angle between sight lines, capped at `WANTED_ANGLE`."""
     one, two = (points - one.center for one in (camera, other))
     cosine = (one * two).sum(1) / (np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1))
@@ -92,7 +92,7 @@ def _worth(points: Array, camera: NumpyCamera, other: NumpyCamera) -> float:
 Panes = Mapping[int, Any]
 
 
-class Merged(NamedTuple):
+class MergedDocument(NamedTuple):
     """A document with the changes of both programs.
 
     Attributes:
@@ -106,7 +106,7 @@ class Merged(NamedTuple):
     renamed: dict[int, int]
 
 
-def merge_documents(base: Any, theirs: Any, ours: Any) -> Merged:
+def merge_documents(base: Any, theirs: Any, ours: Any) -> MergedDocument:
     """Merges two versions of one document.
 
     A pane changed or added on one side is taken from that side. If both sides changed it, theirs is kept, and ours is
@@ -129,7 +129,7 @@ def merge_documents(base: Any, theirs: Any, ours: Any) -> Merged:
             new = renamed[label] = _free_label({*kept, *here})
             kept[new] = {**ours_now, "label": new}
     panes = [pane for _, pane in sorted(kept.items()) if pane is not None]
-    return Merged({**theirs, "panes": panes}, _changes(before, there), renamed)
+    return MergedDocument({**theirs, "panes": panes}, _changes(before, there), renamed)
 
 
 def _free_label(used: set[int]) -> int:
@@ -150,11 +150,11 @@ def _changes(before: Panes, after: Panes) -> list[str]:
     return words or ["no pane changed"]
 
 
-THUMBNAIL = 160
-SHOWN = 2400
+THUMBNAIL_SIDE = 160
+PHOTOGRAPH_SIDE = 2400
 """Pixels of the longer side of photographs sent to the page."""
 QUALITY = 90
-KEPT_BYTES = 200_000_000
+CACHE_BYTES = 200_000_000
 """Maximum memory of encoded photographs."""
 POOR_RECTANGLE = 1.5
 """Ratio of the errors of rectangle and free polygon above which a warning is shown."""
@@ -163,15 +163,15 @@ MOST_GRABBED = 2000
 """Maximum number of points of a hand-drawn outline."""
 KNOWN_VERSIONS = 200
 """Number of remembered versions of the document on which a page may base its changes."""
-GRABBED: dict[str, Field] = {"view": Integer(0, 10**9), "points": ListOf(PLACE)}
+GRAB_FIELDS: dict[str, Field] = {"view": Integer(0, 10**9), "points": ListOf(PIXEL)}
 
 
 class ChangedElsewhereError(ValueError):
-    """Raised when a page saves changes to an outdated document; `answer` is the response to the page."""
+    """Raised when a page saves changes to an outdated document; `response` is sent to the page."""
 
-    def __init__(self, both: Merged, version: str) -> None:
-        super().__init__(f"the marks were changed elsewhere ({', '.join(both.changes)}); both versions are kept")
-        self.answer = {"document": both.document, "renamed": both.renamed, "version": version}
+    def __init__(self, merged: MergedDocument, version: str) -> None:
+        super().__init__(f"the marks were changed elsewhere ({', '.join(merged.changes)}); both versions are kept")
+        self.response = {"document": merged.document, "renamed": merged.renamed, "version": version}
 
 
 @dataclass(frozen=True)
@@ -198,11 +198,11 @@ class Session:
         self.cameras = [NumpyCamera.from_camera(view.camera) for view in self.views]
         points = dataset.points.positions.double().numpy() if dataset.measured_points else np.zeros((0, 3))
         self._points: Array = points[:: max(1, len(points) // POINTS_USED)]
-        self._numbers = {view.name: number for number, view in enumerate(self.views)}
+        self._view_numbers = {view.name: number for number, view in enumerate(self.views)}
         self._lock = Lock()
-        self._pictures: OrderedDict[tuple[int, int], bytes] = OrderedDict()
+        self._jpegs: OrderedDict[tuple[int, int], bytes] = OrderedDict()
         self._versions: OrderedDict[str, Any] = OrderedDict()
-        self._answers: dict[int, tuple[str, dict[str, Any]]] = {}
+        self._records: dict[int, tuple[str, dict[str, Any]]] = {}
         with convert_to_input_error():
             self._document: Any = read_document(self.root)
         self._remember(self._document)
@@ -220,10 +220,10 @@ class Session:
                 {"name": view.name, "width": view.camera.width, "height": view.camera.height} for view in self.views
             ],
             "first": first_view(self.cameras, self._points),
-            **self._current(),
+            **self._current_document(),
         }
 
-    def picture(self, number: int, longest: int) -> bytes:
+    def photograph_jpeg(self, number: int, longest: int) -> bytes:
         """A photograph as JPEG, undistorted, reduced to at most `longest` pixels a side.
 
         Raises:
@@ -231,59 +231,59 @@ class Session:
         """
         view = self.views[number]
         with self._lock:
-            if (number, longest) in self._pictures:
-                self._pictures.move_to_end((number, longest))
-                return self._pictures[number, longest]
+            if (number, longest) in self._jpegs:
+                self._jpegs.move_to_end((number, longest))
+                return self._jpegs[number, longest]
         image = Image.fromarray(view.read_photo().numpy())
         image.thumbnail((longest, longest), Image.Resampling.LANCZOS)
         encoded = io.BytesIO()
         image.save(encoded, "JPEG", quality=QUALITY)
         with self._lock:
-            self._pictures[number, longest] = encoded.getvalue()
-            while sum(map(len, self._pictures.values())) > KEPT_BYTES:
-                self._pictures.popitem(last=False)
+            self._jpegs[number, longest] = encoded.getvalue()
+            while sum(map(len, self._jpegs.values())) > CACHE_BYTES:
+                self._jpegs.popitem(last=False)
         return encoded.getvalue()
 
-    def save(self, asked: Any) -> dict[str, Any]:
+    def save(self, request: Any) -> dict[str, Any]:
         """Saves a changed document; returns the fits of its panes and its version.
 
         Args:
-            asked: `document`, and `version` of the document that the page changed.
+            request: `document`, and `version` of the document that the page changed.
 
         Raises:
             ChangedElsewhereError: another page or program has saved since; nothing is written.
             ValueError: it is not a valid document.
             OSError: the document cannot be saved.
         """
-        fields = check_fields(asked, {"version": Text()}, "the request of the page")
-        document = asked.get("document")
-        panes = parsed_document(document, "the document of the page")
+        fields = check_fields(request, {"version": Text()}, "the request of the page")
+        document = request.get("document")
+        panes = parse_document(document, "the document of the page")
         with self._lock, lock_folder(self.root):
             there = read_document(self.root)
-            if version_of(there) != fields["version"]:
+            if document_version(there) != fields["version"]:
                 base = self._versions.get(fields["version"], {"version": 1, "panes": []})
                 self._remember(there)
-                raise ChangedElsewhereError(merge_documents(base, there, document), version_of(there))
+                raise ChangedElsewhereError(merge_documents(base, there, document), document_version(there))
             write_document(self.root, document)
             self._remember(document)
-        return {"panes": [self._answer(pane) for pane in panes], "version": version_of(document)}
+        return {"panes": [self._pane_record(pane) for pane in panes], "version": document_version(document)}
 
-    def _current(self) -> dict[str, Any]:
+    def _current_document(self) -> dict[str, Any]:
         """The document on disk, which another program may have saved, and its version."""
         with self._lock:
             self._remember(read_document(self.root))
-            return {"document": self._document, "version": version_of(self._document)}
+            return {"document": self._document, "version": document_version(self._document)}
 
     def _remember(self, document: Any) -> None:
         """Store the document on disk and its version."""
-        self._document = self._versions[version_of(document)] = document
-        self._versions.move_to_end(version_of(document))
+        self._document = self._versions[document_version(document)] = document
+        self._versions.move_to_end(document_version(document))
         while len(self._versions) > KNOWN_VERSIONS:
             self._versions.popitem(last=False)
 
-    def grab(self, asked: Any) -> dict[str, Any]:
+    def grab(self, request: Any) -> dict[str, Any]:
         """Outlines of the object inside a rough outline in a photograph."""
-        fields = check_fields(asked, GRABBED, "the outline of the page")
+        fields = check_fields(request, GRAB_FIELDS, "the outline of the page")
         if fields["view"] >= len(self.views) or not 3 <= len(fields["points"]) <= MOST_GRABBED:
             raise ValueError(f"expected 3 to {MOST_GRABBED} points in one of {len(self.views)} views")
         photo = np.asarray(self.views[fields["view"]].read_photo().numpy())
@@ -292,7 +292,7 @@ class Session:
 
     def solve(self, pane: MarkedPane) -> SolvedPane:
         """Fits one pane."""
-        marks = pane.marks(self._numbers)
+        marks = pane.marks(self._view_numbers)
         if len(marks.corners) < 3 or not marks.views():
             return SolvedPane(pane, None, "mark the corners in order around the pane")
         try:
@@ -307,7 +307,7 @@ class Session:
 
         If no pane is marked any more, earlier output is removed.
         """
-        panes = parsed_document(self._current()["document"], "the document")
+        panes = parse_document(self._current_document()["document"], "the document")
         solved = [(one.pane, one.fit) for one in map(self.solve, panes) if one.fit is not None]
         if not solved:
             is_marked = any(places for pane in panes for places in (*pane.corners, *pane.edges))
@@ -315,56 +315,56 @@ class Session:
             if not removed:
                 raise InputError("no pane is known yet; mark the same corners in two photographs")
             stays = f"; {PLANES} stays: it was not written here" if (self.root / PLANES).exists() else ""
-            told = f"no pane is marked; removed the earlier output: {join_names(removed)}{stays}"
-            return {"masks": [], "planes": [], "told": told}
+            message = f"no pane is marked; removed the earlier output: {join_names(removed)}{stays}"
+            return {"masks": [], "planes": [], "told": message}
         written = write_results(self.root, self.views, self.cameras, solved)
         return {
             "masks": written,
             "planes": [{"label": pane.label, "uncertainty": fit.uncertainty} for pane, fit in solved],
         }
 
-    def _answer(self, pane: MarkedPane) -> dict[str, Any]:
+    def _pane_record(self, pane: MarkedPane) -> dict[str, Any]:
         """Record of a pane for the page; the cached one if its corners, edges and shape are unchanged."""
-        marked, known = repr((pane.corners, pane.edges, pane.shape)), self._answers.get(pane.label)
+        marked, known = repr((pane.corners, pane.edges, pane.shape)), self._records.get(pane.label)
         if known is None or known[0] != marked:
-            known = self._answers[pane.label] = marked, self._record(self.solve(pane))
+            known = self._records[pane.label] = marked, self._make_record(self.solve(pane))
         return known[1]
 
-    def _record(self, solved: SolvedPane) -> dict[str, Any]:
+    def _make_record(self, solved: SolvedPane) -> dict[str, Any]:
         """Record of a pane and its fit for the page."""
         pane, fit = solved.pane, solved.fit
-        marks = pane.marks(self._numbers)
+        marks = pane.marks(self._view_numbers)
         if fit is None:
             return {
                 "label": pane.label,
                 "solved": False,
-                "message": self._crossing(marks) or solved.problem,
+                "message": self._crossing_warning(marks) or solved.problem,
                 "next": [{"view": number} for number in self._second_views(marks)],
                 "lines": self._sight_lines(marks),
             }
         corners = fit.shape.corners()
-        advice = settling_views(fit, self.cameras, marks.views())
+        advice = informative_views(fit, self.cameras, marks.views())
         return {
             "label": pane.label,
             "solved": True,
-            "message": self._crossing(marks) or self._judgement(pane, fit, marks),
+            "message": self._crossing_warning(marks) or self._fit_warning(pane, fit, marks),
             "error": fit.error,
             "uncertainty": fit.uncertainty,
             "errors": fit.errors,
-            "outlines": [np.round(seen_outline(camera, corners), 2).tolist() for camera in self.cameras],
-            "corners": [_places(camera, corners) for camera in self.cameras],
+            "outlines": [np.round(project_outline(camera, corners), 2).tolist() for camera in self.cameras],
+            "corners": [_corner_pixels(camera, corners) for camera in self.cameras],
             "next": [{"view": number, "uncertainty": uncertainty} for number, uncertainty in advice],
         }
 
-    def _crossing(self, marks: Marks) -> str:
+    def _crossing_warning(self, marks: Marks) -> str:
         """A warning about the first photograph in which sides of the outline cross, or an empty string."""
         for view in marks.views():
             outline = [places[view] for places in marks.corners if view in places]
-            if len(outline) == len(marks.corners) and _crosses_itself(np.array(outline)):
+            if len(outline) == len(marks.corners) and _is_self_intersecting(np.array(outline)):
                 return f"the sides cross in {self.views[view].name}: click the corners in order around the pane"
         return ""
 
-    def _judgement(self, pane: MarkedPane, fit: PaneFit, marks: Marks) -> str:
+    def _fit_warning(self, pane: MarkedPane, fit: PaneFit, marks: Marks) -> str:
         """A warning about a poor fit, or an empty string."""
         worst = max(fit.errors, key=fit.errors.__getitem__)
         if pane.shape == "rectangle" and len(marks.corners) == 4 and fit.error > 2:
@@ -390,55 +390,55 @@ class Session:
     def _sight_lines(self, marks: Marks) -> list[list[Any]]:
         """For each corner marked in one view only, its sight line as a segment in each other view, or None."""
         lines = []
-        for places in marks.corners:
+        for pixels in marks.corners:
             segments: list[Any] = [None] * len(self.cameras)
-            if len(places) == 1:
-                ((view, place),) = places.items()
+            if len(pixels) == 1:
+                ((view, pixel),) = pixels.items()
                 segments = [
-                    None if number == view else self._sight_line(view, place, camera)
+                    None if number == view else self._sight_line(view, pixel, camera)
                     for number, camera in enumerate(self.cameras)
                 ]
             lines.append(segments)
         return lines
 
-    def _sight_line(self, view: int, place: Array, camera: NumpyCamera) -> list[list[float]] | None:
+    def _sight_line(self, view: int, pixel: Array, camera: NumpyCamera) -> list[list[float]] | None:
         """The visible segment of a sight line in another view, from near to far."""
         source = self.cameras[view]
-        far = self._reach()
-        ends = source.center + source.rays(place) * np.geomspace(0.01 * far, 10 * far, 60)[:, None]
+        far = self._scene_distance()
+        ends = source.center + source.rays(pixel) * np.geomspace(0.01 * far, 10 * far, 60)[:, None]
         ends = ends[camera.to_camera_axes(ends)[:, 2] > 0.005 * far]
         if len(ends) < 2:
             return None
         return np.round(camera.project(ends[[0, -1]]), 1).tolist()
 
-    def _reach(self) -> float:
+    def _scene_distance(self) -> float:
         """Rough distance of the scene from the cameras."""
         centers = np.stack([camera.center for camera in self.cameras])
-        things = self._points if len(self._points) else centers
-        return max(float(np.median(np.linalg.norm(things - centers.mean(axis=0), axis=1))), 1e-6)
+        points = self._points if len(self._points) else centers
+        return max(float(np.median(np.linalg.norm(points - centers.mean(axis=0), axis=1))), 1e-6)
 
 
-def _crosses_itself(outline: Array) -> bool:
+def _is_self_intersecting(outline: Array) -> bool:
     """Return whether two sides of an outline [K, 2] cross."""
-    along, away = np.roll(outline, -1, axis=0) - outline, outline[None] - outline[:, None]
-    starts = along[:, None, 0] * away[..., 1] - along[:, None, 1] * away[..., 0]
+    along, offsets = np.roll(outline, -1, axis=0) - outline, outline[None] - outline[:, None]
+    starts = along[:, None, 0] * offsets[..., 1] - along[:, None, 1] * offsets[..., 0]
     is_apart = starts * np.roll(starts, -1, axis=1) < 0  # The ends of one side lie on opposite sides of the other.
     return bool((is_apart & is_apart.T).any())
 
 
-def _places(camera: NumpyCamera, corners: Array) -> list[list[float] | None]:
+def _corner_pixels(camera: NumpyCamera, corners: Array) -> list[list[float] | None]:
     """Pixels of corners; None for those behind the camera."""
-    places = np.round(camera.project(corners), 2).tolist()
-    return [place if depth > 0 else None for place, depth in zip(places, camera.to_camera_axes(corners)[:, 2], strict=True)]
+    pixels = np.round(camera.project(corners), 2).tolist()
+    return [pixel if depth > 0 else None for pixel, depth in zip(pixels, camera.to_camera_axes(corners)[:, 2], strict=True)]
 
 
-def opened_session(root: Path) -> Session:
+def open_session(root: Path) -> Session:
     """Opens the session of a capture.
 
     Args:
         root: folder of the capture.
     """
     check_links(root, (ANNOTATIONS, PANE_FOLDER, PLANES))
-    dataset = capture_to_mark(root)
+    dataset = load_capture_to_annotate(root)
     check_folder(root)
     return Session(dataset)

@@ -17,7 +17,7 @@ from glassplat.cli.progress import WorkProgress
 from glassplat.files.writing import check_capture_folder, real_path
 from glassplat.options import Range, Share
 from glassplat.prepare.colmap import LensName, Mapper
-from glassplat.prepare.preparation import PAGE, Preparation, Workplace, check_places, prepare
+from glassplat.prepare.preparation import PAGE, Preparation, WorkFolder, check_paths, prepare
 from glassplat.prepare.reconstruction import Settings
 
 
@@ -49,7 +49,7 @@ class Prepare:
 
     def set_up(self) -> None:
         """Checks input and output, and that pycolmap is installed."""
-        check_places(self._task())
+        check_paths(self._task())
         quiet_pycolmap()
 
     def _task(self) -> Preparation:
@@ -88,7 +88,7 @@ class Prepare:
         if self._has_finished.is_set():
             page = f"glassplat info {shell_word(self._output)} --page {shell_word(self._output / PAGE)}"
             return f"the capture in {self._output} is complete; `{page}` writes its report"
-        if (partial := Workplace(self._output).folder).exists():
+        if (partial := WorkFolder(self._output).folder).exists():
             return f"repeat the command with --resume to continue; finished work is in {partial}"
         return "nothing was written: repeat the command to start again"
 

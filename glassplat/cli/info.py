@@ -147,17 +147,15 @@ def video_finding(path: Path) -> Iterator[Finding]:
     """A video, or a file with a video's suffix."""
     size = path.stat().st_size
     try:
-        footage = video_facts(path)
+        facts = video_facts(path)
     except NoOpenCVError as error:
         yield Finding("a video, by its name", {"bytes": size}, [str(error)])
         return
-    if footage is None:
+    if facts is None:
         problem = "OpenCV cannot read a frame of it; convert it to an MP4, or give a folder of photographs"
         yield Finding("a file with a video's suffix", {"bytes": size}, [problem])
         return
-    finding = Finding(
-        "a video", {"bytes": size, "frames": footage.frames, "pictures": f"{footage.width}x{footage.height}"}
-    )
+    finding = Finding("a video", {"bytes": size, "frames": facts.frames, "pictures": f"{facts.width}x{facts.height}"})
     finding.next.append(
         f"glassplat prepare {shell_word(path)} --output CAPTURE    extracts frames and estimates their camera poses"
     )

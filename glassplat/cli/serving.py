@@ -17,7 +17,7 @@ from torch import Tensor
 
 from glassplat.access import is_local
 from glassplat.annotate.server import AnnotationServer
-from glassplat.annotate.session import opened_session
+from glassplat.annotate.session import open_session
 from glassplat.cli.console import print_line, shell_word
 from glassplat.cli.runs import load_run_dataset, print_address
 from glassplat.errors import InputError
@@ -70,7 +70,7 @@ def photograph_readers(run: Path) -> dict[str, Callable[[], Tensor]]:
 
 def serve_annotation(command: Annotate, console: Console) -> None:
     """Serves the page until it is closed or interrupted."""
-    session = opened_session(command.capture)
+    session = open_session(command.capture)
     with AnnotationServer(session, command.port) as server, ExitStack() as stack:
         port = server.server_address[1]
         print_line(console, f"{len(session.views)} photographs; the page is at {server.address}")

@@ -29,18 +29,18 @@ from glassplat.training.messages import Working
 
 Result = TypeVar("Result")
 
-LOOK_EVERY = 0.25
+POLL_SECONDS = 0.25
 """Seconds between two checks of the progress."""
 PAIRS_AT_ONCE = 50
 """Pairs of photographs matched between two checks for cancellation; COLMAP's default of 1225 takes many minutes."""
 
 
-def interruptible(work: Callable[[Any], Result], meanwhile: Callable[[], None] = lambda: None) -> Result:
+def run_interruptible(work: Callable[[Any], Result], poll: Callable[[], None] = lambda: None) -> Result:
     """Runs work in a thread, so that signals reach the main thread, which then cancels the work.
 
     Args:
         work: receives a `pycolmap.CancellationToken`; calls that do not take one run to their end.
-        meanwhile: called a few times a second while the work runs.
+        poll: called a few times a second while the work runs.
 
     Raises:
         Exception: raised by the work.
@@ -62,8 +62,8 @@ def interruptible(work: Callable[[Any], Result], meanwhile: Callable[[], None] =
 
     threading.Thread(target=run, name="pycolmap", daemon=True).start()
     try:
-        while not ended.wait(LOOK_EVERY):
-            meanwhile()
+        while not ended.wait(POLL_SECONDS):
+            poll()
     except BaseException:
         token.cancel()
         ended.wait()  # Waits for writes to the database, so that it is consistent.
@@ -77,15 +77,15 @@ Item = TypeVar("Item")
 LensName = Literal["simple_pinhole", "simple_radial", "radial", "opencv", "opencv_fisheye"]
 """COLMAP's camera models, the simplest first: except for the fisheye, each one adds distortion parameters."""
 
-USUAL_FOCAL = 1.2
+DEFAULT_FOCAL = 1.2
 """Default focal length, in longer image sides, of photographs without EXIF: roughly a phone's main lens."""
 SEED = 0
-OF_DATABASE = ("SQLite", "database", "basic_string")
+DATABASE_ERROR_WORDS = ("SQLite", "database", "basic_string")
 """Parts of COLMAP's messages if its database fails; the last one if a text is missing in it."""
 
 
 @dataclass(frozen=True)
-class Features:
+class FeatureOptions:
     """Options for finding and matching features.
 
     Attributes:
@@ -110,15 +110,15 @@ class FeatureDatabase:
     """
 
     path: Path
-    pictures: Path
+    image_folder: Path
     photographs: Sequence[Photograph]
 
     @property
-    def picture_names(self) -> list[str]:
+    def image_names(self) -> list[str]:
         """Names of all photographs in the database."""
-        return [self.picture_name(index) for index in range(len(self.photographs))]
+        return [self.image_name(index) for index in range(len(self.photographs))]
 
-    def picture_name(self, index: int) -> str:
+    def image_name(self, index: int) -> str:
         """Name of a photograph in the database."""
         return f"{index:06d}.png"
 
@@ -129,14 +129,14 @@ class FeatureDatabase:
                 return
             database.clear_all_tables()
             keys = dict.fromkeys(map(_camera_key, self.photographs))
-            rigs = {key: _new_rig(database, lens, key, self._focal(key)) for key in keys}
+            rigs = {key: _add_rig(database, lens, key, self._focal(key)) for key in keys}
             for index, photograph in enumerate(self.photographs):
-                _add_image(database, self.picture_name(index), *rigs[_camera_key(photograph)])
+                _add_image(database, self.image_name(index), *rigs[_camera_key(photograph)])
 
-    def write_pictures(self, listen: Listener) -> None:
+    def write_images(self, listen: Listener) -> None:
         """Writes missing greyscale images: upright, reduced."""
-        self.pictures.mkdir(parents=True, exist_ok=True)
-        targets = [self.pictures / name for name in self.picture_names]
+        self.image_folder.mkdir(parents=True, exist_ok=True)
+        targets = [self.image_folder / name for name in self.image_names]
         missing = [index for index, target in enumerate(targets) if not target.is_file()]
         for done, index in enumerate(missing):
             listen(Working("reading the photographs", done, len(missing)))
@@ -144,7 +144,7 @@ class FeatureDatabase:
                 pixels = read_photograph(self.photographs[index])
                 Image.fromarray(pixels).convert("L").save(temporary, compress_level=1)
 
-    def extract(self, features: Features, listen: Listener) -> None:
+    def extract(self, features: FeatureOptions, listen: Listener) -> None:
         """Extracts features of the photographs without any."""
         options = library.pycolmap.FeatureExtractionOptions(use_gpu=False)
         options.sift.max_num_features = features.most
@@ -154,22 +154,22 @@ class FeatureDatabase:
         def work(token: Any) -> None:
             library.pycolmap.extract_features(
                 self.path,
-                self.pictures,
-                image_names=self.picture_names,  # A killed command may have left a partial file there.
+                self.image_folder,
+                image_names=self.image_names,  # A killed command may have left a partial file there.
                 extraction_options=options,
                 device=library.pycolmap.Device.cpu,
                 cancellation_token=token,
             )
 
         with self._open() as database:
-            watched = _Watched("extracting features", _image_ids(database), database.exists_keypoints, listen)
-            interruptible(work, watched.look)
+            progress = _DatabaseProgress("extracting features", _image_ids(database), database.exists_keypoints, listen)
+            run_interruptible(work, progress.report)
 
-    def match(self, pairs: Sequence[tuple[int, int]], features: Features, listen: Listener) -> None:
+    def match(self, pairs: Sequence[tuple[int, int]], features: FeatureOptions, listen: Listener) -> None:
         """Matches pairs of photographs, by index, that are not matched yet."""
-        listed = self.path.with_suffix(".pairs.txt")
-        names = [(self.picture_name(one), self.picture_name(other)) for one, other in pairs]
-        listed.write_text("".join(f"{one} {other}\n" for one, other in names), encoding="utf-8")
+        pairs_file = self.path.with_suffix(".pairs.txt")
+        names = [(self.image_name(one), self.image_name(other)) for one, other in pairs]
+        pairs_file.write_text("".join(f"{one} {other}\n" for one, other in names), encoding="utf-8")
         matching = library.pycolmap.FeatureMatchingOptions(use_gpu=False)
         matching.guided_matching = features.guided
         verification = library.pycolmap.TwoViewGeometryOptions()
@@ -180,7 +180,7 @@ class FeatureDatabase:
                 self.path,
                 matching_options=matching,
                 pairing_options=library.pycolmap.ImportedPairingOptions(
-                    match_list_path=listed, block_size=PAIRS_AT_ONCE
+                    match_list_path=pairs_file, block_size=PAIRS_AT_ONCE
                 ),
                 verification_options=verification,
                 device=library.pycolmap.Device.cpu,
@@ -190,10 +190,10 @@ class FeatureDatabase:
         with self._open() as database:
             ids = _image_ids(database)
             items = [(ids[one], ids[other]) for one, other in pairs]
-            watched = _Watched(
+            progress = _DatabaseProgress(
                 "matching photographs", items, lambda two: database.exists_two_view_geometry(*two), listen
             )
-            interruptible(work, watched.look)
+            run_interruptible(work, progress.report)
 
     def feature_counts(self) -> NDArray[np.int64]:
         """[P] number of features of each photograph."""
@@ -233,7 +233,7 @@ def check_database(path: Path) -> Iterator[None]:
         raise
     except (RuntimeError, LookupError, ValueError) as error:
         reason = str(error)
-        if isinstance(error, RuntimeError) and not any(word in reason for word in OF_DATABASE):
+        if isinstance(error, RuntimeError) and not any(word in reason for word in DATABASE_ERROR_WORDS):
             raise
         if "disk is full" in reason:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
@@ -242,7 +242,7 @@ def check_database(path: Path) -> Iterator[None]:
         ) from error
 
 
-class _Watched(Generic[Item]):
+class _DatabaseProgress(Generic[Item]):
     """Progress of COLMAP: counts the items with results in the database while COLMAP runs.
 
     The database is read by COLMAP's SQLite. Python's is another copy in this process: closing a file in one drops the
@@ -253,7 +253,7 @@ class _Watched(Generic[Item]):
         self._what, self._total = what, len(items)
         self._missing, self._exists, self._listen = items, exists, listen
 
-    def look(self) -> None:
+    def report(self) -> None:
         """Checks the items missing at the last call, and reports progress."""
         self._missing = [item for item in self._missing if not self._exists(item)]
         self._listen(Working(self._what, self._total - len(self._missing), self._total))
@@ -268,12 +268,12 @@ def _camera_key(photograph: Photograph) -> tuple[str, int, int]:
     return photograph.device, photograph.width, photograph.height
 
 
-def _new_rig(database: Any, lens: LensName, key: tuple[str, int, int], focal: float | None) -> tuple[int, int]:
+def _add_rig(database: Any, lens: LensName, key: tuple[str, int, int], focal: float | None) -> tuple[int, int]:
     """Adds the camera of a device and a rig with only this camera; returns their ids."""
     _, width, height = key
     model = getattr(library.pycolmap.CameraModelId, lens.upper())
     camera = library.pycolmap.Camera.create_from_model_id(
-        0, model, focal or USUAL_FOCAL * max(width, height), width, height
+        0, model, focal or DEFAULT_FOCAL * max(width, height), width, height
     )
     camera.has_prior_focal_length = focal is not None
     camera.camera_id = database.write_camera(camera)
@@ -296,7 +296,7 @@ Pairs = list[tuple[int, int]]
 MOST_EXHAUSTIVE = 80
 """Maximum number of photographs of which all pairs are matched; these are 3160."""
 NEIGHBOURS = 10
-ALIKE = 10
+MOST_SIMILAR = 10
 """Number of similar photographs, taken anywhere, with which each one is matched; this closes loops."""
 WORDS, SAMPLED = 64, 20_000
 """Number of visual words, and of descriptors from which they are learned."""
@@ -313,8 +313,8 @@ def neighbouring_pairs(count: int) -> Pairs:
     return [(index + step, index) for index in range(count) for step in steps if index + step < count]
 
 
-def alike_pairs(descriptors: Sequence[NDArray[np.uint8]]) -> Pairs:
-    """Pairs of each photograph with the `ALIKE` most similar ones, by a visual vocabulary learned from all of them.
+def similar_pairs(descriptors: Sequence[NDArray[np.uint8]]) -> Pairs:
+    """Pairs of each photograph with the `MOST_SIMILAR` nearest ones, by a visual vocabulary learned from all of them.
 
     The descriptor of a photograph is the sum of differences between its features and their nearest words, for each word
     (VLAD, Jégou et al. 2010), with signed square roots. No pretrained vocabulary is needed.
@@ -323,19 +323,19 @@ def alike_pairs(descriptors: Sequence[NDArray[np.uint8]]) -> Pairs:
         descriptors: [F, 128] of each photograph.
     """
     signatures = _signatures([np.asarray(part, dtype=np.float32) for part in descriptors])
-    likeness = signatures @ signatures.T
-    np.fill_diagonal(likeness, -np.inf)
-    nearest = np.argsort(-likeness, axis=1, kind="stable")[:, : min(ALIKE, len(descriptors) - 1)]
+    similarity = signatures @ signatures.T
+    np.fill_diagonal(similarity, -np.inf)
+    nearest = np.argsort(-similarity, axis=1, kind="stable")[:, : min(MOST_SIMILAR, len(descriptors) - 1)]
     found = {(max(one, int(other)), min(one, int(other))) for one, row in enumerate(nearest) for other in row}
     return sorted(found)
 
 
-def chosen_pairs(descriptors: Sequence[NDArray[np.uint8]]) -> Pairs:
+def pairs_to_match(descriptors: Sequence[NDArray[np.uint8]]) -> Pairs:
     """The pairs to match, of photographs with these descriptors."""
     count = len(descriptors)
     if count <= MOST_EXHAUSTIVE:
         return all_pairs(count)
-    return sorted({*neighbouring_pairs(count), *alike_pairs(descriptors)})
+    return sorted({*neighbouring_pairs(count), *similar_pairs(descriptors)})
 
 
 def _signatures(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
@@ -364,7 +364,7 @@ Mapper = Literal["incremental", "global"]
 
 
 @dataclass(frozen=True)
-class Mapping:
+class MappingOptions:
     """Options for registering photographs.
 
     Attributes:
@@ -380,7 +380,7 @@ REGISTERING = "registering the photographs"
 
 
 def register_photographs(
-    database: Path, mapper: Mapper, options: Mapping, *, count: int, listen: Listener
+    database: Path, mapper: Mapper, options: MappingOptions, *, count: int, listen: Listener
 ) -> list[Any]:
     """Registers photographs; returns their connected groups as `pycolmap.Reconstruction`, the largest first.
 
@@ -395,31 +395,33 @@ def register_photographs(
     output.mkdir(exist_ok=True)
     listen(Working(REGISTERING, 0, count))
     if mapper == "incremental":
-        work = _incremental(database, output, _incremental_options(options), count, listen)
+        work = _incremental_mapping(database, output, _incremental_options(options), count, listen)
     else:
-        work = _global(database, output)
+        work = _global_mapping(database, output)
     with check_database(database):
-        found = interruptible(work)
+        found = run_interruptible(work)
     return sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 
-def _incremental(database: Path, output: Path, options: Any, count: int, listen: Listener) -> Callable[[Any], dict]:
+def _incremental_mapping(
+    database: Path, output: Path, options: Any, count: int, listen: Listener
+) -> Callable[[Any], dict]:
     group = registered_now = 0
 
-    def tell() -> None:
+    def report() -> None:
         # Progress is per group, because the remaining time of one is not that of all.
         what = REGISTERING if group <= 1 else f"{REGISTERING}, group {group}"
         listen(Working(what, registered_now, count))
 
-    def begun() -> None:
+    def begin_group() -> None:
         nonlocal group, registered_now
         group, registered_now = group + 1, 2
-        tell()
+        report()
 
-    def next_one() -> None:
+    def count_image() -> None:
         nonlocal registered_now
         registered_now = min(registered_now + 1, count)
-        tell()
+        report()
 
     def work(token: Any) -> dict:
         return library.pycolmap.incremental_mapping(
@@ -427,15 +429,15 @@ def _incremental(database: Path, output: Path, options: Any, count: int, listen:
             output,
             output,
             options=options,
-            initial_image_pair_callback=begun,
-            next_image_callback=next_one,
+            initial_image_pair_callback=begin_group,
+            next_image_callback=count_image,
             cancellation_token=token,
         )
 
     return work
 
 
-def _global(database: Path, output: Path) -> Callable[[Any], dict]:
+def _global_mapping(database: Path, output: Path) -> Callable[[Any], dict]:
     options = library.pycolmap.GlobalPipelineOptions(random_seed=SEED)
 
     def work(token: Any) -> dict:
@@ -444,7 +446,7 @@ def _global(database: Path, output: Path) -> Callable[[Any], dict]:
     return work
 
 
-def _incremental_options(options: Mapping) -> Any:
+def _incremental_options(options: MappingOptions) -> Any:
     chosen = library.pycolmap.IncrementalPipelineOptions(random_seed=SEED, min_model_size=3, extract_colors=False)
     chosen.mapper.init_min_tri_angle = options.first_angle
     chosen.mapper.abs_pose_min_num_inliers = options.least_matches

@@ -32,13 +32,13 @@ class Note:
 
 Listener = Callable[[Working | Note], None]
 
-UNREADABLE = (".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
+UNREADABLE_SUFFIXES = (".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
 """Photographs that Pillow cannot read."""
 HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 """Bytes 8 to 12 of HEIF files, whatever their suffix: phones and messengers name some of them `.jpg`."""
 LEAST_SIDE = 64
 """Minimum shorter side in pixels; smaller images have too few features."""
-FEWEST = 3
+FEWEST_PHOTOGRAPHS = 3
 FILM_DIAGONAL = math.hypot(36, 24)
 """Diagonal of 35 mm film in millimetres, to which focal lengths are converted."""
 SIDEWAYS = (5, 6, 7, 8)
@@ -67,11 +67,11 @@ class Photograph:
     transparent: bool = False
 
 
-PICTURE_SUFFIX = ".jpg"
+PHOTOGRAPH_SUFFIX = ".jpg"
 """Suffix of photographs written into a capture."""
 CAPTURE_FOLDERS = ("sparse", "panes", "gt", "ignore")
 MASK_FOLDERS = (PANE_FOLDER, MASK_FOLDER, IGNORE_FOLDER)
-NOT_CARRIED = (
+MASKS_NOT_COPIED = (
     "They are not copied to the capture: make masks for its undistorted, possibly smaller photographs, and put "
     "them into its masks/, ignore/ or panes/."
 )
@@ -87,38 +87,38 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
         listen(
             Note(
                 f"Skipped masks, recognised by their names or folders: {_names_below(folder, sorted(masks))}. "
-                f"{NOT_CARRIED}"
+                f"{MASKS_NOT_COPIED}"
             )
         )
         paths = [path for path in paths if path not in masks]
     names = capture_names(paths, folder)
     found: dict[bytes, Photograph] = {}
-    same: list[tuple[Path, bytes]] = []
+    duplicates: list[tuple[Path, bytes]] = []
     broken: dict[str, InputError] = {}
     for done, path in enumerate(paths):
         listen(Working("checking the photographs", done, len(paths)))
         try:
-            photograph, contents = _examine(path, names[path], max_size)
+            photograph, contents = _inspect_photograph(path, names[path], max_size)
         except InputError as error:
             broken[path.name] = error
             continue
-        kept, twin = found.get(contents, photograph), photograph
+        kept, duplicate = found.get(contents, photograph), photograph
         if len(kept.name) > len(photograph.name):
-            kept, twin = photograph, kept  # `IMG 9 copy.jpg` sorts before `IMG 9.jpg`; keep the latter.
+            kept, duplicate = photograph, kept  # `IMG 9 copy.jpg` sorts before `IMG 9.jpg`; keep the latter.
         found[contents] = kept
-        if twin is not kept:
-            same.append((twin.path, contents))
+        if duplicate is not kept:
+            duplicates.append((duplicate.path, contents))
     if broken:
-        raise _refusal(broken, len(paths))
-    twins = [f"{path.name} (as {found[contents].path.name})" for path, contents in same]
-    if len(found) < FEWEST:
-        again = f", and duplicates of them ({join_names(twins)})" if twins else ""
+        raise _unusable_error(broken, len(paths))
+    duplicate_names = [f"{path.name} (as {found[contents].path.name})" for path, contents in duplicates]
+    if len(found) < FEWEST_PHOTOGRAPHS:
+        again = f", and duplicates of them ({join_names(duplicate_names)})" if duplicate_names else ""
         raise InputError(
-            f"{folder} holds too few photographs: {len(found)}{again}; expected at least {FEWEST}, better 30 or "
-            "more, taken a step apart"
+            f"{folder} holds too few photographs: {len(found)}{again}; expected at least {FEWEST_PHOTOGRAPHS}, better "
+            "30 or more, taken a step apart"
         )
-    if twins:
-        listen(Note(f"Skipped duplicates: {join_names(twins)}."))
+    if duplicate_names:
+        listen(Note(f"Skipped duplicates: {join_names(duplicate_names)}."))
     cut_out = [one.path for one in found.values() if one.transparent]
     if cut_out:
         listen(
@@ -140,7 +140,7 @@ def file_states(source: Path) -> dict[str, list[int]]:
     return found
 
 
-def _refusal(broken: Mapping[str, InputError], count: int) -> InputError:
+def _unusable_error(broken: Mapping[str, InputError], count: int) -> InputError:
     """Error that names the unusable ones of `count` photographs."""
     first = next(iter(broken.values()))
     if len(broken) == 1:
@@ -156,7 +156,7 @@ def broken_photographs(paths: Sequence[Path], least_side: int) -> list[str]:
     broken = []
     for path in paths:
         try:
-            _examine(path, path.name, LEAST_SIDE, least_side)
+            _inspect_photograph(path, path.name, LEAST_SIDE, least_side)
         except InputError:
             broken.append(path.name)
     return broken
@@ -168,15 +168,15 @@ def capture_names(paths: Sequence[Path], folder: Path) -> dict[Path, str]:
     Names are unique even without suffix, which masks require. Undecodable bytes and line breaks are replaced.
     """
     unreadable = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
-    spoken = {path: unreadable.sub("_", path.relative_to(folder).as_posix()) for path in paths}
+    printable = {path: unreadable.sub("_", path.relative_to(folder).as_posix()) for path in paths}
     # Names may collide, for example after replacing undecodable bytes.
     counts: Counter[str] = Counter()
-    for path, name in spoken.items():
+    for path, name in printable.items():
         counts[name] += 1
         if counts[name] > 1:
-            spoken[path] = f"{name}-{counts[name]}"
-    pictures = images.image_paths(list(spoken.values()))
-    return {path: pictures[name].with_suffix(PICTURE_SUFFIX).as_posix() for path, name in spoken.items()}
+            printable[path] = f"{name}-{counts[name]}"
+    unique = images.image_paths(list(printable.values()))
+    return {path: unique[name].with_suffix(PHOTOGRAPH_SUFFIX).as_posix() for path, name in printable.items()}
 
 
 def masks_among(paths: Sequence[Path]) -> list[Path]:
@@ -199,7 +199,7 @@ def _names_below(folder: Path, paths: Sequence[Path]) -> str:
 def read_photograph(photograph: Photograph) -> NDArray[np.uint8]:
     """[H, W, 3] sRGB, upright, reduced; transparent parts black."""
     try:
-        image = _upright(photograph.path).resize(
+        image = _read_upright(photograph.path).resize(
             (photograph.width, photograph.height), Image.Resampling.LANCZOS, reducing_gap=3
         )
     except (ValueError, FileNotFoundError) as error:
@@ -207,7 +207,7 @@ def read_photograph(photograph: Photograph) -> NDArray[np.uint8]:
     return np.ascontiguousarray(image, dtype=np.uint8)
 
 
-def _upright(path: Path) -> Image.Image:
+def _read_upright(path: Path) -> Image.Image:
     """The image as 8-bit sRGB over black, rotated by its EXIF orientation."""
     with images.checked_image(path) as image:
         orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
@@ -239,13 +239,13 @@ def _photograph_paths(folder: Path) -> list[Path]:
     if not paths:
         found = join_names(sorted(path.name for path in files)) or "nothing"
         raise InputError(f"no photograph in {folder}; expected {', '.join(suffixes)} files, found {found}")
-    return sorted(paths, key=lambda path: _numbers_as_such(path.relative_to(folder).as_posix()))
+    return sorted(paths, key=lambda path: _natural_order_key(path.relative_to(folder).as_posix()))
 
 
 def _unreadable_kind(path: Path) -> str | None:
     """Format of a photograph that Pillow cannot read, by its suffix or first bytes; None for all others."""
     suffix = path.suffix.lower()
-    if suffix in UNREADABLE or (suffix in images.HEIF_SUFFIXES and not images.can_read_heif()):
+    if suffix in UNREADABLE_SUFFIXES or (suffix in images.HEIF_SUFFIXES and not images.can_read_heif()):
         return suffix[1:].upper()
     if suffix not in images.IMAGE_SUFFIXES or images.can_read_heif():
         return None
@@ -257,13 +257,13 @@ def _unreadable_kind(path: Path) -> str | None:
     return "HEIC" if start[4:8] == b"ftyp" and start[8:] in HEIF_BRANDS else None
 
 
-def _numbers_as_such(name: str) -> tuple[tuple[int, int, str], ...]:
+def _natural_order_key(name: str) -> tuple[tuple[int, int, str], ...]:
     """Sorting key for natural order: numbers in a name by their value."""
     parts = re.findall(r"\d+|\D+", name)
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts)
 
 
-def _examine(path: Path, name: str, max_size: int, least_side: int = LEAST_SIDE) -> tuple[Photograph, bytes]:
+def _inspect_photograph(path: Path, name: str, max_size: int, least_side: int = LEAST_SIDE) -> tuple[Photograph, bytes]:
     """A photograph and the hash of its file, which is decoded at a small size to detect truncation."""
     try:
         size = images.image_size(path)
@@ -286,18 +286,18 @@ def _examine(path: Path, name: str, max_size: int, least_side: int = LEAST_SIDE)
     width, height = size[::-1] if sideways else size
     scale = min(1.0, max_size / max(size))
     width, height = round(width * scale), round(height * scale)
-    device, focal = _device(tags), _focal(tags, width, height)
+    device, focal = _device_name(tags), _focal_length(tags, width, height)
     return Photograph(path, name, width, height, device, focal, transparent), contents
 
 
-def _device(tags: dict) -> str:
+def _device_name(tags: dict) -> str:
     """Maker, model, lens and zoom from EXIF; digital zoom appears only in the 35 mm equivalent focal length."""
     lens = (ExifTags.Base.LensModel, ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
     kinds = (ExifTags.Base.Make, ExifTags.Base.Model, *lens)
     return " ".join(str(tags[kind]).strip("\0 ") for kind in kinds if tags.get(kind))
 
 
-def _focal(tags: dict, width: int, height: int) -> float | None:
+def _focal_length(tags: dict, width: int, height: int) -> float | None:
     """Focal length in pixels of the reduced photograph, from the 35 mm equivalent."""
     try:
         focal = float(tags.get(ExifTags.Base.FocalLengthIn35mmFilm) or 0)
@@ -317,7 +317,7 @@ FEWEST_CORNERS = 10
 
 
 @dataclass(frozen=True)
-class Footage:
+class FrameStatistics:
     """Measurements for each frame of a video, from a first pass.
 
     Attributes:
@@ -329,7 +329,7 @@ class Footage:
     sharpness: NDArray[np.float64]
 
 
-def frames_of(video: Path, folder: Path, most: int, listen: Listener) -> list[Path]:
+def extract_frames(video: Path, folder: Path, most: int, listen: Listener) -> list[Path]:
     """Writes selected frames of a video as PNG files into a folder, named by their index in the video.
 
     Args:
@@ -338,32 +338,32 @@ def frames_of(video: Path, folder: Path, most: int, listen: Listener) -> list[Pa
         most: maximum number of frames; a video with little motion yields fewer.
         listen: receives the progress.
     """
-    cv2 = _opencv()
-    footage = _measure_motion(cv2, video, listen)
-    chosen = chosen_frames(footage, most)
+    cv2 = _import_opencv()
+    statistics = _measure_motion(cv2, video, listen)
+    chosen = chosen_frames(statistics, most)
     if len(chosen) < FEWEST_FRAMES:
         raise InputError(
-            f"{video} has {len(chosen)} sufficiently different views in {len(footage.sharpness)} frames; expected at "
-            f"least {FEWEST_FRAMES}: walk slowly past the subject, with enough light"
+            f"{video} has {len(chosen)} sufficiently different views in {len(statistics.sharpness)} frames; expected "
+            f"at least {FEWEST_FRAMES}: walk slowly past the subject, with enough light"
         )
     folder.mkdir(parents=True, exist_ok=True)
     paths = {int(number): folder / f"frame_{number:06d}.png" for number in chosen}
     missing = {number for number, path in paths.items() if not path.is_file()}
-    for number, frame in enumerate(_frames(cv2, video) if missing else ()):
+    for number, frame in enumerate(_read_frames(cv2, video) if missing else ()):
         if number in missing:
             listen(Working("extracting frames", sorted(paths).index(number), len(paths)))
             images.write_image(paths[number], frame[:, :, ::-1])
     return list(paths.values())
 
 
-def chosen_frames(footage: Footage, most: int) -> NDArray[np.int64]:
+def chosen_frames(statistics: FrameStatistics, most: int) -> NDArray[np.int64]:
     """Indices of the sharpest frame in each interval of equal motion, which is at least `LEAST_SPACING`."""
-    path = footage.travelled
+    path = statistics.travelled
     spacing = max(float(path[-1] - path[0]) / most, LEAST_SPACING)
     # The last frame belongs to the last interval.
-    stretch = np.minimum(np.floor((path - path[0]) / spacing).astype(np.int64), most - 1)
-    order = np.lexsort((-footage.sharpness, stretch))
-    firsts = np.unique(stretch[order], return_index=True)[1]
+    interval = np.minimum(np.floor((path - path[0]) / spacing).astype(np.int64), most - 1)
+    order = np.lexsort((-statistics.sharpness, interval))
+    firsts = np.unique(interval[order], return_index=True)[1]
     return np.sort(order[firsts])
 
 
@@ -386,12 +386,12 @@ def video_facts(video: Path) -> VideoFacts | None:
     Raises:
         NoOpenCVError: OpenCV is not installed.
     """
-    cv2 = _opencv()
-    frame = next(_frames(cv2, video), None)
-    return None if frame is None else VideoFacts(_length(cv2, video), frame.shape[1], frame.shape[0])
+    cv2 = _import_opencv()
+    frame = next(_read_frames(cv2, video), None)
+    return None if frame is None else VideoFacts(_frame_count(cv2, video), frame.shape[1], frame.shape[0])
 
 
-def _opencv() -> Any:
+def _import_opencv() -> Any:
     try:
         return importlib.import_module("cv2")
     except ImportError as error:
@@ -401,32 +401,32 @@ def _opencv() -> Any:
         ) from error
 
 
-def _measure_motion(cv2: Any, video: Path, listen: Listener) -> Footage:
+def _measure_motion(cv2: Any, video: Path, listen: Listener) -> FrameStatistics:
     travelled, sharpness = [], []
-    before, way = None, 0.0
-    total = _length(cv2, video)
-    for number, frame in enumerate(_frames(cv2, video)):
+    before, distance = None, 0.0
+    total = _frame_count(cv2, video)
+    for number, frame in enumerate(_read_frames(cv2, video)):
         if number % 10 == 0:
             listen(Working("reading the video", min(number, total), total))
-        small = _small_grey(cv2, frame)
+        small = _reduce_to_grey(cv2, frame)
         if before is not None:
-            way += _motion(cv2, before, small)
-        travelled.append(way)
+            distance += _motion(cv2, before, small)
+        travelled.append(distance)
         sharpness.append(float(cv2.Laplacian(small, cv2.CV_64F).var()))
         before = small
     if not travelled:
         raise InputError(f"{video} has no frame that OpenCV can read; expected a video, or a folder of photographs")
-    return Footage(np.array(travelled), np.array(sharpness))
+    return FrameStatistics(np.array(travelled), np.array(sharpness))
 
 
-def _length(cv2: Any, video: Path) -> int:
+def _frame_count(cv2: Any, video: Path) -> int:
     capture = cv2.VideoCapture(str(video))
     frames = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
     capture.release()
     return max(frames, 1)
 
 
-def _frames(cv2: Any, video: Path) -> Iterator[NDArray[np.uint8]]:
+def _read_frames(cv2: Any, video: Path) -> Iterator[NDArray[np.uint8]]:
     """Frames [H, W, 3], BGR, rotated by the metadata of the video."""
     capture = cv2.VideoCapture(str(video))
     try:
@@ -439,7 +439,7 @@ def _frames(cv2: Any, video: Path) -> Iterator[NDArray[np.uint8]]:
         capture.release()
 
 
-def _small_grey(cv2: Any, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _reduce_to_grey(cv2: Any, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
     scale = min(1.0, SMALL_SIDE / max(frame.shape[:2]))
     size = [max(1, round(side * scale)) for side in frame.shape[1::-1]]
     return cv2.resize(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), size, interpolation=cv2.INTER_AREA)
@@ -451,5 +451,5 @@ def _motion(cv2: Any, before: NDArray[np.uint8], after: NDArray[np.uint8]) -> fl
     if corners is None or len(corners) < FEWEST_CORNERS:
         return 0.0
     moved, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None)
-    ways = np.linalg.norm(moved - corners, axis=-1)[found.astype(bool)]
-    return float(np.median(ways)) / max(before.shape) if len(ways) >= FEWEST_CORNERS else 0.0
+    lengths = np.linalg.norm(moved - corners, axis=-1)[found.astype(bool)]
+    return float(np.median(lengths)) / max(before.shape) if len(lengths) >= FEWEST_CORNERS else 0.0

@@ -24,20 +24,20 @@ from glassplat.errors import InputError, join_names
 from glassplat.files import writing
 from glassplat.files.records import read_json, readable_name
 from glassplat.prepare.photographs import (
-    FEWEST,
-    PICTURE_SUFFIX,
+    FEWEST_PHOTOGRAPHS,
+    PHOTOGRAPH_SUFFIX,
     VIDEO_SUFFIXES,
     Listener,
     Photograph,
+    extract_frames,
     file_states,
-    frames_of,
     masks_among,
     photographs_in,
 )
 from glassplat.prepare.reconstruction import (
+    CannotRegisterError,
     Settings,
     Solution,
-    TooLittleShownError,
     best_solution,
     image_numbers,
     write_capture,
@@ -49,16 +49,16 @@ RECORD = "prepare.json"
 """Record in the capture: inputs of the preparation, and its report."""
 PAGE = "prepare.html"
 """The report in the capture, for people."""
-PHOTOGRAPHS = "photographs"
+PHOTOGRAPHS_KEY = "photographs"
 """Key of the settings of an interrupted preparation: states of the input files."""
-MASKS = "masks"
+MASKS_KEY = "masks"
 """Key of the record: digests of the masks of regions outside the view of a wide lens."""
-MADE = ("images", "sparse", RECORD, PAGE)
+WRITTEN_NAMES = ("images", "sparse", RECORD, PAGE)
 """Everything in a capture that `prepare` writes; other files are the user's work."""
 
 
 @dataclass(frozen=True)
-class Workplace:
+class WorkFolder:
     """The temporary folder in which a capture is made.
 
     Attributes:
@@ -81,7 +81,7 @@ class Workplace:
         return self.folder / "capture"
 
     @contextmanager
-    def alone(self) -> Iterator[None]:
+    def lock(self) -> Iterator[None]:
         """Locks the output against other preparations on this machine, if it supports locks."""
         user = os.getuid() if hasattr(os, "getuid") else ""
         name = hashlib.sha256(os.fsencode(self.output)).hexdigest()[:16]
@@ -108,7 +108,7 @@ class Workplace:
             force: start again, and replace a capture that was prepared before.
         """
         self._check_output(force)
-        known = self._known_settings()
+        known = self._interrupted_settings()
         if known is not None and force and not resume:
             shutil.rmtree(self.folder)
             known = None
@@ -141,15 +141,15 @@ class Workplace:
     def _check_unchanged(self, known: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
         """Refuse to continue with other settings or photographs, because poses and features are stored by index."""
         changed = sorted(key for key in {*known, *settings} if known.get(key) != settings.get(key))
-        if set(changed) - {PHOTOGRAPHS}:
+        if set(changed) - {PHOTOGRAPHS_KEY}:
             raise InputError(
                 f"{self.folder} was started with another "
-                f"{join_names([key for key in changed if key != PHOTOGRAPHS])}; give the same "
+                f"{join_names([key for key in changed if key != PHOTOGRAPHS_KEY])}; give the same "
                 "to --resume, or start again with --force"
             )
         if not changed:
             return
-        before, now = known.get(PHOTOGRAPHS), settings[PHOTOGRAPHS]
+        before, now = known.get(PHOTOGRAPHS_KEY), settings[PHOTOGRAPHS_KEY]
         if not isinstance(before, dict):
             raise InputError(
                 f"{self.folder} does not record the photographs it was started with; start again with --force"
@@ -176,15 +176,15 @@ class Workplace:
                 f"{self.output} holds a capture that was prepared before; choose a new folder for --output, or replace "
                 "it with --force"
             )
-        others = [name for name in found if name not in (*MADE, IGNORE_FOLDER) and not name.startswith(".")]
-        own = read_json(self.output / RECORD).get(MASKS, ())
+        others = [name for name in found if name not in (*WRITTEN_NAMES, IGNORE_FOLDER) and not name.startswith(".")]
+        own = read_json(self.output / RECORD).get(MASKS_KEY, ())
         others += [
             path.relative_to(self.output).as_posix()
             for path in sorted((self.output / IGNORE_FOLDER).rglob("*"))
             if path.is_file() and writing.file_digest(path) not in own
         ]
         pictures = [path for path in (self.output / "images").rglob("[!.]*") if path.is_file()]
-        added = {path for path in pictures if path.suffix != PICTURE_SUFFIX} | set(masks_among(pictures))
+        added = {path for path in pictures if path.suffix != PHOTOGRAPH_SUFFIX} | set(masks_among(pictures))
         others += sorted(path.relative_to(self.output).as_posix() for path in added)
         if others:
             raise InputError(
@@ -192,7 +192,7 @@ class Workplace:
                 "be removed by --force: move the folder away, or choose a new one for --output"
             )
 
-    def _known_settings(self) -> dict[str, Any] | None:
+    def _interrupted_settings(self) -> dict[str, Any] | None:
         """Settings of an interrupted preparation, or None."""
         if not self.folder.exists() or not any(self.folder.iterdir()):
             return None
@@ -210,7 +210,7 @@ class Workplace:
 FEW_FEATURES = 500
 SHORT_TRACK = 3.0
 LARGE_ERROR = 1.5
-USUAL_FOCALS = (0.4, 3.0)
+PLAUSIBLE_FOCALS = (0.4, 3.0)
 """Range of plausible focal lengths, in longer image sides."""
 
 
@@ -247,7 +247,7 @@ class Report:
     advice: tuple[str, ...]
 
     @property
-    def share(self) -> float:
+    def registered_share(self) -> float:
         """Share of the photographs that were registered."""
         return self.registered / self.photographs
 
@@ -263,37 +263,37 @@ class Report:
         ]
 
 
-def report_of(solution: Solution) -> Report:
+def make_report(solution: Solution) -> Report:
     """The report of a solution; zeros if it has no model."""
     photographs = solution.database.photographs
     missing = [readable_name(one.path.name) for one in solution.missing()]
     model = solution.models[0] if solution.models else None
     features = int(np.median(solution.database.feature_counts()))
-    figures = Report(
+    report = Report(
         photographs=len(photographs),
         registered=solution.registered,
         missing=tuple(missing),
-        groups=_groups(solution),
+        groups=_group_sizes(solution),
         points=int(model.num_points3D()) if model else 0,
         reprojection_error=float(model.compute_mean_reprojection_error()) if model else 0.0,
         track_length=float(model.compute_mean_track_length()) if model else 0.0,
         features=features,
         cameras=tuple(_describe_lenses(model)) if model else (),
         attempt=solution.attempt,
-        attempts=solution.tried,
+        attempts=solution.attempts_made,
         advice=(),
     )
-    return Report(**{**figures.__dict__, "advice": tuple(_advice(figures, missing, solution))})
+    return Report(**{**report.__dict__, "advice": tuple(_advice(report, missing, solution))})
 
 
-def _groups(solution: Solution) -> tuple[int, ...]:
+def _group_sizes(solution: Solution) -> tuple[int, ...]:
     """Number of photographs that each model adds to the larger ones, because some may be in several models."""
     known: set[int] = set()
     sizes = []
     for model in solution.models:
         added = set(image_numbers(model)) - known
         known |= added
-        if len(added) >= FEWEST:
+        if len(added) >= FEWEST_PHOTOGRAPHS:
             sizes.append(len(added))
     return tuple(sizes)
 
@@ -308,31 +308,31 @@ def _describe_lenses(model: Any) -> list[str]:
     ]
 
 
-def _advice(figures: Report, missing: list[str], solution: Solution) -> list[str]:
+def _advice(report: Report, missing: list[str], solution: Solution) -> list[str]:
     advice = []
     if missing:
         advice.append(
             f"take more photographs around {join_names(missing, 3)}: in steps of half a metre, with two thirds "
             f"overlap, and some that show the surroundings of the glass"
         )
-    if len(figures.groups) > 1:
+    if len(report.groups) > 1:
         advice.append(
-            f"the photographs fall into {len(figures.groups)} groups without matches between them "
-            f"({', '.join(map(str, figures.groups))} photographs): take some that connect them, or prepare each "
+            f"the photographs fall into {len(report.groups)} groups without matches between them "
+            f"({', '.join(map(str, report.groups))} photographs): take some that connect them, or prepare each "
             "group separately"
         )
-    if figures.features < FEW_FEATURES:
+    if report.features < FEW_FEATURES:
         advice.append(
-            f"photographs have only {figures.features} features (median): use more light, a steadier camera, "
+            f"photographs have only {report.features} features (median): use more light, a steadier camera, "
             f"or a larger --max-size"
         )
-    if figures.points and figures.track_length < SHORT_TRACK:
+    if report.points and report.track_length < SHORT_TRACK:
         advice.append("points are visible in few photographs: take more, in smaller steps")
-    if figures.reprojection_error > LARGE_ERROR:
+    if report.reprojection_error > LARGE_ERROR:
         advice.append(
             "points have large errors for a static scene: make sure that nothing large moves, or try --lens opencv"
         )
-    model, (least, most) = solution.models[0] if solution.models else None, USUAL_FOCALS
+    model, (least, most) = solution.models[0] if solution.models else None, PLAUSIBLE_FOCALS
     cameras = [] if model is None else model.cameras.values()
     if any(not least <= one.mean_focal_length() / max(one.width, one.height) <= most for one in cameras):
         advice.append("a focal length is implausible: take photographs from different distances")
@@ -375,33 +375,33 @@ def prepare(task: Preparation, listen: Listener, *, resume: bool = False, force:
         resume: continue an interrupted call.
         force: replace a capture that was prepared before, or restart an interrupted preparation.
     """
-    check_places(task)
+    check_paths(task)
     quiet_pycolmap()
-    workplace = Workplace(task.output)
-    with workplace.alone():
-        return _prepare(task, workplace, listen, resume=resume, force=force)
+    work_folder = WorkFolder(task.output)
+    with work_folder.lock():
+        return _prepare(task, work_folder, listen, resume=resume, force=force)
 
 
-def _prepare(task: Preparation, workplace: Workplace, listen: Listener, *, resume: bool, force: bool) -> Report:
-    settings = {**task.record(), PHOTOGRAPHS: file_states(task.source)}
-    missing = writing.missing_folders(workplace.folder.parent)
-    begun = workplace.begin(settings, resume=resume, force=force)
+def _prepare(task: Preparation, work_folder: WorkFolder, listen: Listener, *, resume: bool, force: bool) -> Report:
+    settings = {**task.record(), PHOTOGRAPHS_KEY: file_states(task.source)}
+    missing = writing.missing_folders(work_folder.folder.parent)
+    begun = work_folder.begin(settings, resume=resume, force=force)
     try:
-        photographs = _photographs(task, workplace, listen)
+        photographs = _read_photographs(task, work_folder, listen)
         begun = False
-        solution = best_solution(photographs, workplace.folder, task.settings, task.least_registered, listen)
-        report = report_of(solution)
+        solution = best_solution(photographs, work_folder.folder, task.settings, task.least_registered, listen)
+        report = make_report(solution)
         _check_enough(report, task)
     except InputError as error:
         # Keep the results of an earlier call, because the photographs may only be unavailable at the moment.
-        if begun or isinstance(error, TooLittleShownError):
-            workplace.discard()
+        if begun or isinstance(error, CannotRegisterError):
+            work_folder.discard()
             writing.remove_empty(missing)
         raise
-    write_capture(solution, workplace.capture, listen)
-    masks = sorted({writing.file_digest(path) for path in (workplace.capture / IGNORE_FOLDER).rglob("*.png")})
-    made = {"command": "prepare", "version": __version__, **task.record()}
-    workplace.finish({**made, "report": asdict(report), **({MASKS: masks} if masks else {})})
+    write_capture(solution, work_folder.capture, listen)
+    masks = sorted({writing.file_digest(path) for path in (work_folder.capture / IGNORE_FOLDER).rglob("*.png")})
+    record = {"command": "prepare", "version": __version__, **task.record()}
+    work_folder.finish({**record, "report": asdict(report), **({MASKS_KEY: masks} if masks else {})})
     return report
 
 
@@ -410,7 +410,7 @@ def is_video(source: Path) -> bool:
     return source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES
 
 
-def check_places(task: Preparation) -> None:
+def check_paths(task: Preparation) -> None:
     """Refuse an input other than a folder or a video, and an output inside the input."""
     source, output = writing.real_path(task.source), writing.real_path(task.output)
     if source.is_file() and not is_video(source):
@@ -426,25 +426,25 @@ def check_places(task: Preparation) -> None:
         )
 
 
-def _photographs(task: Preparation, workplace: Workplace, listen: Listener) -> list[Photograph]:
+def _read_photographs(task: Preparation, work_folder: WorkFolder, listen: Listener) -> list[Photograph]:
     """Photographs of the folder or the video."""
     if not is_video(task.source):
         return photographs_in(task.source, task.max_size, listen)
-    frames = workplace.folder / "frames"
-    frames_of(task.source, frames, task.frames, listen)
+    frames = work_folder.folder / "frames"
+    extract_frames(task.source, frames, task.frames, listen)
     return photographs_in(frames, task.max_size, listen)
 
 
 def _check_enough(report: Report, task: Preparation) -> None:
     """Refuse a capture with too few registered photographs."""
-    if report.registered >= FEWEST and report.share >= task.least_registered:
+    if report.registered >= FEWEST_PHOTOGRAPHS and report.registered_share >= task.least_registered:
         return
     lines = "\n".join(report.lines())
-    kind = InputError if report.registered >= FEWEST else TooLittleShownError
+    kind = InputError if report.registered >= FEWEST_PHOTOGRAPHS else CannotRegisterError
     remedy = (
         "nothing was written"
-        if kind is TooLittleShownError
-        else f"to accept this, repeat with --resume --least-registered {int(100 * report.share) / 100:g}"
+        if kind is CannotRegisterError
+        else f"to accept this, repeat with --resume --least-registered {int(100 * report.registered_share) / 100:g}"
     )
     raise kind(
         f"{report.registered} of {report.photographs} photographs could be registered, expected at least "

@@ -17,11 +17,11 @@ from glassplat.errors import InputError, join_names
 from glassplat.files.images import write_image
 from glassplat.prepare.colmap import (
     FeatureDatabase,
-    Features,
+    FeatureOptions,
     LensName,
     Mapper,
-    Mapping,
-    chosen_pairs,
+    MappingOptions,
+    pairs_to_match,
     register_photographs,
 )
 from glassplat.prepare.photographs import Listener, Note, Photograph, read_photograph
@@ -29,7 +29,7 @@ from glassplat.training.messages import Working
 
 FEWEST_FEATURES = 50
 """Minimum number of features of at least half of the photographs; fewer cannot be matched."""
-ENOUGH = 0.95
+ENOUGH_REGISTERED = 0.95
 """Share of registered photographs above which no further attempt of equal cost is made."""
 
 
@@ -38,17 +38,17 @@ class Attempt:
     """Settings of one attempt; `name` follows "trying again with"."""
 
     name: str
-    features: Features
-    mapping: Mapping
+    features: FeatureOptions
+    mapping: MappingOptions
 
 
-USUAL = Features(most=4096, least_contrast=1 / 150)
-MANY = Features(most=12_000, least_contrast=1 / 600, guided=True)
+DEFAULT_FEATURES = FeatureOptions(most=4096, least_contrast=1 / 150)
+MANY_FEATURES = FeatureOptions(most=12_000, least_contrast=1 / 600, guided=True)
 ATTEMPTS = (
-    Attempt("the usual settings", USUAL, Mapping()),
-    Attempt("lower thresholds for matches between photographs", USUAL, Mapping(8, 20)),
-    Attempt("three times as many features, including weak ones", MANY, Mapping()),
-    Attempt("many features and lower thresholds", MANY, Mapping(8, 20)),
+    Attempt("the usual settings", DEFAULT_FEATURES, MappingOptions()),
+    Attempt("lower thresholds for matches between photographs", DEFAULT_FEATURES, MappingOptions(8, 20)),
+    Attempt("three times as many features, including weak ones", MANY_FEATURES, MappingOptions()),
+    Attempt("many features and lower thresholds", MANY_FEATURES, MappingOptions(8, 20)),
 )
 
 
@@ -66,7 +66,7 @@ class Solution:
     database: FeatureDatabase
     models: Sequence[Any]
     attempt: str
-    tried: int
+    attempts_made: int
 
     @property
     def registered(self) -> int:
@@ -108,7 +108,7 @@ def best_solution(
     tried = 0
     for attempt in ATTEMPTS:
         if best is not None:
-            enough = least if attempt.features == MANY else max(ENOUGH, least)
+            enough = least if attempt.features == MANY_FEATURES else max(ENOUGH_REGISTERED, least)
             if best.registered >= enough * len(photographs):
                 break
             note = (
@@ -124,23 +124,23 @@ def best_solution(
         if best is None or found.registered > best.registered:
             best = found
     assert best is not None
-    return replace(best, tried=tried)
+    return replace(best, attempts_made=tried)
 
 
 def _match_features(
-    photographs: Sequence[Photograph], work: Path, features: Features, settings: Settings, listen: Listener
+    photographs: Sequence[Photograph], work: Path, features: FeatureOptions, settings: Settings, listen: Listener
 ) -> FeatureDatabase:
-    """The database of these features, with the pairs selected by `chosen_pairs` matched."""
+    """The database of these features, with the pairs selected by `pairs_to_match` matched."""
     database = FeatureDatabase(work / f"features-{features.most}.db", work / "grey", photographs)
-    database.write_pictures(listen)
+    database.write_images(listen)
     database.create(settings.lens)
     database.extract(features, listen)
     _check_texture(database)
-    database.match(chosen_pairs(database.descriptors()), features, listen)
+    database.match(pairs_to_match(database.descriptors()), features, listen)
     return database
 
 
-class TooLittleShownError(InputError):
+class CannotRegisterError(InputError):
     """Raised when no option can register these photographs, so that partial results are useless."""
 
 
@@ -148,7 +148,7 @@ def _check_texture(database: FeatureDatabase) -> None:
     counts = database.feature_counts()
     poor = [one.path.name for one, count in zip(database.photographs, counts, strict=True) if count < FEWEST_FEATURES]
     if 2 * len(poor) > len(counts):
-        raise TooLittleShownError(
+        raise CannotRegisterError(
             f"{len(poor)} of {len(counts)} photographs have fewer than {FEWEST_FEATURES} features "
             f"({join_names(poor)}): they are blurred, dark or without texture. Use more light, hold the camera still, "
             "and include textured objects, such as the surroundings of the pane"
@@ -166,7 +166,7 @@ def write_capture(solution: Solution, folder: Path, listen: Listener) -> None:
     model = solution.models[0]
     lenses = {key: library.pycolmap.Camera(camera.todict()) for key, camera in model.cameras.items()}
     wide = _wide_lenses(lenses)
-    _straighten(model)
+    _undistort_model(model)
     images = image_numbers(model)
     for done, (number, image) in enumerate(sorted(images.items())):
         photograph = solution.database.photographs[number]
@@ -196,16 +196,16 @@ def _wide_lenses(cameras: dict[int, Any]) -> dict[int, Lens]:
     return {key: lens for key, lens in lenses.items() if blank_share(lens)}
 
 
-def _straighten(model: Any) -> None:
+def _undistort_model(model: Any) -> None:
     """Replaces the cameras of a model by pinhole cameras, and undistorts its observations."""
     options = library.pycolmap.UndistortCameraOptions()
     pinholes = {key: library.pycolmap.undistort_camera(options, camera) for key, camera in model.cameras.items()}
     for image in image_numbers(model).values():
         pixels = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
         rays = np.asarray(model.cameras[image.camera_id].cam_from_img(pixels)).reshape(-1, 2)
-        straight = pinholes[image.camera_id].img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
-        for point, place in zip(image.points2D, np.asarray(straight).reshape(-1, 2), strict=True):
-            point.xy = place
+        undistorted = pinholes[image.camera_id].img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
+        for point, pixel in zip(image.points2D, np.asarray(undistorted).reshape(-1, 2), strict=True):
+            point.xy = pixel
     for key, pinhole in pinholes.items():
         camera = model.camera(key)
         camera.model, camera.params = pinhole.model, pinhole.params

@@ -30,8 +30,8 @@ from glassplat.scene.panes import Planes
 
 Array = NDArray[np.float64]
 
-SIZE = (640, 440)
-MARGIN = 14
+PLAN_SIZE = (640, 440)
+PLAN_MARGIN = 14
 MOST_POINTS = 4000
 """Maximum number of points drawn; more are subsampled evenly."""
 OUTLIERS = 4.0
@@ -41,7 +41,7 @@ HEADING = 11.0
 """Length, in pixels, of a camera's line along its viewing direction."""
 
 
-def plan(views: Sequence[View], points: PointCloud, behind: NDArray[np.bool_], planes: Planes | None) -> str:
+def plan_svg(views: Sequence[View], points: PointCloud, behind: NDArray[np.bool_], planes: Planes | None) -> str:
     """The plan as SVG.
 
     Args:
@@ -51,23 +51,23 @@ def plan(views: Sequence[View], points: PointCloud, behind: NDArray[np.bool_], p
         planes: panes, if any are known.
     """
     cameras = [NumpyCamera.from_camera(view.camera) for view in views]
-    axes = _from_above(cameras)
+    axes = _plan_axes(cameras)
     centers = np.stack([camera.center for camera in cameras]) @ axes.T
-    places = points.positions.cpu().double().numpy() @ axes.T
+    positions = points.positions.cpu().double().numpy() @ axes.T
     panes = [] if planes is None else [corners @ axes.T for corners in _corners(planes)]
-    on_page = _fitting(places, np.concatenate([centers, *panes]))
+    to_page = _page_map(positions, np.concatenate([centers, *panes]))
     colors = points.colors.cpu().numpy()
     drawn = [
-        *_points(on_page(places), colors, behind),
-        *(_line(on_page(pane[[0, 1, 2, 3, 0]]), "#ffd24a", 2) for pane in panes),
-        _line(on_page(centers), "#3a76b8", 1),
-        *_headings(cameras, axes, on_page),
+        *_point_circles(to_page(positions), colors, behind),
+        *(_polyline(to_page(pane[[0, 1, 2, 3, 0]]), "#ffd24a", 2) for pane in panes),
+        _polyline(to_page(centers), "#3a76b8", 1),
+        *_headings(cameras, axes, to_page),
     ]
-    width, height = SIZE
+    width, height = PLAN_SIZE
     return f'<svg width="{width}" height="{height}" viewBox="0 0 {width} {height}">{"".join(drawn)}</svg>'
 
 
-def _from_above(cameras: Sequence[NumpyCamera]) -> Array:
+def _plan_axes(cameras: Sequence[NumpyCamera]) -> Array:
     """[2, 3] axes of the plan, right and down, in world space; the mean viewing direction is up in the plan."""
     up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
     up /= max(float(np.linalg.norm(up)), 1e-9)
@@ -87,19 +87,19 @@ def _corners(planes: Planes) -> list[Array]:
     return [center + RECTANGLE @ side for center, side in zip(centers, sides, strict=True)]
 
 
-def _fitting(places: Array, always: Array) -> Callable[[Array], Array]:
+def _page_map(points: Array, required: Array) -> Callable[[Array], Array]:
     """The map from plan coordinates to pixels."""
-    reach = np.percentile(places, [OUTLIERS, 100 - OUTLIERS], axis=0) if len(places) else always[:0].reshape(0, 2)
-    all_of_it = np.concatenate([reach, always])
-    low, high = all_of_it.min(axis=0), all_of_it.max(axis=0)
-    scale = float(((np.array(SIZE) - 2 * MARGIN) / np.maximum(high - low, 1e-9)).min())
+    reach = np.percentile(points, [OUTLIERS, 100 - OUTLIERS], axis=0) if len(points) else required[:0].reshape(0, 2)
+    everything = np.concatenate([reach, required])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    scale = float(((np.array(PLAN_SIZE) - 2 * PLAN_MARGIN) / np.maximum(high - low, 1e-9)).min())
     middle = (low + high) / 2
-    return lambda one: np.asarray((one - middle) * scale + np.array(SIZE) / 2)
+    return lambda one: np.asarray((one - middle) * scale + np.array(PLAN_SIZE) / 2)
 
 
-def _points(pixels: Array, colors: NDArray[np.generic], behind: NDArray[np.bool_]) -> list[str]:
+def _point_circles(pixels: Array, colors: NDArray[np.generic], behind: NDArray[np.bool_]) -> list[str]:
     every = max(1, -(-len(pixels) // MOST_POINTS))
-    inside = np.all((pixels >= 0) & (pixels <= np.array(SIZE)), axis=1).reshape(-1)
+    inside = np.all((pixels >= 0) & (pixels <= np.array(PLAN_SIZE)), axis=1).reshape(-1)
     shown = [int(row) for row in np.flatnonzero(inside)[::every]]
     return [
         f'<circle cx="{pixels[row][0]:.1f}" cy="{pixels[row][1]:.1f}" r="1.3" '
@@ -113,17 +113,17 @@ def _hex(color: NDArray[np.generic]) -> str:
     return f"#{red:02x}{green:02x}{blue:02x}"
 
 
-def _line(pixels: Array, color: str, width: float) -> str:
+def _polyline(pixels: Array, color: str, width: float) -> str:
     path = " ".join(f"{x:.1f},{y:.1f}" for x, y in pixels)
     return f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="{width}"/>'
 
 
-def _headings(cameras: Sequence[NumpyCamera], axes: Array, on_page: Callable[[Array], Array]) -> list[str]:
+def _headings(cameras: Sequence[NumpyCamera], axes: Array, to_page: Callable[[Array], Array]) -> list[str]:
     strokes = []
     for camera in cameras:
-        begin = on_page((camera.center @ axes.T)[None])[0]
+        begin = to_page((camera.center @ axes.T)[None])[0]
         heading = axes @ camera.rotation[2]
-        strokes.append(_line(np.stack([begin, begin + HEADING * heading]), "#7cc0ff", 1.5))
+        strokes.append(_polyline(np.stack([begin, begin + HEADING * heading]), "#7cc0ff", 1.5))
         strokes.append(f'<circle cx="{begin[0]:.1f}" cy="{begin[1]:.1f}" r="2.6" fill="#5aa9ff"/>')
     return strokes
 
@@ -131,9 +131,9 @@ def _headings(cameras: Sequence[NumpyCamera], axes: Array, on_page: Callable[[Ar
 THUMBNAIL = (160, 120)
 MOST_THUMBNAILS = 200
 """Maximum number of thumbnails, which keeps the page below 2 MB; more are subsampled evenly."""
-TRACKS = (2, 3, 4, 5, 7, 10, 15, 1 << 30)
+TRACK_BINS = (2, 3, 4, 5, 7, 10, 15, 1 << 30)
 """Edges of the bins by number of photographs per point; the upper edge is exclusive."""
-ERRORS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, np.inf)
+ERROR_BINS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, np.inf)
 FEW_POINTS = 50
 """A photograph with fewer points is poorly constrained."""
 
@@ -150,25 +150,25 @@ svg { background: #0c0d0f; border-radius: 8px }
 """
 
 
-COUNT, NAMES = Integer(0), ListOf(Text())
+COUNT_FIELD, NAMES_FIELD = Integer(0), ListOf(Text())
 REPORT: dict[str, Field] = {
-    "photographs": COUNT,
-    "registered": COUNT,
-    "missing": NAMES,
-    "points": COUNT,
+    "photographs": COUNT_FIELD,
+    "registered": COUNT_FIELD,
+    "missing": NAMES_FIELD,
+    "points": COUNT_FIELD,
     "reprojection_error": Number(),
     "track_length": Number(),
-    "features": COUNT,
-    "cameras": NAMES,
+    "features": COUNT_FIELD,
+    "cameras": NAMES_FIELD,
     "attempt": Text(),
-    "attempts": COUNT,
-    "advice": NAMES,
+    "attempts": COUNT_FIELD,
+    "advice": NAMES_FIELD,
 }
 """Fields of a preparation's report that the page shows."""
 
 
 @dataclass(frozen=True)
-class Shown:
+class PhotographStatistics:
     """Statistics of one photograph in the model.
 
     Attributes:
@@ -209,7 +209,7 @@ def _read_report(path: Path) -> dict[str, Any]:
 
 def _page(report: Mapping[str, Any], dataset: Dataset, model: Any, planes: Planes | None, title: str) -> str:
     views = sorted((*dataset.train, *dataset.test), key=lambda view: natural_sort_key(view.name))
-    behind = _behind(dataset, planes)
+    behind = _points_behind_panes(dataset, planes)
     points = list(model.points3D.values())
     tracks = np.array([point.track.length() for point in points])
     errors = np.array([point.error for point in points])
@@ -219,18 +219,18 @@ def _page(report: Mapping[str, Any], dataset: Dataset, model: Any, planes: Plane
         f"<h1>{html.escape(title)}</h1>",
         f'<div class="cards">{"".join(_cards(report, behind, planes))}</div>',
         *(f'<p class="advice">{html.escape(str(line))}</p>' for line in report["advice"]),
-        f"<section><h2>Plan</h2>{plan(views, dataset.points, behind, planes)}<p>{legend}</p></section>",
-        f"<section>{_bars('Points by number of photographs', tracks, TRACKS)}"
-        f"{_bars('Points by reprojection error, in pixels', errors, ERRORS)}</section>",
+        f"<section><h2>Plan</h2>{plan_svg(views, dataset.points, behind, planes)}<p>{legend}</p></section>",
+        f"<section>{_histogram('Points by number of photographs', tracks, TRACK_BINS)}"
+        f"{_histogram('Points by reprojection error, in pixels', errors, ERROR_BINS)}</section>",
         "<h2>Photographs</h2>",
-        f'<div class="photographs">{"".join(_photographs(_shown(views, model)))}</div>',
-        *_missing(report["missing"]),
+        f'<div class="photographs">{"".join(_figures(_photograph_statistics(views, model)))}</div>',
+        *_missing_section(report["missing"]),
     ]
     head = f'<meta charset="utf-8"><title>{html.escape(title)}</title><style>{STYLE}{PAGE_STYLE}</style>'
     return f"<!doctype html>\n<html><head>{head}</head><body>\n" + "\n".join(body) + "\n</body></html>\n"
 
 
-def _behind(dataset: Dataset, planes: Planes | None) -> NDArray[np.bool_]:
+def _points_behind_panes(dataset: Dataset, planes: Planes | None) -> NDArray[np.bool_]:
     """[N] mask of points that most photographs show through a pane."""
     if planes is None:
         return np.zeros(len(dataset.points), dtype=bool)
@@ -254,47 +254,47 @@ def _cards(report: Mapping[str, Any], behind: NDArray[np.bool_], planes: Planes 
     return [f"<div><b>{html.escape(str(value))}</b><span>{name}</span></div>" for name, value in facts.items()]
 
 
-def _bars(title: str, values: NDArray[Any], edges: Sequence[float]) -> str:
+def _histogram(title: str, values: NDArray[Any], edges: Sequence[float]) -> str:
     """A histogram as a table; the last bin is open."""
     counts = [int(((values >= low) & (values < high)).sum()) for low, high in itertools.pairwise(edges)]
     most = max([*counts, 1])
     rows = [
-        f'<tr><td>{_bin(low, high)}</td><td>{count:,}</td><td style="text-align: left"><span class="bar" '
+        f'<tr><td>{_bin_label(low, high)}</td><td>{count:,}</td><td style="text-align: left"><span class="bar" '
         f'style="width: {240 * count / most:.0f}px"></span></td></tr>'
         for (low, high), count in zip(itertools.pairwise(edges), counts, strict=True)
     ]
     return f"<h2>{title}</h2><table>{''.join(rows)}</table>"
 
 
-def _bin(low: float, high: float) -> str:
+def _bin_label(low: float, high: float) -> str:
     if high >= 1 << 30:
         return f"{low:g} and more"
     last = high - 1 if isinstance(low, int) else high
     return f"{low:g}" if last == low else f"{low:g} to {last:g}"
 
 
-def _shown(views: Sequence[View], model: Any) -> list[Shown]:
+def _photograph_statistics(views: Sequence[View], model: Any) -> list[PhotographStatistics]:
     # Accents may be encoded in another way in file names than in the model.
     images = {normalize("NFC", image.name): image for image in model.images.values()}
     found = []
     for view in views:
         keys = [point.point3D_id for point in images[normalize("NFC", view.name)].points2D if point.has_point3D()]
         error = float(np.mean([model.points3D[key].error for key in keys])) if keys else 0.0
-        found.append(Shown(view, len(keys), error))
+        found.append(PhotographStatistics(view, len(keys), error))
     return found
 
 
-def _photographs(shown: Sequence[Shown]) -> list[str]:
-    every = -(-len(shown) // MOST_THUMBNAILS)
-    return [_photograph(one) for one in shown[::every]]
+def _figures(statistics: Sequence[PhotographStatistics]) -> list[str]:
+    every = -(-len(statistics) // MOST_THUMBNAILS)
+    return [_figure(one) for one in statistics[::every]]
 
 
-def _photograph(shown: Shown) -> str:
-    weak = ' class="weak"' if shown.points < FEW_POINTS else ""
-    name = html.escape(shown.view.name)
+def _figure(statistics: PhotographStatistics) -> str:
+    weak = ' class="weak"' if statistics.points < FEW_POINTS else ""
+    name = html.escape(statistics.view.name)
     return (
-        f'<figure{weak}><img src="{_thumbnail(shown.view)}" alt="{name}">{name}<br>{shown.points} points, '
-        f"error {shown.error:.2f} pixels</figure>"
+        f'<figure{weak}><img src="{_thumbnail(statistics.view)}" alt="{name}">{name}<br>{statistics.points} points, '
+        f"error {statistics.error:.2f} pixels</figure>"
     )
 
 
@@ -307,7 +307,7 @@ def _thumbnail(view: View) -> str:
     return f"data:image/jpeg;base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
-def _missing(names: Sequence[str]) -> list[str]:
+def _missing_section(names: Sequence[str]) -> list[str]:
     if not names:
         return []
     return ["<h2>Not registered</h2>", f'<p class="advice">{html.escape(", ".join(map(str, names)))}</p>']

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from glassplat.annotate.server import AnnotationServer
-from glassplat.annotate.session import Session, opened_session
+from glassplat.annotate.session import Session, open_session
 from glassplat.scene.camera import Camera
 from tests.panes.pane_scene import FRONT, camera_from, label_image
 
@@ -97,7 +97,7 @@ def room(tmp_path: Path) -> Path:
 @contextmanager
 def serving(root: Path) -> Iterator[AnnotationServer]:
     """A server that runs next to the test."""
-    with AnnotationServer(opened_session(root), 0) as server:
+    with AnnotationServer(open_session(root), 0) as server:
         thread = Thread(target=server.serve_forever, args=(0.02,))
         thread.start()
         try:

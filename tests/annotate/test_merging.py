@@ -11,7 +11,7 @@ import pytest
 
 from glassplat.annotate import session
 from glassplat.annotate.document import MOST_PANES, read_document
-from glassplat.annotate.session import ChangedElsewhereError, merge_documents, opened_session
+from glassplat.annotate.session import ChangedElsewhereError, merge_documents, open_session
 from tests.annotate.conftest import marked_document, saved
 
 
@@ -54,7 +54,7 @@ def test_two_programs_that_save_at_the_same_moment_drop_nothing(
 ) -> None:
     if not has_folder_locks:
         monkeypatch.setitem(sys.modules, "fcntl", None)  # As on Windows.
-    one, other = opened_session(room), opened_session(room)
+    one, other = open_session(room), open_session(room)
     second: list[Future[Any]] = []
     write = session.write_document
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from glassplat.annotate.document import fill_polygon, parsed_document, seen_outline, with_strokes
+from glassplat.annotate.document import apply_strokes, fill_polygon, parse_document, project_outline
 from glassplat.annotate.fit import fit_pane
-from glassplat.annotate.results import in_photograph, pane_labels
-from glassplat.annotate.session import opened_session
+from glassplat.annotate.results import pane_labels, resample_to_photograph
+from glassplat.annotate.session import open_session
 from glassplat.captures.dataset import load_dataset
 from glassplat.captures.view import PhotoFile
 from glassplat.cli.main import main
@@ -29,7 +29,7 @@ EVERYTHING = {"kind": "polygon", "effect": "cut", "radius": 1, "points": [[0, 0]
 
 
 def finish(root: Path, document: dict) -> dict:
-    session = opened_session(root)
+    session = open_session(root)
     saved(session, document)
     return session.finish()
 
@@ -79,7 +79,7 @@ def test_writing_again_replaces_what_was_written_and_nothing_else(room: Path) ->
     assert sorted(path.name for path in (room / "panes").glob("*.png")) == ["1.png", "2.png"]
     Image.new("L", (300, 220), 1).save(room / "panes" / "4.png")
     with pytest.raises(InputError, match=r"not made by `glassplat annotate` \(4\.png\)"):
-        opened_session(room)
+        open_session(room)
     assert (room / "panes" / "4.png").exists()
 
 
@@ -143,7 +143,7 @@ def test_an_interrupt_at_any_file_loses_nothing(written: int, room: Path, monkey
         replace_file(source, target)
 
     replace_file = os.replace
-    session = opened_session(room)
+    session = open_session(room)
     saved(session, marked_document(strokes={"0.png": [EVERYTHING]}))
     with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
         patched.setattr(os, "replace", replace)
@@ -154,19 +154,19 @@ def test_an_interrupt_at_any_file_loses_nothing(written: int, room: Path, monkey
     assert load_dataset(room).pane_labels == (1,)
     Image.new("L", (300, 220), 1).save(room / "panes" / "0.png")
     with pytest.raises(InputError, match=r"not made by `glassplat annotate` \(0\.png\)"):
-        opened_session(room)
+        open_session(room)
 
 
 def test_masks_of_the_format_or_in_another_folder_were_not_made_here(room: Path) -> None:
     (room / "masks").mkdir()
     Image.new("L", (300, 220), 1).save(room / "masks" / "0.png")
     with pytest.raises(InputError, match="marked by masks that were not made by `glassplat annotate`"):
-        opened_session(room)
+        open_session(room)
     (room / "transforms.json").rename(room / "transforms_train.json")
     (room / "masks" / "0.png").rename(room / "masks" / "MirrorMask_0.png")
     (room / "panes").mkdir()
     with pytest.raises(InputError, match="marked by masks that were not made by `glassplat annotate`"):
-        opened_session(room)
+        open_session(room)
 
 
 @pytest.mark.parametrize("unmarked", [{"version": 1, "panes": []}, marked_document(())])
@@ -189,7 +189,7 @@ def test_unmarking_removes_nothing_that_was_not_written_here(room: Path) -> None
     with pytest.raises(InputError, match="no pane is known yet"):
         finish(room, marked_document((0,)))
     assert (room / "panes" / "1.png").exists()
-    session = opened_session(room)
+    session = open_session(room)
     saved(session, nothing)
     Image.new("L", (300, 220), 1).save(room / "panes" / "4.png")
     with pytest.raises(InputError, match=r"not made by `glassplat annotate` \(4\.png\)"):
@@ -224,7 +224,7 @@ def test_a_record_of_earlier_versions_tells_of_masks_only(room: Path) -> None:
 
 
 def test_what_another_program_has_saved_is_what_is_written(room: Path) -> None:
-    session = opened_session(room)
+    session = open_session(room)
     saved(session, marked_document())
     (room / "annotations.json").write_text(json.dumps(marked_document((0, 1, 2, 3))))
     assert session.finish()["masks"] == NAMES[:4]
@@ -247,7 +247,7 @@ def test_the_nearer_pane_hides_the_farther_one(room: Path) -> None:
         places = [
             {name: camera.project(c).tolist() for name, camera in zip(NAMES, cameras, strict=True)} for c in corners
         ]
-        (marked,) = parsed_document(marked_document(label=label, corners=places), "here")
+        (marked,) = parse_document(marked_document(label=label, corners=places), "here")
         numbers = {name: number for number, name in enumerate(NAMES)}
         panes.append((marked, fit_pane(marked.marks(numbers), cameras, "rectangle")))
     for order in (panes, panes[::-1]):
@@ -259,18 +259,18 @@ def test_the_nearer_pane_hides_the_farther_one(room: Path) -> None:
 def test_an_outline_that_passes_the_camera_is_cut_off() -> None:
     camera = NumpyCamera.from_camera(camera_from((0.0, 0.0, 0.0), np.array([0.0, 0.0, 1.0])))
     floor = np.array([[-5.0, 1, -5], [5, 1, -5], [5, 1, 5], [-5, 1, 5]])
-    mask = fill_polygon(seen_outline(camera, floor), (300, 220))
+    mask = fill_polygon(project_outline(camera, floor), (300, 220))
     horizon = 110 + 240 * 1 / 5
     rows = np.flatnonzero(mask.any(axis=1))
     assert rows.min() == pytest.approx(horizon, abs=2) and rows.max() == 219
     behind = floor - [0, 0, 10]
-    assert not fill_polygon(seen_outline(camera, behind), (300, 220)).any()
+    assert not fill_polygon(project_outline(camera, behind), (300, 220)).any()
 
 
 def test_an_outline_that_passes_the_camera_keeps_its_edges_straight() -> None:
     camera = NumpyCamera.from_camera(camera_from((0.0, 0.0, 0.0), np.array([0.0, 0.0, 1.0])))
     wall = np.array([[-2.0, -1, 6], [2.5, -1, -20], [2.5, 1, -20], [-2, 1, 6]])
-    mask = fill_polygon(seen_outline(camera, wall), (300, 220))
+    mask = fill_polygon(project_outline(camera, wall), (300, 220))
     x, y = np.meshgrid(np.arange(300) + 0.5, np.arange(220) + 0.5)
     rays = camera.rays(np.stack([x, y], axis=-1))
     normal = np.cross(wall[1] - wall[0], wall[3] - wall[0])
@@ -282,7 +282,7 @@ def test_an_outline_that_passes_the_camera_keeps_its_edges_straight() -> None:
 def test_put_back_restores_no_more_than_there_was() -> None:
     mask = np.zeros((40, 40), dtype=bool)
     mask[10:30, 10:30] = True
-    (pane,) = parsed_document(
+    (pane,) = parse_document(
         marked_document(
             strokes={
                 "0.png": [
@@ -293,7 +293,7 @@ def test_put_back_restores_no_more_than_there_was() -> None:
         ),
         "here",
     )
-    found = with_strokes(mask, pane.strokes["0.png"])
+    found = apply_strokes(mask, pane.strokes["0.png"])
     assert found[20, 20] and not found[14, 20] and not found[20, 33] and not (found & ~mask).any()
 
 
@@ -324,7 +324,7 @@ def test_masks_of_bent_photographs_are_bent_too(room: Path) -> None:
     assert isinstance(reader, PhotoFile) and reader.pixel_map.lens is not None
     labels = np.zeros((view.camera.height, view.camera.width), dtype=np.uint8)
     labels[60:160, 80:220] = 1
-    bent = in_photograph(view, labels)
+    bent = resample_to_photograph(view, labels)
     assert bent.shape == (220, 300)
     back = reader.pixel_map.map_labels(bent)
     assert (back != labels).mean() < 0.02
@@ -349,11 +349,11 @@ def test_photographs_without_poses_are_told_what_makes_a_capture_of_them(
 def test_a_damaged_document_is_named(room: Path) -> None:
     (room / "annotations.json").write_text('{"version": 1}')
     with pytest.raises(InputError, match=r"annotations\.json has no panes"):
-        opened_session(room)
+        open_session(room)
 
 
 def test_the_wrong_order_of_corners_is_called_into_question(room: Path) -> None:
-    session = opened_session(room)
+    session = open_session(room)
     document = marked_document()
     _, second, _, fourth = document["panes"][0]["corners"]
     second[NAMES[0]], fourth[NAMES[0]] = fourth[NAMES[0]], second[NAMES[0]]  # The other way round: no sides cross.
@@ -362,7 +362,7 @@ def test_the_wrong_order_of_corners_is_called_into_question(room: Path) -> None:
 
 
 def test_the_suggested_photograph_lowers_the_doubt(room: Path) -> None:
-    session = opened_session(room)
+    session = open_session(room)
     two = saved(session, marked_document((0, 2)))["panes"][0]
     best = two["next"][0]
     assert best["uncertainty"] < two["uncertainty"]
@@ -373,7 +373,7 @@ def test_the_suggested_photograph_lowers_the_doubt(room: Path) -> None:
 def test_only_panes_that_have_changed_are_fitted_again(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fitted = []
     monkeypatch.setattr("glassplat.annotate.session.fit_pane", lambda *given: fitted.append(given) or fit_pane(*given))
-    opened, document = opened_session(room), marked_document()
+    opened, document = open_session(room), marked_document()
     document["panes"] += marked_document(label=2)["panes"]
     first = saved(opened, document)["panes"]
     assert len(fitted) == 2 and [answer["label"] for answer in first] == [1, 2]
@@ -393,7 +393,7 @@ CROSSED = ((0, 0), (1, 2), (2, 1), (3, 3))
 @pytest.mark.parametrize("shape", ["rectangle", "polygon"])
 def test_sides_that_cross_are_told_of(shape: str, room: Path) -> None:
     document = marked_document(shape=shape)
-    session, corners = opened_session(room), document["panes"][0]["corners"]
+    session, corners = open_session(room), document["panes"][0]["corners"]
     assert saved(session, document)["panes"][0]["message"] == ""
     for crossing in ({NAMES[0]}, {NAMES[0], NAMES[1], NAMES[2]}):
         swapped = [{**corners[one], **{view: corners[other][view] for view in crossing}} for one, other in CROSSED]

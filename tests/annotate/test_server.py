@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from glassplat.access import cookie_name
-from glassplat.annotate.document import MOST_CORNERS, MOST_PLACES
+from glassplat.annotate.document import MOST_CORNERS, MOST_STROKE_POINTS
 from glassplat.annotate.server import LARGEST_BODY, AnnotationServer
-from glassplat.annotate.session import opened_session
+from glassplat.annotate.session import open_session
 from glassplat.errors import InputError
 from tests.annotate.conftest import NAMES, marked_document, serving
 
@@ -197,7 +197,7 @@ def test_nonsense_changes_nothing(body: Any, status: int, server: AnnotationServ
 
 
 def test_more_points_than_fit_are_counted_in_the_refusal(server: AnnotationServer) -> None:
-    stroke = {"kind": "brush", "effect": "cut", "radius": 5, "points": [[1, 1]] * (MOST_PLACES + 1)}
+    stroke = {"kind": "brush", "effect": "cut", "radius": 5, "points": [[1, 1]] * (MOST_STROKE_POINTS + 1)}
     _, answer = save(server, marked_document(strokes={"0.png": [stroke]}))
     assert "1 strokes of 20001 points; expected at most 32 and 500, of 20000 points" in answer["error"]
 
@@ -255,4 +255,4 @@ def test_a_port_in_use_says_what_to_do(room: Path) -> None:
         taken.listen()
         port = taken.getsockname()[1]
         with pytest.raises(InputError, match=rf"port {port} is in use; choose another with --port"):
-            AnnotationServer(opened_session(room), port)
+            AnnotationServer(open_session(room), port)

@@ -10,9 +10,9 @@ import pytest
 
 from glassplat.captures import colmap_library as library
 from glassplat.prepare import colmap, reconstruction
-from glassplat.prepare.colmap import Features, Mapping
+from glassplat.prepare.colmap import FeatureOptions, MappingOptions
 from glassplat.prepare.photographs import Note
-from glassplat.prepare.reconstruction import MANY, USUAL, Settings, best_solution
+from glassplat.prepare.reconstruction import DEFAULT_FEATURES, MANY_FEATURES, Settings, best_solution
 from glassplat.training.messages import Working
 
 
@@ -37,23 +37,23 @@ class Matches:
 @pytest.mark.parametrize(
     ("sizes", "least", "features", "best"),
     [
-        ([61], 0.8, [USUAL], 61),
-        ([54, 56], 0.8, [USUAL, USUAL], 56),
-        ([56, 54], 0.8, [USUAL, USUAL], 56),
-        ([54, 54, 62], 0.95, [USUAL, USUAL, MANY], 62),
-        ([62, 62, 62, 64], 1.0, [USUAL, USUAL, MANY, MANY], 64),
-        ([20, 30, 52], 0.8, [USUAL, USUAL, MANY], 52),
-        ([20, 0, 40, 50], 0.8, [USUAL, USUAL, MANY, MANY], 50),
+        ([61], 0.8, [DEFAULT_FEATURES], 61),
+        ([54, 56], 0.8, [DEFAULT_FEATURES, DEFAULT_FEATURES], 56),
+        ([56, 54], 0.8, [DEFAULT_FEATURES, DEFAULT_FEATURES], 56),
+        ([54, 54, 62], 0.95, [DEFAULT_FEATURES, DEFAULT_FEATURES, MANY_FEATURES], 62),
+        ([62, 62, 62, 64], 1.0, [DEFAULT_FEATURES, DEFAULT_FEATURES, MANY_FEATURES, MANY_FEATURES], 64),
+        ([20, 30, 52], 0.8, [DEFAULT_FEATURES, DEFAULT_FEATURES, MANY_FEATURES], 52),
+        ([20, 0, 40, 50], 0.8, [DEFAULT_FEATURES, DEFAULT_FEATURES, MANY_FEATURES, MANY_FEATURES], 50),
     ],
 )
 def test_more_features_only_where_too_few_are_placed(
-    monkeypatch: pytest.MonkeyPatch, sizes: list[int], least: float, features: list[Features], best: int
+    monkeypatch: pytest.MonkeyPatch, sizes: list[int], least: float, features: list[FeatureOptions], best: int
 ) -> None:
     photographs: Any = tuple(range(64))
-    tried: list[Features] = []
+    tried: list[FeatureOptions] = []
     notes: list[Any] = []
 
-    def matched(photographs: Any, work: Path, features: Features, *unused: Any) -> Matches:
+    def matched(photographs: Any, work: Path, features: FeatureOptions, *unused: Any) -> Matches:
         tried.append(features)
         return Matches(work, photographs)
 
@@ -66,7 +66,7 @@ def test_more_features_only_where_too_few_are_placed(
     monkeypatch.setattr(reconstruction, "register_photographs", placed)
     solution = best_solution(photographs, Path("work"), Settings(), least, notes.append)
     assert tried == features
-    assert (solution.registered, solution.tried) == (best, len(sizes))
+    assert (solution.registered, solution.attempts_made) == (best, len(sizes))
     assert len(notes) == len(sizes) - 1 and all(isinstance(note, Note) for note in notes)
 
 
@@ -80,6 +80,6 @@ def test_a_second_group_is_work_of_its_own(monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setattr(library.pycolmap, "incremental_mapping", mapping)
     heard: list[Any] = []
-    colmap._incremental(Path("d"), Path("o"), Mapping(), 9, heard.append)(None)
+    colmap._incremental_mapping(Path("d"), Path("o"), MappingOptions(), 9, heard.append)(None)
     first, second = "registering the photographs", "registering the photographs, group 2"
     assert heard == [Working(first, done, 9) for done in (2, 3, 4, 5)] + [Working(second, done, 9) for done in (2, 3)]

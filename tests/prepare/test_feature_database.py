@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from glassplat.errors import InputError
-from glassplat.prepare.colmap import FeatureDatabase, Features, check_database
+from glassplat.prepare.colmap import FeatureDatabase, FeatureOptions, check_database
 from glassplat.prepare.photographs import Photograph
 
 
@@ -58,12 +58,12 @@ def test_half_a_picture_of_a_killed_command_is_no_photograph(tmp_path: Path) -> 
         Image.fromarray(noise).resize((160, 120), Image.Resampling.BICUBIC).save(path)
         photographs.append(Photograph(path, path.name, 160, 120, "", None))
     database = FeatureDatabase(tmp_path / "features.db", tmp_path / "grey", photographs)
-    database.write_pictures(lambda message: None)
+    database.write_images(lambda message: None)
     whole = (tmp_path / "grey" / "000000.png").read_bytes()
     for name, data in ((".000002.0a.tmp.png", whole), (".000003.0b.tmp.png", whole[: len(whole) // 2])):
         (tmp_path / "grey" / name).write_bytes(data)
     database.create("simple_radial")
-    database.extract(Features(500, 0.0067), lambda message: None)
+    database.extract(FeatureOptions(500, 0.0067), lambda message: None)
     counts = database.feature_counts()
     assert len(counts) == 2 and (counts > 0).all()
 

@@ -20,7 +20,7 @@ from glassplat.cli import capture
 from glassplat.cli.main import main
 from glassplat.errors import InputError
 from glassplat.prepare import preparation, report_page
-from glassplat.prepare.colmap import interruptible
+from glassplat.prepare.colmap import run_interruptible
 from glassplat.prepare.preparation import PAGE, RECORD, Preparation, prepare
 from tests.prepare.conftest import Heard
 from tests.prepare.test_video import film
@@ -41,20 +41,20 @@ def test_an_interrupt_waits_until_the_work_has_ended() -> None:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
-            interruptible(work)
+            run_interruptible(work)
     finally:
         signal.signal(signal.SIGINT, before)
     assert ended
 
 
 def test_work_that_ends_tells_its_result_and_what_it_raised() -> None:
-    assert interruptible(lambda token: 5) == 5
+    assert run_interruptible(lambda token: 5) == 5
 
     def failing(token: Any) -> None:
         raise RuntimeError("no features")
 
     with pytest.raises(RuntimeError, match="no features"):
-        interruptible(failing)
+        run_interruptible(failing)
 
 
 def interrupt(*arguments: Any, **options: Any) -> None:

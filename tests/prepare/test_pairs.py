@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from glassplat.prepare.colmap import MOST_EXHAUSTIVE, alike_pairs, all_pairs, chosen_pairs, neighbouring_pairs
+from glassplat.prepare.colmap import MOST_EXHAUSTIVE, all_pairs, neighbouring_pairs, pairs_to_match, similar_pairs
 
 
 def walk_round(count: int, *, places: int = 30) -> list[np.ndarray]:
@@ -21,13 +21,13 @@ def test_all_pairs_are_each_once() -> None:
 
 
 def test_few_photographs_are_all_compared() -> None:
-    assert len(chosen_pairs([np.zeros((0, 128), np.uint8)] * MOST_EXHAUSTIVE)) == MOST_EXHAUSTIVE * 79 // 2
+    assert len(pairs_to_match([np.zeros((0, 128), np.uint8)] * MOST_EXHAUSTIVE)) == MOST_EXHAUSTIVE * 79 // 2
 
 
 def test_of_many_a_loop_is_closed_by_what_looks_alike() -> None:
     count = 100
     descriptors = walk_round(count)
-    pairs = set(chosen_pairs(descriptors))
+    pairs = set(pairs_to_match(descriptors))
     assert set(neighbouring_pairs(count)) <= pairs
     assert (count - 1, 0) in pairs and (count - 1, 0) not in neighbouring_pairs(count)
     assert len(pairs) < count * (count - 1) / 4
@@ -35,10 +35,10 @@ def test_of_many_a_loop_is_closed_by_what_looks_alike() -> None:
 
 
 def test_the_likest_share_features() -> None:
-    found = {frozenset(pair) for pair in alike_pairs(walk_round(60))}
+    found = {frozenset(pair) for pair in similar_pairs(walk_round(60))}
     assert all(frozenset((k, (k + 1) % 60)) in found for k in range(60))
 
 
 def test_photographs_without_features_are_no_obstacle() -> None:
     descriptors = [*walk_round(90), np.zeros((0, 128), np.uint8)]
-    assert chosen_pairs(descriptors) == chosen_pairs(descriptors)
+    assert pairs_to_match(descriptors) == pairs_to_match(descriptors)

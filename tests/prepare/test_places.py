@@ -12,7 +12,7 @@ from PIL import Image
 from glassplat.cli.main import main
 from glassplat.errors import InputError
 from glassplat.prepare import preparation, report_page
-from glassplat.prepare.preparation import PAGE, RECORD, Report, Workplace
+from glassplat.prepare.preparation import PAGE, RECORD, Report, WorkFolder
 
 
 def refused(source: Path, output: Path, capsys: pytest.CaptureFixture[str]) -> str:
@@ -91,10 +91,10 @@ def test_force_replaces_masks_that_were_prepared_and_no_others(tmp_path: Path) -
     mask.parent.mkdir(parents=True)
     mask.write_bytes(b"what a wide lens did not see")
     (output / RECORD).write_text(json.dumps({"masks": [hashlib.sha256(mask.read_bytes()).hexdigest()]}))
-    Workplace(output).begin({}, resume=False, force=True)
+    WorkFolder(output).begin({}, resume=False, force=True)
     mask.write_bytes(b"a passer-by, too")
     with pytest.raises(InputError, match=r"capture holds ignore/left/1.png, which are not from `glassplat prepare`"):
-        Workplace(output).begin({}, resume=False, force=True)
+        WorkFolder(output).begin({}, resume=False, force=True)
 
 
 @pytest.mark.parametrize("name", ["normals/a.png", "notes.txt", "panes/a.png", "images/a_mask.jpg", "images/b/c.png"])
@@ -110,11 +110,11 @@ def test_force_removes_only_what_was_prepared(tmp_path: Path, name: str) -> None
         InputError,
         match=rf"capture holds {named}, which are not from `glassplat prepare` and would be removed by --force",
     ):
-        Workplace(output).begin({}, resume=False, force=True)
+        WorkFolder(output).begin({}, resume=False, force=True)
     (output / name).unlink()
     if named != name:
         (output / named).rmdir()
-    Workplace(output).begin({}, resume=False, force=True)
+    WorkFolder(output).begin({}, resume=False, force=True)
 
 
 def test_a_mounted_disk_is_no_output(
@@ -129,7 +129,7 @@ def test_a_mounted_disk_is_no_output(
 def finish(monkeypatch: pytest.MonkeyPatch) -> None:
     """Has preparations write an empty capture at once."""
     monkeypatch.setattr(preparation, "best_solution", lambda *_: None)
-    monkeypatch.setattr(preparation, "report_of", lambda _: Report(3, 3, (), (3,), 9, 0.1, 3.0, 9, (), "", 1, ()))
+    monkeypatch.setattr(preparation, "make_report", lambda _: Report(3, 3, (), (3,), 9, 0.1, 3.0, 9, (), "", 1, ()))
     monkeypatch.setattr(preparation, "write_capture", lambda _, folder, *__: (folder / "images").mkdir(parents=True))
 
 
@@ -154,13 +154,13 @@ def test_an_output_may_be_a_link_or_the_current_folder(
 def test_a_capture_that_another_preparation_makes_is_left_to_it(
     option: str, photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    workplace = Workplace(tmp_path / "capture")
-    with workplace.alone():
+    workplace = WorkFolder(tmp_path / "capture")
+    with workplace.lock():
         workplace.begin({}, resume=False, force=False)
         assert main(["prepare", str(photographs), "--output", str(tmp_path / "capture"), option]) == 2
         assert "another preparation is writing" in " ".join(capsys.readouterr().err.split())
         assert (workplace.folder / "settings.json").is_file()
-        with Workplace(tmp_path / "other").alone():
+        with WorkFolder(tmp_path / "other").lock():
             pass
-    with workplace.alone():
+    with workplace.lock():
         pass

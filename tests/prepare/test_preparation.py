@@ -132,7 +132,7 @@ def test_only_one_sqlite_has_the_database_open_and_progress_is_read_from_it(
         raise AssertionError("another SQLite opened the database")
 
     monkeypatch.setattr(sqlite3, "connect", refuse)
-    monkeypatch.setattr(colmap, "LOOK_EVERY", 0.001)
+    monkeypatch.setattr(colmap, "POLL_SECONDS", 0.001)
     assert prepare(Preparation(photographs, tmp_path / "capture"), heard).registered == len(CONNECTED)
     for phase in ("extracting features", "matching photographs"):
         told = [message.done for message in heard if isinstance(message, Working) and message.what == phase]

@@ -16,7 +16,7 @@ from rich.console import Console
 from glassplat.cli.capture import Prepare
 from glassplat.files.records import read_json
 from glassplat.prepare.photographs import Photograph
-from glassplat.prepare.preparation import Preparation, report_of
+from glassplat.prepare.preparation import Preparation, make_report
 from glassplat.prepare.reconstruction import Solution
 
 
@@ -72,14 +72,14 @@ class FakeModel:
 
 
 def report(models: list[Any], *, count: int = 10, features: int = 3000) -> Any:
-    return report_of(Solution(FakeDatabase(count, features), models, "the usual settings", 1))  # type: ignore[arg-type]
+    return make_report(Solution(FakeDatabase(count, features), models, "the usual settings", 1))  # type: ignore[arg-type]
 
 
 def test_names_that_are_no_text_can_be_read_again(tmp_path: Path) -> None:
     solution = Solution(FakeDatabase(4, 3000), [FakeModel(range(3))], "", 1)  # type: ignore[arg-type]
     folder = tmp_path / os.fsdecode(b"caf\xe9")
     solution.database.photographs[3] = Photograph(folder / os.fsdecode(b"\xe9.jpg"), "_.jpg", 640, 480, "", None)
-    record = {"report": asdict(report_of(solution)), **Preparation(folder, tmp_path).record()}
+    record = {"report": asdict(make_report(solution)), **Preparation(folder, tmp_path).record()}
     (tmp_path / "record.json").write_text(json.dumps(record))
     found = read_json(tmp_path / "record.json")
     assert found["report"]["missing"] == [r"\xe9.jpg"] and found["input"].endswith(r"caf\xe9")
@@ -88,7 +88,7 @@ def test_names_that_are_no_text_can_be_read_again(tmp_path: Path) -> None:
 
 def test_a_good_preparation_needs_no_advice() -> None:
     found = report([FakeModel(range(10))])
-    assert found.share == 1 and found.groups == (10,) and found.advice == () and found.missing == ()
+    assert found.registered_share == 1 and found.groups == (10,) and found.advice == () and found.missing == ()
     assert found.lines()[0].startswith("10 of 10 photographs registered, with")
 
 

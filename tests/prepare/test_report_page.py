@@ -17,7 +17,7 @@ from glassplat.cli.main import main
 from glassplat.cli.train import SCENE
 from glassplat.errors import InputError
 from glassplat.prepare.preparation import PAGE
-from glassplat.prepare.report_page import _bin, _cards, plan, write_page
+from glassplat.prepare.report_page import _bin_label, _cards, plan_svg, write_page
 from tests.render.tiny_scene import pane
 
 RECORD: dict[str, Any] = {
@@ -118,7 +118,7 @@ def test_a_record_without_a_report_is_named(record: object, tmp_path: Path) -> N
 def test_cameras_in_the_plan_lie_as_they_stood() -> None:
     dataset = load_dataset(SCENE)
     views = sorted(dataset.train, key=lambda view: view.name)
-    drawing = plan(views, dataset.points, np.zeros(len(dataset.points), dtype=bool), None)
+    drawing = plan_svg(views, dataset.points, np.zeros(len(dataset.points), dtype=bool), None)
     found = re.findall(r'cx="([\d.-]+)" cy="([\d.-]+)" r="2.6"', drawing)
     pixels = np.array(found, dtype=np.float64)
     centers = np.stack([view.camera.center.double().numpy() for view in views])
@@ -137,4 +137,9 @@ def _level(views: list) -> np.ndarray:
 
 
 def test_bins_of_whole_numbers_do_not_overlap() -> None:
-    assert [_bin(2, 3), _bin(5, 7), _bin(15, 1 << 30), _bin(0.25, 0.5)] == ["2", "5 to 6", "15 and more", "0.25 to 0.5"]
+    assert [_bin_label(2, 3), _bin_label(5, 7), _bin_label(15, 1 << 30), _bin_label(0.25, 0.5)] == [
+        "2",
+        "5 to 6",
+        "15 and more",
+        "0.25 to 0.5",
+    ]

@@ -11,7 +11,7 @@ import pytest
 from glassplat.errors import InputError
 from glassplat.files.images import image_size
 from glassplat.prepare import photographs as video
-from glassplat.prepare.photographs import Footage, chosen_frames, frames_of
+from glassplat.prepare.photographs import FrameStatistics, chosen_frames, extract_frames
 from tests.prepare.conftest import Heard
 
 WIDTH, HEIGHT = 320, 240
@@ -33,7 +33,7 @@ def film(path: Path, offsets: np.ndarray, *, blurred: range = range(0)) -> Path:
 def test_frames_are_spaced_by_motion_not_by_time(tmp_path: Path, heard: Heard) -> None:
     # It stands, walks for 40 frames, and stands again.
     offsets = np.concatenate([np.zeros(30), np.arange(40) * 16, np.full(30, 39 * 16)])
-    paths = frames_of(film(tmp_path / "walk.avi", offsets), tmp_path / "frames", 20, heard)
+    paths = extract_frames(film(tmp_path / "walk.avi", offsets), tmp_path / "frames", 20, heard)
     numbers = [int(path.stem.split("_")[1]) for path in paths]
     assert 15 <= len(paths) <= 22
     assert sum(30 <= number < 71 for number in numbers) >= len(numbers) - 2
@@ -43,7 +43,7 @@ def test_frames_are_spaced_by_motion_not_by_time(tmp_path: Path, heard: Heard) -
 def test_blurred_frames_are_passed_over(tmp_path: Path, heard: Heard) -> None:
     blurred = range(1, 60, 2)
     path = film(tmp_path / "walk.avi", np.arange(60) * 8, blurred=blurred)
-    numbers = [int(one.stem.split("_")[1]) for one in frames_of(path, tmp_path / "frames", 15, heard)]
+    numbers = [int(one.stem.split("_")[1]) for one in extract_frames(path, tmp_path / "frames", 15, heard)]
     assert len(numbers) >= 12
     # A stretch may hold a single frame; chance alone would choose every second time.
     assert sum(number in blurred for number in numbers) <= 1
@@ -51,22 +51,22 @@ def test_blurred_frames_are_passed_over(tmp_path: Path, heard: Heard) -> None:
 
 def test_frames_that_are_there_stay(tmp_path: Path, heard: Heard) -> None:
     path = film(tmp_path / "walk.avi", np.arange(60) * 8)
-    first = frames_of(path, tmp_path / "frames", 15, heard)
+    first = extract_frames(path, tmp_path / "frames", 15, heard)
     times = {one: one.stat().st_mtime_ns for one in first}
     first[3].unlink()
-    again = frames_of(path, tmp_path / "frames", 15, heard)
+    again = extract_frames(path, tmp_path / "frames", 15, heard)
     assert again == first and first[3].is_file()
     assert all(one.stat().st_mtime_ns == times[one] for one in first if one != first[3])
 
 
 def test_the_sharpest_of_each_stretch_is_chosen() -> None:
-    footage = Footage(np.array([0.0, 0.01, 0.03, 0.05, 0.051, 0.09]), np.array([1.0, 5.0, 2.0, 1.0, 3.0, 1.0]))
+    footage = FrameStatistics(np.array([0.0, 0.01, 0.03, 0.05, 0.051, 0.09]), np.array([1.0, 5.0, 2.0, 1.0, 3.0, 1.0]))
     assert chosen_frames(footage, 3).tolist() == [1, 4, 5]
 
 
 @pytest.mark.parametrize("most", [8, 16, 20])
 def test_no_more_frames_than_wanted_are_chosen(most: int) -> None:
-    assert len(chosen_frames(Footage(np.linspace(0, 3, 70), np.ones(70)), most)) == most
+    assert len(chosen_frames(FrameStatistics(np.linspace(0, 3, 70), np.ones(70)), most)) == most
 
 
 @pytest.mark.parametrize("still", [True, False])
@@ -78,7 +78,7 @@ def test_a_video_of_nothing_is_refused(still: bool, tmp_path: Path, heard: Heard
         path.write_bytes(b"this is no video")
     expected = "has 1 sufficiently different views in 40 frames" if still else "has no frame that OpenCV can read"
     with pytest.raises(InputError, match=expected):
-        frames_of(path, tmp_path / "frames", 15, heard)
+        extract_frames(path, tmp_path / "frames", 15, heard)
 
 
 def test_without_opencv_it_says_what_to_install(tmp_path: Path, heard: Heard, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,4 +87,4 @@ def test_without_opencv_it_says_what_to_install(tmp_path: Path, heard: Heard, mo
 
     monkeypatch.setattr(video.importlib, "import_module", missing)
     with pytest.raises(InputError, match=r"pip install 'glassplat\[video\]'"):
-        frames_of(tmp_path / "x.mp4", tmp_path / "frames", 15, heard)
+        extract_frames(tmp_path / "x.mp4", tmp_path / "frames", 15, heard)
