@@ -19,8 +19,8 @@ from benchmarks.methods import doublings, thread_count
 from benchmarks.scene import bench_camera, bench_scene
 from benchmarks.table import Table
 from glassplat.render.planar import Planar
-from glassplat.viewer.drawing import ViewRequest, draw_picture
-from glassplat.viewer.render_loop import Picture, RenderLoop, RenderThread
+from glassplat.viewer.drawing import ViewRequest, draw_image
+from glassplat.viewer.render_loop import ImageArray, RenderLoop, RenderThread
 from glassplat.viewer.server import COARSE_QUALITY, SHARP_QUALITY
 
 WIDTH, HEIGHT, COUNT = 640, 480, 100_000
@@ -63,7 +63,7 @@ class Looker:
         self._changed = threading.Condition()
         self._thread = RenderThread(self._loop)
         threads = numba.get_num_threads()
-        self._loop.call(lambda: numba.set_num_threads(threads))  # Each Python thread has a number of its own.
+        self._loop.schedule(lambda: numba.set_num_threads(threads))  # Each Python thread has a number of its own.
 
     def stop(self) -> None:
         """Ends the drawing."""
@@ -92,14 +92,14 @@ class Looker:
             self._shown.clear()
             self._request = replace(self._request, cam_from_world=pose)
             begun = time.perf_counter()
-            self._loop.ask(1, self._request, (WIDTH, HEIGHT))
+            self._loop.submit(1, self._request, (WIDTH, HEIGHT))
         return begun
 
-    def _draw(self, request: ViewRequest, rows: int) -> Picture:
+    def _draw(self, request: ViewRequest, rows: int) -> ImageArray:
         self._drawing = request
-        return draw_picture(self._scene, self._renderer, request, rows)
+        return draw_image(self._scene, self._renderer, request, rows)
 
-    def _show(self, client: int, picture: Picture, is_full: bool) -> None:
+    def _show(self, client: int, picture: ImageArray, is_full: bool) -> None:
         """Packs the picture as viser does."""
         Image.fromarray(picture).save(BytesIO(), "JPEG", quality=SHARP_QUALITY if is_full else COARSE_QUALITY)
         with self._changed:

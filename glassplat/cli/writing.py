@@ -29,9 +29,9 @@ from glassplat.files.sidecars import read_cameras, write_cameras
 from glassplat.files.writing import SPLAT_WRITERS, atomic_write, real_path, scene_source, write_splats
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model import model as models
-from glassplat.publish.camera_paths import fit_to_width, interpolate_cameras, keyframes_of
-from glassplat.publish.film import check_size, side_by_side, wipe_pictures, write_film
-from glassplat.publish.web_page import MOST_GAUSSIANS, PREVIEW, Sharing, check_panes, fits, write_preview
+from glassplat.publish.camera_paths import fit_to_width, interpolate_cameras, select_keyframes
+from glassplat.publish.film import check_size, encode_video, side_by_side, wipe_images
+from glassplat.publish.web_page import MOST_GAUSSIANS, PREVIEW, Sharing, check_panes, fits_page, write_preview
 from glassplat.render.frame import check_layers
 from glassplat.render.layers import layer_image
 from glassplat.render.planar import Planar, dereflected_photo
@@ -136,7 +136,7 @@ def write_video(command: Video, console: Console) -> None:
         check_size(command.output, columns * cameras[0].width, cameras[0].height)
     with WorkProgress(console) as progress, atomic_write(command.output) as temporary:
         frames = track_progress("filming", _video_frames(command, model, cameras), len(cameras), progress)
-        write_film(temporary, frames, count=len(cameras), fps=command.fps)
+        encode_video(temporary, frames, count=len(cameras), fps=command.fps)
     print_line(console, f"{len(cameras)} pictures, {command.output.stat().st_size / 1e6:.2f} MB -> {command.output}")
 
 
@@ -147,7 +147,7 @@ def _video_cameras(command: Video, model: models.Model) -> list[Camera]:
             cameras = interpolate_cameras([camera for _, camera in read_cameras(command.keyframes)], frames)
         elif command.path == "interpolate":
             cameras = interpolate_cameras(
-                keyframes_of([model.cameras[name] for name in sorted(model.cameras, key=natural_sort_key)]), frames
+                select_keyframes([model.cameras[name] for name in sorted(model.cameras, key=natural_sort_key)]), frames
             )
         else:
             cameras = model.orbit(frames)
@@ -163,7 +163,7 @@ def _video_frames(command: Video, model: models.Model, cameras: Sequence[Camera]
             shown = [_quantized_image(layer_image(frame, layer)) for layer in command.layers]
         if command.layout == "wipe":
             share = 0.5 + WIPE_SPAN / 2 * math.sin(2 * math.pi * index / len(cameras))
-            yield wipe_pictures(shown[0], shown[1], share)
+            yield wipe_images(shown[0], shown[1], share)
         else:
             yield side_by_side(shown)
 
@@ -282,7 +282,7 @@ def _exported_model(command: Export, model: models.Model) -> models.Model:
 def _write_page(command: Export, model: models.Model, console: Console) -> list[Path]:
     """Writes the page, and its preview if it has an address; returns the written files."""
     path = command.output / "index.html"
-    if not fits(model.scene):
+    if not fits_page(model.scene):
         print_warning(
             console, f"a page holds {MOST_GAUSSIANS:,} Gaussians: this one shows those that cover the largest areas"
         )

@@ -42,7 +42,7 @@ from glassplat.scene.corrections import DEFAULT_UP, estimate_up
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene, covering_glass, with_intensity, with_pane
-from glassplat.viewer.drawing import ERROR, ViewerState, Writer
+from glassplat.viewer.drawing import ERROR_LAYER, ViewerState, Writer
 from glassplat.viewer.render_loop import LOCALHOST, vacant_port
 from glassplat.viewer.server import Viewer
 
@@ -88,7 +88,7 @@ class Model:
         camera = self.cameras[name]
         width = min(NOTEBOOK_WIDTH, camera.width)
         small = camera.resize(width, max(1, round(width * camera.height / camera.width)))
-        encoded = web_page.in_base64(web_page.jpeg(self.image(small), quality=90))
+        encoded = web_page.base64_text(web_page.jpeg_bytes(self.image(small), quality=90))
         return f'<p>{text}</p><img src="data:image/jpeg;base64,{encoded}" alt="{html.escape(name)}">'
 
     def show(self) -> Viewer:
@@ -363,7 +363,7 @@ def viewer_state(
     """
     layers: list[str] = [layer for layer in model.layers if layer not in HIDDEN_LAYERS]
     if photographs:
-        layers.append(ERROR)
+        layers.append(ERROR_LAYER)
     return ViewerState(
         model.name, model.scene, model.renderer, layers, tuple(model.cameras.items()), photographs, writer
     )

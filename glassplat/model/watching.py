@@ -22,7 +22,7 @@ from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
 from glassplat.training.messages import Message, StepDone
 from glassplat.viewer.drawing import ViewerState
-from glassplat.viewer.render_loop import DrawingShare, check_port
+from glassplat.viewer.render_loop import RenderBudget, check_port
 from glassplat.viewer.server import Viewer
 
 VALID_NAME = re.compile(r"\w[\w .+-]{0,99}")
@@ -118,7 +118,7 @@ class WatchedTraining:
         self._training, self._dataset = training, dataset
         self._host, self._port, self._announce = host, port, announce
         self._viewer: Viewer | None = None
-        self._share: DrawingShare | None = None
+        self._share: RenderBudget | None = None
         self._refreshed = 0.0
         self._is_paused, self._is_save_requested = False, False
 
@@ -128,7 +128,7 @@ class WatchedTraining:
             return
         if self._viewer is None or self._share is None:
             self._viewer = Viewer(self._state(), self._host, self._port, {"pause": self._pause, "save": self._save})
-            self._share = DrawingShare(self._viewer.loop)
+            self._share = RenderBudget(self._viewer.loop)
             self._announce(self._viewer)
         if self._viewer.is_watched:
             self._update(self._viewer, message)
@@ -147,7 +147,7 @@ class WatchedTraining:
     def _update(self, viewer: Viewer, message: StepDone) -> None:
         """Shows the current scene, and requests new images at intervals."""
         scene = self._training.state.scene  # Not `model`, which would correct all cameras at every step.
-        viewer.change(scene, current_renderer(self._training.recipe, scene))
+        viewer.replace_scene(scene, current_renderer(self._training.recipe, scene))
         now = time.monotonic()
         if now - self._refreshed >= REFRESH_SECONDS and viewer.loop.expected_seconds() is None:
             self._refreshed = now

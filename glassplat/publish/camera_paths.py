@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.publish.web_page import least_along, survey_capture
+from glassplat.publish.web_page import least_aligned_axis, survey_capture
 from glassplat.scene.camera import Camera, look_at
 
 MOST_KEYFRAMES = 12
@@ -41,17 +41,20 @@ def orbit(cameras: Sequence[Camera], extent: float, frames: int) -> list[Camera]
     radius, height = float(flat.norm(dim=1).median()), float(heights.median())
     least = LEAST_LOOP * survey.distance
     if float(facing.norm()) < ALL_AROUND or radius < least:
-        first = flat[0] if float(flat[0].norm()) > least else torch.linalg.cross(survey.up, least_along(survey.up))
+        first = (
+            flat[0] if float(flat[0].norm()) > least else torch.linalg.cross(survey.up, least_aligned_axis(survey.up))
+        )
         aside = torch.nn.functional.normalize(first, dim=0)
         ahead, radius = torch.linalg.cross(survey.up, aside), max(radius, least)
-        places = [radius * (math.cos(a) * aside + math.sin(a) * ahead) + height * survey.up for a in angles]
+        offsets = [radius * (math.cos(a) * aside + math.sin(a) * ahead) + height * survey.up for a in angles]
     else:
         arm = arms.median(dim=0).values
         right = torch.nn.functional.normalize(torch.linalg.cross(survey.up, arm), dim=0)
-        wide, tall = (_loop(arms @ axis, survey.distance) for axis in (right, survey.up))
-        places = [arm + wide * math.sin(a) * right + tall * math.cos(a) * survey.up for a in angles]
+        wide, tall = (_loop_radius(arms @ axis, survey.distance) for axis in (right, survey.up))
+        offsets = [arm + wide * math.sin(a) * right + tall * math.cos(a) * survey.up for a in angles]
     return [
-        replace(cameras[0], cam_from_world=look_at(survey.focus + place, survey.focus, survey.up)) for place in places
+        replace(cameras[0], cam_from_world=look_at(survey.focus + offset, survey.focus, survey.up))
+        for offset in offsets
     ]
 
 
@@ -75,18 +78,18 @@ def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     times = np.linspace(0, knots[-1], frames)
     poses = [camera.cam_from_world.double().cpu().numpy() for camera in cameras]
     rotations = Rotation.from_matrix(np.stack([pose[:3, :3] for pose in poses]))
-    turned = RotationSpline(knots, rotations)(times).as_matrix()
-    places = CubicSpline(knots, np.stack([camera.center.double().cpu().numpy() for camera in cameras]))(times)
+    path_rotations = RotationSpline(knots, rotations)(times).as_matrix()
+    positions = CubicSpline(knots, np.stack([camera.center.double().cpu().numpy() for camera in cameras]))(times)
     first = cameras[0]
-    lenses = np.array([_lens(camera, first.width, first.height) for camera in cameras])
+    lenses = np.array([_intrinsics_for_size(camera, first.width, first.height) for camera in cameras])
     lens = np.stack([np.interp(times, knots, column) for column in lenses.T], axis=1)
     path = []
-    for rotation, place, (fx, fy, cx, cy) in zip(turned, places, lens.tolist(), strict=True):
-        path.append(Camera(_pose(rotation, place), fx, fy, cx, cy, first.width, first.height))
+    for rotation, position, (fx, fy, cx, cy) in zip(path_rotations, positions, lens.tolist(), strict=True):
+        path.append(Camera(_pose(rotation, position), fx, fy, cx, cy, first.width, first.height))
     return path
 
 
-def keyframes_of(cameras: Sequence[Camera]) -> list[Camera]:
+def select_keyframes(cameras: Sequence[Camera]) -> list[Camera]:
     """At most `MOST_KEYFRAMES` of the cameras, evenly spaced, including the first and the last one."""
     count = min(len(cameras), MOST_KEYFRAMES)
     return [cameras[round(index * (len(cameras) - 1) / max(count - 1, 1))] for index in range(count)]
@@ -98,18 +101,18 @@ def fit_to_width(camera: Camera, width: int) -> Camera:
     return camera.resize(width, height)
 
 
-def _lens(camera: Camera, width: int, height: int) -> tuple[float, float, float, float]:
+def _intrinsics_for_size(camera: Camera, width: int, height: int) -> tuple[float, float, float, float]:
     """(fx, fy, cx, cy) of a camera for another image size, filled by the centre of its own image."""
     scale = max(width / camera.width, height / camera.height)
     cx, cy = width / 2 + scale * (camera.cx - camera.width / 2), height / 2 + scale * (camera.cy - camera.height / 2)
     return scale * camera.fx, scale * camera.fy, cx, cy
 
 
-def _loop(spread: Tensor, distance: float) -> float:
+def _loop_radius(spread: Tensor, distance: float) -> float:
     return max(SHARE_OF_SPREAD * float(spread.std(correction=0)), LEAST_LOOP * distance)
 
 
-def _pose(rotation: NDArray[np.float64], place: NDArray[np.float64]) -> Tensor:
+def _pose(rotation: NDArray[np.float64], position: NDArray[np.float64]) -> Tensor:
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ place
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
     return torch.from_numpy(pose).float()

@@ -38,21 +38,23 @@ class Floaters:
         count = min(NEIGHBOURS, len(means) - 1)
         apart = cKDTree(means).query(means, k=count + 1, workers=-1)[0].reshape(len(means), -1)[:, -1]
         near = cKDTree(cameras.detach().double().cpu().numpy()).query(means)[0]
-        self._apart, self._near = torch.from_numpy(apart), torch.from_numpy(near)
-        self._longest = gaussians.log_scales.detach().double().cpu().amax(dim=1).exp()
+        self._neighbour_distances, self._camera_distances = torch.from_numpy(apart), torch.from_numpy(near)
+        self._largest_scales = gaussians.log_scales.detach().double().cpu().amax(dim=1).exp()
 
     def masks(self, cleaning: Cleaning) -> dict[str, Tensor]:
         """[N] bool for each rule: the Gaussians it removes."""
-        everywhere = torch.zeros(len(self._longest), dtype=torch.bool)
+        everywhere = torch.zeros(len(self._largest_scales), dtype=torch.bool)
         found = {"outside": everywhere, "isolated": everywhere, "oversized": everywhere}
         if cleaning.box is not None:
             corners = torch.tensor(cleaning.box, dtype=torch.float64).reshape(2, 3)
             means = self._gaussians.means.detach().double().cpu()
             found["outside"] = ((means < corners.amin(dim=0)) | (means > corners.amax(dim=0))).any(dim=1)
         if cleaning.isolated:
-            found["isolated"] = self._apart > cleaning.isolated * self._longest.clamp(min=float(self._longest.median()))
+            found["isolated"] = self._neighbour_distances > cleaning.isolated * self._largest_scales.clamp(
+                min=float(self._largest_scales.median())
+            )
         if cleaning.oversized:
-            found["oversized"] = self._longest > cleaning.oversized * self._near
+            found["oversized"] = self._largest_scales > cleaning.oversized * self._camera_distances
         return found
 
 

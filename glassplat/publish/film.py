@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-Picture = NDArray[np.uint8]
+ImageArray = NDArray[np.uint8]
 
 CODECS = {".mp4": "vp09"}
 ANIMATIONS = (".webp", ".gif")
@@ -25,12 +25,12 @@ MOST_IN_GIF = 50
 """Maximum frames per second: a GIF counts in hundredths of a second, and browsers play one hundredth as ten."""
 
 
-def write_film(path: Path, pictures: Iterable[Picture], *, count: int, fps: int) -> None:
+def encode_video(path: Path, frames: Iterable[ImageArray], *, count: int, fps: int) -> None:
     """Writes a video.
 
     Args:
         path: a new file; its suffix is one of `SUFFIXES`.
-        pictures: frames [H, W, 3] of equal, even size; read one at a time.
+        frames: [H, W, 3] of equal, even size; read one at a time.
         count: number of frames.
         fps: frames per second.
 
@@ -39,7 +39,7 @@ def write_film(path: Path, pictures: Iterable[Picture], *, count: int, fps: int)
         OSError: the video cannot be written, as on a full disk.
         ValueError: there is no frame, or the suffix is not supported.
     """
-    stream = iter(pictures)
+    stream = iter(frames)
     first = next(stream, None)
     if first is None or path.suffix not in SUFFIXES:
         raise ValueError(f"a video needs a frame and a name that ends in one of {', '.join(SUFFIXES)}")
@@ -79,17 +79,17 @@ def check_size(path: Path, width: int, height: int) -> None:
         )
 
 
-def side_by_side(pictures: list[Picture]) -> Picture:
+def side_by_side(images: list[ImageArray]) -> ImageArray:
     """Images of one size, concatenated horizontally."""
-    return np.concatenate(pictures, axis=1)
+    return np.concatenate(images, axis=1)
 
 
-def wipe_pictures(left: Picture, right: Picture, share: float) -> Picture:
+def wipe_images(left: ImageArray, right: ImageArray, share: float) -> ImageArray:
     """A split image: the left one up to a share of the width, a white line, and the right one."""
     column = round(share * left.shape[1])
-    picture = np.concatenate([left[:, :column], right[:, column:]], axis=1)
-    picture[:, max(column - 1, 0) : column + 1] = 255
-    return picture
+    image = np.concatenate([left[:, :column], right[:, column:]], axis=1)
+    image[:, max(column - 1, 0) : column + 1] = 255
+    return image
 
 
 def _durations(path: Path, count: int, fps: int) -> list[int]:
@@ -99,33 +99,33 @@ def _durations(path: Path, count: int, fps: int) -> list[int]:
     return [after - before for before, after in pairwise(ends)]
 
 
-class _LaterPictures:
+class _LaterFrames:
     """All frames but the first, as one multi-frame image; Pillow would keep a list of images in memory."""
 
-    def __init__(self, pictures: Iterator[Picture], count: int) -> None:
+    def __init__(self, frames: Iterator[ImageArray], count: int) -> None:
         self.n_frames = count
-        self._pictures = pictures
+        self._frames = frames
         self._image: Image.Image | None = None
 
     def seek(self, frame: int) -> None:
         """Reads the next frame; Pillow requests them in order."""
         if frame >= self.n_frames:
             raise EOFError
-        self._image = Image.fromarray(next(self._pictures))
+        self._image = Image.fromarray(next(self._frames))
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._image, name)
 
 
-def _write_animation(path: Path, first: Picture, rest: Iterator[Picture], durations: list[int]) -> None:
-    later = _LaterPictures(rest, len(durations) - 1)
+def _write_animation(path: Path, first: ImageArray, rest: Iterator[ImageArray], durations: list[int]) -> None:
+    later = _LaterFrames(rest, len(durations) - 1)
     with path.open("wb") as file:  # After Ctrl-C, Pillow would leave a file open that it opened.
         kind = path.suffix.removeprefix(".").upper()
         options = {"duration": durations, "loop": 0, "quality": WEBP_QUALITY}
         Image.fromarray(first).save(file, kind, save_all=True, append_images=[later], **options)
 
 
-def _write_video(path: Path, first: Picture, rest: Iterator[Picture], fps: int) -> None:
+def _write_video(path: Path, first: ImageArray, rest: Iterator[ImageArray], fps: int) -> None:
     import cv2
 
     height, width = first.shape[:2]
@@ -134,22 +134,22 @@ def _write_video(path: Path, first: Picture, rest: Iterator[Picture], fps: int) 
         if not writer.isOpened():
             raise OSError(f"this OpenCV cannot write VP9 to {path}; give a name that ends in .webp")
         count = 0
-        for picture in chain([first], rest):
-            writer.write(np.ascontiguousarray(picture[..., ::-1]))
+        for frame in chain([first], rest):
+            writer.write(np.ascontiguousarray(frame[..., ::-1]))
             count += 1
     finally:
         writer.release()
     # The encoder does not report a full disk.
-    if _pictures_in(path) != count:
+    if _count_frames(path) != count:
         raise OSError(f"the video could not be written completely to {path}; is the disk full?")
 
 
-def _pictures_in(path: Path) -> int:
+def _count_frames(path: Path) -> int:
     import cv2
 
-    film = cv2.VideoCapture(str(path))
+    video = cv2.VideoCapture(str(path))
     count = 0
-    while film.grab():
+    while video.grab():
         count += 1
-    film.release()
+    video.release()
     return count

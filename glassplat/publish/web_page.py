@@ -39,7 +39,7 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes, nearest_panes
 from glassplat.scene.scene import Scene, without_glass
 
-COUNT = 24
+CAMERA_COUNT = 24
 WIDTH, HEIGHT = 960, 640
 FOV_RAD = math.radians(50)
 ELEVATION = 0.25
@@ -47,7 +47,7 @@ ELEVATION = 0.25
 INNER_SHARE = 0.96
 """Share of the Gaussians, the inner ones, that the images should contain."""
 MOST_SAMPLED = 200_000
-CLOSE = 1.15
+DISTANCE_FACTOR = 1.15
 
 
 def cameras_around(gaussians: Gaussians, up: Tensor) -> list[tuple[str, Camera]]:
@@ -59,12 +59,12 @@ def cameras_around(gaussians: Gaussians, up: Tensor) -> list[tuple[str, Camera]]
     """
     middle, radius = bounding_ball(gaussians)
     middle, up = middle.cpu(), torch.nn.functional.normalize(up.double().cpu(), dim=0)
-    aside = torch.nn.functional.normalize(torch.linalg.cross(up, least_along(up)), dim=0)
+    aside = torch.nn.functional.normalize(torch.linalg.cross(up, least_aligned_axis(up)), dim=0)
     ahead = torch.linalg.cross(up, aside)
-    distance = CLOSE * radius / math.tan(FOV_RAD / 2)
+    distance = DISTANCE_FACTOR * radius / math.tan(FOV_RAD / 2)
     cameras = []
-    for index in range(COUNT):
-        angle = 2 * math.pi * index / COUNT
+    for index in range(CAMERA_COUNT):
+        angle = 2 * math.pi * index / CAMERA_COUNT
         arm = math.cos(angle) * ahead + math.sin(angle) * aside + ELEVATION * up
         eye = middle + distance * arm
         camera = Camera.look_at(eye, middle, up=up, fov_rad=FOV_RAD, width=WIDTH, height=HEIGHT)
@@ -90,20 +90,20 @@ def bounding_ball(gaussians: Gaussians) -> tuple[Tensor, float]:
     return middle, max(float(distances.quantile(INNER_SHARE)), 1e-6)
 
 
-def least_along(up: Tensor) -> Tensor:
+def least_aligned_axis(up: Tensor) -> Tensor:
     """The coordinate axis with the largest angle to a direction."""
     return torch.eye(3, dtype=up.dtype)[int(up.abs().argmin())]
 
 
-TOWARDS_MIDDLE = 0.02
+MIDDLE_WEIGHT = 0.02
 """Weight of a point in front of the cameras when intersecting their sight lines, which may be parallel."""
-SPACINGS, SHARE_OF_DISTANCE = 2.5, 0.12
+REACH_IN_SPACINGS, REACH_PER_DISTANCE = 2.5, 0.12
 """Reach around photographs: the larger of a multiple of their spacing and a share of the distance to the focus."""
 FULL_SHARE = 0.55
 """Share of the image that panes should fill in the first view."""
 
 
-class Surveyed(NamedTuple):
+class CaptureSurvey(NamedTuple):
     """Geometry of a capture's cameras.
 
     Attributes:
@@ -119,7 +119,7 @@ class Surveyed(NamedTuple):
     reach: float
 
 
-def survey_capture(cameras: Sequence[Camera], extent: float) -> Surveyed:
+def survey_capture(cameras: Sequence[Camera], extent: float) -> CaptureSurvey:
     """Estimates focus, up direction, distance and reach from the poses of a capture.
 
     Args:
@@ -130,7 +130,7 @@ def survey_capture(cameras: Sequence[Camera], extent: float) -> Surveyed:
     centers, forward = -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0], poses[:, 2, :3]
     across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
     ahead = centers.mean(0) + extent * forward.mean(0)
-    weight = TOWARDS_MIDDLE * len(cameras)
+    weight = MIDDLE_WEIGHT * len(cameras)
     total = across.sum(0) + weight * torch.eye(3, dtype=torch.float64)
     focus = torch.linalg.solve(total, (across @ centers[..., None])[..., 0].sum(0) + weight * ahead)
     distance = float((centers - focus).norm(dim=1).median())
@@ -140,8 +140,8 @@ def survey_capture(cameras: Sequence[Camera], extent: float) -> Surveyed:
             torch.full((len(cameras),), torch.inf, dtype=torch.float64)
         )
         spacing = float(distances.amin(dim=1).median())
-    reach = max(SPACINGS * spacing, SHARE_OF_DISTANCE * distance, 1e-6)
-    return Surveyed(focus, torch.tensor(estimate_up(cameras), dtype=torch.float64), distance, reach)
+    reach = max(REACH_IN_SPACINGS * spacing, REACH_PER_DISTANCE * distance, 1e-6)
+    return CaptureSurvey(focus, torch.tensor(estimate_up(cameras), dtype=torch.float64), distance, reach)
 
 
 @torch.no_grad()
@@ -149,10 +149,10 @@ def best_view(planes: Planes, cameras: Sequence[Camera]) -> int:
     """Index of the initial camera, where panes fill about half of the image, centred; without panes the middle one."""
     if not len(planes):
         return len(cameras) // 2
-    return min(range(len(cameras)), key=lambda k: _composition(planes, cameras[k]))
+    return min(range(len(cameras)), key=lambda k: _framing_score(planes, cameras[k]))
 
 
-def _composition(planes: Planes, camera: Camera) -> float:
+def _framing_score(planes: Planes, camera: Camera) -> float:
     """Score of a view of the panes, lower is better: by their share of the image and their distance from its centre."""
     small = camera.resize(64, max(1, round(64 * camera.height / camera.width)))
     rows, columns = (nearest_hits(panes_in_camera(planes, small), small).pane >= 0).nonzero(as_tuple=True)
@@ -221,10 +221,10 @@ def write_preview(path: Path | str, scene: Scene, renderer: Renderer, cameras: S
     )
     image = renderer(scene, camera).rgb
     if len(scene.planes):
-        bare = renderer(without_glass(scene), camera).rgb
-        image = torch.cat([image[:, :middle], bare[:, middle:]], dim=1)
+        without_panes = renderer(without_glass(scene), camera).rgb
+        image = torch.cat([image[:, :middle], without_panes[:, middle:]], dim=1)
         image[:, middle - DIVIDER : middle + DIVIDER] = 1
-    write_bytes(path, jpeg(image))
+    write_bytes(path, jpeg_bytes(image))
 
 
 def write_page(
@@ -273,10 +273,10 @@ def page_text(
     kind = scene.primary.means.dtype
     cameras = [(name, replace(camera, cam_from_world=camera.cam_from_world.to(kind))) for name, camera in cameras]
     poster_view = best_view(scene.planes, [camera for _, camera in cameras])
-    poster = jpeg(renderer(scene, poster_camera(cameras[poster_view][1])).rgb)
+    poster = jpeg_bytes(renderer(scene, poster_camera(cameras[poster_view][1])).rgb)
     scene = replace(scene, primary=visible_gaussians(scene.primary), glass=visible_gaussians(scene.glass))
     drawable = len(scene.primary)
-    scene = fitting(scene, [camera for _, camera in cameras]).to("cpu")
+    scene = select_for_page(scene, [camera for _, camera in cameras]).to("cpu")
     mirrored = settings.get("mirrored")
     cube = b"" if mirrored is None else cube_bytes(scene, settings)
     channel, channel_range = channel_bytes(scene) if mirrored is None else (strength_bytes(scene), [0.0, 0.0])
@@ -289,22 +289,22 @@ def page_text(
         scene.glass, sh=torch.zeros(len(scene.glass), 1, 3, dtype=torch.float32), channels={}, active_sh_degree=0
     )
     return fill_template(
-        asset("page.html"),
+        read_asset("page.html"),
         {
             "title": html.escape(title),
             "subtitle": html.escape(subtitle),
             "description": html.escape(DESCRIPTION if count else DESCRIPTIONS[mirrored is not None]),
             "credit": html.escape(sharing.credit),
             "preview": preview_tags(sharing.url),
-            "style": asset("style.css"),
-            "poster": in_base64(poster),
-            "scene": in_script(description | {"channelRange": channel_range}),
-            "primary": in_base64(spz_bytes(replace(scene.primary, channels={}))),
-            "glass": in_base64(spz_bytes(glass)),
-            "channel": in_base64(gzip.compress(channel, 9, mtime=0)),
-            "cube": in_base64(gzip.compress(cube, 9, mtime=0)),
-            "shaders": in_script({name: asset(name) for name in SHADERS}),
-            "script": "\n".join(asset(name) for name in SCRIPTS),
+            "style": read_asset("style.css"),
+            "poster": base64_text(poster),
+            "scene": script_json(description | {"channelRange": channel_range}),
+            "primary": base64_text(spz_bytes(replace(scene.primary, channels={}))),
+            "glass": base64_text(spz_bytes(glass)),
+            "channel": base64_text(gzip.compress(channel, 9, mtime=0)),
+            "cube": base64_text(gzip.compress(cube, 9, mtime=0)),
+            "shaders": script_json({name: read_asset(name) for name in SHADERS}),
+            "script": "\n".join(read_asset(name) for name in SCRIPTS),
         },
     )
 
@@ -315,12 +315,12 @@ def preview_tags(url: str | None) -> str:
         return ""
     address = urlsplit(url)
     folder = re.sub(r"/$|/[^/]*\.html?$", "", address.path, flags=re.IGNORECASE)
-    picture = address._replace(path=f"{folder}/{PREVIEW}", query="", fragment="").geturl()
-    tags = {"og:url": url, "og:image": picture, "og:image:width": PREVIEW_WIDTH, "og:image:height": PREVIEW_HEIGHT}
+    image_url = address._replace(path=f"{folder}/{PREVIEW}", query="", fragment="").geturl()
+    tags = {"og:url": url, "og:image": image_url, "og:image:width": PREVIEW_WIDTH, "og:image:height": PREVIEW_HEIGHT}
     return "\n".join(f'<meta property="{name}" content="{html.escape(str(value))}">' for name, value in tags.items())
 
 
-def asset(name: str) -> str:
+def read_asset(name: str) -> str:
     """Text of a source file of the page."""
     return (files("glassplat") / "web_page" / name).read_text(encoding="utf-8")
 
@@ -335,12 +335,12 @@ def fill_template(template: str, values: dict[str, str]) -> str:
     return "".join(text)
 
 
-def in_script(value: Any) -> str:
+def script_json(value: Any) -> str:
     """JSON escaped so that it cannot close the surrounding script element."""
     return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
-def in_base64(data: bytes) -> str:
+def base64_text(data: bytes) -> str:
     """Bytes as base64 text."""
     return base64.b64encode(data).decode("ascii")
 
@@ -350,12 +350,12 @@ def visible_gaussians(gaussians: Gaussians) -> Gaussians:
     return gaussians.select(torch.sigmoid(gaussians.logit_opacities) > LEAST_OPACITY)
 
 
-def fits(scene: Scene) -> bool:
+def fits_page(scene: Scene) -> bool:
     """Return whether a page can show all visible Gaussians."""
     return len(visible_gaussians(scene.primary)) + len(visible_gaussians(scene.glass)) <= MOST_GAUSSIANS
 
 
-def fitting(scene: Scene, cameras: Sequence[Camera]) -> Scene:
+def select_for_page(scene: Scene, cameras: Sequence[Camera]) -> Scene:
     """The scene with as many primary Gaussians as a page can show: those that contribute most to any photograph."""
     room = max(MOST_GAUSSIANS - len(scene.glass), 0)
     if len(scene.primary) <= room:
@@ -376,7 +376,7 @@ def poster_camera(camera: Camera) -> Camera:
     return camera.resize(max(1, round(share * camera.width)), max(1, round(share * camera.height)))
 
 
-def jpeg(image: Tensor, quality: int = POSTER_QUALITY) -> bytes:
+def jpeg_bytes(image: Tensor, quality: int = POSTER_QUALITY) -> bytes:
     """An image [H, W, 3] in [0, 1] as JPEG."""
     stream = io.BytesIO()
     pixels = torch.round(image.clamp(0, 1) * 255).to("cpu", torch.uint8).numpy()
@@ -443,38 +443,38 @@ def describe_scene(
     return {
         **settings,
         "near": NEAR_PER_EXTENT * scene.extent,
-        "panes": [described_pane(scene.planes, index) for index in range(len(scene.planes))],
-        "views": [described_view(*cameras[index]) for index in kept],
+        "panes": [describe_pane(scene.planes, index) for index in range(len(scene.planes))],
+        "views": [describe_view(*cameras[index]) for index in kept],
         "first": kept.index(first),
-        "focus": in_page(survey.focus),
-        "up": in_page(survey.up),
+        "focus": to_page_axes(survey.focus),
+        "up": to_page_axes(survey.up),
         "reach": survey.reach,
     }
 
 
-def described_pane(planes: Planes, index: int) -> dict[str, Any]:
+def describe_pane(planes: Planes, index: int) -> dict[str, Any]:
     """One pane in the page's world."""
     tangents, bitangents = planes.axes()
     return {
         "label": int(planes.labels[index]),
         "mirror": planes.labels[index] in planes.mirrors,
-        "center": in_page(planes.centers[index]),
-        "normal": in_page(planes.normals[index]),
-        "tangent": in_page(tangents[index]),
-        "bitangent": in_page(bitangents[index]),
+        "center": to_page_axes(planes.centers[index]),
+        "normal": to_page_axes(planes.normals[index]),
+        "tangent": to_page_axes(tangents[index]),
+        "bitangent": to_page_axes(bitangents[index]),
         "half": planes.half_sizes[index].tolist(),
         "reflectance": float(planes.base_reflectances[index]),
         "transmittance": [1, 1, 1] if planes.transmittances is None else planes.transmittances[index].tolist(),
     }
 
 
-def described_view(name: str, camera: Camera) -> dict[str, Any]:
+def describe_view(name: str, camera: Camera) -> dict[str, Any]:
     """One photograph's camera in the page's world; the rotation by rows."""
     rotation = camera.cam_from_world[:3, :3].cpu() * torch.tensor(HALF_TURN_X, dtype=torch.float32)
     return {
         "name": name,
         "rotation": [round(value, 6) for value in rotation.flatten().tolist()],
-        "position": in_page(camera.center),
+        "position": to_page_axes(camera.center),
         "fx": camera.fx,
         "fy": camera.fy,
         "cx": camera.cx,
@@ -484,7 +484,7 @@ def described_view(name: str, camera: Camera) -> dict[str, Any]:
     }
 
 
-def in_page(vector: Tensor) -> list[float]:
+def to_page_axes(vector: Tensor) -> list[float]:
     """A point or a direction [3] of the capture in the page's world."""
-    turned: list[float] = (vector.detach().cpu().double().numpy() * np.asarray(HALF_TURN_X)).tolist()
-    return turned
+    flipped: list[float] = (vector.detach().cpu().double().numpy() * np.asarray(HALF_TURN_X)).tolist()
+    return flipped

@@ -28,9 +28,9 @@ def log_errors(callback: Callable[..., Any]) -> Callable[..., None]:
     """Wraps a callback to log its errors, which would print tracebacks in viser's threads and stop a training run."""
 
     @wraps(callback)
-    def call(*given: Any) -> None:
+    def call(*arguments: Any) -> None:
         try:
-            callback(*given)
+            callback(*arguments)
         except Exception as error:  # noqa: BLE001 - A client must not stop the server or the other clients.
             logger.warning("a request of a browser failed: %s: %s", type(error).__name__, error)
 
@@ -86,7 +86,7 @@ class PaneGizmo:
         """Shows or hides the gizmo; its position applies in both cases."""
         self._handle.visible = visible
 
-    def put_back(self) -> None:
+    def reset(self) -> None:
         """Resets the gizmo to the pane's original pose."""
         self._handle.wxyz, self._handle.position = self._start, self._center
 
@@ -94,15 +94,15 @@ class PaneGizmo:
         """Removes the gizmo and its outline from the view."""
         self._handle.remove()
 
-    def move(self) -> PaneMove | None:
+    def pane_move(self) -> PaneMove | None:
         """Movement of the pane; None if it was not moved."""
         wxyz, position = np.asarray(self._handle.wxyz), np.asarray(self._handle.position)
         if np.array_equal(wxyz, self._start) and np.array_equal(position, self._center):
             return None
-        turn = np.array([1.0, 0, 0, 0])
+        rotation = np.array([1.0, 0, 0, 0])
         if not np.array_equal(wxyz, self._start):
-            turn = wxyz_of(matrix_of(wxyz) @ matrix_of(self._start).T)
-        return PaneMove(self.label, tuple(turn.tolist()), tuple((position - self._center).tolist()))
+            rotation = wxyz_of(matrix_of(wxyz) @ matrix_of(self._start).T)
+        return PaneMove(self.label, tuple(rotation.tolist()), tuple((position - self._center).tolist()))
 
 
 class PaneControls:
@@ -116,18 +116,18 @@ class PaneControls:
             planes: of the displayed scene; at least one.
         """
         gui = handle.gui
-        self._own = dict(zip(planes.labels, planes.base_reflectances.tolist(), strict=True))
+        self._initial_reflectances = dict(zip(planes.labels, planes.base_reflectances.tolist(), strict=True))
         self._gizmos = [PaneGizmo(handle.scene, planes, row) for row in range(len(planes))]
         with gui.add_folder("Glass"):
             self._glass = gui.add_dropdown("Panes", ("as it is", "mirror", "none"))
             with gui.add_folder("Reflectance R0", expand_by_default=len(planes) <= MOST_OPEN):
                 self._reflectances = {
                     label: gui.add_slider(f"Pane {label}", 0.0, 1.0, 0.005, round(value, 3))
-                    for label, value in self._own.items()
+                    for label, value in self._initial_reflectances.items()
                 }
             self._gain = gui.add_slider("Gain", LEAST_GAIN, MOST_GAIN, 0.05, 1.0)
             self._chosen = gui.add_dropdown("Move pane", (NO_PANE, *map(str, planes.labels)))
-            self._back = gui.add_button("Reset panes")
+            self._reset_button = gui.add_button("Reset panes")
 
     def listen(self, changed: Callable[[], None]) -> None:
         """Calls `changed` whenever the request changes, and shows the gizmo of the selected pane."""
@@ -136,18 +136,20 @@ class PaneControls:
         for gizmo in self._gizmos:
             gizmo.listen(changed)
         self._chosen.on_update(log_errors(lambda _: self._show_gizmo()))
-        self._back.on_click(log_errors(lambda _: self._put_back(changed)))
+        self._reset_button.on_click(log_errors(lambda _: self._reset(changed)))
 
     def apply(self, request: ViewRequest) -> ViewRequest:
         """The request, with the edits of panes from the controls."""
-        sliders = {label: within(slider.value, 0.0, 1.0) for label, slider in self._reflectances.items()}
-        changed = [(label, value) for label, value in sliders.items() if value != round(self._own[label], 3)]
-        moves = [move for gizmo in self._gizmos if (move := gizmo.move()) is not None]
+        sliders = {label: clamp(slider.value, 0.0, 1.0) for label, slider in self._reflectances.items()}
+        changed = [
+            (label, value) for label, value in sliders.items() if value != round(self._initial_reflectances[label], 3)
+        ]
+        moves = [move for gizmo in self._gizmos if (move := gizmo.pane_move()) is not None]
         return replace(
             request,
             glass=self._glass.value,
             reflectances=tuple(changed),
-            gain=within(self._gain.value, LEAST_GAIN, MOST_GAIN),
+            gain=clamp(self._gain.value, LEAST_GAIN, MOST_GAIN),
             moves=tuple(moves),
         )
 
@@ -160,13 +162,13 @@ class PaneControls:
         for gizmo in self._gizmos:
             gizmo.show(str(gizmo.label) == self._chosen.value)
 
-    def _put_back(self, changed: Callable[[], None]) -> None:
+    def _reset(self, changed: Callable[[], None]) -> None:
         for gizmo in self._gizmos:
-            gizmo.put_back()
+            gizmo.reset()
         changed()
 
 
-def within(value: float, least: float, most: float) -> float:
+def clamp(value: float, least: float, most: float) -> float:
     """The value of a client clamped to a range; NaN becomes the minimum."""
     return min(max(value, least), most) if value == value else least
 
@@ -188,36 +190,36 @@ class CleanControls:
         self._state, usual = state, Cleaning()
         self._floaters: Floaters | None = None
         with gui.add_folder("Clean", expand_by_default=False):
-            self._on = gui.add_checkbox("Remove floaters", False)
+            self._enabled = gui.add_checkbox("Remove floaters", False)
             self._isolated = gui.add_slider("Isolated", 0.0, MOST_ISOLATED, 0.5, usual.isolated)
             self._oversized = gui.add_slider("Oversized", 0.0, MOST_OVERSIZED, 0.05, usual.oversized)
             self._box = gui.add_text("Box", "", hint=BOX_HINT)
-            self._told = gui.add_markdown("")
+            self._message = gui.add_markdown("")
 
     def listen(self, changed: Callable[[], None]) -> None:
         """Calls `changed` whenever the request changes."""
-        for control in (self._on, self._isolated, self._oversized, self._box):
+        for control in (self._enabled, self._isolated, self._oversized, self._box):
             control.on_update(log_errors(lambda _: changed()))
 
     def apply(self, request: ViewRequest) -> ViewRequest:
         """The request, with the mask of Gaussians that the controls keep."""
-        if not self._on.value:
-            self._told.content = ""
+        if not self._enabled.value:
+            self._message.content = ""
             return request
         primary = self._state.scene.primary
         if self._floaters is None:
             self._floaters = Floaters(primary, torch.stack([camera.center for _, camera in self._state.cameras]))
         cleaning = Cleaning(
-            box_of(self._box.value),
-            within(self._isolated.value, 0.0, MOST_ISOLATED),
-            within(self._oversized.value, 0.0, MOST_OVERSIZED),
+            parse_box(self._box.value),
+            clamp(self._isolated.value, 0.0, MOST_ISOLATED),
+            clamp(self._oversized.value, 0.0, MOST_OVERSIZED),
         )
         kept = ~torch.stack(list(self._floaters.masks(cleaning).values())).any(dim=0)
-        self._told.content = f"{int(kept.sum())} of {len(primary)} Gaussians kept"
+        self._message.content = f"{int(kept.sum())} of {len(primary)} Gaussians kept"
         return replace(request, kept=kept) if bool(kept.any()) else request
 
 
-def box_of(text: str) -> tuple[float, float, float, float, float, float] | None:
+def parse_box(text: str) -> tuple[float, float, float, float, float, float] | None:
     """Two corners of a box, parsed from text; None unless it consists of six finite numbers."""
     try:
         x, y, z, u, v, w = (float(number) for number in text.replace(",", " ").split())
@@ -241,26 +243,26 @@ class MeasureControls:
     def lay_out(self, clicked: Callable[[np.ndarray], None]) -> None:
         """Adds the controls; `clicked` is called with the direction [3] of each click."""
         with self._handle.gui.add_folder("Measure", expand_by_default=False):
-            self._on = self._handle.gui.add_checkbox("Click two points", False)
-            self._told = self._handle.gui.add_markdown(self._distance())
-        self._on.on_update(log_errors(lambda _: self._listen(clicked)))
+            self._enabled = self._handle.gui.add_checkbox("Click two points", False)
+            self._message = self._handle.gui.add_markdown(self._distance())
+        self._enabled.on_update(log_errors(lambda _: self._listen_to_clicks(clicked)))
 
-    def take(self, point: np.ndarray) -> None:
+    def add_point(self, point: np.ndarray) -> None:
         """Adds a point [3]; a third one starts a new measurement."""
         self._points = [*self._points, point] if len(self._points) < 2 else [point]
-        self._told.content = self._distance()
+        self._message.content = self._distance()
         ends = np.stack([self._points[0], self._points[-1]]).astype(np.float32)
         self._handle.scene.add_line_segments(
             "/measured", ends[None], MEASURE_COLOR, thickness=3.0, thickness_units="screen"
         )
 
-    def _listen(self, clicked: Callable[[np.ndarray], None]) -> None:
+    def _listen_to_clicks(self, clicked: Callable[[np.ndarray], None]) -> None:
         """Listens to clicks once the checkbox is first checked, because pages that report clicks look different."""
-        if not self._on.value or self._is_listening:
+        if not self._enabled.value or self._is_listening:
             return
         self._is_listening = True
         register = self._handle.scene.on_click()
-        register(log_errors(lambda event: clicked(np.array(event.ray_direction)) if self._on.value else None))
+        register(log_errors(lambda event: clicked(np.array(event.ray_direction)) if self._enabled.value else None))
 
     def _distance(self) -> str:
         if len(self._points) < 2:
@@ -296,13 +298,13 @@ class KeyframeControls:
         self._playing: threading.Event | None = None
         # viser calls the callbacks of quick successive clicks concurrently.
         self._lock = threading.Lock()
-        self._step = threading.Lock()
+        self._move_lock = threading.Lock()
 
-    def lay_out(self, go: Callable[[Camera], None], save: Callable[[str], None] | None) -> None:
+    def lay_out(self, move_camera: Callable[[Camera], None], save: Callable[[str], None] | None) -> None:
         """Adds the controls.
 
         Args:
-            go: moves the client's camera.
+            move_camera: moves the client's camera.
             save: writes the keyframes under a name; None if writing is not allowed.
         """
         gui = self._handle.gui
@@ -310,7 +312,7 @@ class KeyframeControls:
             self._count = gui.add_markdown(self._count_text())
             gui.add_button("Add this view").on_click(log_errors(lambda _: self.add()))
             gui.add_button("Remove last").on_click(log_errors(lambda _: self.remove()))
-            gui.add_button("Play or stop").on_click(log_errors(lambda _: self.play(go)))
+            gui.add_button("Play or stop").on_click(log_errors(lambda _: self.play(move_camera)))
             if save is not None:
                 name = gui.add_text("Name", "keyframes")
                 gui.add_button("Save keyframes").on_click(log_errors(lambda _: save(name.value)))
@@ -344,7 +346,7 @@ class KeyframeControls:
                 self.keyframes = self.keyframes[:-1]
                 self._count.content = self._count_text()
 
-    def play(self, go: Callable[[Camera], None]) -> None:
+    def play(self, move_camera: Callable[[Camera], None]) -> None:
         """Starts or stops moving the client along the path of the video."""
         keyframes = self.keyframes
         with self._lock:
@@ -356,11 +358,11 @@ class KeyframeControls:
         frames = (len(keyframes) - 1) * SECONDS_BETWEEN * PLAYED_PER_SECOND + 1
         # A separate thread, because viser has few, and all clients share them.
         path = interpolate_cameras(keyframes, frames)
-        threading.Thread(target=_play, args=(path, go, ended, self._step), daemon=True).start()
+        threading.Thread(target=_play, args=(path, move_camera, ended, self._move_lock), daemon=True).start()
 
     def stop(self) -> None:
         """Stops playback, for example when the client leaves; the camera does not move after this returns."""
-        with self._step:
+        with self._move_lock:
             if self._playing is not None:
                 self._playing.set()
 
@@ -369,13 +371,15 @@ class KeyframeControls:
         return f"{count} {'keyframe' if count == 1 else 'keyframes'}" + (", a video needs two" if count < 2 else "")
 
 
-def _play(path: list[Camera], go: Callable[[Camera], None], ended: threading.Event, step: threading.Lock) -> None:
-    """Moves along a path until its end or until playback stops; `step` is held during each move."""
+def _play(
+    path: list[Camera], move_camera: Callable[[Camera], None], ended: threading.Event, move_lock: threading.Lock
+) -> None:
+    """Moves along a path until its end or until playback stops; `move_lock` is held during each move."""
     for camera in path:
-        with step:
+        with move_lock:
             if ended.is_set():
                 return
-            go(camera)
+            move_camera(camera)
         if ended.wait(1 / PLAYED_PER_SECOND):
             return
     ended.set()
@@ -388,45 +392,45 @@ NO_PHOTOGRAPH = np.zeros((2, 3, 3), dtype=np.uint8)
 class PhotographControls:
     """A folder of controls: a list of photographs whose cameras can be selected, and the nearest photograph."""
 
-    def __init__(self, gui: Any, state: ViewerState, at: int) -> None:
+    def __init__(self, gui: Any, state: ViewerState, initial: int) -> None:
         """Lays out the controls; `listen` activates them.
 
         Args:
             gui: of the client.
             state: the displayed scene.
-            at: index of the initial photograph.
+            initial: index of the initial photograph.
         """
-        self._state, self._at, self._on_screen = state, at, -1
+        self._state, self._current, self._shown = state, initial, -1
         self._names = tuple(name for name, _ in state.cameras)
         with gui.add_folder("Photographs"):
-            self._name = gui.add_dropdown("Go to", self._names, initial_value=self._names[at])
+            self._name = gui.add_dropdown("Go to", self._names, initial_value=self._names[initial])
             self._steps = gui.add_button_group("Step", ("previous", "next"))
             self._photo = None
             if state.photographs:
                 self._photo = gui.add_image(NO_PHOTOGRAPH, label="Nearest photograph")
 
-    def listen(self, stand_at: Callable[[int], None]) -> None:
-        """Calls `stand_at` with the index of the selected photograph, which moves the camera there."""
+    def listen(self, go_to: Callable[[int], None]) -> None:
+        """Calls `go_to` with the index of the selected photograph, which moves the camera there."""
         names, steps = self._names, self._steps
         self._name.on_update(
-            log_errors(lambda event: stand_at(names.index(self._name.value)) if event.client is not None else None)
+            log_errors(lambda event: go_to(names.index(self._name.value)) if event.client is not None else None)
         )
-        steps.on_click(log_errors(lambda _: stand_at((self._at + (1 if steps.value == "next" else -1)) % len(names))))
+        steps.on_click(log_errors(lambda _: go_to((self._current + (1 if steps.value == "next" else -1)) % len(names))))
 
-    def stands_at(self, index: int) -> None:
+    def mark_current(self, index: int) -> None:
         """Marks a photograph as the one at whose pose the camera is."""
-        self._at = index
+        self._current = index
         self._name.value = self._state.cameras[index][0]
 
     def show_nearest(self, index: int) -> None:
         """Shows a photograph unless it is displayed already; the label reports unreadable ones."""
         cameras = self._state.cameras
-        if torch.equal(cameras[index][1].cam_from_world, cameras[self._at][1].cam_from_world):
-            index = self._at  # Of photographs with equal poses, the selected one.
+        if torch.equal(cameras[index][1].cam_from_world, cameras[self._current][1].cam_from_world):
+            index = self._current  # Of photographs with equal poses, the selected one.
         name = cameras[index][0]
-        if self._photo is None or index == self._on_screen or name not in self._state.photographs:
+        if self._photo is None or index == self._shown or name not in self._state.photographs:
             return
-        self._at = self._on_screen = index
+        self._current = self._shown = index
         try:
             photo = self._state.photographs[name]()
         except (OSError, ValueError) as error:

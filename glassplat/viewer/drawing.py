@@ -85,14 +85,14 @@ class Viewpoints:
 
     def nearest(self, center: NDArray[np.float64], forward: NDArray[np.float64]) -> int:
         """Index of the camera whose position and direction are nearest to those of a view; both [3]."""
-        away = np.linalg.norm(self._centers - center, axis=1) / self._extent
-        aside = np.arccos(np.clip(self._forwards @ forward, -1, 1))
-        return int(np.argmin(away + aside))
+        distances = np.linalg.norm(self._centers - center, axis=1) / self._extent
+        angles = np.arccos(np.clip(self._forwards @ forward, -1, 1))
+        return int(np.argmin(distances + angles))
 
 
 Glass = Literal["as it is", "mirror", "none"]
 LEAST_GAIN, MOST_GAIN = 0.1, 10.0
-ERROR = "error"
+ERROR_LAYER = "error"
 """The layer that compares with a photograph."""
 MEASURED_ROWS, SURFACE_COVERAGE = 480, 0.5
 """Rows of the image in which points are measured, and the alpha below which a pixel shows no surface."""
@@ -123,7 +123,7 @@ class ViewRequest:
     reflectances: tuple[tuple[int, float], ...] = ()
     gain: float = 1.0
     moves: tuple[PaneMove, ...] = ()
-    against: int | None = None
+    compared_photograph: int | None = None
     kept: Tensor | None = None
 
     def camera(self, height: int) -> Camera:
@@ -152,14 +152,14 @@ def edit_scene(scene: Scene, request: ViewRequest) -> Scene:
 
 
 @torch.no_grad()
-def draw_picture(scene: Scene, renderer: Renderer, request: ViewRequest, height: int) -> NDArray[np.uint8]:
+def draw_image(scene: Scene, renderer: Renderer, request: ViewRequest, height: int) -> NDArray[np.uint8]:
     """The image [H, W, 3] of a request; `rgb` replaces a layer that the frame does not have."""
     frame = renderer.with_layers([request.layer])(edit_scene(scene, request), request.camera(height))
-    return _picture(layer_image(frame, request.layer if request.layer in (*frame.layers, PHOTOGRAPHED) else "rgb"))
+    return _to_uint8(layer_image(frame, request.layer if request.layer in (*frame.layers, PHOTOGRAPHED) else "rgb"))
 
 
 @torch.no_grad()
-def error_drawn(
+def draw_error_map(
     scene: Scene, renderer: Renderer, request: ViewRequest, height: int, camera: Camera, photo: Tensor, *, name: str
 ) -> NDArray[np.uint8]:
     """Error map [H, W, 3] of the edited scene against a photograph, with its exposure and camera; W follows the aspect.
@@ -186,11 +186,11 @@ def error_drawn(
     colors = error_colors(image, small)
     missing = max(1, round(request.aspect * rows)) - columns
     left = missing // 2
-    return _picture(torch.nn.functional.pad(colors, (0, 0, left, missing - left)))
+    return _to_uint8(torch.nn.functional.pad(colors, (0, 0, left, missing - left)))
 
 
 @torch.no_grad()
-def point_along(
+def surface_point(
     scene: Scene, renderer: Renderer, request: ViewRequest, direction: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """[3] the surface point visible in a direction [3] (world axes) from the camera of a request."""
@@ -208,7 +208,7 @@ def point_along(
     return point
 
 
-def _picture(image: Tensor) -> NDArray[np.uint8]:
+def _to_uint8(image: Tensor) -> NDArray[np.uint8]:
     """An image [H, W] or [H, W, 3] in [0, 1] as bytes."""
     if image.dim() == 2:
         image = image[..., None].expand(-1, -1, 3)

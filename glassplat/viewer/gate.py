@@ -35,13 +35,13 @@ LARGEST_MESSAGE = 64 * 1024
 LONGEST_TEXT = 1000
 LARGEST_WINDOW = 16_384
 """Maximum width and height of the browser's window, pixels."""
-LEAST_TURN, MOST_TURN = 1e-3, 1e3
+LEAST_LENGTH, MOST_LENGTH = 1e-3, 1e3
 """Bounds of the length of a quaternion."""
-POSITION, TURN = ListOf(COORDINATE, 3), ListOf(Number(-MOST_TURN, MOST_TURN), 4)
+POSITION, QUATERNION = ListOf(COORDINATE, 3), Items(Number(-MOST_LENGTH, MOST_LENGTH), 4)
 PAGE_PATH = re.compile(r"/|(/[\w@+-][\w@+.,-]{0,199}){1,8}", re.ASCII)
 """Path of a file of viser's page: no component starts with a dot, and no character is percent-encoded."""
 HEADERS = {"X-Frame-Options": "DENY", "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
-TURNS_TO_ANNOUNCE = 4
+HANDLER_DELAY_ITERATIONS = 4
 """Iterations of asyncio's loop from accepting a connection until its handler runs."""
 _SERVE = threading.Lock()
 logger = logging.getLogger(__name__)
@@ -70,7 +70,7 @@ class ControlValue(Field):
 GIZMO: dict[str, Field] = {"name": ShortText(), "owner": Optional(ShortText(), "")}
 MESSAGES: dict[str, dict[str, Field]] = {
     "ViewerCameraMessage": {
-        "wxyz": TURN,
+        "wxyz": QUATERNION,
         "position": POSITION,
         "fov": Number(1e-3, 3.14),
         "near": COORDINATE,
@@ -81,7 +81,7 @@ MESSAGES: dict[str, dict[str, Field]] = {
         "up_direction": POSITION,
     },
     "GuiUpdateMessage": {"uuid": ShortText(), "updates": DictOf(ControlValue())},
-    "TransformControlsUpdateMessage": {**GIZMO, "wxyz": TURN, "position": POSITION},
+    "TransformControlsUpdateMessage": {**GIZMO, "wxyz": QUATERNION, "position": POSITION},
     "TransformControlsDragStartMessage": GIZMO,
     "TransformControlsDragEndMessage": GIZMO,
     "ScenePointerMessage": {
@@ -98,14 +98,15 @@ Ignored messages include requests to share the scene through a public server, up
 """
 
 
-def understood(data: str | bytes) -> bytes | None:
+def parse_message(data: str | bytes) -> bytes | None:
     """A message reduced to the fields listed in `MESSAGES`; None if it is to be ignored."""
     try:
         message = msgspec.msgpack.decode(data if isinstance(data, bytes) else b"")
         kind = message["type"]
         fields = check_fields(message, MESSAGES[kind], kind)
-        turn = fields.get("wxyz", (1.0,))
-        if sum(part * part for part in turn) < LEAST_TURN**2 or fields.get("updates", {"value": 0}).keys() != {"value"}:
+        quaternion = fields.get("wxyz", (1.0,))
+        updates = fields.get("updates", {"value": 0})
+        if sum(part * part for part in quaternion) < LEAST_LENGTH**2 or updates.keys() != {"value"}:
             return None
     except (ValueError, TypeError, KeyError, RecursionError):  # msgspec's errors are ValueErrors.
         return None
@@ -117,7 +118,7 @@ class GuardedConnection(ServerConnection):
 
     async def recv(self, decode: bool | None = None) -> Any:
         """The next accepted message."""
-        while (message := understood(await super().recv(decode))) is None:
+        while (message := parse_message(await super().recv(decode))) is None:
             pass
         return message
 
@@ -135,7 +136,7 @@ class GuardedServe(serve):
         with suppress(NotImplementedError):  # The event loop of Windows has no readers.
             for listening in self.server.sockets:
                 loop.remove_reader(listening.fileno())
-        for _ in range(TURNS_TO_ANNOUNCE):
+        for _ in range(HANDLER_DELAY_ITERATIONS):
             await asyncio.sleep(0)
         idle = {by: task for by, task in self.server.handlers.items() if by.protocol.state is State.CONNECTING}
         for connection, task in idle.items():
@@ -145,18 +146,18 @@ class GuardedServe(serve):
         await self.server.wait_closed()
 
 
-def admission(access: Access, page: Callable[..., Any] | None) -> Callable[[ServerConnection, Request], Any]:
+def request_filter(access: Access, page: Callable[..., Any] | None) -> Callable[[ServerConnection, Request], Any]:
     """A function for `process_request` that passes authorised requests to `page`, and rejects others."""
 
     def answer(connection: ServerConnection, request: Request) -> Any:
         try:
-            entry = check_request(access, request)
+            login_headers = check_request(access, request)
         except RefusedError as refused:
-            return reply_with(refused.status, {"Content-Type": "text/plain; charset=utf-8"}, str(refused))
-        if entry is not None:
-            return reply_with(HTTPStatus.OK, entry)
+            return make_response(refused.status, {"Content-Type": "text/plain; charset=utf-8"}, str(refused))
+        if login_headers is not None:
+            return make_response(HTTPStatus.OK, login_headers)
         if PAGE_PATH.fullmatch(request.path.partition("?")[0]) is None:  # viser may follow `..` out of its folder.
-            return reply_with(HTTPStatus.NOT_FOUND, {}, "there is no such page")
+            return make_response(HTTPStatus.NOT_FOUND, {}, "there is no such page")
         response = None if page is None else page(connection, request)
         if isinstance(response, Response):
             for name, value in HEADERS.items():
@@ -178,13 +179,13 @@ def check_request(access: Access, request: Request) -> Mapping[str, str] | None:
     access.check_host(hosts[0])
     if upgrades or origins:
         access.check_origin(origins[0] if origins else None, hosts[0])
-    entry = access.login_headers(request.path, hosts[0])
-    if entry is None:
+    login_headers = access.login_headers(request.path, hosts[0])
+    if login_headers is None:
         access.check_cookie("; ".join(request.headers.get_all("Cookie")), hosts[0])
-    return entry
+    return login_headers
 
 
-def reply_with(status: HTTPStatus, headers: Mapping[str, str], text: str = "") -> Response:
+def make_response(status: HTTPStatus, headers: Mapping[str, str], text: str = "") -> Response:
     """A response that viser does not handle."""
     body = text.encode()
     length = {"Content-Length": str(len(body)), "Cache-Control": "no-store", "Connection": "close"}
@@ -193,15 +194,15 @@ def reply_with(status: HTTPStatus, headers: Mapping[str, str], text: str = "") -
 
 def guarded_server(access: Access, *, host: str, port: int, title: str) -> viser.ViserServer:
     """A viser server that serves only requests authorised by `access`, and ignores unknown messages."""
-    made: list[str] = []
+    handler_modules: list[str] = []
     with _SERVE, redirect_stdout(io.StringIO()):  # Commands print the address themselves, not viser's table.
-        usual: Any = websockets_server.serve
+        original_serve: Any = websockets_server.serve
 
         def guarded(handler: Callable[..., Any], *where: Any, **options: Any) -> Any:
             if not (getattr(handler, "__module__", None) or "").startswith("viser."):
-                return usual(handler, *where, **options)
-            made.append(handler.__module__)
-            page = admission(access, options.get("process_request"))
+                return original_serve(handler, *where, **options)
+            handler_modules.append(handler.__module__)
+            page = request_filter(access, options.get("process_request"))
             more = {"create_connection": GuardedConnection, "process_request": page, "max_size": LARGEST_MESSAGE}
             return GuardedServe(handler, *where, **options | more)
 
@@ -209,8 +210,8 @@ def guarded_server(access: Access, *, host: str, port: int, title: str) -> viser
         try:
             found = viser.ViserServer(host=host, port=port, label=title, verbose=False)
         finally:
-            websockets_server.serve = usual  # type: ignore[misc]
-        if not made:
+            websockets_server.serve = original_serve  # type: ignore[misc]
+        if not handler_modules:
             found.stop()
             raise InputError(
                 f"viser {viser.__version__} starts its server in a way that glassplat cannot protect: anybody "

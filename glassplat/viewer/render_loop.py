@@ -3,7 +3,7 @@
 Each request has a generation. An image is dropped if its client has requested another view since.
 
 Only one thread renders, because kernels are not reentrant: a `RenderThread`, or a thread with other work that limits
-the share of its time spent on rendering by a `DrawingShare`.
+the share of its time spent on rendering by a `RenderBudget`.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ def check_port(host: str, port: int) -> int:
             raise InputError(f"port {port} of {host} cannot be used ({reason}); choose another --port") from error
 
 
-Wanted = TypeVar("Wanted")
-Picture = NDArray[np.uint8]
+ViewT = TypeVar("ViewT")
+ImageArray = NDArray[np.uint8]
 
 LEAST_WIDTH = 320
 LONGEST_WAIT = 0.5
@@ -75,7 +75,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Request(Generic[Wanted]):
+class Request(Generic[ViewT]):
     """The newest request of a client.
 
     Attributes:
@@ -85,19 +85,19 @@ class Request(Generic[Wanted]):
         is_coarse_shown: the client has the coarse image.
     """
 
-    view: Wanted
+    view: ViewT
     size: tuple[int, int]
     generation: int
     is_coarse_shown: bool = False
 
 
-class RenderLoop(Generic[Wanted]):
+class RenderLoop(Generic[ViewT]):
     """Newest request of each client; `serve` renders the next image."""
 
     def __init__(
         self,
-        draw: Callable[[Wanted, int], Picture],
-        show: Callable[[int, Picture, bool], None],
+        draw: Callable[[ViewT, int], ImageArray],
+        show: Callable[[int, ImageArray, bool], None],
         fail: Callable[[int, str], None] = lambda client, reason: None,
     ) -> None:
         """Starts without requests.
@@ -108,14 +108,14 @@ class RenderLoop(Generic[Wanted]):
             fail: notifies a client of the reason why rendering failed.
         """
         self._draw, self._show, self._fail = draw, show, fail
-        self._requests: dict[int, Request[Wanted]] = {}
+        self._requests: dict[int, Request[ViewT]] = {}
         self._calls: list[Callable[[], None]] = []
         self._changed = threading.Condition()
         self._generation, self._turn = 0, 0
         self._seconds_per_pixel = 1e-7
-        self._complaint = ""
+        self._last_error = ""
 
-    def ask(self, client: int, view: Wanted, size: tuple[int, int]) -> None:
+    def submit(self, client: int, view: ViewT, size: tuple[int, int]) -> None:
         """Replaces the request of a client."""
         with self._changed:
             self._generation += 1
@@ -127,7 +127,7 @@ class RenderLoop(Generic[Wanted]):
         with self._changed:
             self._requests.pop(client, None)
 
-    def call(self, work: Callable[[], None]) -> None:
+    def schedule(self, work: Callable[[], None]) -> None:
         """Schedules a call on the rendering thread, before the next image."""
         with self._changed:
             self._calls.append(work)
@@ -146,7 +146,7 @@ class RenderLoop(Generic[Wanted]):
             elif call is not None:
                 call()
         except Exception as error:  # noqa: BLE001 - The thread, which may be training, continues.
-            self._complain(error)
+            self._log_error(error)
         return True
 
     def wait(self, seconds: float) -> None:
@@ -175,7 +175,7 @@ class RenderLoop(Generic[Wanted]):
         share = (COARSE_SECONDS / (self._seconds_per_pixel * width * height)) ** 0.5
         return max(1, round(height * min(1.0, max(share, LEAST_WIDTH / width))))
 
-    def _next(self) -> tuple[int, Request[Wanted]]:
+    def _next(self) -> tuple[int, Request[ViewT]]:
         """The next client and its request, in turn; clients without a coarse image come first."""
         waiting = [client for client, request in self._requests.items() if not request.is_coarse_shown]
         clients = sorted(waiting or self._requests)
@@ -183,12 +183,12 @@ class RenderLoop(Generic[Wanted]):
         self._turn = client
         return client, self._requests[client]
 
-    def _serve(self, client: int, request: Request[Wanted]) -> None:
+    def _serve(self, client: int, request: Request[ViewT]) -> None:
         height = request.size[1]
         coarse = self.coarse_height(request.size)
         is_sharp = request.is_coarse_shown or coarse >= height
         rows = height if is_sharp else coarse
-        picture = self._draw_timed(client, request.view, rows)
+        image = self._draw_timed(client, request.view, rows)
         with self._changed:
             current = self._requests.get(client)
             if current is None or current.generation != request.generation:
@@ -197,27 +197,27 @@ class RenderLoop(Generic[Wanted]):
                 del self._requests[client]
             else:
                 self._requests[client] = Request(request.view, request.size, request.generation, True)
-        if picture is not None:
-            self._show(client, picture, is_sharp)
+        if image is not None:
+            self._show(client, image, is_sharp)
 
-    def _draw_timed(self, client: int, view: Wanted, rows: int) -> Picture | None:
+    def _draw_timed(self, client: int, view: ViewT, rows: int) -> ImageArray | None:
         """The rendered image; None on failure, which must not affect other clients."""
         begun = time.perf_counter()
         try:
-            picture = self._draw(view, rows)
+            image = self._draw(view, rows)
         except Exception as error:  # noqa: BLE001 - Any failure, such as a missing photograph or no memory.
-            self._fail(client, self._complain(error))
+            self._fail(client, self._log_error(error))
             return None
-        seconds = (time.perf_counter() - begun) / (picture.shape[0] * picture.shape[1])
+        seconds = (time.perf_counter() - begun) / (image.shape[0] * image.shape[1])
         self._seconds_per_pixel += SMOOTHING * (seconds - self._seconds_per_pixel)
-        return picture
+        return image
 
-    def _complain(self, error: Exception) -> str:
+    def _log_error(self, error: Exception) -> str:
         """The error as text; it is logged unless it repeats the previous one."""
         text = str(error) or type(error).__name__
-        if text != self._complaint:
+        if text != self._last_error:
             logger.warning("a view could not be rendered: %s", text)
-        self._complaint = text
+        self._last_error = text
         return text
 
 
@@ -241,20 +241,22 @@ class RenderThread:
                 self._loop.wait(LONGEST_WAIT)
 
 
-class DrawingShare:
+class RenderBudget:
     """Limits rendering in a program with other work to a share of its time; without requests it takes none."""
 
     def __init__(self, loop: RenderLoop[Any], clock: Callable[[], float] = time.perf_counter) -> None:
         """Starts with enough saved time to render at once."""
         self._loop, self._clock = loop, clock
-        self._saved, self._since = MOST_SAVED, clock()
+        self._saved_seconds, self._since = MOST_SAVED, clock()
 
     def draw(self) -> None:
         """Renders as much as there is time for; to be called between two pieces of work."""
         worked = self._clock() - self._since
-        self._saved = min(self._saved + MOST_SHARE * worked, MOST_SAVED)
-        while (expected := self._loop.expected_seconds()) is not None and self._saved >= min(expected, MOST_SAVED):
+        self._saved_seconds = min(self._saved_seconds + MOST_SHARE * worked, MOST_SAVED)
+        while (expected := self._loop.expected_seconds()) is not None and self._saved_seconds >= min(
+            expected, MOST_SAVED
+        ):
             begun = self._clock()
             self._loop.serve()
-            self._saved -= self._clock() - begun
+            self._saved_seconds -= self._clock() - begun
         self._since = self._clock()

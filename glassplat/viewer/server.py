@@ -34,7 +34,7 @@ LARGEST_HEIGHT, MOST_PIXELS = 1080, 4_000_000
 SHARP_QUALITY, COARSE_QUALITY = 90, 60
 LEAST_AHEAD = 0.1
 """Minimum distance from the camera to the point it orbits, as a share of the extent."""
-WAITING = ("Rendering", "The first image may take a minute or two: kernels are compiled once per machine.")
+WAITING_NOTIFICATION = ("Rendering", "The first image may take a minute or two: kernels are compiled once per machine.")
 """Title and text of the notification shown until the first image."""
 
 
@@ -42,7 +42,7 @@ class Client:
     """One browser."""
 
     def __init__(self, handle: Any, viewer: Viewer) -> None:
-        """Lays out the controls and moves to the first view; the caller then calls `ask`."""
+        """Lays out the controls and moves to the first view; the caller then calls `request_render`."""
         self._handle, self._viewer = handle, viewer
         self._status, self._nearest = "", viewer.first
         self._layer: Any = None
@@ -51,45 +51,45 @@ class Client:
         self._measure = controls.MeasureControls(handle)
         self.keyframes = controls.KeyframeControls(handle, viewer.state.scene.extent, self.camera)
         self._failure = ""
-        self._waiting: Any = handle.add_notification(*WAITING, loading=True, with_close_button=False)
+        self._waiting: Any = handle.add_notification(*WAITING_NOTIFICATION, loading=True, with_close_button=False)
         self.lay_out()
-        self.stand_at(viewer.first)
-        handle.camera.on_update(controls.log_errors(lambda _: self.ask()))
+        self.go_to_photograph(viewer.first)
+        handle.camera.on_update(controls.log_errors(lambda _: self.request_render()))
 
-    def show(self, picture: NDArray[np.uint8], is_sharp: bool) -> None:
+    def show(self, image: NDArray[np.uint8], is_sharp: bool) -> None:
         """Displays an image; at full resolution also the nearest photograph."""
         quality = SHARP_QUALITY if is_sharp else COARSE_QUALITY
-        self._handle.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
+        self._handle.scene.set_background_image(image, format="jpeg", jpeg_quality=quality)
         self._stop_waiting()
         self._failure = ""
         if is_sharp:
             self._photographs.show_nearest(self._nearest)
 
-    def say_failed(self, reason: str) -> None:
+    def show_failure(self, reason: str) -> None:
         """Notifies of the reason why rendering failed, once for repeated failures."""
         self._stop_waiting()
         if reason != self._failure:
             self._failure = reason
             self._notify("No image", reason, "red")
 
-    def tell(self, status: str) -> None:
+    def show_status(self, status: str) -> None:
         """Shows a line above the controls."""
         self._status = status
-        if self._told is not None:
-            self._told.content = plain(status)
+        if self._status_line is not None:
+            self._status_line.content = escape_markdown(status)
 
-    def leave(self) -> None:
+    def stop_playback(self) -> None:
         """Stops playback, because the browser has disconnected."""
         self.keyframes.stop()
 
-    def ask(self) -> None:
+    def request_render(self) -> None:
         """Requests the view given by the controls and the camera."""
         request = self.request()
         if request is None:
             return
         most = min(LARGEST_HEIGHT, int((MOST_PIXELS / request.aspect) ** 0.5))
         rows = max(1, min(int(self._handle.camera.image_height), most))
-        self._viewer.loop.ask(self._handle.client_id, request, (max(1, round(request.aspect * rows)), rows))
+        self._viewer.loop.submit(self._handle.client_id, request, (max(1, round(request.aspect * rows)), rows))
 
     def request(self) -> drawing.ViewRequest | None:
         """Request of the controls and the camera; None before the browser has reported its camera."""
@@ -100,9 +100,9 @@ class Client:
         except AssertionError:  # The browser has not sent its camera yet.
             return None
         self._nearest = self._viewer.viewpoints.nearest(position, drawing.matrix_of(wxyz)[:, 2])
-        against = self._nearest if self._layer.value == drawing.ERROR else None
+        compared_photograph = self._nearest if self._layer.value == drawing.ERROR_LAYER else None
         pose = cam_from_world(wxyz, position)
-        request = drawing.ViewRequest(pose, fov_rad, aspect, self._layer.value, against=against)
+        request = drawing.ViewRequest(pose, fov_rad, aspect, self._layer.value, compared_photograph=compared_photograph)
         request = request if self._clean is None else self._clean.apply(request)
         return request if self._panes is None else self._panes.apply(request)
 
@@ -111,14 +111,14 @@ class Client:
         request = self.request()
         return None if request is None else request.camera(max(1, int(self._handle.camera.image_height)))
 
-    def stand_at(self, index: int) -> None:
+    def go_to_photograph(self, index: int) -> None:
         """Moves the camera to the pose of a photograph and shows it; playback of keyframes stops."""
         self.keyframes.stop()
-        self._photographs.stands_at(index)
+        self._photographs.mark_current(index)
         self._photographs.show_nearest(index)
-        self.go(self._viewer.state.cameras[index][1])
+        self.move_camera(self._viewer.state.cameras[index][1])
 
-    def go(self, camera: Camera) -> None:
+    def move_camera(self, camera: Camera) -> None:
         """Moves the camera."""
         rotation = camera.cam_from_world[:3, :3].double().cpu().numpy()
         position = camera.center.double().cpu().numpy()
@@ -136,11 +136,11 @@ class Client:
         layers = tuple(state.layers)
         chosen = layers[0] if self._layer is None else self._layer.value
         gui.reset()
-        self._told = gui.add_markdown(plain(self._status)) if self._viewer.buttons else None
+        self._status_line = gui.add_markdown(escape_markdown(self._status)) if self._viewer.buttons else None
         for name, act in self._viewer.buttons.items():
             gui.add_button(name).on_click(controls.log_errors(lambda _, act=act: act()))
         self._layer = gui.add_dropdown("Layer", layers, initial_value=chosen)
-        self._layer.on_update(controls.log_errors(lambda _: self.ask()))
+        self._layer.on_update(controls.log_errors(lambda _: self.request_render()))
         panes = state.scene.planes
         if self._panes is not None:
             self._panes.remove()
@@ -151,13 +151,13 @@ class Client:
         self._photographs = controls.PhotographControls(gui, state, self._nearest)
         # After all are created, because a control may fire as soon as it listens.
         if self._panes is not None:
-            self._panes.listen(self.ask)
+            self._panes.listen(self.request_render)
         if self._clean is not None:
-            self._clean.listen(self.ask)
-        self._photographs.listen(self.stand_at)
-        self.keyframes.lay_out(self.go, None if state.writer is None else self.save_keyframes)
+            self._clean.listen(self.request_render)
+        self._photographs.listen(self.go_to_photograph)
+        self.keyframes.lay_out(self.move_camera, None if state.writer is None else self.save_keyframes)
         if state.writer is not None:
-            self._add_saving(f"{state.title}-edited")
+            self._add_save_controls(f"{state.title}-edited")
 
     def measure(self, direction: NDArray[np.float64]) -> None:
         """Adds the surface point visible in a direction [3] (world axes) to the measurement.
@@ -170,13 +170,13 @@ class Client:
 
         def work() -> None:
             try:
-                self._measure.take(
-                    drawing.point_along(self._viewer.state.scene, self._viewer.state.renderer, request, direction)
+                self._measure.add_point(
+                    drawing.surface_point(self._viewer.state.scene, self._viewer.state.renderer, request, direction)
                 )
             except ValueError as error:
                 self._notify("No point", str(error), "red")
 
-        self._viewer.loop.call(controls.log_errors(work))
+        self._viewer.loop.schedule(controls.log_errors(work))
 
     def save_scene(self, name: str) -> None:
         """Saves the edited scene under a new name; a notification reports the result."""
@@ -190,7 +190,7 @@ class Client:
         if writer is not None:
             self._save(lambda: writer.write_keyframes(keyframes, name))
 
-    def _add_saving(self, name: str) -> None:
+    def _add_save_controls(self, name: str) -> None:
         gui = self._handle.gui
         with gui.add_folder("Edited scene", expand_by_default=False):
             text = gui.add_text("Name", name)
@@ -205,7 +205,7 @@ class Client:
             except (InputError, ValueError, OSError, RuntimeError) as error:
                 self._notify("Not saved", str(error), "red")
 
-        self._viewer.loop.call(work)
+        self._viewer.loop.schedule(work)
 
     def _stop_waiting(self) -> None:
         if self._waiting is not None:
@@ -216,7 +216,7 @@ class Client:
         self._handle.add_notification(title, body, color=color)
 
 
-def plain(text: str) -> str:
+def escape_markdown(text: str) -> str:
     """Text escaped for Markdown, so that the page shows it verbatim: names may look like HTML."""
     return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", text)
 
@@ -304,23 +304,23 @@ class Viewer:
         with redirect_stdout(io.StringIO()):
             self._server.stop()
 
-    def change(self, scene: Scene, renderer: Renderer) -> None:
+    def replace_scene(self, scene: Scene, renderer: Renderer) -> None:
         """Replaces the displayed scene; to be called by the rendering thread. `refresh` renders it."""
-        had = self.state.scene.planes.labels
+        previous_labels = self.state.scene.planes.labels
         self.state = replace(self.state, scene=scene, renderer=renderer)
-        if scene.planes.labels != had:
+        if scene.planes.labels != previous_labels:
             for client in list(self._clients.values()):
                 controls.log_errors(client.lay_out)()
 
     def refresh(self, status: str = "") -> None:
         """Requests the views of all clients again, and shows them a status line."""
         for client in list(self._clients.values()):
-            controls.log_errors(client.tell)(status)
-            controls.log_errors(client.ask)()
+            controls.log_errors(client.show_status)(status)
+            controls.log_errors(client.request_render)()
 
     def _on_connect(self, handle: Any) -> None:
         client = self._clients[handle.client_id] = Client(handle, self)
-        client.ask()
+        client.request_render()
         if handle.client_id not in self._server.get_clients():  # It disconnected before it was registered here.
             self._on_disconnect(handle)
 
@@ -328,15 +328,15 @@ class Viewer:
         self.loop.forget(handle.client_id)
         gone = self._clients.pop(handle.client_id, None)
         if gone is not None:
-            gone.leave()
+            gone.stop_playback()
 
     def _draw(self, request: drawing.ViewRequest, height: int) -> NDArray[np.uint8]:
         scene, renderer = self.state.scene, self.state.renderer
-        if request.against is None:
-            return drawing.draw_picture(scene, renderer, request, height)
-        name, camera = self.state.cameras[request.against]
-        photo = self._photograph(request.against)
-        return drawing.error_drawn(scene, renderer, request, height, camera, photo, name=name)
+        if request.compared_photograph is None:
+            return drawing.draw_image(scene, renderer, request, height)
+        name, camera = self.state.cameras[request.compared_photograph]
+        photo = self._photograph(request.compared_photograph)
+        return drawing.draw_error_map(scene, renderer, request, height, camera, photo, name=name)
 
     def _read_photograph(self, index: int) -> Tensor:
         """[H, W, 3] uint8.
@@ -352,9 +352,9 @@ class Viewer:
     def _fail(self, client: int, reason: str) -> None:
         found = self._clients.get(client)
         if found is not None:
-            found.say_failed(reason)
+            found.show_failure(reason)
 
-    def _show(self, client: int, picture: NDArray[np.uint8], is_sharp: bool) -> None:
+    def _show(self, client: int, image: NDArray[np.uint8], is_sharp: bool) -> None:
         found = self._clients.get(client)
         if found is not None:
-            found.show(picture, is_sharp)
+            found.show(image, is_sharp)

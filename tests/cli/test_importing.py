@@ -39,7 +39,7 @@ def test_a_terminal_shows_a_line_that_is_gone_afterwards(monkeypatch: pytest.Mon
 
 def test_what_is_there_is_not_announced(monkeypatch: pytest.MonkeyPatch) -> None:
     console = standard_error(monkeypatch, terminal())
-    assert import_pytorch_module("glassplat.cli.console").LINE is LOADING_LINE
+    assert import_pytorch_module("glassplat.cli.console").LOADING_LINE is LOADING_LINE
     assert shown(console) == ""
 
 

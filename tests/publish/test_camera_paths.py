@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from glassplat.publish.camera_paths import fit_to_width, interpolate_cameras, keyframes_of, orbit
+from glassplat.publish.camera_paths import fit_to_width, interpolate_cameras, orbit, select_keyframes
 from glassplat.publish.web_page import best_view, cameras_around, survey_capture
 from glassplat.scene.camera import Camera
 from tests.files.test_spz import typical
@@ -79,7 +79,7 @@ def test_an_orbit_stays_in_front_of_what_was_seen_from_one_side() -> None:
 
 @pytest.mark.parametrize("count", [1, 2, 5, 12, 40])
 def test_keyframes_are_few_and_spread_from_the_first_to_the_last(count: int) -> None:
-    found: list[Any] = keyframes_of(range(count))  # type: ignore[arg-type]
+    found: list[Any] = select_keyframes(range(count))  # type: ignore[arg-type]
     assert found[0] == 0 and found[-1] == count - 1 and len(found) == min(count, 12)
     steps = [after - before for before, after in pairwise(found)]
     assert not steps or max(steps) - min(steps) <= 1
@@ -87,7 +87,7 @@ def test_keyframes_are_few_and_spread_from_the_first_to_the_last(count: int) -> 
 
 @pytest.mark.parametrize("frames", [2, 25])
 def test_an_interpolated_path_begins_and_ends_at_its_cameras(frames: int) -> None:
-    keys = keyframes_of(AROUND)[:5]
+    keys = select_keyframes(AROUND)[:5]
     path = interpolate_cameras(keys, frames)
     assert len(path) == frames
     for mine, given in ((path[0], keys[0]), (path[-1], keys[-1])):
@@ -119,7 +119,7 @@ def test_no_picture_of_a_path_is_stretched_by_a_camera_on_its_side() -> None:
 def test_one_camera_is_no_path() -> None:
     with pytest.raises(ValueError, match="at least two"):
         interpolate_cameras(AROUND[:1], 10)
-    assert keyframes_of(AROUND[:1]) == AROUND[:1]
+    assert select_keyframes(AROUND[:1]) == AROUND[:1]
 
 
 def test_the_first_view_shows_the_pane_in_its_middle() -> None:

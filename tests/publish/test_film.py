@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from glassplat.publish.film import check_encoder, side_by_side, wipe_pictures, write_film
+from glassplat.publish.film import check_encoder, encode_video, side_by_side, wipe_images
 
 PICTURES = [np.full((48, 64, 3), (40 + 20 * k, 100, 200 - 15 * k), dtype=np.uint8) for k in range(6)]
 
@@ -35,7 +35,7 @@ def seek(film: Image.Image, index: int) -> Image.Image:
 @pytest.mark.parametrize("suffix", [".mp4", ".webp", ".gif"])
 def test_every_picture_is_in_the_film(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"film{suffix}"
-    write_film(path, iter(PICTURES), count=len(PICTURES), fps=10)
+    encode_video(path, iter(PICTURES), count=len(PICTURES), fps=10)
     colors = mean_colors(path)
     assert len(colors) == len(PICTURES)
     for color, picture in zip(colors, PICTURES, strict=True):
@@ -47,7 +47,7 @@ def test_every_picture_is_in_the_film(suffix: str, tmp_path: Path) -> None:
 )
 def test_a_film_takes_as_long_as_its_pictures_per_second_say(suffix: str, fps: int, tmp_path: Path) -> None:
     path = tmp_path / f"film{suffix}"
-    write_film(path, iter(PICTURES * 8), count=48, fps=fps)
+    encode_video(path, iter(PICTURES * 8), count=48, fps=fps)
     with Image.open(path) as film:
         shown = sum(seek(film, k).info["duration"] for k in range(film.n_frames))
     assert shown == pytest.approx(1000 * 48 / fps, abs=10)
@@ -65,7 +65,7 @@ def test_pictures_of_a_webp_do_not_stay_in_memory(tmp_path: Path, monkeypatch: p
         return image
 
     monkeypatch.setattr(Image, "fromarray", noted)
-    write_film(tmp_path / "film.webp", iter(PICTURES * 8), count=48, fps=10)
+    encode_video(tmp_path / "film.webp", iter(PICTURES * 8), count=48, fps=10)
     assert len(made) == 48 and most <= 3
 
 
@@ -77,14 +77,14 @@ def test_what_is_no_film_is_refused(tmp_path: Path) -> None:
     check_encoder(tmp_path / "film.gif", 50)
     check_encoder(tmp_path / "film.webp", 120)
     with pytest.raises(ValueError, match="needs a frame"):
-        write_film(tmp_path / "film.webp", iter([]), count=1, fps=10)
+        encode_video(tmp_path / "film.webp", iter([]), count=1, fps=10)
     with pytest.raises(OSError, match="VP9"):
-        write_film(tmp_path / "none" / "film.mp4", iter(PICTURES), count=6, fps=10)
+        encode_video(tmp_path / "none" / "film.mp4", iter(PICTURES), count=6, fps=10)
 
 
 def test_a_wipe_shows_both() -> None:
     left, right = PICTURES[0], PICTURES[5]
-    picture = wipe_pictures(left, right, 0.25)
+    picture = wipe_images(left, right, 0.25)
     assert (picture[:, :15] == left[:, :15]).all() and (picture[:, 17:] == right[:, 17:]).all()
     assert (picture[:, 15:17] == 255).all()
     assert side_by_side([left, right]).shape == (48, 128, 3)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from glassplat.publish.web_page import in_script, page_text, write_page
+from glassplat.publish.web_page import page_text, script_json, write_page
 from glassplat.render.planar import Planar
 from tests.browser_needed import needs_browser
 from tests.publish.test_web_page import CAMERAS
@@ -81,7 +81,7 @@ def test_preferences_of_the_reader_count(tmp_path: Path) -> None:
 
 @needs_browser
 def test_a_frame_that_holds_the_page_as_text_keeps_it(tmp_path: Path) -> None:
-    page = in_script(page_text(true_scene(), Planar(), CAMERAS, "Framed"))
+    page = script_json(page_text(true_scene(), Planar(), CAMERAS, "Framed"))
     frame = "<iframe allow=\"fullscreen 'none'\"></iframe>"
     (tmp_path / "outer.html").write_text(f"{frame}<script>document.querySelector('iframe').srcdoc = {page}</script>")
     with Browser(tmp_path / "outer.html", 640, 480) as browser:

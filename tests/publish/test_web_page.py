@@ -22,13 +22,13 @@ from glassplat.publish.web_page import (
     SCRIPTS,
     SHADERS,
     Sharing,
-    asset,
     cube_bytes,
     fill_template,
-    fits,
-    fitting,
+    fits_page,
     page_text,
     preview_tags,
+    read_asset,
+    select_for_page,
     write_page,
     write_preview,
 )
@@ -481,7 +481,7 @@ def test_the_page_is_one_file_of_little_script() -> None:
     page = page_text(true_scene(), Planar(), CAMERAS, "title")
     outside = re.findall(r"(?:src|href|url)\s*[=(]\s*[\"']?(?!data:)[a-z]+:", page)
     assert not outside and "http://" not in page and "https://" not in page and "<noscript>" in page
-    assert sum(len(asset(name)) for name in (*SCRIPTS, *SHADERS)) <= LARGEST_SCRIPT
+    assert sum(len(read_asset(name)) for name in (*SCRIPTS, *SHADERS)) <= LARGEST_SCRIPT
 
 
 @pytest.mark.parametrize("rest", ["", "/", "/index.html", "?a=b", "/?a=b/c", "#top", "/index.html?a=b#view=1.png"])
@@ -546,10 +546,10 @@ def test_a_page_keeps_what_photographs_show_of_more_gaussians_than_it_holds(monk
     scene, cameras = true_scene(), [camera for _, camera in CAMERAS]
     faint = scene.primary.with_tensors({"logit_opacities": torch.full_like(scene.primary.logit_opacities, -5)})
     crowded = replace(scene, primary=concatenated(faint, scene.primary))
-    assert fits(crowded) and fitting(crowded, cameras) is crowded
+    assert fits_page(crowded) and select_for_page(crowded, cameras) is crowded
     monkeypatch.setattr(web_page, "MOST_GAUSSIANS", len(scene.primary) + len(scene.glass))
-    assert not fits(crowded)
-    kept, count = fitting(crowded, cameras), len(scene.primary)
+    assert not fits_page(crowded)
+    kept, count = select_for_page(crowded, cameras), len(scene.primary)
     assert len(kept.primary) == count
     for camera in cameras:
         assert psnr(Planar()(kept, camera).rgb, Planar()(crowded, camera).rgb) > 40

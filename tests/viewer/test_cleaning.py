@@ -14,8 +14,8 @@ import torch
 from glassplat.model.model import viewer_state
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
-from glassplat.viewer.controls import box_of
-from glassplat.viewer.drawing import ViewRequest, edit_scene, point_along
+from glassplat.viewer.controls import parse_box
+from glassplat.viewer.drawing import ViewRequest, edit_scene, surface_point
 from glassplat.viewer.server import Client, Viewer
 from tests.model.test_model import model
 from tests.publish.test_cleaning import wall
@@ -45,16 +45,16 @@ def test_a_point_lies_where_the_wall_is_and_nowhere_beside_it() -> None:
     request = ViewRequest(POSE, 1.0, 1.0)
     for aside in (0.0, 0.2, -0.25):
         direction = np.array([aside, 0.0, 1.0]) / np.hypot(aside, 1.0)
-        found = point_along(wall_scene(), splat, request, direction)
+        found = surface_point(wall_scene(), splat, request, direction)
         np.testing.assert_allclose(found, [3 * aside, 0.0, 3.0], atol=0.05)
     for away in ([0.45, 0.0, 0.89], [0.0, 0.0, -1.0], [0.9, 0.0, 0.43]):
         with pytest.raises(ValueError, match=r"there is no surface|behind"):
-            point_along(wall_scene(), splat, request, np.array(away))
+            surface_point(wall_scene(), splat, request, np.array(away))
 
 
 def test_a_box_is_six_numbers() -> None:
-    assert box_of("0 1 2, 3 4 5") == (0, 1, 2, 3, 4, 5)
-    assert box_of("0 1 2") is box_of("a b c d e f") is box_of("0 1 2 3 4 nan") is None
+    assert parse_box("0 1 2, 3 4 5") == (0, 1, 2, 3, 4, 5)
+    assert parse_box("0 1 2") is parse_box("a b c d e f") is parse_box("0 1 2 3 4 nan") is None
 
 
 async def until(holds: Callable[[], bool]) -> None:
@@ -121,7 +121,7 @@ def test_two_clicks_are_measured_and_floaters_go_and_come_back() -> None:
             await begin_to_measure(client, inner)
             for aside in (0.25, -0.25):
                 await click(client, aside)
-            await until(lambda: "--scale" in inner._measure._told.content)
+            await until(lambda: "--scale" in inner._measure._message.content)
             first, second = inner._measure._points
             assert np.linalg.norm(first - second) == pytest.approx(1.5, abs=0.05)
             await client.set("Box", "-2 -2 0 0 2 4")

@@ -13,7 +13,7 @@ from glassplat.render.deferred import Deferred
 from glassplat.render.planar import Planar
 from glassplat.scene.corrections import Exposures
 from glassplat.scene.scene import Environment, PaneMove, Scene, as_mirrors, move_panes, with_reflectance, without_glass
-from glassplat.viewer.drawing import Viewpoints, ViewRequest, draw_picture, edit_scene, error_drawn
+from glassplat.viewer.drawing import Viewpoints, ViewRequest, draw_error_map, draw_image, edit_scene
 from glassplat.viewer.server import cam_from_world
 from tests.training.tiny_capture import tiny_capture, true_scene
 
@@ -33,7 +33,7 @@ EDITS = {
 
 @pytest.mark.parametrize(("asked", "scene"), EDITS.values(), ids=EDITS)
 def test_a_request_is_the_render_of_the_edited_scene(asked: ViewRequest, scene: object) -> None:
-    picture = draw_picture(true_scene(), Planar(), asked, 40)
+    picture = draw_image(true_scene(), Planar(), asked, 40)
     with torch.no_grad():
         truth = Planar()(scene, asked.camera(40)).rgb
     assert picture.shape == (40, 56, 3)
@@ -42,7 +42,7 @@ def test_a_request_is_the_render_of_the_edited_scene(asked: ViewRequest, scene: 
 
 @pytest.mark.parametrize("layer", ["transmission", "reflection", "strength", "depth", "mask", "no such layer"])
 def test_every_layer_is_a_picture(layer: str) -> None:
-    assert draw_picture(true_scene(), Planar(), replace(REQUEST, layer=layer), 24).shape == (24, 34, 3)
+    assert draw_image(true_scene(), Planar(), replace(REQUEST, layer=layer), 24).shape == (24, 34, 3)
 
 
 def test_what_is_not_wished_for_keeps_every_bit() -> None:
@@ -57,7 +57,7 @@ def test_a_layer_that_is_drawn_on_request_is_drawn() -> None:
         true_scene().extent,
         environment=Environment.random(8, generator=torch.Generator().manual_seed(2)),
     )
-    surroundings = draw_picture(scene, Deferred(), replace(REQUEST, layer="environment"), 24)
+    surroundings = draw_image(scene, Deferred(), replace(REQUEST, layer="environment"), 24)
     with torch.no_grad():
         truth = Deferred(environment=True)(scene, REQUEST.camera(24)).layers["environment"]
     assert np.abs(surroundings / 255 - truth.clamp(0, 1).numpy()).max() < 0.003
@@ -66,15 +66,15 @@ def test_a_layer_that_is_drawn_on_request_is_drawn() -> None:
 def test_the_error_is_none_where_the_photograph_is_the_render_and_follows_edits() -> None:
     view = tiny_capture().train[1]
     wide = replace(REQUEST, aspect=3.0)
-    same = error_drawn(true_scene(), Planar(), wide, 4000, view.camera, view.photo, name=view.name)
+    same = draw_error_map(true_scene(), Planar(), wide, 4000, view.camera, view.photo, name=view.name)
     assert same.shape == (28, 84, 3)
     assert same[..., 0].max() <= 5 and not same[:, :22].any() and not same[:, 62:].any()
-    elsewhere = error_drawn(
+    elsewhere = draw_error_map(
         true_scene(), Planar(), replace(wide, glass="mirror"), 28, view.camera, view.photo, name=view.name
     )
     assert elsewhere[:, 22:62, 0].max() > 100
     narrow = replace(REQUEST, aspect=0.5)
-    assert error_drawn(true_scene(), Planar(), narrow, 20, view.camera, view.photo, name=view.name).shape == (
+    assert draw_error_map(true_scene(), Planar(), narrow, 20, view.camera, view.photo, name=view.name).shape == (
         20,
         10,
         3,
@@ -86,7 +86,7 @@ def test_the_error_is_in_the_colours_of_the_photograph() -> None:
     affine = torch.cat([-0.3 * torch.eye(3), torch.zeros(3, 1)], dim=1).expand(2, 3, 4)
     scene = replace(true_scene(), exposures=Exposures(affine, (first.name, last.name)))
     dark = (0.7 * view.photo.float()).round().to(torch.uint8)
-    same = error_drawn(scene, Planar(), REQUEST, 28, view.camera, dark, name=view.name)
+    same = draw_error_map(scene, Planar(), REQUEST, 28, view.camera, dark, name=view.name)
     assert same[..., 0].max() <= 5
 
 

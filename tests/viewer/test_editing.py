@@ -122,7 +122,7 @@ def pane_is_dragged(client: Client, browser: Browser) -> torch.Tensor:
     client._panes._chosen.value = "1"
 
     def is_dragged() -> bool:
-        client.stand_at(2)
+        client.go_to_photograph(2)
         eventually(lambda: client._nearest == 2)
         time.sleep(0.5)  # The gizmo is drawn after the camera has moved.
         browser.drag([on_screen(client, center + arrow * length * side) for length in (0.85, 1.3)])
@@ -143,7 +143,7 @@ def keyframes_are_set_and_played(client: Client, browser: Browser) -> list[Camer
     unfold(browser, "Keyframes", "Add this view")
     stood: list[Camera] = []
     for index in (1, 4, 0):
-        client.stand_at(index)
+        client.go_to_photograph(index)
         eventually(lambda index=index: client._nearest == index)
         press(browser, "Add this view", lambda: len(client.keyframes.keyframes) == len(stood) + 1)
         stood.append(client.camera())
@@ -157,14 +157,14 @@ def keyframes_are_set_and_played(client: Client, browser: Browser) -> list[Camer
 
 def error_is_shown(viewer: Viewer, client: Client, browser: Browser) -> None:
     """The error layer compares with the photograph that is shown beside, and follows edits."""
-    client.stand_at(3)
+    client.go_to_photograph(3)
     eventually(lambda: says(browser, "Nearest photograph: 3.png"))
     pictures: list[np.ndarray] = []
     show = viewer._show
     viewer.loop._show = lambda to, picture, is_sharp: (pictures.append(picture), show(to, picture, is_sharp))
     client._layer.value = "error"
     # Where the browser stood before, it may tell once more before it obeys.
-    eventually(lambda: client.request().against == 3)
+    eventually(lambda: client.request().compared_photograph == 3)
     eventually(lambda: bool(pictures) and pictures[-1][..., 0].max() <= 5)
     client._panes._glass.value = "mirror"
     eventually(lambda: pictures[-1][..., 0].max() > 100)

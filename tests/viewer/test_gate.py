@@ -25,7 +25,7 @@ from websockets.http11 import Request
 from glassplat.access import cookie_name
 from glassplat.errors import InputError
 from glassplat.viewer import gate
-from glassplat.viewer.gate import LARGEST_MESSAGE, MESSAGES, understood
+from glassplat.viewer.gate import LARGEST_MESSAGE, MESSAGES, parse_message
 from glassplat.viewer.server import MOST_PIXELS, Viewer
 from tests.viewer.free_port import free_port
 from tests.viewer.test_server import STATE
@@ -105,7 +105,7 @@ PATHS_OUT = (
 def test_no_path_leads_out_of_the_page_s_folder(path: str, viewer: Viewer) -> None:
     """viser 1.0 follows every path that it is asked for."""
     asked: list[Request] = []
-    answer = gate.admission(viewer.access, lambda connection, request: asked.append(request))
+    answer = gate.request_filter(viewer.access, lambda connection, request: asked.append(request))
     cookie = f"{cookie_name('localhost:80')}={viewer.access.key}"
     refused = answer(None, Request(path, Headers({"Host": "localhost:80", "Cookie": cookie})))
     assert not asked and refused.status_code == 404
@@ -150,8 +150,8 @@ BAD_CAMERAS = [
 
 @pytest.mark.parametrize("change", BAD_CAMERAS, ids=str)
 def test_a_camera_out_of_bounds_is_not_heard(change: dict[str, Any]) -> None:
-    assert understood(msgspec.msgpack.encode(CAMERA)) is not None
-    assert understood(msgspec.msgpack.encode(CAMERA | change)) is None
+    assert parse_message(msgspec.msgpack.encode(CAMERA)) is not None
+    assert parse_message(msgspec.msgpack.encode(CAMERA | change)) is None
 
 
 @pytest.mark.parametrize(
@@ -166,7 +166,7 @@ def test_a_camera_out_of_bounds_is_not_heard(change: dict[str, Any]) -> None:
     ],
 )  # fmt: skip
 def test_what_is_no_message_of_a_page_is_not_heard(message: str | bytes) -> None:
-    assert understood(message) is None
+    assert parse_message(message) is None
 
 
 def test_every_message_that_is_heard_is_one_of_viser_s_with_these_fields() -> None:

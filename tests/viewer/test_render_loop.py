@@ -15,8 +15,8 @@ from glassplat.errors import InputError
 from glassplat.viewer.render_loop import (
     LEAST_WIDTH,
     MOST_SHARE,
-    DrawingShare,
-    Picture,
+    ImageArray,
+    RenderBudget,
     RenderLoop,
     RenderThread,
     check_port,
@@ -39,7 +39,7 @@ class Recorder:
         self.loop: RenderLoop[int] = RenderLoop(self.draw, self.show)
         self.thread = RenderThread(self.loop)
 
-    def draw(self, view: int, rows: int) -> Picture:
+    def draw(self, view: int, rows: int) -> ImageArray:
         self._at_once += 1
         self.most_at_once = max(self.most_at_once, self._at_once)
         self.drawn.append((view, rows))
@@ -51,7 +51,7 @@ class Recorder:
         self._at_once -= 1
         return np.full((rows, round(rows * SIZE[0] / SIZE[1]), 3), view, dtype=np.uint8)
 
-    def show(self, client: int, picture: Picture, is_sharp: bool) -> None:
+    def show(self, client: int, picture: ImageArray, is_sharp: bool) -> None:
         self.shown.append((client, int(picture[0, 0, 0]), is_sharp))
 
 
@@ -83,7 +83,7 @@ def test_a_port_of_any_address_of_this_machine_is_checked(host: str) -> None:
 def test_a_coarse_picture_comes_first_and_a_sharp_one_follows() -> None:
     recorder = Recorder(held=True)
     slow(recorder)
-    recorder.loop.ask(1, 7, SIZE)
+    recorder.loop.submit(1, 7, SIZE)
     recorder.let.set()
     wait_until(lambda: len(recorder.shown) == 2)
     recorder.thread.stop()
@@ -94,7 +94,7 @@ def test_a_coarse_picture_comes_first_and_a_sharp_one_follows() -> None:
 
 def test_what_is_drawn_quickly_is_sharp_at_once() -> None:
     recorder = Recorder()
-    recorder.loop.ask(1, 7, (640, 360))
+    recorder.loop.submit(1, 7, (640, 360))
     wait_until(lambda: bool(recorder.shown))
     recorder.thread.stop()
     assert recorder.shown == [(1, 7, True)]
@@ -102,10 +102,10 @@ def test_what_is_drawn_quickly_is_sharp_at_once() -> None:
 
 def test_pictures_of_the_past_are_not_shown() -> None:
     recorder = Recorder(held=True)
-    recorder.loop.ask(1, 1, SIZE)
+    recorder.loop.submit(1, 1, SIZE)
     wait_until(lambda: len(recorder.drawn) == 1)
     for view in (2, 3, 4):
-        recorder.loop.ask(1, view, SIZE)
+        recorder.loop.submit(1, view, SIZE)
     recorder.let.set()
     wait_until(lambda: (1, 4, True) in recorder.shown)
     recorder.thread.stop()
@@ -116,7 +116,7 @@ def test_clients_take_turns_and_one_picture_is_drawn_at_a_time() -> None:
     recorder = Recorder(held=True)
     slow(recorder)
     for client in range(5):
-        recorder.loop.ask(client, 10 + client, SIZE)
+        recorder.loop.submit(client, 10 + client, SIZE)
     recorder.let.set()
     wait_until(lambda: sum(sharp for *_, sharp in recorder.shown) == 5)
     recorder.thread.stop()
@@ -126,11 +126,11 @@ def test_clients_take_turns_and_one_picture_is_drawn_at_a_time() -> None:
 
 def test_who_has_gone_is_forgotten_and_errors_end_nothing() -> None:
     recorder = Recorder(held=True)
-    recorder.loop.ask(1, 1, SIZE)
+    recorder.loop.submit(1, 1, SIZE)
     wait_until(lambda: len(recorder.drawn) == 1)
     recorder.loop.forget(1)
-    recorder.loop.ask(2, -1, SIZE)
-    recorder.loop.ask(3, 3, SIZE)
+    recorder.loop.submit(2, -1, SIZE)
+    recorder.loop.submit(3, 3, SIZE)
     recorder.let.set()
     wait_until(lambda: (3, 3, True) in recorder.shown)
     recorder.thread.stop()
@@ -140,13 +140,13 @@ def test_who_has_gone_is_forgotten_and_errors_end_nothing() -> None:
 def test_what_is_called_for_is_done_by_the_thread_that_draws() -> None:
     recorder = Recorder(held=True)
     threads: list[str] = []
-    recorder.loop.ask(1, 1, SIZE)
+    recorder.loop.submit(1, 1, SIZE)
     wait_until(lambda: len(recorder.drawn) == 1)
     for _ in range(2):
-        recorder.loop.call(lambda: threads.append(threading.current_thread().name))
+        recorder.loop.schedule(lambda: threads.append(threading.current_thread().name))
     recorder.let.set()
     wait_until(lambda: len(threads) == 2)
-    recorder.loop.call(lambda: threads.append("while nothing is drawn"))
+    recorder.loop.schedule(lambda: threads.append("while nothing is drawn"))
     wait_until(lambda: len(threads) == 3)
     recorder.thread.stop()
     assert threads[:2] == ["render", "render"]
@@ -158,9 +158,9 @@ class Clock:
     def __init__(self) -> None:
         self.now, self.drawing = 0.0, 0.0
         self.loop: RenderLoop[int] = RenderLoop(self.draw, lambda *shown: None)
-        self.share = DrawingShare(self.loop, lambda: self.now)
+        self.share = RenderBudget(self.loop, lambda: self.now)
 
-    def draw(self, view: int, rows: int) -> Picture:
+    def draw(self, view: int, rows: int) -> ImageArray:
         seconds = 1e-6 * rows * rows * SIZE[0] / SIZE[1]
         self.now, self.drawing = self.now + seconds, self.drawing + seconds
         return np.zeros((rows, round(rows * SIZE[0] / SIZE[1]), 3), dtype=np.uint8)
@@ -171,7 +171,7 @@ def test_drawing_takes_its_share_of_the_time_and_no_more() -> None:
     clock.share.draw()
     assert clock.drawing == 0
     for step in range(2000):
-        clock.loop.ask(step % 3, step, SIZE)
+        clock.loop.submit(step % 3, step, SIZE)
         clock.now += 0.2
         clock.share.draw()
     assert 0.5 * MOST_SHARE < clock.drawing / clock.now <= MOST_SHARE
@@ -180,7 +180,7 @@ def test_drawing_takes_its_share_of_the_time_and_no_more() -> None:
 def test_what_is_called_for_waits_for_no_saved_time() -> None:
     clock = Clock()
     done: list[bool] = []
-    clock.loop.call(lambda: done.append(True))
+    clock.loop.schedule(lambda: done.append(True))
     clock.share.draw()
     assert done and clock.loop.expected_seconds() is None
 
@@ -188,6 +188,6 @@ def test_what_is_called_for_waits_for_no_saved_time() -> None:
 def test_a_picture_that_takes_longer_than_can_be_saved_is_drawn_all_the_same() -> None:
     clock = Clock()
     clock.loop._seconds_per_pixel = 1e-3
-    clock.loop.ask(1, 1, SIZE)
+    clock.loop.submit(1, 1, SIZE)
     clock.share.draw()
     assert clock.drawing > 0

@@ -14,7 +14,7 @@ import pytest
 from glassplat.cli.main import main, parse_arguments
 from glassplat.render.planar import Planar
 from glassplat.viewer.drawing import ViewerState
-from glassplat.viewer.server import WAITING, Viewer
+from glassplat.viewer.server import WAITING_NOTIFICATION, Viewer
 from tests.browser_needed import needs_browser
 from tests.cli.tiny_run import write_run
 from tests.training.tiny_capture import tiny_capture, true_scene
@@ -61,10 +61,10 @@ def test_a_browser_is_shown_sharp_pictures_and_may_leave() -> None:
     try:
         with Browser(viewer.address, 400, 300) as browser:
             eventually(lambda: any(shown))
-            eventually(lambda: WAITING[1] not in browser.evaluate("document.body.innerText"))
+            eventually(lambda: WAITING_NOTIFICATION[1] not in browser.evaluate("document.body.innerText"))
             (client,) = viewer._clients.values()
             shown.clear()
-            client.stand_at(2)
+            client.go_to_photograph(2)
             client._panes._glass.value = "mirror"
             eventually(lambda: any(shown))
             eventually(lambda: "Layer" in browser.evaluate("document.body.innerText"))
@@ -90,7 +90,7 @@ def test_who_waits_for_the_first_picture_is_told_so() -> None:
     viewer = Viewer(STATE, "127.0.0.1", free_port())  # Nobody draws before it starts.
     try:
         with Browser(viewer.address, 400, 300) as browser:
-            eventually(lambda: WAITING[1] in browser.evaluate("document.body.innerText"))
+            eventually(lambda: WAITING_NOTIFICATION[1] in browser.evaluate("document.body.innerText"))
     finally:
         viewer.stop()
 

@@ -116,7 +116,7 @@ def test_a_camera_without_a_field_of_view_ends_no_training(
 ) -> None:
     """It is not heard; and it would end its picture only, should the gate let it through."""
     if not is_guarded:
-        monkeypatch.setattr(gate, "understood", lambda data: data)
+        monkeypatch.setattr(gate, "parse_message", lambda data: data)
 
     async def look(viewer: Viewer) -> None:
         async with ViewerClient(viewer.address) as client:
