@@ -134,7 +134,7 @@ def photographs_finding(path: Path) -> Iterator[Finding]:
 
 
 def describe_broken(photographs: Sequence[Path], finding: Finding, least_side: int) -> int:
-    """Decodes photographs to find broken and small ones; returns the number of good ones."""
+    """Decodes photographs to find broken and small ones; returns their number."""
     if broken := broken_photographs(photographs, least_side):
         finding.problems.append(
             f"{len(broken)} are broken, tiny or of a kind that cannot be read ({join_names(broken)}); replace or "
