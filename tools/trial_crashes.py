@@ -305,7 +305,7 @@ def save_marks(room: Path, log: Path) -> None:
                 except OSError:  # The disk is full, which the page says; nothing was saved.
                     return
                 except ChangedElsewhereError as changed:
-                    asked = {name: changed.answer[name] for name in ("document", "version")}
+                    asked = {name: changed.response[name] for name in ("document", "version")}
             print(place, file=lines, flush=True)
 
 

@@ -156,11 +156,11 @@ def test_a_disk_on_which_nothing_more_fits_gets_its_room_back(slow_files: Files,
     with memory.cache_on_disk(tmp_path):
         numbers(memory, slow_files)
         spool = memory._disk_cache
-        assert len(spool._places) > 10
+        assert len(spool._entries) > 10
         spool._file.close()
         spool._file = Failing()
         spool.put(PixelSource(lambda: torch.zeros(SIZE)), torch.zeros(SIZE))
-        assert spool._file is None and not spool._places
+        assert spool._file is None and not spool._entries
         assert numbers(memory, slow_files) == list(range(20))
 
 

@@ -113,7 +113,7 @@ def test_steps_lead_past_photographs_from_one_place() -> None:
     stops, labels = [], []
 
     def stand_at(index: int) -> None:
-        controls.stands_at(index)
+        controls.mark_current(index)
         controls.show_nearest(index)
         pose = cameras[index][1].cam_from_world.double()
         controls.show_nearest(viewpoints.nearest((-pose[:3, :3].T @ pose[:3, 3]).numpy(), pose[2, :3].numpy()))
