@@ -429,7 +429,9 @@ def _is_self_intersecting(outline: Array) -> bool:
 def _corner_pixels(camera: NumpyCamera, corners: Array) -> list[list[float] | None]:
     """Pixels of corners; None for those behind the camera."""
     pixels = np.round(camera.project(corners), 2).tolist()
-    return [pixel if depth > 0 else None for pixel, depth in zip(pixels, camera.to_camera_axes(corners)[:, 2], strict=True)]
+    return [
+        pixel if depth > 0 else None for pixel, depth in zip(pixels, camera.to_camera_axes(corners)[:, 2], strict=True)
+    ]
 
 
 def open_session(root: Path) -> Session:

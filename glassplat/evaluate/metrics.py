@@ -194,9 +194,7 @@ def psnr(image: Tensor, target: Tensor, region: Tensor | None = None) -> float:
     return math.inf if mean_square == 0 else 10 * math.log10(255**2 / mean_square)
 
 
-def correct_colors(
-    image: Tensor, target: Tensor, columns: slice = slice(None), region: Tensor | None = None
-) -> Tensor:
+def correct_colors(image: Tensor, target: Tensor, columns: slice = slice(None), region: Tensor | None = None) -> Tensor:
     """The image [H, W, 3] after the affine colour transform that fits it to another one in least squares.
 
     Exposure and white balance of a test photograph are unknown; the remaining error is due to the scene.

@@ -288,7 +288,12 @@ def _surface_axes(gaussians: Gaussians) -> Tensor:
 
 log = logging.getLogger("glassplat.training")
 
-PROPAGATION_ENDED, MOST_REFLECTIVE, LAST_GROWTH, VIEW_DEPENDENT = "propagation ended", "most reflective", "reflective grew", "turns with the view"
+PROPAGATION_ENDED, MOST_REFLECTIVE, LAST_GROWTH, VIEW_DEPENDENT = (
+    "propagation ended",
+    "most reflective",
+    "reflective grew",
+    "turns with the view",
+)
 """Keys of `TrainState.records`: step of the end, largest reflected share, step of its last growth, and the
 view-dependent, non-reflective share."""
 OPACITIES_RAISED, OPACITIES_LOWERED = "opacities raised", "opacities lowered"
@@ -423,7 +428,9 @@ class Propagate:
             view_dependent = state.records.get(VIEW_DEPENDENT)
             if view_dependent is None:
                 view_dependent = self.measure.view_dependent_share(state.scene, dataset.train, self.renderer)
-            advice = (MATTE_ADVICE if view_dependent < LEAST_VIEW_DEPENDENT else OVERLOOKED_ADVICE) % (100 * view_dependent)
+            advice = (MATTE_ADVICE if view_dependent < LEAST_VIEW_DEPENDENT else OVERLOOKED_ADVICE) % (
+                100 * view_dependent
+            )
         log.warning(NOTHING_FOUND, clock.step, AS_SPLAT if self.matte_rates else "", advice)
 
 

@@ -219,7 +219,9 @@ class Run:
         return with_gradients(self._messages())
 
     def _messages(self) -> Generator[Message, None, None]:
-        self._ranks.check_same_settings(shared_settings(self.recipe, self._settings, self._dataset) | {"resume": self._resume})
+        self._ranks.check_same_settings(
+            shared_settings(self.recipe, self._settings, self._dataset) | {"resume": self._resume}
+        )
         yield from self._run_as_leader() if self._ranks.is_leader else self._run_as_follower()
         self._ranks.exchange()  # Other ranks wait until the leader has written the scene.
 

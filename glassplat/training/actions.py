@@ -178,7 +178,9 @@ class PruneIdle:
         return True
 
 
-def replace_in_morton_order(state: TrainState, gaussians: Gaussians, moments: densify.Moments, part: str = "primary") -> None:
+def replace_in_morton_order(
+    state: TrainState, gaussians: Gaussians, moments: densify.Moments, part: str = "primary"
+) -> None:
     """Replaces a part of the scene and its moments, sorted in Morton order."""
     order = densify.sort_by_morton_code(gaussians.means)
     ordered, moments = densify.apply_edit(gaussians, moments, order, part=part)
@@ -425,7 +427,9 @@ class SeedUnexplained(AtShares):
         return True
 
 
-def seed_gaussians(primary: Gaussians, points: PointCloud, *, opacity: float = 0.1, size: float | None = None) -> Gaussians:
+def seed_gaussians(
+    primary: Gaussians, points: PointCloud, *, opacity: float = 0.1, size: float | None = None
+) -> Gaussians:
     """Gaussians from points, like the primary ones; other channels get the median of these.
 
     Args:
@@ -501,7 +505,11 @@ def unexplained_positions(
         direction_sums[rows] += torch.nn.functional.normalize(camera.center - in_view, dim=1) * missing[:, None]
     mean = color_sums / agreeing_views.clamp(min=1)[:, None]
     spread = (square_sums / agreeing_views.clamp(min=1)[:, None] - mean.square()).clamp(min=0).mean(dim=1).sqrt()
-    found = (agreeing_views >= FEWEST_AGREEING_VIEWS) & (agreeing_views >= LEAST_AGREEING_SHARE * seeing_views) & (spread < MOST_COLOR_DEVIATION)
+    found = (
+        (agreeing_views >= FEWEST_AGREEING_VIEWS)
+        & (agreeing_views >= LEAST_AGREEING_SHARE * seeing_views)
+        & (spread < MOST_COLOR_DEVIATION)
+    )
     found &= direction_sums.norm(dim=1) < MOST_MEAN_DIRECTION * agreeing_views
     cloud = PointCloud(positions[found].cpu(), (255 * mean[found]).round().to(torch.uint8).cpu())
     return cloud, 0.6 * cell

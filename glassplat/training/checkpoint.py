@@ -225,7 +225,9 @@ def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
         planes=Planes(**planes, labels=header["labels"], mirrors=header["mirrors"]),
         environment=environment,
         up=direction(header["up"], "the header"),
-        exposures=Exposures(exposure_tensors["affine"], tuple(header["photographs"])) if exposure_tensors else empty.exposures,
+        exposures=Exposures(exposure_tensors["affine"], tuple(header["photographs"]))
+        if exposure_tensors
+        else empty.exposures,
         **sets,
     )
 

@@ -37,7 +37,7 @@ LARGEST_WINDOW = 16_384
 """Maximum width and height of the browser's window, pixels."""
 LEAST_LENGTH, MOST_LENGTH = 1e-3, 1e3
 """Bounds of the length of a quaternion."""
-POSITION, QUATERNION = ListOf(COORDINATE, 3), Items(Number(-MOST_LENGTH, MOST_LENGTH), 4)
+POSITION, QUATERNION = ListOf(COORDINATE, 3), ListOf(Number(-MOST_LENGTH, MOST_LENGTH), 4)
 PAGE_PATH = re.compile(r"/|(/[\w@+-][\w@+.,-]{0,199}){1,8}", re.ASCII)
 """Path of a file of viser's page: no component starts with a dot, and no character is percent-encoded."""
 HEADERS = {"X-Frame-Options": "DENY", "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
