@@ -1,4 +1,4 @@
-"""Measurements: of speed, `python -m benchmarks`; of quality over scenes, `python -m benchmarks.compare`."""
+"""Measurements of speed (`python -m benchmarks`) and of quality over scenes (`python -m benchmarks.compare`)."""
 
-# Before PyTorch, as whoever uses the package should: it says how threads wait.
+# Imported before PyTorch, because it sets how idle threads wait.
 import glassplat  # noqa: F401

@@ -1,4 +1,4 @@
-"""`python -m benchmarks [--write]`: measures everything; with --write, puts the tables into docs/performance.md."""
+"""`python -m benchmarks [--write]`: runs all measurements; --write puts the tables into docs/performance.md."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from benchmarks.methods import deferred_costs, method_costs, scaling
 from benchmarks.steps import step_costs
 
 WRITTEN = (kernel_times, method_costs)
-"""The measurements whose tables the page shows."""
+"""Measurements whose tables the page shows."""
 PAGE = Path(__file__).parent.parent / "docs" / "performance.md"
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 
 
 def machine() -> str:
-    """The machine and versions, in one line."""
+    """Description of the machine and the versions, in one line."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.is_file():
@@ -35,7 +35,7 @@ def machine() -> str:
 
 
 def main() -> None:
-    """Measures, prints, and writes if asked to."""
+    """Measures, prints the tables, and writes them with --write."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--write", action="store_true", help="put the tables into docs/performance.md")
     arguments = parser.parse_args()

@@ -1,16 +1,16 @@
-"""Compare methods and variants of them over scenes: train, evaluate, and write the tables of docs/results.md.
+"""Compare methods and their variants over scenes: train, evaluate, and write the tables of docs/results.md.
 
     python -m benchmarks.compare rooms/1 rooms/2 --methods splat planar --iterations 7000 --output runs/rooms
     python -m benchmarks.compare rooms/* --variant no-conflict="--weights.conflict 0" --variant mcmc="--strategy mcmc"
     python -m benchmarks.compare rooms/* --variant planar:paper="--preset paper" --options "--downscale 2" --table
 
-Every run is `glassplat train` and `glassplat eval` in a process of its own, in OUTPUT/SCENE/NAME-seedN. Repeat the
-command to go on after an interrupt: finished runs are skipped, begun ones go on from their checkpoint. A run that fails
-does not stop the others. The tables are printed and kept in OUTPUT/tables.md, with all results in OUTPUT/results.json.
+Every run calls `glassplat train` and `glassplat eval` in its own process, and writes to OUTPUT/SCENE/NAME-seedN. Repeat
+the command to continue after an interrupt: finished runs are skipped, unfinished ones continue from their checkpoint. A
+run that fails does not stop the others. The tables are printed and saved in OUTPUT/tables.md, all results in
+OUTPUT/results.json.
 
-Several of these commands may share one OUTPUT, on one machine or many: each run is claimed by a lock on its folder,
-which ends with the process, so that nothing is done twice and what a dead one leaves is taken up by the next. Under
-Slurm:
+Several of these commands may share one OUTPUT, on one or several machines. Each run is claimed by a lock on its folder,
+which is released when the process ends: no run is done twice, and the run of a dead process is taken over. Under Slurm:
 
     sbatch --array 0-7 --wrap 'python -m benchmarks.compare rooms/* --task $SLURM_ARRAY_TASK_ID --of 8'
 """
@@ -42,14 +42,14 @@ BASELINE = "splat"
 COMMAND, LOG, RESULTS = "command.json", "output.log", "results.json"
 CLAIM, FAILED = "claim.lock", "failed.txt"
 PATIENCE = 2.0
-"""Seconds after which what others do is looked at again."""
+"""Seconds between checks of the runs of other processes."""
 
 
 class Column(NamedTuple):
-    """A metric: its title, its name in `results.json`, how it is written, and how two runs are compared by it.
+    """A metric: its title, its name in `results.json`, its number format, and the way in which two runs are compared.
 
-    `of_panes` marks what is a mean over the scene's panes; `is_ratio` what is compared by quotient, because absolute
-    values differ between scenes and machines.
+    `of_panes` marks means over the panes of a scene. `is_ratio` marks metrics that are compared as ratios, because
+    absolute values differ between scenes and machines.
     """
 
     title: str
@@ -80,7 +80,7 @@ COLUMNS = (
 )
 IMAGE, PANE = COLUMNS[0], COLUMNS[3]
 GAINED, REACHED = (IMAGE, PANE, COLUMNS[4]), (COLUMNS[5], COLUMNS[11])
-"""What a method gains over the baseline, and what the baseline has none of: reflections and R0."""
+"""Metrics compared with the baseline, and metrics that the baseline lacks: reflections and R0."""
 
 
 @dataclass(frozen=True)
@@ -89,10 +89,10 @@ class Run:
 
     Attributes:
         scene: name of the capture in the tables.
-        name: of the method, with that of the variant: `planar`, `planar:no-conflict`.
-        seed: of the training.
-        directory: of the run.
-        train: arguments of `glassplat train`, but for the output.
+        name: method, or method and variant: `planar`, `planar:no-conflict`.
+        seed: random seed of the training.
+        directory: directory of the run.
+        train: arguments of `glassplat train`, without the output.
     """
 
     scene: str
@@ -107,17 +107,17 @@ class Run:
         return f"{self.scene}, {self.name}, seed {self.seed}"
 
     def results(self) -> dict[str, Any] | None:
-        """The metrics of the finished run; None before it is finished.
+        """Metrics of the run; None until it is finished.
 
         Raises:
-            SystemExit: the folder holds a run of other options.
+            SystemExit: the folder holds a run with other options.
         """
         self.check()
         file = self.directory / RESULTS
         return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
 
     def check(self) -> None:
-        """Refuse a folder that holds a run of other options."""
+        """Raise SystemExit if the folder holds a run with other options."""
         file = self.directory / COMMAND
         if file.is_file() and (begun := json.loads(file.read_text(encoding="utf-8"))) != list(self.train):
             raise SystemExit(
@@ -126,7 +126,7 @@ class Run:
             )
 
     def claimed(self) -> FileLock | None:
-        """The lock on this run; None while another process, or a training that it left behind, works on it."""
+        """Acquires the lock on this run; None if another process, or a training that it left running, works on it."""
         self.directory.mkdir(parents=True, exist_ok=True)
         lock = FileLock(self.directory / CLAIM, blocking=False, mode=0o666)
         try:
@@ -141,7 +141,7 @@ class Run:
         return lock
 
     def failed_since(self, moment: float) -> str | None:
-        """The reason of a failure after a moment, in seconds since the epoch; None without one."""
+        """Message of a failure after `moment`, in seconds since the epoch; None if there was none."""
         file = self.directory / FAILED
         try:
             return file.read_text(encoding="utf-8") if file.stat().st_mtime >= moment else None
@@ -149,26 +149,26 @@ class Run:
             return None
 
     def start(self) -> subprocess.Popen[bytes]:
-        """Begins the training, or goes on with it."""
+        """Starts the training, or resumes it."""
         self.directory.mkdir(parents=True, exist_ok=True)
-        # Atomically: other processes look at it meanwhile.
+        # Written atomically, because other processes read it.
         write_text(self.directory / COMMAND, json.dumps(self.train, indent=2) + "\n")
         begun = ["--resume"] if (self.directory / "checkpoint.safetensors").is_file() else []
         return self._glassplat("train", *self.train, "--output", str(self.directory), *begun)
 
     def evaluate(self) -> subprocess.Popen[bytes]:
-        """Begins the evaluation of the trained run."""
+        """Starts the evaluation of the trained run."""
         return self._glassplat("eval", str(self.directory))
 
     def said(self) -> str:
-        """The last lines of what its commands said, without the frame of a message."""
+        """Last lines of the output of its commands, without the frame of a message."""
         file = self.directory / LOG
         lines = file.read_text(encoding="utf-8", errors="replace").split("\n") if file.is_file() else []
         words = [line.strip("│╭╮╰╯─ \r") for line in lines]
-        return " ".join([line for line in words if line][-3:]) or "nothing was said"
+        return " ".join([line for line in words if line][-3:]) or "no output"
 
     def _glassplat(self, *arguments: str) -> subprocess.Popen[bytes]:
-        # A session of its own: Ctrl-C reaches this process alone, which then asks the others to end.
+        # A new session: Ctrl-C reaches only this process, which then terminates the others.
         with (self.directory / LOG).open("ab") as log:
             return subprocess.Popen(
                 [sys.executable, "-m", "glassplat", *arguments],
@@ -180,7 +180,7 @@ class Run:
 
 
 def planned_runs(arguments: argparse.Namespace) -> list[Run]:
-    """A run for each scene, seed, and method or variant, scene by scene."""
+    """Runs for each combination of scene, seed, and method or variant, scene by scene."""
     common = ("--iterations", str(arguments.iterations), *shlex.split(arguments.options))
     scenes = zip(scene_names(arguments.scenes), arguments.scenes, strict=True)
     named = named_options(arguments.methods, arguments.variant)
@@ -197,11 +197,11 @@ def planned_runs(arguments: argparse.Namespace) -> list[Run]:
 
 
 def named_options(methods: Sequence[str], variants: Sequence[str]) -> list[tuple[str, str, list[str]]]:
-    """Name, method and options of all that is compared: the methods as they are, and each variant of them.
+    """Name, method and options of everything compared: the plain methods, and their variants.
 
     Args:
-        methods: names.
-        variants: `[METHOD:]NAME=OPTIONS`; without a method it is one of every method but `splat`.
+        methods: names of the methods.
+        variants: `[METHOD:]NAME=OPTIONS`; without METHOD, the variant applies to every method except `splat`.
     """
     named: list[tuple[str, str, list[str]]] = [(method, method, []) for method in methods]
     for variant in variants:
@@ -217,7 +217,7 @@ def named_options(methods: Sequence[str], variants: Sequence[str]) -> list[tuple
 
 
 def scene_names(captures: Sequence[Path]) -> list[str]:
-    """A short name for every capture: its folder, with as many folders above as tell them apart."""
+    """Short names of the captures: the folder name, preceded by as many parent folders as make the names unique."""
     folders = [path.resolve() for path in captures]
     missing = [str(path) for path in captures if not path.is_dir()]
     if missing or len(set(folders)) < len(folders):
@@ -229,7 +229,7 @@ def scene_names(captures: Sequence[Path]) -> list[str]:
 
 
 class Working(NamedTuple):
-    """A run that this process works on: the command, since when, its process and the lock on the run."""
+    """A run in progress: its command, start time, process and lock."""
 
     command: str
     since: float
@@ -238,13 +238,13 @@ class Working(NamedTuple):
 
 
 def execute(runs: Sequence[Run], jobs: int, after_each: Callable[[], object], first: int = 0) -> list[str]:
-    """Trains and evaluates what is not finished, `jobs` at a time; returns why runs failed, here or elsewhere.
+    """Trains and evaluates unfinished runs, `jobs` at a time; returns messages of failures, here or in other processes.
 
     Args:
-        runs: all of them; other processes may work on the same ones.
-        jobs: how many at a time.
-        after_each: called when one is finished.
-        first: number of the run to begin with, so that processes that start together take different ones.
+        runs: all runs; other processes may work on the same ones.
+        jobs: number of runs at a time.
+        after_each: called after each finished run.
+        first: index of the first run to try, so that processes started together take different ones.
     """
     begun, failures = time.time(), []
     waiting = deque(run for run in (*runs[first:], *runs[:first]) if run.results() is None)
@@ -289,7 +289,7 @@ def execute(runs: Sequence[Run], jobs: int, after_each: Callable[[], object], fi
                 work.lock.release()
     finally:
         for work in running.values():
-            work.process.terminate()  # As Ctrl-C would: a checkpoint is written.
+            work.process.terminate()  # Like Ctrl-C, so that a checkpoint is written.
         for work in running.values():
             work.process.wait()
             work.lock.release()
@@ -297,7 +297,7 @@ def execute(runs: Sequence[Run], jobs: int, after_each: Callable[[], object], fi
 
 
 def described(run: Run, seconds: float) -> str:
-    """The image's and the pane's metric of a run that has just ended, and how long it took."""
+    """Image and pane metrics of a run that has just ended, and its duration."""
     values = values_of(run.results() or {})
     shown = [f"{column.title} {values[column]:.2f}" for column in (IMAGE, PANE) if values[column] is not None]
     return ", ".join([*shown, f"{seconds:.0f} s"])
@@ -305,11 +305,11 @@ def described(run: Run, seconds: float) -> str:
 
 Values = Mapping[Column, float | None]
 Measured = dict[tuple[str, str, int], Values]
-"""By scene, name and seed."""
+"""Values by scene, name and seed."""
 
 
 def values_of(results: Mapping[str, Any]) -> dict[Column, float | None]:
-    """The columns' values in `results.json`."""
+    """Values of the columns in `results.json`."""
     panes = results.get("planes") or []
     return {
         column: mean([pane.get(column.name) for pane in panes]) if column.of_panes else results.get(column.name)
@@ -318,13 +318,13 @@ def values_of(results: Mapping[str, Any]) -> dict[Column, float | None]:
 
 
 def mean(values: Iterable[float | None]) -> float | None:
-    """Of the values that there are; None without any."""
+    """Mean of the known values; None without any."""
     known = [value for value in values if value is not None]
     return statistics.fmean(known) if known else None
 
 
 def compared(measured: Measured, name: str, baseline: str) -> dict[str, list[Values]]:
-    """Gains of `name` over `baseline`, as differences or ratios, by scene, seed against equal seed."""
+    """Gains of `name` over `baseline`, as differences or ratios, by scene; runs of equal seeds are compared."""
     found: dict[str, list[Values]] = {}
     for (scene, other, seed), values in measured.items():
         if other == name and (scene, baseline, seed) in measured:
@@ -333,7 +333,7 @@ def compared(measured: Measured, name: str, baseline: str) -> dict[str, list[Val
 
 
 def difference(mine: Values, other: Values) -> dict[Column, float | None]:
-    """Differences, and quotients of what is a ratio; None where one has no value."""
+    """Differences, or ratios of `is_ratio` columns; None if either value is missing."""
     result: dict[Column, float | None] = {}
     for column in COLUMNS:
         a, b = mine[column], other[column]
@@ -345,7 +345,7 @@ def difference(mine: Values, other: Values) -> dict[Column, float | None]:
 
 
 def tables(measured: Measured) -> str:
-    """All tables, as markdown."""
+    """All tables as Markdown."""
     names = list(dict.fromkeys(name for _, name, _ in measured))
     parts = ["### Scenes", "", *value_table(measured), ""]
     above = [name for name in names if name != BASELINE and compared(measured, name, BASELINE)]
@@ -371,9 +371,9 @@ def value_table(measured: Measured) -> list[str]:
 
 
 def gain_table(measured: Measured, names: Sequence[str]) -> list[str]:
-    """Means over scenes of what methods gain, their worst scene and how many scenes are below the baseline.
+    """Mean gains of methods over scenes, their worst scene, and the number of scenes below the baseline.
 
-    Of reflections and of R0, which the baseline has none of, it is the value itself.
+    For reflections and R0, which the baseline lacks, the value itself is shown.
     """
     rows = []
     for name in names:
@@ -391,7 +391,7 @@ def gain_table(measured: Measured, names: Sequence[str]) -> list[str]:
 
 
 def variant_table(measured: Measured, pairs: Sequence[tuple[str, str]]) -> list[str]:
-    """Means over scenes of what a variant has more than its method, or how many times as much."""
+    """Mean differences or ratios between a variant and its method, over scenes."""
     found = {name: compared(measured, name, plain) for name, plain in pairs}
     used = [c for c in COLUMNS if any(v[c] is not None for by in found.values() for vs in by.values() for v in vs)]
     rows = []
@@ -409,27 +409,27 @@ def variant_table(measured: Measured, pairs: Sequence[tuple[str, str]]) -> list[
 
 
 def spread(values: Sequence[float | None], column: Column) -> str:
-    """The mean, and the standard deviation of several."""
+    """The mean, with the standard deviation if there are several values."""
     known = [value for value in values if value is not None]
     deviation = f" ± {statistics.stdev(known):{column.style}}" if len(known) > 1 else ""
     return written(mean(known), column) + deviation
 
 
 def written(value: float | None, column: Column, sign: str = "") -> str:
-    """A value as its column has it; a dash where there is none."""
+    """A value in the format of its column; a dash if it is missing."""
     return "-" if value is None else f"{value:{sign}{column.style}}"
 
 
 def markdown(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """The lines of a table."""
+    """Lines of a Markdown table."""
     return [f"| {' | '.join(cells)} |" for cells in (titles, ["---"] * len(titles), *rows)]
 
 
 def write_tables(output: Path, runs: Sequence[Run]) -> str:
-    """Writes the tables and the results of all finished runs; returns the tables."""
+    """Writes tables and results of all finished runs; returns the tables."""
     finished = [(run, results) for run in runs if (results := run.results()) is not None]
     if not finished:
-        return "nothing is finished"
+        return "no run is finished"
     text = tables({(run.scene, run.name, run.seed): values_of(results) for run, results in finished})
     kept = [{"scene": r.scene, "name": r.name, "train": r.train} | results for r, results in finished]
     for name, content in ((RESULTS, json.dumps(kept, indent=2) + "\n"), ("tables.md", text)):
@@ -438,7 +438,7 @@ def write_tables(output: Path, runs: Sequence[Run]) -> str:
 
 
 def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """The options."""
+    """Parses the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path, nargs="+", help="folders of captures")
     parser.add_argument("--methods", nargs="+", default=["splat", "planar"])
@@ -447,12 +447,12 @@ def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--iterations", type=int, default=7000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--options", default="", help='of every training, such as "--downscale 2"')
+    parser.add_argument("--options", default="", help='options of every training, such as "--downscale 2"')
     parser.add_argument("--output", type=Path, default=Path("runs/compare"))
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time; set NUMBA_NUM_THREADS with it")
     parser.add_argument("--task", type=int, default=0, help="number of this process among those that share the output")
-    parser.add_argument("--of", type=int, default=1, help="how many they are")
-    parser.add_argument("--table", action="store_true", help="only write the tables of what is finished")
+    parser.add_argument("--of", type=int, default=1, help="number of these processes")
+    parser.add_argument("--table", action="store_true", help="only write the tables of finished runs")
     options = parser.parse_args(arguments)
     if not 0 <= options.task < options.of:
         parser.error(f"--task is {options.task}, of {options.of}; expected a number from 0 on, below --of")
@@ -460,7 +460,7 @@ def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs what is missing and prints the tables; returns the exit code."""
+    """Executes unfinished runs and prints the tables; returns the exit code."""
     options = parsed(arguments)
     runs = planned_runs(options)
     first = options.task * len(runs) // options.of

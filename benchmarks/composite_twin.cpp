@@ -1,6 +1,6 @@
-// The two hot loops of compositing once more, by a C++ compiler: what `python -m benchmarks.twin` holds the kernels against.
+// The two hot loops of compositing in C++, with which `python -m benchmarks.twin` compares the kernels.
 //
-// The same steps as glassplat/kernels/composite/cpu.py and cpu_backward.py, for four channels, images of whole
+// The steps are those of glassplat/kernels/composite/cpu.py and cpu_backward.py, for four channels, images of whole
 // tiles, and neither glass nor deviations. Names are those of glassplat/kernels/composite/cpu_tile.py.
 #include <cmath>
 #include <cstdint>
@@ -130,7 +130,7 @@ void write_tile(const float *state, const float *planes, float *image, float *al
     }
 }
 
-// Halves of the lanes of two vectors, each of which holds sums of so many lanes, added up.
+// One step of a lane reduction: adds the two halves of each group of W lanes of two vectors into one vector.
 template <int W> Vec halved(Vec a, Vec b) {
     Ints near, far;
     for (int i = 0; i < LANES; i++) {

@@ -1,6 +1,6 @@
-"""`python -m benchmarks.discs`: what discs cost beside ellipsoids of the same places and two of their three sizes.
+"""`python -m benchmarks.discs`: cost of discs compared with ellipsoids of the same positions and two of their sizes.
 
-Processor time, the least of several rounds in which both take turns, so that other programs hardly matter.
+CPU time, the minimum over several rounds in which both alternate, so that other programs hardly matter.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ COUNT, ROUNDS, NEAR = 100_000, 7, 0.03
 
 
 class Primitive(NamedTuple):
-    """The steps of one kind of Gaussians, and how many (tile, splat) pairs they have."""
+    """Steps for one kind of Gaussians, and the number of their (tile, splat) pairs."""
 
     works: dict[str, Work]
     pairs: int
 
 
 def learning(gaussians: Gaussians) -> Gaussians:
-    """The same set as leaves of a graph."""
+    """The same set as leaf tensors that require gradients."""
     return gaussians.with_tensors({name: t.clone().requires_grad_() for name, t in gaussians.tensors().items()})
 
 
 def backward(outputs: Sequence[Tensor], gaussians: Gaussians) -> Work:
-    """A backward pass to all tensors that can be repeated."""
+    """A repeatable backward pass to all tensors."""
     smooth = [output for output in outputs if output.requires_grad]
     weights = [torch.rand_like(output) for output in smooth]
     inputs = list(gaussians.tensors().values())
@@ -49,7 +49,7 @@ def backward(outputs: Sequence[Tensor], gaussians: Gaussians) -> Work:
 
 
 def ellipsoids(gaussians: Gaussians, camera: Camera) -> Primitive:
-    """Projection, tiles and blending of ellipsoids with colour and depth."""
+    """Projection, tile binning and blending of ellipsoids with colour and depth."""
     own = learning(gaussians)
     projected = project_gaussians(own, camera, near=NEAR)
     splats = Splats(*(t.detach() for t in concat_splats(projected)))
@@ -68,7 +68,7 @@ def ellipsoids(gaussians: Gaussians, camera: Camera) -> Primitive:
 
 
 def discs(gaussians: Gaussians, camera: Camera) -> Primitive:
-    """The same of discs, with colour and normals, depths and distortion."""
+    """The same for discs, with colour, normals, depths and distortion."""
     flat = replace(gaussians, log_scales=gaussians.log_scales[:, :2].contiguous())
     own = learning(flat)
     projected = projected_discs(own, camera, near=NEAR)
@@ -85,7 +85,7 @@ def discs(gaussians: Gaussians, camera: Camera) -> Primitive:
 
 
 def disc_costs() -> Table:
-    """Milliseconds of both, and their ratio."""
+    """Milliseconds of both primitives, and their ratio."""
     camera, gaussians = bench_camera(WIDTH, HEIGHT), room(COUNT)
     solid, flat = ellipsoids(gaussians, camera), discs(gaussians, camera)
     table = Table(

@@ -1,8 +1,8 @@
-"""`python -m benchmarks.gpu`: checks the CUDA kernels on this machine's GPU, times them beside gsplat, trains `planar`.
+"""`python -m benchmarks.gpu`: checks the CUDA kernels on this GPU, times them and gsplat, and trains `planar`.
 
-Each part is a process of its own with a limit of time, because an error of a GPU spoils whatever its process does
-afterwards: one part that fails leaves the others. All limits together are below nine minutes. gsplat compiles itself
-when it is first called; `pip install gsplat==1.5.3`, or go without.
+Each part runs in its own process with a time limit, because a CUDA error makes the process unusable: if one part fails,
+the others still run. The limits add up to less than nine minutes. gsplat is optional (`pip install gsplat==1.5.3`), and
+compiles itself on its first call.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ CHECKS = [
 ]
 DATA, ITERATIONS = ROOT / "glassplat" / "demo_scene", 7000
 LIMITS = {"launch": 60, "parity": 165, "frames": 100, "operations": 60, "training": 150}
-"""The parts in their order, and the seconds that each may take."""
+"""Parts in their order, and the time limit of each in seconds."""
 
 
 def main() -> int:
-    """Runs every part, or the one that is named; 1 where there is no GPU or a part fails."""
+    """Runs all parts, or the one given by --part; returns 1 without a GPU or if a part fails."""
     arguments = parsed()
     problem = cuda_problem()
     if problem is not None:
@@ -54,18 +54,18 @@ def main() -> int:
 def parsed() -> argparse.Namespace:
     """Parse the command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.gpu", description=__doc__)
-    parser.add_argument("--count", type=int, default=COUNT, help="Gaussians of the timings")
-    parser.add_argument("--data", type=Path, default=DATA, help="capture to train on; the bundled one by default")
+    parser.add_argument("--count", type=int, default=COUNT, help="number of Gaussians in the timings")
+    parser.add_argument("--data", type=Path, default=DATA, help="capture to train on; default: the bundled one")
     parser.add_argument(
         "--iterations", type=int, default=ITERATIONS, help="length of the training run; 0 trains nothing"
     )
-    parser.add_argument("--cpu-run", type=Path, help="folder of the same run on the CPU, evaluated, to compare with")
-    parser.add_argument("--part", choices=tuple(LIMITS), help="run this part alone, in this process")
+    parser.add_argument("--cpu-run", type=Path, help="evaluated run of the same training on the CPU, to compare with")
+    parser.add_argument("--part", choices=tuple(LIMITS), help="run only this part, in this process")
     return parser.parse_args()
 
 
 def succeeds(part: str, options: list[str]) -> bool:
-    """Runs a part in a process of its own, which prints what it finds; says where it fails or takes too long."""
+    """Runs a part in its own process, which prints its results; reports failures and timeouts."""
     command, started = [sys.executable, "-m", "benchmarks.gpu", "--part", part, *options], time.perf_counter()
     try:
         status = subprocess.run(command, cwd=ROOT, timeout=LIMITS[part], check=False).returncode
@@ -79,7 +79,7 @@ def succeeds(part: str, options: list[str]) -> bool:
 
 
 def launch(arguments: argparse.Namespace) -> str:
-    """The least that has to work: one kernel is compiled, loaded and launched, and does what it should."""
+    """Minimal check: one kernel is compiled, loaded and launched, and its result is correct."""
     from glassplat.kernels.adam import Update, adam
 
     parameter = torch.ones(1000, 3, device="cuda")
@@ -90,7 +90,7 @@ def launch(arguments: argparse.Namespace) -> str:
 
 
 def parity(arguments: argparse.Namespace) -> str:
-    """Every kernel against its twin, and float32 against float64 at sizes that the twins cannot bear."""
+    """Checks every kernel against its twin, and float32 against float64 at sizes too large for the twins."""
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *CHECKS]
     status = subprocess.run(command, cwd=ROOT, env=os.environ | {"PYTHONUNBUFFERED": "1"}, check=False).returncode
     if status:
@@ -99,21 +99,21 @@ def parity(arguments: argparse.Namespace) -> str:
 
 
 def frames(arguments: argparse.Namespace) -> str:
-    """Frames, gradients and steps of both methods, and gsplat's."""
+    """Times frames, gradients and steps of both methods and of gsplat."""
     from benchmarks.gpu_frames import measured
 
     return measured(arguments.count).markdown()
 
 
 def operations(arguments: argparse.Namespace) -> str:
-    """Milliseconds of each operation, forward and backward."""
+    """Times each operation, forward and backward."""
     from benchmarks.gpu_operations import kernel_times
 
     return kernel_times(arguments.count).markdown()
 
 
 def train(arguments: argparse.Namespace) -> str:
-    """A whole run of `planar`, and its quality."""
+    """Trains a complete `planar` run and evaluates it."""
     from benchmarks.gpu_training import training
 
     with tempfile.TemporaryDirectory() as folder:
@@ -121,7 +121,7 @@ def train(arguments: argparse.Namespace) -> str:
     return table.markdown()
 
 
-# What a part imports it imports itself: what one lacks is no business of the others.
+# Each part imports its own modules, so that a missing package does not affect the others.
 PARTS: dict[str, Callable[[argparse.Namespace], str]] = {
     "launch": launch,
     "parity": parity,

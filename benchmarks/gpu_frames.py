@@ -1,4 +1,4 @@
-"""Frames, gradients and steps on a GPU, beside gsplat 1.5.3 where that is installed."""
+"""Frames, gradients and steps on a GPU, compared with gsplat 1.5.3 if it is installed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ WIDTH, HEIGHT, REPEATS = 960, 720, 15
 
 
 def measured(count: int) -> Table:
-    """Frames, gradients and steps of both methods, and gsplat's."""
+    """Frames, gradients and steps of both methods and of gsplat."""
     camera = bench_camera(WIDTH, HEIGHT).to("cuda")
     scene = bench_scene(count, 1, 0.5, camera.to("cpu")).to("cuda")
     mirroring = mirroring_scene(count).to("cuda")
@@ -57,15 +57,13 @@ def measured(count: int) -> Table:
     for work in works.values():
         work()
     torch.cuda.synchronize()
-    note = (
-        f"First use of all kernels took {time.perf_counter() - started:.1f} s, compilation included where the disk had "
-    )
-    note += "none. Memory is the most that torch held beyond the scene and what came before. "
+    note = f"First use of all kernels took {time.perf_counter() - started:.1f} s, including compilation if the cache "
+    note += "was empty. Memory is the peak of torch beyond the scene and earlier allocations. "
     note += "Ratios are medians of ratios taken round by round." if theirs else "gsplat is not installed."
     seconds = interleaved_seconds({name: timed(work) for name, work in (works | theirs).items()}, REPEATS)
     table = Table(
         f"On a GPU: {count:,} primary Gaussians, SH 3, {WIDTH}x{HEIGHT}, one pane over half of the image, or all "
-        "of it mirroring as many more",
+        "Gaussians reflecting as many others",
         ("what", "ms", "gsplat, ms", "gsplat : ours", "memory, MiB", "gsplat memory, MiB"),
         note,
     )
@@ -77,7 +75,7 @@ def measured(count: int) -> Table:
 
 
 def beside(seconds: Mapping[str, list[float]], name: str, partner: str | None) -> tuple[object, object]:
-    """The other's milliseconds and how many times ours they are; nothing where there is no other."""
+    """Milliseconds of gsplat and their ratio to ours; empty without a counterpart."""
     if partner is None:
         return "", ""
     return milliseconds(seconds, partner), paired_ratio(seconds, partner, name)
@@ -89,7 +87,7 @@ def milliseconds(seconds: Mapping[str, list[float]], name: str) -> float:
 
 
 def timed(work: Work) -> Work:
-    """The work, until the GPU is done with it."""
+    """The work followed by a synchronisation with the GPU."""
 
     def until_done() -> None:
         work()
@@ -99,7 +97,7 @@ def timed(work: Work) -> Work:
 
 
 def peak(work: Work) -> int:
-    """Most memory that torch held during the work beyond what it held before, in MiB."""
+    """Peak memory that torch allocated during the work, beyond what was allocated before, in MiB."""
     torch.cuda.synchronize()
     torch.cuda.reset_peak_memory_stats()
     before = torch.cuda.memory_allocated()
@@ -109,14 +107,14 @@ def peak(work: Work) -> int:
 
 
 def trainable(scene: Scene, camera: Camera) -> tuple[Tensor, list[Tensor]]:
-    """A frame's colours [H, W, 3], and the leaves that they depend on."""
+    """Colours of a frame [H, W, 3], and the leaf tensors that they depend on."""
     leaves = {name: tensor.detach().requires_grad_() for name, tensor in scene.primary.tensors().items()}
     frame = Splat(depth=False)(Scene(scene.primary.with_tensors(leaves), scene.extent), camera)
     return frame.rgb, [leaf for name, leaf in leaves.items() if name != "log_intensity"]
 
 
 def gradient_work(scene: Scene, camera: Camera) -> Work:
-    """One frame and the gradients of all raw Gaussian tensors."""
+    """Renders one frame and computes the gradients of all raw Gaussian tensors."""
 
     def work() -> None:
         image, leaves = trainable(scene, camera)
@@ -126,14 +124,14 @@ def gradient_work(scene: Scene, camera: Camera) -> Work:
 
 
 def backward_work(scene: Scene, camera: Camera) -> Work:
-    """The gradients alone, of a frame that is there."""
+    """Computes only the gradients of a rendered frame."""
     image, leaves = trainable(scene, camera)
     ones = torch.ones_like(image)
     return lambda: torch.autograd.grad([image], leaves, [ones], retain_graph=True, allow_unused=True)
 
 
 def gsplat_works(scene: Scene, view: View) -> dict[str, Work]:
-    """The same by gsplat; activations included, as in ours. Its step has our L1 and SSIM, and torch's fused Adam."""
+    """The same work in gsplat, including activations. Its step uses our L1 and SSIM, and the fused Adam of torch."""
     rasterization = importlib.import_module("gsplat").rasterization
     gaussians, camera = scene.primary, view.camera
     names = ("means", "quats", "log_scales", "logit_opacities", "sh")

@@ -1,4 +1,4 @@
-"""Each operation on a GPU, and both passes of compositing against measured peaks. Importing this needs numba-cuda."""
+"""Times of each operation on a GPU, and both passes of compositing against measured peaks. Requires numba-cuda."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.frame import concat_splats
 
 RAYS_WIDTH = 1024
-"""Of the square image of a mirror ball that throws the rays, in pixels."""
+"""Width of the square image of a mirror ball that reflects the rays, in pixels."""
 
 Bound = Callable[[Peaks], float]
 
@@ -71,7 +71,7 @@ def kernel_times(count: int) -> Table:
 
 
 def least_seconds(splats: Splats, channels: Tensor, bins: TileBins, evaluations: int) -> dict[str, Bound]:
-    """Least seconds of both passes of `composite`, from the counts of a forward pass."""
+    """Lower bounds in seconds for both passes of `composite`, from the counts of a forward pass."""
     forward = kernels_for("composite", channels.device).composite
     marks, count = channels.new_zeros(1, 0), channels.shape[1]
     options: dict[str, Any] = {"marks": marks, "num_primary": count, "deviation": None, "needs_gradients": True}

@@ -1,4 +1,4 @@
-"""A GPU's peaks of arithmetic and memory, measured. Importing this needs numba-cuda."""
+"""Measured peaks of arithmetic and memory bandwidth of a GPU. Requires numba-cuda."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ THREADS, CHAINS, ROUNDS = 256, 8, 4096
 
 @cache
 def multiply_adds(real: type) -> Kernel:
-    """Chains of multiply-adds that nothing waits for."""
+    """Kernel of independent chains of multiply-adds."""
 
     @kernel("multiply_adds", real, "real1 int")
     def chains(values, rounds):  # type: ignore[no-untyped-def]
@@ -34,7 +34,7 @@ def multiply_adds(real: type) -> Kernel:
 
 
 def measured_peaks() -> Peaks:
-    """Peaks of the current GPU, as simple kernels reach them."""
+    """Peaks that simple kernels reach on the current GPU."""
     blocks = 32 * torch.cuda.get_device_properties(0).multi_processor_count
     values = torch.full((blocks * THREADS,), 0.5, device="cuda")
     arithmetic = seconds(lambda: multiply_adds(np.float32)(blocks, THREADS, values, ROUNDS))
@@ -45,7 +45,7 @@ def measured_peaks() -> Peaks:
 
 
 def seconds(work: Callable[[], object], repeats: int = 7) -> float:
-    """Median seconds of work on the GPU, by its own clock."""
+    """Median seconds of work on the GPU, measured by CUDA events."""
     work()
     found = []
     for _ in range(repeats):

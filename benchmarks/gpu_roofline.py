@@ -1,4 +1,4 @@
-"""Least times of the compositing kernels at a GPU's peaks, from counted multiply-adds and bytes."""
+"""Lower bounds for the times of the compositing kernels at the peaks of a GPU, from counted multiply-adds and bytes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from benchmarks.kernels import MULTIPLY_ADDS
 from glassplat.kernels.composite.cuda_tile import BUCKET, PIXELS
 
 GEOMETRY_BYTES = 28
-"""Of one pair: the splat's index, mean, conic and opacity."""
+"""Bytes read per pair: index, mean, conic and opacity of the splat."""
 MOMENTS = 6
 
 
@@ -22,8 +22,8 @@ class Peaks(NamedTuple):
 class Counts(NamedTuple):
     """Counts of a traversal of all tiles.
 
-    pairs: (tile, splat) pairs that any pixel looked at. evaluations: of a splat at a pixel. buckets: that were stored.
-    pixels: of the image. channels: of a splat.
+    pairs: (tile, splat) pairs visited by any pixel. evaluations: evaluations of a splat at a pixel. buckets: stored
+        buckets. pixels: pixels of the image. channels: channels per splat.
     """
 
     pairs: int
@@ -34,38 +34,38 @@ class Counts(NamedTuple):
 
 
 class Demand(NamedTuple):
-    """Multiply-adds and bytes of one run of a kernel."""
+    """Multiply-adds and bytes of one launch of a kernel."""
 
     multiply_adds: float
     bytes: float
 
     def seconds_at(self, peaks: Peaks) -> float:
-        """The least time: either the arithmetic or the memory is the bound."""
+        """Lower bound of the time, limited by arithmetic or by memory."""
         return max(self.multiply_adds / peaks.multiply_adds, self.bytes / peaks.bytes)
 
 
 def forward_demand(counts: Counts) -> Demand:
-    """Of the forward pass with what the backward pass needs: splats are read once per tile, state is written once."""
+    """Demand of the forward pass in training: splats are read once per tile, and the saved state is written once."""
     splats = counts.pairs * (GEOMETRY_BYTES + 4 * counts.channels)
     kept = counts.buckets * PIXELS * 4 * (counts.channels + 1)
     return Demand(counts.evaluations * MULTIPLY_ADDS, splats + kept + counts.pixels * 4 * (counts.channels + 6))
 
 
 def backward_demand(counts: Counts) -> Demand:
-    """Of the backward pass: as the forward pass, and one gradient row for each pair; twice the arithmetic."""
+    """Demand of the backward pass: twice the arithmetic of the forward pass, and one more gradient row per pair."""
     forward = forward_demand(counts)
     rows = counts.pairs * 4 * (MOMENTS + counts.channels)
     return Demand(2 * forward.multiply_adds, forward.bytes + rows)
 
 
 def counts_of(saved: Any, visited: int, pairs: int, channels: int) -> Counts:
-    """Counts from what the forward pass saved.
+    """Counts from the state saved by the forward pass.
 
     Args:
         saved: `glassplat.kernels.composite.cuda.Saved`.
-        visited: evaluations of a traversal in which no pixel stops early.
-        pairs: all (tile, splat) pairs.
-        channels: of a splat.
+        visited: evaluations in a traversal without early stopping.
+        pairs: number of (tile, splat) pairs.
+        channels: channels per splat.
     """
     last = saved.last[:, 0]
     share = float((last.double() + 1).sum()) / max(pairs * PIXELS, 1)

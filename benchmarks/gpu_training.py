@@ -1,4 +1,4 @@
-"""A whole run of `planar` on a capture, and its quality compared with the same run on the CPU."""
+"""A complete run of `planar` on a capture, and its quality compared with the same run on the CPU."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from glassplat.methods.planar_recipe import PlanarRecipe
 
 METRICS = ("psnr", "ssim", "lpips", "pane_psnr", "transmission_psnr", "reflection_psnr")
 SAME = ("method", "iterations", "seed", "downscale")
-"""What two runs have to have in common to be compared."""
+"""Fields that must be equal for two runs to be comparable."""
 
 
 def training(
     data: Path, iterations: int, output: Path, *, cpu_run: Path | None, device: DeviceName = "cuda", seed: int = 0
 ) -> Table:
-    """Trains and evaluates `planar`, and compares the metrics with those of the CPU's run.
+    """Trains and evaluates `planar`, and compares the metrics with those of a run on the CPU.
 
     Args:
-        data: a capture.
+        data: directory of the capture.
         iterations: length of the run.
-        output: folder of the run, new.
-        cpu_run: folder of the same run on the CPU, evaluated; None leaves its column empty.
-        device: where to train.
+        output: new directory of the run.
+        cpu_run: directory of the evaluated run on the CPU; None leaves its column empty.
+        device: device to train on.
         seed: random seed.
 
     Raises:
-        ValueError: the CPU's run is another one.
+        ValueError: the run on the CPU has other settings.
     """
     recorded = {} if cpu_run is None else json.loads((cpu_run / "results.json").read_text())
     console = Console(quiet=True)
@@ -47,7 +47,7 @@ def training(
 
 
 def beside_the_cpu(found: Mapping[str, Any], recorded: Mapping[str, Any], seconds: float, data: Path) -> Table:
-    """The table of one run; `recorded` are the CPU's results, empty where there are none."""
+    """Table of one run; `recorded` are the results on the CPU, or empty."""
     if recorded and (other := {name: recorded.get(name) for name in SAME}) != {name: found[name] for name in SAME}:
         raise ValueError(f"the run on the CPU is {other}; expected { {name: found[name] for name in SAME} }")
     iterations = found["iterations"]

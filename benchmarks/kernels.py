@@ -1,4 +1,4 @@
-"""Throughput of the kernels, compared with the machine's multiply-add peak and their PyTorch twins."""
+"""Throughput of the kernels, compared with the multiply-add peak of the machine and with their PyTorch twins."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ alpha and transmittance 3, colour 3."""
 
 
 def raw_of(gaussians: Gaussians, trainable: bool = False) -> RawGaussians:
-    """The tensors that `project` takes."""
+    """Arguments of `project`."""
     g = gaussians
     tensors = (g.means, g.quats, g.log_scales, g.logit_opacities, g.sh)
     return RawGaussians(*(t.clone().requires_grad_() if trainable else t for t in tensors))
@@ -120,18 +120,18 @@ def kernel_times() -> Table:
 
 
 def backward(outputs: list[Tensor], weights: list[Tensor], inputs: list[Any]) -> Work:
-    """A backward pass that can be repeated."""
+    """A repeatable backward pass."""
     return lambda: torch.autograd.grad(outputs, inputs, weights, retain_graph=True)
 
 
 def at_threads(work: Work, threads: int) -> float:
-    """Median seconds on a number of threads."""
+    """Median seconds on the given number of threads."""
     with thread_count(threads):
         return median_seconds(work)
 
 
 def twin_ratios() -> Table:
-    """Speed of the kernels relative to their twins, at a size the twins can bear."""
+    """Speed of the kernels relative to their twins, at sizes that the twins can handle."""
     camera = bench_camera(64, 48)
     gaussians = room(1000)
     raw, batch = raw_of(gaussians), batch_of(camera)

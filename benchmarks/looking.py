@@ -25,16 +25,16 @@ from glassplat.viewer.server import COARSE_QUALITY, SHARP_QUALITY
 
 WIDTH, HEIGHT, COUNT = 640, 480, 100_000
 MOST_FIRST, MOST_FULL = 100, 400
-"""Milliseconds that are aimed at, on two cores."""
+"""Targets in milliseconds, on two cores."""
 WARM_UP = 5
 STEP = 0.02
-"""World units from one camera to the next."""
+"""Distance between successive cameras, world units."""
 AFTER_FIRST = 0.01
-"""Seconds after the first picture at which the camera moves again, while the full one is being drawn."""
+"""Seconds between the first image and the next camera move, while the full image is being rendered."""
 
 
 class Answer(NamedTuple):
-    """Milliseconds from a move to its first picture and to the full one, and how wide the first one is."""
+    """Milliseconds from a camera move to its first and to its full image, and the width of the first."""
 
     first: float
     full: float
@@ -42,7 +42,7 @@ class Answer(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """A picture that was sent: when, how wide, and whether it is the full one."""
+    """A sent image: its time, its width, and whether it is the full one."""
 
     at: float
     width: int
@@ -50,10 +50,10 @@ class Shown(NamedTuple):
 
 
 class Looker:
-    """Somebody who moves, waits for the pictures as they go to the browser, and notes when they come."""
+    """A simulated user who moves the camera, and records when the encoded images would be sent to the browser."""
 
     def __init__(self, count: int = COUNT) -> None:
-        """Begins to look at a room of so many Gaussians with one pane over half of the picture."""
+        """Starts rendering a room of `count` Gaussians with one pane over half of the image."""
         camera = bench_camera(WIDTH, HEIGHT)
         self._scene, self._renderer = bench_scene(count, 1, 0.5, camera), Planar()
         self._request = ViewRequest(camera.cam_from_world, 2 * float(np.arctan(HEIGHT / 2 / camera.fy)), WIDTH / HEIGHT)
@@ -63,18 +63,18 @@ class Looker:
         self._changed = threading.Condition()
         self._thread = RenderThread(self._loop)
         threads = numba.get_num_threads()
-        self._loop.schedule(lambda: numba.set_num_threads(threads))  # Each Python thread has a number of its own.
+        self._loop.schedule(lambda: numba.set_num_threads(threads))  # The thread count is per Python thread.
 
     def stop(self) -> None:
-        """Ends the drawing."""
+        """Stops the render thread."""
         self._thread.stop()
 
     def answer(self, place: int, *, moving: bool) -> Answer:
-        """Moves to a place, and waits for the full picture.
+        """Moves the camera to a position, and waits for the full image.
 
         Args:
-            place: number of the place.
-            moving: begin while the full picture of another place is being drawn.
+            place: number of the position.
+            moving: start while the full image at another position is being rendered.
         """
         if moving:
             self._ask(place + 0.5)
@@ -100,7 +100,7 @@ class Looker:
         return draw_image(self._scene, self._renderer, request, rows)
 
     def _show(self, client: int, picture: ImageArray, is_full: bool) -> None:
-        """Packs the picture as viser does."""
+        """Encodes the image as viser does."""
         Image.fromarray(picture).save(BytesIO(), "JPEG", quality=SHARP_QUALITY if is_full else COARSE_QUALITY)
         with self._changed:
             if self._drawing is self._request:
@@ -113,7 +113,7 @@ class Looker:
 
 
 def answers(moves: int, count: int, *, moving: bool) -> list[Answer]:
-    """Latencies of a number of moves, after some to warm up."""
+    """Latencies of `moves` camera moves, after some warm-up moves."""
     looker = Looker(count)
     try:
         return [looker.answer(place, moving=moving) for place in range(WARM_UP + moves)][WARM_UP:]
@@ -122,12 +122,12 @@ def answers(moves: int, count: int, *, moving: bool) -> list[Answer]:
 
 
 def looking_times(moves: int = 40, count: int = COUNT) -> Table:
-    """From a move of the camera to its pictures, from rest and while another one is drawn, for 1, 2, ... threads."""
+    """Latency of images after a camera move, from rest and during another frame, for 1, 2, ... threads."""
     table = Table(
         f"From a move in the viewer to its picture, {count:,} Gaussians, one pane over half of {WIDTH}x{HEIGHT}",
         ("threads", "the camera", "first, ms", "slowest of 20", "its width", "full, ms", "slowest of 20"),
-        f"Medians over {moves} moves, and what one in twenty exceeds; packed for the browser, without its way there. "
-        f"Aims on two cores: {MOST_FIRST} and {MOST_FULL} ms.",
+        f"Medians and 95th percentiles over {moves} moves; encoded for the browser, without the network. "
+        f"Targets on two cores: {MOST_FIRST} and {MOST_FULL} ms.",
     )
     for threads in doublings(numba.config.NUMBA_NUM_THREADS):
         with thread_count(threads):

@@ -1,4 +1,4 @@
-"""Cost of the reflections: `planar` and `deferred` against `splat`, frame and training step, in one run."""
+"""Cost of reflections: frames and training steps of `planar` and `deferred` compared with `splat`, in one run."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def frame_work(scene: Scene, renderer: Renderer, camera: Camera) -> Work:
 
 
 def bare_work(scene: Scene, camera: Camera) -> Work:
-    """Least work of a `planar` frame: the `splat` frame, and the mirrored one in the tiles of the panes."""
+    """Minimum work of a `planar` frame: the `splat` frame, and the mirrored one in the tiles of the panes."""
     splat, planes = Splat(depth=False), scene.planes
     hits = nearest_hits(panes_in_camera(planes, camera), camera)
     views = mirrored_views(planes, camera)
@@ -66,7 +66,7 @@ def bare_work(scene: Scene, camera: Camera) -> Work:
 
 
 def step_work(scene: Scene, stage: Stage, view: View) -> Work:
-    """One optimisation step, without densification."""
+    """Runs one optimisation step, without densification."""
     state = TrainState(scene, seed=0)
 
     def work() -> None:
@@ -77,7 +77,7 @@ def step_work(scene: Scene, stage: Stage, view: View) -> Work:
 
 
 def view_of(camera: Camera) -> View:
-    """A photograph of noise with a mask, to train against."""
+    """A view with a noise photograph and a mask, to train on."""
     generator = torch.Generator().manual_seed(0)
     photo = (255 * torch.rand(camera.height, camera.width, 3, generator=generator)).to(torch.uint8)
     return View.in_memory(
@@ -86,7 +86,7 @@ def view_of(camera: Camera) -> View:
 
 
 def against_splat(method: str, scene: Scene, renderer: Renderer, stage: Stage, view: View) -> list[float]:
-    """Milliseconds of a `splat` frame and the method's, their ratio, and the same of a training step."""
+    """Milliseconds of a frame in `splat` and in the method, their ratio, and the same for a training step."""
     splat_stage, camera = SplatRecipe().stages(0)[0], view.camera
     frames = interleaved_seconds(
         {"splat": frame_work(scene, Splat(depth=False), camera), method: frame_work(scene, renderer, camera)}
@@ -102,7 +102,7 @@ def against_splat(method: str, scene: Scene, renderer: Renderer, stage: Stage, v
 
 
 def method_costs() -> Table:
-    """Frame and step of both methods with the same primary Gaussians."""
+    """Frames and steps of both methods with the same primary Gaussians."""
     camera = bench_camera(WIDTH, HEIGHT)
     view = view_of(camera)
     table = Table(
@@ -133,7 +133,7 @@ def method_costs() -> Table:
 
 
 def deferred_costs() -> Table:
-    """Frame and step of `deferred` and `splat` with the same Gaussians."""
+    """Frames and steps of `deferred` and `splat` with the same Gaussians."""
     table = Table(
         "deferred against splat, SH 3, every Gaussian glossy",
         (
@@ -158,7 +158,7 @@ def deferred_costs() -> Table:
 
 
 def scaling() -> Table:
-    """Frame time over Gaussians, pixels, panes and threads."""
+    """Frame time as a function of the number of Gaussians, pixels, panes and threads."""
     everything = numba.config.NUMBA_NUM_THREADS
     table = Table("Scaling of a frame", ("what", "Gaussians", "pixels", "panes", "threads", "ms", "frames/s"))
     cases = [
@@ -186,7 +186,7 @@ def doublings(most: int) -> list[int]:
 
 @contextmanager
 def thread_count(threads: int) -> Iterator[None]:
-    """Runs kernels and PyTorch on so many threads."""
+    """Runs kernels and PyTorch on the given number of threads."""
     before = numba.get_num_threads(), torch.get_num_threads()
     numba.set_num_threads(threads)
     torch.set_num_threads(threads)

@@ -1,6 +1,6 @@
-"""`python -m benchmarks.parts METHOD [--data CAPTURE] [--iterations N]`: where a run's time goes, stage by stage.
+"""`python -m benchmarks.parts METHOD [--data CAPTURE] [--iterations N]`: profile of a training run by stage.
 
-Trains, and times every launch of a kernel; what is left of a step is Python and PyTorch between them. Processor time
+Trains, and times every kernel launch; the rest of a step is Python and PyTorch between the launches. Times are CPU time
 on one thread, so that other programs hardly matter.
 """
 
@@ -29,7 +29,7 @@ from glassplat.training.stage import TrainState
 
 BEFORE, BETWEEN, TOTAL, STEPS = "before its first step", "between kernels", "all of it", "steps"
 LEAST_SHARE = 0.005
-"""Of a stage; kernels that take less have no row."""
+"""Share of a stage; kernels below it have no row."""
 
 Seconds = defaultdict[str, float]
 Costs = dict[str, Seconds]
@@ -38,7 +38,7 @@ Costs = dict[str, Seconds]
 
 @contextmanager
 def timed_kernels(seconds: Seconds) -> Iterator[None]:
-    """Adds the processor time of each launch to what its kernel has taken."""
+    """Adds the CPU time of each launch to the total of its kernel."""
     launch = Kernel.__call__
 
     def timed(kernel: Kernel, *arguments: Any) -> Any:
@@ -53,7 +53,7 @@ def timed_kernels(seconds: Seconds) -> Iterator[None]:
 
 
 def costs_of(messages: Iterator[Message]) -> Costs:
-    """Costs of the stages of a run; the preparation of a stage counts apart from its steps."""
+    """Costs of the stages of a run; the preparation of a stage is counted separately from its steps."""
     costs: Costs = {}
     seconds: Seconds = defaultdict(float)
     with timed_kernels(seconds):
@@ -73,7 +73,7 @@ def costs_of(messages: Iterator[Message]) -> Costs:
 
 
 def add_step(stage: Seconds, kernels: Seconds, taken: float) -> None:
-    """Adds a step, of which kernels took what they did."""
+    """Adds a step that took `taken` seconds in all and `kernels` in each kernel."""
     stage[STEPS] += 1
     stage[TOTAL] += taken
     stage[BETWEEN] += taken - sum(kernels.values())
@@ -82,7 +82,7 @@ def add_step(stage: Seconds, kernels: Seconds, taken: float) -> None:
 
 
 def parts_table(costs: Mapping[str, Mapping[str, float]], title: str) -> Table:
-    """Milliseconds of a step by part, for each stage."""
+    """Milliseconds per step by part, for each stage."""
     note = "Milliseconds of processor time a step on one thread, but for the rows that say otherwise."
     table, stages = Table(title, ("part", *costs), note), list(costs.values())
     table.add("steps", *(round(stage.get(STEPS, 0)) for stage in stages))
@@ -97,11 +97,11 @@ def parts_table(costs: Mapping[str, Mapping[str, float]], title: str) -> Table:
 
 
 def main() -> None:
-    """Trains, measures and prints."""
+    """Trains, measures and prints the table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.parts", description=__doc__)
     parser.add_argument("method", choices=list(RECIPES))
-    parser.add_argument("--data", type=Path, default=SCENE, help="capture; the bundled one unless given")
-    parser.add_argument("--downscale", type=float, default=DEMO_DOWNSCALE, help="shrinks photographs by this factor")
+    parser.add_argument("--data", type=Path, default=SCENE, help="capture; default: the bundled one")
+    parser.add_argument("--downscale", type=float, default=DEMO_DOWNSCALE, help="reduction factor of photographs")
     parser.add_argument("--iterations", type=int, default=3000, help="length of the run")
     arguments = parser.parse_args()
     numba.set_num_threads(1)

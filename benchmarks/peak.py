@@ -1,4 +1,4 @@
-"""The machine's multiply-add peak, measured, as the yardstick of the compositing kernel."""
+"""Measured multiply-add peak of the machine, the reference for the compositing kernel."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _multiply_add(seeds: np.ndarray, rounds: int) -> float:
 
 
 def peak_multiply_adds(threads: int) -> float:
-    """Single-precision multiply-adds per second that this machine reaches on `threads` threads."""
+    """Single-precision multiply-adds per second of this machine on `threads` threads."""
     numba.set_num_threads(threads)
     seeds = np.full(threads, 0.5, dtype=np.float32)
     seconds = median_seconds(lambda: _multiply_add(seeds, ROUNDS), repeats=5)

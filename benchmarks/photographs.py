@@ -1,10 +1,10 @@
-"""Memory of a training whose photographs do not fit, and what it loses by reading them again.
+"""Memory of a training whose photographs do not fit, and the cost of reading them again.
 
     python -m benchmarks.photographs PHOTOS --count 3000 --memory 3 --seconds 240
     python -m benchmarks.photographs PHOTOS --count 300 --memory 0.1 --downscale 2 --distortion 0.05 --seconds 240
 
-It repeats the photographs of a folder, by links in a temporary one, from places on a circle; what is learned from them
-means nothing. The first half of the time, in which memory fills, is left out of the shares.
+The photographs of a folder are repeated by links in a temporary folder, with camera positions on a circle, so the
+result is meaningless. The first half of the time, in which memory fills, is excluded from the shares.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from glassplat.training.stage import TrainState
 
 READ = 10
 POINTS = 5_000
-"""Few, so that a step is as short as it may be."""
+"""A small number, so that steps are as short as possible."""
 
 
 class Waited(PixelCache):
-    """A memory that adds up the seconds for which training has waited; other threads may wait."""
+    """Photograph memory that adds up the seconds for which the main thread, which trains, has waited."""
 
     seconds = 0.0
 
     def get(self, source: PixelSource) -> Tensor:
-        """The pixels, as ever."""
+        """Returns the pixels, as in the base class."""
         begun = time.perf_counter()
         found = super().get(source)
         if threading.current_thread() is threading.main_thread():
@@ -51,13 +51,13 @@ class Waited(PixelCache):
 
 
 def resident_gigabytes() -> float:
-    """Memory that the process holds now."""
+    """Resident memory of the process."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize() / 1e9
 
 
 def write_capture(photographs: list[Path], count: int, distortion: float, folder: Path) -> None:
-    """A capture of so many photographs, which look at the middle of a circle."""
+    """Writes a capture of `count` photographs, whose cameras on a circle face its centre."""
     (folder / "images").mkdir()
     frames = []
     for number, source in zip(range(count), itertools.cycle(photographs), strict=False):
@@ -74,7 +74,7 @@ def write_capture(photographs: list[Path], count: int, distortion: float, folder
 
 
 def read_seconds(views: tuple[View, ...], folder: Path) -> tuple[float, float]:
-    """Seconds of a core for a photograph: from its file, and from where undistorted and reduced ones are kept."""
+    """CPU seconds per photograph: reading its file, and reading the undistorted, reduced copy from the spool."""
     spool, begun = DiskCache(folder), time.thread_time()
     pixels = [(PixelSource(view.read_photo), view.read_photo()) for view in views]
     read = time.thread_time()
@@ -89,7 +89,7 @@ def read_seconds(views: tuple[View, ...], folder: Path) -> tuple[float, float]:
 
 
 def measure(folder: Path, memory: float, downscale: float, seconds: float) -> None:
-    """Trains for a while and prints a line ten times, and the shares at the end."""
+    """Trains for the given seconds, and prints ten progress lines and the final shares."""
     dataset = load_dataset(folder, downscale=downscale)
     camera = dataset.train[0].camera
     known = Waited(memory * 1e9, largest=camera.width * camera.height)
@@ -131,12 +131,12 @@ def measure(folder: Path, memory: float, downscale: float, seconds: float) -> No
 def main() -> None:
     """Measures one capture."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("photographs", type=Path, help="folder of photographs of one size, or of such folders")
+    parser.add_argument("photographs", type=Path, help="folder of photographs of one size, or of several such folders")
     parser.add_argument("--count", type=int, default=3000, help="photographs of the capture")
     parser.add_argument("--memory", type=float, default=3.0, help="gigabytes of photographs that may stay in memory")
     parser.add_argument("--downscale", type=float, default=1.0, help="factor by which photographs are reduced")
-    parser.add_argument("--distortion", type=float, default=0.0, help="of the lens, which is undone: k1")
-    parser.add_argument("--seconds", type=float, default=240.0, help="length of the training")
+    parser.add_argument("--distortion", type=float, default=0.0, help="distortion k1 of the lens, which is removed")
+    parser.add_argument("--seconds", type=float, default=240.0, help="duration of the training")
     arguments = parser.parse_args()
     found = sorted(path for path in arguments.photographs.rglob("*") if path.suffix.lower() in (".jpg", ".png"))
     with tempfile.TemporaryDirectory() as folder:

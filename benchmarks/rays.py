@@ -1,7 +1,7 @@
-"""`python -m benchmarks.rays [--embree FOLDER]`: rays through discs, beside Embree's traversal of the same; one thread.
+"""`python -m benchmarks.rays [--embree FOLDER]`: rays traced through discs, compared with Embree; one thread.
 
-Embree stands in `embreex`, of which the library alone is used: `pip install embreex==4.4.0.post1`, or unpack its wheel
-and name the folder. With it and a C++ compiler, `benchmarks/trace_embree.cpp` gives it the tracer's own hit maths.
+The Embree library comes from `embreex`: `pip install embreex==4.4.0.post1`, or unpack its wheel and pass the folder.
+`benchmarks/trace_embree.cpp`, which needs a C++ compiler, gives Embree the same intersection code as our tracer.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ SOURCE = Path(__file__).with_name("trace_embree.cpp")
 COUNTS = (10_000, 100_000, 300_000, 1_000_000)
 WIDTH, ROUNDS, SEED = 160, 5, 0
 CLEARANCE = 0.3
-"""Radius of the mirror ball that throws the rays."""
+"""Radius of the mirror ball that reflects the rays."""
 
 
 class Case(NamedTuple):
-    """Discs of an activated set, rays, and the hierarchy."""
+    """Activated discs, rays, and the BVH."""
 
     shapes: Shapes
     rays: Rays
@@ -44,11 +44,11 @@ class Case(NamedTuple):
 
 
 def surrounding_discs(count: int) -> RawGaussians:
-    """Discs all around, between 1 and 3 from the origin; smaller where they are many, so that rays meet as many."""
+    """Discs in all directions, 1 to 3 from the origin; the more, the smaller, so that hits per ray stay the same."""
     generator = torch.Generator().manual_seed(SEED)
     means = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
     means = means * (1 + 2 * torch.rand(count, 1, generator=generator))
-    # Along a Morton curve, as training keeps them.
+    # In Morton order, as in training.
     means = means[morton_codes(means).argsort()]
     size = math.log(0.035 * math.sqrt(10_000 / count))
     return RawGaussians(
@@ -61,7 +61,7 @@ def surrounding_discs(count: int) -> RawGaussians:
 
 
 def mirrored_rays(width: int) -> Rays:
-    """Rays of a camera after a mirror ball at the origin has reflected them, row by row of those that meet it."""
+    """Camera rays reflected by a mirror ball at the origin, row by row; rays that miss the ball are left out."""
     across = (torch.arange(width) + 0.5) / width * 2 - 1
     y, x = torch.meshgrid(across, across, indexing="ij")
     eye = torch.tensor([0.0, 0.0, -0.9])
@@ -76,7 +76,7 @@ def mirrored_rays(width: int) -> Rays:
 
 
 def own_works(case: Case) -> dict[str, Work]:
-    """Both passes without colours and with those of degree 3, and the hierarchy built."""
+    """Tracing without colours, both passes with SH of degree 3, and the construction of the BVH."""
     options: dict[str, Any] = {"flat": True, "near": 0.0}
     colored = cpu.trace(case.shapes, case.rays, case.bvh, degree=3, needs_gradients=True, **options)
     cotangents = [torch.ones_like(output) for output in colored[:3]]
@@ -91,7 +91,7 @@ def own_works(case: Case) -> dict[str, Work]:
 
 
 def operation_works(count: int, width: int, device: str) -> dict[str, Work]:
-    """The operations themselves on a device, both passes with colours of degree 3 and gradients to everything."""
+    """The operations on a device: BVH construction, and both passes with SH degree 3 and gradients to all inputs."""
     discs = RawGaussians(*(tensor.to(device).requires_grad_() for tensor in surrounding_discs(count)))
     rays = Rays(*(tensor.to(device).requires_grad_() for tensor in mirrored_rays(width)))
     shapes = Shapes(*(tensor.detach() for tensor in shapes_of(discs)))
@@ -106,10 +106,10 @@ def operation_works(count: int, width: int, device: str) -> dict[str, Work]:
 
 
 class Embree:
-    """Embree's library, and the callbacks that give it discs."""
+    """The Embree library, and the callbacks that define discs."""
 
     def __init__(self, folder: Path, build: Path) -> None:
-        # Symbols of the first two are those that the third one lacks.
+        # Loaded in order of dependency: the compiled library needs symbols of these two.
         for pattern in ("libtbb*.so*", "libembree4*.so*"):
             (found,) = (folder / "embreex.libs").glob(pattern)
             ctypes.CDLL(str(found), mode=ctypes.RTLD_GLOBAL)
@@ -122,30 +122,30 @@ class Embree:
         self.kept: list[Tensor] = []
 
     def scene(self, shapes: Shapes, *, robust: bool) -> ctypes.c_void_p:
-        """Builds its hierarchy over discs; the one before is no longer to be traced."""
+        """Builds an Embree BVH over discs; the previous scene must not be traced any more."""
         self.kept = [*shapes[:3], reach(shapes.opacities)]
         count, flags = ctypes.c_long(len(shapes.means)), ctypes.c_int(robust)
         return ctypes.c_void_p(self.library.new_scene(self.device, count, flags, *map(address, self.kept)))
 
     def trace(self, scene: ctypes.c_void_p, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
-        """Alphas, depths and hits."""
+        """Returns alphas, depths and numbers of hits."""
         count = len(rays.origins)
         found = torch.empty(count), torch.empty(count), torch.empty(count, dtype=torch.int32)
         self.library.trace(scene, ctypes.c_long(count), *map(address, rays), ctypes.c_float(0.0), *map(address, found))
         return found
 
     def build(self, shapes: Shapes) -> None:
-        """Builds a hierarchy and lets it go."""
+        """Builds a BVH and releases it."""
         self.library.release_scene(self.scene(shapes, robust=False))
 
 
 def address(tensor: Tensor) -> ctypes.c_void_p:
-    """An argument as C takes it."""
+    """Data pointer of a tensor for a call into C."""
     return ctypes.c_void_p(tensor.data_ptr())
 
 
 def case_of(count: int, width: int) -> Case:
-    """Discs, what the mirror ball throws among them, and the hierarchy."""
+    """Discs, rays reflected by the mirror ball, and the BVH."""
     with torch.no_grad():
         shapes = Shapes(*(tensor.contiguous() for tensor in shapes_of(surrounding_discs(count))))
     rays = Rays(*(tensor.contiguous() for tensor in mirrored_rays(width)))
@@ -153,7 +153,7 @@ def case_of(count: int, width: int) -> Case:
 
 
 def add_case(tables: tuple[Table, Table], case: Case, embree: Embree | None, rounds: int) -> str:
-    """Adds a row to both tables; says how far the two agree."""
+    """Adds a row to both tables; returns a description of how well the two tracers agree."""
     works, agreement = own_works(case), ""
     found = cpu.trace(case.shapes, case.rays, case.bvh, flat=True, degree=-1, needs_gradients=False, near=0.0)
     if embree is not None:
@@ -162,7 +162,7 @@ def add_case(tables: tuple[Table, Table], case: Case, embree: Embree | None, rou
         same = (theirs[2] == found[3]).float().mean()
         furthest = (theirs[0] - found[1]).abs().max()
         agreement = f"{same:.2%} of the rays have as many hits, alphas differ by at most {furthest:.1e}"
-        # Its hierarchy is built last: the discs that it reads are those of the last one.
+        # Embree's BVH is built last, because its callbacks read the discs of the latest scene.
         works |= {"embree": lambda: embree.trace(scene, case.rays), "embree build": lambda: embree.build(case.shapes)}
     seconds = interleaved_seconds(works, rounds, time.process_time)
     count, rays = f"{len(case.shapes.means):,}", len(found[1])
@@ -179,7 +179,7 @@ def add_case(tables: tuple[Table, Table], case: Case, embree: Embree | None, rou
 
 
 def new_tables(rays: int) -> tuple[Table, Table]:
-    """Rays a second, and milliseconds of building."""
+    """Empty tables of rays per second and of milliseconds of BVH construction."""
     columns = ("discs", "hits a ray", "k rays/s", "Embree, k rays/s", "ours : Embree")
     note = "Processor time. Without colours, but for the last two columns; ratios are medians of ratios round by round."
     title, built = f"{rays:,} rays of a mirror ball through discs, one thread", ("build", "Embree's build")
@@ -190,12 +190,12 @@ def new_tables(rays: int) -> tuple[Table, Table]:
 
 
 def main() -> None:
-    """Measures and prints."""
+    """Measures and prints both tables."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.rays", description=__doc__)
     parser.add_argument("--embree", type=Path, default=Path(sysconfig.get_path("purelib")), help="holds embreex.libs")
-    parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="discs")
-    parser.add_argument("--rounds", type=int, default=ROUNDS, help="of each piece of work, in turn")
-    parser.add_argument("--width", type=int, default=WIDTH, help="of the square image of the ball, in pixels")
+    parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="numbers of discs")
+    parser.add_argument("--rounds", type=int, default=ROUNDS, help="interleaved repetitions of each measurement")
+    parser.add_argument("--width", type=int, default=WIDTH, help="width of the square image of the ball, in pixels")
     arguments = parser.parse_args()
     numba.set_num_threads(1)
     torch.set_num_threads(1)

@@ -1,11 +1,10 @@
 #!/usr/bin/env bash
-# All runs behind docs/results.md, table by table. On two cores they take eight hours; finished ones are not repeated.
+# All runs of docs/results.md, table by table. They take eight hours on two cores; finished runs are skipped.
 #
 #     bash benchmarks/results.sh DATA OUTPUT [--task I --of N]
-#
-# DATA holds the captures: facade, screen, fox, showcase, corner, mirror and front. Scenes that it lacks are made there:
-# the rooms, and with Mitsuba 3 the glossy ones (docs/scenes.md). Once they are made, several of these commands may
-# share one OUTPUT (benchmarks/compare.py). Each table is in OUTPUT/NAME/tables.md.
+# DATA holds the captures: facade, screen, fox, showcase, corner, mirror and front. Missing scenes are generated there:
+# the rooms, and the glossy ones with Mitsuba 3 (docs/scenes.md). Afterwards, several of these commands may share one
+# OUTPUT (benchmarks/compare.py). Each table is written to OUTPUT/NAME/tables.md.
 set -euo pipefail
 data=$1 output=$2
 shift 2
@@ -17,7 +16,7 @@ compare() { # NAME SCENE... [--OPTION...]
 
 make_once() { # FOLDER TOOL [--OPTION...]
     [[ -d $data/$1 ]] && return
-    rm -rf "$data/$1.part" # what an interrupted command left
+    rm -rf "$data/$1.part" # left by an interrupted command
     python -m "tools.$2" --output "$data/$1.part" "${@:3}"
     mv "$data/$1.part" "$data/$1"
 }
@@ -37,7 +36,7 @@ compare screen "$data/screen"
 compare fox "$data/fox" --methods splat --options "--downscale 4"
 compare scenes "$data"/{showcase,corner,mirror,front}
 compare rooms "$data"/rooms/{245..254}
-# Seed 0 is among the parts.
+# Seed 0 is part of `parts`.
 compare chance "$data/showcase" --methods planar --iterations 3000 --seeds 1 2
 compare parts "$data"/{showcase,corner} --iterations 3000 \
     --variant depth="--weights.depth 0" --variant conflict="--weights.conflict 0" \

@@ -1,4 +1,4 @@
-"""A synthetic room whose splats have the sizes of a trained capture, with panes across part of the image."""
+"""A synthetic room with splats as large as those of a trained capture, and panes over part of the image."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def bench_camera(width: int, height: int) -> Camera:
 
 
 def room(count: int, seed: int = 0, sh_degree: int = 3) -> Gaussians:
-    """Half of the Gaussians before the camera, half behind it where panes mirror them.
+    """A room with half of the Gaussians in front of the camera, and half behind it, where panes reflect them.
 
-    Sizes shrink with the number, as they do in training: the image stays covered about equally often.
+    Sizes shrink with the number, as in training, so that the overdraw of the image stays about constant.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -48,7 +48,7 @@ def room(count: int, seed: int = 0, sh_degree: int = 3) -> Gaussians:
 
 
 def panes(count: int, share: float, camera: Camera) -> Planes:
-    """Upright panes side by side that together cover a share of the image's width, over its full height."""
+    """Upright panes next to each other that cover a share of the image width, over its full height."""
     left, right = -camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx
     width = share * (right - left) / count * PANE_DEPTH
     centers = torch.zeros(count, 3)
@@ -85,7 +85,7 @@ def glass_on(planes: Planes, per_pane: int = 1000, seed: int = 1) -> Gaussians:
 
 
 def bench_scene(count: int, num_panes: int, share: float, camera: Camera) -> Scene:
-    """The room behind and before `num_panes` panes."""
+    """The room on both sides of `num_panes` panes."""
     planes = panes(num_panes, share, camera) if num_panes else Planes.empty()
     if not num_panes:
         return Scene(room(count), extent=3.0)
@@ -93,13 +93,13 @@ def bench_scene(count: int, num_panes: int, share: float, camera: Camera) -> Sce
 
 
 def glossy_scene(count: int) -> Scene:
-    """The same room, all of it glossy, in a random environment."""
+    """The same room with glossy Gaussians only, in a random environment."""
     primary = room(count)
     environment = Environment.random(128, generator=torch.Generator().manual_seed(2))
     return Scene(replace(primary, channels={"logit_strength": torch.zeros(count)}), extent=3.0, environment=environment)
 
 
 def mirroring_scene(count: int) -> Scene:
-    """The same room, every Gaussian of which mirrors as many others, those of another room."""
+    """The same room with glossy Gaussians only, which reflect a second room of equally many Gaussians."""
     primary, others = room(count), replace(room(count, seed=3), channels={})
     return Scene(replace(primary, channels={"logit_strength": torch.zeros(count)}), extent=3.0, surroundings=others)

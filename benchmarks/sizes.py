@@ -1,8 +1,8 @@
-"""Time and memory of what grows with the number of Gaussians: python -m benchmarks.sizes [--counts N ...].
+"""Time and memory of operations that grow with the number of Gaussians: python -m benchmarks.sizes [--counts N ...].
 
-A room behind a pane that covers half of an image of 960x540, SH degree 3, float32. Each size has a process of its own,
-so that the memory named is its own. Frames and steps are medians of five; everything else happens once, after the same
-with few Gaussians.
+The scene is a room behind a pane that covers half of an image of 960x540, SH degree 3, float32. Each size runs in its
+own process, so that peak memory is measured separately. Frames and steps are medians of five; all other work runs once,
+after a warm-up with few Gaussians.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ Works = dict[str, Callable[[], Any]]
 
 
 def works_of(count: int, device: torch.device, folder: Path) -> tuple[Works, Works]:
-    """Work that is repeated, and work that is done once, in the order of the table."""
+    """Repeated and single pieces of work, in the order of the table."""
     camera = bench_camera(WIDTH, HEIGHT).to(device)
     scene = bench_scene(count, 1, 0.5, bench_camera(WIDTH, HEIGHT)).to(device)
     view, state = view_of(camera), TrainState(scene, seed=0)
@@ -82,7 +82,7 @@ def works_of(count: int, device: torch.device, folder: Path) -> tuple[Works, Wor
 
 
 def measure(count: int, device: torch.device) -> None:
-    """Prints a row for each piece of work: its name, milliseconds, and the most memory so far in MB."""
+    """Prints a row for each piece of work: its name, milliseconds, and the peak memory so far in MB."""
 
     def finished(work: Callable[[], Any]) -> None:
         with torch.no_grad() if work in once.values() else torch.enable_grad():
@@ -114,7 +114,7 @@ def measure(count: int, device: torch.device) -> None:
 
 
 def peak_megabytes(device: torch.device) -> float:
-    """The most memory so far: of the process, or what PyTorch held on the GPU since the last question."""
+    """Peak memory: of the process so far, or of PyTorch on the GPU since the last reset."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 1e6
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
@@ -123,7 +123,7 @@ def peak_megabytes(device: torch.device) -> float:
 def main() -> None:
     """Measures every size and prints the table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.sizes", description=__doc__)
-    parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="Gaussians of the scenes")
+    parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="numbers of Gaussians")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()

@@ -1,8 +1,8 @@
 """Seconds to the first line of a command: python -m benchmarks.start [--run RUN].
 
-That is the clock's time from the start of the process to its first line, when it has refused or begun: `train` and
-`info` say it when they have read what the capture's folder holds, `demo` when it has begun to train, what renders
-when it has read the run's records. All of that comes before PyTorch, of whose import a terminal shows a line.
+Wall-clock time from the start of the process to its first line, which reports an error or the start of the work.
+`train` and `info` print it after reading the folder of the capture, `demo` at the start of training, rendering commands
+after reading the records of the run. All this happens before PyTorch is imported.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from benchmarks.table import Table
 from glassplat.cli.train import SCENE
 
 ROUNDS = 3
-"""Of which the median is told, after one that only warms up."""
+"""Number of timed rounds, whose median is shown; one warm-up round precedes them."""
 OUTPUT = "{output}"
-"""Stands in a command line for a folder that is not there yet."""
+"""Placeholder in a command line for a folder that does not exist yet."""
 
 COMMANDS = (
     ("--help",),
@@ -48,14 +48,14 @@ OF_RUNS = (
 
 
 class FirstLine(NamedTuple):
-    """First line of a process, and the seconds after its start."""
+    """First line of a process, and the seconds since its start."""
 
     text: str
     seconds: float
 
 
 def first_line(arguments: Sequence[str]) -> FirstLine:
-    """Runs `python ARGUMENTS` until it says something, and ends it."""
+    """Runs `python ARGUMENTS` until it prints a line, and terminates it."""
     begin = time.perf_counter()
     with subprocess.Popen(
         [sys.executable, "-u", *arguments],
@@ -68,13 +68,13 @@ def first_line(arguments: Sequence[str]) -> FirstLine:
         text = process.stdout.readline()
         seconds = time.perf_counter() - begin
         if process.poll() is None:
-            process.terminate()  # Not killed: `demo` has another command to end.
+            process.terminate()  # Not killed, because `demo` has to terminate its child.
     return FirstLine(text.strip(), seconds)
 
 
 def start_times(commands: Sequence[Sequence[str]], rounds: int = ROUNDS) -> Table:
-    """The median for each command line of `glassplat`."""
-    table = Table("How soon a command says its first word", ("glassplat ...", "seconds", "says"))
+    """Median seconds for each command line of `glassplat`."""
+    table = Table("Time to the first line of a command", ("glassplat ...", "seconds", "first line"))
     for command in commands:
         heard = []
         for _ in range(1 + rounds):
@@ -89,7 +89,7 @@ def start_times(commands: Sequence[Sequence[str]], rounds: int = ROUNDS) -> Tabl
 def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--run", type=Path, help="a planar run, for the commands that take one")
+    parser.add_argument("--run", type=Path, help="a planar run, for commands that take a run")
     run = parser.parse_args().run
     of_runs = [] if run is None else [[part.replace("{run}", str(run)) for part in command] for command in OF_RUNS]
     print(start_times([*COMMANDS, *of_runs]).markdown())

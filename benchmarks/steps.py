@@ -1,6 +1,6 @@
-"""Whole steps of training: python -m benchmarks.steps [--data CAPTURE] [--run RUN].
+"""Complete training steps: python -m benchmarks.steps [--data CAPTURE] [--run RUN].
 
-That is everything between two photographs: the frame, its losses and gradients, Adam, and what densification collects.
+A step is the frame, its losses and gradients, Adam, and the statistics for densification.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from glassplat.training.messages import Message, StepDone
 from glassplat.training.stage import TrainState, stage_starts
 
 ITERATIONS = 7000
-"""Length of the run of which the first steps are timed."""
+"""Length of the run whose first steps are timed."""
 
 Begin = Callable[[], tuple[Any, Dataset, TrainState, int]]
-"""Gives recipe, capture, state and length of a run."""
+"""Returns recipe, capture, state and length of a run."""
 
 
 def first_steps(capture: Path) -> Begin:
-    """A run of `splat` at its beginning, with a Gaussian for each point of a capture."""
+    """The start of a `splat` run, with one Gaussian per point of a capture."""
 
     def begin() -> tuple[Any, Dataset, TrainState, int]:
         dataset = load_dataset(capture, background=photo_background(SplatRecipe()))
@@ -45,7 +45,7 @@ def first_steps(capture: Path) -> Begin:
 
 
 def last_stage(run: Path) -> Begin:
-    """The last stage of a finished run, with the Gaussians that it ended with, as if it had just begun."""
+    """The start of the last stage of a finished run, with its final Gaussians."""
 
     def begin() -> tuple[Any, Dataset, TrainState, int]:
         stored = open_run(run, "cpu")
@@ -57,7 +57,7 @@ def last_stage(run: Path) -> Begin:
 
 
 def step_costs(begins: tuple[Begin, ...] = (first_steps(SCENE),), rounds: int = 40) -> Table:
-    """Milliseconds of a step for 1, 2, 4, ... threads."""
+    """Milliseconds per step for 1, 2, 4, ... threads."""
     table = Table(
         "A step of training",
         ("run", "method", "pixels", "Gaussians", "threads", "ms", "CPU ms"),
@@ -66,7 +66,7 @@ def step_costs(begins: tuple[Begin, ...] = (first_steps(SCENE),), rounds: int = 
     for begin in begins:
         recipe, dataset, state, iterations = begin()
         for view in dataset.train:
-            _ = view.photo  # Reads it, as training does in its first pass.
+            _ = view.photo  # Loads the photograph, as the first pass of training does.
         camera, count = dataset.train[0].camera, len(state.scene.primary)
         messages = train(recipe.stages(state.seed), dataset, state, iterations)
         for threads, times in step_clocks(messages, rounds).items():
@@ -77,7 +77,7 @@ def step_costs(begins: tuple[Begin, ...] = (first_steps(SCENE),), rounds: int = 
 
 
 def step_clocks(messages: Iterator[Message], rounds: int) -> dict[int, list[tuple[float, float]]]:
-    """Milliseconds on the clock and of processor time of steps of a run, by the number of threads."""
+    """Wall-clock and CPU milliseconds of the steps of a run, by the number of threads."""
     times: dict[int, list[tuple[float, float]]] = {n: [] for n in doublings(numba.config.NUMBA_NUM_THREADS)}
     for _ in range(rounds + 1):
         for threads, known in times.items():
@@ -87,10 +87,10 @@ def step_clocks(messages: Iterator[Message], rounds: int) -> dict[int, list[tupl
 
 
 def main() -> None:
-    """Measures and prints."""
+    """Measures and prints the table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.steps", description=__doc__)
     parser.add_argument(
-        "--data", type=Path, action="append", default=[], help="capture whose points `splat` begins with"
+        "--data", type=Path, action="append", default=[], help="capture whose points `splat` starts with"
     )
     parser.add_argument("--run", type=Path, action="append", default=[], help="finished run whose last stage is timed")
     parser.add_argument("--rounds", type=int, default=40, help="steps for each number of threads")

@@ -1,4 +1,4 @@
-"""Tables as markdown."""
+"""Tables in Markdown."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Table:
-    """A titled table that is filled row by row."""
+    """A table with a title, filled row by row."""
 
     title: str
     columns: tuple[str, ...]
@@ -22,7 +22,7 @@ class Table:
         self.rows.append(tuple(shown(cell) for cell in cells))
 
     def markdown(self) -> str:
-        """The table as markdown."""
+        """The table in Markdown."""
         lines = [f"### {self.title}", ""]
         if self.note:
             lines += [self.note, ""]
@@ -31,7 +31,7 @@ class Table:
 
 
 def shown(cell: object) -> str:
-    """A cell's text."""
+    """Text of a cell."""
     return f"{cell:.3g}" if isinstance(cell, float) else str(cell)
 
 

@@ -1,4 +1,4 @@
-"""Timing that holds on a noisy machine: interleaved repeats, medians and paired ratios."""
+"""Robust timing on a noisy machine: interleaved repetitions, medians and paired ratios."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def median_seconds(work: Work, repeats: int = 7) -> float:
 
 
 def paired_ratio(seconds: Mapping[str, list[float]], over: str, under: str) -> float:
-    """Median of the ratios round by round, which slow drift of the machine does not move."""
+    """Median of the ratios round by round, which is insensitive to slow drift of the machine."""
     return statistics.median(a / b for a, b in zip(seconds[over], seconds[under], strict=True))
 
 
 def clocks_of(work: Work) -> tuple[float, float]:
-    """Milliseconds on the clock and of processor time, all threads together."""
+    """Milliseconds of wall-clock time, and of CPU time of all threads together."""
     start, processor = time.perf_counter(), time.process_time()
     work()
     return 1e3 * (time.perf_counter() - start), 1e3 * (time.process_time() - processor)

@@ -1,8 +1,8 @@
-// Rays through discs with Embree's hierarchy and traversal: what `python -m benchmarks.rays` holds the tracer against.
+// Rays through discs with the BVH and traversal of Embree, with which `python -m benchmarks.rays` compares the tracer.
 //
-// Each disc is a primitive of one user geometry, whose callback does what glassplat/kernels/trace does with a Gaussian:
-// the same hit maths, the same nearest 16 hits, and the next search beyond the last of them. Embree's library brings no
-// headers, so what is called of its C interface (version 4) is declared here. One thread.
+// Each disc is a primitive of one user geometry, whose callback treats it like glassplat/kernels/trace: the same hit
+// maths, the same nearest 16 hits, and the next search starting after the last of them. The library ships without
+// headers, so the parts of its C interface (version 4) in use are declared here. One thread.
 #include <cmath>
 #include <cstdint>
 #include <cstring>

@@ -1,4 +1,4 @@
-"""A frame of a trained `deferred` run against `splat` with the same Gaussians: python -m benchmarks.trained RUN."""
+"""Frames of a trained `deferred` run compared with `splat` on the same Gaussians: python -m benchmarks.trained RUN."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from glassplat.render.splat import Splat
 
 
 def frame_costs(stored: StoredRun, renderer: Deferred, rounds: int) -> Table:
-    """Frames of all test views in turn, without depths, for 1, 2, 4, ... threads."""
+    """Times frames of all test views in turn, without depths, for 1, 2, 4, ... threads."""
     splat = Splat(renderer.background, depth=False)
     methods = (splat, replace(renderer, depth=False))
     pairs = [[frame_work(stored.scene, method, view.camera) for method in methods] for view in stored.dataset.test]
@@ -40,10 +40,10 @@ def frame_costs(stored: StoredRun, renderer: Deferred, rounds: int) -> Table:
 
 
 def main() -> None:
-    """Measures and prints."""
+    """Measures and prints the table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.trained", description=__doc__)
     parser.add_argument("run", type=Path, help="directory of a `deferred` run")
-    parser.add_argument("--rounds", type=int, default=9, help="how often each test view is rendered")
+    parser.add_argument("--rounds", type=int, default=9, help="number of times that each test view is rendered")
     arguments = parser.parse_args()
     stored = open_run(arguments.run, "cpu")
     if not isinstance(stored.renderer, Deferred):

@@ -1,6 +1,6 @@
-"""`python -m benchmarks.twin`: the kernels that blend, compared with C++ loops compiled here and now; one thread.
+"""`python -m benchmarks.twin`: the blending kernels compared with C++ loops that are compiled on the spot; one thread.
 
-The anchor for what Numba makes of its vectors: same algorithm, same tensors, in turn, in one run.
+A reference for the vector code that Numba generates: same algorithm, same tensors, interleaved in one run.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ FLAGS = (
     *("-O3", "-march=native", "-std=c++17", "-shared", "-fPIC", "-Wno-psabi", "-ffp-contract=fast"),
     *("-fno-math-errno", "-fno-trapping-math", "-fassociative-math", "-fno-signed-zeros", "-freciprocal-math"),
 )
-"""As free with floating-point arithmetic as kernels are, and no freer."""
+"""The same relaxations of floating-point arithmetic as in the kernels."""
 CASES = ((100_000, 480, 352), (100_000, 960, 720), (1_000_000, 480, 352))
 CHANNELS = 4
 ROUNDS = 15
@@ -47,14 +47,14 @@ Array = NDArray[Any]
 
 
 class Blending(NamedTuple):
-    """Flat inputs of both passes, with the results of the first that the second needs.
+    """Flat inputs of both passes, and the results of the forward pass that the backward pass needs.
 
     Attributes:
         splats: means [S, 2], conics [S, 3], opacities [S] and channels [S, 4].
-        lists: splats of the pairs, offsets of the tiles and offsets of the splats.
-        saved: packed splats, what pairs reach, and states of tiles.
-        images: image and alpha.
-        rows: sums of the pairs.
+        lists: splat indices of the pairs, offsets of the tiles and offsets of the splats.
+        saved: packed splats, blocks reached by each pair, and states of tiles.
+        images: blended image and alpha.
+        rows: gradient sums of the pairs.
     """
 
     splats: tuple[Array, ...]
@@ -65,7 +65,7 @@ class Blending(NamedTuple):
 
 
 def compiled_library(source: Path, folder: Path) -> ctypes.CDLL | None:
-    """A file of C++, compiled into a folder; None where there is no compiler."""
+    """Compiles a C++ file into a folder and loads it; None without a compiler."""
     compiler = next(filter(None, map(shutil.which, (os.environ.get("CXX", ""), *COMPILERS))), None)
     if compiler is None:
         return None
@@ -75,7 +75,7 @@ def compiled_library(source: Path, folder: Path) -> ctypes.CDLL | None:
 
 
 def room_splats(count: int, width: int, height: int) -> tuple[Splats, Array, TileBins]:
-    """The splats of the bench's room, their colours and depths, and their tiles."""
+    """Splats of the benchmark room, their colours and depths, and their tile bins."""
     camera = bench_camera(width, height)
     with torch.no_grad():
         projected = project_gaussians(room(count), camera, near=0.03)
@@ -85,7 +85,7 @@ def room_splats(count: int, width: int, height: int) -> tuple[Splats, Array, Til
 
 
 def blending(splats: Splats, channels: Array, bins: TileBins) -> Blending:
-    """Room for the results of one side, kernels or twin."""
+    """Inputs, and buffers for the results of one side, kernels or twin."""
     fields = [tensor.numpy() for tensor in splats[:3]]
     count, pairs, tiles = len(channels), len(bins.pair_splats), len(bins.active)
     floats = (count * tile.LANES, tiles * tile.STATE, bins.height * bins.width * CHANNELS, bins.height * bins.width)
@@ -100,7 +100,7 @@ def blending(splats: Splats, channels: Array, bins: TileBins) -> Blending:
 
 
 def kernel_works(given: Blending, bins: TileBins, weights: tuple[Array, Array]) -> dict[str, Work]:
-    """Both passes as the package makes them."""
+    """Both passes by the kernels of the package."""
     forward, backward = composite_forward(np.float32), composite_backward(np.float32, True)
     active, count = bins.active.numpy(), len(given.splats[3])
     pair_splats, tile_offsets, splat_offsets = given.lists
@@ -118,7 +118,7 @@ def kernel_works(given: Blending, bins: TileBins, weights: tuple[Array, Array]) 
 
 
 def twin_works(library: ctypes.CDLL, given: Blending, bins: TileBins, weights: tuple[Array, Array]) -> dict[str, Work]:
-    """Both passes as the C++ compiler makes them."""
+    """Both passes by the C++ twin."""
     pair_splats, tile_offsets, splat_offsets = given.lists
     size = ctypes.c_int(bins.width), ctypes.c_int(bins.height)
     count = ctypes.c_long(len(given.splats[3]))
@@ -131,12 +131,12 @@ def twin_works(library: ctypes.CDLL, given: Blending, bins: TileBins, weights: t
 
 
 def _passed(value: Any) -> Any:
-    """An argument as C takes it."""
+    """An argument converted for a call into C."""
     return value.ctypes.data_as(ctypes.c_void_p) if isinstance(value, np.ndarray) else value
 
 
 def add_case(table: Table, library: ctypes.CDLL, case: tuple[int, int, int], rounds: int) -> float:
-    """Adds the rows of one case; returns the largest difference of the two images."""
+    """Adds the rows of one case; returns the largest difference between the two images."""
     splats, channels, bins = room_splats(*case)
     generator = np.random.default_rng(0)
     image_weights = generator.standard_normal(bins.width * bins.height * CHANNELS, np.float32)
@@ -152,9 +152,9 @@ def add_case(table: Table, library: ctypes.CDLL, case: tuple[int, int, int], rou
 
 
 def main() -> None:
-    """Measures and prints; says so where there is no compiler."""
+    """Measures and prints the table; exits with a message without a compiler."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.twin", description=__doc__)
-    parser.add_argument("--rounds", type=int, default=ROUNDS, help="of each pass, kernel and twin in turn")
+    parser.add_argument("--rounds", type=int, default=ROUNDS, help="interleaved repetitions of each pass")
     arguments = parser.parse_args()
     table = Table(
         "Blending by the kernels and by C++", ("case", "pass", "kernel, ms", "C++, ms", "kernel : C++"),

@@ -1,4 +1,4 @@
-"""Train a place with a window pane, and follow it step by step.
+"""Train a scene with a window pane, and follow the training step by step.
 
 python examples/1_train.py --data CAPTURE --output runs/place --iterations 7000
 """
@@ -18,11 +18,11 @@ def main(data: Path = DEMO, output: Path = Path("runs/place"), iterations: int =
         f"{len(dataset.train)} photographs to learn from, {len(dataset.test)} to test with, panes {dataset.pane_labels}"
     )
 
-    # A recipe is a dataclass: what it trains with are its fields. "planar" would take them as they are by default.
+    # A recipe is a dataclass whose fields are the training options. Pass "planar" instead for the defaults.
     recipe = glassplat.PlanarRecipe(sh_degree=2, fresnel="pane")
     training = glassplat.Training(dataset, recipe, iterations=iterations, output=output)
 
-    # The loop is yours: between two messages, `training.model` is what was learned so far.
+    # You own the loop: between two messages, `training.model` is the current model.
     for message in training:
         match message:
             case glassplat.StageEntered(step=step, stage=stage):

@@ -1,4 +1,4 @@
-"""Render what is behind the glass and what it reflects, from a photograph's camera and along a path.
+"""Render transmission and reflection as separate layers, from the camera of a photograph and along a path.
 
 python examples/2_layers.py runs/place --output pictures
 """
@@ -21,17 +21,17 @@ def main(run: tyro.conf.Positional[Path], output: Path = Path("pictures"), frame
     model = glassplat.load(run)  # Or any .ply, .spz or .splat.
     print(model, "renders", ", ".join(model.layers))
 
-    # `image` is for looking: [H, W, 3] in [0, 1].
+    # `image` returns an image for display: [H, W, 3] in [0, 1].
     name = next(iter(model.cameras))
     for layer in model.layers:
         save(output / f"{layer}.png", model.image(name, layer))
 
-    # `render` is for computing: a frame of tensors. Transmission, reflection and strength make the image.
+    # `render` returns a frame of tensors for computations. Transmission, reflection and strength make up the image.
     with torch.no_grad():
         frame = model.render(name, layers=["transmission", "reflection", "strength", "depth"])
     print({layer: tuple(tensor.shape) for layer, tensor in frame.layers.items()})
 
-    # A camera is where one wants it.
+    # Cameras can be placed anywhere, here on an orbit.
     for index, camera in enumerate(model.orbit(frames)):
         save(output / f"orbit_{index:03d}.png", model.image(camera.resize(480, 320)))
 

@@ -1,4 +1,4 @@
-"""Edit the panes of a scene: take the glass away, make it a mirror, move it, add another one; save and publish it.
+"""Edit the panes of a scene: remove the glass, make it a mirror, move it, add another pane; save and publish it.
 
 python examples/3_panes.py runs/place --output edited
 """
@@ -14,7 +14,7 @@ def main(run: tyro.conf.Positional[Path], output: Path = Path("edited")) -> None
     model = glassplat.load(run)
     pane = model.panes[0]
 
-    # Models are values: what edits one returns another, and shares with it what it did not edit.
+    # Models are immutable: an edit returns a new model, which shares all unchanged tensors with the old one.
     edits = {
         "without_glass": model.without_glass(),
         "mirror": model.with_mirrors(pane),
@@ -27,14 +27,15 @@ def main(run: tyro.conf.Positional[Path], output: Path = Path("edited")) -> None
             edit, f"changes the image by {float((edited.image(name) - model.image(name)).abs().mean()):.4f} on average"
         )
 
-    # A mirror where there was none, also in a scene of another program: its middle, its normal, half its sides.
+    # Add a mirror by its centre, its normal and its half sizes; this also works in scenes of other programs.
     planes = model.scene.planes
     size = 0.2 * model.scene.extent
     beside = planes.centers[0] + 0.1 * model.scene.extent * planes.normals[0]
     mirrored = model.with_pane(beside.tolist(), planes.normals[0].tolist(), (size, size), base_reflectance=1)
     print(mirrored)
 
-    # For other programs, with the panes next to it; as a page for any browser; and as it is, to go on with.
+    # Save for other programs, with the panes in a separate file; as a page for any browser; and as a run to continue
+    # with.
     for file in ("mirror.ply", "page.html", "run"):
         print("->", edits["mirror"].save(output / file))
 

@@ -1,4 +1,4 @@
-"""Put the renderer into a loop of your own: find how strongly a pane reflects, and where a camera stood, by descent.
+"""Use the renderer in your own optimisation loop: recover the reflectance of a pane and the position of a camera.
 
 python examples/4_gradients.py runs/place --data CAPTURE
 """
@@ -19,9 +19,10 @@ def main(run: tyro.conf.Positional[Path], data: Path = DEMO, downscale: float = 
     view = glassplat.load_dataset(data, downscale=downscale).train[0]
     photo = view.photo.to(model.scene.primary.means) / 255
 
-    # Every tensor of the scene has a name; those that replace one take its gradient. R0 begins too high, ...
+    # Every tensor of the scene has a name, and a tensor that replaces one receives its gradient. R0 starts too high,
+    # ...
     logits = torch.full_like(model.scene.planes.logit_reflectances, 0.0).requires_grad_()
-    # ... and the camera a little aside of where the photograph was taken.
+    # ... and the camera is shifted slightly from the position of the photograph.
     shift = torch.tensor([0.01, 0.0, 0.0]).mul(model.scene.extent).to(photo).requires_grad_()
     pose = view.camera.cam_from_world.to(photo)
 

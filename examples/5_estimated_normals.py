@@ -1,9 +1,9 @@
-"""Estimate normals from each photograph by itself, which `traced` and `deferred` learn shapes from.
+"""Estimate normals from each single photograph, from which `traced` and `deferred` learn shapes.
 
 python examples/5_estimated_normals.py --data CAPTURE
 
-The network is Metric3D (https://github.com/YvanYin/Metric3D, BSD-2), which torch.hub fetches with its weights; it needs
-`pip install mmengine timm`. Any other of the same interface will do: a repository or a folder with a `hubconf.py`.
+The network is Metric3D (https://github.com/YvanYin/Metric3D, BSD-2), which torch.hub downloads with its weights; it
+needs `pip install mmengine timm`. Any repository or folder with a `hubconf.py` of the same interface works too.
 """
 
 from pathlib import Path
@@ -18,7 +18,7 @@ from torch.nn.functional import interpolate, normalize, pad
 import glassplat
 
 MEAN, STD = torch.tensor([123.675, 116.28, 103.53]), torch.tensor([58.395, 57.12, 57.375])
-"""Of the photographs that the network has learned from."""
+"""Statistics of the training images of the network, per channel."""
 
 
 def main(
@@ -53,15 +53,15 @@ def estimated(network: torch.nn.Module, photo: Tensor, height: int, width: int) 
     scale = min(height / rows, width / columns)
     picture = (photo.float() - MEAN.to(photo.device)) / STD.to(photo.device)
     picture = interpolate(picture.permute(2, 0, 1)[None], scale_factor=scale, mode="bilinear", antialias=True)
-    # The network wants pictures of one size: what is missing is filled with the mean colour.
+    # The network expects images of one size: the remainder is filled with the mean colour.
     above, before = (height - picture.shape[2]) // 2, (width - picture.shape[3]) // 2
     filled = pad(picture, (before, width - picture.shape[3] - before, above, height - picture.shape[2] - above))
     found = network.inference({"input": filled})[2]["prediction_normal"][:, :3]
-    # Some networks give pictures back that are smaller than those they were given.
+    # Some networks return images smaller than their input.
     found = interpolate(found, (height, width), mode="bilinear")
     shown = found[:, :, above : above + picture.shape[2], before : before + picture.shape[3]]
     normals = normalize(interpolate(shown, (rows, columns), mode="bilinear")[0].permute(1, 2, 0), dim=-1)
-    # What is seen faces the camera, which tells z forward and y down from z backward and y up.
+    # Visible surfaces face the camera, which distinguishes z forward and y down from z backward and y up.
     return normals if normals[..., 2].mean() > 0 else normals * normals.new_tensor([1.0, -1.0, -1.0])
 
 
