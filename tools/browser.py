@@ -1,4 +1,4 @@
-"""A headless Chromium without a GPU, used as a person uses it: clicks, keys, and pictures of what it shows.
+"""A headless Chromium without a GPU, controlled like a user would: clicks, keys and screenshots.
 
 Playwright drives it; Chromium itself is a Debian package (`make browser`).
 """
@@ -19,25 +19,25 @@ import numpy as np
 from PIL import Image
 
 STEPS = 5
-"""Moves of the mouse from one place of a drag to the next."""
+"""Mouse moves between two points of a drag."""
 OPTIONS = (
     "--disable-quic", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
     "--proxy-server=127.0.0.1:9",
 )  # fmt: skip
-"""The last one sends whatever a page would load from anywhere into the void."""
+"""Command-line options of Chromium; the last one blocks all network access of pages."""
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 PATIENCE = 60.0
-"""Seconds that anything on the page may take, on a machine that does much else."""
+"""Timeout in seconds of any action on the page, sufficient on a busy machine."""
 LONGEST = 1000 * PATIENCE
-"""The same in Playwright's milliseconds."""
+"""The same in milliseconds, for Playwright."""
 KEYS = {"Right": "ArrowRight", "Left": "ArrowLeft", "Up": "ArrowUp", "Down": "ArrowDown"}
 
 
 def wait_until(holds: Callable[[], Any], what: str) -> Any:
-    """The first value that is true.
+    """Polls `holds`, and returns its first true value.
 
     Raises:
-        AssertionError: it takes too long.
+        AssertionError: the timeout has passed.
     """
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
@@ -49,7 +49,7 @@ def wait_until(holds: Callable[[], Any], what: str) -> Any:
 
 @contextmanager
 def running_chromium() -> Iterator[Any]:
-    """Chromium and Playwright, which a thread can have only once: begun for the first who asks, ended with the last."""
+    """Chromium and Playwright, one pair per thread: started for the first user, stopped after the last."""
     from playwright.sync_api import sync_playwright
 
     if not _running:
@@ -71,16 +71,16 @@ def running_chromium() -> Iterator[Any]:
 
 
 _running: list[tuple[Any, Any]] = []
-"""The same two, for each who uses them."""
+"""The running pair, once for each of its users."""
 
 
 class Browser:
-    """One tab, apart from all others; use it in a `with` statement."""
+    """One isolated tab; use it in a `with` statement."""
 
     def __init__(
         self, page: Path | str = "about:blank", width: int = 640, height: int = 480, *, query: str = "#still"
     ) -> None:
-        """Opens a page from its file, with what stands behind its address, or from its address."""
+        """Opens a page from a file, with `query` appended to its address, or from an address."""
         self._requests: list[str] = []
         self._complaints: list[str] = []
         with ExitStack() as ending:
@@ -91,7 +91,7 @@ class Browser:
             self._tab.on("request", lambda request: self._requests.append(request.url))
             self._tab.on("pageerror", lambda error: self._complaints.append(str(error)))
             self._tab.on("console", lambda said: said.type == "error" and self._complaints.append(said.text))
-            self._tab.on("dialog", lambda asked: asked.accept())  # As when a page asks whether to leave it.
+            self._tab.on("dialog", lambda asked: asked.accept())  # Such as the question whether to leave the page.
             self.open(page if isinstance(page, str) else page.resolve().as_uri() + query)
             self._ending = ending.pop_all()
 
@@ -102,19 +102,19 @@ class Browser:
         self._ending.close()
 
     def open(self, address: str) -> None:
-        """Goes to an address, and waits until it is loaded."""
+        """Opens an address, and waits until the page is loaded."""
         if self._tab.goto(address) is None and address != "about:blank":
-            self._tab.reload()  # The same page at another place in it is not loaded again by itself.
+            self._tab.reload()  # A change of the fragment alone does not reload the page.
         if address.startswith("http") and "?" in address:
-            self._tab.wait_for_url(lambda at: "?" not in at)  # A link with a key in it leads on to the page.
+            self._tab.wait_for_url(lambda at: "?" not in at)  # A link with a key redirects to the page.
 
     def prefer(self, **media: Any) -> None:
-        """Loads the page again for a person with preferences, such as `reduced_motion="reduce"`."""
+        """Reloads the page with media preferences, such as `reduced_motion="reduce"`."""
         self._tab.emulate_media(**media)
         self._tab.reload()
 
     def evaluate(self, expression: str) -> Any:
-        """The value of an expression, awaited; raises RuntimeError with what the page threw."""
+        """Evaluates and awaits an expression; raises RuntimeError with the exception of the page."""
         from playwright.sync_api import Error
 
         try:
@@ -123,7 +123,7 @@ class Browser:
             raise RuntimeError(error.message) from error
 
     def run(self, script: str, *arguments: Any) -> Any:
-        """The value of a function body in the page."""
+        """Runs a function body in the page, and returns its value."""
         return self.evaluate(f"(function () {{ {script} }}).apply(null, {json.dumps(arguments)})")
 
     def wait(self, expression: str, what: str) -> Any:
@@ -131,15 +131,15 @@ class Browser:
         return wait_until(lambda: self.evaluate(expression), what)
 
     def screenshot(self) -> bytes:
-        """Picture of the window, as PNG."""
+        """Screenshot of the window, as PNG."""
         return self._tab.screenshot()
 
     def picture(self) -> np.ndarray:
-        """[H, W, 3] uint8, what the window shows."""
+        """Screenshot of the window, [H, W, 3] uint8."""
         return np.array(Image.open(io.BytesIO(self.screenshot())).convert("RGB"))
 
     def keys(self, *names: str) -> None:
-        """Presses keys together, by their letter or name."""
+        """Presses keys together, each given by its letter or name."""
         self._tab.keyboard.press("+".join(KEYS.get(name, name) for name in names))
 
     def press(self, selector: str) -> None:
@@ -147,11 +147,11 @@ class Browser:
         self._tab.locator(selector).first.click()
 
     def click(self, x: float, y: float, *, times: int = 1) -> None:
-        """Clicks at a place of the window."""
+        """Clicks at a position in the window."""
         self._tab.mouse.click(x, y, click_count=times)
 
     def drag(self, path: Sequence[tuple[float, float]], *, pause: float = 0) -> None:
-        """Presses at the first place, moves through the others with pauses of seconds, and lets go at the last."""
+        """Presses at the first position, moves through the others with pauses in seconds, and releases at the last."""
         mouse = self._tab.mouse
         mouse.move(*path[0])
         mouse.down()
@@ -163,7 +163,7 @@ class Browser:
         mouse.up()
 
     def requests(self) -> list[str]:
-        """Every address that the page asked for."""
+        """All addresses that the page requested."""
         return self._requests
 
     def complaints(self) -> list[str]:

@@ -1,10 +1,10 @@
-"""Measure the prose of the documentation and refuse what is hard to read.
+"""Measure the prose of the documentation, and reject text that is hard to read.
 
     python -m tools.check_prose
 
-Checked are README.md, CONTRIBUTING.md, SECURITY.md and the pages in docs/: their length, the mean and the longest
-sentence, and words that are private to this project or that send a reader in circles. In Python files no docstring may
-begin with a riddle such as "Whether ..." or "What ...".
+It checks README.md, CONTRIBUTING.md, SECURITY.md and the pages in docs/: their length, the mean and the longest
+sentence, and words that are private to this project or obscure. In Python files no docstring may begin with a question
+word such as "Whether ..." or "What ...".
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ BANNED = {
     r"throws? back": "reflects",
     r"shares? out": "splits",
 }
-"""Patterns of words that pages do without, and what to write instead. Code is not looked at."""
+"""Patterns of words to avoid on pages, and their replacements. Code is not checked."""
 
 RIDDLE = re.compile(r"(Whether|What|How|Which|Who|Whom|Whose|Why|When|Where)\b")
 
@@ -58,8 +58,8 @@ class Prose:
     """The sentences of a page.
 
     Attributes:
-        sentences: of paragraphs and lists.
-        cells: of tables, which count for the longest sentence and not for the mean.
+        sentences: sentences of paragraphs and lists.
+        cells: sentences in cells of tables, which count for the longest sentence and not for the mean.
     """
 
     sentences: list[str]
@@ -67,7 +67,7 @@ class Prose:
 
 
 def prose_of(markdown: str) -> Prose:
-    """Split a page into sentences; code, pictures, comments and headings are left out."""
+    """Split a page into sentences; code, images, comments and headings are left out."""
     text = PICTURE.sub("", COMMENT.sub("", FENCE.sub("\n", markdown)))
     text = LINK.sub(r"\1", CODE.sub("Code", text))
     blocks: list[str] = []
@@ -90,7 +90,7 @@ def prose_of(markdown: str) -> Prose:
 
 
 def words_of(text: str) -> list[str]:
-    """The words of a text: whatever holds a letter or a digit."""
+    """Words of a text: tokens that contain a letter or a digit."""
     return [word for word in text.split() if re.search(r"\w", word)]
 
 
@@ -111,7 +111,7 @@ def mean_words(prose: Prose) -> float:
 
 
 def size_complaints(readme: str, pages: dict[str, str]) -> Iterator[str]:
-    """Return whether README and docs are too long, and their sentences on the mean."""
+    """Complaints if README or docs, or their sentences on average, are too long."""
     lines = sum(len(text.splitlines()) for text in pages.values())
     words = sum(len(text.split()) for text in pages.values())
     if lines > MOST_DOCS_LINES or words > MOST_DOCS_WORDS:
@@ -134,7 +134,7 @@ def riddles(path: Path) -> Iterator[str]:
 
 
 def main() -> None:
-    """Print what was measured and every complaint; end with 1 if there is one."""
+    """Print the measurements and all complaints; exit with 1 if there are any."""
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     paths = sorted((ROOT / "docs").glob("**/*.md"))
     pages = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in paths}

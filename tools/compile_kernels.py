@@ -1,7 +1,7 @@
-"""Compiles every CUDA kernel without a GPU and says what each of them takes: python -m tools.compile_kernels.
+"""Compiles every CUDA kernel without a GPU, and reports its resources: python -m tools.compile_kernels.
 
-NVVM makes PTX for a compute capability, and nvJitLink, which is what Numba links with on a GPU, makes machine code of
-it and reports registers, spills and shared memory. Neither needs a driver.
+NVVM compiles PTX for a compute capability. nvJitLink, the linker of Numba on a GPU, turns it into machine code and
+reports registers, spills and shared memory. Neither needs a driver.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ COSTS = ("shared bytes", "local bytes")
 
 
 class Resources(NamedTuple):
-    """Resources of a thread or block of a kernel: registers, bytes spilled and fetched back, bytes shared, and bytes of
-    a thread's own memory, which is where its arrays are that do not fit into registers.
+    """Resources of a kernel: registers and spilled bytes (stores and loads) per thread, bytes of shared memory per
+    block, and bytes of local memory per thread, which holds arrays that do not fit into registers.
     """
 
     registers: int
@@ -40,7 +40,7 @@ class Resources(NamedTuple):
 
 
 def all_kernels(real: type = np.float32) -> list[Any]:
-    """Every kernel of the package, built for one floating-point type, in the order of their names."""
+    """All kernels of the package for one floating-point type, sorted by name."""
     package = importlib.import_module(PACKAGE)
     names = [entry.name for entry in pkgutil.walk_packages(package.__path__, f"{PACKAGE}.")]
     modules = [importlib.import_module(name) for name in names if name.rpartition(".")[2].startswith("cuda")]
@@ -57,22 +57,22 @@ def all_kernels(real: type = np.float32) -> list[Any]:
 
 
 def kernels_of(factory: Callable[..., Any], real: type) -> list[Any]:
-    """The kernels of a factory: of those for discs or ellipsoids, `flat` or not, both."""
+    """The kernels of a factory; both variants if it has a parameter `flat` for discs and ellipsoids."""
     if "flat" in inspect.signature(factory).parameters:
         return [factory(real, flat) for flat in (True, False)]
     return [factory(real) if first_parameter(factory) == "real" else factory()]
 
 
 def first_parameter(factory: Callable[..., Any]) -> str | None:
-    """First argument of a factory of kernels: `real` or, of kernels without floating-point numbers, `key`."""
+    """First parameter of a kernel factory: `real`, or `key` for kernels without floating-point numbers."""
     return next(iter(inspect.signature(factory).parameters), None)
 
 
 @contextmanager
 def without_device(capability: tuple[int, int]) -> Iterator[None]:
-    """Lets Numba compile where there is no driver, nor NVRTC, which it asks for the GPUs that are known.
+    """Lets Numba compile without a driver, and without NVRTC, which it queries for supported GPUs.
 
-    Where NVRTC is installed, as on every machine with a GPU, it is asked: what it says decides there too.
+    If NVRTC is installed, as on every machine with a GPU, its answer is used, as in normal operation.
     """
     device = SimpleNamespace(compute_capability=capability)
     with ExitStack() as stack:
@@ -90,7 +90,7 @@ def ptx_of(kernel: Any, capabilities: Sequence[tuple[int, int]] = CAPABILITIES) 
 
     options = {"debug": None, "lineinfo": False, "fastmath": False, "opt": None, "abi_info": None, "forceinline": False}
     with without_device(capabilities[0]):
-        # What `numba.cuda.compile` does, but typing and lowering, most of the time, happen once for all capabilities.
+        # As `numba.cuda.compile`, but with typing and lowering, which take most of the time, once for all capabilities.
         library, _ = compiler._compile_pyfunc_with_fixup(
             kernel.function, types.void(*kernel.signature), device=False, cc=capabilities[0], abi="numba",
             launch_bounds=None, lto=False, **options,
@@ -99,7 +99,7 @@ def ptx_of(kernel: Any, capabilities: Sequence[tuple[int, int]] = CAPABILITIES) 
 
 
 def linked(ptx: str, capability: tuple[int, int]) -> Resources:
-    """Links PTX into machine code and reads the linker's report: what the kernel takes."""
+    """Links PTX into machine code, and parses the resources from the report of the linker."""
     from cuda.bindings import nvjitlink
 
     handle = nvjitlink.create(2, [f"-arch=sm_{capability[0]}{capability[1]}", "-verbose"])
@@ -115,7 +115,7 @@ def linked(ptx: str, capability: tuple[int, int]) -> Resources:
 
 
 def read_report(report: str) -> Resources:
-    """Registers, spills and shared memory from the linker's text."""
+    """Parses registers, spills, shared and local memory from the text of the linker."""
 
     def largest(pattern: str) -> int:
         return max((int(number) for number in re.findall(pattern, report)), default=0)
@@ -126,7 +126,7 @@ def read_report(report: str) -> Resources:
 
 
 def table(kernels: Sequence[Any]) -> list[str]:
-    """A markdown table of what kernels take, one column of registers for each compute capability."""
+    """A Markdown table of the resources of kernels, with one column of registers per compute capability."""
     heads = ["kernel", *(f"sm_{major}{minor}" for major, minor in CAPABILITIES), *COSTS]
     lines = ["| " + " | ".join(heads) + " |", "| --- " * len(heads) + "|"]
     for kernel in kernels:

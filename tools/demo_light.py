@@ -1,4 +1,4 @@
-"""Light of the demo scene, path-traced once with Mitsuba 3, and what rays see of it; importing this needs Mitsuba."""
+"""Lighting of the demo scene, path-traced once with Mitsuba 3, and radiance along rays; requires Mitsuba."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from tools.pane_tracer import Seen, reflectance
 mi.set_variant("llvm_ad_rgb")
 
 SUN, TOWARDS_SUN = (3.7, 2.8, 1.76), (0.42, 0.72, 0.56)
-"""Irradiance of the evening sun, and the way to it: behind the shop, so that it lights the houses on the other side."""
+"""Irradiance of the evening sun, and its direction: behind the shop, so that it lights the houses on the other side."""
 SKY = 2.0
-"""Factor on the radiance of the sky."""
+"""Scale factor of the sky radiance."""
 BOUNCES, BRIGHTEST = 6, 40.0
-"""Of a path of light; what a path may bring, lest single ones leave spots."""
+"""Maximum length of a light path, and clamp of its radiance against fireflies."""
 AT_ONCE = 1_500_000
-"""Paths that are followed in one go."""
+"""Number of paths traced at a time."""
 ABOVE, MET_BEFORE = 2e-3, 1e-2
-"""How far above a corner its paths begin, and how far they may go to meet it, metres."""
+"""Height above a vertex at which its paths start, and the distance within which they have to hit it, metres."""
 SMOOTHINGS = 8
-"""Times that the light of a corner is averaged with its neighbours', against noise."""
+"""Number of smoothing steps of the vertex lighting against noise."""
 
 
 class LitScene:
-    """All but the pane, each corner of a triangle with the light that falls on it."""
+    """The scene without the pane, with the incident light stored at every vertex."""
 
     def __init__(self, paths: int, exposure: float, cache: Path | None = None) -> None:
-        """Path-traces the light, unless a file `cache` keeps it from before."""
+        """Path-traces the light, or loads it from the file `cache` if it exists."""
         self._exposure = exposure
         shapes = _merged(all_shapes())
         self._scene = _loaded(shapes)
@@ -54,7 +54,7 @@ class LitScene:
         self._sky = self._scene.environment()
 
     def radiance(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        """Linear radiance [N, 3] along rays with unit directions, without the pane, and distances [N]."""
+        """Linear radiance [N, 3] along rays with unit directions, ignoring the pane, and distances [N]."""
         hit = self._scene.ray_intersect(mi.Ray3f(_points(origins), mi.Vector3f(_points(directions))))
         met = hit.is_valid()
         albedo = hit.bsdf().eval_diffuse_reflectance(hit, met)
@@ -64,7 +64,7 @@ class LitScene:
         return self._exposure * colors, np.where(np.array(met), np.array(hit.t), np.inf)
 
     def seen(self, origins: Array, directions: Array) -> Seen:
-        """Results of rays [N, 3] with unit directions that start before the pane."""
+        """Traces rays [N, 3] with unit directions that start in front of the pane."""
         transmission, distance = self.radiance(origins, directions)
         inwards = directions[:, 1]
         to_pane = np.where(inwards > 0, -origins[:, 1] / np.maximum(inwards, 1e-9), np.inf)
@@ -83,7 +83,7 @@ class LitScene:
 
 @njit(cache=True)
 def _strengths(cosines: Array) -> Array:
-    """Share of light that the pane returns, by the cosines [N] between rays and its normal."""
+    """Reflectance of the pane, by the cosines [N] between rays and its normal."""
     strengths = np.empty_like(cosines)
     for number in range(len(cosines)):
         strengths[number] = reflectance(cosines[number], REFRACTION)
@@ -91,7 +91,7 @@ def _strengths(cosines: Array) -> Array:
 
 
 def _merged(shapes: list[Shape]) -> list[Shape]:
-    """One shape for each picture and glow."""
+    """Merges shapes with the same texture and glow."""
     groups = defaultdict(list)
     for shape in shapes:
         groups[shape.paint, shape.glow].append(shape)
@@ -105,7 +105,7 @@ def _merged(shapes: list[Shape]) -> list[Shape]:
 
 
 def _loaded(shapes: list[Shape]) -> Any:
-    """The scene as Mitsuba knows it."""
+    """The scene as a Mitsuba scene."""
     materials = {}
     for name, picture in pictures().items():
         bitmap = mi.Bitmap((255 * np.ascontiguousarray(picture[::-1])).astype(np.uint8))
@@ -128,7 +128,7 @@ def _loaded(shapes: list[Shape]) -> Any:
     for number, shape in enumerate(shapes):
         properties = mi.Properties()
         properties["bsdf"] = materials[shape.paint]
-        if shape.glow and shape.glow != STREET_LAMP:  # By day these shine, and light nothing.
+        if shape.glow and shape.glow != STREET_LAMP:  # Street lamps emit by day, but light nothing.
             light = {"type": "area", "radiance": {"type": "rgb", "value": shape.glow}}
             properties["emitter"] = mi.load_dict(light)
         mesh = mi.Mesh(f"m{number}", len(shape.vertices), len(shape.faces), properties, True, True)
@@ -143,15 +143,15 @@ def _loaded(shapes: list[Shape]) -> Any:
 
 
 def _points(values: Array) -> Any:
-    """[N, 3] as Mitsuba's points."""
+    """Converts [N, 3] to Mitsuba points."""
     return mi.Point3f(*(mi.Float(np.ascontiguousarray(column, dtype=np.float32)) for column in values.T))
 
 
 def _light_at(scene: Any, shapes: list[Shape], paths: int) -> list[Array]:
-    """Light [V, 3] at the corners of each shape, as the radiance that white would have there.
+    """Light [V, 3] at the vertices of each shape, as the radiance of a white surface there.
 
-    A ray from just above a corner down to it gives its radiance, by the picture there; divided by the picture it is the
-    light, with what sun, sky and lamps bring at once and over other things.
+    A ray from just above a vertex down to it returns the radiance of the textured surface. Divided by the texture, this
+    is the direct and indirect light of sun, sky and lamps.
     """
     corners = np.concatenate([_nudged(shape) for shape in shapes])
     normals = np.concatenate([shape.normals for shape in shapes])
@@ -166,7 +166,7 @@ def _light_at(scene: Any, shapes: list[Shape], paths: int) -> list[Array]:
     dr.eval(ray, factor)
     for number in range(rounds):
         sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(dr.opaque(mi.UInt32, number), dr.width(origin))  # Opaque, or each round is compiled anew.
+        sampler.seed(dr.opaque(mi.UInt32, number), dr.width(origin))  # Opaque, or every round is compiled again.
         radiance, _, _ = integrator.sample(scene, sampler, ray)
         brought = np.array(dr.clip(radiance * factor, 0.0, BRIGHTEST)).T.reshape(-1, at_once, 3)
         light += brought.mean(axis=1) / rounds
@@ -178,7 +178,7 @@ def _light_at(scene: Any, shapes: list[Shape], paths: int) -> list[Array]:
 
 
 def _nudged(shape: Shape) -> Array:
-    """Corners [V, 3] moved a little into one of their triangles: rays may slip between triangles that meet."""
+    """Vertices [V, 3] moved slightly into one of their triangles, because rays may slip between adjacent triangles."""
     towards = shape.vertices.copy()
     for corner in range(3):
         towards[shape.faces[:, corner]] = shape.vertices[shape.faces].mean(axis=1)
@@ -186,7 +186,7 @@ def _nudged(shape: Shape) -> Array:
 
 
 def _smoothed(light: Array, shape: Shape) -> Array:
-    """Light averaged over the edges of triangles."""
+    """Light smoothed along the edges of triangles."""
     edges = np.concatenate([shape.faces[:, [0, 1]], shape.faces[:, [1, 2]], shape.faces[:, [2, 0]]])
     for _ in range(SMOOTHINGS):
         total, count = 2 * light, np.full(len(light), 2.0)

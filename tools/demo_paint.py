@@ -1,4 +1,4 @@
-"""Pictures that are painted on the things of the demo scene: wood, bricks, fronts of houses, a map, a sky."""
+"""Procedural textures of the objects in the demo scene: wood, bricks, house fronts, a map, a sky."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ SERIF = "DejaVuSerif-Bold.ttf"
 
 
 def noise(size: tuple[int, int], sigma: tuple[float, float], seed: int) -> Picture:
-    """Smooth noise [H, W] of mean 0 and deviation 1 that repeats."""
+    """Smooth tileable noise [H, W] of mean 0 and standard deviation 1."""
     field = np.random.default_rng(seed).normal(size=size[::-1])
     smooth = gaussian_filter(field, sigma[::-1], mode="wrap")
     return (smooth - smooth.mean()) / smooth.std()
 
 
 def clouds(size: tuple[int, int], seed: int, octaves: int = 5, base: float = 0.12) -> Picture:
-    """Noise of many sizes, [H, W]."""
+    """Fractal noise [H, W] of several octaves."""
     total = sum(0.55**k * noise(size, (base * size[1] / 2**k,) * 2, seed + k) for k in range(octaves))
     return (total - total.mean()) / total.std()
 
 
 def grained(color: Color, size: tuple[int, int], seed: int, amount: float = 0.07) -> Picture:
-    """One colour with some grain, sRGB [H, W, 3] in [0, 1]."""
+    """A uniform colour with some grain, sRGB [H, W, 3] in [0, 1]."""
     grain = clouds(size, seed, 6, 0.06)[..., None] * amount
     return np.clip(np.array(color) / 255 * (1 + grain), 0, 1)
 
 
 def drawn(base: Picture, draw: Callable[[ImageDraw.ImageDraw], object], blur: float = 0.0) -> Picture:
-    """A picture on which something is drawn; the grain below stays."""
+    """An image with a drawing on it; the grain below is preserved."""
     flat = Image.new("RGBA", (base.shape[1], base.shape[0]), (0, 0, 0, 0))
     draw(ImageDraw.Draw(flat))
     if blur:
@@ -49,7 +49,7 @@ def drawn(base: Picture, draw: Callable[[ImageDraw.ImageDraw], object], blur: fl
 
 
 def font(size: int, name: str = SERIF) -> ImageFont.FreeTypeFont:
-    """A free font that most systems have."""
+    """A free font that is installed on most systems."""
     return ImageFont.truetype(name, size)
 
 
@@ -71,7 +71,7 @@ def planks(color: Color, seed: int, rows: int = 6) -> Picture:
 
 
 def bricks(color: Color, seed: int) -> Picture:
-    """Bricks of 16 rows and 8 columns, each in a tone of its own."""
+    """Bricks of 16 rows and 8 columns, each in its own tone."""
     picture, generator = grained((190, 180, 165), (1024, 1024), seed), np.random.default_rng(seed)
     for row in range(16):
         for column in range(8):
@@ -194,7 +194,7 @@ def lettering(text: str, ground: Color, ink: Color, size: tuple[int, int], lette
 
 
 def globe() -> Picture:
-    """A world of its own: sea, land, ice and lines of latitude; x goes once round."""
+    """An invented globe: sea, land, ice and lines of latitude; x spans one revolution."""
     size = (1024, 512)
     height = clouds(size, 12, 6, 0.13)
     latitude = np.abs(np.linspace(-1, 1, size[1]))[:, None]
@@ -269,7 +269,7 @@ def clock() -> Picture:
 
 
 def landscape(seed: int) -> Picture:
-    """A painting: hills before an evening sky, with a lake."""
+    """A painting: hills in front of an evening sky, with a lake."""
     y = np.linspace(0, 1, 384)[:, None, None]
     picture = np.broadcast_to(
         (1 - y) * np.array([0.25, 0.35, 0.62]) + y * np.array([1.0, 0.62, 0.30]), (384, 512, 3)
@@ -298,7 +298,7 @@ def squares(seed: int) -> Picture:
 
 
 def spines(seed: int) -> Picture:
-    """The backs of twelve books."""
+    """The spines of twelve books."""
     generator = np.random.default_rng(seed)
     colors = [(120, 32, 36), (28, 66, 92), (60, 84, 50), (150, 110, 50), (70, 46, 84), (190, 170, 130), (30, 30, 36)]
     titles = [
@@ -345,7 +345,7 @@ def leaves(seed: int) -> Picture:
 
 
 def sky() -> Picture:
-    """Linear radiance of an evening sky, as a panorama [H, W, 3]: the upper half; the lower one is dim ground."""
+    """Linear radiance of an evening sky, as a panorama [H, W, 3]; the lower half is dim ground."""
     height, width = 256, 512
     elevation = np.linspace(math.pi / 2, -math.pi / 2, height)[:, None]
     up = np.clip(np.sin(elevation), 0, 1)[..., None]
@@ -360,7 +360,7 @@ def sky() -> Picture:
 
 
 def pictures() -> dict[str, Picture]:
-    """All pictures, sRGB in [0, 1]."""
+    """All textures, sRGB in [0, 1]."""
     flat = {
         "white": (236, 234, 228),
         "tea": (120, 62, 24),

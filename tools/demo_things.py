@@ -1,6 +1,6 @@
-"""Shapes of the demo scene: a shop window with curiosities, and the street before it.
+"""Shapes of the demo scene: a shop window with curiosities, and the street in front of it.
 
-World units are metres: x to the right along the shop's front, y into the shop, z up; the pane lies in y = 0.
+World units are metres: x to the right along the shop front, y into the shop, z up; the pane lies in y = 0.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
 LEFT, RIGHT, BOTTOM, TOP = -1.25, 1.25, 0.55, 2.05
-"""Of the pane."""
+"""Extent of the pane."""
 REFRACTION = 1.6
-"""Of the pane."""
+"""Refractive index of the pane."""
 DEPTH = 0.95
-"""Of the display behind it."""
+"""Depth of the display behind the pane."""
 FAR = -8.2
-"""Of the fronts on the other side of the street."""
+"""Position along y of the house fronts on the other side of the street."""
 STREET_LAMP = (1.6, 1.25, 0.8)
 """Radiance of the lamps in the street."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """Triangles with a picture on them.
+    """Textured triangles.
 
     Attributes:
-        vertices: [V, 3].
-        normals: [V, 3] unit, on the side that is seen.
-        uv: [V, 2] places in the picture, which repeats.
-        faces: [F, 3].
-        paint: name of the picture.
-        glow: linear radiance of what shines by itself; 0 for what is lit.
+        vertices: [V, 3] positions.
+        normals: [V, 3] unit, on the visible side.
+        uv: [V, 2] texture coordinates; the texture repeats.
+        faces: [F, 3] vertex indices.
+        paint: name of the texture.
+        glow: emitted linear radiance; 0 if the shape does not emit.
     """
 
     vertices: Array
@@ -49,7 +49,7 @@ class Shape:
     glow: Triple | None = None
 
     def moved(self, offset: Triple, turn_deg: float = 0.0, scale: float = 1.0) -> Shape:
-        """Scaled, turned about the vertical and shifted."""
+        """The shape scaled, rotated about the vertical, and shifted."""
         c, s = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
         turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
         return replace(self, vertices=scale * self.vertices @ turn.T + offset, normals=self.normals @ turn.T)
@@ -73,15 +73,15 @@ def quad(
     corner: Triple, along: Triple, up: Triple, paint: str, *, spacing: float, picture: tuple[float, float] = (0.0, 0.0),
     glow: Triple | None = None,
 ) -> Shape:  # fmt: skip
-    """A parallelogram, seen from where `along` is to the right and `up` is up.
+    """A parallelogram that is visible from the side on which `along` points right and `up` points up.
 
     Args:
-        corner: the lower left one.
-        along: lower edge.
-        up: left edge.
-        paint: name of the picture.
-        spacing: of the points at which light is computed.
-        picture: width and height of the picture in metres; 0 stretches it over the whole.
+        corner: lower left corner.
+        along: vector of the lower edge.
+        up: vector of the left edge.
+        paint: name of the texture.
+        spacing: distance of the vertices, at which light is computed.
+        picture: width and height of the texture in metres; 0 stretches it over the parallelogram.
         glow: see `Shape`.
     """
     u, v = np.array(along, float), np.array(up, float)
@@ -113,14 +113,14 @@ def box(
 
 def lathe(profile: Sequence[tuple[float, float]], paint: str, *, turns: int = 48, smooth: int = 8, repeat: float = 1.0,
           glow: Triple | None = None) -> Shape:  # fmt: skip
-    """A body of revolution about z through points (radius, height) from below; the picture goes once round.
+    """A surface of revolution about z through points (radius, height), from the lowest one.
 
     Args:
-        profile: points that a smooth curve goes through.
-        paint: name of the picture.
-        turns: steps round the axis.
-        smooth: points of the curve between two of the profile; 1 leaves its corners.
-        repeat: times that the picture goes round.
+        profile: points of a smooth curve.
+        paint: name of the texture.
+        turns: number of segments around the axis.
+        smooth: segments of the curve between two points of the profile; 1 keeps its corners.
+        repeat: repetitions of the texture around the axis.
         glow: see `Shape`.
     """
     from scipy.interpolate import PchipInterpolator
@@ -187,12 +187,12 @@ def slab(outline: Sequence[tuple[float, float]], thickness: float, paint: str, *
 
 
 def placed(shapes: Sequence[Shape], offset: Triple, turn_deg: float = 0.0, scale: float = 1.0) -> list[Shape]:
-    """Shapes that belong together, moved together."""
+    """A group of shapes, moved together."""
     return [shape.moved(offset, turn_deg, scale) for shape in shapes]
 
 
 def teapot() -> list[Shape]:
-    """A pot of porcelain, 0.3 wide."""
+    """A porcelain teapot, 0.3 wide."""
     body = [(0.001, 0), (0.06, 0), (0.065, 0.01), (0.1, 0.05), (0.115, 0.1), (0.1, 0.15), (0.07, 0.175), (0.062, 0.18)]
     lid = [(0.066, 0.178), (0.05, 0.2), (0.02, 0.212), (0.012, 0.22), (0.02, 0.235), (0.012, 0.25), (0.001, 0.252)]
     s = np.linspace(0, 1, 24)[:, None]
@@ -217,7 +217,7 @@ def cup() -> list[Shape]:
 
 
 def duck() -> list[Shape]:
-    """A duck for the bath."""
+    """A rubber duck."""
     return [
         ellipsoid((0, 0, 0.075), (0.12, 0.09, 0.075), "yellow"),
         ellipsoid((0.07, 0, 0.185), (0.062, 0.06, 0.06), "yellow"),
@@ -231,7 +231,7 @@ def duck() -> list[Shape]:
 
 
 def globe() -> list[Shape]:
-    """A globe in a ring of brass on a wooden foot."""
+    """A globe in a brass ring on a wooden foot."""
     a = np.linspace(-1.45, 1.45, 40)
     ring = np.stack([0.185 * np.cos(a), 0 * a, 0.36 + 0.185 * np.sin(a)], -1)
     foot = [(0.001, 0), (0.12, 0), (0.12, 0.02), (0.06, 0.04), (0.02, 0.07), (0.03, 0.1), (0.015, 0.14), (0.02, 0.19)]
@@ -243,7 +243,7 @@ def globe() -> list[Shape]:
 
 
 def gramophone() -> list[Shape]:
-    """A box with a horn of brass."""
+    """A box with a brass horn."""
     s = np.linspace(0, 1, 40)[:, None]
     path = (1 - s) ** 2 * [0, 0.12, 0.16] + 2 * s * (1 - s) * [0, 0.16, 0.5] + s**2 * [0.0, -0.12, 0.52]
     horn = tube(path, 0.012 + 0.19 * s[:, 0] ** 3.2, "brass", 40)
@@ -258,7 +258,7 @@ def gramophone() -> list[Shape]:
 
 
 def mantel_clock() -> list[Shape]:
-    """A clock with a round head."""
+    """A clock with a round top."""
     a = np.linspace(0, math.pi, 25)
     outline = [(-0.13, 0.0), (0.13, 0.0), *zip(0.13 * np.cos(a), 0.2 + 0.13 * np.sin(a), strict=True)]
     angle, r = np.meshgrid(np.linspace(0, 2 * math.pi, 49), np.linspace(0.0, 0.105, 12))
@@ -270,7 +270,7 @@ def mantel_clock() -> list[Shape]:
 
 
 def boat() -> list[Shape]:
-    """A model of a sailing boat on a stand."""
+    """A model sailing boat on a stand."""
     t, side = np.meshgrid(np.linspace(-1, 1, 40), np.linspace(-math.pi / 2, math.pi / 2, 16))
     width = 0.055 * (1 - np.abs(t) ** 2.6)
     points = np.stack(
@@ -326,7 +326,7 @@ def lamp() -> list[Shape]:
 
 
 def framed(width: float, height: float, paint: str, place: Triple) -> list[Shape]:
-    """A painting in a frame of gold on the back wall."""
+    """A painting in a golden frame on the back wall."""
     x, y, z = place
     rim = 0.035
     made = [quad((x, y, z), (width, 0, 0), (0, 0, height), paint, spacing=0.03)]
@@ -382,7 +382,7 @@ def display() -> list[Shape]:
 
 
 def shop_front() -> list[Shape]:
-    """The wall round the pane, as a painted front of wood, with a door, a sign and bricks above."""
+    """The wall around the pane: a painted wooden front with a door, a sign and bricks above."""
     paint, s = "green", 0.05
     made = []
     for low, high in (
@@ -481,13 +481,13 @@ def houses() -> list[Shape]:
 
 
 def cafe() -> list[Shape]:
-    """The awning of a café, and tables and chairs before it."""
+    """The awning of a café, with tables and chairs in front."""
     awning = quad((9.2, FAR + 0.02, 2.4), (-5.0, 0, 0), (0, 1.1, -0.5), "awning", spacing=0.12, picture=(2.5, 0))
     under = replace(
         awning, normals=-awning.normals, faces=awning.faces[:, ::-1], vertices=awning.vertices - [0, 0, 0.01]
     )
     made = [awning, under]
-    for x in (5.0, 6.4, 7.8):  # tables before the café
+    for x in (5.0, 6.4, 7.8):  # tables in front of the café
         made += placed(
             [
                 lathe(
@@ -539,5 +539,5 @@ def street() -> list[Shape]:
 
 
 def all_shapes() -> list[Shape]:
-    """The whole scene but the pane."""
+    """All shapes of the scene, without the pane."""
     return [*display(), *shop_front(), *street()]

@@ -1,6 +1,6 @@
-"""Normals as a network estimates them from one photograph: the true ones, off by an error that varies slowly over it.
+"""Simulated normals of a monocular estimator: the true normals with an error that varies slowly over the image.
 
-What networks do to mirrors, of which some are taken for what they mirror, is not imitated.
+The typical failure of networks on mirrors, whose reflections they treat as geometry, is not simulated.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from scipy.ndimage import gaussian_filter, zoom
 Array = NDArray[np.floating]
 
 WAVES = 4
-"""Turns are drawn at as many places along each side of a picture, and are smooth between them."""
+"""Number of random rotations along each side of an image, with smooth interpolation between them."""
 BLUR = 1 / 100
-"""Standard deviation of the blur of normals, of the picture's width: networks round edges off."""
+"""Standard deviation of the blur of normals, as a share of the image width: networks smooth edges."""
 
 
 def estimated_normals(normals: Array, coverage: Array, error_deg: float, random: np.random.Generator) -> Array:
-    """Normals that an estimator would give for one photograph.
+    """Simulated estimate of normals for one photograph.
 
     Args:
-        normals: [S, S, 3] true unit normals in the camera's axes; zero where nothing is.
-        coverage: [S, S] share of each pixel that shows something.
+        normals: [S, S, 3] true unit normals in camera axes; zero on the background.
+        coverage: [S, S] share of each pixel that is covered by the scene.
         error_deg: mean angle between the true and the estimated normals.
-        random: where the error comes from.
+        random: generator of the error.
 
     Returns:
         [S, S, 3] unit normals; zero where less than half of a pixel is covered.
@@ -38,7 +38,7 @@ def estimated_normals(normals: Array, coverage: Array, error_deg: float, random:
 
 
 def smooth_turns(size: int, error_rad: float, random: np.random.Generator) -> Array:
-    """Rotation vectors [S, S, 3] that turn the directions of a picture by `error_rad` on average."""
+    """Rotation vectors [S, S, 3] that turn the directions of an image by `error_rad` on average."""
     coarse = random.standard_normal((WAVES, WAVES, 3))
     field = zoom(coarse, (size / WAVES, size / WAVES, 1), order=3, mode="nearest", grid_mode=True)
     # Two of three components turn a direction, and the length of two normal numbers is sqrt(pi / 2) on average.
@@ -46,7 +46,7 @@ def smooth_turns(size: int, error_rad: float, random: np.random.Generator) -> Ar
 
 
 def rotated(vectors: Array, turns: Array) -> Array:
-    """Vectors [..., 3] turned about rotation vectors [..., 3] (Rodrigues)."""
+    """Vectors [..., 3] rotated by rotation vectors [..., 3] (Rodrigues)."""
     angle = np.linalg.norm(turns, axis=-1, keepdims=True)
     axis = turns / np.maximum(angle, 1e-12)
     along = (axis * vectors).sum(axis=-1, keepdims=True) * axis

@@ -1,11 +1,11 @@
-"""Makes the screenshots of docs/tutorial.md, docs/capture.md and docs/looking.md, from scenes of our own.
+"""Makes the screenshots of docs/tutorial.md, docs/capture.md and docs/looking.md from synthetic scenes.
 
     python -m tools.make_capture_pictures --scene SCENE --capture CAPTURE --run RUN --busy BUSY --output docs/images
 
-`--scene` ships the truth about its panes (`gt/planes.json`), which is where corners are clicked on the page of
-`glassplat annotate`; of `--capture`, which `glassplat prepare` made, the report is shown, and of `--run` the overview
-that `glassplat eval` wrote, and its scene in `glassplat view`. `--busy` is a scene of `tools.make_pane_scene
---passers-by`; a photograph of it is shown next to its masks. What is not given keeps its pictures.
+`--scene` has ground truth of its panes (`gt/planes.json`), which gives the corners to click in `glassplat annotate`.
+`--capture` was made by `glassplat prepare`, and its report is shown; `--run` has an overview written by `glassplat
+eval`, and its scene is shown in `glassplat view`. `--busy` is a scene of `tools.make_pane_scene --passers-by`, of which a photograph is shown next to its masks.
+Images of options that are not given stay unchanged.
 """
 
 from __future__ import annotations
@@ -40,32 +40,32 @@ SETTLED = 3.0
 """Seconds after which the viewer has drawn what was asked."""
 COLORS = 128
 GAP, CAPTION = 8, 22
-"""Pixels between tiles, and above them."""
+"""Gap between tiles, and height of their captions, pixels."""
 APART = 4
-"""Of the photographs that show the whole pane, every how manyth is marked."""
+"""Stride between the marked photographs, among those that show the whole pane."""
 
 
 def true_corners(scene: Path) -> NDArray[np.float64]:
-    """[4, 3] of the scene's first pane, round it."""
+    """Corners [4, 3] of the first pane of the scene, in order around it."""
     plane = json.loads((scene / "gt" / "planes.json").read_text())[0]
     center, u, v = (np.array(plane[key]) for key in ("center", "half_u", "half_v"))
     return np.stack([center - u + v, center + u + v, center + u - v, center - u - v])
 
 
 def whole_views(cameras: Sequence[NumpyCamera], corners: NDArray[np.float64]) -> list[int]:
-    """Views that show the whole pane, with a little room next to the photograph."""
+    """Indices of views that show the whole pane; corners may lie slightly outside the photograph."""
     return [number for number, camera in enumerate(cameras) if camera.contains(corners, 0.2).all()]
 
 
 def save(page: MarkingPage, path: Path) -> None:
-    """Saves what the window shows, with few colours, which keeps the repository small."""
+    """Saves a screenshot with few colours, to keep the repository small."""
     picture = Image.fromarray(page.window.picture())
     picture.quantize(COLORS, dither=Image.Dither.NONE).save(path, optimize=True)
     print(path)
 
 
 def draw_page(page: Path, picture: Path) -> None:
-    """Saves how a page on disk begins."""
+    """Saves a screenshot of the top of a page on disk."""
     with Browser(page, *PAGE_SIZE, query="") as window:
         window.run("for (const one of document.images) one.loading = 'eager'")
         window.wait("[...document.images].every(one => one.complete)", "the pictures of the page")
@@ -74,7 +74,7 @@ def draw_page(page: Path, picture: Path) -> None:
 
 
 def draw(scene: Path, output: Path) -> None:
-    """Marks the scene's pane in a copy of it, and saves two pictures on the way."""
+    """Marks the pane in a copy of the scene, and saves two screenshots on the way."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / scene.name
         shutil.copytree(scene, copy, ignore=shutil.ignore_patterns("panes", "masks", "planes.json", "annot*", "gt"))
@@ -119,7 +119,7 @@ def draw_viewer(run: Path, output: Path) -> None:
 
 
 def draw_masks(scene: Path, picture: Path) -> None:
-    """Saves a photograph in which somebody passes next to its mask of panes and its mask of what is left out."""
+    """Saves a photograph with a passer-by, next to its pane mask and its mask of ignored pixels."""
     somebody = {path.name: np.array(Image.open(path)) > 0 for path in sorted((scene / "gt/passers_by").iterdir())}
     name = max((scene / "panes").iterdir(), key=lambda path: somebody.get(path.name, np.zeros(1)).sum()).name
     tiles = {
@@ -141,7 +141,7 @@ def draw_masks(scene: Path, picture: Path) -> None:
 
 
 def main() -> None:
-    """Reads the arguments and draws."""
+    """Parses the arguments and makes the screenshots."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path)
     parser.add_argument("--capture", type=Path)

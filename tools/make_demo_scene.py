@@ -1,12 +1,12 @@
-"""Makes the bundled demo scene: a shop window full of curiosities, in which a sunlit street is mirrored.
+"""Makes the bundled demo scene: a shop window full of curiosities, which reflects a sunlit street.
 
     pip install -e '.[scenes]'
     python -m tools.make_demo_scene --output glassplat/demo_scene
 
-Everything is matte and lit by path tracing, so that it shines alike in all directions and pictures have no noise. A
-photograph is (1 - strength) * transmission + strength * reflection in linear radiance, with Fresnel's law for a thin
-pane. `tools/demo_things.py` has the shapes, `tools/demo_paint.py` what is painted on them, `tools/demo_light.py` the
-light.
+All surfaces are matte, with path-traced light stored at vertices, so that radiance does not depend on the view and
+images have no noise. A photograph is (1 - strength) * transmission + strength * reflection in linear radiance, with
+Fresnel's law for a thin pane. Shapes are in `tools/demo_things.py`, textures in `tools/demo_paint.py`, lighting in
+`tools/demo_light.py`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from tools.pane_tracer import Array, Seen, reflectance
 MOST_BYTES = 8_000_000
 FOCAL_PER_WIDTH = 0.9
 AWAY_EVERY = 6
-"""Every so many views look away from the pane, at the street."""
+"""Every sixth view shows the street instead of the pane."""
 EXPOSURE = 1.2
 PHOTOGRAPH, LAYER = 83, 93
 """JPEG qualities."""
@@ -61,12 +61,12 @@ licensed with it (Apache-2.0). It shows the layout that `glassplat train` reads:
 
 @dataclass(frozen=True)
 class Arguments:
-    """Lights and photographs the scene."""
+    """Options of the scene: lighting and photographs."""
 
     output: Path
     """Folder to write; must not exist yet."""
     width: int = 640
-    """Of the photographs, pixels; heights are three quarters of it."""
+    """Width of the photographs in pixels; the height is three quarters of it."""
     views: int = 64
     """Photographs; every eighth is a test view."""
     masks: int = 8
@@ -74,18 +74,18 @@ class Arguments:
     points: int = 6000
     """Sparse points."""
     paths: int = 200
-    """Of light, to each corner of a triangle."""
+    """Light paths per vertex."""
     rays: int = 3
-    """For each pixel and axis."""
+    """Rays per pixel and axis."""
     light: Path | None = None
-    """File that keeps the light, to photograph the same scene again."""
+    """Cache file of the lighting, for rendering the same scene again."""
 
 
 class Lit(Protocol):
-    """A scene that rays go through; see `tools.demo_light.LitScene`."""
+    """A scene that can be ray-traced; see `tools.demo_light.LitScene`."""
 
     def seen(self, origins: Array, directions: Array) -> Seen:
-        """Results of rays [N, 3] with unit directions."""
+        """Traces rays [N, 3] with unit directions."""
         ...
 
 
@@ -124,24 +124,24 @@ def view(lit: Lit, pose: Array, width: int, rays: int) -> dict[str, Array]:
         name: getattr(seen, name).reshape(height, width, rays**2, -1).mean(axis=2)
         for name in ("radiance", "transmission", "reflection", "strength")
     }
-    # Of rays that meet no pane, a pixel at its edge has nothing to show.
+    # At the edge of the pane, average over the rays that hit it.
     layers["reflection"] /= np.maximum((labels > 0).mean(axis=2), 1e-9)[..., None]
     return layers | {"label": labels[:, :, rays**2 // 2], "whole": whole_labels(labels)}
 
 
 def save_jpeg(path: Path, linear: Array, quality: int) -> None:
-    """Writes a picture in the full resolution of its colours, by which reflections differ from what is behind."""
+    """Writes an image without chroma subsampling, because reflections often differ from the transmission by colour."""
     Image.fromarray(picture(linear[:, :, None])).save(path, quality=quality, subsampling=0, optimize=True)
 
 
 def annotated_views(layers: list[Array], masks: int) -> set[int]:
-    """Numbers of the training views that get a mask, evenly among those that show a good part of the pane."""
+    """Indices of the training views that get a mask, evenly spaced among those that show a large part of the pane."""
     shown = [n for n, label in enumerate(layers) if n % TEST_EVERY and label.mean() > 0.15]
     return {shown[index] for index in np.linspace(0, len(shown) - 1, masks).astype(int)}
 
 
 def sparse_points(lit: Lit, poses: list[Array], count: int) -> tuple[Array, NDArray[np.uint8]]:
-    """Positions and colours [P, 3] of points that random rays meet, some of them mirrored, as structure from motion."""
+    """Positions and colours [P, 3] of points hit by random rays, some of them mirrored, as in structure from motion."""
     generator = np.random.default_rng(0)
     origins, directions = random_rays(poses, count, generator)
     seen = lit.seen(origins, directions)
@@ -149,7 +149,7 @@ def sparse_points(lit: Lit, poses: list[Array], count: int) -> tuple[Array, NDAr
     virtual = (seen.label > 0) & (generator.random(count) < VIRTUAL_IN_GLASS)
     place = origins[virtual] + seen.to_pane[virtual, None] * directions[virtual]
     beyond = lit.seen(place - [0, 1e-4, 0], directions[virtual] * [1, -1, 1])
-    # Straight on behind the pane, as far as the light has come.
+    # Virtual points: straight on behind the pane, at the length of the reflected path.
     colors[virtual], length[virtual] = beyond.transmission, seen.to_pane[virtual] + beyond.distance
     kept = np.isfinite(length)
     positions = origins[kept] + length[kept, None] * directions[kept]
@@ -158,7 +158,7 @@ def sparse_points(lit: Lit, poses: list[Array], count: int) -> tuple[Array, NDAr
 
 
 def write_truth(folder: Path, name: str, layers: dict[str, Array]) -> None:
-    """Writes the layers of a test view, how much the pane reflects, and where it is."""
+    """Writes the layers of a test view, the reflectance of the pane, and its mask."""
     save_jpeg(folder / "trans" / f"{name}.jpg", layers["transmission"], LAYER)
     save_jpeg(folder / "refl" / f"{name}.jpg", layers["reflection"], LAYER)
     strength = np.round(65535 * layers["strength"][..., 0]).astype(np.uint16)
@@ -167,7 +167,7 @@ def write_truth(folder: Path, name: str, layers: dict[str, Array]) -> None:
 
 
 def write_plane(path: Path) -> None:
-    """Writes the true pane."""
+    """Writes the true plane of the pane."""
     entry = {
         "label": 1,
         "center": [(LEFT + RIGHT) / 2, 0.0, (BOTTOM + TOP) / 2],
@@ -181,7 +181,7 @@ def write_plane(path: Path) -> None:
 
 
 def main(arguments: Arguments) -> None:
-    """Makes the scene, and refuses one that is too large to bundle."""
+    """Makes the scene; raises ValueError if it is too large to bundle."""
     from tools.demo_light import LitScene
 
     folder = arguments.output
