@@ -1,9 +1,9 @@
-"""Write the tables "What differs from the paper" of the pages of the methods, from the presets themselves.
+"""Write the tables "What differs from the paper" on the pages of the methods, from the presets.
 
     python -m tools.make_differences
 
-A row is a field of the recipe whose value in `--preset paper` is another one. Here are only the reasons; a test holds
-that the pages are up to date, and that no difference is without a reason.
+Each row is a recipe field whose value differs in `--preset paper`. This file holds only the reasons. A test checks that
+the pages are up to date and that every difference has a reason.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from glassplat.methods.recipe import RECIPES, recipe_of
 DOCS = Path(__file__).parent.parent / "docs"
 BEGIN, END = "<!-- differences: begin -->", "<!-- differences: end -->"
 COMMON = "splat"
-"""Differences that every method shares stand on the page of this one."""
+"""Method whose page lists the differences shared by all methods."""
 
 ALL = {
     "rates.short_run_power": "Short runs learn faster: by (30,000 / n)^0.5 in n >= 3,000 iterations; not opacities.",
@@ -113,11 +113,11 @@ REASONS: dict[str, dict[str, str]] = {
         "normals_throughout": "Later, depths are too noisy: -0.25 to -1 dB.",
     },
 }
-"""Why a field differs, by method and dotted name."""
+"""Reasons for differences, by method and dotted field name."""
 
 
 def leaves(options: Any, name: str = "") -> dict[str, Any]:
-    """Every single value of nested options, by its dotted name."""
+    """All leaf values of nested options, by dotted name."""
     if not dataclasses.is_dataclass(options):
         return {name: options}
     parts = [
@@ -128,13 +128,13 @@ def leaves(options: Any, name: str = "") -> dict[str, Any]:
 
 
 def differences(method: str) -> dict[str, tuple[Any, Any]]:
-    """The default and the published value of every field in which the two differ."""
+    """Default and published value of every field in which they differ."""
     ours, published = leaves(recipe_of(method)), leaves(recipe_of(method, "paper"))
     return {name: (value, published[name]) for name, value in ours.items() if value != published[name]}
 
 
 def written(value: Any) -> str:
-    """A value as it stands in a table."""
+    """A value formatted for the table."""
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, tuple):
@@ -143,13 +143,13 @@ def written(value: Any) -> str:
 
 
 def own_differences(method: str) -> dict[str, tuple[Any, Any]]:
-    """The differences of a method without those that all methods share."""
+    """Differences of a method, without those shared by all methods."""
     shared = differences(COMMON) if method != COMMON else {}
     return {name: values for name, values in differences(method).items() if shared.get(name) != values}
 
 
 def table_of(method: str) -> str:
-    """The table of a method, without the rows that all methods share."""
+    """Table of a method, without the rows shared by all methods."""
     rows = [
         f"| `{name}` | {written(ours)} | {written(published)} | {REASONS[method][name]} |"
         for name, (ours, published) in own_differences(method).items()
@@ -158,7 +158,7 @@ def table_of(method: str) -> str:
 
 
 def with_table(page: str, method: str) -> str:
-    """A page whose table is that of the presets."""
+    """The text of a page with its table replaced by that of the presets."""
     before, begin, rest = page.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:

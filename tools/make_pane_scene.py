@@ -1,12 +1,11 @@
-"""Makes a capture of a room with free-standing panes, photographed all the way round, with exact layers.
+"""Renders a capture of a room with free-standing panes, with cameras all around and exact layers.
 
     python -m tools.make_pane_scene --output scenes/screens
     python -m tools.make_pane_scene --output scenes/room-1 --drawn 1
 
-`screens`: two panes of glass, one upright, one leaning, through which the other is seen, stand between things; a mirror
-hangs on a wall. With `--drawn` everything is drawn by chance (`tools/pane_draws.py`); `--window` and `--case` make
-other places with names (`tools/pane_places.py`). docs/scenes.md describes the files. Needs nothing but glassplat's own
-dependencies.
+The default scene `screens` has two panes of glass, of which one leans and is visible through the other, between
+objects, and a mirror on a wall. `--drawn` makes random scenes (`tools/pane_draws.py`); `--window` and `--case` make the
+other named scenes (`tools/pane_places.py`). docs/scenes.md describes the files. No extra dependencies are needed.
 """
 
 from __future__ import annotations
@@ -42,61 +41,61 @@ from tools.pane_tracer import Array, Seen
 
 TEST_EVERY = 8
 POINT_NOISE = 0.005
-"""Standard deviation of the sparse points about the surfaces, world units."""
+"""Standard deviation of the sparse points from the surfaces, world units."""
 GAP = 0.02
-"""Between the two panes of double glazing, world units."""
+"""Distance between the two panes of double glazing, world units."""
 PASSERS, SENSOR = 77, 78
-"""Keep what is drawn for those who walk by, and for the sensor, apart from all else."""
+"""Keys that separate the random streams of passers-by and of sensor noise from all others."""
 VIRTUAL_IN_GLASS, VIRTUAL_IN_MIRROR = 0.4, 1.0
-"""Share of the sparse points seen in a pane that lie where it shows what it mirrors, as structure from motion finds."""
+"""Share of the sparse points seen in a pane that lie at mirrored positions, as structure from motion finds them."""
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Ray-traces a room with free-standing panes."""
+    """Options of the ray-traced scene."""
 
     output: Path
     """Folder to write; must not exist yet."""
     width: int = 256
-    """Of the photographs, pixels; heights are three quarters of it."""
+    """Width of the photographs in pixels; the height is three quarters of it."""
     views: int = 96
     """Photographs; every eighth is a test view."""
     noise: float = 0.0
-    """Standard deviation of the sensor's noise in photographs, of 255."""
+    """Standard deviation of the sensor noise in photographs, in units of 1/255."""
     masks: int = 8
     """Annotated training views."""
     points: int = 6000
     """Sparse points."""
     seed: int = 0
-    """Of cameras and points of `screens`, `window` and `case`."""
+    """Random seed of cameras and points of `screens`, `window` and `case`."""
     drawn: int | None = None
-    """Seed of a place drawn by chance, to make in place of `screens`; of all that is random in it, too."""
+    """Seed of a random scene instead of `screens`, and of everything random in it."""
     window: bool = False
-    """Make a large window before a dark case, photographed from the front, in place of `screens`."""
+    """Make a large window of a dark case, photographed from the front, instead of `screens`."""
     case: bool = False
-    """Make a silver bowl in a case with a glass front and a mirrored back, in place of `screens`."""
+    """Make a silver bowl in a case with a glass front and a mirrored back, instead of `screens`."""
     passers_by: float = 0.0
-    """Share of the training views in which somebody stands somewhere in the room, in each elsewhere."""
+    """Share of the training views with a person in the room, each at another position."""
     photographer: bool = False
-    """Somebody stands behind the camera with a phone before the face, and is seen in panes and mirrors."""
+    """Add a photographer behind the camera, holding a phone, who is reflected in panes and mirrors."""
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Share of red, green and blue light that panes of glass let through of what they do not reflect."""
+    """Transmittance of the glass for red, green and blue, applied to the light that is not reflected."""
     second_pane: float | None = None
-    """Make the glass double: behind each pane is another, tilted by so many degrees against it."""
+    """Make double glazing: a second pane behind each pane, tilted against it by this many degrees."""
 
     @property
     def any_seed(self) -> int:
-        """Of all that is random."""
+        """Seed of everything random."""
         return self.seed if self.drawn is None else self.drawn
 
 
 def picture(radiance: Array, noise: Array | float = 0.0) -> NDArray[np.uint8]:
-    """sRGB [H, W, 3] of the radiance [H, W, S, 3] of the rays in each pixel; brighter than white is white."""
+    """sRGB [H, W, 3] of the radiance [H, W, S, 3] of the rays in each pixel, clipped at white."""
     return as_bytes(srgb_from_linear(np.clip(radiance.mean(axis=2), 0, 1)) + noise)
 
 
 def whole_labels(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """[H, W] label that all rays of a pixel agree on, else 0."""
+    """[H, W] label shared by all rays of a pixel, else 0."""
     return np.where(labels.min(axis=2) == labels.max(axis=2), labels[:, :, 0], 0).astype(np.uint8)
 
 
@@ -111,29 +110,29 @@ def write_photograph(arguments: Arguments, number: int, seen: Seen, *, annotated
 
 
 def write_layers(folder: Path, name: str, seen: Seen) -> None:
-    """Writes what comes through the panes of a test view, and what they mirror."""
+    """Writes transmission and reflection of a test view."""
     for part in ("trans", "refl"):
         (folder / part).mkdir(parents=True, exist_ok=True)
     Image.fromarray(picture(seen.transmission)).save(folder / "trans" / name)
-    # Of rays that meet no pane, a pixel at the edge of one has nothing to show.
+    # At the edge of a pane, average over the rays that hit it.
     share = np.maximum((seen.label > 0).mean(axis=2), 1e-9)[..., None, None]
     Image.fromarray(picture(seen.reflection / share)).save(folder / "refl" / name)
 
 
 def write_strength(folder: Path, name: str, seen: Seen) -> None:
-    """Writes how much the panes of a test view reflect, and where they are."""
+    """Writes reflectance and masks of the panes of a test view."""
     strength = np.round(65535 * seen.strength.mean(axis=2)).astype(np.uint16)
     Image.fromarray(strength).save(folder / name)
     Image.fromarray(whole_labels(seen.label)).save(folder / name.replace(".png", "_pane.png"))
 
 
 def write_surface(folder: Path, name: str, normals: Array) -> None:
-    """Writes where silver is seen, directly or through panes, and which way it faces; nothing where there is none.
+    """Writes coverage and normals of silver objects, seen directly or through panes; writes nothing if none is visible.
 
     Args:
-        folder: of the photographs.
-        name: of one.
-        normals: [H, W, S, 3] of its rays, 0 where they do not end on silver.
+        folder: folder of the photographs.
+        name: file name of the photograph.
+        normals: [H, W, S, 3] normals at the ends of its rays, 0 for rays that do not end on silver.
     """
     share = (np.linalg.norm(normals, axis=-1) > 0).mean(axis=2)
     mean = normals.sum(axis=2) / np.maximum(np.linalg.norm(normals.sum(axis=2), axis=-1, keepdims=True), 1e-9)
@@ -143,7 +142,7 @@ def write_surface(folder: Path, name: str, normals: Array) -> None:
 
 
 def random_rays(poses: list[Array], count: int, generator: np.random.Generator) -> tuple[Array, Array]:
-    """Origins and unit directions [N, 3] of rays through random places of random views."""
+    """Origins and unit directions [N, 3] of rays through random pixels of random views."""
     eyes = np.stack(poses)[generator.integers(len(poses), size=count)]
     rays = np.concatenate([generator.uniform(-0.55, 0.55, (count, 2)) * [1, 0.75], np.ones((count, 1))], axis=1)
     directions = np.einsum("nij,nj->ni", eyes[:, :3, :3], rays)
@@ -151,7 +150,7 @@ def random_rays(poses: list[Array], count: int, generator: np.random.Generator) 
 
 
 def sparse_points(place: Place, poses: list[Array], count: int, seed: int) -> tuple[Array, NDArray[np.uint8]]:
-    """Positions and colours [P, 3] of surface points that random rays of the cameras meet, some of them mirrored."""
+    """Positions and colours [P, 3] of surface points hit by random camera rays, some of them mirrored."""
     generator = np.random.default_rng(seed)
     origins, directions = random_rays(poses, count, generator)
     bare, shown = place.without_panes(), place.seen(origins, directions)
@@ -165,7 +164,7 @@ def sparse_points(place: Place, poses: list[Array], count: int, seed: int) -> tu
         points = origins[chosen] + shown.to_pane[chosen, None] * directions[chosen]
         beyond = bare.seen(points, directions[chosen] - 2 * along[:, None] * pane.normal)
         colors[chosen], kept[chosen] = beyond.radiance, has_features(beyond)
-        # Straight on behind the pane, as far as the light has come.
+        # Virtual points: straight on behind the pane, at the length of the reflected path.
         length[chosen] = shown.to_pane[chosen] + beyond.distance
     noise = generator.normal(scale=POINT_NOISE, size=(count, 3))
     positions = origins + length[:, None] * directions + noise
@@ -173,20 +172,20 @@ def sparse_points(place: Place, poses: list[Array], count: int, seed: int) -> tu
 
 
 def has_features(seen: Seen) -> NDArray[np.bool_]:
-    """[N] whether structure from motion finds points: not on silver, where they slide, nor where pictures clip."""
+    """[N] bool: rays that give SfM points; not those on silver, where points slide, nor clipped ones."""
     return ~seen.normal.any(axis=1) & (seen.radiance < 1).any(axis=1)
 
 
 def write_colmap(
     folder: Path, width: int, focal_per_width: float, poses: Mapping[str, Array], points: tuple[Array, Array]
 ) -> None:
-    """Writes a COLMAP text model of one pinhole camera, whose pictures are three quarters as high as wide.
+    """Writes a COLMAP text model of one pinhole camera with images of aspect ratio 4:3.
 
     Args:
-        folder: to write to.
-        width: of the pictures, pixels.
+        folder: output folder.
+        width: width of the images, pixels.
         focal_per_width: focal length, as a share of the width.
-        poses: camera-to-world [4, 4] by the name of the photograph.
+        poses: camera-to-world [4, 4] by name of the photograph.
         points: positions and colours [P, 3].
     """
     height, focal = width * 3 // 4, focal_per_width * width
@@ -206,7 +205,7 @@ def write_colmap(
 
 
 def write_planes(path: Path, place: Place) -> None:
-    """Writes the true panes."""
+    """Writes the true planes of the panes."""
     entries = [
         {
             "label": pane.label,
@@ -224,7 +223,7 @@ def write_planes(path: Path, place: Place) -> None:
 
 
 def write_rectangles(path: Path, place: Place) -> None:
-    """Writes the panes as they would be marked by hand, for those that are seen through others only."""
+    """Writes the panes as marked by hand, for panes that are visible only through others."""
     entries = [
         {
             "label": pane.label,
@@ -245,10 +244,10 @@ def view_name(number: int) -> str:
 
 
 def annotated_views(place: Place, poses: list[Array], masks: int) -> set[int]:
-    """Numbers of the training views that get a mask, in which every pane is marked.
+    """Indices of the training views that get a mask, in which every pane is marked.
 
-    One after the other, for the pane that the masks show least often: of the third of views in which it is largest the
-    one farthest from those chosen before.
+    They are chosen greedily, each for the pane that the masks show least often so far. Among the third of the views in
+    which this pane is largest, the one farthest from those already chosen is taken.
     """
     training = [number for number in range(len(poses)) if number % TEST_EVERY]
     labels = np.stack([place.view(poses[number], *PREVIEW).label for number in training])
@@ -265,7 +264,7 @@ def annotated_views(place: Place, poses: list[Array], masks: int) -> set[int]:
 
 
 def with_passer_by(arguments: Arguments, place: Place, number: int, pose: Array) -> Place:
-    """The place when a photograph was taken: the same, or with somebody in it."""
+    """The scene at the time of a photograph, with a passer-by or without."""
     generator = np.random.default_rng([arguments.seed, number, PASSERS])
     if generator.random() >= arguments.passers_by:
         return place
@@ -274,7 +273,7 @@ def with_passer_by(arguments: Arguments, place: Place, number: int, pose: Array)
 
 
 def write_difference(path: Path, picture: NDArray[np.uint8], other: NDArray[np.uint8]) -> None:
-    """Writes a mask of the pixels in which two pictures differ by more than rounding, and their neighbours."""
+    """Writes a mask of the pixels in which two images differ by more than rounding, dilated by one pixel."""
     path.parent.mkdir(parents=True, exist_ok=True)
     differs = np.abs(picture.astype(int) - other).max(axis=2) > 2
     mask = maximum_filter(255 * differs.astype(np.uint8), 3)
@@ -282,7 +281,7 @@ def write_difference(path: Path, picture: NDArray[np.uint8], other: NDArray[np.u
 
 
 def write_view(arguments: Arguments, place: Place, number: int, pose: Array, *, annotated: bool) -> None:
-    """Writes all that there is of a view; true layers are those without a photographer, and next to them with one."""
+    """Writes all files of a view; the true layers are without the photographer, with a second set that includes him."""
     folder, name, size = arguments.output, view_name(number), (arguments.width, arguments.width * 3 // 4)
     peopled = replace(place, photographer=photographer(pose)) if arguments.photographer else place
     seen = peopled.view(pose, *size)
@@ -303,7 +302,7 @@ def write_view(arguments: Arguments, place: Place, number: int, pose: Array, *, 
 
 
 def chosen_place(arguments: Arguments) -> DrawnPlace:
-    """The place to photograph, and from where."""
+    """The scene and its camera poses."""
     if arguments.drawn is not None:
         return draw_place(arguments.drawn, arguments.views)
     if arguments.window:
@@ -314,19 +313,19 @@ def chosen_place(arguments: Arguments) -> DrawnPlace:
 
 
 def with_glass(place: Place, arguments: Arguments) -> Place:
-    """The place with such panes of glass as are asked for; mirrors stay as they are."""
+    """The scene with the tint and double glazing of the options; mirrors stay unchanged."""
     return replace(place, panes=tuple(flawed(p, arguments) if p.refraction else p for p in place.panes))
 
 
 def flawed(pane: Pane, arguments: Arguments) -> Pane:
-    """A pane in the tint, and doubled as it is asked for."""
+    """A pane with the tint and second pane of the options."""
     tilt = arguments.second_pane
     second = None if tilt is None else SecondPane(GAP, math.radians(tilt))
     return replace(pane, tint=arguments.tint, second=second)
 
 
 def main(arguments: Arguments) -> None:
-    """Makes the scene."""
+    """Renders and writes the scene."""
     folder = arguments.output
     if arguments.drawn is not None and arguments.passers_by:
         raise ValueError("nobody walks by in drawn places; leave out --passers-by or --drawn")

@@ -1,8 +1,8 @@
-"""The README's picture: one test view of a finished `planar` or `deferred` run, taken apart.
+"""The image of the README: the layers of one test view of a finished `planar` or `deferred` run.
 
 python tools/make_readme_picture.py RUN --view 0016.jpg --output docs/images/window.png
 
-With `--output sway.json` it writes cameras that sway before that view instead, for the moving picture:
+`--output sway.json` writes cameras that sway around that view instead, for the animation:
 
 glassplat video RUN --output wipe.webp --path keyframes --keyframes sway.json --layers rgb without_panes --layout wipe
 """
@@ -30,18 +30,18 @@ PARTS = {
 
 
 SWAY = (-0.35, 0.0, 0.35, 0.0, -0.35)
-"""Places of the swaying camera along its horizontal axis, world units."""
+"""Offsets of the swaying camera along its horizontal axis, world units."""
 
 
 def swaying(camera: dict[str, Any]) -> list[dict[str, Any]]:
-    """Cameras to the left and right of one of a run's `cameras.json`, as keyframes of a film."""
+    """Cameras to the left and right of one in `cameras.json` of a run, as keyframes of a video."""
     right = [row[0] for row in camera["rotation"]]
     places = [[p + shift * r for p, r in zip(camera["position"], right, strict=True)] for shift in SWAY]
     return [{**camera, "id": k, "img_name": f"{k}.png", "position": place} for k, place in enumerate(places)]
 
 
 def main() -> None:
-    """Renders the view and writes the picture, or the cameras."""
+    """Renders the view and writes the image, or the cameras."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--view", required=True, help="name of a test view")

@@ -1,4 +1,4 @@
-"""Makes small scenes of reflective objects under a known environment, with Mitsuba 3.
+"""Renders small scenes of reflective objects under a known environment with Mitsuba 3.
 
     pip install -e '.[scenes]'
     python -m tools.make_scenes --output runs/reflective --scenes ball torus control
@@ -38,42 +38,42 @@ Variant = Literal["llvm_ad_rgb", "cuda_ad_rgb"]
 Array = NDArray[np.floating]
 
 CAMERA_DISTANCE = 4.0
-"""World units from `LOOKED_AT` to every camera."""
+"""Distance of every camera from `LOOKED_AT`, world units."""
 CAMERA_ANGLE_X_RAD = 0.6911
 """Opening angle of the NeRF-synthetic cameras."""
 LOOKED_AT = np.array([0.0, 0.0, -0.15])
 ELEVATIONS_DEG = (8.0, 75.0)
-"""Lowest and highest camera above the horizontal through `LOOKED_AT`."""
+"""Smallest and largest elevation of cameras above the horizontal through `LOOKED_AT`."""
 GOLDEN_ANGLE_RAD = math.pi * (3 - math.sqrt(5))
 TEST_AZIMUTH_RAD = 1.0
-"""Turns the spiral of the test cameras against that of the training cameras."""
+"""Rotation between the spirals of the test and the training cameras."""
 
 BALL_RADIUS = 0.7
 TORUS_MAJOR, TORUS_MINOR = 0.58, 0.25
 TORUS_TILT_DEG = 40.0
 TORUS_COLOR = (0.34, 0.02, 0.04)
 TORUS_REFRACTION = 2.5
-"""Refractive index of the coating: it reflects 18 % head-on, far more than lacquer does."""
+"""Refractive index of the coating: it reflects 18 % at normal incidence, far more than lacquer."""
 GROUND_RADIUS = 1.2
 TEXTURE_SIZE = 1024
 BOUNCES = 6
 SUBPIXELS = 8
-"""Rays per pixel and axis that measure normals, coverage and strength."""
+"""Rays per pixel and axis for normals, coverage and strength."""
 MITSUBA_FROM_OPENGL = np.diag([-1.0, 1.0, -1.0, 1.0])
 WORLD_FROM_MITSUBA_SKY = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""Mitsuba's environments have +y up, +z in the middle and +x a quarter from the left."""
+"""Environment maps in Mitsuba have +y up, +z in the centre column and +x a quarter from the left."""
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Path-traces scenes of reflective objects, with true normals, strength and environment."""
+    """Options of path-traced scenes of reflective objects, with true normals, strength and environment."""
 
     output: Path
-    """Folder that gets one folder per scene; those must not exist yet."""
+    """Folder in which one folder per scene is created; these must not exist yet."""
     scenes: tuple[SceneName, ...] = ()
-    """Which of the scenes with names to make; all of them if no seed is given either."""
+    """Named scenes to make; all of them if no seed is given either."""
     seed: tuple[int, ...] = ()
-    """Scenes drawn by chance to make, each named after its seed."""
+    """Seeds of random scenes to make, each named after its seed."""
     size: int = 256
     """Width and height of the images, pixels."""
     train: int = 80
@@ -83,18 +83,18 @@ class Arguments:
     samples: int = 256
     """Light paths per pixel."""
     points: int = 0
-    """Random grey points to write next to the images; 0 leaves them to whoever reads the scene (glassplat: 100,000)."""
+    """Random grey points to write next to the images; 0 leaves them to the loader (glassplat: 100,000)."""
     environment_height: int = 512
     """Height of the equirectangular environment, pixels."""
     estimated_normals: float | None = None
-    """Normals as estimated from single photographs next to those for training, off by so many degrees on average."""
+    """Also write simulated monocular normals of the training views, with this mean error in degrees."""
     variant: Variant = "llvm_ad_rgb"
     """Mitsuba's backend: CPU or NVIDIA GPU."""
 
 
 @dataclass(frozen=True)
 class Studio:
-    """One scene in Mitsuba and how many of its shapes, the first ones, count as reflective."""
+    """A Mitsuba scene, of whose shapes the first `mirrors` count as reflective."""
 
     mitsuba: Any
     scene: Any
@@ -102,8 +102,8 @@ class Studio:
     size: int
 
     def shows_mirror(self, hits: Any) -> Array:
-        """Mask of the hits [R] that lie on something reflective, as 0 and 1."""
-        # A scene may copy shapes while it is built, so that they are found again by their place.
+        """Mask of the hits [R] on reflective shapes, as 0 and 1."""
+        # Shapes are found by their index, because Mitsuba may copy them while building the scene.
         shapes = self.scene.shapes()[: self.mirrors]
         return sum((np.array(hits.shape == shape, dtype=np.float64) for shape in shapes), np.zeros(1))
 
@@ -129,13 +129,13 @@ def world_from_opengl(position: Array, target: Array = LOOKED_AT) -> Array:
 
 
 def textured(mitsuba: Any, reflectance: Array) -> dict[str, Any]:
-    """A matte material that shows a picture of linear reflectances [H, W, 3]."""
+    """A diffuse material with a texture of linear reflectances [H, W, 3]."""
     bitmap = mitsuba.Bitmap(np.ascontiguousarray(reflectance, dtype=np.float32))
     return {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": bitmap, "raw": True}}
 
 
 def mesh(mitsuba: Any, triangles: Triangles, material: Mapping[str, Any]) -> Any:
-    """A Mitsuba mesh of one material."""
+    """A Mitsuba mesh with one material."""
     properties = mitsuba.Properties()
     properties["mesh_bsdf"] = mitsuba.load_dict(dict(material))
     shape = mitsuba.Mesh(
@@ -156,7 +156,7 @@ def mesh(mitsuba: Any, triangles: Triangles, material: Mapping[str, Any]) -> Any
 
 
 def make_body(mitsuba: Any, name: StudioName) -> tuple[Any, float]:
-    """The object of a scene, about the origin, and the height of the ground that it stands on."""
+    """The object of a named scene, about the origin, and the height of the ground below it."""
     if name == "torus":
         coated = {
             "type": "plastic",
@@ -171,7 +171,7 @@ def make_body(mitsuba: Any, name: StudioName) -> tuple[Any, float]:
 
 
 def make_drawn_body(mitsuba: Any, body: Body) -> Any:
-    """One thing of a drawn scene."""
+    """One body of a random scene."""
     tint = {"type": "rgb", "value": list(body.tint)}
     if body.coating == "mirror":
         material: dict[str, Any] = {"type": "conductor", "material": "none"}
@@ -191,7 +191,7 @@ def make_drawn_body(mitsuba: Any, body: Body) -> Any:
 
 
 def make_studio(mitsuba: Any, name: StudioName, environment: Array, size: int) -> Studio:
-    """A scene with a name: object, ground and environment."""
+    """A named scene: object, ground and environment."""
     body, ground_z = make_body(mitsuba, name)
     ground = mesh(
         mitsuba, disc(GROUND_RADIUS, ground_z), textured(mitsuba, ground_texture(GROUND_RADIUS, TEXTURE_SIZE))
@@ -200,7 +200,7 @@ def make_studio(mitsuba: Any, name: StudioName, environment: Array, size: int) -
 
 
 def make_drawn_studio(mitsuba: Any, drawn: DrawnScene, environment: Array, size: int) -> Studio:
-    """A drawn scene: its bodies, stand and environment."""
+    """A random scene: its bodies, stand and environment."""
     stand = drawn.stand
     picture = ground_texture(stand.radius, TEXTURE_SIZE, checker_size=stand.checker_size, seed=stand.pattern_seed)
     ground = mesh(mitsuba, disc(stand.radius, stand.z), textured(mitsuba, picture))
@@ -212,7 +212,7 @@ def make_drawn_studio(mitsuba: Any, drawn: DrawnScene, environment: Array, size:
 def assembled(
     mitsuba: Any, bodies: tuple[Any, ...], ground: Any, environment: Array, *, mirrors: int, size: int
 ) -> Studio:
-    """Bodies, of which the first `mirrors` reflect, ground and environment; where it shows, images are transparent."""
+    """A scene of bodies, of which `mirrors` reflect, ground and environment; images are transparent in front of it."""
     sky = {
         "type": "envmap",
         "bitmap": mitsuba.Bitmap(np.ascontiguousarray(environment)),
@@ -249,7 +249,7 @@ def make_sensor(studio: Studio, pose: Array, samples: int) -> Any:
 
 
 def photograph(studio: Studio, pose: Array, samples: int, seed: int) -> NDArray[np.uint8]:
-    """One view [S, S, 4]: sRGB, and in the last channel coverage, by which the colours are not multiplied."""
+    """One view [S, S, 4]: sRGB and coverage, with straight (not premultiplied) colours."""
     sensor = make_sensor(studio, pose, samples)
     linear = np.array(studio.mitsuba.render(studio.scene, sensor=sensor, spp=samples, seed=seed), dtype=np.float64)
     alpha = np.clip(linear[..., 3:], 0, 1)
@@ -258,11 +258,11 @@ def photograph(studio: Studio, pose: Array, samples: int, seed: int) -> NDArray[
 
 
 def visible_surfaces(studio: Studio, pose: Array) -> tuple[Array, Array]:
-    """Surfaces that one camera sees, from rays through a regular grid in every pixel.
+    """Surfaces visible to one camera, from rays through a regular grid in every pixel.
 
     Returns:
-        Unit world normal averaged over what is covered, and coverage, [S, S, 4]; and the share [S, S] of the pixel
-        that shows the reflective object.
+        Unit world normal averaged over the covered part of the pixel, and coverage, [S, S, 4]; and the share [S, S] of
+        the pixel that shows a reflective object.
     """
     fine = studio.size * SUBPIXELS
     half = math.tan(CAMERA_ANGLE_X_RAD / 2)
@@ -296,7 +296,7 @@ def linear_from_srgb(srgb: Array) -> Array:
 
 
 def as_bytes(unit: Array) -> NDArray[np.uint8]:
-    """Eight bits of values in [0, 1]."""
+    """Values in [0, 1] as uint8."""
     return np.round(np.clip(unit, 0, 1) * 255).astype(np.uint8)
 
 
@@ -321,7 +321,7 @@ def write_estimate(studio: Studio, pose: Array, stem: Path, error_deg: float, se
 
 
 def write_views(studio: Studio, folder: Path, part: Literal["train", "test"], arguments: Arguments) -> None:
-    """Renders one part of the split and writes its `transforms_<part>.json` when all of it is there."""
+    """Renders one part of the split, and writes its `transforms_<part>.json` when it is complete."""
     count, azimuth_rad = (arguments.train, 0.0) if part == "train" else (arguments.test, TEST_AZIMUTH_RAD)
     (folder / part).mkdir()
     frames = []
@@ -344,7 +344,7 @@ def write_views(studio: Studio, folder: Path, part: Literal["train", "test"], ar
 
 
 def write_environment(mitsuba: Any, environment: Array, folder: Path) -> None:
-    """Writes `environment.exr`, linear radiance in half floats, and `environment.png`, sRGB cut at 1."""
+    """Writes `environment.exr`, linear radiance in half floats, and `environment.png`, sRGB clipped at 1."""
     bitmap = mitsuba.Bitmap(np.ascontiguousarray(environment, dtype=np.float32))
     bitmap.convert(component_format=mitsuba.Struct.Type.Float16).write(str(folder / "environment.exr"))
     Image.fromarray(as_bytes(srgb_from_linear(np.clip(environment, 0, 1)))).save(
@@ -353,21 +353,21 @@ def write_environment(mitsuba: Any, environment: Array, folder: Path) -> None:
 
 
 def write_points(count: int, folder: Path) -> None:
-    """Writes `points3d.ply`: random points of the box in which such captures lie."""
+    """Writes `points3d.ply`: random points in the bounding box of NeRF-synthetic captures."""
     cloud = points_in_box(count)
     rows = np.concatenate([cloud.positions, cloud.colors], axis=1).astype(np.float32)
     write_table(folder / "points3d.ply", ["x", "y", "z", "red", "green", "blue"], rows)
 
 
 def main(arguments: Arguments) -> None:
-    """Makes every scene that was asked for, after checking that none would be overwritten."""
+    """Makes all requested scenes, after checking that none would be overwritten."""
     names = arguments.scenes or (() if arguments.seed else NAMES)
     wanted: list[SceneName | int] = [*names, *arguments.seed]
     folders = {key: arguments.output / (key if isinstance(key, str) else f"drawn-{key}") for key in wanted}
     existing = [str(folder) for folder in folders.values() if folder.exists()]
     if existing:
         raise FileExistsError(f"{', '.join(existing)} exist; expected new folders, so remove them first")
-    # Imported here because the backend has to be chosen before the rest of Mitsuba can be used.
+    # Imported here, because the backend has to be chosen before the rest of Mitsuba can be used.
     import mitsuba
 
     mitsuba.set_variant(arguments.variant)
@@ -376,7 +376,7 @@ def main(arguments: Arguments) -> None:
 
 
 def make_scene(mitsuba: Any, key: SceneName | int, folder: Path, arguments: Arguments) -> None:
-    """Makes the scene of a name or a seed in a new folder."""
+    """Makes the scene of a name or seed in a new folder."""
     folder.mkdir(parents=True)
     if isinstance(key, int) or key in NEAR_SCENES:
         drawn = draw_scene(key) if isinstance(key, int) else near_scene(cast(NearScene, key))

@@ -1,16 +1,16 @@
-"""Marks panes of a capture on the page of `glassplat annotate`, in a headless browser, as somebody would with a mouse.
+"""Marks panes of a capture on the page of `glassplat annotate` in a headless browser, as a user would with a mouse.
 
     python -m tools.marking_page CAPTURE MARKS.json --pictures FOLDER
 
-MARKS.json maps names of photographs to what is clicked in them, in pixels of the photograph without distortion:
+MARKS.json maps names of photographs to the clicked points, in pixels of the undistorted photograph:
 
     {"frame_0003.jpg": {"corners": [[120, 80], [900, 60], null, [110, 520]],
                         "edges": [null, [[905, 300], [908, 500]], null, null],
                         "cut": [[[300, 400], ...]]}, ...}
 
-What is null is not to be seen in that photograph, and is skipped.
+Corners and edges that are null are not visible in that photograph, and are skipped.
 
-Masks and planes are written at the end, and with `--pictures` what the page shows on the way.
+Masks and planes are written at the end; `--pictures` also saves screenshots on the way.
 """
 
 from __future__ import annotations
@@ -32,34 +32,34 @@ from tools.browser import Browser
 
 Places = Sequence[Any] | np.ndarray
 WHOLE = 1.5
-"""What the canvas shows of a photograph at first, in its sizes: there is room for corners next to it."""
+"""Initial extent of the canvas in units of the photograph size, which leaves room for corners outside of it."""
 
 
 class MarkingPage:
-    """The page, and the browser that it is open in."""
+    """The page in a browser."""
 
     def __init__(self, window: Browser, server: AnnotationServer) -> None:
         self.window, self.server = window, server
         self._view = 0
 
     def open(self) -> None:
-        """Opens the page, or opens it again."""
+        """Opens or reopens the page."""
         self.window.open(self.server.address)
         self.window.wait("document.body.dataset.ready === 'yes'", "the page")
         self.saved()
 
     def saved(self) -> None:
-        """Waits until the server knows everything."""
+        """Waits until all marks are saved on the server."""
         self.window.wait("['saved', undefined].includes(document.body.dataset.state)", "the document to be saved")
 
     def show(self, view: int) -> None:
-        """Goes to a photograph, by its number."""
+        """Shows a photograph, given by its index."""
         self.window.run("document.querySelectorAll('#views button')[arguments[0]].click()", view)
         self.window.wait(f"document.body.dataset.view === '{view}'", f"photograph {view}")
         self._view = view
 
     def on_screen(self, places: Places) -> list[tuple[float, float]]:
-        """Places of the photograph that is shown whole, in the window."""
+        """Window positions of points in the photograph, at the initial zoom."""
         left, top, width, height = self.window.run(
             "const box = document.getElementById('canvas').getBoundingClientRect();"
             "return [box.left, box.top, box.width, box.height]"
@@ -70,7 +70,7 @@ class MarkingPage:
         return [(x + scale * float(place[0]), y + scale * float(place[1])) for place in places]
 
     def mark(self, view: int, corners: Places) -> None:
-        """Clicks corners, one after the other; None skips one."""
+        """Clicks corners in order; None skips one."""
         self.show(view)
         self.window.keys("1")
         for corner in corners:
@@ -81,7 +81,7 @@ class MarkingPage:
         self.saved()
 
     def mark_edges(self, view: int, edges: Sequence[Places | None]) -> None:
-        """Draws along edges, one after the other; None skips one."""
+        """Draws along edges in order; None skips one."""
         self.show(view)
         self.window.keys("2")
         for ends in edges:
@@ -93,7 +93,7 @@ class MarkingPage:
         self.saved()
 
     def cut(self, view: int, outline: Places) -> None:
-        """Cuts a polygon out."""
+        """Cuts out a polygon."""
         self.show(view)
         self.window.keys("3")
         for x, y in self.on_screen(outline):
@@ -103,19 +103,19 @@ class MarkingPage:
         self.saved()
 
     def write(self) -> str:
-        """Writes masks and planes; what the page says."""
+        """Writes masks and planes; returns the message of the page."""
         self.window.press("#write")
         self.window.wait("document.body.dataset.written", "masks and planes")
         return str(self.window.run("return document.getElementById('status').textContent"))
 
     def said(self) -> str:
-        """Text next to the panes."""
+        """Status text next to the panes."""
         return str(self.window.run("return document.getElementById('panes').innerText"))
 
 
 @contextmanager
 def marking_page(capture: Path, *, width: int = 1400, height: int = 900) -> Iterator[MarkingPage]:
-    """The page of a capture, open in a browser."""
+    """The page of a capture in a browser."""
     with AnnotationServer(open_session(capture), 0) as server:
         thread = Thread(target=server.serve_forever, args=(0.02,))
         thread.start()
@@ -130,7 +130,7 @@ def marking_page(capture: Path, *, width: int = 1400, height: int = 900) -> Iter
 
 
 def mark_all(page: MarkingPage, marks: Mapping[str, Any], pictures: Path | None) -> None:
-    """Does what a file of marks says, photograph by photograph."""
+    """Marks everything from a file of marks, photograph by photograph."""
     numbers = {view.name: number for number, view in enumerate(page.server.session.views)}
     for done, (name, what) in enumerate(marks.items(), start=1):
         page.mark(numbers[name], what.get("corners", []))
@@ -148,7 +148,7 @@ def _save(page: MarkingPage, pictures: Path | None, name: str) -> None:
 
 
 def main() -> None:
-    """Marks, writes, and says what was written."""
+    """Marks the panes, writes masks and planes, and prints the message of the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture", type=Path)
     parser.add_argument("marks", type=Path)

@@ -1,4 +1,4 @@
-"""Likeness of a run's web page to its render, and how soon and how often the page draws without a GPU.
+"""Similarity of the web page of a run to its renders, and latency and frame rate of the page without a GPU.
 
 python -m tools.page_likeness runs/showcase out/index.html
 """
@@ -29,7 +29,7 @@ DRAG_STEPS = 40
 
 
 def wanted(camera: Camera, layer: str) -> str:
-    """A call of the page's script for the picture of a camera."""
+    """JavaScript call that returns the image of a camera."""
     flip = torch.tensor(HALF_TURN_X)
     rotation, position = camera.cam_from_world[:3, :3] * flip, camera.center * flip
     values: dict[str, Any] = {"rotation": rotation.flatten().tolist(), "position": position.tolist()}
@@ -39,18 +39,18 @@ def wanted(camera: Camera, layer: str) -> str:
 
 
 def picture(browser: Browser, camera: Camera, layer: str = "rgb") -> torch.Tensor:
-    """Picture of a layer in the page, [H, W, 3] uint8."""
+    """Image of a layer in the page, [H, W, 3] uint8."""
     return pixels_of(browser.evaluate(wanted(camera, layer)), camera.width, camera.height)
 
 
 def pixels_of(text: str, width: int, height: int) -> torch.Tensor:
-    """Picture that the page's script returns, as [H, W, 3] uint8."""
+    """Decodes an image returned by the page, as [H, W, 3] uint8."""
     pixels = np.frombuffer(base64.b64decode(text), dtype=np.uint8)
     return torch.from_numpy(pixels.reshape(height, width, 4)[::-1, :, :3].copy())
 
 
 def likenesses(browser: Browser, model: Model) -> list[float]:
-    """PSNR of the page's pictures against the renders of some cameras of test views, every eighth by name."""
+    """PSNR of the page against renders of the model, for some of the test views."""
     cameras = [model.cameras[name] for name in sorted(model.cameras)[::TEST_EVERY]]
     found = []
     for camera in cameras[:: max(1, len(cameras) // VIEWS)][:VIEWS]:
@@ -62,34 +62,34 @@ def likenesses(browser: Browser, model: Model) -> list[float]:
 
 @dataclass(frozen=True)
 class Walk:
-    """Record of a page while it is dragged and after it is let go."""
+    """Record of the page during a drag and after its release."""
 
     moving: list[dict[str, float]]
-    """Pictures while dragged: `time` in milliseconds, `scale` of its resolution, `splats` that it drew."""
+    """Frames during the drag: `time` in milliseconds, `scale` of the resolution, number of drawn `splats`."""
     resting: list[dict[str, float]]
-    """Pictures after that, up to the whole one."""
+    """Frames after the release, up to the one at full resolution."""
     seconds: float
-    """How long it was dragged."""
+    """Duration of the drag."""
     end: float
-    """When it was held still, in milliseconds."""
+    """Time of the end of the drag, in milliseconds."""
     processor: float
-    """Seconds of processor time that the browser took meanwhile."""
+    """CPU seconds of the browser during the drag."""
 
     def report(self) -> str:
-        """Both, in two lines."""
+        """Report of both phases, in two lines."""
         scale = statistics.mean(picture["scale"] for picture in self.moving)
         splats, every = (statistics.mean(p["splats"] for p in ps) for ps in (self.moving, self.resting[-1:]))
         count, first = len(self.moving), self.resting[0]
         return (
-            f"moving: {count / self.seconds:.1f} pictures a second in software, {self.processor / count:.3f} s of "
-            f"processor time each, at {scale:.0%} of the resolution, {splats / every:.0%} of the Gaussians\n"
-            f"at rest: the next picture after {(first['time'] - self.end) / 1000:.2f} s, "
-            f"the whole one after {(self.resting[-1]['time'] - self.end) / 1000:.2f} s"
+            f"moving: {count / self.seconds:.1f} frames per second in software, {self.processor / count:.3f} s of "
+            f"CPU time each, at {scale:.0%} of the resolution, {splats / every:.0%} of the Gaussians\n"
+            f"at rest: the next frame after {(first['time'] - self.end) / 1000:.2f} s, "
+            f"full resolution after {(self.resting[-1]['time'] - self.end) / 1000:.2f} s"
         )
 
 
 def processor_seconds(process: int) -> float:
-    """User and system time of all that a process has started and that still runs."""
+    """User and system time of all running descendants of a process."""
     seconds, ticks = 0.0, os.sysconf("SC_CLK_TCK")
     pending, children = [process], _running()
     while pending:
@@ -100,19 +100,19 @@ def processor_seconds(process: int) -> float:
 
 
 def _running() -> dict[int, list[tuple[int, int]]]:
-    """Of every process its children, with the clock ticks that they have used."""
+    """Children of every process, with the clock ticks that they have used."""
     children: dict[int, list[tuple[int, int]]] = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
             fields = stat.read_text().rpartition(")")[2].split()
-        except OSError:  # It has ended meanwhile.
+        except OSError:  # The process has ended.
             continue
         children.setdefault(int(fields[1]), []).append((int(stat.parent.name), int(fields[11]) + int(fields[12])))
     return children
 
 
 def walked(browser: Browser) -> Walk:
-    """Drags the page for a while as a person would, holds it still, and waits for the whole picture."""
+    """Drags the page like a user, stops, and waits for the frame at full resolution."""
     noted = "glassplat.then(({ noted }) => noted)"
     wait = "glassplat.then(({ noted }) => noted.some(({ scale }) => scale === 1))"
     browser.wait(wait, "the first whole picture")
@@ -127,7 +127,7 @@ def walked(browser: Browser) -> Walk:
 
 
 def main() -> None:
-    """Prints both."""
+    """Prints similarity, latency and frame rate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, help="a trained run")
     parser.add_argument("page", type=Path, help="its exported page")
