@@ -281,7 +281,7 @@ def write_difference(path: Path, picture: NDArray[np.uint8], other: NDArray[np.u
 
 
 def write_view(arguments: Arguments, place: Place, number: int, pose: Array, *, annotated: bool) -> None:
-    """Writes all files of a view; the true layers are without the photographer, with a second set that includes him."""
+    """Writes all files of a view; the true layers exclude the photographer, and a second set includes them."""
     folder, name, size = arguments.output, view_name(number), (arguments.width, arguments.width * 3 // 4)
     peopled = replace(place, photographer=photographer(pose)) if arguments.photographer else place
     seen = peopled.view(pose, *size)

@@ -212,7 +212,7 @@ def make_drawn_studio(mitsuba: Any, drawn: DrawnScene, environment: Array, size:
 def assembled(
     mitsuba: Any, bodies: tuple[Any, ...], ground: Any, environment: Array, *, mirrors: int, size: int
 ) -> Studio:
-    """A scene of bodies, of which `mirrors` reflect, ground and environment; images are transparent in front of it."""
+    """A scene of bodies (the first `mirrors` reflect), ground and environment, which is transparent in images."""
     sky = {
         "type": "envmap",
         "bitmap": mitsuba.Bitmap(np.ascontiguousarray(environment)),

@@ -1,9 +1,9 @@
-"""Rooms with panes drawn by chance: what they are, what is in them and how they are photographed, from a seed.
+"""Random rooms with panes: geometry, contents and camera poses, generated from a seed.
 
-What a method was tuned on says little about what it does elsewhere. Seeds take turns at three settings (panes that
-stand freely in a room, a shop window of coplanar panes with posts between, windows in a wall with a room or a street
-behind) and at the walks of the camera (from the front, all round, along a line). Number and size of panes, glass,
-mirrors, things, paints and lamps are drawn.
+Scenes on which a method was tuned say little about its generality. Seeds cycle through three settings (free-standing
+panes in a room, a shop window of coplanar panes with posts, windows in a wall in front of a room or a street) and
+through the camera walks (from the front, all around, along a line). Number and size of panes, glass, mirrors, objects,
+paints and lamps are random.
 """
 
 from __future__ import annotations
@@ -32,42 +32,42 @@ WALKS: dict[Setting, tuple[Walk, ...]] = {
 
 OPENGL_FROM_CAM = np.diag([1.0, -1.0, -1.0, 1.0])
 HALF_WIDTHS, DEPTHS, CEILINGS = (1.9, 2.7), (2.6, 3.8), (2.3, 3.0)
-"""Of rooms, world units."""
+"""Dimensions of rooms, world units."""
 REFRACTIONS, LEANS_DEG = (1.45, 1.8), (-28.0, 28.0)
 POSTS, PIERS = (0.05, 0.12), (0.3, 0.7)
-"""Between the panes of a shop window, and between windows."""
+"""Widths between the panes of a shop window, and between windows."""
 EYES, STANDS, LINES = (0.9, 1.7), (1.0, 1.9), (1.1, 1.7)
-"""Heights of cameras, and distances from the panes in walks from the front or around, and along a line."""
+"""Heights of cameras, and their distances from the panes in walks from the front or around, and along a line."""
 ARC_DEG = 60.0
-"""How far to either side of a pane's normal a walk goes that stays on one side."""
+"""Largest angle to the normal of a pane in walks that stay on one side."""
 CLEARANCE = 0.25
-"""Between a camera and anything else."""
+"""Minimum distance between a camera and anything else."""
 FREE_VIEW = 1.8
-"""Least distance of what a view that looks past the panes shows in its middle."""
+"""Minimum depth at the centre of views that face away from the panes."""
 LOOK_AROUND = 3
-"""One view of so many looks past the panes."""
+"""One view in three faces away from the panes."""
 ODDS, WALL_ODDS = (0.45, 0.2, 0.2, 0.15), (0.6, 0.07, 0.08, 0.25)
-"""Of the patterns of paints."""
+"""Probabilities of the paint patterns of objects, and of walls."""
 THICK = 0.1
-"""Of walls."""
+"""Thickness of walls."""
 TRIES, REDRAWS = 200, 200
 LEAST_LARGEST, LEAST_SEEN, LEAST_VIEWS = 0.06, 0.015, 0.3
-"""Each pane covers such a share of some photograph, and such a share in so large a part of all photographs."""
+"""Each pane has to cover the first share of some photograph, and the second in this part of all photographs."""
 LEAST_CLIPPED = 0.002
-"""Mean share of a photograph that lamps make white."""
+"""Minimum mean share of clipped pixels, which show lamps."""
 PREVIEW = (16, 12)
-"""Width and height at which views are judged before they are rendered."""
+"""Width and height of previews for checking views."""
 
 
 @dataclass(frozen=True)
 class DrawnPlace:
-    """A place and where it is photographed from.
+    """A scene and its camera poses.
 
     Attributes:
-        place: what there is.
+        place: the scene.
         poses: camera-to-world [4, 4] each, x right, y down, z forward.
-        words: what was drawn.
-        room: [2, 3] lowest and highest corner of where the cameras stay; None if it was not drawn.
+        words: description of the scene.
+        room: [2, 3] lowest and highest corner of the region of the cameras; None for named scenes.
     """
 
     place: Place
@@ -78,15 +78,15 @@ class DrawnPlace:
 
 @dataclass(frozen=True)
 class _Stage:
-    """A place before it is photographed: what is in it, and the stretch of floor from which the panes are seen.
+    """A scene without cameras: its contents, and the room in which the cameras stay.
 
     Attributes:
-        things: without posters and lamps.
-        panes: those of glass.
+        things: objects without posters and lamps.
+        panes: panes of glass.
         low: lowest corner of the room of the cameras.
         high: highest corner.
-        words: what it is.
-        lamps: behind the glass.
+        words: description of the setting.
+        lamps: lamps behind the glass.
     """
 
     things: tuple[Thing, ...]
@@ -98,10 +98,10 @@ class _Stage:
 
 
 def draw_place(seed: int, views: int) -> DrawnPlace:
-    """The place of a seed, the same one wherever it is drawn, with so many views; drawn anew until it can be seen.
+    """The scene of a seed with `views` views, deterministic; redrawn until its panes are visible enough.
 
     Raises:
-        RuntimeError: none of many could.
+        RuntimeError: no draw was successful.
     """
     for attempt in range(REDRAWS):
         drawn = _draw_once(np.random.default_rng([seed, attempt]), seed, views)
@@ -111,7 +111,7 @@ def draw_place(seed: int, views: int) -> DrawnPlace:
 
 
 def is_shown(drawn: DrawnPlace) -> bool:
-    """Return whether photographs show enough of each pane, and lamps."""
+    """Return whether the photographs show enough of each pane, and lamps."""
     seen = [drawn.place.view(pose, *PREVIEW) for pose in drawn.poses]
     labels = np.stack([view.label for view in seen])
     shares = np.stack([(labels == pane.label).mean(axis=(1, 2, 3)) for pane in drawn.place.panes])
@@ -129,7 +129,7 @@ def world_from_cam(position: Array, target: Array) -> Array:
 
 
 def _draw_once(generator: Generator, seed: int, views: int) -> DrawnPlace | None:
-    """A place in the setting and on the walk of a seed; None where a mirror or a camera found no place of its own."""
+    """A scene in the setting and with the walk of a seed; None if no valid position of a mirror or camera was found."""
     setting = SETTINGS[seed % len(SETTINGS)]
     stage = _draw_screens(generator) if setting == "screens" else _draw_glass_wall(generator, setting)
     panes = stage.panes
@@ -164,7 +164,7 @@ def _draw_paint(
 
 
 def _draw_walls(generator: Generator, low: Array, high: Array, *, shade: float, missing: str = "") -> list[Box]:
-    """Floor, ceiling and four walls about a room, each in a paint of its own; a missing one is named by its side."""
+    """Floor, ceiling and four walls around a room, each in its own paint; `missing` names a side to leave out."""
     sides = {"west": (0, 0), "east": (0, 1), "near": (1, 0), "far": (1, 1), "floor": (2, 0), "ceiling": (2, 1)}
     boxes = []
     for name, (axis, side) in sides.items():
@@ -177,7 +177,7 @@ def _draw_walls(generator: Generator, low: Array, high: Array, *, shade: float, 
 
 
 def _draw_screens(generator: Generator) -> _Stage:
-    """One to three panes that stand freely near the middle of a room, some of them next to each other in a plane."""
+    """One to three free-standing panes near the middle of a room, some of them coplanar neighbours."""
     half_x, half_y = generator.uniform(*HALF_WIDTHS, 2)
     low, high = np.array([-half_x, -half_y, 0.0]), np.array([half_x, half_y, _between(generator, CEILINGS)])
     things: list[Thing] = [*_draw_walls(generator, low, high, shade=1.0)]
@@ -219,7 +219,7 @@ def _draw_screen(generator: Generator, label: int, near: tuple[float, ...]) -> P
 
 
 def _draw_post(generator: Generator, pane: Pane, width: float, number: int) -> Carried:
-    """Between the pane that is so many places next to `pane` and the one before that."""
+    """The post between the neighbours `number` - 1 and `number` of `pane` in its plane."""
     frame = np.eye(4)
     frame[:3, :3] = np.stack([pane.tangent, pane.bitangent, np.cross(pane.tangent, pane.bitangent)], axis=1)
     frame[:3, 3] = pane.center + ((2 * number - 1) * pane.half_sizes[0] + (number - 0.5) * width) * pane.tangent
@@ -229,7 +229,7 @@ def _draw_post(generator: Generator, pane: Pane, width: float, number: int) -> C
 
 
 def _draw_glass_wall(generator: Generator, setting: Setting) -> _Stage:
-    """A wall at y = 0 with panes in it, the cameras' room before it, and a shop, a room or a street behind it."""
+    """A wall at y = 0 with panes, the room of the cameras in front of it, and a shop, a room or a street behind it."""
     shop, street = setting == "shop", bool(generator.random() < 0.5)
     half, depth, ceiling = (_between(generator, limits) for limits in (HALF_WIDTHS, DEPTHS, CEILINGS))
     low, high = np.array([-half, -depth, 0.0]), np.array([half, 0.0, ceiling])
@@ -261,7 +261,7 @@ def _draw_glass_wall(generator: Generator, setting: Setting) -> _Stage:
     )
     furniture: list[Thing] = []
     for _ in range(int(generator.integers(4, 8))):
-        # Along the walls, out of the way.
+        # Along the walls, out of the way of the cameras.
         x, y = generator.uniform(0.4, half - 0.3), generator.uniform(-depth + 0.3, -0.7)
         x, y = (half - 0.35, y) if generator.random() < 0.5 else (x, -depth + 0.35)
         side = generator.choice([-1, 1])
@@ -276,7 +276,7 @@ def _draw_pierced_wall(
     heights: tuple[float, float],
     holes: Sequence[tuple[float, float]],
 ) -> list[Box]:
-    """The wall at y = 0 from one x to another and up to a height, with holes between two heights."""
+    """The wall at y = 0 between two x and up to a height, with holes between two heights."""
     paint, other = _draw_paint(generator, (0.8, 2.5), 1.0, WALL_ODDS), _draw_paint(generator, (0.3, 1.0), 0.7)
     left, right, ceiling = wall
     sill, top = heights
@@ -295,7 +295,7 @@ def _draw_pierced_wall(
 
 
 def _draw_shop(generator: Generator, half: float, sill: float, ceiling: float) -> tuple[list[Thing], tuple[Lamp, ...]]:
-    """A dim shallow room behind glass, with things on a podium."""
+    """A dim shallow room behind glass, with objects on a podium."""
     shade, deep = _between(generator, (0.2, 0.6)), _between(generator, (0.9, 1.7))
     low, high = np.array([-half, THICK / 2, 0.0]), np.array([half, deep, ceiling])
     things: list[Thing] = [*_draw_walls(generator, low, high, shade=shade, missing="near")]
@@ -312,7 +312,7 @@ def _draw_shop(generator: Generator, half: float, sill: float, ceiling: float) -
 
 
 def _draw_other_room(generator: Generator, half: float, ceiling: float) -> tuple[list[Thing], tuple[Lamp, ...]]:
-    """A room behind windows, with things on its floor."""
+    """A room behind windows, with objects on its floor."""
     shade, deep = _between(generator, (0.4, 1.0)), _between(generator, (1.8, 3.0))
     low, high = np.array([-half, THICK / 2, 0.0]), np.array([half, deep, ceiling])
     things: list[Thing] = [*_draw_walls(generator, low, high, shade=shade, missing="near")]
@@ -323,7 +323,7 @@ def _draw_other_room(generator: Generator, half: float, ceiling: float) -> tuple
 
 
 def _draw_street(generator: Generator) -> tuple[list[Thing], tuple[Lamp, ...]]:
-    """A street behind windows: houses under a bright sky, and things before them."""
+    """A street behind windows: houses under a bright sky, with objects in front of them."""
     road = Box((-9.0, THICK / 2, -0.3), (9.0, 9.0, -0.1), _draw_paint(generator, (1.5, 3.0), 1.0))
     things: list[Thing] = [road]
     left = -7.0
@@ -366,11 +366,11 @@ def _draw_thing(
 
 
 def _draw_posters(generator: Generator, stage: _Stage) -> list[Thing]:
-    """Pictures on the side walls and the wall behind the cameras."""
+    """Posters on the side walls and the wall behind the cameras."""
     posters: list[Thing] = []
     for _ in range(int(generator.integers(3, 8))):
         axis, side = int(generator.integers(2)), bool(generator.random() < 0.5)
-        # There is no wall but one of glass at y = 0, unless the panes stand freely.
+        # At y = 0 there is only the wall with panes, unless the panes are free-standing.
         side = side and not (axis == 1 and stage.high[1] == 0)
         middle = generator.uniform(stage.low + np.array([0.5, 0.5, 1.0]), stage.high - np.array([0.5, 0.5, 0.7]))
         half = np.append(generator.uniform(0.15, 0.45, 2), generator.uniform(0.15, 0.4))
@@ -386,7 +386,7 @@ def _draw_posters(generator: Generator, stage: _Stage) -> list[Thing]:
 
 
 def _draw_lamps(generator: Generator, stage: _Stage) -> tuple[list[Thing], tuple[Lamp, ...]]:
-    """One to three lamps brighter than white: balls on a cable, shades on a stand, panels under the ceiling."""
+    """One to three lamps brighter than white: balls on cables, shades on stands, panels under the ceiling."""
     things: list[Thing] = []
     lights = []
     ceiling = float(stage.high[2])
@@ -411,14 +411,14 @@ def _draw_lamps(generator: Generator, stage: _Stage) -> tuple[list[Thing], tuple
 
 
 def _rod(x: float, y: float, heights: tuple[float, float]) -> Cylinder:
-    """A cable or a stand."""
+    """A vertical rod: a cable or a stand."""
     return Cylinder(
         (x - 0.015, y - 0.015, heights[0]), (x + 0.015, y + 0.015, heights[1]), Paint(shade=0.2, pattern="plain")
     )
 
 
 def _draw_mirror(generator: Generator, stage: _Stage, *, free: bool) -> Pane:
-    """On a side wall or free-standing; with walls of glass, on a side wall."""
+    """A mirror, free-standing if `free`, else on a side wall."""
     label = len(stage.panes) + 1
     half_sizes = (_between(generator, (0.4, 0.7)), _between(generator, (0.4, 0.6)))
     height = _between(generator, (1.0, 1.3))
@@ -433,7 +433,7 @@ def _draw_mirror(generator: Generator, stage: _Stage, *, free: bool) -> Pane:
 
 
 def _distance_to_pane(pane: Pane, where: Array) -> float:
-    """On the floor plan, from a point to the strip that a pane stands over, its lean included."""
+    """Distance on the floor plan from a point to the footprint of a pane, including its lean."""
     level = np.array([pane.tangent[0], pane.tangent[1]])
     offset = where - pane.center[:2]
     along = float(np.clip(offset @ level, -pane.half_sizes[0], pane.half_sizes[0]))
@@ -442,7 +442,7 @@ def _distance_to_pane(pane: Pane, where: Array) -> float:
 
 
 def _touch(pane: Pane, other: Pane) -> bool:
-    """Return whether two panes stand nearer to each other than a step, on the floor plan."""
+    """Return whether two panes are closer to each other on the floor plan than a step."""
     steps = np.linspace(-1, 1, 9)[:, None] * pane.half_sizes[0] * pane.tangent[:2]
     return min(_distance_to_pane(other, pane.center[:2] + step) for step in steps) < 0.3
 
@@ -450,15 +450,15 @@ def _touch(pane: Pane, other: Pane) -> bool:
 def _draw_poses(
     generator: Generator, place: Place, stage: _Stage, *, walk: Walk, turns: bool, views: int
 ) -> list[Array]:
-    """Camera-to-world: two of three look at a pane, one of three past all of them, as level as people do.
+    """Upright camera-to-world poses; two in three face a pane, one in three faces elsewhere if `turns`.
 
     Args:
-        generator: of what is drawn.
-        place: that is photographed.
+        generator: random generator.
+        place: the photographed scene.
         stage: the room in which the camera stays.
-        walk: its kind.
-        turns: whether the camera is turned round on it; where it is not, all views look at a pane.
-        views: how many.
+        walk: kind of the walk.
+        turns: whether some views face away from the panes; otherwise all views face a pane.
+        views: number of views.
     """
     course = (_between(generator, LINES), generator.uniform(-0.2, 0.2), _between(generator, (1.1, 1.6)))
     poses = []
@@ -475,7 +475,7 @@ def _draw_poses(
 
 
 def _draw_target(generator: Generator, place: Place, position: Array) -> Array:
-    """A place in any direction in which something lies not too near: nobody photographs a bare wall from close by."""
+    """A target in a random direction with enough free depth: nobody photographs a bare wall at close range."""
     azimuths = generator.uniform(0, 2 * math.pi, 8)
     rises = generator.uniform(-0.35, 0.25, 8)
     directions = np.stack([np.cos(azimuths), np.sin(azimuths), rises], axis=1)
@@ -488,7 +488,7 @@ def _draw_target(generator: Generator, place: Place, position: Array) -> Array:
 def _draw_position(
     generator: Generator, place: Place, stage: _Stage, course: tuple[Walk, float, tuple[float, float, float]]
 ) -> Array | None:
-    """Somewhere before the panes of glass or around them, or on a line past them; None if nothing is clear there."""
+    """A camera position in front of the panes, around them, or on a line past them; None if no free one was found."""
     kind, progress, (distance, slope, height) = course
     glass = [pane for pane in place.panes if pane.refraction]
     first, middle = glass[0], np.mean([pane.center for pane in glass], axis=0)[:2]
@@ -513,7 +513,7 @@ def _draw_position(
 
 
 def is_clear(place: Place, position: Array) -> bool:
-    """Return whether nothing, panes included, is nearer to a position [3] than `CLEARANCE`, or around it."""
+    """Return whether a position [3] is outside all objects, and at least `CLEARANCE` away from them and from panes."""
     z = np.linspace(-1, 1, 64)
     turn = GOLDEN_ANGLE_RAD * np.arange(64)
     flat = np.sqrt(1 - z**2)
@@ -524,7 +524,7 @@ def is_clear(place: Place, position: Array) -> bool:
 
 
 def _holds(thing: Thing, position: Array) -> bool:
-    """Return whether a place lies in the span of a thing, or outside of a room."""
+    """Return whether a position is inside the bounding box of an object, or outside a room."""
     room = isinstance(thing, Box) and thing.room
     if isinstance(thing, Carried):
         position, thing = (np.linalg.inv(thing.world_from_thing) @ [*position, 1.0])[:3], thing.thing

@@ -1,9 +1,9 @@
-"""Places with names for the tracer of panes, how they are photographed, and people in them.
+"""Named scenes for the pane tracer, with their camera poses and people.
 
-`screens`: two panes of glass, one upright, one leaning, through which the other is seen, stand between things; a mirror
-hangs on a wall. `window`: a large window before a dark case, photographed from the front, where whoever takes the
-photographs is seen. `case`: a case with a glass front and a mirrored back, and a silver bowl in it: flat and curved
-mirrors in one place.
+`screens`: two panes of glass between objects, one upright and one leaning, which are visible through each other, and a
+mirror on a wall. `window`: a large window of a dark case, photographed from the front, which reflects the photographer.
+`case`: a case with a glass front and a mirrored back that contains a silver bowl, so flat and curved mirrors in one
+scene.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from tools.pane_tracer import Array
 
 LOOKED_AT = np.array([0.0, 0.1, 0.8])
 ORBIT = (1.45, 1.75)
-"""Least and largest distance of cameras from the vertical through `LOOKED_AT`, world units."""
+"""Smallest and largest distance of cameras from the vertical axis through `LOOKED_AT`, world units."""
 HEIGHTS = (0.7, 1.7)
 SHELF, TOP = 0.7, 1.6
-"""Heights of what the case stands on, and of its upper edge; it is open above and at the sides."""
+"""Heights of the base of the case and of its upper edge; it is open at the top and at the sides."""
 FRONT, BACK = 0.1, 1.05
-"""Of the case along y; the cameras are on the side of smaller y."""
+"""Extent of the case along y; the cameras are on the side of smaller y."""
 HALF_WIDTH, POST = 0.8, 0.06
 TOWARDS_CAMERAS, ALONG = np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])
 BOWL = Silver((-0.05, 0.5, 1.03), (0.34, 0.34, 0.26))
 SHADE = 0.6
-"""Of what the case is made of: darker than the room, so that the glass shows the room."""
+"""Shade of the case: darker than the room, so that reflections of the room are visible."""
 WINDOW_HEIGHT = 1.25
-"""Of the middle of the pane."""
+"""Height of the centre of the pane."""
 DARK, PLAIN = 0.12, 0.6
 PHONE = Box((-0.08, -0.04, -0.02), (0.08, 0.04, -0.01), Paint(70, shade=0.1))
 # In dark clothes, as most people are; face and hands are bright.
@@ -42,12 +42,12 @@ HANDS = (Ball((-0.09, 0.05, -0.05), 0.045, Paint(80)), Ball((0.09, 0.05, -0.05),
 LEG_TOP, LEG_WIDTH = 0.8, 0.18
 UP = np.array([0.0, 0.0, 1.0])
 EYES = (1.5, 1.75)
-"""Heights of those who walk by, world units."""
+"""Heights of passers-by, world units."""
 FROM_WALLS, FROM_CAMERA = 0.4, 0.7
 
 
 def screens_place() -> Place:
-    """The room, what is in it, and its panes."""
+    """The scene `screens`: a room with objects and panes."""
     things = (
         Box((-2.2, -2.2, 0.0), (2.2, 2.2, 2.6), Paint(10), room=True),
         Ball((0.35, 0.15, 0.25), 0.25, Paint(20)),
@@ -67,7 +67,7 @@ def screens_place() -> Place:
 
 
 def screens_poses(count: int, seed: int) -> list[Array]:
-    """Camera-to-world [4, 4]: two of three look at the panes from all around, one of three looks around in the room."""
+    """Camera-to-world [4, 4]: two in three face the panes from all around, one in three faces the room."""
     generator = np.random.default_rng(seed)
     poses = []
     for number in range(count):
@@ -84,10 +84,10 @@ def screens_poses(count: int, seed: int) -> list[Array]:
 
 
 def window_place() -> Place:
-    """A room whose far end is a case behind glass, with things on either side."""
+    """The scene `window`: a room with a case behind glass at its far end, and objects on both sides."""
     things = (
         Box((-2.2, -3.4, 0.0), (2.2, 0.9, 2.6), Paint(10, shade=PLAIN), room=True),
-        # The case: its floor, its back, and what stands in it.
+        # The case: its floor, its back, and its contents.
         Box((-2.3, 0.02, -0.1), (2.3, 1.0, 0.55), Paint(40, shade=DARK)),
         Box((-2.3, 0.8, 0.4), (2.3, 1.0, 2.7), Paint(60, shade=DARK)),
         Box((-2.3, 0.02, 2.0), (2.3, 1.0, 2.7), Paint(65, shade=DARK)),
@@ -104,7 +104,7 @@ def window_place() -> Place:
 
 
 def window_poses(count: int, seed: int) -> list[Array]:
-    """Camera-to-world [4, 4], OpenCV axes: two of three look at the window, one of three into the room."""
+    """Camera-to-world [4, 4], OpenCV axes: two in three face the window, one in three the room."""
     generator = np.random.default_rng(seed)
     poses = []
     for number in range(count):
@@ -119,16 +119,16 @@ def window_poses(count: int, seed: int) -> list[Array]:
 
 
 def case_place() -> Place:
-    """The case, what is in it, and a room with things."""
+    """The scene `case`: the case with its contents, in a room with objects."""
     things = (
-        # A bowl makes all things small: in coarse patterns there is something left to see.
+        # A coarse pattern, because the bowl shows everything reduced in size.
         Box((-2.2, -2.2, 0.0), (2.2, 1.6, 2.6), Paint(10, coarseness=2.5), room=True),
-        # The case: what it stands on, its back, and its posts.
+        # The case: its base, its back, and its posts.
         Box((-0.9, 0.05, 0.0), (0.9, 1.2, SHELF), Paint(44, shade=SHADE, coarseness=1.5)),
         Box((-0.86, BACK + 0.01, SHELF), (0.86, 1.2, TOP), Paint(40, shade=SHADE)),
         Box((-HALF_WIDTH - POST, FRONT, SHELF), (-HALF_WIDTH, FRONT + POST, TOP), Paint(61, shade=SHADE)),
         Box((HALF_WIDTH, FRONT, SHELF), (HALF_WIDTH + POST, FRONT + POST, TOP), Paint(65, shade=SHADE)),
-        # Next to the bowl, and what it stands on.
+        # Objects next to the bowl, and its stand.
         Box((-0.17, 0.38, SHELF), (0.07, 0.62, 0.78), Paint(12, shade=SHADE)),
         Ball((-0.52, 0.38, 0.83), 0.13, Paint(20)),
         Ball((0.4, 0.3, 0.8), 0.1, Paint(30)),
@@ -150,7 +150,7 @@ def case_place() -> Place:
 
 
 def case_poses(count: int, seed: int) -> list[Array]:
-    """Camera-to-world [4, 4], OpenCV axes: two of three look at the case, one of three into the room."""
+    """Camera-to-world [4, 4], OpenCV axes: two in three face the case, one in three the room."""
     generator = np.random.default_rng(seed)
     poses = []
     for number in range(count):
@@ -164,12 +164,12 @@ def case_poses(count: int, seed: int) -> list[Array]:
 
 
 def photographer(world_from_cam: Array) -> tuple[Thing, ...]:
-    """Person who takes photographs of a room with the floor at z = 0.
+    """The photographer, in a room with the floor at z = 0.
 
-    The body is as high as the camera needs it and turns with it, but stands upright however the camera is tilted.
+    The body follows the height and azimuth of the camera, but stays upright when the camera is tilted.
 
     Args:
-        world_from_cam: [4, 4] of the photograph, OpenCV axes, world units as metres.
+        world_from_cam: [4, 4] pose of the photograph, OpenCV axes, world units in metres.
     """
     frame, height = upright_frame(world_from_cam), float(world_from_cam[2, 3])
     parts: list[Ball | Box] = [PHONE, HEAD, TORSO, *HANDS]
@@ -181,12 +181,12 @@ def photographer(world_from_cam: Array) -> tuple[Thing, ...]:
 
 
 def passer_by(room: Box, camera: Array, generator: np.random.Generator) -> tuple[Thing, ...]:
-    """Somebody who stands anywhere in a room, turned anywhere, but not where the camera is.
+    """A person at a random position and azimuth in a room, at a distance from the camera.
 
     Args:
-        room: with the floor at z = 0.
-        camera: [3] its place.
-        generator: where the place comes from.
+        room: room with the floor at z = 0.
+        camera: [3] position of the camera.
+        generator: random generator.
     """
     low, high = np.array(room.low)[:2] + FROM_WALLS, np.array(room.high)[:2] - FROM_WALLS
     place = generator.uniform(low, high)
@@ -200,7 +200,7 @@ def passer_by(room: Box, camera: Array, generator: np.random.Generator) -> tuple
 
 
 def upright_frame(world_from_cam: Array) -> Array:
-    """[4, 4] the camera's frame, turned so that its y axis points straight down; its x axis stays level."""
+    """[4, 4] camera frame, rotated so that its y axis points straight down and its x axis is level."""
     forward = world_from_cam[:3, 2] - (world_from_cam[:3, 2] @ UP) * UP
     forward /= np.linalg.norm(forward)
     frame = np.eye(4)

@@ -1,4 +1,4 @@
-"""Contents of rooms for the ray tracer of panes: things, panes of glass, mirrors, silver, lamps, and places of them."""
+"""Scene description for the pane tracer: objects, panes of glass, mirrors, silver, lamps, and scenes of them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FOCAL_PER_WIDTH = 0.85
 SUBPIXELS = 3
 """Rays per pixel and axis."""
 FREQUENCIES = (0.7, 0.4, 6.0)
-"""Of patches, of where they are chequered, and of the grain; waves per unit of the pattern."""
+"""Frequencies of patches, of the mask of their chequers, and of the grain; waves per pattern unit."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class Paint:
     """Radiance of a surface.
 
     Attributes:
-        seed: chooses the pattern's colours and places.
-        shade: factor on all colours.
-        coarseness: world units of the pattern's unit.
-        pattern: patches of five colours, some of them chequered; stripes or dots of two; or one colour.
-        glow: linear radiance of what shines by itself, in place of all these; above 1 photographs clip.
+        seed: random seed of the colours and the layout of the pattern.
+        shade: scale factor of all colours.
+        coarseness: size of a pattern unit, world units.
+        pattern: patches of five colours, some of them chequered; stripes or dots of two colours; or one colour.
+        glow: emitted linear radiance, which replaces all others; photographs clip above 1.
     """
 
     seed: int = 0
@@ -45,12 +45,12 @@ class Paint:
 
     @property
     def code(self) -> int:
-        """The tracer's number of the pattern."""
+        """Code of the pattern in the tracer."""
         return pane_tracer.GLOW if self.glow else PATTERNS.index(self.pattern)
 
     @property
     def inks(self) -> Array:
-        """[5, 3] radiances to choose from; stripes and dots take the first two, plain surfaces the first."""
+        """[5, 3] radiances of the palette; stripes and dots use the first two, plain surfaces the first."""
         if self.glow:
             return np.tile(np.array(self.glow), (len(INK), 1))
         return INK if self.pattern == "patches" else np.random.default_rng(self.seed).permutation(INK)
@@ -58,7 +58,7 @@ class Paint:
 
 @lru_cache(maxsize=4)
 def _camera_rays(width: int, height: int) -> Array:
-    """Unit directions [H W S, 3] of the rays of an image in the camera's axes, evenly over each pixel."""
+    """Unit directions [H W S, 3] of the rays of an image in camera axes, evenly spaced over each pixel."""
     fine = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS
     x, y, dx, dy = np.meshgrid(np.arange(width), np.arange(height), fine, fine, indexing="xy")
     focal = FOCAL_PER_WIDTH * width
@@ -79,7 +79,7 @@ def paint_waves(seed: int) -> Array:
 
 @dataclass(frozen=True)
 class Ball:
-    """A ball, or with a `stretch` an ellipsoid so many times as high as wide."""
+    """A ball, or an ellipsoid whose height is `stretch` times its width."""
 
     center: Triple
     radius: float
@@ -88,19 +88,19 @@ class Ball:
 
     @property
     def span(self) -> Array:
-        """[2, 3] lowest and highest corner of what surrounds it."""
+        """[2, 3] lowest and highest corner of the bounding box."""
         half = self.radius * np.array([1.0, 1.0, self.stretch])
         return np.array([self.center - half, self.center + half])
 
     @property
     def shape(self) -> int:
-        """The tracer's number of the shape."""
+        """Code of the shape in the tracer."""
         return pane_tracer.BALL
 
 
 @dataclass(frozen=True)
 class Box:
-    """A box along the axes, seen from outside, or as a room from inside."""
+    """An axis-aligned box, visible from outside, or from inside if it is a room."""
 
     low: Triple
     high: Triple
@@ -120,7 +120,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Cylinder:
-    """An upright cylinder with a lid and a floor, elliptical where the span is not square."""
+    """A closed upright cylinder, elliptical if its footprint is not square."""
 
     low: Triple
     high: Triple
@@ -139,10 +139,10 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Carried:
-    """A thing that is carried about, its pattern with it.
+    """A rigidly moved object, together with its pattern.
 
     Attributes:
-        thing: as it is in a frame of its own.
+        thing: the object in its local frame.
         world_from_thing: [4, 4] rigid transform of that frame.
     """
 
@@ -155,11 +155,11 @@ Thing = Ball | Box | Cylinder | Carried
 
 @dataclass(frozen=True)
 class Silver:
-    """An ellipsoid along the axes that mirrors all light, such as a bowl with its lid on.
+    """An axis-aligned ellipsoid that reflects all light, such as a silver bowl with a lid.
 
     Attributes:
         center: world units.
-        radii: along the axes.
+        radii: radii along the axes.
     """
 
     center: Triple
@@ -168,7 +168,7 @@ class Silver:
 
 @dataclass(frozen=True)
 class Lamp:
-    """Makes what is near it and faces it shine more: by `power` at the centre, half of that at a distance `reach`."""
+    """A light that brightens near surfaces facing it: by `power` at its centre, by half of that at distance `reach`."""
 
     center: Triple
     reach: float
@@ -177,11 +177,11 @@ class Lamp:
 
 @dataclass(frozen=True)
 class SecondPane:
-    """The other pane of double glazing, which mirrors as the first one does.
+    """The second pane of double glazing, with the reflectance of the first.
 
     Attributes:
-        gap: how far behind the first one it is, seen from the side to which the normal points, world units.
-        tilt_rad: by which it is turned about the pane's tangent.
+        gap: distance behind the first pane, seen from the side to which the normal points, world units.
+        tilt_rad: rotation about the tangent of the first pane.
     """
 
     gap: float
@@ -190,17 +190,17 @@ class SecondPane:
 
 @dataclass(frozen=True)
 class Pane:
-    """A flat rectangle of glass, or a mirror on both sides.
+    """A flat rectangle of glass, or a two-sided mirror.
 
     Attributes:
-        label: its number, from 1.
+        label: number of the pane, starting at 1.
         center: world units.
         normal: unit.
         tangent: unit, along the first side.
         half_sizes: half the lengths of the sides.
         refraction: refractive index; None for a mirror.
-        tint: share of red, green and blue light that gets through of what is not reflected.
-        second: pane of double glazing; None for a single pane.
+        tint: transmittance for red, green and blue, applied to the light that is not reflected.
+        second: second pane of double glazing; None for a single pane.
     """
 
     label: int
@@ -214,18 +214,18 @@ class Pane:
 
     @property
     def bitangent(self) -> Array:
-        """Unit, along the second side."""
+        """Unit vector along the second side."""
         return np.cross(self.normal, self.tangent)
 
     @property
     def base_reflectance(self) -> float:
-        """Share of the light that comes back at normal incidence, of both panes of double glazing."""
+        """Reflectance at normal incidence, of both panes in double glazing."""
         once = pane_tracer.reflectance(1.0, self.refraction or 0.0)
         return float(once if self.second is None else once + once * (1 - once) ** 2)
 
     @property
     def second_plane(self) -> Array:
-        """[2, 3] centre and normal of the second pane; those of the first where there is none."""
+        """[2, 3] centre and normal of the second pane; those of the first without one."""
         second = self.second or SecondPane(0.0, 0.0)
         turned = np.cos(second.tilt_rad) * self.normal + np.sin(second.tilt_rad) * self.bitangent
         return np.array([self.center - second.gap * self.normal, turned])
@@ -240,22 +240,22 @@ def standing_pane(
     half_sizes: tuple[float, float],
     refraction: float | None = 1.5,
 ) -> Pane:
-    """A pane whose lower side is level: turned about the vertical from facing -y, then leaning back."""
+    """A pane with a level lower side: rotated about the vertical from facing -y, then leaning back."""
     axes = Rotation.from_euler("xz", [-lean_deg, turn_deg], degrees=True).as_matrix()
     return Pane(label, np.array(center), -axes[:, 1], axes[:, 0], half_sizes, refraction)
 
 
 @dataclass(frozen=True)
 class Place:
-    """Things and panes.
+    """A scene of objects and panes.
 
     Attributes:
-        things: what there is; one must be a room, so that every ray ends.
-        panes: glass and mirrors.
-        lamps: which light things; they themselves are not seen.
-        ambient: light everywhere, as a factor on what paints shine.
-        photographer: things that stand where the rays come from: light meets them after a reflection only.
-        silver: curved things that mirror everything.
+        things: objects; one must be a room, so that every ray ends.
+        panes: panes of glass and mirrors.
+        lamps: lights on objects; they are invisible themselves.
+        ambient: ambient light, as a factor on the radiance of paints.
+        photographer: objects at the camera, visible only after a reflection.
+        silver: curved perfect mirrors.
     """
 
     things: Sequence[Thing]
@@ -266,30 +266,30 @@ class Place:
     silver: Sequence[Silver] = ()
 
     def seen(self, origins: Array, directions: Array, reflections: int = REFLECTIONS) -> Seen:
-        """Colours that rays [N, 3] with unit directions [N, 3] see, with the panes' labels."""
+        """Traces rays [N, 3] with unit directions [N, 3]."""
         seen = trace(self.tables, origins, directions, reflections)
         labels = np.array([0, *(pane.label for pane in self.panes)], dtype=np.uint8)
         return seen._replace(label=labels[seen.label])
 
     def view(self, pose: Array, width: int, height: int) -> Seen:
-        """Colours of the rays of an image, `SUBPIXELS` squared for each pixel: [H, W, S, ...] each.
+        """Traces the rays of an image, `SUBPIXELS` squared for each pixel: [H, W, S, ...] each.
 
         Args:
             pose: [4, 4] camera-to-world: x right, y down, z forward.
-            width: of the image, pixels.
-            height: of the image.
+            width: width of the image, pixels.
+            height: height of the image, pixels.
         """
         directions = _camera_rays(width, height) @ pose[:3, :3].T
         seen = self.seen(np.broadcast_to(pose[:3, 3], directions.shape), directions)
         return Seen(*(layer.reshape(height, width, SUBPIXELS**2, *layer.shape[1:]) for layer in seen))
 
     def without_panes(self) -> Place:
-        """The same place without glass and mirrors."""
+        """The same scene without glass and mirrors."""
         return replace(self, panes=())
 
     @cached_property
     def tables(self) -> Tables:
-        """The place as the tracer reads it."""
+        """The scene as records for the tracer."""
         things = [*self.things, *self.photographer]
         return Tables(
             things=np.array([_thing_record(thing) for thing in things], dtype=pane_tracer.THING),
@@ -310,7 +310,7 @@ def _thing_record(thing: Thing) -> tuple[object, ...]:
     low, high = thing.span
     paint, middle = thing.paint, world_from_thing @ [*(low + high) / 2, 1.0]
     pattern = (paint.code, paint.inks, paint.shade, paint.coarseness, paint_waves(paint.seed))
-    # A little larger, lest rounding make a ray miss what it just touches.
+    # Slightly enlarged, so that rounding does not make a grazing ray miss.
     square_radius = 1.001 * ((high - low) ** 2).sum() / 4
     return (thing.shape, low, high, middle[:3], square_radius, turned, frame[:3], *pattern)
 

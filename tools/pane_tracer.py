@@ -1,9 +1,9 @@
-"""An exact ray tracer of luminous, matte things, thin panes and curved mirrors, compiled with Numba.
+"""An exact ray tracer for matte emissive objects, thin panes and curved mirrors, compiled with Numba.
 
-Things shine with the radiance of their paint under the lamps, the same in all directions, so that a picture has no
-noise. Panes are thin: light goes through without a bend, and what comes back is the sum over all passages between the
-two surfaces, by Fresnel's law for each polarisation. Light is followed through up to `REFLECTIONS` reflections one
-after the other. `tools/pane_things.py` describes places; this file traces rays through their tables.
+Objects emit the radiance of their paint under the lamps equally in all directions, so images have no noise. Panes are
+thin: light passes without a bend, and their reflectance sums all multiple reflections between the two surfaces, by
+Fresnel's law for each polarisation. Paths have up to `REFLECTIONS` successive reflections. `tools/pane_things.py`
+describes scenes; this file traces rays through their tables.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 REFLECTIONS = 3
-"""How many reflections one after the other are followed."""
+"""Maximum number of successive reflections along a path."""
 SELF = 1e-6
-"""A ray does not meet the pane from which it starts: distances below this do not count, world units."""
+"""Minimum hit distance, world units, so that a ray does not hit the pane from which it starts."""
 BALL, BOX, ROOM, CYLINDER = range(4)
 PATCHES, STRIPES, DOTS, PLAIN, GLOW = range(5)
 CHECK, STRIPE, DOT_SPACING, DOT_RADIUS = 0.25, 0.11, 0.22, 0.33
-"""Sizes in patterns, world units; radii of dots as a share of their spacing."""
+"""Sizes in patterns, in pattern units; the radius of dots is a share of their spacing."""
 # Minimax polynomial of cos(2 pi x) in x^2 on [-1/2, 1/2], exact to 1e-12: unlike `math.cos` it is vectorised.
 C0, C1, C2 = 0.9999999999990647, -19.73920880157127, 64.93939395775345
 C3, C4, C5 = -85.45681453437972, 60.24458621793278, -26.42561649473334
@@ -35,16 +35,16 @@ WAVES, INKS = 16, 5
 THING = np.dtype(
     [
         ("shape", "i8"),  # `BALL`, `BOX`, `ROOM` or `CYLINDER`
-        ("low", "f8", 3),  # the corners of what surrounds it in its frame
+        ("low", "f8", 3),  # corners of its bounding box in its frame
         ("high", "f8", 3),
-        ("middle", "f8", 3),  # of the ball that holds it, in the world, and the square of the ball's radius
+        ("middle", "f8", 3),  # of its bounding sphere, in the world, with the squared radius
         ("square_radius", "f8"),
         ("turned", "i8"),  # whether the frame differs from the world's
         ("frame", "f8", (3, 4)),  # thing_from_world, rigid
-        ("pattern", "i8"),  # of the paint
-        ("inks", "f8", (INKS, 3)),  # colours of the paint; of glowing things the radiance
-        ("shade", "f8"),  # a factor on them
-        ("scale", "f8"),  # world units of the pattern's unit
+        ("pattern", "i8"),  # pattern of the paint
+        ("inks", "f8", (INKS, 3)),  # colours of the paint; the radiance of emitters
+        ("shade", "f8"),  # scale factor of the colours
+        ("scale", "f8"),  # world units per pattern unit
         ("waves", "f8", (3, 4, WAVES)),  # three noises: wave vectors in cycles per unit, phases in cycles
     ]
 )
@@ -67,15 +67,15 @@ LAMP = np.dtype([("center", "f8", 3), ("power", "f8"), ("reach", "f8")])
 
 
 class Tables(NamedTuple):
-    """A place as records, which compiled code reads.
+    """A scene as records for compiled code.
 
     Attributes:
-        things: of `THING`.
-        direct: number of the things that are seen directly; those after them are met after a reflection only.
-        panes: of `PANE`.
-        silver: of `SILVER`.
-        lamps: of `LAMP`.
-        ambient: light everywhere, as a factor on inks.
+        things: records of `THING`.
+        direct: number of objects that are directly visible; the remaining ones are visible only after a reflection.
+        panes: records of `PANE`.
+        silver: records of `SILVER`.
+        lamps: records of `LAMP`.
+        ambient: ambient light, as a factor on inks.
     """
 
     things: np.ndarray
@@ -91,13 +91,13 @@ class Seen(NamedTuple):
 
     Attributes:
         radiance: [N, 3] linear, with all panes: (1 - strength) transmission + strength reflection.
-        transmission: [N, 3] what comes through the first pane in its tint, with what panes behind it reflect.
-        reflection: [N, 3] what the first pane would show as a perfect mirror; 0 without a pane.
+        transmission: [N, 3] radiance through the first pane with its tint, including reflections in panes behind it.
+        reflection: [N, 3] radiance if the first pane were a perfect mirror; 0 without a pane.
         strength: [N] reflectance of the first pane.
-        label: [N] number of the first pane, from 1, 0 where there is none.
-        normal: [N, 3] of the silver in which a ray ends that goes straight through all panes, 0 where it does not.
-        distance: [N] to the thing or silver in which that ray ends.
-        to_pane: [N] to the first pane, infinite where there is none.
+        label: [N] number of the first pane, starting at 1; 0 without one.
+        normal: [N, 3] normal of the silver that the ray, passing straight through all panes, ends on; else 0.
+        distance: [N] to the object or silver that this ray ends on.
+        to_pane: [N] distance to the first pane, infinite without one.
     """
 
     radiance: Array
@@ -111,7 +111,7 @@ class Seen(NamedTuple):
 
 
 def trace(tables: Tables, origins: Array, directions: Array, reflections: int = REFLECTIONS) -> Seen:
-    """Trace rays [N, 3] with unit directions [N, 3]; panes that light meets after `reflections` are not there."""
+    """Trace rays [N, 3] with unit directions [N, 3]; panes are ignored after `reflections` reflections."""
     count = len(directions)
     colors, scalars, labels = np.zeros((count, 4, 3)), np.zeros((count, 3)), np.zeros(count, dtype=np.uint8)
     rays = np.ascontiguousarray(origins, dtype=float), np.ascontiguousarray(directions, dtype=float)
@@ -135,7 +135,7 @@ def moved(point, factor, step):
 
 @njit(cache=True)
 def vector(row):
-    """The first three values of a row as a tuple, which costs no memory."""
+    """The first three values of a row as a tuple, which needs no allocation."""
     return row[0], row[1], row[2]
 
 
@@ -159,7 +159,7 @@ def _trace_rays(tables, origins, directions, reflections, outputs):
 
 @njit(cache=True)
 def _trace_ray(tables, ray, reflections, number, outputs):
-    """Writes what one ray sees into a row of the outputs."""
+    """Traces one ray and writes a row of the outputs."""
     colors, scalars, labels = outputs
     origin, direction = ray
     normal, end = _silver_end(tables, origin, direction, _nearest_thing(tables, origin, direction, False)[0])
@@ -188,14 +188,14 @@ def _trace_ray(tables, ray, reflections, number, outputs):
 
 @njit(cache=True)
 def _radiance(tables, ray, reflections, after_mirror, stack):
-    """Radiance along a ray: the sum over all ways on which light comes, of their share times what shines there.
+    """Radiance along a ray: the sum over all light paths of their throughput times the emitted radiance.
 
     Args:
-        tables: of the place.
+        tables: records of the scene.
         ray: origin and unit direction.
-        reflections: how many more are followed.
-        after_mirror: whether the ray comes from a mirror already, so that it may meet the photographer.
-        stack: [D, 11] scratch: ways yet to be followed, as origin, direction, share, reflections, after_mirror.
+        reflections: remaining number of reflections.
+        after_mirror: whether the ray was reflected before, so that it may hit the photographer.
+        stack: [D, 11] scratch of pending paths: origin, direction, throughput, reflections, after_mirror.
     """
     top = _push(stack, 0, ray, ((1.0, 1.0, 1.0), reflections, after_mirror))
     red, green, blue = 0.0, 0.0, 0.0
@@ -233,7 +233,7 @@ def _radiance(tables, ray, reflections, after_mirror, stack):
 
 @njit(cache=True)
 def _push(stack, top, ray, state):
-    """Adds a way to those yet to be followed; how many there are then."""
+    """Pushes a pending path; returns the new size of the stack."""
     for c in range(3):
         stack[top, c], stack[top, 3 + c], stack[top, 6 + c] = ray[0][c], ray[1][c], state[0][c]
     stack[top, 9], stack[top, 10] = state[1], 1.0 if state[2] else 0.0
@@ -242,7 +242,7 @@ def _push(stack, top, ray, state):
 
 @njit(cache=True)
 def _nearest_thing(tables, origin, direction, after_mirror):
-    """Distance and number of the first thing on a ray."""
+    """Distance and index of the first object on a ray."""
     nearest, found = np.inf, -1
     for number in range(len(tables.things) if after_mirror else tables.direct):
         thing = tables.things[number]
@@ -258,7 +258,7 @@ def _nearest_thing(tables, origin, direction, after_mirror):
 
 @njit(cache=True)
 def _in_frame(frame, point, w):
-    """A point (w = 1) or direction (w = 0) in a thing's frame."""
+    """A point (w = 1) or direction (w = 0) in the frame of an object."""
     return (
         frame[0, 0] * point[0] + frame[0, 1] * point[1] + frame[0, 2] * point[2] + w * frame[0, 3],
         frame[1, 0] * point[0] + frame[1, 1] * point[1] + frame[1, 2] * point[2] + w * frame[1, 3],
@@ -268,7 +268,7 @@ def _in_frame(frame, point, w):
 
 @njit(cache=True)
 def distance_to(thing, origin, direction):
-    """Distance along a ray to a thing; infinite if it meets none."""
+    """Distance along a ray to an object; infinite if it misses."""
     if thing.turned:
         origin, direction = _in_frame(thing.frame, origin, 1.0), _in_frame(thing.frame, direction, 0.0)
     low, high = vector(thing.low), vector(thing.high)
@@ -290,7 +290,7 @@ def distance_to(thing, origin, direction):
 
 @njit(cache=True)
 def _through_slab(low, high, origin, direction):
-    """Distances at which a ray enters and leaves what lies between two parallel planes."""
+    """Distances at which a ray enters and leaves the slab between two parallel planes."""
     if direction == 0:
         return (-np.inf, np.inf) if low <= origin <= high else (np.inf, -np.inf)
     to_low, to_high = (low - origin) / direction, (high - origin) / direction
@@ -299,7 +299,7 @@ def _through_slab(low, high, origin, direction):
 
 @njit(cache=True)
 def _through_ellipsoid(low, high, axes, ray):
-    """Distances at which a ray enters and leaves an ellipsoid; with two axes an endless upright cylinder."""
+    """Distances at which a ray enters and leaves an ellipsoid, or with two axes an infinite upright cylinder."""
     square, middle, rest = 0.0, 0.0, -1.0
     for axis in range(axes):
         scale = 2.0 / (high[axis] - low[axis])
@@ -316,7 +316,7 @@ def _through_ellipsoid(low, high, axes, ray):
 
 @njit(cache=True)
 def _silver_end(tables, origin, direction, end):
-    """Normal of the silver that a ray meets before `end`, and where it does; 0 and `end` where it meets none."""
+    """Normal and distance of the first silver hit closer than `end`; 0 and `end` without one."""
     normal = (0.0, 0.0, 0.0)
     for silver in tables.silver:
         low, high = vector(silver.low), vector(silver.high)
@@ -329,7 +329,7 @@ def _silver_end(tables, origin, direction, end):
 
 @njit(cache=True)
 def _next_pane(tables, origin, direction, between):
-    """Number and distance of the first pane on a ray between two distances; -1 where there is none."""
+    """Index and distance of the first pane on a ray between two distances; the index is -1 without one."""
     nearest, found = between[1], -1
     for number in range(len(tables.panes)):
         pane = tables.panes[number]
@@ -348,9 +348,9 @@ def _next_pane(tables, origin, direction, between):
 
 @njit(cache=True)
 def _meeting(pane, which, ray):
-    """Meeting of a ray with a pane or its second pane: the place, where it goes on, and the share of light that does.
+    """Reflection of a ray at a pane or its second pane: the point, the reflected direction, and the reflected share.
 
-    Light that goes to and fro between the two panes of double glazing is left out.
+    Multiple reflections between the two panes of double glazing are neglected.
     """
     origin, direction = ray
     center, normal = vector(pane.center), vector(pane.normal)
@@ -365,9 +365,9 @@ def _meeting(pane, which, ray):
 
 @njit(cache=True)
 def reflectance(cosine, refraction):
-    """Share of unpolarised light that a pane returns, by the cosine between ray and normal; 1 for mirrors.
+    """Reflectance of a pane for unpolarised light, by the cosine between ray and normal; 1 for mirrors.
 
-    Fresnel's law for each polarisation, r; between the two surfaces light goes to and fro, 2 r / (1 + r) in all.
+    With Fresnel's r for each polarisation, multiple reflections between the two surfaces sum to 2 r / (1 + r).
     """
     if refraction == 0:
         return 1.0
@@ -379,7 +379,7 @@ def reflectance(cosine, refraction):
 
 @njit(cache=True)
 def _shining(tables, thing, point):
-    """Radiance of a thing at a point of its surface: its paint's, by the light of lamps there."""
+    """Radiance of an object at a surface point: its paint under the light of the lamps."""
     inks, pattern = thing.inks, thing.pattern
     if pattern == GLOW:
         return inks[0, 0], inks[0, 1], inks[0, 2]
@@ -409,7 +409,7 @@ def _shining(tables, thing, point):
 
 @njit(cache=True)
 def _cell(place, side):
-    """Sum of the whole coordinates of the cube of so large a side in which a place lies."""
+    """Sum of the integer coordinates of the grid cell of size `side` that contains a position."""
     return int(
         math.floor(place[0] / side + 0.5) + math.floor(place[1] / side + 0.5) + math.floor(place[2] / side + 0.5)
     )
@@ -417,7 +417,7 @@ def _cell(place, side):
 
 @njit(cache=True)
 def _from_dot(place):
-    """Distance to the middle of the nearest dot, as a share of their spacing."""
+    """Distance to the centre of the nearest dot, as a share of the spacing."""
     x, y, z = place[0] / DOT_SPACING, place[1] / DOT_SPACING, place[2] / DOT_SPACING
     x, y, z = x - np.rint(x), y - np.rint(y), z - np.rint(z)
     return math.sqrt(x * x + y * y + z * z)
@@ -431,14 +431,14 @@ def noise(waves, place):
         cycles = place[0] * waves[0, wave] + place[1] * waves[1, wave] + place[2] * waves[2, wave] + waves[3, wave]
         cycles -= np.rint(cycles)
         x = cycles * cycles
-        # Written out, so that the compiler takes several waves at once.
+        # Unrolled, so that the compiler vectorises over waves.
         total += (((((((C8 * x + C7) * x + C6) * x + C5) * x + C4) * x + C3) * x + C2) * x + C1) * x + C0
     return 0.5 + total / math.sqrt(8.0 * waves.shape[1])
 
 
 @njit(cache=True)
 def _lamplight(tables, point, normal):
-    """Light of all lamps at a point, half of it whichever way that faces; lamps cast no shadows."""
+    """Light of all lamps at a point, without shadows; diffuse shading is wrapped around the back."""
     light = 0.0
     for lamp in range(len(tables.lamps)):
         row = tables.lamps[lamp]
@@ -451,7 +451,7 @@ def _lamplight(tables, point, normal):
 
 @njit(cache=True)
 def _round_normal(low, high, axes, point):
-    """Unit normal of the ellipsoid that fills a span, or with two axes of the upright cylinder."""
+    """Unit normal of the ellipsoid inscribed in a box, or with two axes of the upright cylinder."""
     x = (2 * point[0] - low[0] - high[0]) / (high[0] - low[0]) ** 2
     y = (2 * point[1] - low[1] - high[1]) / (high[1] - low[1]) ** 2
     z = (2 * point[2] - low[2] - high[2]) / (high[2] - low[2]) ** 2 if axes == 3 else 0.0
@@ -460,7 +460,7 @@ def _round_normal(low, high, axes, point):
 
 @njit(cache=True)
 def _normal(thing, local):
-    """Unit normal in the world at a point in the frame of a thing, on the side from which that is seen."""
+    """Unit world normal at a point in the frame of an object, on its visible side."""
     low, high, shape = vector(thing.low), vector(thing.high), thing.shape
     x, y, z = (
         (2 * local[0] - low[0] - high[0]) / (high[0] - low[0]),
