@@ -1,4 +1,4 @@
-"""Inputs for readers of files, before they are damaged: small files of every kind, as we and others write them."""
+"""Seed files for fuzzing readers: small valid files of every kind, as written by glassplat and other programs."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ from glassplat.training.densify import ScreenStatistics
 from glassplat.training.stage import Optimizer, TrainState
 
 LARGEST_PICTURE_MIB = 2048
-"""At the 134 megapixels that are the most which is read."""
+"""Memory needed for 134 megapixels, the largest image that is read."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +62,11 @@ class Reader:
     """A reader of files.
 
     Attributes:
-        name: of the file that it is given, in a folder of its own.
-        read: reads it; may raise ValueError or FileNotFoundError.
-        seeds: writes files to begin with into a folder.
-        longest: bytes of a file.
-        most_mib: at once.
+        name: name of the file passed to it, in its own folder.
+        read: reads the file; may raise ValueError or FileNotFoundError.
+        seeds: writes seed files into a folder.
+        longest: maximum file size, bytes.
+        most_mib: maximum memory use, MiB.
     """
 
     name: str
@@ -77,7 +77,7 @@ class Reader:
 
 
 def gaussians_of(coefficients: int, count: int = 3) -> Gaussians:
-    """A few Gaussians; the same ones every time."""
+    """A few Gaussians, deterministic."""
     generator = torch.Generator().manual_seed(coefficients)
 
     def draw(*shape: int) -> torch.Tensor:
@@ -153,7 +153,7 @@ def _colmap_seeds(folder: Path) -> None:
 
 
 def _colmap(path: Path) -> None:
-    """Three files in one: each with its length in front."""
+    """Splits one file into three, each preceded by its length, and reads the model."""
     data = path.read_bytes()
     for name in COLMAP_PARTS:
         size = struct.unpack("<I", data[:4].ljust(4, b"\0"))[0]
@@ -164,7 +164,7 @@ def _colmap(path: Path) -> None:
 
 TEXT_PARTS = ("cameras.txt", "images.txt", "points3D.txt")
 BETWEEN = b"#--\n"
-"""Between the three files of a model in text, which are damaged as one."""
+"""Separator of the three files of a text model, which are damaged as one."""
 
 
 def _text_seeds(folder: Path) -> None:
@@ -177,7 +177,7 @@ def _text_seeds(folder: Path) -> None:
 
 
 def _colmap_text(path: Path) -> None:
-    """Three files in one."""
+    """Splits one file into three and reads the text model."""
     for name, data in zip(TEXT_PARTS, path.read_bytes().split(BETWEEN, 2), strict=False):
         (path.parent / name).write_bytes(data)
     for image in read_model(path.parent).images:
@@ -202,7 +202,7 @@ def _database_seeds(folder: Path) -> None:
 
 
 def _database(path: Path) -> None:
-    """State from which an interrupted preparation goes on."""
+    """Reads the feature database from which an interrupted preparation continues."""
     for suffix in ("-wal", "-shm", "-journal"):
         path.with_name(path.name + suffix).unlink(missing_ok=True)
     features = _features(path)

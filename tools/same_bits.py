@@ -1,11 +1,11 @@
-"""Hashes of what every method learns, renders and exports, to show that a change of the code leaves them alone.
+"""Hashes of all that each method learns, renders and exports, to show that a code change preserves every bit.
 
     NUMBA_NUM_THREADS=1 python tools/same_bits.py --write before.json
     NUMBA_NUM_THREADS=1 python tools/same_bits.py --compare before.json
 
-It trains small scenes for 100 steps through the command line and knows nothing else of the package, so that it outlives
-any move inside. A case, layer or value that a commit has taken away is named and is no difference. The scenes are made
-once and kept in `--scenes`. To compare two commits, run the same file with PYTHONPATH set to either tree.
+It trains small scenes for 100 steps and uses only the command line, so it survives refactoring of the package. Cases,
+layers and values that a commit has removed are listed, and do not count as differences. The scenes are made once and
+kept in `--scenes`. To compare two commits, run the same file with PYTHONPATH set to either tree.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ LAYERS = (
     *("environment", "surroundings", "median_depth", "photographed"),
 )
 NAMES_RUN = "glassplat.json"
-"""Says where the run lies, which is another place each time."""
+"""File that contains the location of the run, which differs every time."""
 FORMATS = ("ply", "spz", "glb", "html")
 BLOCK = re.compile(r'<script type="([^"]+)" id="([^"]+)">(.*?)</script>', re.DOTALL)
 Hashes = dict[str, str]
 
 
 class Case(NamedTuple):
-    """One run: the scene, and what `glassplat train` is given besides."""
+    """One run: the scene, and the arguments of `glassplat train`."""
 
     scene: str
     arguments: str
@@ -72,12 +72,12 @@ CASES: dict[str, Case] = {
 
 
 def digest(content: bytes | str) -> str:
-    """The first 16 digits of a SHA-256."""
+    """First 16 hexadecimal digits of the SHA-256."""
     return hashlib.sha256(content if isinstance(content, bytes) else content.encode()).hexdigest()[:16]
 
 
 def glassplat(arguments: Iterable[str]) -> str | None:
-    """Runs a command in this process; returns the end of what it said where it failed."""
+    """Runs a command in this process; returns the end of its output if it fails."""
     said, before = io.StringIO(), sys.argv
     sys.argv = ["glassplat", *arguments]
     try:
@@ -91,7 +91,7 @@ def glassplat(arguments: Iterable[str]) -> str | None:
 
 
 def leaves(value: Any, name: str) -> Iterator[tuple[str, str]]:
-    """Every value of a JSON document by its path, so that one that is gone leaves the others comparable."""
+    """Values of a JSON document by their paths, so that removed values leave the others comparable."""
     if isinstance(value, dict):
         for key, inner in value.items():
             yield from leaves(inner, f"{name}.{key}")
@@ -103,7 +103,7 @@ def leaves(value: Any, name: str) -> Iterator[tuple[str, str]]:
 
 
 def hashes_of_file(path: Path, name: str) -> Iterator[tuple[str, str]]:
-    """Hashes of what a file holds: of JSON each value, of a page its data and not its code."""
+    """Hashes of the contents of a file: each value of JSON, and only the data of a web page, not its code."""
     if path.suffix == ".json":
         yield from leaves(json.loads(path.read_text()), name)
     elif path.suffix == ".html":
@@ -117,7 +117,7 @@ def hashes_of_file(path: Path, name: str) -> Iterator[tuple[str, str]]:
 
 
 def hashes_of_folder(folder: Path, name: str) -> Iterator[tuple[str, str]]:
-    """Hashes of all its files."""
+    """Hashes of all files in a folder."""
     for path in sorted(folder.rglob("*")):
         if path.is_file() and path.name != NAMES_RUN:
             yield from hashes_of_file(path, f"{name}/{path.relative_to(folder)}")
@@ -158,7 +158,7 @@ def hashes_of_case(name: str, scenes: Path, work: Path, iterations: int) -> Hash
 
 
 def make_scenes(folder: Path) -> None:
-    """Puts the scenes in place, those that are not there yet: the bundled ones smaller, and one with three panes."""
+    """Makes missing scenes: reduced copies of the bundled ones, and a scene with three panes."""
     import glassplat as package
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -179,7 +179,7 @@ def make_scenes(folder: Path) -> None:
 
 
 def shrink(source: Path, target: Path, factor: int = 10) -> None:
-    """Copies a COLMAP text capture with photographs and masks of a tenth of the size, and every third point."""
+    """Copies a COLMAP text capture with photographs and masks reduced by `factor`, and every third point."""
     shutil.copytree(source, target, ignore=shutil.ignore_patterns("gt"))
     for path in [*target.glob("images/*"), *target.glob("panes/*"), *target.glob("masks/*")]:
         image = Image.open(path)
@@ -197,7 +197,7 @@ def shrink(source: Path, target: Path, factor: int = 10) -> None:
 
 
 def ignore_corner(capture: Path) -> None:
-    """Marks a corner of every photograph as not to be learnt from."""
+    """Writes masks that exclude a corner of every photograph from training."""
     (capture / "ignore").mkdir()
     for path in sorted((capture / "images").iterdir()):
         mask = np.zeros(np.asarray(Image.open(path)).shape[:2], np.uint8)
@@ -206,7 +206,7 @@ def ignore_corner(capture: Path) -> None:
 
 
 def compared(before: Hashes, now: Hashes) -> int:
-    """Prints what differs and what is gone; returns how many values differ."""
+    """Prints differing and removed values; returns the number of differing values."""
     gone = sorted(set(before) - set(now))
     failed = {name.split("/")[0]: said for name, said in now.items() if name.endswith("/failed")}
     differ = [name for name in before if name in now and before[name] != now[name] and not name.endswith("/failed")]
@@ -223,7 +223,7 @@ def compared(before: Hashes, now: Hashes) -> int:
 
 
 def main() -> int:
-    """Hashes all cases; with `--compare` 1 where one differs."""
+    """Hashes all cases; returns 1 if `--compare` finds a difference."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--write", type=Path, help="file for the hashes")
     parser.add_argument("--compare", type=Path, help="file of hashes to compare with")

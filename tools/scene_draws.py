@@ -1,7 +1,7 @@
-"""Glossy scenes drawn by chance: shapes, coatings, surroundings and a stand, all from one seed.
+"""Random glossy scenes: shapes, coatings, surroundings and a stand, generated from one seed.
 
-What a method was tuned on says little about what it does elsewhere. These scenes have what the scenes with names
-have, a glossy thing on a matte patterned stand under distant light, and share nothing else with them.
+Scenes on which a method was tuned say little about its generality. These scenes share only the setup of the named ones,
+a glossy object on a matte patterned stand under distant light.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ Coating = Literal["mirror", "metal", "glaze", "patterned glaze", "matte", "patte
 
 SHAPES: tuple[Shape, ...] = ("ball", "egg", "box", "pebble", "torus")
 COATINGS: tuple[Coating, ...] = ("mirror", "metal", "glaze", "patterned glaze")
-"""Those that are drawn."""
+"""Reflective coatings to draw from."""
 MATTE: tuple[Coating, ...] = ("matte", "patterned")
-"""Those that reflect nothing like a mirror."""
+"""Coatings without specular reflection."""
 SIZES = ((0.6, 0.75), (0.42, 0.5))
-"""Least and largest radius of a body that is alone, and of one of two, world units."""
+"""Smallest and largest radius of a single body, and of one of two, world units."""
 DISTANCES = (0.0, 0.55)
-"""From the middle of the stand to the middle of each body, for as many bodies."""
+"""Distance of bodies from the centre of the stand, for one and for two bodies."""
 
 
 @dataclass(frozen=True)
 class Body:
-    """A thing, as a rule one that reflects.
+    """An object, usually a reflective one.
 
     Attributes:
-        shape: its kind, which `triangles` are one of.
-        triangles: where it is.
+        shape: kind of the shape.
+        triangles: mesh of the shape, in its position.
         coating: a perfect mirror, a tinted one, a smooth clear coat over a matte colour or over patches, or these
             without the coat.
-        tint: of the metal, or of the matte colour, linear.
+        tint: linear colour of the metal, or of the matte base.
         refraction: refractive index of the glaze.
-        pattern_seed: chooses the patches.
+        pattern_seed: random seed of the patches.
     """
 
     shape: Shape
@@ -56,7 +56,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Stand:
-    """The disc that everything stands on; attributes as of `scene_surfaces.disc` and `ground_texture`."""
+    """The disc below all bodies; attributes as in `scene_surfaces.disc` and `ground_texture`."""
 
     radius: float
     z: float
@@ -66,7 +66,7 @@ class Stand:
 
 @dataclass(frozen=True)
 class DrawnScene:
-    """One scene."""
+    """A random scene: bodies, stand and surroundings."""
 
     bodies: tuple[Body, ...]
     stand: Stand
@@ -74,12 +74,12 @@ class DrawnScene:
 
 
 def draw_scene(seed: int) -> DrawnScene:
-    """The scene of a seed, the same one wherever it is drawn."""
+    """The scene of a seed, deterministic."""
     generator = np.random.default_rng(seed)
     count = int(generator.integers(1, len(SIZES) + 1))
     bodies = tuple(_draw_body(generator, count, number) for number in range(count))
     height = max(float(body.triangles.positions[:, 2].max()) for body in bodies)
-    # Bodies were made to stand on z = 0; cameras look a little below the origin.
+    # Bodies stand on z = 0 at first, but cameras aim slightly below the origin.
     down = np.array([0.0, 0.0, -height / 2])
     lowered = tuple(_moved(body, down) for body in bodies)
     stand = Stand(
@@ -96,7 +96,7 @@ def _moved(body: Body, offset: Array) -> Body:
 
 
 def _draw_body(generator: np.random.Generator, count: int, number: int) -> Body:
-    """One of `count` bodies, which stand evenly around the middle, on z = 0."""
+    """One of `count` bodies, evenly spaced around the centre, on z = 0."""
     shape = SHAPES[generator.integers(len(SHAPES))]
     size = generator.uniform(*SIZES[count - 1])
     triangles = _draw_shape(generator, shape, size)
@@ -114,7 +114,7 @@ def _draw_body(generator: np.random.Generator, count: int, number: int) -> Body:
 
 
 def _draw_shape(generator: np.random.Generator, shape: Shape, size: float) -> Triangles:
-    """A shape about the origin that reaches about `size` from there, turned at random where that shows."""
+    """A shape about the origin with a radius of about `size`, randomly rotated unless that is invisible."""
     turn = Rotation.from_euler("zx", [generator.uniform(0, 360), generator.uniform(-25, 25)], degrees=True).as_matrix()
     if shape == "torus":
         thickness = generator.uniform(0.28, 0.42)
@@ -123,7 +123,7 @@ def _draw_shape(generator: np.random.Generator, shape: Shape, size: float) -> Tr
 
 
 def _radius_function(generator: np.random.Generator, shape: Shape, size: float) -> Callable[[Array], Array]:
-    """The distance of the surface from the middle, as a function of unit directions [..., 3]."""
+    """Distance of the surface from the centre, as a function of unit directions [..., 3]."""
     if shape == "ball":
         return lambda directions: size * np.ones(directions.shape[:-1])
     half_axes = size * generator.uniform(0.65, 1.0, 3)
@@ -153,7 +153,7 @@ def _draw_surroundings(generator: np.random.Generator) -> Surroundings:
 
 
 def _draw_panel(generator: np.random.Generator, horizon: Color) -> Panel:
-    """A lamp, a window, or something dark before the sky."""
+    """A lamp, a window, or a dark object in front of the sky."""
     dark = generator.random() < 0.35
     panes = (int(generator.integers(1, 4)), int(generator.integers(1, 4)))
     return Panel(

@@ -1,8 +1,8 @@
-"""The distant surroundings of the reflective scenes: an equirectangular picture, drawn in numpy.
+"""Distant surroundings of the reflective scenes: an equirectangular image, drawn in NumPy.
 
-The convention is that of docs/conventions.md: z is up. The top row looks at the zenith, the bottom row at the nadir.
-The centre column looks along +x, the column a quarter from the left along +y: the picture is what somebody who stands
-inside sees, so that writing reads from left to right.
+The convention is that of docs/conventions.md: z is up. The top row is the zenith, the bottom row the nadir. The centre
+column is +x, the column a quarter from the left +y. The image is seen from inside, so that writing reads from left to
+right.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Array = NDArray[np.floating]
 Color = tuple[float, float, float]
 
 SUPERSAMPLING = 2
-"""Drawn pixels per pixel and axis; their mean radiance is kept, so that edges are smooth."""
+"""Samples per pixel and axis, which are averaged for smooth edges."""
 
 ZENITH: Color = (0.10, 0.24, 0.62)
 HORIZON: Color = (0.86, 0.76, 0.62)
@@ -30,11 +30,11 @@ WHITE: Color = (0.85, 0.85, 0.85)
 
 @dataclass(frozen=True)
 class Panel:
-    """A rectangle on the sphere of directions; its sides are meridians and parallels.
+    """A rectangle on the sphere of directions, bounded by meridians and parallels.
 
     Attributes:
-        azimuth_deg: of its middle, from +x towards +y.
-        elevation_deg: of its middle, above the horizon.
+        azimuth_deg: azimuth of the centre, from +x towards +y.
+        elevation_deg: elevation of the centre above the horizon.
         size_deg: width in azimuth and height in elevation.
         color: linear radiance.
         panes: columns and rows of glass, separated by dark bars; (1, 1) is a plain rectangle.
@@ -49,7 +49,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Sign:
-    """White writing on a black board, on the horizon's side that `azimuth_deg` names; sizes as in `Panel`."""
+    """White writing on a black board on the horizon at `azimuth_deg`; sizes as in `Panel`."""
 
     azimuth_deg: float
     elevation_deg: float
@@ -77,11 +77,11 @@ SIGNS = (
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Contents of an environment; the defaults are those of the scenes with names.
+    """Contents of an environment; the defaults are those of the named scenes.
 
     Attributes:
         zenith, horizon: colours of the sky, linear radiance.
-        far_floor, near_floor: of the tiles below the horizon, at the horizon and at the nadir.
+        far_floor, near_floor: colours of the tiles at the horizon and at the nadir.
         panels: lamps and windows; later ones cover earlier ones.
         signs: boards with writing.
         charts: whether checkers, stripes and a skylight are drawn, for judging how sharp a recovered environment is.
@@ -104,7 +104,7 @@ BAR_DEG = 1.2
 
 
 def directions(height: int) -> Array:
-    """Unit world directions [height, 2 height, 3] of the pixel centres of an equirectangular picture."""
+    """Unit world directions [height, 2 height, 3] of the pixel centres of an equirectangular image."""
     azimuth = np.pi * (1 - 2 * (np.arange(2 * height) + 0.5) / (2 * height))
     polar = (np.pi * (np.arange(height) + 0.5) / height)[:, None]
     horizontal = np.sin(polar)
@@ -128,12 +128,12 @@ def make_environment(height: int, surroundings: Surroundings = NAMED) -> NDArray
 
 
 def _blend(low: Color, high: Color, share: Array) -> Array:
-    """Colours [..., 3] from `low`, where the share is 0, to `high`, where it is 1."""
+    """Linear interpolation of colours [..., 3] from `low` (share 0) to `high` (share 1)."""
     return np.asarray(low) + share[..., None] * (np.asarray(high) - np.asarray(low))
 
 
 def _sky_and_floor(surroundings: Surroundings, azimuth_deg: Array, elevation_deg: Array) -> Array:
-    """A gradient above the horizon and tiles below, which meet in a sharp line."""
+    """A gradient above the horizon and tiles below, separated by a sharp line."""
     sky = _blend(surroundings.horizon, surroundings.zenith, np.clip(elevation_deg / 70, 0, 1) ** 0.7)
     floor = _blend(surroundings.far_floor, surroundings.near_floor, np.clip(-elevation_deg / 60, 0, 1))
     tiles = (np.floor(azimuth_deg / 15) + np.floor(elevation_deg / 7.5)) % 2
@@ -155,7 +155,7 @@ def _draw_bands(radiance: Array, azimuth_deg: Array, elevation_deg: Array) -> No
 
 
 def _offsets(panel: Panel, azimuth_deg: Array, elevation_deg: Array) -> tuple[Array, Array]:
-    """Azimuth and elevation from the middle of a panel, in degrees."""
+    """Azimuth and elevation relative to the centre of a panel, in degrees."""
     return (azimuth_deg - panel.azimuth_deg + 180) % 360 - 180, elevation_deg - panel.elevation_deg
 
 
@@ -180,7 +180,7 @@ def _draw_panel(radiance: Array, panel: Panel, azimuth_deg: Array, elevation_deg
 
 
 def _draw_signs(radiance: Array, signs: Sequence[Sign]) -> None:
-    """Boards that name the axis they stand on."""
+    """Draws boards that show the name of their axis."""
     height, width = radiance.shape[:2]
     per_degree = height / 180
     for sign in signs:

@@ -1,4 +1,4 @@
-"""Glossy scenes in which what is mirrored is near: a table full of things, a sheet of metal, a car before a wall."""
+"""Glossy scenes with nearby reflected objects: a table full of objects, a sheet of metal, a car next to a wall."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ NearScene = Literal["table", "gold", "sheet", "car"]
 NEAR_SCENES: tuple[NearScene, ...] = ("table", "gold", "sheet", "car")
 
 BALL_RADIUS = 0.5
-"""Of the mirror ball on the table."""
+"""Radius of the mirror ball on the table."""
 SHEET_SIZE = (1.5, 0.95)
 """Width and height of the sheet of metal, world units."""
 SHEET_SWING = 0.16
-"""How far the sheet swings to either side of its plane."""
+"""Amplitude of the waves of the sheet."""
 SHEET_THICKNESS = 0.02
 CAR_HALF_AXES = np.array([0.72, 0.36, 0.27])
 WALL = np.array([1.1, 0.05, 0.55])
@@ -35,7 +35,7 @@ COLORS: tuple[Color, ...] = (
 
 
 def near_scene(name: NearScene) -> DrawnScene:
-    """The scene of a name: what mirrors comes first among the bodies."""
+    """The scene of a name; reflective bodies come first."""
     makers: dict[str, Callable[[], tuple[tuple[Body, ...], Stand]]] = {
         "table": _table,
         "gold": _gold,
@@ -47,7 +47,7 @@ def near_scene(name: NearScene) -> DrawnScene:
 
 
 def _table() -> tuple[tuple[Body, ...], Stand]:
-    """A mirror ball among six matte things that stand around it on one table."""
+    """A mirror ball on a table, surrounded by six matte objects."""
     stand = Stand(radius=1.25, z=-BALL_RADIUS, checker_size=0.2, pattern_seed=1)
     ball = star_shaped(lambda d: BALL_RADIUS * np.ones(d.shape[:-1]))
     around = tuple(_standing(number, 0.92, 60.0 * number + 11.0, stand.z) for number in range(6))
@@ -55,23 +55,23 @@ def _table() -> tuple[tuple[Body, ...], Stand]:
 
 
 def _gold() -> tuple[tuple[Body, ...], Stand]:
-    """The table with a ball of gold in place of the mirror."""
+    """The table with a golden ball instead of the mirror ball."""
     (mirror, *around), stand = _table()
     return (_body("ball", mirror.triangles, "metal", number=2), *around), stand
 
 
 def _sheet() -> tuple[tuple[Body, ...], Stand]:
-    """A waved sheet of polished metal that stands upright, with things on both sides of it."""
+    """An upright wavy sheet of polished metal, with objects on both sides."""
     stand = Stand(radius=1.25, z=-0.5, checker_size=0.25, pattern_seed=5)
     sheet = placed(_waved_sheet(), np.eye(3), np.array([0.0, 0.0, stand.z + SHEET_SIZE[1] / 2]))
-    # None in the sheet's own plane, y = 0.
+    # None in the plane of the sheet, y = 0.
     angles_deg = (50.0, 90.0, 135.0, 235.0, 270.0, 315.0)
     around = tuple(_standing(number, 0.72, angle, stand.z) for number, angle in enumerate(angles_deg))
     return (_body("box", sheet, "metal", number=5), *around), stand
 
 
 def _car() -> tuple[tuple[Body, ...], Stand]:
-    """A lacquered body like a car's, next to a patterned wall and before two things."""
+    """A lacquered car-like body, next to a patterned wall and in front of two objects."""
     stand = Stand(radius=1.25, z=-0.4, checker_size=0.3, pattern_seed=7)
     body = star_shaped(lambda d: np.sum(np.abs(d / CAR_HALF_AXES) ** 3.0, axis=-1) ** (-1 / 3.0))
     body = placed(body, np.eye(3), np.array([0.0, 0.0, stand.z + CAR_HALF_AXES[2]]))
@@ -85,7 +85,7 @@ def _car() -> tuple[tuple[Body, ...], Stand]:
 
 
 def _standing(number: int, distance: float, angle_deg: float, ground_z: float) -> Body:
-    """One of the matte things, on the ground at a distance from the middle."""
+    """One of the matte objects, on the ground at a distance from the centre."""
     half_axes = np.array([(0.13, 0.13, 0.30), (0.18, 0.18, 0.18), (0.15, 0.15, 0.21)][number % 3])
     power = (2.0, 6.0, 2.0)[(number + 1) % 3]
     shape: Shape = "box" if power > 2 else "egg"
@@ -101,7 +101,7 @@ def _body(shape: Shape, triangles: Triangles, coating: Coating, *, number: int, 
 
 
 def _waved_sheet(columns: int = 240, rows: int = 24) -> Triangles:
-    """A thin closed sheet about the origin: y swings with x like a sine, z is up."""
+    """A thin closed sheet about the origin, with y a sine of x; z is up."""
     width, height = SHEET_SIZE
     x = width * (np.arange(columns + 1) / columns - 0.5)
     z = height * (np.arange(rows + 1) / rows - 0.5)
@@ -128,12 +128,12 @@ def _waved_sheet(columns: int = 240, rows: int = 24) -> Triangles:
 
 
 def _block(half_sizes: Array) -> Triangles:
-    """A box about the origin whose six faces show the whole texture each."""
+    """A box about the origin, each face of which shows the whole texture."""
     corners = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
     positions, normals = [], []
     for axis in range(3):
         for side in (1.0, -1.0):
-            # Anticlockwise seen from +axis; turned round for the other side.
+            # Counter-clockwise seen from +axis; reversed for the other side.
             face = np.zeros((4, 3))
             face[:, axis], face[:, (axis + 1) % 3], face[:, (axis + 2) % 3] = side, *corners[:: int(side)].T
             positions.append(face * half_sizes)
@@ -144,7 +144,7 @@ def _block(half_sizes: Array) -> Triangles:
 
 
 def _grid_faces(columns: int, rows: int) -> NDArray[np.int64]:
-    """Two triangles [2 columns rows, 3] for each cell of a grid; they face -y where columns run to +x, rows to +z."""
+    """Two triangles per grid cell, [2 columns rows, 3]; they face -y if columns run to +x and rows to +z."""
     corner = (np.arange(columns)[:, None] * (rows + 1) + np.arange(rows)).ravel()
     beside, above = corner + rows + 1, corner + 1
     return np.concatenate([np.stack([corner, beside, beside + 1], -1), np.stack([corner, beside + 1, above], -1)])

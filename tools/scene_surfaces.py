@@ -1,4 +1,4 @@
-"""Shapes and textures of the reflective scenes, made in numpy: triangles with normals, pictures of solid patterns."""
+"""Shapes and textures of the reflective scenes, made in NumPy: meshes with normals, and images of solid patterns."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ Array = NDArray[np.floating]
 
 WAVES = 48
 CHECKER_SIZE = 0.2
-"""Side of a square of the ground, world units."""
+"""Side of the checkerboard squares of the ground, world units."""
 INK = np.array([[0.08, 0.22, 0.45], [0.62, 0.25, 0.10], [0.80, 0.70, 0.42], [0.12, 0.36, 0.20], [0.72, 0.72, 0.70]])
-"""Linear reflectances [5, 3] that textures choose from."""
+"""Palette of textures, linear reflectances [5, 3]."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class Triangles:
     Attributes:
         positions: [V, 3], world units.
         normals: [V, 3], unit, outwards.
-        coordinates: [V, 2] in [0, 1], where textures are looked up.
-        faces: [F, 3] indices, anticlockwise seen from outside.
+        coordinates: [V, 2] texture coordinates in [0, 1].
+        faces: [F, 3] indices, counter-clockwise seen from outside.
     """
 
     positions: Array
@@ -83,7 +83,7 @@ def torus_depth(major: float, minor: float, tilt_deg: float) -> float:
 
 
 def star_shaped(radius_along: Callable[[Array], Array], rings: int = 320, segments: int = 160) -> Triangles:
-    """A closed surface about the origin that every ray from there meets once.
+    """A closed surface about the origin that every ray from there hits exactly once.
 
     Args:
         radius_along: distance [...] of the surface in unit directions [..., 3]; smooth, for the sake of the normals.
@@ -123,15 +123,15 @@ def placed(triangles: Triangles, turn: Array, offset: Array) -> Triangles:
 
 
 def solid_noise(points: Array, frequency: float, seed: int, waves: int = WAVES) -> Array:
-    """A smooth random pattern in space: [...] in about [0, 1] at points [..., 3].
+    """Smooth 3D noise [...] in about [0, 1] at points [..., 3].
 
-    A solid pattern has neither seams nor poles, whatever surface it is cut by.
+    A solid pattern has neither seams nor poles on any surface.
 
     Args:
-        points: world units.
+        points: positions in world units.
         frequency: typical waves per world unit.
-        seed: chooses the pattern.
-        waves: how many waves add up; fewer are faster, and less even.
+        seed: random seed of the pattern.
+        waves: number of summed waves; fewer are faster, but less uniform.
     """
     generator = np.random.default_rng(seed)
     vectors = generator.normal(scale=2 * np.pi * frequency / np.sqrt(3), size=(waves, 3))
@@ -145,7 +145,7 @@ def solid_noise(points: Array, frequency: float, seed: int, waves: int = WAVES) 
 def ground_texture(
     radius: float, size: int, *, checker_size: float = CHECKER_SIZE, seed: int = 1
 ) -> NDArray[np.float32]:
-    """Linear reflectance [size, size, 3] of the disc: a checkerboard, each half of it with its own pattern."""
+    """Linear reflectance [size, size, 3] of the disc: a checkerboard of two patterns."""
     line = radius * (2 * (np.arange(size) + 0.5) / size - 1)
     x, y = np.meshgrid(line, line)
     points = np.stack([x, y, np.zeros_like(x)], axis=-1)
@@ -168,6 +168,6 @@ def ball_texture(size: int, *, seed: int = 3) -> NDArray[np.float32]:
 
 
 def _patches(points: Array, *, frequency: float, seed: int) -> Array:
-    """Areas of the colours of `INK` [..., 3] with crisp borders, at points [..., 3]."""
+    """Patches in the colours of `INK` [..., 3] with sharp borders, at points [..., 3]."""
     level = solid_noise(points, frequency, seed)
     return INK[np.clip((level * len(INK)).astype(int), 0, len(INK) - 1)]

@@ -1,6 +1,6 @@
-"""Hooks of MkDocs: the public names for the reference, and pages of the repository that do not lie in docs/.
+"""Hooks of MkDocs: the public names for the reference, and pages of the repository outside of docs/.
 
-Pages in docs/ link to those as files of the repository (`../lab/panes.md`); in the site they are neighbours.
+Pages in docs/ link to the latter as files of the repository (`../lab/panes.md`); in the site they are in one tree.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ INTO_DOCS = re.compile(r"\]\((\.\./)?docs/")
 
 
 def on_files(files: Files, *, config: Any) -> Files:
-    """Add what lies elsewhere."""
+    """Add the pages outside of docs/."""
     paths = [ROOT / name for name in PAGES]
     paths += [path for pattern in PATTERNS for path in sorted(ROOT.glob(pattern))]
     for path in paths:
@@ -33,7 +33,7 @@ def on_files(files: Files, *, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
-    """Lead links to where the pages lie in the site."""
+    """Redirect links to the locations of the pages in the site."""
     name = page.file.src_uri
     if name.startswith("lab/"):
         return INTO_DOCS.sub("](../", markdown)

@@ -1,10 +1,10 @@
-"""Many clients that click at random look at a scene for long: does memory stay flat, does everybody get pictures?
+"""Soak test of the viewer: many clients act at random; memory must stay constant, and all must get images.
 
     python -m tools.soak_viewer RUN --clients 50 --minutes 120 [--deaf 2] [--pause 0.25]
 
-Starts `glassplat view` in a process of its own and speaks viser's protocol, as browsers do: cameras that move, every
-control that the page has, panes that are dragged, connections that are cut. Deaf ones ask for pictures and never fetch
-any. At the end all clients rest, and each that hears has to get a picture. Memory is that of the viewer's process; its
+It starts `glassplat view` in a separate process and uses the protocol of viser, like a browser. Clients move cameras,
+use every control of the page, drag panes, and drop connections. Deaf clients request images but never read any. At the
+end all clients pause, and each one that is not deaf has to receive an image. Memory is that of the viewer process; its
 slope is fitted to the second half of the time.
 """
 
@@ -33,10 +33,10 @@ from tools.viewer_client import ViewerClient
 
 SIZES = ((640, 480), (1280, 720), (390, 844))
 LEAVES = 0.01
-"""Of the actions, how many cut the connection."""
+"""Share of the actions that drop the connection."""
 BETWEEN_SAMPLES = 5.0
 LAST_PICTURE = 300.0
-"""Seconds in which every client that rests has to get a picture."""
+"""Timeout in seconds for every paused client to receive an image."""
 MOST_TOLD = 20
 COMPLAINTS = ("Traceback", "Error", "could not be rendered")
 
@@ -52,7 +52,7 @@ class Count:
 
 
 class Looker:
-    """One client that does what people do, and some things that they do not."""
+    """One client, with typical and unusual actions."""
 
     def __init__(self, address: str, seed: int, pause: float, count: Count, *, is_deaf: bool = False) -> None:
         self._address, self._random, self._pause, self._count = address, random.Random(seed), pause, count
@@ -75,13 +75,13 @@ class Looker:
                     finally:
                         self._count.pictures += client.pictures - before
                         if self._random.random() < 0.5:
-                            client.connection.transport.abort()  # As when a laptop is closed.
+                            client.connection.transport.abort()  # As if a laptop were closed.
             except (ConnectionClosed, OSError, TimeoutError) as error:
                 self._count.refused.append(f"{type(error).__name__}: {error}")
                 await asyncio.sleep(1)
 
     async def _act(self, client: ViewerClient) -> None:
-        """Acts until it leaves; while it rests, it only listens."""
+        """Acts until it leaves; while paused, it only listens."""
         before: int | None = None
         while True:
             await asyncio.sleep(self._random.expovariate(1 / self._pause))
@@ -98,7 +98,7 @@ class Looker:
             await self._random.choice((self._look, self._look, self._click, self._drag))(client)
 
     async def _look(self, client: ViewerClient) -> None:
-        """The camera moves on a circle round the origin."""
+        """Moves the camera on a circle around the origin."""
         self._angle += self._random.gauss(0, 0.1)
         half = self._angle / 2
         await client.look(
@@ -110,7 +110,7 @@ class Looker:
         )
 
     async def _click(self, client: ViewerClient) -> None:
-        """One control of the page, whichever."""
+        """Sets a random control of the page."""
         if not client.controls:
             return
         uuid, made = self._random.choice(list(client.controls.items()))
@@ -126,7 +126,7 @@ class Looker:
         await client.send("GuiUpdateMessage", uuid=uuid, updates={"value": value})
 
     async def _drag(self, client: ViewerClient) -> None:
-        """A pane is moved and turned a little."""
+        """Moves and rotates a pane slightly."""
         if not client.gizmos:
             return
         name, made = self._random.choice(list(client.gizmos.items()))
@@ -142,7 +142,7 @@ class Looker:
 
 @dataclass
 class Soaked:
-    """Result of a soak: seconds and MiB of samples, counts, and lines in which the viewer complained."""
+    """Result of a soak test: seconds and MiB of samples, counts, and error lines of the viewer."""
 
     samples: list[tuple[float, float]]
     count: Count
@@ -152,13 +152,13 @@ class Soaked:
 
     @property
     def slope(self) -> float:
-        """MiB an hour, over the second half of the samples."""
+        """Slope of memory in MiB per hour, over the second half of the samples."""
         half = np.array(self.samples[len(self.samples) // 2 :])
         return float(3600 * np.polyfit(half[:, 0], half[:, 1], 1)[0]) if len(half) > 2 else 0.0
 
 
 def resident_mib(pid: int) -> float:
-    """Memory of a process, MiB."""
+    """Resident memory of a process, MiB."""
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
@@ -166,7 +166,7 @@ def resident_mib(pid: int) -> float:
 async def soak(
     run: Path, clients: int, minutes: float, *, deaf: int = 0, pause: float = 0.25, say: Any = print
 ) -> Soaked:
-    """Starts a viewer and its clients, of which some are deaf, waits, and ends them all."""
+    """Starts a viewer and clients, of which some are deaf, waits, and stops them all."""
     port, count = free_port(), Count()
     with tempfile.TemporaryDirectory() as kept, tempfile.TemporaryFile("w+") as log:
         command = ["-m", "glassplat", "view", str(run), "--port", str(port), "--output", kept]
@@ -198,7 +198,7 @@ async def soak(
 
 
 async def printed_address(log: IO[str], viewer: asyncio.subprocess.Process) -> str:
-    """Address that the viewer prints; raises RuntimeError if it ends before."""
+    """Address printed by the viewer; raises RuntimeError if it ends before."""
     while viewer.returncode is None:
         found = re.search(r"viewer: (http\S+)", os.pread(log.fileno(), 1_000_000, 0).decode())
         if found:
@@ -208,7 +208,7 @@ async def printed_address(log: IO[str], viewer: asyncio.subprocess.Process) -> s
 
 
 async def sampled(pid: int, seconds: float, count: Count, say: Any) -> list[tuple[float, float]]:
-    """Memory over time, with a line each minute."""
+    """Samples memory over time, and prints a line each minute."""
     begun, samples, said = time.monotonic(), list[tuple[float, float]](), 0
     while (now := time.monotonic() - begun) < seconds:
         samples.append((now, resident_mib(pid)))
@@ -222,12 +222,12 @@ async def sampled(pid: int, seconds: float, count: Count, say: Any) -> list[tupl
 
 
 def main() -> int:
-    """Soaks, and says how it went; 1 if somebody got no picture or the viewer complained."""
+    """Runs the soak test and prints the result; returns 1 if a client got no image or the viewer reported errors."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--clients", type=int, default=50)
     parser.add_argument("--minutes", type=float, default=120)
-    parser.add_argument("--deaf", type=int, default=0, help="of the clients, how many never fetch a picture")
+    parser.add_argument("--deaf", type=int, default=0, help="number of clients that never read an image")
     parser.add_argument("--pause", type=float, default=0.25, help="mean seconds between two actions of a client")
     options = parser.parse_args()
     found = asyncio.run(

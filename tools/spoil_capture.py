@@ -1,14 +1,13 @@
-"""A copy of a capture with a flaw that real ones have; its true layers, poses and masks stay as they are.
+"""Copies a capture and adds flaws of real captures; the true layers, poses and masks stay unchanged.
 
 python -m tools.spoil_capture CAPTURE --output COPY [--exposure STOPS] [--white-balance STOPS]
                              [--pose-noise DEGREES] [--passers-by SHARE] [--seed N]
 
-Photographs are brightened and tinted in linear radiance, as a camera's automatic exposure and white balance do, each by
-factors of its own, and clipped at white. Cameras of a COLMAP model in text are turned about each of their axes, and
-shifted by as much as the turn moves what is one radius of the cameras away; `true_images.txt` keeps the true poses.
-Captures with `transforms_train.json`, such as those of `tools/make_scenes.py`, will do for these three flaws too.
-Passers-by stand before everything in some photographs, but in no eighth one, which is a test view; `gt/passers_by/` has
-masks of them.
+Photographs are scaled per channel in linear radiance, each by its own factors, like automatic exposure and white
+balance, and clipped at white. Cameras of a COLMAP text model are rotated about each of their axes, and shifted as much
+as the rotation moves points one camera radius away; `true_images.txt` keeps the true poses. These three flaws also work
+for captures with `transforms_train.json`, such as those of `tools/make_scenes.py`. Passers-by occlude everything in
+some photographs, except for test views (every eighth); `gt/passers_by/` has masks of them.
 """
 
 from __future__ import annotations
@@ -30,20 +29,20 @@ from glassplat.files.images import read_colors, write_image
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 
 FIGURES = (0.4, 0.9)
-"""Heights of passers-by, as shares of the photograph's."""
+"""Heights of passers-by, as shares of the photograph height."""
 IMAGES, MODEL, TRUE_MODEL = "images", "sparse/0/images.txt", "true_images.txt"
 SPLITS, TRANSFORMS = ("train", "test"), "transforms_{}.json"
 
 
 def main() -> None:
-    """Writes the copy."""
+    """Parses the arguments and writes the copy."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture", type=Path)
     parser.add_argument("--output", type=Path, required=True, help="a folder that does not exist yet")
     parser.add_argument("--exposure", type=float, default=0.0, help="standard deviation of the exposure, in stops")
-    parser.add_argument("--white-balance", type=float, default=0.0, help="the same of each channel besides")
-    parser.add_argument("--pose-noise", type=float, default=0.0, help="standard deviation of the turns, in degrees")
-    parser.add_argument("--passers-by", type=float, default=0.0, help="share of the photographs that show somebody")
+    parser.add_argument("--white-balance", type=float, default=0.0, help="additional deviation of each channel")
+    parser.add_argument("--pose-noise", type=float, default=0.0, help="standard deviation of the rotations, in degrees")
+    parser.add_argument("--passers-by", type=float, default=0.0, help="share of the photographs with a passer-by")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     by_transforms = (given.capture / TRANSFORMS.format(SPLITS[0])).is_file()
@@ -68,17 +67,17 @@ def main() -> None:
 def spoil(
     capture: Path, output: Path, exposure: float, white_balance: float, random: np.random.Generator
 ) -> dict[str, NDArray[np.float64]]:
-    """Copies a capture with other exposures.
+    """Copies a capture with varied exposures.
 
     Args:
         capture: its folder.
-        output: of the copy.
+        output: folder of the copy.
         exposure: standard deviation of the exposures, in stops.
-        white_balance: the same of each channel besides.
-        random: where they come from.
+        white_balance: additional standard deviation of each channel, in stops.
+        random: random generator.
 
     Returns:
-        The factors [3] on the linear channels, by photograph; none where photographs stay as they are.
+        Factors [3] of the linear channels by photograph; empty if photographs are unchanged.
     """
     shutil.copytree(capture, output)
     factors: dict[str, NDArray[np.float64]] = {}
@@ -92,7 +91,7 @@ def spoil(
 
 
 def photographs(capture: Path) -> list[tuple[str, Path]]:
-    """Names and paths of a capture's photographs: those in `images/`, or those that its transforms name."""
+    """Names and paths of the photographs of a capture, from `images/` or from its transforms."""
     if (capture / IMAGES).is_dir():
         paths = sorted(path for path in (capture / IMAGES).rglob("*") if path.is_file())
         return [(path.relative_to(capture / IMAGES).as_posix(), path) for path in paths]
@@ -101,18 +100,18 @@ def photographs(capture: Path) -> list[tuple[str, Path]]:
 
 
 def frames_of(capture: Path, split: str) -> list[dict[str, Any]]:
-    """The frames of a capture's `transforms_train.json` or `transforms_test.json`."""
+    """Frames in `transforms_train.json` or `transforms_test.json` of a capture."""
     frames: list[dict[str, Any]] = json.loads((capture / TRANSFORMS.format(split)).read_text())["frames"]
     return frames
 
 
 def disturb_transforms(capture: Path, noise: float, random: np.random.Generator) -> None:
-    """Moves every camera of a capture with transforms a little, each by itself; as `disturb_poses`.
+    """Perturbs every camera of a capture with transforms independently, like `disturb_poses`.
 
     Args:
         capture: its folder; `true_transforms_train.json` and `..._test.json` are kept next to the new ones.
-        noise: standard deviation of the turns about each axis, radians, and of the shifts, in radii of the cameras.
-        random: where they come from.
+        noise: standard deviation of the rotations about each axis, radians, and of the shifts, in camera radii.
+        random: random generator.
     """
     for split in SPLITS:
         path = capture / TRANSFORMS.format(split)
@@ -130,12 +129,12 @@ def disturb_transforms(capture: Path, noise: float, random: np.random.Generator)
 
 
 def disturb_poses(path: Path, noise: float, random: np.random.Generator) -> None:
-    """Moves every camera of a COLMAP model a little, each by itself.
+    """Perturbs every camera of a COLMAP model independently.
 
     Args:
         path: its `images.txt`; the true one is kept next to it.
-        noise: standard deviation of the turns about each axis, radians, and of the shifts, in radii of the cameras.
-        random: where they come from.
+        noise: standard deviation of the rotations about each axis, radians, and of the shifts, in camera radii.
+        random: random generator.
     """
     lines = path.read_text().splitlines()
     shutil.copyfile(path, path.with_name(TRUE_MODEL))
@@ -154,12 +153,12 @@ def disturb_poses(path: Path, noise: float, random: np.random.Generator) -> None
 
 
 def add_passers_by(capture: Path, share: float, random: np.random.Generator) -> None:
-    """Paints somebody into photographs of a capture, and writes masks of where.
+    """Paints passers-by into photographs of a capture, and writes masks of them.
 
     Args:
         capture: its folder.
-        share: of the photographs that are not test views.
-        random: who stands where.
+        share: share of the photographs, excluding test views.
+        random: random generator.
     """
     paths = sorted(path for path in (capture / IMAGES).rglob("*") if path.is_file())
     for number, path in enumerate(paths):
@@ -176,7 +175,7 @@ def add_passers_by(capture: Path, share: float, random: np.random.Generator) -> 
 
 
 def figure(height: int, width: int, random: np.random.Generator) -> NDArray[np.bool_]:
-    """[H, W] the pixels of somebody who stands in the picture: a head, and a body down to the feet."""
+    """[H, W] mask of a standing person: a head, and a body down to the feet."""
     size = random.uniform(*FIGURES) * height
     middle, feet = random.uniform(0.1, 0.9) * width, random.uniform(0.7, 1.2) * height
     y, x = np.mgrid[:height, :width] + 0.5
@@ -187,7 +186,7 @@ def figure(height: int, width: int, random: np.random.Generator) -> NDArray[np.b
 
 
 def exposed(photo: NDArray[np.uint8], factors: NDArray[np.float64]) -> torch.Tensor:
-    """A photograph [H, W, 3 or 4] whose linear channels are multiplied by factors [3], clipped at white."""
+    """A photograph [H, W, 3 or 4] with linear channels multiplied by factors [3], clipped at white."""
     linear = linear_from_srgb(torch.from_numpy(photo[..., :3].astype(np.float32)) / 255)
     brighter = (linear * torch.from_numpy(factors).float()).clamp(0, 1)
     colors = torch.round(255 * srgb_from_linear(brighter)).to(torch.uint8)

@@ -1,17 +1,17 @@
-"""Tries what SECURITY.md promises, by class, with cases that follow from a seed.
+"""Tests the promises of SECURITY.md, by class, with random cases from a seed.
 
     python -m tools.trial CLASS --seed 3 --cases 100 [--minutes 10]
 
-| class | what is tried |
+| class | what is tested |
 |---|---|
-| crashes | commands that are killed, interrupted, or run out of disk at any moment, and what is left of their work |
+| crashes | commands that are killed, interrupted, or run out of disk at a random moment, and the files they leave |
 | readers | damaged files of every kind, for every reader |
-| servers | strangers, nonsense, slow and many clients, at `view` and at `annotate` |
-| numbers | values that nobody should give, through the Python interface |
-| machines | no home, other locales, odd names, a damaged cache of kernels, two processes at once |
+| servers | unauthorised, malformed, slow and many clients of `view` and `annotate` |
+| numbers | invalid and extreme values in the Python interface |
+| machines | no home directory, other locales, unusual names, a damaged kernel cache, two processes at once |
 
-A case is a fault if it lets somebody in, loses work, hangs, ends in a traceback or in an error that says nothing. Every
-process has 8 GiB of address space and ten minutes. Returns 1 if there is a fault.
+A case is a fault if it grants unauthorised access, loses work, hangs, or ends with a traceback or an empty error. Every
+process is limited to 8 GiB of address space and ten minutes. The exit code is 1 if there is a fault.
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ CLASSES = ("crashes", "readers", "servers", "numbers", "machines")
 
 
 class Case(NamedTuple):
-    """Case that was tried, and the fault of its end; none if that is empty."""
+    """A tested case and its fault; an empty string means none."""
 
     what: str
     fault: str = ""
 
 
 class Trial(Protocol):
-    """The cases of one class."""
+    """Generator of the cases of one class."""
 
     def __call__(self, seed: int, cases: int, place: Path) -> Iterator[Case]:
-        """So many cases, tried one after the other; `place` is an empty folder."""
+        """Tests `cases` cases in order; `place` is an empty folder."""
         ...
 
 
 def trial_of(name: str) -> Trial:
-    """The function `cases` of a class's module, which is imported now."""
+    """Imports the module of a class, and returns its function `cases`."""
     found: Trial = importlib.import_module(f"tools.trial_{name}").cases
     return found
 
 
 def tried(name: str, seed: int, cases: int, minutes: float) -> tuple[int, list[Case]]:
-    """Try as many cases as there is time for; returns their number and the faults, which are printed at once."""
+    """Test cases until the time is up; returns their number and the faults, which are printed immediately."""
     end, count, faults = time.monotonic() + 60 * minutes, 0, list[Case]()
     with tempfile.TemporaryDirectory(prefix="trial-", ignore_cleanup_errors=True) as place:
         for case in trial_of(name)(seed, cases, Path(place)):
@@ -64,12 +64,12 @@ def tried(name: str, seed: int, cases: int, minutes: float) -> tuple[int, list[C
 
 
 def main() -> int:
-    """Tries one class, and says how it went."""
+    """Tests one class and prints a summary."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kind", choices=CLASSES, metavar="CLASS", help=", ".join(CLASSES))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--cases", type=int, default=100)
-    parser.add_argument("--minutes", type=float, default=10.0, help="no case begins after so long")
+    parser.add_argument("--minutes", type=float, default=10.0, help="no case starts after this time")
     options = parser.parse_args()
     begun = time.monotonic()
     count, faults = tried(options.kind, options.seed, options.cases, options.minutes)

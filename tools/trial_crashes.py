@@ -1,8 +1,8 @@
-"""Commands that end at any moment: killed, interrupted, out of disk, or with their output taken away.
+"""Commands that end at a random moment: killed, interrupted, out of disk, or with their output removed.
 
-What is left is never a half-written file that is taken for whole: `glassplat info` reads it without a traceback, and a
-training that is resumed ends with the same bits as one that nobody disturbed. Full and read-only disks are small file
-systems in memory, which only the administrator may mount.
+No half-written file may be treated as complete: `glassplat info` reads what is left without a traceback, and a resumed
+training ends with the same bits as an undisturbed one. Full and read-only disks are small file systems in memory, which
+only root can mount.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ METHODS = ("splat", "planar", "deferred", "traced")
 STEPS = 60
 CHECKPOINT = "checkpoint.safetensors"
 MOST_LOST = 120.0
-"""Seconds of a training."""
+"""Maximum seconds of training that a kill may lose."""
 TIMES = """
 import random, time
 shift, truth = random.Random(0), (time.time, time.time_ns)
 time.time = lambda: truth[0]() + shift.uniform(-1e6, 1e6)
 time.time_ns = lambda: truth[1]() + shift.randint(-10**15, 10**15)
 """
-"""A clock that jumps by days each time somebody looks."""
+"""Module that makes the clock jump by days at every call."""
 
 
 class Integer(NamedTuple):
-    """A training that nobody disturbed."""
+    """An undisturbed training."""
 
     method: str
     data: Path
@@ -56,8 +56,8 @@ class Integer(NamedTuple):
 
 
 def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
-    """Mostly trainings; each method is trained undisturbed when it is first needed."""
-    for module in ("runs", "evaluation", "writing", "details"):  # What takes long is imported before processes fork.
+    """Mostly trainings; each method is trained undisturbed on first use."""
+    for module in ("runs", "evaluation", "writing", "details"):  # Slow imports happen before processes fork.
         importlib.import_module(f"glassplat.cli.{module}")
     data = place / "capture"
     made_apart(write_tiny_capture, data)
@@ -75,7 +75,7 @@ def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
 
 
 def made_apart(write: Callable[[Path], object], folder: Path) -> None:
-    """Write a folder in a copy of this process, in which no tensor may be computed: threads do not survive a fork."""
+    """Writes a folder in a fork: threads do not survive forks, so this process must not compute tensors."""
     writer = get_context("fork").Process(target=write, args=(folder,))
     writer.start()
     writer.join()
@@ -90,7 +90,7 @@ def training(whole: Integer, folder: Path, *more: str) -> Sequence[str | Path]:
 
 
 def undisturbed(method: str, data: Path, folder: Path) -> Integer:
-    """A training that ends by itself; the first one compiles kernels."""
+    """Runs a training to its end; the first one compiles kernels."""
     for _ in range(2):
         shutil.rmtree(folder, ignore_errors=True)
         begun = time.monotonic()
@@ -101,19 +101,19 @@ def undisturbed(method: str, data: Path, folder: Path) -> Integer:
 
 
 def digests_of(folder: Path) -> frozenset[tuple[str, str]]:
-    """Name and digest of every file of a run's last scene."""
+    """Names and digests of all files of the last scene of a run."""
     files = (path for path in (folder / "point_cloud" / f"iteration_{STEPS}").rglob("*") if path.is_file())
     return frozenset((path.name, hashlib.sha256(path.read_bytes()).hexdigest()) for path in files)
 
 
 def other_bits(folder: Path, whole: Integer) -> str:
-    """Fault of a run that ended with other files than one that nobody disturbed, with their names."""
+    """Fault of a run whose final files differ from those of the undisturbed run, with their names."""
     differing = digests_of(folder) ^ whole.digests
     return f"it ended with other bits: {sorted({name for name, _ in differing})}" if differing else ""
 
 
 def resumed(whole: Integer, folder: Path) -> str:
-    """Fault of a run that goes on; one that has nothing to go on from begins again."""
+    """Resumes a run, or restarts it without a checkpoint; returns its fault."""
     if folder.exists():
         fault = run_forked(["info", folder]).fault()
         if fault:
@@ -125,7 +125,7 @@ def resumed(whole: Integer, folder: Path) -> str:
 
 
 def wait_for_moment(draw: random.Random, whole: Integer, folder: Path) -> None:
-    """Any moment of a training; two thirds of them are after its first checkpoint."""
+    """Waits for a random moment of a training, in two of three cases after its first checkpoint."""
     if draw.random() < 1 / 3:
         time.sleep(draw.uniform(0, whole.seconds))
         return
@@ -136,7 +136,7 @@ def wait_for_moment(draw: random.Random, whole: Integer, folder: Path) -> None:
 
 
 def killed(draw: random.Random, whole: Integer, folder: Path) -> str:
-    """A training is killed, and loses little."""
+    """Kills a training, which may lose little."""
 
     def kill(pid: int) -> None:
         wait_for_moment(draw, whole, folder)
@@ -150,14 +150,14 @@ def killed(draw: random.Random, whole: Integer, folder: Path) -> str:
 
 
 def interrupted(draw: random.Random, whole: Integer, folder: Path) -> str:
-    """Somebody presses Ctrl-C one to four times within half a second."""
+    """Sends Ctrl-C one to four times within half a second."""
     times = draw.randint(1, 4)
     sent = Sent(signal.SIGINT, draw.uniform(0, 2 * whole.seconds + 3), times, 0.5 / times)
     return run(training(whole, folder), sent=sent).fault() or resumed(whole, folder)
 
 
 def out_of_disk(draw: random.Random, whole: Integer, folder: Path) -> str:
-    """The disk is full at some write; later there is space."""
+    """Fills the disk at some write; later there is space."""
     with small_disk(folder, draw.choice((0, 4, 8, 16, 40, 100, 200)) + draw.randrange(1, 40)) as change:
         fault = run_forked(training(whole, folder / "run")).fault()
         change("size=1g")
@@ -165,13 +165,13 @@ def out_of_disk(draw: random.Random, whole: Integer, folder: Path) -> str:
 
 
 def read_only(draw: random.Random, whole: Integer, folder: Path) -> str:
-    """The disk becomes read-only in the middle; later it can be written."""
+    """Makes the disk read-only during the training, and writable later."""
     with small_disk(folder, 1 << 20) as change:
 
         def protect(pid: int) -> None:
             wait_for_moment(draw, whole, folder / "run")
             for _ in range(100):
-                with suppress(subprocess.CalledProcessError):  # While a file is open there.
+                with suppress(subprocess.CalledProcessError):  # Fails while a file is open there.
                     change("ro")
                     return
                 time.sleep(0.005)
@@ -182,7 +182,7 @@ def read_only(draw: random.Random, whole: Integer, folder: Path) -> str:
 
 
 def taken_away(draw: random.Random, whole: Integer, folder: Path) -> str:
-    """The output is removed, or replaced by a file, while the command works."""
+    """Removes the output, or replaces it by a file, while the command runs."""
     replaced = draw.random() < 0.5
 
     def take(pid: int) -> None:
@@ -199,7 +199,7 @@ def taken_away(draw: random.Random, whole: Integer, folder: Path) -> str:
 
 
 def two_at_once(draw: random.Random, whole: Integer, folder: Path) -> str:
-    """Two processes train into one folder: one does, the other one is refused."""
+    """Two processes train into one folder: one succeeds, and the other is rejected."""
     with ThreadPoolExecutor(2) as pool:
         ended: list[Ended] = list(pool.map(lambda _: run(training(whole, folder)), range(2)))
     faults = "; ".join(fault for one in ended if (fault := one.fault()))
@@ -211,7 +211,7 @@ def two_at_once(draw: random.Random, whole: Integer, folder: Path) -> str:
 
 
 def clock_jumps(draw: random.Random, whole: Integer, folder: Path) -> str:
-    """The clock jumps to and fro by days."""
+    """Trains with a clock that jumps back and forth by days."""
     site = folder.with_name(f"{folder.name}-clock")
     site.mkdir()
     (site / "sitecustomize.py").write_text(TIMES)
@@ -223,7 +223,7 @@ def clock_jumps(draw: random.Random, whole: Integer, folder: Path) -> str:
 
 
 def killer(seconds: float) -> Callable[[int], None]:
-    """Kill a process after so many seconds."""
+    """Returns a function that kills a process after the given seconds."""
 
     def kill(pid: int) -> None:
         time.sleep(seconds)
@@ -233,7 +233,7 @@ def killer(seconds: float) -> Callable[[int], None]:
 
 
 def written(draw: random.Random, whole: Integer, folder: Path) -> str:
-    """Something is made of a finished run, killed or out of disk on the way, and made again."""
+    """Runs a command on a finished run that is killed or runs out of disk, and repeats it."""
     made = folder / "made"
     film = ["--seconds", "0.5", "--fps", "8", "--width", "64"]
     name, *more = draw.choice((["eval"], ["export"], ["render"], ["video", *film]))
@@ -256,7 +256,7 @@ def written(draw: random.Random, whole: Integer, folder: Path) -> str:
 
 
 def marked(draw: random.Random, whole: Integer, folder: Path) -> str:
-    """Two programs save marks of one capture, and are killed or out of disk: what was saved is there."""
+    """Two programs save marks of one capture, and are killed or run out of disk: all saved marks must exist."""
     with small_disk(folder, 1 << 20) as change:
         room = folder / "room"
         made_apart(write_room, room)
@@ -267,7 +267,7 @@ def marked(draw: random.Random, whole: Integer, folder: Path) -> str:
 
 
 def marks_fault(draw: random.Random, room: Path, logs: Sequence[Path]) -> str:
-    """Fault of marks that two programs save at once, each with a log whose name ends in its number."""
+    """Fault of marks saved by two programs at once, each with a log whose name ends in its number."""
     context = get_context("fork")
     savers = [context.Process(target=save_marks, args=(room, log)) for log in logs]
     for saver in savers:
@@ -286,7 +286,7 @@ def marks_fault(draw: random.Random, room: Path, logs: Sequence[Path]) -> str:
 
 
 def save_marks(room: Path, log: Path) -> None:
-    """Adds pane after pane, each with a corner that no other has, and writes a line for each that is saved."""
+    """Adds pane after pane, each with a unique corner, and logs a line for each saved one."""
     session = open_session(room)
     with log.open("w") as lines:
         for number in range(20):
@@ -302,7 +302,7 @@ def save_marks(room: Path, log: Path) -> None:
                 try:
                     session.save(asked)
                     break
-                except OSError:  # The disk is full, which the page says; nothing was saved.
+                except OSError:  # The disk is full, which the page reports; nothing was saved.
                     return
                 except ChangedElsewhereError as changed:
                     asked = {name: changed.response[name] for name in ("document", "version")}
@@ -310,7 +310,7 @@ def save_marks(room: Path, log: Path) -> None:
 
 
 def prepared(draw: random.Random, whole: Integer, folder: Path) -> str:
-    """A preparation is killed or out of disk, and goes on."""
+    """Kills a preparation or lets it run out of disk, and resumes it."""
     is_killed = draw.random() < 0.5
     with small_disk(folder, 1 << 20) as change:
         photographs = copy_photographs(folder / "photographs")
@@ -324,7 +324,7 @@ def prepared(draw: random.Random, whole: Integer, folder: Path) -> str:
 
 
 def prepared_again(command: Sequence[str | Path], capture: Path) -> str:
-    """Fault of a preparation that goes on, where it was not done."""
+    """Resumes an unfinished preparation; returns its fault."""
     is_begun = capture.with_name("capture.partial").exists()
     if capture.exists() and not is_begun:
         return run_forked(["info", capture]).fault()

@@ -1,4 +1,4 @@
-"""Machines unlike ours: no home, other locales, odd names, a damaged cache of kernels, few and many threads."""
+"""Unusual machines: no home directory, other locales, odd names, a damaged kernel cache, few and many threads."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from tools.trial_process import ROOT, run, small_disk
 
 KINDS = ("home", "locale", "name", "cache", "two", "threads", "columns", "temporary")
 ONE_CACHE = {"NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator"}
-"""Kernels come from NUMBA_CACHE_DIR alone, not from where they lie ready."""
+"""Environment in which kernels are loaded only from NUMBA_CACHE_DIR, not from the bundled cache."""
 DAMAGED, MOST_FILLINGS = 3, 4
 LOCALES = ("C", "POSIX", "tr_TR.UTF-8", "de_DE.ISO-8859-1", "C.UTF-8", "nonsense", "")
 NAMES = ("a b", "a\nb", "\N{GRINNING FACE}", "[bold]x[/bold]", "-x", "a'b\"c", "%s{0}", "é" * 80, "a\tb", "\udcff")
 
 
 def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
-    """Renders of one small run, each on another machine, compared with what ours renders."""
+    """Renders one small run in various environments, and compares the images with those of the normal one."""
     scene = write_run(place / "run")
     ended = run(["render", scene, "--output", place / "ours", "--device", "cpu"])
     if ended.code != 0:
@@ -36,7 +36,7 @@ def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
         folder.mkdir()
         kind = KINDS[number % len(KINDS)]
         with ExitStack() as disks:
-            if kind == "cache":  # The administrator may write into any folder, but not to a disk that is read-only.
+            if kind == "cache":  # Root can write into any folder, but not to a read-only disk.
                 change = disks.enter_context(small_disk(folder / "kernels", 1 << 20))
             what, environment, source = machine(kind, draw, folder, scene)
             if what == "read-only":
@@ -49,12 +49,12 @@ def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
 
 
 def pictures(folder: Path) -> dict[str, bytes]:
-    """The pictures in a folder by name."""
+    """Images in a folder, by name."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*.png"))}
 
 
 def machine(kind: str, draw: random.Random, folder: Path, scene: Path) -> tuple[str, Mapping[str, str], Path]:
-    """Odd environment, with its description and the run that it renders."""
+    """Description of an unusual environment, its variables, and the run to render."""
     known = dict(os.environ)
     kernels = folder / "kernels"
     if kind == "home":
@@ -93,7 +93,7 @@ def machine(kind: str, draw: random.Random, folder: Path, scene: Path) -> tuple[
 
 
 def damaged_cache(what: str, draw: random.Random, kernels: Path, scene: Path) -> None:
-    """A cache that was filled by us, and then damaged: few files, where what they hold is compiled again."""
+    """Damages a filled cache: few files only, if their contents have to be compiled again."""
     if what == "a file":
         kernels.write_text("x")
         return
@@ -105,13 +105,13 @@ def damaged_cache(what: str, draw: random.Random, kernels: Path, scene: Path) ->
             path.unlink()
         elif what == "garbage":
             path.write_bytes(draw.randbytes(len(data)))
-        elif what != "read-only" or draw.random() < 0.5:  # Half of what cannot be written is cut short as well.
+        elif what != "read-only" or draw.random() < 0.5:  # Half of the files in a read-only cache are truncated too.
             path.write_bytes(b"" if what == "empty" else data[: draw.randrange(len(data) + 1)])
 
 
 @cache
 def filled_cache(scene: Path) -> Path:
-    """A cache with all kernels that a render of a scene needs, which is kept for the next trial: it takes minutes."""
+    """A cache with all kernels needed to render a scene; it is reused, because filling it takes minutes."""
     folder = ROOT / "runs" / "trial" / "kernels"
     environment = dict(os.environ) | {"NUMBA_CACHE_DIR": str(folder)} | ONE_CACHE
     for _ in range(MOST_FILLINGS):
@@ -124,11 +124,11 @@ def filled_cache(scene: Path) -> Path:
 
 
 def tried(environment: Mapping[str, str], scene: Path, folder: Path, truth: dict[str, bytes], *, twice: bool) -> str:
-    """Fault of renders in an environment, one or two at once."""
+    """Renders in an environment, once or twice concurrently; returns the fault."""
     outputs = [folder / "one", folder / "other"][: 2 if twice else 1]
 
     def rendered(output: Path) -> str:
-        # An absolute path: a name that begins with a dash is an option otherwise.
+        # An absolute path, because a name with a leading dash would be read as an option.
         ended = run(["render", scene.absolute(), "--output", output, "--device", "cpu"], environment=environment)
         if ended.fault() or ended.code != 0:
             return ended.fault() or f"code {ended.code}: {ended.output[-300:]}"

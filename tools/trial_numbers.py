@@ -1,7 +1,7 @@
-"""Values that nobody should give, through the Python interface: a finite picture, or an error that says what is wrong.
+"""Invalid values in the Python interface, which must give a finite image or an error that explains the problem.
 
-Any field of a scene and of a camera gets NaN, infinities, zeros and 1e30; cameras stand in Gaussians and on panes; a
-million Gaussians lie in one tile; and trainings begin with photographs in which nothing can be learned.
+Every field of a scene and a camera is set to NaN, infinities, zeros and 1e30. Cameras are inside Gaussians and on
+panes, a million Gaussians lie in one tile, and trainings use degenerate photographs.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from tools.trial import Case
 
 POISON = (math.nan, math.inf, -math.inf, 0.0, 1e30, -1e30, 1e-30, 3e38)
 MOST_SECONDS = 60.0
-"""Of the processor."""
+"""Limit of CPU time per case."""
 METHODS = ("splat", "planar", "deferred", "traced")
 
 
 def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
-    """Nine of ten are pictures, the tenth is a training of a few steps."""
+    """Nine of ten cases are frames, the tenth is a training of a few steps."""
     warnings.simplefilter("ignore")
     for method in METHODS:
         with torch.no_grad():
             renderer, scene = rendered(method)
-            renderer(scene, tiny_capture().train[1].camera)  # Kernels are compiled.
+            renderer(scene, tiny_capture().train[1].camera)  # Compiles the kernels.
     for number in range(cases):
         draw = random.Random(f"{seed} {number}")
         what, work = training(draw) if number % 10 == 9 else picture(draw)
@@ -45,20 +45,20 @@ def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
 
 
 def fault_of(work: Callable[[], Any]) -> str:
-    """Fault of an end; none if it ends well, or raises an error with a text."""
+    """Fault of the work; none if it succeeds, or raises an expected error with a message."""
     begun = time.process_time()
     try:
         work()
     except (ValueError, glassplat.InputError) as error:
         return "" if str(error).strip() else "an error without a text"
-    except Exception as error:  # noqa: BLE001 - Any other error is what is looked for.
+    except Exception as error:  # noqa: BLE001 - Any other error is a fault.
         return f"{type(error).__name__}: {str(error)[:300]}"
     seconds = time.process_time() - begun
     return f"it took {seconds:.0f} s" if seconds > MOST_SECONDS else ""
 
 
 def picture(draw: random.Random) -> tuple[str, Callable[[], None]]:
-    """A picture of a poisoned scene, or from a poisoned camera."""
+    """A frame of a poisoned scene, or from a poisoned camera."""
     renderer, scene = rendered(draw.choice(METHODS))
     camera, changes = tiny_capture().train[1].camera, dict[str, Any]()
     kind = draw.choice(("scene", "scene", "camera", "inside", "pane", "crowd"))
@@ -88,7 +88,7 @@ def picture(draw: random.Random) -> tuple[str, Callable[[], None]]:
 
 
 def rendered(method: str) -> tuple[Renderer, Scene]:
-    """A renderer of a method, and the tiny scene with what it needs."""
+    """The renderer of a method, and a tiny scene with the fields that it needs."""
     scene = true_scene()
     if method == "planar":
         return glassplat.Planar(), scene
@@ -103,7 +103,7 @@ def rendered(method: str) -> tuple[Renderer, Scene]:
 
 
 def poisoned(scene: Scene, draw: random.Random) -> tuple[str, Scene]:
-    """One to all values of one field become something else."""
+    """Replaces one, some or all values of a field."""
     name, tensor = draw.choice([(name, tensor) for name, tensor in scene.parameters().items() if tensor.numel()])
     value, changed = draw.choice(POISON), tensor.detach().clone()
     flat = changed.view(-1)
@@ -113,7 +113,7 @@ def poisoned(scene: Scene, draw: random.Random) -> tuple[str, Scene]:
 
 
 def poisoned_camera(camera: Camera, draw: random.Random) -> tuple[str, dict[str, Any]]:
-    """Changes of a camera, of one of its values."""
+    """Changes of one value of a camera."""
     value = draw.choice(POISON)
     if draw.random() < 0.5:
         pose, row, column = camera.cam_from_world.clone(), draw.randrange(3), draw.randrange(4)
@@ -124,13 +124,13 @@ def poisoned_camera(camera: Camera, draw: random.Random) -> tuple[str, dict[str,
 
 
 def at(place: torch.Tensor) -> Camera:
-    """A camera at a place."""
+    """A camera at a position."""
     camera = camera_at(*place.tolist())
     return replace(camera, cam_from_world=camera.cam_from_world.float())
 
 
 def crowded(scene: Scene, draw: random.Random) -> tuple[str, Scene]:
-    """A hundred thousand or a million Gaussians in one place."""
+    """A hundred thousand or a million Gaussians at one position."""
     count = draw.choice((100_000, 1_000_000))
     times = count // len(scene.primary)
     tensors = {
@@ -141,7 +141,7 @@ def crowded(scene: Scene, draw: random.Random) -> tuple[str, Scene]:
 
 
 def training(draw: random.Random) -> tuple[str, Callable[[], None]]:
-    """A few steps on photographs in which little can be learned."""
+    """A few training steps on degenerate photographs."""
     method, kind = (
         draw.choice(METHODS),
         draw.choice(("8x8", "one", "equal cameras", "black", "masked", "unmasked", "far")),
@@ -171,7 +171,7 @@ def training(draw: random.Random) -> tuple[str, Callable[[], None]]:
 
 
 def changed(view: View, *, camera: Camera | None = None, photo: Any = None, fill: int | None = None) -> View:
-    """A view with another camera, photograph, or a mask of one label."""
+    """A view with another camera or photograph, or a mask of one label."""
     photo = view.photo if photo is None else photo
     labels = None if fill is None else torch.full(photo.shape[:2], fill, dtype=torch.uint8)
     return View.in_memory(view.name, camera or view.camera, photo=photo, pane_labels=labels)

@@ -1,4 +1,4 @@
-"""Commands in processes of their own, bounded in memory and time, for `tools/trial.py`."""
+"""Commands in separate processes with limited memory and time, for `tools/trial.py`."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 MOST_BYTES, MOST_SECONDS = 8 << 30, 600
-GOOD_CODES = (0, 1, 2, 129, 130, 141, 143, -signal.SIGINT)  # The last where Ctrl-C comes while Python ends.
+GOOD_CODES = (0, 1, 2, 129, 130, 141, 143, -signal.SIGINT)  # The last one if Ctrl-C arrives during the exit of Python.
 COMPLAINTS = ("Traceback (most recent call last)", "unexpected error", "Fatal Python error", "terminate called")
 
 
 @dataclass(frozen=True)
 class Ended:
-    """End of a command; `code` is None where it was killed, here or for its time."""
+    """Result of a command; `code` is None if it was killed, on purpose or after a timeout."""
 
     code: int | None
     output: str
     is_late: bool = False
 
     def fault(self) -> str:
-        """Fault of such an end; none if it was asked for, or gave one readable message."""
+        """Fault of the result; none if it was intended, or gave one readable message."""
         if self.is_late:
             return f"it did not end in {MOST_SECONDS} s: {self.output[-300:]!r}"
         if any(word in self.output for word in COMPLAINTS):
@@ -42,7 +42,7 @@ class Ended:
 
 @dataclass(frozen=True)
 class Sent:
-    """Signals to a command: after so many seconds of its work, so many times, with so many seconds between."""
+    """Signals to a command: their delay in seconds, their number, and the seconds between them."""
 
     signal: int
     after: float
@@ -60,9 +60,9 @@ def run(
     """Runs `glassplat` with these options.
 
     Args:
-        options: of the command line.
-        sent: signals that it gets on the way.
-        environment: in place of ours; this tree is put before its PYTHONPATH.
+        options: arguments of the command line.
+        sent: signals to send while it runs.
+        environment: replaces the current one; this tree is prepended to its PYTHONPATH.
         largest_file: bytes after which a write fails, as on a full disk.
     """
 
@@ -77,11 +77,11 @@ def run(
     with tempfile.TemporaryFile() as log:
         process = subprocess.Popen(
             [sys.executable, "-m", "glassplat", *map(str, options)],
-            stdout=subprocess.PIPE if largest_file is not None else log,  # A pipe has no size.
+            stdout=subprocess.PIPE if largest_file is not None else log,  # The limit does not apply to pipes.
             stderr=subprocess.STDOUT,
             stdin=subprocess.DEVNULL,
             env=known,
-            preexec_fn=bound,  # noqa: PLW1509 - Nothing else runs here.
+            preexec_fn=bound,  # noqa: PLW1509 - No other thread runs here.
         )
         begun = time.monotonic()
         if sent is not None:
@@ -99,16 +99,16 @@ def run(
 
 
 def bound_memory() -> None:
-    """This process gets no more than `MOST_BYTES`."""
+    """Limits the address space of this process to `MOST_BYTES`."""
     resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES))
 
 
 def run_forked(options: Sequence[str | Path], act: Callable[[int], None] = lambda pid: None) -> Ended:
-    """As `run`, in a copy of this process, which has imported what takes long.
+    """As `run`, in a fork of this process, in which slow imports are done.
 
     Args:
-        options: of the command line.
-        act: is called while it works, with its number: waits, and does something to it or to what it works on.
+        options: arguments of the command line.
+        act: called with the process id while the command runs, to disturb it or its files.
     """
     with tempfile.TemporaryFile() as log:
         process = get_context("fork").Process(target=_command, args=([*map(str, options)], log.fileno()))
@@ -126,22 +126,22 @@ def run_forked(options: Sequence[str | Path], act: Callable[[int], None] = lambd
 
 
 def _command(options: list[str], log: int) -> None:
-    """Run a command of glassplat in the forked process."""
+    """Runs a command of glassplat in the forked process."""
     from glassplat.cli.main import main
 
     bound_memory()
     for stream in (1, 2):
         os.dup2(log, stream)
-    sys.stdin = open(os.devnull)  # noqa: SIM115 - It is open until the process ends.
+    sys.stdin = open(os.devnull)  # noqa: SIM115 - Stays open until the process ends.
     sys.exit(main(options))
 
 
 @contextmanager
 def small_disk(folder: Path, kilobytes: int) -> Iterator[Callable[[str], None]]:
-    """A file system of so many kilobytes at a new folder; what is yielded changes its options, such as `size=1g`.
+    """Mounts a small file system at a new folder; yields a function that changes its options, such as `size=1g`.
 
     Raises:
-        PermissionError: only the administrator may make one.
+        PermissionError: the user is not root.
     """
     if os.geteuid() != 0:
         raise PermissionError("only the administrator may mount a small disk; run the trial as such, in a container")

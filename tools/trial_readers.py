@@ -1,4 +1,4 @@
-"""Damaged files for every reader: a typed error within 2 seconds and a GiB of memory, or a value."""
+"""Damaged files for every reader, which must return a value or a typed error within 2 seconds and 1 GiB of memory."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TOKENS = (
 
 
 def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
-    """Spread over all readers; each has a process of its own, so that one that dies is a fault like others."""
+    """Distributes the cases over all readers; each runs in its own process, so that a crash is a fault like others."""
     from tools.reader_seeds import READERS
 
     each = max(1, cases // len(READERS))
@@ -46,10 +46,10 @@ def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
 
 
 def child(name: str, seed: int, count: int, place: Path, log: Path) -> None:
-    """Tries one reader in this process, and writes a line for each case."""
-    for output in (1, 2):  # OpenEXR reports every damage there, besides its error.
+    """Tests one reader in this process, and logs a line for each case."""
+    for output in (1, 2):  # OpenEXR also prints every problem there.
         os.dup2(os.open(os.devnull, os.O_WRONLY), output)
-    torch.set_num_threads(1)  # The threads of the process that this one was forked from are not here.
+    torch.set_num_threads(1)  # Threads do not survive the fork.
     bound_memory(name)
     with log.open("w") as lines:
         for case in tried(name, seed, count, place):
@@ -57,7 +57,7 @@ def child(name: str, seed: int, count: int, place: Path, log: Path) -> None:
 
 
 def damaged(data: bytes, others: list[bytes], draw: random.Random) -> bytes:
-    """A file with one to eight changes: bytes, tokens, numbers, parts cut out, doubled, or of another file."""
+    """A file with one to eight changes: bytes, tokens, numbers; parts deleted, repeated, or of another file."""
     changed = bytearray(data)
     for _ in range(draw.randint(1, 8)):
         at, length = draw.randrange(len(changed) + 1), draw.choice((1, 2, 4, 8, 64))
@@ -82,7 +82,7 @@ def damaged(data: bytes, others: list[bytes], draw: random.Random) -> bytes:
 
 
 def tried(name: str, seed: int, count: int, place: Path) -> Iterator[Case]:
-    """Cases of one reader, in this process."""
+    """Tests cases of one reader in this process."""
     from tools.reader_seeds import READERS
 
     reader, draw = READERS[name], random.Random(f"{name} {seed}")
@@ -100,7 +100,7 @@ def tried(name: str, seed: int, count: int, place: Path) -> Iterator[Case]:
             reader.read(there / reader.name)
         except (ValueError, FileNotFoundError) as error:
             fault = "" if str(error).strip() else "an error without a text"
-        except BaseException as error:  # noqa: BLE001 - Any other error is what is looked for.
+        except BaseException as error:  # noqa: BLE001 - Any other error is a fault.
             fault = f"{type(error).__name__}: {str(error)[:300]}"
         seconds = time.process_time() - begun
         if not fault and seconds > MOST_SECONDS:
@@ -114,7 +114,7 @@ def tried(name: str, seed: int, count: int, place: Path) -> Iterator[Case]:
 
 
 def bound_memory(name: str) -> None:
-    """From here on a reader of this process gets `MOST_MIB` more than it has, or what its pictures need."""
+    """Limits further memory of this process to `MOST_MIB`, or to the requirement of readers of images."""
     from tools.reader_seeds import READERS
 
     pages = int(Path("/proc/self/statm").read_text().split()[0])

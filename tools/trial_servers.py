@@ -1,8 +1,8 @@
-"""Strangers and nonsense at `view` and `annotate`: nobody gets in, nothing is written, and the next client is served.
+"""Unauthorised and malformed requests to `view` and `annotate`: all are rejected, and the next client is served.
 
-The servers run in this process. After every case a client with the link has to be served, nothing may have been printed
-with a traceback, and the marks of the capture are what they were. The first case are photographs and captures with
-names that are HTML, through `prepare`, training, `eval` and `export`.
+The servers run in this process. After every case a client with the link has to be served, no traceback may have been
+printed, and the marks of the capture must be unchanged. The first case passes photographs and captures with HTML in
+their names through `prepare`, training, `eval` and `export`.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ HEADERS = (
 
 
 def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
-    """Half of them at `view`, half at `annotate`."""
+    """Cases, half of them for `view` and half for `annotate`."""
     yield Case("names that are HTML", names_fault(place / "names"))
     draw = random.Random(seed)
     root = write_room(place / "room")
@@ -74,12 +74,12 @@ def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
 
 
 def elsewhere_fault(port: int) -> str:
-    """Fault of a server that listens on an address of this computer by which others reach it."""
+    """Fault if the server listens on an address that other computers can reach."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect(("192.0.2.1", 9))  # Sends nothing; says which address others would see.
+            probe.connect(("192.0.2.1", 9))  # Sends nothing; determines the external address.
         except OSError:
-            return ""  # No others.
+            return ""  # No network.
         address = probe.getsockname()[0]
     with suppress(OSError), socket.create_connection((address, port), timeout=20):
         return f"listens at {address}"
@@ -87,7 +87,7 @@ def elsewhere_fault(port: int) -> str:
 
 
 def names_fault(place: Path) -> str:
-    """Fault of pages about photographs and a capture that are called HTML."""
+    """Fault of pages about photographs and a capture with HTML in their names."""
     data = write_tiny_capture(place / HTML)
     for folder in ("images", "panes"):
         for path in sorted((data / folder).iterdir()):
@@ -111,7 +111,7 @@ def names_fault(place: Path) -> str:
 
 
 def oddly_named(folder: Path) -> Path:
-    """Photographs with names that are HTML, one of which shows nothing and cannot be placed."""
+    """Writes photographs with HTML in their names, one of which is uniform and cannot be registered."""
     copy_photographs(folder)
     for path in sorted(folder.iterdir()):
         path.rename(path.with_name(f"{HTML} {path.name}"))
@@ -121,7 +121,7 @@ def oddly_named(folder: Path) -> Path:
 
 @contextmanager
 def viewed() -> Iterator[Viewer]:
-    """A viewer of the tiny scene."""
+    """Runs a viewer of the tiny scene."""
     views = tiny_capture().train
     photographs = {view.name: lambda: torch.zeros(28, 40, 3, dtype=torch.uint8) for view in views}
     cameras = [(view.name, view.camera) for view in views]
@@ -137,7 +137,7 @@ def viewed() -> Iterator[Viewer]:
 
 @contextmanager
 def annotated(root: Path) -> Iterator[AnnotationServer]:
-    """The page for marking, of a capture."""
+    """Runs the annotation server of a capture."""
     with AnnotationServer(open_session(root), 0) as server:
         thread = Thread(target=server.serve_forever, args=(0.02,))
         thread.start()
@@ -149,7 +149,7 @@ def annotated(root: Path) -> Iterator[AnnotationServer]:
 
 
 def at_view(viewer: Viewer, draw: random.Random, number: int) -> tuple[str, str]:
-    """One case at the viewer, and what is wrong with how it ended."""
+    """Tests one case at the viewer; returns its name and fault."""
     kind = draw.choice(("stranger", "messages", "messages", "long", "slow", "garbage"))
     if number in (3, 5):
         kind = "many" if number == 3 else "silent"
@@ -157,7 +157,7 @@ def at_view(viewer: Viewer, draw: random.Random, number: int) -> tuple[str, str]
     sys.stderr = there
     try:
         fault = asyncio.run(asyncio.wait_for(VIEWED[kind](viewer, draw), 120)) or asyncio.run(served(viewer))
-    except Exception as error:  # noqa: BLE001 - A client that is not served ends in whatever error.
+    except Exception as error:  # noqa: BLE001 - Any error means that a client was not served.
         fault = f"{type(error).__name__}: {error}"
     finally:
         sys.stderr = errors
@@ -166,14 +166,14 @@ def at_view(viewer: Viewer, draw: random.Random, number: int) -> tuple[str, str]
 
 
 async def served(viewer: Viewer) -> str:
-    """A client with the link gets a picture."""
+    """Checks that a client with the link gets an image."""
     async with ViewerClient(viewer.address) as client:
         await client.picture(60)
     return ""
 
 
 async def stranger(viewer: Viewer, draw: random.Random) -> str:
-    """Another origin, host or key than that of the page."""
+    """Connects with a wrong origin, host or key."""
     local = f"localhost:{viewer.port}"
     origins = (
         "http://evil.example",
@@ -197,7 +197,7 @@ async def stranger(viewer: Viewer, draw: random.Random) -> str:
 
 
 async def messages(viewer: Viewer, draw: random.Random) -> str:
-    """Fifty messages with fields that are anything, and values of controls that are anything."""
+    """Sends fifty messages with random fields, and random values of controls."""
     async with ViewerClient(viewer.address) as client:
         await client.picture()
         for _ in range(50):
@@ -216,7 +216,7 @@ async def messages(viewer: Viewer, draw: random.Random) -> str:
 
 
 async def long(viewer: Viewer, draw: random.Random) -> str:
-    """A message that is too long."""
+    """Sends a message that is too long."""
     async with ViewerClient(viewer.address) as client:
         with suppress(ConnectionClosed):
             await client.connection.send(bytes(LARGEST_MESSAGE * draw.choice((2, 50))))
@@ -225,7 +225,7 @@ async def long(viewer: Viewer, draw: random.Random) -> str:
 
 
 async def slow(viewer: Viewer, draw: random.Random) -> str:
-    """A client that asks for much, reads nothing, and is cut off."""
+    """Requests many images without reading them, until the server disconnects."""
     async with ViewerClient(viewer.address) as client:
         client.stop_hearing()
         for step in range(30):
@@ -236,7 +236,7 @@ async def slow(viewer: Viewer, draw: random.Random) -> str:
 
 
 async def many(viewer: Viewer, draw: random.Random) -> str:
-    """A hundred clients at once; each gets a picture."""
+    """Connects a hundred clients at once, each of which has to get an image."""
 
     async def one() -> None:
         async with ViewerClient(viewer.address) as client:
@@ -248,7 +248,7 @@ async def many(viewer: Viewer, draw: random.Random) -> str:
 
 
 async def silent(viewer: Viewer, draw: random.Random) -> str:
-    """A hundred connections that say nothing, while somebody looks."""
+    """Opens a hundred silent connections, while another client requests an image."""
     writers = [(await asyncio.open_connection("127.0.0.1", viewer.port))[1] for _ in range(MANY)]
     try:
         return await served(viewer)
@@ -258,7 +258,7 @@ async def silent(viewer: Viewer, draw: random.Random) -> str:
 
 
 async def garbage(viewer: Viewer, draw: random.Random) -> str:
-    """A request that is none, with the key or without."""
+    """Sends a malformed request, with or without the key."""
     has_key = draw.random() < 0.5
     cookie = f"{cookie_name(f'localhost:{viewer.port}')}={viewer.access.key}" if has_key else ""
     return answered_well(viewer.port, request(draw, viewer.port, cookie), let_in=has_key)
@@ -271,7 +271,7 @@ VIEWED = {
 
 
 def at_annotate(server: AnnotationServer, draw: random.Random, number: int) -> tuple[str, str]:
-    """One case at the page for marking: with the key, or without, and what is wrong with how it ended."""
+    """Tests one case at the annotation server, with or without the key; returns its name and fault."""
     if number in (4, 6):
         return f"annotate {'many' if number == 4 else 'silent'}", many_annotating(server, is_silent=number == 6)
     file = server.session.root / "annotations.json"
@@ -285,7 +285,7 @@ def at_annotate(server: AnnotationServer, draw: random.Random, number: int) -> t
         sent = request(draw, port, cookie)
         fault = answered_well(port, sent, let_in=has_key)
         fault = fault or capture_fault(server)
-    except Exception as error:  # noqa: BLE001 - Whatever it is, the next client was not served.
+    except Exception as error:  # noqa: BLE001 - Any error means that the next client was not served.
         fault = f"{type(error).__name__}: {error}"
     finally:
         sys.stderr = errors
@@ -300,14 +300,14 @@ def at_annotate(server: AnnotationServer, draw: random.Random, number: int) -> t
 
 
 def capture_fault(server: AnnotationServer) -> str:
-    """Fault of what a page with the key is told about the capture."""
+    """Fault of the description of the capture that an authorised page receives."""
     cookie = f"{cookie_name(urlsplit(server.address).netloc)}={server.access.key}"
     status, _, body = page(server.address, "/capture", Cookie=cookie)
     return "" if status == 200 and "views" in json.loads(body) else f"/capture answers {status}"
 
 
 def many_annotating(server: AnnotationServer, *, is_silent: bool) -> str:
-    """A hundred pages at once, or one while a hundred connections have begun a save and say no more."""
+    """Opens a hundred pages at once, or one page while a hundred connections stall in the middle of a save."""
     host, port = "127.0.0.1", int(server.server_address[1])
     cookie = f"{cookie_name(f'{host}:{port}')}={server.access.key}"
     begun = f"POST /document HTTP/1.1\r\nHost: {host}:{port}\r\nOrigin: http://{host}:{port}\r\nCookie: {cookie}\r\n"
@@ -317,13 +317,13 @@ def many_annotating(server: AnnotationServer, *, is_silent: bool) -> str:
             silent.sendall(f"{begun}Content-Length: 8000000\r\n\r\n{{".encode())
         try:
             faults = list(pool.map(lambda _: capture_fault(server), range(1 if is_silent else MANY)))
-        except Exception as error:  # noqa: BLE001 - Whatever it is, somebody was not served.
+        except Exception as error:  # noqa: BLE001 - Any error means that a client was not served.
             return f"{type(error).__name__}: {error}"
     return next(filter(None, faults), "")
 
 
 def request(draw: random.Random, port: int, cookie: str) -> bytes:
-    """Bytes that are nearly a request."""
+    """Bytes that resemble a request."""
     path = draw.choice([path for path in PATHS if not (cookie and path in ("/close", "/results"))])
     lines = [f"{draw.choice(METHODS)} {path} HTTP/{draw.choice(('1.1', '1.0', '9.9', 'x'))}"]
     lines.append(f"Host: {draw.choice((f'127.0.0.1:{port}', 'evil.example', '', '[::1]', ':' * 99))}")
@@ -337,10 +337,10 @@ def request(draw: random.Random, port: int, cookie: str) -> bytes:
 
 
 def answered_well(port: int, sent: bytes, *, let_in: bool = False) -> str:
-    """Fault of the answer to bytes: it is one for those who have the key, or an error of ours."""
+    """Fault of the answer to a request: data without the key, or an internal error of the server."""
     with socket.create_connection(("127.0.0.1", port), timeout=20) as connection, suppress(ConnectionError):
         connection.sendall(sent)
-        with suppress(OSError):  # The server has answered and closed already.
+        with suppress(OSError):  # The server has already answered and closed.
             connection.shutdown(socket.SHUT_WR)
         answer = b""
         while part := connection.recv(65536):

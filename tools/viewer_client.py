@@ -1,6 +1,6 @@
-"""A client of `glassplat view` without a browser: it speaks viser's protocol, as pages do, and as no page would.
+"""A client of `glassplat view` without a browser, which can use the protocol of viser correctly and incorrectly.
 
-It has whatever origin, host and key it is told to have, and sends whatever it is told to send.
+It connects with any given origin, host and key, and sends any given message.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ class ViewerClient:
     """One connection to a viewer; use it in an `async with` statement.
 
     Attributes:
-        pictures: how many pictures of the scene came.
-        controls: messages that made controls, by their number.
-        gizmos: messages that made arrows on panes, by their name.
-        notes: titles and texts of what was told.
+        pictures: number of received images of the scene.
+        controls: messages that created controls, by their uuid.
+        gizmos: messages that created gizmos on panes, by their name.
+        notes: titles and texts of notifications.
     """
 
     def __init__(self, address: str, *, origin: str | None = "", host: str = "", key: str | None = None) -> None:
-        """Knows an address as the command prints it; origin and host are those of its page, the key that in it."""
+        """Parses an address as the command prints it; by default, origin, host and key are taken from it."""
         parts = urlsplit(address)
         self.netloc = parts.netloc
         self._origin, self._host = f"http://{parts.netloc}" if origin == "" else origin, host or parts.netloc
@@ -49,7 +49,7 @@ class ViewerClient:
         self.notes: list[str] = []
 
     async def __aenter__(self) -> ViewerClient:
-        """Connects; raises websockets' InvalidStatus where it is not let in."""
+        """Connects; raises InvalidStatus of websockets if access is denied."""
         headers = {"Cookie": f"{cookie_name(self._host)}={self._key}"} if self._key else {}
         name, _, port = self.netloc.partition(":")
         self.connection: ClientConnection = await connect(
@@ -72,15 +72,15 @@ class ViewerClient:
         await self.connection.close()
 
     def stop_hearing(self) -> None:
-        """Reads nothing from now on, so that what the server sends piles up."""
+        """Stops reading, so that messages from the server pile up."""
         self._hearing.cancel()
 
     async def send(self, kind: str, **fields: Any) -> None:
-        """One message."""
+        """Sends one message."""
         await self.connection.send(msgspec.msgpack.encode({"type": kind, **fields}))
 
     async def look(self, **changes: Any) -> None:
-        """A camera before the origin, with some of its fields as given."""
+        """Sends a camera in front of the origin, with the given fields replaced."""
         usual: dict[str, Any] = {
             "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, 0.0, -2.0), "fov": 1.0, "near": 0.01, "far": 1000.0,
             "image_height": 240, "image_width": 320, "look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, -1.0, 0.0),
@@ -88,18 +88,18 @@ class ViewerClient:
         await self.send("ViewerCameraMessage", **usual | changes)
 
     async def set(self, label: str, value: Any, seconds: float = 60) -> None:
-        """Sets the control with that label, once it is there; raises TimeoutError where it does not come."""
+        """Sets the control with the given label once it exists; raises TimeoutError if it does not appear."""
         async with asyncio.timeout(seconds):
             while (uuid := self.labels().get(label)) is None:
                 await asyncio.sleep(0.02)
         await self.send("GuiUpdateMessage", uuid=uuid, updates={"value": value})
 
     def labels(self) -> dict[str, str]:
-        """The controls by what is written on them."""
+        """Uuids of controls by their labels."""
         return {str(made["props"].get("label")): uuid for uuid, made in self.controls.items()}
 
     async def picture(self, seconds: float = 60) -> None:
-        """Looks, and waits for one more picture; raises TimeoutError where none comes."""
+        """Sends a camera and waits for one more image; raises TimeoutError if none arrives."""
         before = self.pictures
         await self.look()
         async with asyncio.timeout(seconds):
@@ -117,7 +117,7 @@ class ViewerClient:
     def _learn(self, message: dict[str, Any]) -> None:
         kind = message["type"]
         if kind == "BackgroundImageMessage":
-            self.pictures += message["rgb_data"] is not None  # viser says at first that there is none.
+            self.pictures += message["rgb_data"] is not None  # The first message of viser has no image.
         elif kind in CONTROLS:
             self.controls[message["uuid"]] = message
         elif kind == "TransformControlsMessage":
@@ -127,7 +127,7 @@ class ViewerClient:
 
 
 def page(address: str, path: str = "/", **headers: str) -> tuple[int, dict[str, str], bytes]:
-    """Status, headers and body of a page, without following where it leads."""
+    """Status, headers and body of a page, without following redirects."""
     parts = urlsplit(address)
     connection = HTTPConnection(parts.netloc, timeout=30)
     try:
