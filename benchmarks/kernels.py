@@ -102,7 +102,7 @@ def kernel_times() -> Table:
     evaluations = evaluated_pixels(splats, flat.colors, bins)
     peak = peak_multiply_adds(2)
     table = Table(
-        f"Kernels, {COUNT // 1000}k Gaussians (half of them before the camera), SH 3, {WIDTH}x{HEIGHT}",
+        f"Kernels, {COUNT // 1000}k Gaussians (half of them in front of the camera), SH 3, {WIDTH}x{HEIGHT}",
         ("kernel", "1 thread, ms", "2 threads, ms", "evaluations/s, 2 threads", "share of peak"),
         f"{len(bins.pair_splats):,} (tile, splat) pairs, {evaluations:,} pixel-Gaussian evaluations. The peak is "
         f"measured: {peak / 1e9:.0f} G multiply-adds/s on two threads; an evaluation counts {MULTIPLY_ADDS} forward "

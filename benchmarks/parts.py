@@ -83,7 +83,7 @@ def add_step(stage: Seconds, kernels: Seconds, taken: float) -> None:
 
 def parts_table(costs: Mapping[str, Mapping[str, float]], title: str) -> Table:
     """Milliseconds per step by part, for each stage."""
-    note = "Milliseconds of processor time a step on one thread, but for the rows that say otherwise."
+    note = "Milliseconds of CPU time per step on one thread, unless the row says otherwise."
     table, stages = Table(title, ("part", *costs), note), list(costs.values())
     table.add("steps", *(round(stage.get(STEPS, 0)) for stage in stages))
     table.add(f"{BEFORE}, seconds in all", *(stage.get(BEFORE, 0.0) for stage in stages))

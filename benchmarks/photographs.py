@@ -118,14 +118,14 @@ def measure(folder: Path, memory: float, downscale: float, seconds: float) -> No
     step, since, waited, computed = first
     steps, wall = message.step - step, passed - since
     share = (known.seconds - waited) / wall
-    print(f"{wall / steps * 1e3:.0f} ms a step, {100 * share:.2f} % of it waiting for photographs")
+    print(f"{wall / steps * 1e3:.0f} ms per step, {100 * share:.2f} % of it waiting for photographs")
     computed = time.thread_time() - computed
     reading, again = read_seconds(dataset.train[:READ], folder)
     print(
-        f"a core takes {computed / steps * 1e3:.0f} ms for a step, {reading * 1e3:.0f} ms to read a photograph, "
-        f"{again * 1e3:.1f} ms to read it again once it is undistorted and reduced"
+        f"CPU time: {computed / steps * 1e3:.0f} ms per step, {reading * 1e3:.0f} ms to read a photograph, "
+        f"{again * 1e3:.1f} ms to read its undistorted, reduced copy again"
     )
-    print(f"at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB")
+    print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB")
 
 
 def main() -> None:

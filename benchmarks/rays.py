@@ -181,11 +181,11 @@ def add_case(tables: tuple[Table, Table], case: Case, embree: Embree | None, rou
 def new_tables(rays: int) -> tuple[Table, Table]:
     """Empty tables of rays per second and of milliseconds of BVH construction."""
     columns = ("discs", "hits a ray", "k rays/s", "Embree, k rays/s", "ours : Embree")
-    note = "Processor time. Without colours, but for the last two columns; ratios are medians of ratios round by round."
+    note = "CPU time, without colours except in the last two columns; ratios are medians of ratios round by round."
     title, built = f"{rays:,} rays of a mirror ball through discs, one thread", ("build", "Embree's build")
     return (
         Table(title, (*columns, "k rays/s, SH 3", "backward : forward"), note),
-        Table("The hierarchy, milliseconds", ("discs", *built), "Processor time, one thread."),
+        Table("BVH construction, milliseconds", ("discs", *built), "CPU time, one thread."),
     )
 
 

@@ -158,7 +158,7 @@ def main() -> None:
     arguments = parser.parse_args()
     table = Table(
         "Blending by the kernels and by C++", ("case", "pass", "kernel, ms", "C++, ms", "kernel : C++"),
-        "Four channels, one thread, processor time; ratios are medians of ratios taken round by round.",
+        "Four channels, one thread, CPU time; ratios are medians of ratios taken round by round.",
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         library = compiled_library(SOURCE, Path(folder))

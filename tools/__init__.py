@@ -1,4 +1,4 @@
-"""Programs for who works on the package: `python -m tools.NAME`."""
+"""Programs for developers of the package: `python -m tools.NAME`."""
 
-# Before PyTorch, as whoever uses the package should: it says how threads wait.
+# Imported before PyTorch, because it sets how idle threads wait.
 import glassplat  # noqa: F401

@@ -44,7 +44,7 @@ def wait_until(holds: Callable[[], Any], what: str) -> Any:
         if found := holds():
             return found
         time.sleep(0.05)
-    raise AssertionError(f"waited {PATIENCE:.0f} s in vain for {what}")
+    raise AssertionError(f"timed out after {PATIENCE:.0f} s waiting for {what}")
 
 
 @contextmanager

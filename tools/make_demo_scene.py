@@ -213,7 +213,7 @@ def main(arguments: Arguments) -> None:
     total = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     print(f"{folder}: {total / 1e6:.1f} MB")
     if total > MOST_BYTES:
-        raise ValueError(f"the scene takes {total} bytes where {MOST_BYTES} are the most; choose a smaller --width")
+        raise ValueError(f"the scene takes {total} bytes; expected at most {MOST_BYTES}, so choose a smaller --width")
 
 
 if __name__ == "__main__":

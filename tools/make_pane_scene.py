@@ -328,7 +328,7 @@ def main(arguments: Arguments) -> None:
     """Renders and writes the scene."""
     folder = arguments.output
     if arguments.drawn is not None and arguments.passers_by:
-        raise ValueError("nobody walks by in drawn places; leave out --passers-by or --drawn")
+        raise ValueError("random scenes have no passers-by; leave out --passers-by or --drawn")
     if folder.exists():
         raise FileExistsError(f"{folder} exists; expected a new folder, so remove it first")
     for part in ("images", "panes", "sparse/0", "gt/strength"):

@@ -244,7 +244,7 @@ def main() -> int:
     print(
         f"{found.count.connections} connections, {found.count.actions} actions, {found.count.pictures} pictures; "
         f"half-way {first:.0f} MiB, at the end {last:.0f}, slope {found.slope:+.1f} MiB/h; all at rest: "
-        f"{found.without_picture} of {options.clients - options.deaf} without a picture after "
+        f"{found.without_picture} of {options.clients - options.deaf} without an image after "
         f"{found.seconds_to_last:.1f} s"
     )
     for line, times in Counter([*found.complaints, *found.count.refused]).most_common(MOST_TOLD):

@@ -96,7 +96,7 @@ def undisturbed(method: str, data: Path, folder: Path) -> Integer:
         begun = time.monotonic()
         ended = run_forked(training(Integer(method, data, folder, frozenset(), 0), folder))
         if ended.code != 0:
-            raise RuntimeError(f"{method} cannot be trained at all: {ended.output[-500:]}")
+            raise RuntimeError(f"{method} cannot be trained: {ended.output[-500:]}")
     return Integer(method, data, folder, digests_of(folder), time.monotonic() - begun)
 
 
@@ -109,7 +109,7 @@ def digests_of(folder: Path) -> frozenset[tuple[str, str]]:
 def other_bits(folder: Path, whole: Integer) -> str:
     """Fault of a run whose final files differ from those of the undisturbed run, with their names."""
     differing = digests_of(folder) ^ whole.digests
-    return f"it ended with other bits: {sorted({name for name, _ in differing})}" if differing else ""
+    return f"the result has other bits: {sorted({name for name, _ in differing})}" if differing else ""
 
 
 def resumed(whole: Integer, folder: Path) -> str:
@@ -145,7 +145,7 @@ def killed(draw: random.Random, whole: Integer, folder: Path) -> str:
     ended = run_forked(training(whole, folder), act=kill)
     checkpoint = folder / CHECKPOINT
     if checkpoint.exists() and time.time() - checkpoint.stat().st_mtime > MOST_LOST:
-        return "it lost more than two minutes"
+        return "more than two minutes of training were lost"
     return ended.fault() or resumed(whole, folder)
 
 
@@ -206,7 +206,7 @@ def two_at_once(draw: random.Random, whole: Integer, folder: Path) -> str:
     if faults:
         return faults
     if 0 not in [one.code for one in ended]:
-        return f"neither was done: {[one.output[-200:] for one in ended]}"
+        return f"neither process succeeded: {[one.output[-200:] for one in ended]}"
     return other_bits(folder, whole)
 
 

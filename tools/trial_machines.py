@@ -132,7 +132,7 @@ def tried(environment: Mapping[str, str], scene: Path, folder: Path, truth: dict
         ended = run(["render", scene.absolute(), "--output", output, "--device", "cpu"], environment=environment)
         if ended.fault() or ended.code != 0:
             return ended.fault() or f"code {ended.code}: {ended.output[-300:]}"
-        return "" if pictures(output) == truth else "other pictures than elsewhere"
+        return "" if pictures(output) == truth else "images differ from those of the normal environment"
 
     with ThreadPoolExecutor(2) as pool:
         return "; ".join(fault for fault in pool.map(rendered, outputs) if fault)

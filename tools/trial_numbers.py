@@ -50,7 +50,7 @@ def fault_of(work: Callable[[], Any]) -> str:
     try:
         work()
     except (ValueError, glassplat.InputError) as error:
-        return "" if str(error).strip() else "an error without a text"
+        return "" if str(error).strip() else "an error without a message"
     except Exception as error:  # noqa: BLE001 - Any other error is a fault.
         return f"{type(error).__name__}: {str(error)[:300]}"
     seconds = time.process_time() - begun
@@ -82,7 +82,7 @@ def picture(draw: random.Random) -> tuple[str, Callable[[], None]]:
         with torch.no_grad():
             rgb = renderer(scene, replace(camera, **changes)).rgb
         if not bool(torch.isfinite(rgb).all()):
-            raise ArithmeticError("the picture is not finite")
+            raise ArithmeticError("the image is not finite")
 
     return f"{type(renderer).__name__} {kind} {name}", work
 

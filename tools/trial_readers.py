@@ -99,7 +99,7 @@ def tried(name: str, seed: int, count: int, place: Path) -> Iterator[Case]:
         try:
             reader.read(there / reader.name)
         except (ValueError, FileNotFoundError) as error:
-            fault = "" if str(error).strip() else "an error without a text"
+            fault = "" if str(error).strip() else "an error without a message"
         except BaseException as error:  # noqa: BLE001 - Any other error is a fault.
             fault = f"{type(error).__name__}: {str(error)[:300]}"
         seconds = time.process_time() - begun

@@ -191,7 +191,7 @@ async def stranger(viewer: Viewer, draw: random.Random) -> str:
         return ""
     try:
         async with ViewerClient(viewer.address, **given):
-            return f"was let in with {given}"
+            return f"was granted access with {given}"
     except (InvalidHandshake, ConnectionClosed, OSError, ValueError):
         return ""
 
