@@ -91,8 +91,8 @@ def disc_costs() -> Table:
     table = Table(
         f"Discs and ellipsoids, {COUNT // 1000}k Gaussians, {WIDTH}x{HEIGHT}",
         ("step", "ellipsoids, ms", "discs, ms", "ratio"),
-        f"{solid.pairs:,} (tile, splat) pairs of ellipsoids with 4 channels, {flat.pairs:,} of discs with 6 and depths; "
-        "CPU time.",
+        f"{solid.pairs:,} (tile, splat) pairs of ellipsoids with 4 channels, {flat.pairs:,} of discs with 6 and "
+        "depths; CPU time.",
     )
     for name, work in solid.works.items():
         seconds = interleaved_seconds({"solid": work, "flat": flat.works[name]}, ROUNDS, time.process_time)

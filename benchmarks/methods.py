@@ -119,7 +119,7 @@ def method_costs() -> Table:
             "minimum frame ratio",
         ),
         "Ratios are medians of ratios taken round by round. The planar step is one of stage 3 on an annotated view. "
-        "The minimum frame ratio is that of a splat frame and the bare mirrored images together: no glass, no blending.",
+        "The minimum frame ratio is that of a splat frame plus the bare mirrored images: no glass, no blending.",
     )
     planar_stage = PlanarRecipe().stages(0)[2]
     for number, share in PANES:

@@ -34,8 +34,7 @@ def main(run: tyro.conf.Positional[Path], output: Path = Path("edited")) -> None
     mirrored = model.with_pane(beside.tolist(), planes.normals[0].tolist(), (size, size), base_reflectance=1)
     print(mirrored)
 
-    # Save for other programs, with the panes in a separate file; as a page for any browser; and as a run to continue
-    # with.
+    # Save for other programs, with the panes in a separate file; as a page for any browser; and as a run to reload.
     for file in ("mirror.ply", "page.html", "run"):
         print("->", edits["mirror"].save(output / file))
 

@@ -19,8 +19,7 @@ def main(run: tyro.conf.Positional[Path], data: Path = DEMO, downscale: float = 
     view = glassplat.load_dataset(data, downscale=downscale).train[0]
     photo = view.photo.to(model.scene.primary.means) / 255
 
-    # Every tensor of the scene has a name, and a tensor that replaces one receives its gradient. R0 starts too high,
-    # ...
+    # Every tensor of the scene has a name; a tensor that replaces it receives its gradient. R0 starts too high, ...
     logits = torch.full_like(model.scene.planes.logit_reflectances, 0.0).requires_grad_()
     # ... and the camera is shifted slightly from the position of the photograph.
     shift = torch.tensor([0.01, 0.0, 0.0]).mul(model.scene.extent).to(photo).requires_grad_()

@@ -30,7 +30,7 @@ COSTS = ("shared bytes", "local bytes")
 
 class Resources(NamedTuple):
     """Resources of a kernel: registers and spilled bytes (stores and loads) per thread, bytes of shared memory per
-    block, and bytes of local memory per thread, which holds arrays that do not fit into registers.
+    block, and bytes of local memory per thread. Arrays that do not fit into registers are in local memory.
     """
 
     registers: int

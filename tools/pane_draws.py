@@ -1,9 +1,9 @@
 """Random rooms with panes: geometry, contents and camera poses, generated from a seed.
 
-Scenes on which a method was tuned say little about its generality. Seeds cycle through three settings (free-standing
-panes in a room, a shop window of coplanar panes with posts, windows in a wall in front of a room or a street) and
-through the camera walks (from the front, all around, along a line). Number and size of panes, glass, mirrors, objects,
-paints and lamps are random.
+Scenes on which a method was tuned say little about its generality. Seeds cycle through three settings: free-standing
+panes in a room, a shop window of coplanar panes with posts, and windows in a wall in front of a room or a street. They
+also cycle through the camera walks: from the front, all around, and along a line. Number and size of panes, glass,
+mirrors, objects, paints and lamps are random.
 """
 
 from __future__ import annotations

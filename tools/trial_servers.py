@@ -1,4 +1,4 @@
-"""Unauthorised and malformed requests to `view` and `annotate`: all are rejected, and the next client is served.
+"""Attacks on `view` and `annotate`: none gets access or changes files, and the next client is served.
 
 The servers run in this process. After every case a client with the link has to be served, no traceback may have been
 printed, and the marks of the capture must be unchanged. The first case passes photographs and captures with HTML in
