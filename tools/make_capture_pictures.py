@@ -4,8 +4,8 @@
 
 `--scene` has ground truth of its panes (`gt/planes.json`), which gives the corners to click in `glassplat annotate`.
 `--capture` was made by `glassplat prepare`, and its report is shown; `--run` has an overview written by `glassplat
-eval`, and its scene is shown in `glassplat view`. `--busy` is a scene of `tools.make_pane_scene --passers-by`, of which a photograph is shown next to its masks.
-Images of options that are not given stay unchanged.
+eval`, and its scene is shown in `glassplat view`. `--busy` is a scene of `tools.make_pane_scene --passers-by`, of which
+a photograph is shown next to its masks. Images of options that are not given stay unchanged.
 """
 
 from __future__ import annotations
