@@ -73,16 +73,15 @@ def _reflection_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
     """Stages of a run long enough for normal propagation."""
     strategy = strategy_of(recipe)
     image, view_dependence = image_term(recipe.ssim_weight), recipe.view_dependence_weight
-    regular: tuple[Action, ...] = (GrowSh(Every(recipe.intervals.sh)), *strategy.resets)
-    # As in `splat`, where a scene has to look right before mirrors can be recognised.
-    regular = regular if recipe.search.begin_found else ()
+    # As in `splat`, where a scene has to look right before mirrors can be recognised; in 3DGS-DR all but the harmonics.
+    grow: tuple[Action, ...] = (GrowSh(Every(recipe.intervals.sh)),) if recipe.search.begin_found else ()
     bootstrap = Stage(
         name="1 bootstrap",
         share=recipe.bootstrap,
         renderer=Splat(recipe.background or BLACK, depth=False),
         losses=(image, *strategy.terms),
         rates=(_rates_of_splat(recipe) if recipe.search.begin_found else recipe.rates).of("primary", view_dependence),
-        actions=(*strategy.edits, *regular),
+        actions=(*strategy.edits, *grow, *strategy.resets),
         post_steps=strategy.post_steps,
         densify_until=strategy.densify_until,
     )

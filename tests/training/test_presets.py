@@ -13,7 +13,7 @@ import torch
 from glassplat.cli import main
 from glassplat.cli.train import SCENE
 from glassplat.kernels.maths.images import linear_from_srgb
-from glassplat.methods.glossy_recipes import DeferredRecipe
+from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
 from glassplat.methods.mirrors import PROPAGATION_ENDED, DensifyWhilePropagating, Propagate, ResetRaised
 from glassplat.methods.planar import PaneSetup
 from glassplat.methods.planar_recipe import PlanarRecipe, ReflectionWeights
@@ -219,6 +219,13 @@ def test_the_published_perturbations_and_resets_meet_in_no_stage() -> None:
     here = PlanarRecipe().stages(0)
     assert moments(here, ResetOpacity, 30_000) == [[], [], [9000, 12_000]]
     assert moments(here, PerturbOpacity, 30_000)[2][-1] == 23_000
+
+
+@pytest.mark.parametrize(("recipe", "iterations"), [(DeferredRecipe.paper(), 61_000), (TracedRecipe.paper(), 40_000)])
+def test_the_published_bootstrap_ends_in_a_reset_as_3dgs_has_it(
+    recipe: DeferredRecipe | TracedRecipe, iterations: int
+) -> None:
+    assert moments(recipe.stages(0, iterations), ResetOpacity, iterations)[0] == [3000]
 
 
 @pytest.mark.parametrize("iterations", [200, 999, 1500, 7000, 7001, 30_000])
