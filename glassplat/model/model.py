@@ -235,11 +235,7 @@ class Model:
         Raises:
             ValueError: the factor is not positive and finite.
         """
-        cameras = {}
-        for name, camera in self.cameras.items():
-            pose = camera.cam_from_world.clone()
-            pose[:3, 3] *= factor
-            cameras[name] = replace(camera, cam_from_world=pose)
+        cameras = {name: camera.scale(factor) for name, camera in self.cameras.items()}
         return replace(self, scene=scene.scale_scene(self.scene, factor), cameras=cameras, path=None)
 
     def without_glass(self) -> Model:

@@ -37,7 +37,7 @@ from glassplat.scene.camera import Camera
 from glassplat.scene.corrections import estimate_up
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes, nearest_panes
-from glassplat.scene.scene import Scene, without_glass
+from glassplat.scene.scene import Scene, scale_scene, without_glass
 
 CAMERA_COUNT = 24
 WIDTH, HEIGHT = 960, 640
@@ -261,6 +261,10 @@ def check_panes(scene: Scene) -> None:
         )
 
 
+LEAST_EXTENT, LARGEST_EXTENT = 0.1, 30.0
+"""Extents outside which a page shows the scene in other units, because SPZ holds sizes of 4.5e-5 to 379 units only."""
+
+
 @torch.no_grad()
 def page_text(
     scene: Scene, renderer: Renderer, cameras: Sequence[tuple[str, Camera]], title: str, *, sharing: Sharing = PRIVATE
@@ -275,6 +279,9 @@ def page_text(
     poster_view = best_view(scene.planes, [camera for _, camera in cameras])
     poster = jpeg_bytes(renderer(scene, poster_camera(cameras[poster_view][1])).rgb)
     scene = replace(scene, primary=visible_gaussians(scene.primary), glass=visible_gaussians(scene.glass))
+    if not LEAST_EXTENT <= scene.extent <= LARGEST_EXTENT:
+        factor = 1 / scene.extent
+        scene, cameras = scale_scene(scene, factor), [(name, camera.scale(factor)) for name, camera in cameras]
     drawable = len(scene.primary)
     scene = select_for_page(scene, [camera for _, camera in cameras]).to("cpu")
     mirrored = settings.get("mirrored")

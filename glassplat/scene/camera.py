@@ -212,6 +212,12 @@ class Camera:
             self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
         )
 
+    def scale(self, factor: float) -> Camera:
+        """The same camera in other units: its centre moves away from the origin by the factor."""
+        pose = self.cam_from_world.clone()
+        pose[:3, 3] *= factor
+        return replace(self, cam_from_world=pose)
+
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Pixel positions [P, 2] and depths [P] (camera z) of world points [P, 3]."""
         in_camera = points @ self.cam_from_world[:3, :3].T + self.cam_from_world[:3, 3]

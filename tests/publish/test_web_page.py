@@ -40,7 +40,7 @@ from glassplat.render.splat import Splat
 from glassplat.render.traced import Traced
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.scene import Environment, Scene, as_mirrors, without_glass
+from glassplat.scene.scene import Environment, Scene, as_mirrors, scale_scene, without_glass
 from tests.browser_needed import needs_browser
 from tests.render.test_deferred import glossy as glossy_scene
 from tests.render.tiny_scene import camera_at, concatenated, in_single_precision
@@ -555,6 +555,19 @@ def test_a_page_keeps_what_photographs_show_of_more_gaussians_than_it_holds(monk
         assert psnr(Planar()(kept, camera).rgb, Planar()(crowded, camera).rgb) > 40
     assert f"{count:,} of {2 * count:,} Gaussians" in page_text(crowded, Planar(), CAMERAS, "title")
     assert f"{count:,} Gaussians" in page_text(scene, Planar(), CAMERAS, "title")
+
+
+@pytest.mark.parametrize("extent", [1e-4, 1e4])
+def test_a_page_shows_a_scene_in_any_unit(extent: float, caplog: pytest.LogCaptureFixture) -> None:
+    """In millimetres or kilometres, most Gaussians have sizes that SPZ does not hold."""
+    found = []
+    for length in (1.0, extent):
+        factor = length / true_scene().extent
+        cameras = [(name, camera.scale(factor)) for name, camera in CAMERAS]
+        page = page_text(scale_scene(true_scene(), factor), Planar(), cameras, "title")
+        found.append([float(value) for value in re.findall(r'"(?:near|reach)": ?([^,}]+)', page)])
+    assert len(found[0]) == 2 and found[1] == pytest.approx(found[0], rel=1e-4)
+    assert not caplog.messages
 
 
 @pytest.mark.parametrize("broken", ["cameras", "values"])
