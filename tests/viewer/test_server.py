@@ -5,16 +5,18 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from urllib.parse import urlsplit
 
+import numpy as np
 import pytest
 
 from glassplat.cli.main import main, parse_arguments
 from glassplat.render.planar import Planar
 from glassplat.viewer.drawing import ViewerState
-from glassplat.viewer.server import WAITING_NOTIFICATION, Viewer
+from glassplat.viewer.server import WAITING_NOTIFICATION, Client, Viewer
 from tests.browser_needed import needs_browser
 from tests.cli.tiny_run import write_run
 from tests.training.tiny_capture import tiny_capture, true_scene
@@ -49,6 +51,14 @@ def test_the_address_is_one_that_browsers_understand(host: str, shown: str) -> N
     address = Viewer.address.fget(viewer)
     assert address == f"http://{shown}:8080/?key=k"
     assert urlsplit(address).port == 8080 and urlsplit(address).hostname == shown.strip("[]")
+
+
+@pytest.mark.parametrize("extent", [1e-3, 1e4])
+def test_handles_are_drawn_in_any_unit(extent: float) -> None:
+    handle = SimpleNamespace(camera=SimpleNamespace(near=0.01, far=1000.0), atomic=nullcontext)
+    viewer = SimpleNamespace(state=SimpleNamespace(scene=SimpleNamespace(extent=extent)), focus=np.zeros(3))
+    Client.go(SimpleNamespace(_handle=handle, _viewer=viewer), VIEWS[0].camera)
+    assert handle.camera.near < 0.1 * extent < 10 * extent < handle.camera.far
 
 
 @needs_browser
