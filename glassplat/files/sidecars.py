@@ -403,7 +403,7 @@ def write_colmap(
     for number, (name, camera) in enumerate(cameras, start=1):
         lens = f"PINHOLE {camera.width} {camera.height} {camera.fx!r} {camera.fy!r} {camera.cx!r} {camera.cy!r}"
         quat = quat_from_rotation(camera.cam_from_world[:3, :3])
-        pose = " ".join(f"{value:.9f}" for value in (*quat.tolist(), *camera.cam_from_world[:3, 3].tolist()))
+        pose = " ".join(f"{value:.9g}" for value in (*quat.tolist(), *camera.cam_from_world[:3, 3].tolist()))
         images.append(f"{number} {pose} {lenses.setdefault(lens, len(lenses) + 1)} {name}\n\n")
     points = [
         f"{number} {x:.9g} {y:.9g} {z:.9g} {r} {g} {b} 0\n"

@@ -1,10 +1,11 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
-from glassplat.files.sidecars import read_cameras, write_cameras
+from glassplat.files.sidecars import read_cameras, write_cameras, write_colmap
 from glassplat.scene.camera import Camera, rotation_from_quat
 
 
@@ -34,6 +35,17 @@ def test_cameras_come_back(tmp_path: Path) -> None:
     torch.testing.assert_close(first.cam_from_world, pose, atol=1e-6, rtol=0)
     names = ("fx", "fy", "cx", "cy", "width", "height")  # From Python 3.13 on, cameras cannot be compared as a whole.
     assert [getattr(first, name) for name in names] == [getattr(camera, name) for name in names]
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_a_colmap_model_has_positions_in_any_unit(unit: float, tmp_path: Path) -> None:
+    pose = torch.eye(4)
+    pose[:3, 3] = unit * torch.tensor([1.23456789, -2.3456789, 0.3456789])
+    camera = Camera(pose, fx=10.0, fy=11.0, cx=4.5, cy=3.0, width=8, height=6)
+    write_colmap(tmp_path, [("a.jpg", camera)], np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8))
+    (line,) = (tmp_path / "images.txt").read_text().split("\n\n")[:-1]
+    stored = [float(value) for value in line.split()[5:8]]
+    assert stored == pytest.approx(pose[:3, 3].tolist(), rel=1e-7)
 
 
 @pytest.mark.parametrize(
