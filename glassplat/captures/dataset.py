@@ -85,7 +85,8 @@ __all__ = ["Dataset", "PointCloud", "View", "load_dataset"]
 
 TEST_EVERY = 8
 EXTENT_MARGIN = 1.1
-FARTHEST_ORIGIN = 1e4
+FARTHEST_ORIGIN = 1e3
+"""Distance of the cameras from the origin, in extents, at which float32 moves them by up to 1e-4 extents."""
 SAME_POSITION = 1e-6
 """Share of the cameras' distance from the origin below which distances between them are rounding."""
 NERFSTUDIO_POINTS = "colmap/sparse/0/points3D.bin"
@@ -294,17 +295,28 @@ def _extent(train: tuple[View, ...]) -> float:
     centers = torch.stack([view.camera.center.double() for view in train])
     radius = float((centers - centers.mean(0)).norm(dim=1).max())
     if radius <= max(SAME_POSITION * float(centers.norm(dim=1).max()), LEAST_RADIUS):
-        raise InputError("all training cameras are at one point; expected photographs from different positions")
+        raise InputError(
+            f"all training cameras are at one point, {_rounded(centers)}, as far as single precision distinguishes; "
+            "expected photographs from different positions, near the origin: shift a georeferenced capture"
+        )
     return EXTENT_MARGIN * radius
 
 
 def _far_origin_warnings(train: tuple[View, ...], extent: float) -> tuple[str, ...]:
     """Warning if coordinates are too large for float32 to resolve the scene."""
-    distance = float(train[0].camera.center.norm())
-    if distance <= FARTHEST_ORIGIN * extent:
+    centers = torch.stack([view.camera.center.double() for view in train])
+    ratio = float(centers.mean(0).norm()) / extent
+    if ratio <= FARTHEST_ORIGIN:
         return ()
-    ratio = distance / extent
-    return (f"The cameras are {ratio:.0f} scene extents away from the origin; shift the capture to keep precision.",)
+    return (
+        f"The cameras are {ratio:.0f} scene extents away from the origin, where single precision blurs the scene; "
+        f"subtract {_rounded(centers)} from all positions of the capture, and add it to results that need it.",
+    )
+
+
+def _rounded(centers: torch.Tensor) -> str:
+    """The mean of positions [V, 3] as text, with seven digits."""
+    return f"({', '.join(f'{value:.7g}' for value in centers.mean(0).tolist())})"
 
 
 def _points_and_warnings(root: Path, capture: Capture, train: tuple[View, ...]) -> tuple[PointCloud, list[str]]:

@@ -163,11 +163,12 @@ def test_too_few_photographs(capture, count: int) -> None:
         load_dataset(capture.root)
 
 
-def test_cameras_at_one_point(capture) -> None:
+@pytest.mark.parametrize(("own", "place"), [(0, [1.0, 2.0, 3.0]), (1, [5e7, 6e8, 0.0])])
+def test_cameras_at_one_point(capture, own: float, place: list[float]) -> None:
     for pose in capture.poses:
-        pose[:3, 3] = -pose[:3, :3] @ [1.0, 2.0, 3.0]
+        pose[:3, 3] = own * pose[:3, 3] - pose[:3, :3] @ place
     capture.write_colmap()
-    with pytest.raises(InputError, match="are at one point"):
+    with pytest.raises(InputError, match=r"are at one point, \((1, 2, 3|.*e\+0[78], .*e\+0[78], .*)\), .*georeferenced"):
         load_dataset(capture.root)
 
 
