@@ -28,6 +28,8 @@ GREY = 128
 SPHERE_COUNT = 20_000
 BOX_COUNT = 100_000
 BOX_HALF_SIZE = 1.3
+MOST_HALF_SIZES = 10.0
+"""Distance of cameras from which the cube is a small part of the picture; synthetic scenes have three half sizes."""
 SEED = 0
 LEAST_CROSSING = 1e-2
 """Smallest eigenvalue of the mean of I - d d^T for which optical axes count as crossing (about 6 degrees apart)."""
@@ -318,7 +320,7 @@ def _load_split(root: Path) -> Capture:
         test_shots=tuple(shots[tested].values()) if tested in shots else None,
         points=read_points(root, files[TRAIN_FILE]),
         format_name=TRAIN_FILE,
-        random_points=points_in_box if _is_blender(files[TRAIN_FILE]) else None,
+        random_points=points_in_box if _is_blender(files[TRAIN_FILE]) and _surrounds_box(shots[TRAIN_FILE]) else None,
         warnings=(*_unused_priors(files[TRAIN_FILE]), *([NO_TEST_FILE_WARNING] if VAL_FILE in shots else ())),
         keep_masks=kept,
     )
@@ -362,6 +364,13 @@ def _unused_priors(settings: Settings) -> list[str]:
 def _is_blender(settings: Settings) -> bool:
     """Return whether a Blender script wrote the file: its lens has nothing but the opening angle."""
     return "camera_angle_x" in settings and "fl_x" not in settings and "w" not in settings
+
+
+def _surrounds_box(shots: Mapping[str, Shot]) -> bool:
+    """Return whether half of the cameras are as far from the cube of `points_in_box` as in the synthetic scenes."""
+    centers = [shot.cam_from_world[:3, :3].T @ shot.cam_from_world[:3, 3] for shot in shots.values()]
+    distance = float(np.median(np.linalg.norm(centers, axis=1)))
+    return BOX_HALF_SIZE < distance < MOST_HALF_SIZES * BOX_HALF_SIZE
 
 
 def _listed_split(

@@ -57,6 +57,17 @@ def test_objects_start_from_random_points_in_their_box(blender: Dataset) -> None
     assert not blender.measured_points
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_objects_in_other_units_start_from_points_that_the_cameras_see(capture, unit: float) -> None:
+    for pose in capture.poses:
+        pose[:3, 3] *= unit
+    write_blender(capture, *LAYOUTS[next(iter(LAYOUTS))])
+    found = load_dataset(capture.root)
+    reach = found.points.positions.norm(dim=1).amax() / unit
+    assert 0.5 < reach < 10
+    assert any("20000 random points" in warning for warning in found.warnings)
+
+
 def test_transparent_photographs_are_laid_over_white(blender: Dataset) -> None:
     assert blender.background == (1.0, 1.0, 1.0)
     assert any("laid over sRGB (1.0, 1.0, 1.0)" in warning for warning in blender.warnings)
