@@ -45,7 +45,7 @@ def measured(count: int) -> Table:
         "traced frame": frame_work(mirroring, Traced(), camera),
         "traced step": step_work(mirroring, TracedRecipe().stages(0)[-1], view),
     }
-    theirs = gsplat_works(scene, view) if importlib.util.find_spec("gsplat") else {}
+    theirs, missing = gsplat_if_usable(scene, view)
     partners = {
         "splat frame": "gsplat frame",
         "planar frame": "gsplat frame",
@@ -59,7 +59,7 @@ def measured(count: int) -> Table:
     torch.cuda.synchronize()
     note = f"First use of all kernels took {time.perf_counter() - started:.1f} s, including compilation if the cache "
     note += "was empty. Memory is the peak of torch beyond the scene and earlier allocations. "
-    note += "Ratios are medians of ratios taken round by round." if theirs else "gsplat is not installed."
+    note += missing or "Ratios are medians of ratios taken round by round."
     seconds = interleaved_seconds({name: timed(work) for name, work in (works | theirs).items()}, REPEATS)
     table = Table(
         f"On a GPU: {count:,} primary Gaussians, SH 3, {WIDTH}x{HEIGHT}, one pane over half of the image, or all "
@@ -128,6 +128,16 @@ def backward_work(scene: Scene, camera: Camera) -> Work:
     image, leaves = trainable(scene, camera)
     ones = torch.ones_like(image)
     return lambda: torch.autograd.grad([image], leaves, [ones], retain_graph=True, allow_unused=True)
+
+
+def gsplat_if_usable(scene: Scene, view: View) -> tuple[dict[str, Work], str]:
+    """The work in gsplat and "", or no work and the reason: gsplat may be installed without having been built."""
+    if importlib.util.find_spec("gsplat") is None:
+        return {}, "gsplat is not installed."
+    try:
+        return gsplat_works(scene, view), ""
+    except (ImportError, OSError, RuntimeError) as error:
+        return {}, f"gsplat cannot be used: {error}."
 
 
 def gsplat_works(scene: Scene, view: View) -> dict[str, Work]:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import gpu
+from benchmarks import gpu, gpu_frames
 from benchmarks.gpu_roofline import Counts, Peaks, backward_demand, forward_demand
 from benchmarks.gpu_training import beside_the_cpu
 from glassplat.kernels.backend.devices import SIMULATED
@@ -125,3 +125,12 @@ def test_the_first_launch_is_checked(monkeypatch: pytest.MonkeyPatch) -> None:
 def made_on_the_cpu(make: Callable[..., torch.Tensor], *size: int, device: str) -> torch.Tensor:
     assert device == "cuda"
     return make(*size)
+
+
+def test_a_gsplat_that_was_not_built_costs_no_timing_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*args: object) -> None:
+        raise ImportError("no module named csrc")
+
+    monkeypatch.setattr(gpu_frames.importlib.util, "find_spec", lambda name: name)
+    monkeypatch.setattr(gpu_frames, "gsplat_works", fail)
+    assert gpu_frames.gsplat_if_usable(None, None) == ({}, "gsplat cannot be used: no module named csrc.")  # type: ignore[arg-type]

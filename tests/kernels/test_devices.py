@@ -34,6 +34,7 @@ def test_auto_takes_the_gpu_and_says_so(gpu: pytest.MonkeyPatch, caplog: pytest.
     with caplog.at_level(logging.INFO):
         assert chosen_device("auto") == torch.device("cuda", 0)
     assert "running on A GPU" in caplog.text
+    assert chosen_device(torch.device("cuda", 0)) == torch.device("cuda", 0)
     assert chosen_device("cpu") == torch.device("cpu")
 
 

@@ -147,6 +147,8 @@ def chosen_device(name: DeviceName | torch.device) -> torch.device:
     import torch
 
     name = cast(DeviceName, str(name))
+    if torch.cuda.is_available() and name == f"cuda:{torch.cuda.current_device()}":
+        name = "cuda"
     if name not in get_args(DeviceName):
         raise ValueError(f"device is {name!r}; expected auto, cpu or cuda, which is PyTorch's current GPU")
     problem = None if name == "cpu" else cuda_problem()
