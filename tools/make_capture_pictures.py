@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 import glassplat
-from glassplat.cli.serving import photographs_of
+from glassplat.cli.serving import photograph_readers
 from glassplat.model.model import viewer_state
 from glassplat.prepare.preparation import PAGE
 from glassplat.scene.camera import NumpyCamera
-from glassplat.viewer.render_loop import LOCAL, vacant_port
+from glassplat.viewer.render_loop import LOCALHOST, vacant_port
 from glassplat.viewer.server import Viewer
 from tools.browser import Browser, wait_until
 from tools.marking_page import MarkingPage, marking_page
@@ -94,8 +94,8 @@ def draw(scene: Path, output: Path) -> None:
 
 def draw_viewer(run: Path, output: Path) -> None:
     """Saves the viewer of a run; then a pane that can be moved, next to the layer *error*."""
-    state = viewer_state(glassplat.load(run), photographs_of(run))
-    viewer = Viewer(state, LOCAL, vacant_port(LOCAL))
+    state = viewer_state(glassplat.load(run), photograph_readers(run))
+    viewer = Viewer(state, LOCALHOST, vacant_port(LOCALHOST))
     viewer.start()
     try:
         with Browser(viewer.address, *VIEWER_SIZE) as window:

@@ -25,7 +25,7 @@ def without_pycolmap(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def example(model: str) -> Lens:
     counts = PARAMETER_COUNTS[model]
-    parameters = [30.0, 31.0][: counts.focal] + [16.0, 13.0][: counts.middle] + [0.01] * counts.extra
+    parameters = [30.0, 31.0][: counts.focal] + [16.0, 13.0][: counts.principal_point] + [0.01] * counts.extra
     return Lens(model, tuple(parameters), 32, 24)
 
 
@@ -38,7 +38,7 @@ def test_the_table_of_models_is_colmaps() -> None:
         found = [camera.focal_length_idxs(), camera.principal_point_idxs(), camera.extra_params_idxs()]
         if model == "EQUIRECTANGULAR":  # Its parameters are its size, of no kind.
             continue
-        assert [len(list(indices)) for indices in found] == [counts.focal, counts.middle, counts.extra]
+        assert [len(list(indices)) for indices in found] == [counts.focal, counts.principal_point, counts.extra]
 
 
 @pytest.mark.parametrize("model", [name for name, counts in PARAMETER_COUNTS.items() if counts.focal])

@@ -57,7 +57,7 @@ def test_the_address_is_one_that_browsers_understand(host: str, shown: str) -> N
 def test_handles_are_drawn_in_any_unit(extent: float) -> None:
     handle = SimpleNamespace(camera=SimpleNamespace(near=0.01, far=1000.0), atomic=nullcontext)
     viewer = SimpleNamespace(state=SimpleNamespace(scene=SimpleNamespace(extent=extent)), focus=np.zeros(3))
-    Client.go(SimpleNamespace(_handle=handle, _viewer=viewer), VIEWS[0].camera)
+    Client.move_camera(SimpleNamespace(_handle=handle, _viewer=viewer), VIEWS[0].camera)
     assert handle.camera.near < 0.1 * extent < 10 * extent < handle.camera.far
 
 
