@@ -27,6 +27,8 @@ PARTS = {
     "reflection": "what it reflects",
     "normal": "normals",
 }
+CAPTION_SIZE = 26
+"""Pixels; legible where a page shows four panels of 400 pixels next to each other."""
 
 
 SWAY = (-0.35, 0.0, 0.35, 0.0, -0.35)
@@ -61,7 +63,7 @@ def main() -> None:
     for layer in (layer for layer in PARTS if layer in frame.layers):
         panels.append(Panel(PARTS[layer], quantize(layer_image(frame, layer))))
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    write_image(arguments.output, compose_sheet([panels], "", "")[TITLE_HEIGHT:])
+    write_image(arguments.output, compose_sheet([panels], "", "", caption_size=CAPTION_SIZE)[TITLE_HEIGHT:])
 
 
 if __name__ == "__main__":

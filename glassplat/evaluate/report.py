@@ -118,19 +118,22 @@ def comparison_sheet(
     return compose_sheet([row for row in rows if any(row)], title, subtitle)
 
 
-def compose_sheet(rows: Sequence[Row], title: str, subtitle: str) -> NDArray[np.uint8]:
+def compose_sheet(
+    rows: Sequence[Row], title: str, subtitle: str, *, caption_size: int = CAPTION_SIZE
+) -> NDArray[np.uint8]:
     """Panels in rows, with captions and a title line; all panels of a row have the size of its first one."""
+    caption_height = caption_size + CAPTION_HEIGHT - CAPTION_SIZE
     sizes = [_panel_size(*next(panel for panel in row if panel).image.shape[1::-1]) for row in rows]
     width = max(len(row) * (size[0] + GAP) - GAP for row, size in zip(rows, sizes, strict=True))
-    height = sum(CAPTION_HEIGHT + size[1] + GAP for size in sizes) - GAP
+    height = sum(caption_height + size[1] + GAP for size in sizes) - GAP
     canvas = Image.new("RGB", (2 * MARGIN + width, 2 * MARGIN + TITLE_HEIGHT + height), BACKGROUND)
     _draw_title(ImageDraw.Draw(canvas), title, subtitle, canvas.width)
     y = MARGIN + TITLE_HEIGHT
     for row, size in zip(rows, sizes, strict=True):
         for column, panel in enumerate(row):
             if panel is not None:
-                _draw_panel(canvas, panel, (MARGIN + column * (size[0] + GAP), y), size)
-        y += CAPTION_HEIGHT + size[1] + GAP
+                _draw_panel(canvas, panel, (MARGIN + column * (size[0] + GAP), y), size, caption_size)
+        y += caption_height + size[1] + GAP
     return np.array(canvas)
 
 
@@ -208,13 +211,15 @@ def _panel_size(width: int, height: int) -> tuple[int, int]:
     return round(width * factor), round(height * factor)
 
 
-def _draw_panel(canvas: Image.Image, panel: Panel, corner: tuple[int, int], size: tuple[int, int]) -> None:
+def _draw_panel(
+    canvas: Image.Image, panel: Panel, corner: tuple[int, int], size: tuple[int, int], caption_size: int
+) -> None:
     image = Image.fromarray(metrics.quantize(panel.image).contiguous().numpy())
     if image.size != size:
         grows = size[0] > image.width
         image = image.resize(size, Image.Resampling.NEAREST if grows else Image.Resampling.LANCZOS)
-    canvas.paste(image, (corner[0], corner[1] + CAPTION_HEIGHT))
-    font = ImageFont.load_default(CAPTION_SIZE)
+    canvas.paste(image, (corner[0], corner[1] + caption_size + CAPTION_HEIGHT - CAPTION_SIZE))
+    font = ImageFont.load_default(caption_size)
     ImageDraw.Draw(canvas).text((corner[0], corner[1] + 2), _one_line(panel.caption), fill=MUTED_TEXT, font=font)
 
 

@@ -301,7 +301,9 @@ def test_a_rank_that_is_asked_to_end_does_not_wait_long_for_a_silent_one(capture
 
 
 def test_a_rank_that_falls_silent_is_given_up_and_what_was_trained_is_saved(capture: Path, tmp_path: Path) -> None:
-    said = last_word_before_a_silent_rank(capture, tmp_path / "run", asked=False, COLLECTIVE_TIMEOUT=timedelta(seconds=15))
+    said = last_word_before_a_silent_rank(
+        capture, tmp_path / "run", asked=False, COLLECTIVE_TIMEOUT=timedelta(seconds=15)
+    )
     assert "does not respond" in said
 
 
