@@ -1,4 +1,4 @@
-"""Random splats, made without the projection, for the tests of what comes after it."""
+"""Random splats, drawn without the projection, for the tests of the operations that follow it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _between(low: float, high: float, shape: Sequence[int], generator: torch.Gen
 
 @pytest.fixture
 def random_splats() -> MakeSplats:
-    """A function that makes random anisotropic splats [C, G] over an image."""
+    """Returns a function that draws random anisotropic splats [C, G] over an image."""
 
     def make(
         shape: tuple[int, int],

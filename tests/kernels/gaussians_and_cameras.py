@@ -1,4 +1,4 @@
-"""Random Gaussians before random cameras, one of them mirrored, for the tests of the kernels."""
+"""Random Gaussians in front of random cameras, one of them mirrored, for the tests of the kernels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def draw(*shape: int, seed: int) -> Tensor:
 
 
 def random_gaussians(count: int, *, coefficients: int = 16, dtype: torch.dtype = torch.float64) -> RawGaussians:
-    """Gaussians around (0, 0, 4), some of them behind the cameras, off screen or too faint to see."""
+    """Gaussians around (0, 0, 4), some of them behind the cameras, off screen or too faint to be visible."""
     tensors = (
         torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64) + 1.5 * draw(count, 3, seed=1),
         draw(count, 4, seed=2),
@@ -29,7 +29,7 @@ def random_gaussians(count: int, *, coefficients: int = 16, dtype: torch.dtype =
 
 
 def random_cameras(count: int, *, clip: bool = False, dtype: torch.dtype = torch.float64) -> CameraBatch:
-    """Cameras near the origin that look along +z; every second one is mirrored, and the blocks are not quite rigid."""
+    """Cameras near the origin that look along +z; every second one is mirrored, and rotations are not quite rigid."""
     poses = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
     poses[:, :3] += 0.1 * draw(count, 3, 4, seed=6)
     poses[1::2, :3, 0] *= -1
@@ -41,7 +41,7 @@ def random_cameras(count: int, *, clip: bool = False, dtype: torch.dtype = torch
 
 
 def needle_before_camera(angle: float, dtype: torch.dtype) -> tuple[RawGaussians, CameraBatch]:
-    """One thin Gaussian without colours, at an angle, whose deviation on screen is 300 px; and its camera."""
+    """One thin, oblique Gaussian without colours, whose standard deviation on screen is 300 px; and its camera."""
     focal, size = 100.0, 96
     tensors = (
         torch.tensor([[0.013, -0.021, 1.0]], dtype=torch.float64),
@@ -55,7 +55,7 @@ def needle_before_camera(angle: float, dtype: torch.dtype) -> tuple[RawGaussians
     return needle, CameraBatch(torch.eye(4, dtype=dtype)[None].requires_grad_(), intrinsics, size, size)
 
 
-HUGE = 0.4  # of the largest number that the type holds
+HUGE = 0.4  # of the largest number that the type can represent
 POISON = {
     "means": [math.nan, math.inf, -math.inf, HUGE],
     "quats": [math.nan, math.inf, HUGE],
@@ -66,7 +66,7 @@ POISON = {
 
 
 def poisoned(clean: RawGaussians, seen: Tensor) -> tuple[RawGaussians, list[int]]:
-    """The Gaussians, in one of those seen each of these values; and which these are."""
+    """The Gaussians with each of these values placed in a different one of those seen, and the indices of these."""
     tensors, victims = [tensor.detach().clone() for tensor in clean], []
     for name, values in POISON.items():
         for value in values:
@@ -78,6 +78,6 @@ def poisoned(clean: RawGaussians, seen: Tensor) -> tuple[RawGaussians, list[int]
 
 
 def as_splats(projected: Projected) -> Splats:
-    """What rasterisation needs, cut off from the graph."""
+    """The inputs of rasterisation, detached from the graph."""
     fields = (projected.means2d, projected.conics, projected.opacities, projected.depths, projected.radii)
     return Splats(*(field.detach() for field in fields))

@@ -1,4 +1,4 @@
-"""A small compiled kernel, and scripts that run it in a process of their own."""
+"""A small compiled kernel, and scripts that run it in a separate process."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ if __name__ == "__main__":
 
 
 def printed_by(script: Path, **environment: str) -> list[str]:
-    """Lines that a Python script prints in a process of its own."""
+    """Lines printed by a Python script in a separate process."""
     done = subprocess.run(
         [sys.executable, str(script)], env=os.environ | environment, capture_output=True, text=True, check=False
     )

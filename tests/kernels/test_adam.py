@@ -76,7 +76,7 @@ def test_a_vector_is_rows_of_one_column() -> None:
 
 
 def several(dtype: torch.dtype) -> list[Update]:
-    """Tensors of less than a task, of several, and of none, whose steps, rates and decays differ."""
+    """Tensors smaller than a task, of several tasks, and empty, whose steps, rates and decays differ."""
     shapes = ((5,), (3000, 4), (0, 3), (700, 16, 3), (1, 3))
     updates = []
     for i, shape in enumerate(shapes):

@@ -1,4 +1,4 @@
-"""Tiles list every splat that covers one of their pixels, nearest first, and hardly any other."""
+"""Tiles list every splat that covers one of their pixels, nearest first, and hardly any others."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def projected_splats(count: int, cameras: int, dtype: torch.dtype = torch.float3
 
 
 def ellipses(centers: Tensor, lengths: Tensor, angles: Tensor, opacities: Tensor, depths: Tensor) -> Splats:
-    """Splats of one camera from their standard deviations [G, 2] along axes turned by an angle; float32."""
+    """Splats of one camera from their standard deviations [G, 2] along axes rotated by an angle; float32."""
     cos, sin = angles.cos(), angles.sin()
     axes = torch.stack([torch.stack([cos, -sin], -1), torch.stack([sin, cos], -1)], -2)
     covariance = axes @ torch.diag_embed(lengths**2) @ axes.mT
@@ -58,7 +58,7 @@ def assert_consistent(bins: TileBins) -> None:
 
 
 def assert_hardly_more(ours: TileBins, theirs: TileBins, excess: float) -> None:
-    """Every pair of the twin is listed, in the twin's order; at most a share `excess` of pairs besides."""
+    """Every pair of the twin is listed, in the twin's order, plus at most a share `excess` of further pairs."""
     assert_consistent(ours)
     for mine, reference in zip(lists(ours), lists(theirs), strict=True):
         wanted = set(reference)
@@ -88,7 +88,7 @@ def test_ellipses_of_all_shapes(longest: float, shortest: float, excess: float) 
 
 
 def test_no_pixel_is_lost_beside_the_image_border_or_at_coverage_of_just_one_level() -> None:
-    """Opacities around 1/255 make dots that reach one pixel centre or none."""
+    """Opacities around 1/255 give dots that reach at most one pixel centre."""
     opacities = 1 / 255 + 1e-5 * draw(500, seed=3)
     centers = torch.randint(-1, 46, (500, 2), generator=torch.Generator().manual_seed(1)) + 0.5
     splats = ellipses(centers.double(), torch.ones(500, 2).double(), draw(500, seed=4), opacities, torch.ones(500))

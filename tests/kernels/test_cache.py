@@ -1,4 +1,4 @@
-"""Compiled kernels come from the disk: another process compiles nothing, and a changed formula compiles again."""
+"""Compiled kernels are loaded from the disk: other processes compile nothing, and a changed formula is recompiled."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_a_kernel_is_announced_then_cached_and_compiled_again_when_its_formula_c
 
 
 def test_another_process_compiles_no_operation(tmp_path: Path) -> None:
-    # This process imports in another order than the script, which is what Numba's own cache stumbles over.
+    # This process imports in another order than the script, which breaks Numba's own cache.
     exec(OPERATIONS, {})
     script = tmp_path / "operations.py"
     script.write_text(OPERATIONS)
@@ -106,10 +106,10 @@ print(image.grad.numpy().tobytes().hex())
 
 
 def test_the_process_that_compiles_runs_the_same_kernels_as_the_next_one(tmp_path: Path) -> None:
-    # This loss is where the body of a parallel loop differed in its last bits from the same body within its kernel.
+    # For this loss, the body of a parallel loop differed in its last bits from the same body within its kernel.
     script = tmp_path / "gradient.py"
     script.write_text(GRADIENT)
-    # Only there, and not next to the sources, where the kernels may lie ready.
+    # Only there, and not next to the sources, where compiled kernels may already be stored.
     fresh = {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator"}
     first, second = (printed_by(script, **fresh)[-1] for _ in range(2))
     assert first == second
@@ -159,7 +159,7 @@ made = factory(np.float32(2))
 
 
 def made_from(source: str) -> Callable[..., Any]:
-    """The function that a source makes."""
+    """The function that a source defines."""
     names: dict[str, Any] = {"__name__": "made"}
     exec(source, names)
     return names["made"]

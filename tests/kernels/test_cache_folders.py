@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept when folders cannot be written, and that those which lie ready are used."""
+"""Folders of compiled kernels: fallbacks for unwritable folders, and use of kernels that are already stored."""
 
 from __future__ import annotations
 
@@ -59,12 +59,12 @@ class Machine:
         return self.root / "temporary"
 
     def refuse(self, path: object) -> None:
-        """As for a user who may not write there; who runs the tests may be root, who may write everywhere."""
+        """Denies access as for a user without permission; the tests may run as root, who may write everywhere."""
         if any(Path(str(path)).absolute().is_relative_to(folder) for folder in self.closed):
             raise PermissionError(13, "Permission denied", str(path))
 
     def run(self) -> tuple[int, list[str]]:
-        """Runs the kernel as a new process would: how often it was compiled, and what was said beside."""
+        """Runs the kernel as a new process would; returns the number of compilations and the other messages."""
         cache_folders._warn_once.cache_clear()
         self.log.clear()
         sys.modules.pop("scale_in_package", None)
@@ -78,7 +78,7 @@ class Machine:
 
 @pytest.fixture
 def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> Machine:
-    """A machine on which the package cannot be written."""
+    """A machine on which the package's folder is not writable."""
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
@@ -93,7 +93,7 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogC
 
 
 def refused(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lets the machine refuse what is written to folders that are closed."""
+    """Makes the machine deny writes to closed folders."""
     whole: dict[str, Callable[..., Any]] = {
         "temporary": tempfile.TemporaryFile,
         "mkdir": os.mkdir,

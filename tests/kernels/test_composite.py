@@ -19,7 +19,7 @@ INPUTS = ("means2d", "conics", "opacities", "channels", "marks", "absgrad")
 
 
 class Blend(NamedTuple):
-    """Everything a call of `composite` takes; `inputs` are its differentiable tensors by name."""
+    """All arguments of a call of `composite`; `inputs` are its differentiable tensors."""
 
     splats: Splats
     channels: Tensor
@@ -50,7 +50,7 @@ def blend(splats: Splats, size: tuple[int, int], *, channels: int = 3, glass: in
 
 
 def deviating(case: Blend, channel: int, *, through_mean: bool) -> Blend:
-    """The same call that also asks for a channel's deviation, with a random factor that is 0 in whole tiles."""
+    """The same call that also requests a channel's deviation, with a random factor that is 0 in whole tiles."""
     generator = torch.Generator().manual_seed(7)
     shape = (case.bins.num_cameras, case.bins.height, case.bins.width)
     where = torch.rand(*shape, generator=generator, dtype=torch.float64).to(case.channels.dtype)
@@ -139,7 +139,7 @@ def test_a_surface_deviates_nowhere(random_splats: MakeSplats) -> None:
 @pytest.mark.parametrize("channels", [1, 6])
 @pytest.mark.parametrize("function", [composite, composite_twin])
 def test_the_deviation_of_a_splat_alone_has_no_gradient(function: Callable[..., Composite], channels: int) -> None:
-    """Where its coverage is small its mean is uncertain, but it has hardly any weight there."""
+    """Where its coverage is small its mean is uncertain, but its weight there is negligible."""
     fields = (torch.tensor([20.3, 15.2]), torch.tensor([0.01, 0.0, 0.01]), torch.tensor(0.8), torch.tensor(3.0))
     splats = Splats(*(field[None, None] for field in fields), torch.full((1, 1, 2), 40.0))
     values = torch.full((1, 1, channels), 3.1, requires_grad=True)
@@ -173,7 +173,7 @@ def test_an_opaque_pile_stops_where_its_twin_stops(
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_needle_reaches_all_its_pixels(dtype: torch.dtype) -> None:
-    """Blocks of a tile that a splat does not reach are left out; of those it grazes, none may be."""
+    """Blocks of a tile that a splat does not reach are skipped; blocks that it grazes must not be."""
     count, size = 150, (70, 50)
     generator = torch.Generator().manual_seed(11)
     angle = torch.pi * torch.rand(count, generator=generator, dtype=torch.float64)
@@ -198,7 +198,7 @@ def test_a_needle_reaches_all_its_pixels(dtype: torch.dtype) -> None:
 
 
 def test_a_needle_whose_determinant_cancels_in_single_precision_is_drawn() -> None:
-    """Its deviations are 10,000 px and 0.55 px."""
+    """Its standard deviations are 10,000 px and 0.55 px."""
     angle, length, thickness = 0.3, 1e4, 0.55
     c, s = math.cos(angle), math.sin(angle)
     xx, yy = ((x / length) ** 2 + (y / thickness) ** 2 for x, y in ((c, s), (s, c)))
@@ -294,7 +294,7 @@ def test_only_active_tiles_are_drawn(random_splats: MakeSplats) -> None:
         assert not some_tiles[~seen].any()
     assert_close(with_gradients(few, composite), with_gradients(few, composite_twin), 2e-5)
 
-    # Bins of every tile with a shorter list of active ones must give the same.
+    # Bins of every tile with a shorter list of active ones must give the same result.
     shortened = full._replace(bins=full.bins._replace(active=few.bins.active))
     expected = with_gradients(few, composite)
     assert all(torch.equal(t, expected[name]) for name, t in with_gradients(shortened, composite).items())
@@ -358,7 +358,7 @@ def test_a_splat_with_broken_geometry_is_not_drawn(random_splats: MakeSplats, fi
     case = blend(random_splats((1, 30), size, dtype=torch.float32), size)
     broken = getattr(case.splats, field).clone()
     broken[0, 4] = value
-    # Binning leaves such splats out; a list that holds them nevertheless must do no harm.
+    # Binning leaves such splats out; a list that nevertheless holds them must do no harm.
     found = with_gradients(case._replace(splats=case.splats._replace(**{field: broken})), composite)
     culled = case.splats.radii.clone()
     culled[0, 4] = 0

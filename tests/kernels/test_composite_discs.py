@@ -1,4 +1,4 @@
-"""Blended discs: against the twin, by finite differences, and against rays."""
+"""Blended discs, compared with the twin, with finite differences and with rays."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ INPUTS = ("means2d", "maps", "opacities", "depths", "channels", "absgrad")
 
 
 class Case(NamedTuple):
-    """Everything a call takes; `inputs` are its differentiable tensors."""
+    """All arguments of a call; `inputs` are its differentiable tensors."""
 
     discs: Discs
     channels: Tensor
@@ -50,7 +50,7 @@ class Case(NamedTuple):
 def scattered(
     count: int, *, size: float = -1.5, opacity: float = 0.0, dtype: torch.dtype = torch.float64
 ) -> RawGaussians:
-    """Discs before a camera at the origin, at all angles to it, some across the near plane or outside the image."""
+    """Discs in front of a camera at the origin, at all angles, some across the near plane or outside the image."""
     tensors = (
         torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64) + draw(count, 3, seed=1) * torch.tensor([1.2, 1.0, 1.0]),
         draw(count, 4, seed=2),
@@ -89,7 +89,7 @@ def with_gradients(case: Case, function: Callable[..., BlendedDiscs]) -> dict[st
     inputs = [tensor.detach().clone().requires_grad_() for tensor in case.inputs()]
     outputs = case.with_inputs(*inputs)(function)
     cotangents = [draw(*o.shape, seed=20 + i).to(o) for i, o in enumerate(outputs)]
-    # Distances of inverse depths are small: so that a mistake in them shows among the rest.
+    # Differences of inverse depths are small and are scaled up so that an error in them shows among the rest.
     cotangents[4] = 100 * cotangents[4]
     # The twin does not touch inputs that reach no pixel; the added zero gives them a gradient of zero.
     total = sum((o * c).sum() for o, c in zip(outputs, cotangents, strict=True)) + 0 * sum(i.sum() for i in inputs)
@@ -99,7 +99,7 @@ def with_gradients(case: Case, function: Callable[..., BlendedDiscs]) -> dict[st
 
 
 def assert_close(found: dict[str, Tensor], expected: dict[str, Tensor], tolerance: float) -> None:
-    """Relative norm of the difference, per tensor."""
+    """Checks the relative norm of the difference per tensor."""
     for name, want in expected.items():
         got, want = found[name].double().flatten(), want.double().flatten()
         assert float((got - want).norm()) <= tolerance * max(float(want.norm()), 1e-3), name
@@ -166,7 +166,7 @@ def test_from_raw_discs_to_images_gradients_match_finite_differences() -> None:
 
 
 def layered(count: int) -> RawGaussians:
-    """Discs that face the camera more or less, each wholly behind the one before, so that order is no question."""
+    """Discs that roughly face the camera, each wholly behind the previous one, so that their order is unambiguous."""
     raw = scattered(count, size=-1.6, opacity=1.0)
     raw.means[:, 2] = torch.linspace(2, 9, count)
     raw.means[:, :2] *= raw.means[:, 2:] / 4
@@ -192,7 +192,7 @@ def test_primary_rays_meet_what_is_rasterised_without_low_pass() -> None:
 
 
 def one_disc(**changes: list[float]) -> RawGaussians:
-    """A half opaque, large disc that faces a camera at the origin from two units away."""
+    """A large, half opaque disc that faces a camera at the origin from two units away."""
     values = {
         "means": [0.0, 0.0, 2.0], "quats": [1.0, 0.0, 0.0, 0.0], "log_scales": [3.0, 3.0], "logit_opacities": 0.0,
         "sh": [[0.1, 0.2, 0.3]],

@@ -1,4 +1,4 @@
-"""`cube_lookup` against its twin, and what a cube map must be: continuous, and the same whichever face is asked."""
+"""`cube_lookup` against its twin, and the continuity of cube maps across the edges of their faces."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_the_map_is_continuous_at_every_edge_and_corner(place: tuple[int, int, i
     texels = normal(6, size, size, 3, seed=5)
     at = torch.tensor(place, dtype=torch.float64)
     free = (at == 0).double()
-    # Along an edge, and from each of its points a small step in every direction.
+    # Along an edge, and at a small step in every direction from each of its points.
     points = at + free * torch.linspace(-0.999, 0.999, 41, dtype=torch.float64)[:, None]
     steps = torch.nn.functional.normalize(normal(30, 1, 3, seed=6), dim=-1)
     here, beside = cube_lookup(texels, points), cube_lookup(texels, points + 1e-9 * steps)

@@ -1,4 +1,4 @@
-"""Choosing a device: what is taken, what is said, and what to do where a GPU cannot be used."""
+"""Choosing a device: accepted names, messages, and advice where a GPU cannot be used."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from glassplat.kernels.backend.devices import CudaUnavailableError, chosen_devic
 
 @pytest.fixture
 def gpu(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
-    """A machine on which everything that a GPU needs is there, as far as torch says."""
+    """A machine that, according to torch, has everything a GPU needs."""
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (9, 0))
@@ -138,7 +138,7 @@ def test_the_extras_are_bounded_and_pair_each_pytorch_with_its_cuda() -> None:
     for extra, cuda in (("cuda", "cu13"), ("cuda12", "cu12")):
         assert f"numba-cuda[{cuda}]>=0.30.2,<0.31" in extras[extra]
         assert "cuda-core>=1.2,<2" in extras[extra]
-    # PyTorch 2.10 pins bindings of CUDA 12, with which the extra for CUDA 13 cannot be installed.
+    # PyTorch 2.10 pins the bindings of CUDA 12, with which the extra for CUDA 13 cannot be installed.
     assert "torch>=2.11" in extras["cuda"]
     assert "numba-cuda>=0.30.2,<0.31" in extras["dev"] and "cuda-core>=1.2,<2" in extras["dev"]
 

@@ -61,7 +61,7 @@ def test_single_pixels_are_eq_15() -> None:
 
 
 def test_edges_that_only_happen_to_meet_count_little_in_cells() -> None:
-    """And what is left of the reflection counts as much as pixel by pixel."""
+    """And the remainder of a reflection counts as much as pixel by pixel."""
     generator = torch.Generator().manual_seed(5)
     own, reflection = torch.rand(2, 62, 62, 3, generator=generator, dtype=torch.float64)
     hit = torch.ones(62, 62, dtype=torch.float64)
@@ -74,7 +74,7 @@ def test_edges_that_only_happen_to_meet_count_little_in_cells() -> None:
 
 @pytest.mark.parametrize(("held", "counted"), [(0.1, 1.0), (2.0, 1.0), (3.0, 0.5), (4.0, 0.0), (10.0, 0.0)])
 def test_a_cell_counts_as_far_as_a_pane_could_have_left_it(held: float, counted: float) -> None:
-    """At one brightness all over, where linear light is sRGB times a factor."""
+    """At a uniform brightness, where linear light is sRGB times a factor."""
     generator = torch.Generator().manual_seed(5)
     edges = 1e-4 * torch.rand(12, 12, 3, generator=generator, dtype=torch.float64)
     hit, strength = torch.ones(12, 12, dtype=torch.float64), torch.full((12, 12), 0.07, dtype=torch.float64)

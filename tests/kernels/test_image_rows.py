@@ -1,4 +1,4 @@
-"""Operations of one pass over an image or over splats that go along with blending."""
+"""Operations in one pass over an image or over splats that accompany blending."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def draw(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tens
 
 
 def blended(dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
-    """An image [13, 21, 4] of colours and depths, and its coverage; a part of it shows nothing."""
+    """An image [13, 21, 4] of colours and depths, and its coverage; part of it is empty."""
     alpha = draw(13, 21, seed=1, dtype=dtype)
     alpha[:5, :7] = 0
     alpha[5, 3] = 1e-6
@@ -36,7 +36,7 @@ def test_depths_are_means_where_anything_is() -> None:
 def test_gradients_of_colours_and_depths(background: tuple[float, ...]) -> None:
     image, alpha = blended()
     leaves = image[4:7, 2:5].clone().requires_grad_(), alpha[4:7, 2:5].clone().requires_grad_()
-    covered = (leaves[1] > 1e-5).detach()  # Elsewhere a finite difference steps over where depths end.
+    covered = (leaves[1] > 1e-5).detach()  # Elsewhere finite differences cross the coverage below which depth is 0.
 
     def where_covered(image: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
         alpha = torch.where(covered, alpha, 0)
@@ -54,7 +54,7 @@ def test_the_background_is_seen_through_what_is_before_it(background: tuple[floa
 
 
 def test_no_gradient_of_the_coverage_is_made_up() -> None:
-    """On black, colours tell nothing of it: the pass that blended them is spared a gradient."""
+    """On black, colours do not depend on coverage: the pass that blended them is spared a gradient."""
     image, alpha = (tensor.requires_grad_() for tensor in blended())
     colors = over_background(image[..., :3], alpha, (0.0, 0.0, 0.0))
     assert torch.autograd.grad(colors.sum(), alpha, allow_unused=True) == (None,)
@@ -62,7 +62,7 @@ def test_no_gradient_of_the_coverage_is_made_up() -> None:
 
 @pytest.mark.parametrize("size", [(40, 53), (2, 2), (1, 7), (7, 1)])
 def test_inside_of_panes(size: tuple[int, int]) -> None:
-    """Patches of three panes and of none, of which a part reflects nothing."""
+    """Patches of three panes and of no pane, part of which reflects nothing."""
     pane = (4 * draw(-(-size[0] // 7), -(-size[1] // 7), seed=5)).int() - 1
     pane = pane.repeat_interleave(7, 0).repeat_interleave(7, 1)[: size[0], : size[1]].contiguous()
     strength = torch.where(draw(*size, seed=2) > 0.03, 0.1, 0.0)

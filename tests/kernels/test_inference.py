@@ -1,4 +1,4 @@
-"""What is made once and kept serves calls with gradients, even if it was made where PyTorch records nothing."""
+"""Values cached while PyTorch records no gradients also serve later calls with gradients."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How an image behind a pane changes with its layers: held against finite differences and the twin."""
+"""Derivatives of an image behind a pane by its layers, compared with finite differences and the twin."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_reflection_weighs_more_the_darker_it_is_behind_the_pane() -> None:
     through, mirrored = layer_derivatives(strength, behind, torch.full_like(behind, 0.5), where, linear=True)
     assert bool((mirrored.diff() < 0).all())
     assert bool((through.diff() > 0).all())
-    assert mirrored[0, 4] == pytest.approx(0.1)  # As bright as each other.
+    assert mirrored[0, 4] == pytest.approx(0.1)  # Both layers are equally bright.
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 3e-5), (torch.float64, 1e-11)])
@@ -114,5 +114,5 @@ def test_slopes_are_read_at_centres_behind_the_surface(dtype: torch.dtype) -> No
     found = sample_derivatives(
         derivatives, near, torch.tensor([means], dtype=dtype), torch.tensor([depths], dtype=dtype)
     )
-    expected = [0.2, 0.5, 1.0, 1.0, 0.4, 0.4, 0.6, 0.4, 1.0]  # Beyond the border as at it, and NaN as at the first.
+    expected = [0.2, 0.5, 1.0, 1.0, 0.4, 0.4, 0.6, 0.4, 1.0]  # Clamped to the border; NaN to the first.
     torch.testing.assert_close(found, torch.tensor([expected], dtype=dtype), rtol=0, atol=0)

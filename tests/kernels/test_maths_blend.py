@@ -30,7 +30,7 @@ def test_rows_in_range_are_those_with_coverage(real: type, xx: float, xy: float,
     reach = maths.vertical_reach(real(xx), real(xy), real(yy), opacity)
     first, last = maths.row_range(real(center), reach, 16)
     assert 0 <= first <= last <= 16
-    # The largest coverage in a row is where the quadratic form is least over x.
+    # The coverage in a row is largest where the quadratic form is smallest over x.
     least = (yy - xy * xy / xx) * (np.arange(16) + 0.5 - center) ** 2
     covered = np.flatnonzero(opacity * np.exp(-0.5 * least) >= ALPHA_MIN)
     assert list(range(first, last)) == list(covered)

@@ -1,4 +1,4 @@
-"""The laws of reflection, seen through `blend_panes`: one pixel for each pair of a reflectance and an angle."""
+"""The laws of reflection, observed through `blend_panes`: one pixel for each pair of a reflectance and an angle."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ COSINES = (1e-4, 1e-3, 0.01, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 0.999)
 
 
 def strengths(bases: Tensor, cosines: Tensor, fresnel: Fresnel = "pane") -> Tensor:
-    """Strength [N] of N panes; each fills a pixel whose ray is the optical axis, and is tilted to show its cosine."""
+    """Strength [N] of N panes. Each fills a pixel whose ray is the optical axis, and is tilted to the given cosine."""
     count = len(bases)
     rgb = bases.new_zeros(1, count, 3)
     normals = torch.stack([(1 - cosines.detach() ** 2).sqrt(), 0 * cosines, cosines], dim=1)
@@ -38,14 +38,14 @@ def grid(
 
 
 def reflectance_of_index(index: float) -> float:
-    """What a pane reflects at normal incidence: both surfaces and the light between them."""
+    """Reflectance of a pane at normal incidence: both surfaces and the light between them."""
     surface = ((index - 1) / (index + 1)) ** 2
     return 2 * surface / (1 + surface)
 
 
 def light_that_comes_back(index: float, cosine: float) -> float:
-    """Follows a ray through a pane: Snell's law, Fresnel's sine and tangent laws, and one inner reflection after the
-    other, until nothing is left.
+    """Traces a ray through a pane with Snell's law, Fresnel's sine and tangent laws and repeated internal reflections,
+    until no light is left.
     """
     outside = math.acos(cosine)
     inside = math.asin(math.sin(outside) / index)

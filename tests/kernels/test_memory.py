@@ -1,4 +1,4 @@
-"""What a process does with freed memory, seen in the pages that it has to fetch again."""
+"""Reuse of freed memory by a process, observed in the pages that it has to fault in again."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PAGES = 30 * 3_000_000 // 4096
 
 
 def pages_again(prepare: str, **environment: str) -> int:
-    """How many pages a process fetches that has already held and freed as much."""
+    """Number of pages faulted in by a process that has already held and freed as much."""
     known = {name: value for name, value in os.environ.items() if name not in CHOSEN_BY_USER}
     done = subprocess.run(
         [sys.executable, "-c", ROUNDS.format(prepare=prepare)],

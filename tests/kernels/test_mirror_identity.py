@@ -1,4 +1,4 @@
-"""A mirrored camera sees what the camera sees of mirrored Gaussians (TR-Gaussians, Eqs. 8 to 12 written out)."""
+"""A mirrored camera's image is the camera's image of mirrored Gaussians (TR-Gaussians, Eqs. 8 to 12 written out)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NEAR = 0.1
 
 
 def rigid_camera(seed: int) -> CameraBatch:
-    """A right-handed camera at a random place, roughly towards +z."""
+    """A right-handed camera at a random position that looks roughly towards +z."""
     rotation, _ = torch.linalg.qr(torch.eye(3, dtype=torch.float64) + 0.3 * draw(3, 3, seed=seed))
     rotation = rotation * rotation.diagonal().sign()
     pose = torch.eye(4, dtype=torch.float64)
@@ -74,7 +74,7 @@ def test_mirroring_the_camera_is_mirroring_the_gaussians(seed: int) -> None:
     normal = torch.nn.functional.normalize(draw(3, seed=seed + 2), dim=0)
     point = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64) + 0.3 * draw(3, seed=seed + 3)
     matrix = mirror_matrix(point, normal)
-    # The Gaussians are mirrored once more beforehand, so that it is the images of them that lie before the camera.
+    # The Gaussians are mirrored once more beforehand, so that their mirror images lie in front of the camera.
     behind = mirrored_gaussians(gaussians, point, normal)
 
     ours = project(behind, camera._replace(cam_from_world=camera.cam_from_world @ matrix), sh_degree=3, near=NEAR)
@@ -85,7 +85,7 @@ def test_mirroring_the_camera_is_mirroring_the_gaussians(seed: int) -> None:
     for name in ("means2d", "conics", "depths", "opacities", "radii"):
         torch.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=1e-9, atol=1e-9)
 
-    # Eq. 11: the colour of an image, seen along d, is that of the Gaussian itself along the reflected direction.
+    # Eq. 11: the colour of a mirror image, seen along d, is the Gaussian's own colour along the reflected direction.
     pose = camera.cam_from_world[0]
     center = -pose[:3, :3].T @ pose[:3, 3]
     directions = torch.nn.functional.normalize(images.means - center, dim=-1)

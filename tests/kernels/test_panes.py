@@ -47,7 +47,7 @@ def test_hits_match_their_twin(dtype: torch.dtype, count: int, masked: bool) -> 
     found, expected = (hits(panes, intrinsics, WIDTH, HEIGHT, mask) for hits in (pane_hits, hits_twin))
     assert count == 0 or len(expected.pane.unique()) > min(count, 2)
     agree(found, expected)
-    # All panes on the rays, one behind another, until none is left.
+    # All panes along the rays, one behind another, until none is left.
     met = []
     while bool((expected.pane >= 0).any()):
         met.append(expected.pane)
@@ -82,7 +82,7 @@ def test_of_coincident_panes_one_is_met() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_panes_of_one_plane_that_overlap_are_one_surface(seed: int) -> None:
-    """Neighbours of a front, whose rectangles are larger than their glass; rounding would tell them apart."""
+    """Adjacent panes of a front, whose rectangles are larger than their glass; rounding would separate them."""
     panes, intrinsics = random_panes(1, torch.float32, seed=seed)
     aside = 0.5 * panes.half_sizes[:, :1] * panes.axes[:, 0]
     beside = panes._replace(centers=panes.centers + aside)
@@ -104,7 +104,7 @@ def test_a_plane_through_the_camera_is_not_hit() -> None:
 
 
 def blend_case(dtype: torch.dtype, count: int = 3) -> dict[str, Tensor]:
-    """Random arguments of `blend_panes`: a tenth of the mask is 0, some colours are dark, some dazzling."""
+    """Random arguments of `blend_panes`: a tenth of the mask is 0, some colours are dark, some very bright."""
     panes, intrinsics = random_panes(count, dtype)
     generator = torch.Generator().manual_seed(2)
 

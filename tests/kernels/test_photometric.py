@@ -13,7 +13,7 @@ from tests.kernels.threads import assert_threads_change_no_bit
 
 
 def pictures(height: int, width: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """An image with structure at several scales, and a photograph that it is a disturbed copy of."""
+    """An image with structure at several scales, and a photograph of which it is a distorted copy."""
     generator = torch.Generator().manual_seed(8)
     y, x = torch.arange(height)[:, None, None] / 7, torch.arange(width)[None, :, None] / 5
     waves = 0.5 + 0.4 * torch.sin(x + torch.tensor([0.0, 1.0, 2.0])) * torch.cos(y)
@@ -24,7 +24,7 @@ def pictures(height: int, width: int, dtype: torch.dtype) -> tuple[Tensor, Tenso
 def with_gradients(
     function: Callable[[Tensor, Tensor], Photometric], image: Tensor, target: Tensor
 ) -> tuple[Photometric, Tensor, Tensor]:
-    """The means, the gradient of L1 alone, and that of a weighted sum."""
+    """The means, the gradient of L1 alone, and the gradient of a weighted sum."""
     image = image.detach().requires_grad_()
     found = function(image, target)
     (by_l1,) = torch.autograd.grad(found.l1, image, retain_graph=True)

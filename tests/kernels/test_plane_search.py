@@ -1,4 +1,4 @@
-"""The kernels of the search for planes: held against their definitions in NumPy."""
+"""The kernels of the search for planes, compared with their definitions in NumPy."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ EYES = [(x, y, -1.0) for x in (-1.2, -0.4, 0.6, 1.2) for y in (0.0, 0.3)]
 
 @pytest.fixture(scope="module")
 def views() -> list[PaneView]:
-    """Of a pane before which another one stands; the last is smaller than the others, and from behind the pane."""
+    """Views of a pane occluded by another one; the last is smaller than the others and sees the pane from behind."""
     near = replace(FRONT, center=FRONT.center + np.array([0.5, 0.2, -0.6]), half_sizes=(0.3, 0.2))
     annotations = scene_of([FRONT, near], [*EYES, (0.5, 0.2, 4.5)])
     found = [pane_view(*annotation, 1) for annotation in annotations]
@@ -38,7 +38,7 @@ def views() -> list[PaneView]:
 
 @pytest.fixture(scope="module")
 def planes() -> PlaneEquations:
-    """The pane's, planes near it, any planes, and planes that a camera lies in or behind."""
+    """The pane's plane, planes near it, arbitrary planes, and planes with a camera on or behind them."""
     rng = np.random.default_rng(0)
     normals = np.concatenate([np.tile(FRONT.normal, (30, 1)) + 0.05 * rng.standard_normal((30, 3)), SIDE.normal[None]])
     normals = np.concatenate([FRONT.normal[None], normals, rng.standard_normal((60, 3)), [[0, 0, 1.0], [0, 0, 1.0]]])
@@ -49,7 +49,7 @@ def planes() -> PlaneEquations:
 
 
 def pixel_and_frame(planes: PlaneEquations, view: PaneView, points: Array, outward: Array) -> tuple[Array, Array]:
-    """Size on the plane of a pixel across an edge, and of what a frame of height one hides; [H, P] each."""
+    """Size on the plane of a pixel across an edge, and of the part hidden by a frame of height one; [H, P] each."""
     height = np.abs(planes.normals @ view.center - planes.offsets)[:, None]
     beyond = np.einsum("hpd,hpd->hp", outward, view.center - points)
     steep = beyond / np.maximum(height, 1e-100)
@@ -82,7 +82,7 @@ def test_followed_edges_are_those_of_the_definition(views: list[PaneView], plane
             for name, expected in (("distances", distances), ("shifts", shifts)):
                 found = getattr(matches, name)[:, other, chosen]
                 assert (found[~compared] == 0).all()
-                # How steeply a camera looks along a plane that it lies in is a matter of rounding, between two bounds.
+                # For a plane that contains the camera, the viewing angle depends on rounding, between two bounds.
                 aside = np.abs(planes.normals @ view.center - planes.offsets)[:, None] > 1e-9
                 sure = compared if name == "distances" else compared & aside
                 np.testing.assert_allclose(found[sure], expected[sure], rtol=1e-9, atol=1e-12)
@@ -106,7 +106,7 @@ def test_images_of_any_size_are_interpolated_up_to_their_rims(shape: tuple[int, 
     height, width = shape
     rng = np.random.default_rng(1)
     field, places = rng.standard_normal(shape), rng.random((200, 2)) * (width, height)
-    # Both look along z: the first from two units before the plane, the second from one.
+    # Both look along z: the first from two units in front of the plane, the second from one.
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[0, 2, 3] = 1.0
     lenses, sizes = np.tile([1.0, 1.0, 0.0, 0.0], (2, 1)), np.array([[9, 9], shape])

@@ -40,7 +40,7 @@ def gradients(projected: Projected, gaussians: RawGaussians, cameras: CameraBatc
 
 
 def assert_parallel(ours: Tensor, theirs: Tensor, tolerance: float, name: str) -> None:
-    """Relative norm of the difference, and no systematic scale between the two."""
+    """Checks the relative norm of the difference, and that there is no systematic scale between the two."""
     assert ours.shape == theirs.shape, name
     norm = theirs.norm()
     assert (ours - theirs).norm() <= tolerance * norm, name
@@ -88,7 +88,7 @@ def test_gradients_agree_with_finite_differences() -> None:
 
 
 def test_the_ellipse_follows_the_tangent_only_near_the_image() -> None:
-    """Far off screen the Jacobian stays that of the border, and its gradient is zero there."""
+    """Far off screen the Jacobian keeps its value at the border, and its gradient is zero there."""
     means = torch.tensor([[6.0, -3.0, 2.0], [0.5, 0.1, 2.0]], dtype=torch.float64, requires_grad=True)
     scales = torch.full((2, 3), math.log(2.5), dtype=torch.float64, requires_grad=True)
     gaussians = random_gaussians(2)._replace(means=means, log_scales=scales)
@@ -176,7 +176,7 @@ def test_a_window_keeps_what_reaches_into_it(dtype: torch.dtype) -> None:
 
 
 def test_coverage_sinks_to_the_bound_at_the_edge_of_the_extents() -> None:
-    """On the ellipse's rightmost and topmost points, opacity exp(-q / 2) is 1/255."""
+    """At the ellipse's rightmost and topmost points, opacity exp(-q / 2) is 1/255."""
     ours = project(random_gaussians(300), random_cameras(1), sh_degree=0, near=NEAR)
     visible = ours.radii[..., 0] > 0
     (xx, xy, yy), opacity, radii = ours.conics[visible].unbind(-1), ours.opacities[visible], ours.radii[visible]
@@ -198,7 +198,7 @@ def test_needles_stay_positive_definite_in_single_precision() -> None:
 
 @pytest.mark.parametrize("angle", [0.3, 0.785, 1.2])
 def test_gradients_of_needles_do_not_cancel_in_single_precision(angle: float) -> None:
-    """A splat of 300 px by 0.5 px, whose image turns a lot with its angle."""
+    """A splat of 300 px by 0.5 px, whose image rotates strongly with its angle."""
     found = {}
     for dtype in (torch.float32, torch.float64):
         needle, camera = needle_before_camera(angle, dtype)
@@ -270,7 +270,7 @@ def test_gradients_of_several_projections_add_up_where_they_are_made(asked: tupl
         loss = sum((1 + i) * field.sin().sum() for i in asked for field in found[i][:5])
         inputs = [*gaussians, *(batch.cam_from_world for batch in batches)]
         once = torch.autograd.grad(loss, inputs, retain_graph=True, allow_unused=True, materialize_grads=True)
-        # What a pass has left behind must not enter the next one, nor what only asks for poses.
+        # State left by one pass must not enter the next one, nor must a pass that asks only for poses.
         torch.autograd.grad(loss, batches[asked[-1]].cam_from_world, retain_graph=True)
         again = torch.autograd.grad(loss, inputs, allow_unused=True, materialize_grads=True)
         assert all(torch.equal(a, b) for a, b in zip(once, again, strict=True))

@@ -28,7 +28,7 @@ def random_discs(count: int, *, coefficients: int = 16, dtype: torch.dtype = tor
 
 
 def gradients(projected: ProjectedDiscs, gaussians: RawGaussians, cameras: CameraBatch) -> dict[str, Tensor]:
-    """Gradients of all inputs for random cotangents of all outputs that have one."""
+    """Gradients of all inputs for random cotangents of all differentiable outputs."""
     # Without coefficients the twin's colours are constant.
     smooth = [(i, output) for i, output in enumerate(projected[:SMOOTH]) if output.requires_grad]
     outputs = [output for _, output in smooth]
@@ -83,7 +83,7 @@ def test_gradients_agree_with_finite_differences() -> None:
 
 
 def test_the_map_leads_to_where_the_ray_meets_the_disc() -> None:
-    """By solving for the place in the world, of rays through pixels around each disc's centre."""
+    """Compared with the intersection solved in world space, for rays through pixels around each disc's centre."""
     discs, cameras = random_discs(200), random_cameras(1)
     found = project_discs(discs, cameras, sh_degree=0, near=NEAR)
     pose, (fx, fy, cx, cy) = cameras.cam_from_world[0], cameras.intrinsics[0]
@@ -180,7 +180,7 @@ def test_a_disc_across_the_near_plane_may_cover_the_whole_image() -> None:
 
 
 def test_a_disc_across_the_near_plane_is_culled_where_all_behind_the_plane_lies_beside_the_image() -> None:
-    """Nothing that is culled would have been seen: a camera with a much wider image draws nothing within the window."""
+    """No culled disc is visible: a camera with a much wider image draws nothing within the window."""
     generator = torch.Generator().manual_seed(4)
     means = torch.randn(400, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.4, 0.4, 0.2]) + 0.3
     raw = RawGaussians(

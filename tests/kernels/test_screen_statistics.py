@@ -1,4 +1,4 @@
-"""The statistics of densification: held against their twin, and by hand."""
+"""The statistics of densification, compared with their twin and with values computed by hand."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.kernels.threads import assert_threads_change_no_bit
 
 @torch.no_grad()
 def add_views_in_torch(sums: Sums, views: Views) -> None:
-    """The definition of `add_views`, for tensors that are checked."""
+    """The definition of `add_views`, for checked tensors."""
     visible = (views.radii > 0).all(dim=-1)
     rows = slice(None) if views.direct else slice(0, 1)
     for total, gradient in ((sums.gradient_sum, views.v_means2d), (sums.absgrad_sum, views.v_absgrad)):

@@ -18,7 +18,7 @@ DIFFERENTIABLE = (COLORS, QUATS, STRENGTHS, EXTRA)
 
 
 def gaussians(count: int, dtype: torch.dtype, extra: int = 2) -> list[Tensor]:
-    """The arguments of the operation; some scales are equal, and a quarter of the Gaussians are not seen."""
+    """The arguments of the operation; some scales are equal, and a quarter of the Gaussians are not visible."""
     generator = torch.Generator().manual_seed(1)
     colors, quats, log_scales, means, others = (
         torch.randn(count, width, generator=generator, dtype=torch.float64) for width in (3, 4, 3, 3, extra)

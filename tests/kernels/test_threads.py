@@ -1,4 +1,4 @@
-"""Which threads run kernels: never TBB's by chance, and never two Python threads at once in Numba's work queue."""
+"""Threading layers of kernels: TBB is never chosen by accident, and Numba's work queue never serves two threads."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ numba.np.ufunc.tbbpool = workqueue
 
 
 def tbb_folder() -> Path | None:
-    """Where the `tbb` package from PyPI has its library."""
+    """Folder of the library of the `tbb` package from PyPI."""
     try:
         files = importlib.metadata.files("tbb") or []
     except importlib.metadata.PackageNotFoundError:
@@ -84,7 +84,7 @@ def tbb_folder() -> Path | None:
 
 
 def has_tbb() -> bool:
-    """Whether the machine has TBB without further ado."""
+    """True if TBB can be loaded without further setup."""
     try:
         ctypes.CDLL("libtbb.so.12")
     except OSError:
@@ -93,7 +93,7 @@ def has_tbb() -> bool:
 
 
 def printed_with_tbb(tmp_path: Path, script: str, **environment: str) -> list[str]:
-    """What a script prints in a process that finds TBB: PyPI's, the system's, or a stand-in."""
+    """Output of a script in a process that finds TBB: PyPI's, the system's, or a stand-in."""
     folder = tbb_folder()
     path = {"LD_LIBRARY_PATH": f"{folder}:{os.environ.get('LD_LIBRARY_PATH', '')}"} if folder else {}
     head = "" if folder or has_tbb() else STAND_IN
@@ -101,7 +101,7 @@ def printed_with_tbb(tmp_path: Path, script: str, **environment: str) -> list[st
 
 
 def printed(tmp_path: Path, script: str, **environment: str) -> list[str]:
-    """What a script prints about threads, in a process with no other settings of Numba."""
+    """Output of a script about threads, in a process without other settings of Numba."""
     file = tmp_path / "script.py"
     file.write_text(script)
     plain = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_THREADING")}
@@ -122,7 +122,7 @@ def test_a_tbb_that_happens_to_be_there_is_not_used_and_the_log_says_so_once(tmp
 
 
 def test_tbb_stays_out_when_the_environment_changes_before_the_first_kernel(tmp_path: Path) -> None:
-    # Numba then reads all its variables anew, and forgets what was set in between.
+    # Numba then reads all its variables again, and forgets those set in between.
     change = 'import os\nos.environ["NUMBA_DEVELOPER_MODE"] = "0"\n'
     *_, result = printed_with_tbb(tmp_path, change + ONE_KERNEL)
     assert result in ("omp", "workqueue")

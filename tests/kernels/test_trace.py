@@ -1,4 +1,4 @@
-"""`trace` and `build_bvh`: against the twin, which knows no hierarchy, by finite differences, and on bad inputs."""
+"""`trace` and `build_bvh`, compared with the twin, which has no hierarchy, and finite differences; bad inputs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def cloud(count: int, scales: int, *, dtype: torch.dtype = torch.float64, size: 
 
 
 def rays_around(count: int, *, dtype: torch.dtype = torch.float64) -> Rays:
-    """Rays of different lengths from around the cloud towards its middle, some of them from inside."""
+    """Rays of different lengths from around the cloud towards its centre, some of them starting inside."""
     generator = torch.Generator().manual_seed(2)
     origins, targets = 3 * torch.randn(2, count, 3, generator=generator, dtype=torch.float64)
     lengths = 0.2 + torch.rand(count, 1, generator=generator, dtype=torch.float64)
@@ -44,7 +44,7 @@ def traced(gaussians: RawGaussians, rays: Rays, *, sh_degree: int = 3, near: flo
 
 
 def with_gradients(function: Callable[..., Traced], gaussians: RawGaussians, rays: Rays, degree: int) -> list[Tensor]:
-    """Everything that comes back, and the gradients of a random sum of it."""
+    """All outputs, and the gradients of a random sum of them."""
     contributions = torch.zeros_like(gaussians.means[:, :2])
     leaves = [tensor.detach().clone().requires_grad_() for tensor in (*gaussians, *rays, contributions)]
     own, own_rays = RawGaussians(*leaves[:5]), Rays(*leaves[5:7])
@@ -117,7 +117,7 @@ def test_hits_that_are_not_kept_are_found_again(scales: int, monkeypatch: pytest
 
 def test_thin_ellipsoids_have_the_gradients_of_float64_in_float32() -> None:
     gaussians, rays = cloud(40, ELLIPSOIDS), rays_around(200)
-    # As thin beside what is met as training leaves them: a millionth of a deviation of the other axes.
+    # As thin as training leaves them: a millionth of the standard deviation of the other axes.
     thin = gaussians._replace(log_scales=gaussians.log_scales - torch.tensor([14.0, 0.0, 0.0]))
     narrow, narrow_rays = RawGaussians(*(x.float() for x in thin)), Rays(*(x.float() for x in rays))
     found = with_gradients(trace, narrow, narrow_rays, 2)
@@ -161,7 +161,7 @@ def test_a_ray_that_is_none_meets_nothing(direction: tuple[float, float, float])
 
 
 def one_disc(**changes: Tensor) -> RawGaussians:
-    """A nearly opaque disc of deviation 1 in the plane z = 2, that is white."""
+    """A nearly opaque, white disc of standard deviation 1 in the plane z = 2."""
     values = {
         "means": torch.tensor([[0.0, 0.0, 2.0]]),
         "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
@@ -208,7 +208,7 @@ def test_hits_before_the_near_distance_are_left_out() -> None:
 def test_nothing_is_met_behind_what_is_opaque() -> None:
     row = RawGaussians(*(x.repeat(50, *(1,) * (x.dim() - 1)) for x in one_disc()))
     row.means[:, 2] = torch.linspace(1, 5, 50)
-    # Each lets a hundredth of the light through: the third would take it below 1e-4.
+    # Each transmits a hundredth of the light: the third would reduce it to less than 1e-4.
     assert int(traced(row, ray((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), sh_degree=0).hits) == 2
 
 
@@ -266,9 +266,9 @@ def test_the_length_of_a_direction_changes_nothing(scales: int, dtype: torch.dty
 
 
 def far_discs(count: int) -> tuple[RawGaussians, Rays]:
-    """Discs far from the origin of the world in single precision, and a ray towards each.
+    """Discs far from the world's origin in single precision, and a ray towards each.
 
-    They are so small that their boxes round to nothing, and eight have each centre, so that those above them do too.
+    Their boxes round to points. Eight discs share each centre, so that the boxes of their parents are points too.
     """
     generator = torch.Generator().manual_seed(3)
     draws = torch.randn(3, count, 3, generator=generator, dtype=torch.float64)

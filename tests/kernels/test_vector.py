@@ -1,4 +1,4 @@
-"""Vectors in kernels, held against NumPy lane by lane."""
+"""Vectors in kernels, compared with NumPy lane by lane."""
 
 from __future__ import annotations
 

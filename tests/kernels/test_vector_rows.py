@@ -1,4 +1,4 @@
-"""Rows in memory and vectors of their columns, held against NumPy."""
+"""Rows in memory and vectors of their columns, compared with NumPy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results that must not depend on the number of threads."""
+"""Checks that results do not depend on the number of threads."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MOST = numba.config.NUMBA_NUM_THREADS
 
 
 def assert_threads_change_no_bit(compute: Callable[[], Iterable[Tensor]]) -> None:
-    """`compute` gives the same tensors on one thread and on all that there are."""
+    """Asserts that `compute` gives the same tensors on one thread and on all available ones."""
     assert MOST > 1
     found = []
     for threads in (1, MOST):

@@ -1,4 +1,4 @@
-"""Values and gradients of CUDA kernels held against those of their twins, on a GPU or in Numba's simulator."""
+"""Comparison of values and gradients of CUDA kernels with those of their twins, on a GPU or in Numba's simulator."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ TOLERANCE = {torch.float64: 1e-9, torch.float32: 2e-4}
 
 
 def on_a_device_or_skipped() -> None:
-    """Skips the test module that asks where there is neither a GPU nor the simulator."""
+    """Skips the calling test module if there is neither a GPU nor the simulator."""
     if not SIMULATED and (problem := cuda_problem()) is not None:
         pytest.skip(f"no GPU to run the CUDA kernels on: {problem}", allow_module_level=True)
 
 
 def many(few: int, number: int) -> int:
-    """A size for the simulator, and one for a GPU."""
+    """`few` in the simulator, `number` on a GPU."""
     return few if SIMULATED else number
 
 
 def on_device(value: Any) -> Any:
-    """Tensors, and records of tensors, on the device under test, as new leaves."""
+    """Tensors, and records of tensors, copied to the device under test as new leaves."""
     if isinstance(value, Tensor):
         return value.detach().to(DEVICE).requires_grad_(value.requires_grad)
     if isinstance(value, tuple) and hasattr(value, "_fields"):
@@ -44,7 +44,7 @@ def on_device(value: Any) -> Any:
 
 
 def close(found: Tensor, expected: Tensor, factor: float = 1.0) -> None:
-    """Agreement relative to the largest entry, because gradients of one tensor differ by orders of magnitude."""
+    """Asserts agreement relative to the largest entry, as gradients of one tensor differ by orders of magnitude."""
     assert found.shape == expected.shape
     if expected.numel() == 0:
         return
@@ -59,7 +59,7 @@ def close(found: Tensor, expected: Tensor, factor: float = 1.0) -> None:
 def check_gradients(
     found: Sequence[Tensor], expected: Sequence[Tensor], inputs: Sequence[Tensor], expected_inputs: Sequence[Tensor]
 ) -> None:
-    """Gradients of random sums of the outputs agree."""
+    """Asserts that the gradients of random sums of the outputs agree."""
     cotangents = [draw(*tensor.shape, seed=90 + i).to(tensor.dtype) for i, tensor in enumerate(expected)]
     gradients = torch.autograd.grad(found, inputs, [c.to(DEVICE) for c in cotangents], allow_unused=True)
     wanted = torch.autograd.grad(expected, expected_inputs, cotangents, allow_unused=True)

@@ -1,8 +1,8 @@
-"""Numba's simulator with threads that take turns: each runs to its next barrier, in an order that is drawn every time.
+"""Numba's simulator with cooperative threads: each runs to its next barrier, in an order that is drawn every time.
 
-The simulator has a thread of the system for each of CUDA's. They fight over the interpreter, and a barrier costs far
-more than what lies between two of them. Here they are greenlets. As the order differs from launch to launch, so do
-results that depend on it, and a kernel that lacks a barrier reads what is not there yet.
+The simulator starts an operating system thread for each of CUDA's. They contend for the interpreter, and a barrier
+costs far more than the work between two of them. Here they are greenlets. As the order differs from launch to launch,
+so do results that depend on it, and a kernel that lacks a barrier reads values that have not been written yet.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ ORDER = random.Random(0)
 
 
 class Turn(greenlet):
-    """One of CUDA's threads, with what kernels ask the simulator's own class for."""
+    """One CUDA thread, with the attributes that kernels request of the simulator's own class."""
 
     def __init__(self, block: kernel.BlockManager, block_index: tuple[int, ...], index: tuple[int, ...]) -> None:
         super().__init__(block._f)
@@ -29,7 +29,7 @@ class Turn(greenlet):
         self.thread_id = index[0] + width * (index[1] + height * index[2])
 
     def syncthreads(self) -> None:
-        """Gives all others their turn."""
+        """Yields to all other threads."""
         self.parent.switch()
 
     syncthreads_count = kernel.BlockThread.syncthreads_count
@@ -38,7 +38,7 @@ class Turn(greenlet):
 
 
 def run_block(self: kernel.BlockManager, block_index: tuple[int, ...], *arguments: Any) -> None:
-    """Runs a block from barrier to barrier; raises what a thread raises."""
+    """Runs a block from barrier to barrier and raises the errors of its threads."""
     threads = [Turn(self, block_index, index) for index in np.ndindex(*self._block_dim)]
     ORDER.shuffle(threads)
     for thread in threads:
@@ -50,6 +50,6 @@ def run_block(self: kernel.BlockManager, block_index: tuple[int, ...], *argument
 
 
 def take_turns() -> None:
-    """Lets all kernels run so that the simulator of this process starts from now on."""
+    """Makes the simulator of this process run all kernels with cooperative threads."""
     kernel.BlockManager.run = run_block
     kernelapi.threading = SimpleNamespace(current_thread=getcurrent)

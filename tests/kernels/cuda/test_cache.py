@@ -1,4 +1,4 @@
-"""Machine code comes from the disk: another process compiles nothing, and a damaged or foreign file does no harm."""
+"""Machine code is loaded from the disk: other processes compile nothing, and damaged or foreign files do no harm."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ print(code.entry, hashlib.sha256(code.cubin).hexdigest())
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where this test's machine code is kept."""
+    """Folder that holds this test's machine code."""
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
     return tmp_path
 
@@ -84,7 +84,7 @@ def images(factor: float = 2.0, *, arguments: str = "real1") -> ImageCache:
 
 
 def made(cached: ImageCache, log: pytest.LogCaptureFixture) -> tuple[Any, int]:
-    """The machine code, and how many times the compiler ran for it."""
+    """The machine code, and the number of times the compiler ran for it."""
     log.clear()
     with log.at_level(logging.INFO, logger="glassplat.kernels"), without_device(CAPABILITY):
         code = cached.machine_code(CAPABILITY)
@@ -174,7 +174,7 @@ def test_another_kernel_that_was_written_at_the_same_time_is_not_loaded(
 def test_where_the_package_cannot_be_written_machine_code_lies_elsewhere(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    (folder / "file").touch()  # No folder can be made in it, whoever asks.
+    (folder / "file").touch()  # No user, not even root, can create a folder in it.
     monkeypatch.setattr(config, "CACHE_DIR", str(folder / "file"))
     monkeypatch.setattr(cpu_cache.UserFolder, "from_function", classmethod(lambda *arguments: None))
     monkeypatch.setattr(caching.InTreeCacheLocator, "ensure_cache_path", refused)

@@ -1,4 +1,4 @@
-"""Every CUDA kernel compiles for three generations of GPUs, without a GPU; prints what each of them takes."""
+"""Every CUDA kernel compiles for three generations of GPUs, without a GPU; prints the resources each of them uses."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NAMED = {kernel.name: kernel for kernel in KERNELS}
 
 @cache
 def compiled(name: str) -> dict[tuple[int, int], str]:
-    """PTX of a kernel for each generation; to compile one takes seconds."""
+    """PTX of a kernel for each generation, cached because compiling takes seconds."""
     return dict(zip(CAPABILITIES, ptx_of(NAMED[name]), strict=True))
 
 
@@ -67,7 +67,7 @@ Tree = str | tuple[str, list[Any]]
 
 
 def exponent_of(ptx: str) -> Tree:
-    """How the first exponent is computed: the names of instructions and what they take, down to what is loaded."""
+    """Expression tree of the first exponent: names of instructions and their operands, down to loaded values."""
     body = ptx[ptx.index(".entry") :]
     made = {
         register: (name, arguments.split(", "))
@@ -86,7 +86,7 @@ def exponent_of(ptx: str) -> Tree:
 
 
 def agree(pattern: Tree, other: Tree, known: dict[str, Tree]) -> bool:
-    """Whether both compute the same: what `pattern` loads, the other may have computed, the same wherever it stands."""
+    """True if both compute the same value; a leaf of `pattern` may stand for any one subexpression of `other`."""
     if isinstance(pattern, str):
         is_another = any(value == other for name, value in known.items() if name != pattern)
         return not is_another and known.setdefault(pattern, other) == other
@@ -106,7 +106,7 @@ def agree(pattern: Tree, other: Tree, known: dict[str, Tree]) -> bool:
 def test_every_pass_computes_the_same_coverage(other: str) -> None:
     first, second = (exponent_of(compiled(name)[9, 0]) for name in ("composite_forward_4_float32", other))
     assert agree(first, second, {}), (first, second)
-    # Nothing is left to the linker, which could fuse a product and a sum.
+    # No contraction is left to the linker, which could fuse a product and a sum.
     assert str(first).count("fma.rn.f32") == 2
     assert "add" not in str(first)
 

@@ -1,4 +1,4 @@
-"""How arguments are handed to a kernel, against Numba's own way of doing it."""
+"""Marshalling of kernel arguments, compared with Numba's own."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def numbas_values(type_: Any, value: Any) -> list[Any]:
 
 
 class Driver:
-    """Stands in for the driver: notes each call, and reads the arguments of a launch as a GPU's driver would."""
+    """Stands in for the driver: records each call, and reads the arguments of a launch as a GPU's driver would."""
 
     CUcontext, CUfunction = int, int
 
@@ -88,7 +88,7 @@ OWN, OTHER, SLOTS, STREAM = 11, 22, 11, 4660
 
 @pytest.fixture
 def gpu(monkeypatch: pytest.MonkeyPatch) -> Driver:
-    """A GPU that is not there, and takes every launch."""
+    """A stand-in for a GPU that accepts every launch."""
     found = Driver()
     library = SimpleNamespace(get_kernel=lambda entry: SimpleNamespace(handle=77))
     monkeypatch.setattr(launch, "driver", found)
@@ -102,7 +102,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> Driver:
 
 
 def handed_over(gpu: Driver, type_: Any, value: Any) -> list[bytes]:
-    """The slots of a launch with an argument of that type, and an array without elements before and behind it."""
+    """The slots of a launch for an argument of that type, passed between two arrays without elements."""
     nothing, before, behind = types.Array(types.int16, 1, "C"), 7, 7
     gpu.slots = before + behind + (5 + 2 * type_.ndim if isinstance(type_, types.Array) else 1)
     made = Kernel(lambda first, argument, last: None, "nothing", (nothing, type_, nothing))
@@ -147,7 +147,7 @@ def test_none_stands_for_an_array_without_elements(gpu: Driver, ndim: int) -> No
     given, own = handed_over(gpu, type_, tensor), handed_over(gpu, type_, None)
     assert own[:4] == given[:4]
     assert int.from_bytes(own[4], "little") == tensor.data_ptr() == 0
-    # No element, no step from one to the next: shapes agree, strides do not count.
+    # Without elements no stride is ever used: shapes agree, strides do not matter.
     assert own[5 : 5 + ndim] == given[5 : 5 + ndim] == [bytes(SLOT)] * ndim
 
 

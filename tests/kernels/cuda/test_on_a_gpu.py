@@ -1,4 +1,4 @@
-"""The whole way from Gaussians to gradients on a GPU, at sizes that neither the simulator nor the twins can bear."""
+"""The whole pipeline from Gaussians to gradients on a GPU, at sizes too large for the simulator and the twins."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CPU, DEVICE = torch.device("cpu"), torch.device("cuda")
 
 
 class Rendered(NamedTuple):
-    """Bins, outputs and gradients of one camera."""
+    """Bins, outputs and gradients for one camera."""
 
     bins: TileBins
     outputs: list[Tensor]
@@ -41,7 +41,7 @@ class Rendered(NamedTuple):
 
 
 def gaussians(count: int, *, size: float) -> list[Tensor]:
-    """Gaussians before a camera at the origin, of about this size at a distance of 4."""
+    """Gaussians in front of a camera at the origin, of about this size at a distance of 4."""
     means = torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64) + torch.tensor([2.0, 1.5, 0.8]) * draw(count, 3, seed=1)
     log_scales = torch.log(torch.tensor(size)) + 0.5 * draw(count, 3, seed=3)
     return [means, draw(count, 4, seed=2), log_scales, draw(count, seed=4), 0.4 * draw(count, 16, 3, seed=5)]
@@ -70,7 +70,7 @@ def rendered(tensors: list[Tensor], width: int, height: int, *, device: torch.de
 
 
 def check_statistics(found: Tensor, expected: Tensor, tolerance: float = 1e-3) -> None:
-    """Length, direction and sign of the error: a bias that no single entry shows adds up over many."""
+    """Checks norm, direction and mean of the error: a bias too small to show in single entries adds up over many."""
     own, want = found.to(CPU, torch.float64).flatten(), expected.flatten()
     assert torch.isfinite(own).all()
     assert abs(own.norm() / want.norm() - 1) < tolerance
@@ -80,7 +80,7 @@ def check_statistics(found: Tensor, expected: Tensor, tolerance: float = 1e-3) -
 
 
 def check_against_the_cpu(tensors: list[Tensor], width: int, height: int) -> None:
-    """float32 on the GPU and float64 on the CPU agree."""
+    """Checks that float32 on the GPU agrees with float64 on the CPU."""
     found = rendered(tensors, width, height, device=DEVICE, dtype=torch.float32)
     expected = rendered(tensors, width, height, device=CPU, dtype=torch.float64)
     assert len(expected.bins.pair_splats) > 0
@@ -121,7 +121,7 @@ def test_ten_million_pairs() -> None:
 
 
 def check_bins(bins: TileBins) -> None:
-    """Every pair is in one tile, and is found from its splat."""
+    """Checks that every pair belongs to exactly one tile and can be found from its splat."""
     pairs = len(bins.pair_splats)
     assert int(bins.tile_offsets[-1]) == int(bins.splat_offsets[-1]) == pairs
     assert torch.equal(bins.pair_slots.sort().values, torch.arange(pairs, dtype=torch.int32, device=DEVICE))
@@ -143,7 +143,7 @@ def test_every_method_trains_and_is_opened_with_all_corrections(method: str, tmp
     dataset = load_dataset(write_tiny_capture(tmp_path / "capture"))
     recipe = replace(recipe_of(method), exposure=PhotoExposure(1e-3), poses=PoseRefinement(1e-4))
     if hasattr(recipe, "least_iterations"):
-        recipe = replace(recipe, least_iterations=1)  # So short a run would not reach its reflections.
+        recipe = replace(recipe, least_iterations=1)  # A run this short would not reach its reflections.
     model = Training(dataset, recipe, iterations=80, device=DEVICE.type, output=tmp_path / "run").run()
     run = open_run(tmp_path / "run", DEVICE.type)
     for view in run.dataset.test:

@@ -34,7 +34,7 @@ on_a_device_or_skipped()
 
 
 def two_panes(dtype: torch.dtype) -> tuple[Panes, Tensor]:
-    """Two rectangles that overlap on screen, and intrinsics."""
+    """Two rectangles that overlap on screen, and the intrinsics."""
     centers = torch.tensor([[0.0, 0.1, 3.0], [0.6, 0.0, 2.5]])
     normals = torch.nn.functional.normalize(torch.tensor([[0.1, 0.2, -1.0], [-0.8, 0.0, -0.6]]), dim=1)
     first = torch.nn.functional.normalize(
@@ -78,7 +78,7 @@ def test_layer_slopes(linear: bool, dtype: torch.dtype) -> None:
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_slopes_at(dtype: torch.dtype) -> None:
-    """At centres within the image, far beyond it and at NaN, before and behind the surface."""
+    """At centres inside the image, far outside it and at NaN, in front of and behind the surface."""
     slopes, near = (draw(HEIGHT, WIDTH, seed=seed).to(dtype) for seed in (1, 2))
     means, depths = 30 * draw(2, many(20, 2000), 2, seed=3).to(dtype), draw(2, many(20, 2000), seed=4).to(dtype)
     means[0, 0, 0], means[1, 1, 1], means[0, 2], means[1, 3] = torch.nan, torch.nan, torch.inf, -torch.inf
@@ -108,7 +108,7 @@ def test_gradient_conflict(size: tuple[int, int], cell: int, has_strength: bool,
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("size", [(many(9, HEIGHT), many(20, WIDTH)), (1, 7), (7, 1)])
 def test_inside_of_panes(size: tuple[int, int], dtype: torch.dtype) -> None:
-    """Stripes of two panes and of none, with holes where nothing reflects."""
+    """Stripes of two panes and of no pane, with holes where nothing reflects."""
     pane = (torch.arange(size[1]).expand(size) // 6 % 3 - 1).int().contiguous()
     strength = (draw(*size, seed=3).to(dtype) + 1.8).clamp(min=0)
     found = panes_operation.inside_panes(pane.to(DEVICE), strength.to(DEVICE))
@@ -118,7 +118,7 @@ def test_inside_of_panes(size: tuple[int, int], dtype: torch.dtype) -> None:
 
 
 def three_planes(dtype: torch.dtype) -> tuple[Planes, Camera]:
-    """Planes of raw normals of any length, one of which the camera sees from behind."""
+    """Planes with raw normals of any length, one of which faces away from the camera."""
     planes = Planes(*(draw(3, n, seed=n + i) for i, n in enumerate((3, 3))), draw(3, seed=5), draw(3, 3, seed=6),
                     draw(3, 2, seed=7).exp(), (1, 2, 3))  # fmt: skip
     pose = random_cameras(1).cam_from_world[0].detach()

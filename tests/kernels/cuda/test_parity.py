@@ -47,7 +47,7 @@ from tests.kernels.test_screen_statistics import add_views_in_torch
 on_a_device_or_skipped()
 
 pytestmark = [
-    # The simulator computes with NumPy's scalars, which warn where a GPU gives infinity.
+    # The simulator computes with NumPy's scalars, which warn where a GPU returns infinity.
     pytest.mark.filterwarnings("ignore::RuntimeWarning"),
 ]
 
@@ -134,7 +134,7 @@ def test_bin_tiles_of_hardly_any_splats(random_splats: SplatMaker, count: int) -
 
 
 def dots(cameras: int, count: int, size: tuple[int, int]) -> Splats:
-    """Splats of which each covers a pixel and no other, so that there is one answer; some lie at the same depth."""
+    """Splats that each cover exactly one pixel, so that the result is unique; some lie at the same depth."""
     generator = torch.Generator().manual_seed(7)
     pixels = torch.rand(cameras, count, 2, generator=generator) * torch.tensor(size)
     ones = torch.ones(cameras, count)
@@ -148,7 +148,7 @@ def dots(cameras: int, count: int, size: tuple[int, int]) -> Splats:
     ("cameras", "count", "size"),
     [
         (0, 3, (20, 17)), (2, 0, (20, 17)), (1, 1, (70, 50)), (1, 30, (20, 17)), (3, 5, (33, 17)),
-        # So many tiles take longer numbers, and in the simulator seconds.
+        # This many tiles need wider integers, and take seconds in the simulator.
         *([] if SIMULATED else [(1, 9, (16 * 40_000, 1)), (2, 3000, (300, 200))]),
     ],
     ids=str,
@@ -206,7 +206,7 @@ Size = tuple[int, int]
 def blended(
     splats: Splats, channels: Tensor, marks: Tensor, absgrad: Tensor, deviation: Deviation | None, own: bool, size: Size
 ) -> list[Tensor]:
-    """Image, alpha, mask and deviation of all cameras with glass; the last camera's first tile is left out."""
+    """Image, alpha, mask and deviation of all cameras with glass; the last camera's first tile is masked out."""
     binning, blending = (tiles_operation, composite_operation) if own else (tiles_twin, composite_twin)
     primary = splats.depths.shape[1] - marks.shape[1]
     mask = torch.ones(splats.depths.shape[0], *tiles_operation.tile_grid(*size), dtype=torch.bool)
@@ -217,14 +217,14 @@ def blended(
 
 
 def check_composite(splats: Splats, glass: int, mean: bool | None, size: Size) -> None:
-    """All outputs and gradients agree, the last `glass` splats being glass, with a deviation unless `mean` is None."""
+    """Checks all outputs and gradients. The last `glass` splats are glass; `mean` None asks for no deviation."""
     (cameras, count), dtype = splats.depths.shape, splats.depths.dtype
     splats = Splats(*(tensor.requires_grad_(i < 3) for i, tensor in enumerate(splats)))
     channels = draw(cameras, count, 4, seed=11).to(dtype).requires_grad_()
     marks = draw(cameras, glass, seed=12).to(dtype).sigmoid().requires_grad_()
     where = draw(cameras, *reversed(size), seed=13).to(dtype).clamp(min=0)
     if mean is not None:
-        # Where one splat alone is blended, it lies at the mean, and rounding decides on which side.
+        # Where a single splat is blended, its value is the mean, and rounding decides on which side it lies.
         everywhere = Deviation(3, torch.ones_like(where), mean)
         where = where * (blended(splats, channels, marks, None, everywhere, False, size)[3].detach() > 1e-6)
     absgrad = torch.zeros(cameras, count, 2, dtype=dtype, requires_grad=True)
@@ -246,7 +246,7 @@ def check_composite(splats: Splats, glass: int, mean: bool | None, size: Size) -
     ("mean", "dtype", "size"),
     [
         (None, torch.float64, (WIDTH, HEIGHT)),
-        # Few rows are enough for the simulator.
+        # A few rows suffice for the simulator.
         (True, torch.float64, (19, 2)),
         (False, torch.float32, (18, 2)),
     ]
@@ -308,7 +308,7 @@ def test_screen_statistics(weight: str, dtype: torch.dtype) -> None:
     found = on_device(expected)
     for direct in (True, False):
         views = Views(v_means, v_absgrad, radii, 40, 30, weights[weight], direct)
-        # In the simulator, tensors on the "device" are the CPU's, whose kernel the operation would take.
+        # In the simulator, tensors on the "device" are CPU tensors, for which the operation would use the CPU's kernel.
         kernels_for("project", DEVICE).add_views(found, on_device(views))
         add_views_in_torch(expected, views)
     for value, want in zip(found, expected, strict=True):
@@ -330,7 +330,7 @@ def test_photometric(dtype: torch.dtype, differentiated: bool) -> None:
 
 
 def directions_of(count: int) -> Tensor:
-    """Random directions, then those of all edges, corners and faces of a cube, and a little next to each."""
+    """Random directions, then those of all edges, corners and faces of a cube, each with a slightly perturbed copy."""
     whole = torch.cartesian_prod(*3 * [torch.tensor([-1.0, 0.0, 1.0])])
     whole = whole[whole.abs().sum(1) > 0]
     return torch.cat([draw(count, 3, seed=6).float(), whole + 0.01 * draw(len(whole), 3, seed=7).float()])
@@ -413,7 +413,7 @@ def test_adam(columns: bool, dtype: torch.dtype) -> None:
 
 @pytest.mark.parametrize("count", [1, 5, 6, 11])
 def test_adam_of_many_parameters(count: int) -> None:
-    """Blocks of threads, and launches of several parameters, end within the list."""
+    """Boundaries of thread blocks, and of launches of several parameters, fall inside the list."""
     shapes = [(256,), (3, 4, 3), (257,), (0, 3), (1, 3), (130, 2), (7,), (2, 2, 3), (1,), (512,), (300,)][:count]
     found, expected = [], []
     for i, shape in enumerate(shapes):

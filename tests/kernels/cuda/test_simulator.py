@@ -1,4 +1,4 @@
-"""Runs the parity tests in Numba's CUDA simulator, in a process of their own: it is chosen when Numba is imported."""
+"""Runs the parity tests in Numba's CUDA simulator, in a separate process: it is chosen when Numba is imported."""
 
 from __future__ import annotations
 

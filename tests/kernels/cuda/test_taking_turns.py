@@ -1,4 +1,4 @@
-"""Threads that take turns give what a GPU gives, and show what depends on their order.
+"""Cooperative threads give the same results as a GPU, and reveal results that depend on their order.
 
 `test_simulator.py` runs this file once more with the simulator on.
 """

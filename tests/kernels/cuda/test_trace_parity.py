@@ -36,7 +36,7 @@ pytestmark = [pytest.mark.filterwarnings("ignore::RuntimeWarning")]
 
 
 def check(gaussians: RawGaussians, rays: Rays, degree: int) -> list[Tensor]:
-    """Holds what comes back, and all gradients, against the twin; returns what comes back."""
+    """Compares the outputs and all gradients with the twin; returns the outputs."""
     found = with_gradients(trace, on_device(gaussians), on_device(rays), degree)
     expected = with_gradients(twin, gaussians, rays, degree)
     for tensor, other in zip(found, expected, strict=True):

@@ -1,4 +1,4 @@
-"""How often a frame and a training step wait for the GPU, counted on a stand-in for one."""
+"""Number of times a frame and a training step wait for the GPU, counted on a stand-in for one."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Waits:
 
 
 def step(recipe: PlanarRecipe | SplatRecipe, stage: int, scene: Scene, view: View, waits: Waits) -> list[str]:
-    """Where the second step on a view waits; the first one makes what stays."""
+    """Waits of the second step on a view; the first one creates the cached tensors."""
     state, chosen = TrainState(scene, seed=0), recipe.stages(seed=0)[stage]
     for _ in range(2):
         waits.places.clear()

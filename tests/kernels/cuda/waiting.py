@@ -32,7 +32,7 @@ KERNEL_WAITS = {"bin_tiles": 1, "trace_gradients": 1}
 
 
 class Waits(TorchDispatchMode):
-    """Notes where the package would wait for a GPU, or copy numbers to it and wait for that; and which kernels run."""
+    """Records where the package would wait for a GPU, including blocking copies to it, and which kernels run."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -43,7 +43,7 @@ class Waits(TorchDispatchMode):
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Notes nothing meanwhile."""
+        """Suspends recording."""
         self.pauses += 1
         try:
             yield
@@ -79,7 +79,7 @@ class Waits(TorchDispatchMode):
 
 
 class Reads(TorchFunctionMode):
-    """Notes what never reaches the dispatcher: a tensor that becomes a list or an array."""
+    """Records reads that never reach the dispatcher: conversions of tensors to lists or arrays."""
 
     def __init__(self, waits: Waits) -> None:
         super().__init__()
@@ -96,7 +96,7 @@ class Reads(TorchFunctionMode):
 
 
 def mirrored_views(centers: Tensor, raw_normals: Tensor, pose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """As the kernel of that name, which there is for GPUs only."""
+    """Stands in for the kernel of that name, which exists only for GPUs."""
     normals = torch.nn.functional.normalize(raw_normals, dim=1)
     eye = -pose[:3, :3].T @ pose[:3, 3]
     facing = normals * ((eye - centers) * normals).sum(1, keepdim=True).sign()
@@ -114,7 +114,7 @@ def mirrored_views_gradients(*tensors: Tensor) -> tuple[Tensor, ...]:
 def panes_in_camera(
     centers: Tensor, raw_normals: Tensor, tangents: Tensor, pose: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """As the kernel of that name."""
+    """Stands in for the kernel of that name."""
     rest = centers[:, 0], tangents, centers[:, :2], tuple(range(1, 1 + len(centers)))
     planes, rotation = Planes(centers, raw_normals, *rest), pose[:3, :3]
     return centers @ rotation.T + pose[:3, 3], planes.normals @ rotation.T, torch.stack(planes.axes(), 1) @ rotation.T
@@ -124,7 +124,7 @@ GPU_ONLY = {"panes": (mirrored_views, mirrored_views_gradients, panes_in_camera)
 
 
 def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch, waits: Waits) -> None:
-    """Lets the program choose as on a GPU, count for its kernels what theirs do, and copy without waiting."""
+    """Makes the program choose as on a GPU, count the waits of its kernels, and copy without waiting."""
     module_of = devices._module
 
     def counted(operation: str, folder: str) -> SimpleNamespace:
@@ -142,7 +142,7 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch, waits: Waits) -> None:
         return SimpleNamespace(**{name: run(name) for name, value in known.items() if callable(value)})
 
     monkeypatch.setattr(devices, "_module", counted)
-    # Its kernel is not asked for on a CPU.
+    # On a CPU its kernel is not requested.
     monkeypatch.setattr(densify, "add_views", add_views_in_torch)
-    # The function itself, as others import it by its name.
+    # The code of the function is replaced because other modules import it by name.
     monkeypatch.setattr(camera.synchronises, "__code__", (lambda device: True).__code__)
