@@ -1,4 +1,4 @@
-"""What Gaussians add to views."""
+"""Contributions of Gaussians to views."""
 
 from __future__ import annotations
 

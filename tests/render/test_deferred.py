@@ -1,4 +1,4 @@
-"""Deferred shading: Eq. 3 of 3DGS-DR in a picture, its gradients, and its limits."""
+"""Deferred shading: Eq. 3 of 3DGS-DR in an image, its gradients, and its limits."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.render.tiny_scene import camera_at, in_single_precision, random_gauss
 
 
 def glossy(strength: float = 0.3, *, count: int = 14, size: int = 4) -> Scene:
-    """Random Gaussians before the camera that mirror a random environment; float64."""
+    """Random Gaussians in front of the camera that reflect a random environment; float64."""
     primary = random_gaussians(count, (0.0, 0.0, 3.0), seed=4)
     raw = 2 * torch.randn(6, size, size, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     strengths = torch.full((count,), math.log(strength / (1 - strength)), dtype=torch.float64)
@@ -27,7 +27,7 @@ def glossy(strength: float = 0.3, *, count: int = 14, size: int = 4) -> Scene:
 
 
 def wall(tilt: float) -> Scene:
-    """One huge, flat, opaque Gaussian at z = 3 that mirrors everything, turned about the vertical axis."""
+    """One huge, flat, opaque Gaussian at z = 3 that reflects everything, rotated about the vertical axis."""
     primary = Gaussians(
         means=torch.tensor([[0.0, 0.0, 3.0]], dtype=torch.float64),
         quats=torch.tensor([[math.cos(tilt / 2), 0.0, math.sin(tilt / 2), 0.0]], dtype=torch.float64),
@@ -41,7 +41,7 @@ def wall(tilt: float) -> Scene:
 
 
 def rolled(camera: Camera) -> Camera:
-    """The camera turned about an oblique axis, so that no world axis is an image axis."""
+    """The camera rotated about an oblique axis, so that no world axis is an image axis."""
     half = 0.05
     turn = torch.linalg.matrix_exp(
         2 * half * torch.tensor([[0, -0.5, 0.7], [0.5, 0, -0.6], [-0.7, 0.6, 0]], dtype=torch.float64)
@@ -59,7 +59,7 @@ def test_a_flat_mirror_shows_the_environment_in_the_mirrored_direction(tilt: flo
     away = view_directions(camera)
     mirrored = away - 2 * (away @ normal)[..., None] * normal
     expected = torch.sigmoid(cube_lookup(wall(tilt).environment.raw, mirrored))
-    # An alpha is at most 0.99.
+    # Alphas are at most 0.99.
     torch.testing.assert_close(frame.rgb, 0.99 * expected, atol=0.02, rtol=0)
     normals = torch.nn.functional.normalize(frame.layers["normal"], dim=-1)
     torch.testing.assert_close(normals, -normal.expand_as(normals), atol=1e-6, rtol=0)

@@ -1,4 +1,4 @@
-"""Taking a reflection off a photograph, and making a mirror of a pane."""
+"""Removing a reflection from a photograph, and turning a pane into a mirror."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def mixed(
 def model(
     behind: torch.Tensor, mirrored: torch.Tensor, share: torch.Tensor, blend: Blend, tint: torch.Tensor = CLEAR
 ) -> Frame:
-    """A rendered view [H, W, 3] of something behind panes that add a share [H, W] of light."""
+    """A rendered view [H, W, 3] of a transmission behind panes that add a share [H, W] of reflected light."""
     layers = {"without_panes": behind, "share": share} | ({} if tint is CLEAR else {"tint": tint})
     return Frame(mixed(behind, mirrored, share[..., None], blend, tint), layers)
 
@@ -45,7 +45,7 @@ def model(
 def case(
     strength: float, blend: Blend, reflection: float = 0.3, glass: torch.Tensor = CLEAR
 ) -> tuple[Frame, torch.Tensor, torch.Tensor]:
-    """A blurred model of a pane in the left half, a photograph, and what is really behind the pane."""
+    """A blurred model of a pane in the left half, a photograph, and the true transmission behind the pane."""
     truth, mirrored = 0.3 + 0.4 * torch.rand(*SIZE, 3), torch.full((*SIZE, 3), reflection)
     share = torch.where(torch.arange(SIZE[1]) < 16, strength, 0.0).expand(*SIZE)
     tint = CLEAR if glass is CLEAR else torch.where(share[..., None] > 0, glass, CLEAR)
@@ -135,7 +135,7 @@ def test_what_the_exposure_made_of_the_photograph_is_left_as_it_is() -> None:
     expected = exposures.apply(truth, "dark.png")
     torch.testing.assert_close(result.float() / 255, expected, rtol=0, atol=4 / 255)
     assert torch.equal(result[:, 16:], dark[:, 16:])
-    # A photograph that was held out has the exposure of its neighbours.
+    # A held-out photograph has the exposure of its neighbours.
     neighbours = Exposures(affine.expand(2, 3, 4), ("a.png", "c.png"))
     held_out = dereflected_photo(frame, dark, "linear", exposures=neighbours, name="b.png")
     assert torch.equal(held_out, result)

@@ -1,4 +1,4 @@
-"""`Splat` draws discs where the Gaussians are flat."""
+"""`Splat` draws discs for flat Gaussians."""
 
 from __future__ import annotations
 

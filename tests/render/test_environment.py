@@ -1,4 +1,4 @@
-"""Environments as panoramas and back, and turned with the world."""
+"""Conversion of environments to panoramas and back, and rotation with the world."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def smooth(size: int = SIZE) -> Environment:
 
 
 def faces_only() -> Environment:
-    """Each face in a colour of its own."""
+    """A different colour for each face."""
     colors = torch.linspace(-2, 2, 18).reshape(6, 1, 1, 3)
     return Environment(colors.expand(6, 4, 4, 3).contiguous())
 

@@ -1,4 +1,4 @@
-"""`rasterization` compared with the PyTorch functions that gsplat tests its own kernels with, forward and backward."""
+"""`rasterization`, forward and backward, compared with the PyTorch functions that gsplat tests its own kernels with."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.render.test_rasterization import CAMERAS, COUNT, FAR, HEIGHT, INTRINS
 
 @pytest.fixture(scope="module")
 def theirs() -> ModuleType:
-    """gsplat's functions by themselves: importing the package would look for a CUDA toolkit."""
+    """gsplat's functions without their package, whose import would search for a CUDA toolkit."""
     package = importlib.util.find_spec("gsplat")
     if package is None or package.origin is None:
         pytest.skip("gsplat is not installed")
@@ -59,7 +59,7 @@ def rendered(theirs: ModuleType, of: dict[str, Tensor], degree: int | None) -> t
 
 
 def along_motions(gradient: Tensor, viewmats: Tensor) -> Tensor:
-    """[C, 6] slopes along turns and shifts of each camera; only along these is a view matrix a camera's."""
+    """[C, 6] derivatives along rotations and translations of each camera; only these keep a view matrix valid."""
     motions = torch.zeros(6, 4, 4, dtype=torch.float64)
     for axis in range(3):
         motions[axis, (axis + 1) % 3, (axis + 2) % 3], motions[axis, (axis + 2) % 3, (axis + 1) % 3] = -1, 1

@@ -1,4 +1,4 @@
-"""What panes show of who took the photograph: as if a body stood at the camera, and nobody anywhere else."""
+"""Reflections of the photographer in panes: as if a body stood at the camera, visible only in the panes."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ CAMERA = tilted_camera()
 
 
 def body() -> Gaussians:
-    """Around the photographer, of one colour from all sides; a part reaches to the front."""
+    """A body around the photographer, of one colour from all sides, part of which extends to the front."""
     drawn = random_gaussians(10, (0.0, 0.1, -0.5), seed=5)
     return replace(drawn, channels={}, sh=drawn.sh[:, :1], active_sh_degree=0)
 
@@ -50,7 +50,7 @@ def photographed(up: Direction | None = UP, scene: Scene | None = None) -> Scene
 
 
 def with_somebody_there(scene: Scene, camera: Camera) -> Scene:
-    """The scene in which the body is a thing like all others, at the camera."""
+    """The scene in which the body is an object like all others, at the camera."""
     frame = world_from_photographer(camera, scene.up)
     there = scene.photographer
     motion = TURN * torch.tensor([1.0, -1, -1, -1]) if scene.up is None else _quat_of(frame)
@@ -67,7 +67,7 @@ def with_somebody_there(scene: Scene, camera: Camera) -> Scene:
 
 
 def _quat_of(frame: Tensor) -> Tensor:
-    """Of a turn by less than half a circle."""
+    """Quaternion of a rotation by less than half a circle."""
     rotation = frame[:3, :3]
     w = torch.sqrt(1 + rotation.trace()) / 2
     skew = torch.stack(

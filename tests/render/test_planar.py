@@ -120,12 +120,12 @@ def test_moving_everything_together_changes_nothing() -> None:
 
 
 def lambertian(scene: Scene) -> Scene:
-    """The scene without view dependence, whose SH would have to be rotated."""
+    """The scene without view dependence, so that no SH need rotating."""
     return replace(scene, primary=replace(scene.primary, active_sh_degree=0))
 
 
 def moved(scene: Scene, camera: Camera, turn: torch.Tensor, shift: torch.Tensor) -> tuple[Scene, Camera]:
-    """Scene, planes and camera after one rigid motion."""
+    """Scene, planes and camera after a common rigid motion."""
     motion = torch.eye(4, dtype=torch.float64)
     motion[:3, :3], motion[:3, 3] = turn, shift
     quat = torch.tensor([0.8, 0.3, -0.4, 0.2], dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Values that nobody should give: a renderer says which, or its picture is finite."""
+"""Invalid parameter values: a renderer either names the parameter, or its image is finite."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`rasterization` renders what gsplat defines, forward and backward; here written out in float64, without kernels."""
+"""`rasterization` renders images as gsplat defines them, forward and backward; here written out in float64."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgro
 
 
 def draws(seed: int, colors: tuple[int, ...], channels: int) -> dict[str, Tensor]:
-    """A random scene before two cameras that look along z; some of it behind, beside or too far away."""
+    """A random scene and two cameras that look along z; parts of it are behind them, out of view or too far away."""
     generator = torch.Generator().manual_seed(seed)
     uniform = torch.rand(COUNT, 3, generator=generator, dtype=torch.float64)
     places = (uniform - torch.tensor([0.5, 0.5, 0.05])) * torch.tensor([5.0, 4.0, 10.0])
@@ -50,12 +50,12 @@ def rotations(quats: Tensor) -> Tensor:
 
 
 def on_screen(of: dict[str, Tensor], camera: int, eps2d: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Pixels [N, 2], covariances [N, 2, 2] with and without the variance that is added, depths [N]."""
+    """Pixels [N, 2], covariances [N, 2, 2] with and without the added variance, depths [N]."""
     pose, lens = of["viewmats"][camera], INTRINSICS[camera]
     x, y, z = (of["means"] @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
     axes = pose[:3, :3] @ rotations(of["quats"]) * of["scales"][:, None]
     fx, fy, cx, cy = lens[0, 0], lens[1, 1], lens[0, 2], lens[1, 2]
-    # Beyond the image by 0.3 of its half the slope stays that of the border.
+    # Outside the image by more than 0.3 of its half size, the Jacobian keeps its value at that border.
     u = (x / z).clamp(-(cx + 0.15 * WIDTH) / fx, (WIDTH - cx + 0.15 * WIDTH) / fx)
     v = (y / z).clamp(-(cy + 0.15 * HEIGHT) / fy, (HEIGHT - cy + 0.15 * HEIGHT) / fy)
     zero = torch.zeros_like(z)
@@ -132,7 +132,7 @@ def test_images_and_gradients_are_those_of_the_definition(shape, channels: int, 
     torch.testing.assert_close(image.double(), expected, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(alpha.double(), coverage, atol=1e-4, rtol=1e-4)
     weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    # The expected depth of a pixel that shows next to nothing has a slope without bound.
+    # The derivative of the expected depth is unbounded where coverage tends to zero.
     weights = weights * (coverage > 0.05)
     found = torch.autograd.grad((image * weights.float()).sum() + alpha.square().sum(), [ours[name] for name in NAMES])
     wanted = torch.autograd.grad((expected * weights).sum() + coverage.square().sum(), [exact[name] for name in NAMES])

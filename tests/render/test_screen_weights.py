@@ -1,4 +1,4 @@
-"""How much densification counts a view in or through a pane: as much as the pane leaves of it."""
+"""Weights of views in densification: a reflection or transmission counts by the share of light that a pane leaves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Panes seen through one another: the optics of several panes on a ray, tested by their properties."""
+"""Panes seen through one another: the optics of several panes along a ray, tested by their properties."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def glass_at(z: float, seed: int) -> Gaussians:
 
 
 def vitrine(*labels: int, front: Planes = FRONT) -> Scene:
-    """`showcase` with things in the last of its two panes' mirror images, and those of the panes that are named."""
+    """`showcase` with objects between its two panes, and with the panes of the given labels and their glass."""
     between = random_gaussians(10, (0.1, -0.1, 3.0), seed=7)
     planes = {1: front, 2: BACK}
     glass = {1: glass_at(2.0, 3), 2: glass_at(4.0, 4)}
@@ -69,7 +69,7 @@ def test_the_layers_are_those_of_the_nearest_pane() -> None:
     assert bool(seen.any()) and not bool(seen.all())
     for name in ("strength", "reflection"):
         torch.testing.assert_close(both.layers[name][seen], front.layers[name][seen])
-    # What the farther pane reflects comes through the nearer one.
+    # Reflections of the farther pane are transmitted by the nearer one.
     torch.testing.assert_close(both.layers["transmission"][seen], back.rgb[seen])
 
 

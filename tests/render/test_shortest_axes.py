@@ -1,4 +1,4 @@
-"""Normals of ellipsoids, of methods that do not shade by them."""
+"""Normals of ellipsoids for methods that do not shade with them."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ TURN = torch.tensor([0.9, 0.2, -0.3, 0.1], dtype=torch.float64)
 
 
 def wall(sign: float) -> Scene:
-    """Flat ellipsoids in a plane that is turned, their shortest axes towards the camera or away from it."""
+    """Flat ellipsoids in a rotated plane, their shortest axes towards the camera or away from it."""
     rotation = rotation_from_quat(TURN)
     spread = torch.linspace(-1.5, 1.5, 12, dtype=torch.float64)
     across, up = torch.meshgrid(spread, spread, indexing="ij")
     places = torch.stack([across, up, torch.zeros_like(up)], dim=-1).reshape(-1, 3) @ rotation.T
     gaussians = random_gaussians(len(places), (0.0, 0.0, 0.0), seed=0)
-    # Half a turn about the first axis puts the third one the other way round, and changes no ellipsoid.
+    # Half a turn about the first axis reverses the third one and leaves the ellipsoids unchanged.
     quats = TURN if sign > 0 else torch.tensor([-TURN[1], TURN[0], TURN[3], -TURN[2]], dtype=torch.float64)
     tensors = {
         "means": places + torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64),

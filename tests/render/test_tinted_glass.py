@@ -1,4 +1,4 @@
-"""Glass that lets through a share of red, green and blue."""
+"""Glass with a separate transmittance for red, green and blue."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Traced reflections: flat mirrors against mirrored cameras, gradients, and limits."""
+"""Traced reflections: flat mirrors compared with mirrored cameras, gradients, and limits."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from tests.render.tiny_scene import camera_at, random_gaussians
 
 
 def mirror_wall(strength: float = 1 - 1e-9) -> Gaussians:
-    """One huge, flat, opaque Gaussian in the plane z = 3, dark and mirroring; float64.
+    """One huge, flat, opaque Gaussian in the plane z = 3, dark and reflective; float64.
 
-    Its depth is that of its centre, and so right where the camera looks straight at it.
+    Its depth is that of its centre, and so only exact where the camera looks straight at it.
     """
     return Gaussians(
         means=torch.tensor([[0.0, 0.0, 3.0]], dtype=torch.float64),
@@ -33,13 +33,13 @@ def mirror_wall(strength: float = 1 - 1e-9) -> Gaussians:
 
 
 def surroundings(count: int = 16) -> Gaussians:
-    """Things behind the camera, which the wall mirrors."""
+    """Objects behind the camera that the wall reflects."""
     found = replace(random_gaussians(count, (0.2, 0.1, -1.5), seed=2), channels={})
     return found.with_tensors({"log_scales": found.log_scales + 1.0})
 
 
 def glossy(strength: float = 0.3) -> Scene:
-    """Random Gaussians before the camera that mirror random ones behind it; float64."""
+    """Random Gaussians in front of the camera that reflect random ones behind it; float64."""
     primary = random_gaussians(14, (0.0, 0.0, 3.0), seed=4)
     strengths = torch.full((14,), math.log(strength / (1 - strength)), dtype=torch.float64)
     return Scene(replace(primary, channels={"logit_strength": strengths}), extent=2.0, surroundings=surroundings())
@@ -63,13 +63,13 @@ def test_a_flat_mirror_shows_what_the_mirrored_camera_sees() -> None:
 @pytest.mark.parametrize("extent", [1.0, 4.0])
 @pytest.mark.parametrize("share", [0.9, 1.1])
 def test_a_ray_meets_nothing_of_the_surface_that_it_leaves(extent: float, share: float) -> None:
-    """Of a white sheet before the mirror, which has the mirror's own place in the surroundings."""
+    """A white sheet in front of the mirror stands for the mirror's own copy in the surroundings."""
     distance = share * START_PER_EXTENT * extent
     shift = torch.tensor([0.0, 0.0, -distance], dtype=torch.float64)
     sheet = replace(mirror_wall(), means=mirror_wall().means + shift, sh=torch.ones(1, 1, 3).double(), channels={})
     camera = camera_at(0.0, 0.0, 0.0)
     shown = Traced()(Scene(mirror_wall(), extent, surroundings=sheet), camera).layers["reflection"]
-    # In the middle, to which the wall's depth belongs and where rays leave it at a right angle.
+    # At the centre, where the wall's depth is exact and rays leave it at normal incidence.
     assert bool(shown[14, 20].any()) == (share > 1)
 
 
@@ -78,7 +78,7 @@ def flattened(gaussians: Gaussians) -> Gaussians:
 
 
 def test_a_mirror_of_discs_shows_what_the_mirrored_camera_sees() -> None:
-    """Their depth is right wherever the camera looks, also where it does not look straight at the mirror."""
+    """The depth of discs is exact wherever the camera looks, not only at normal incidence."""
     around = flattened(surroundings())
     scene = Scene(flattened(mirror_wall()), extent=0.01, surroundings=around)
     for camera in (camera_at(0.1, -0.2, 0.0), turned(camera_at(0.1, -0.2, 0.0))):
@@ -89,7 +89,7 @@ def test_a_mirror_of_discs_shows_what_the_mirrored_camera_sees() -> None:
 
 
 def turned(camera: Camera, angle_rad: float = 0.3) -> Camera:
-    """The camera turned to the right about its own centre."""
+    """The camera rotated to the right about its own centre."""
     cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
     turn = torch.eye(4, dtype=torch.float64)
     turn[0, 0], turn[0, 2], turn[2, 0], turn[2, 2] = cosine, -sine, sine, cosine
@@ -125,7 +125,7 @@ def test_layers_recombine() -> None:
 
 
 def test_densification_is_told_how_far_away_rays_meet_things() -> None:
-    """Over a wide mirror the middle of all places that mirror says nothing of where one thing is mirrored."""
+    """On a wide mirror, the mean position of reflecting pixels does not show where a single object is reflected."""
     origins = torch.tensor([[-5.0, 0, 0], [5.0, 0, 0], [5.0, 0, 1.0]], dtype=torch.float64)
     directions = torch.tensor([[0.0, 0, 1.0]] * 3, dtype=torch.float64)
     small = Gaussians(
@@ -226,7 +226,7 @@ def test_the_environment_is_behind_the_surroundings() -> None:
     distant = Deferred(environment=True)(scene, camera)
     without = Traced(surroundings=True)(replace(scene, surroundings=transparent), camera)
     for traced, shaded in (("reflection", "reflection"), ("surroundings", "environment")):
-        # `deferred` finds no direction where next to nothing is.
+        # `deferred` finds no direction where coverage is close to zero.
         seen = frame.layers["alpha"] > 0.01
         torch.testing.assert_close(without.layers[traced][seen], distant.layers[shaded][seen], atol=1e-6, rtol=0)
     assert not torch.allclose(frame.layers["reflection"], distant.layers["reflection"], atol=0.05)
@@ -261,9 +261,9 @@ def test_a_frame_with_absgrad_says_how_far_away_the_surroundings_were_met() -> N
     frame = Traced()(scene, camera, with_absgrad=True)
     (record,) = frame.space
     weights, products = torch.autograd.grad(frame.rgb.sum(), record.contributions)[0].unbind(dim=1)
-    # Things are three units before the camera, and the surroundings one and a half behind it.
+    # Objects are three units in front of the camera, and the surroundings one and a half behind it.
     expected = (scene.surroundings.means - torch.tensor([0.0, 0.0, 3.0])).norm(dim=1)
-    met = weights > 0.02  # And not grazed at one end.
+    met = weights > 0.02  # Excludes Gaussians that are only grazed at one end.
     assert int(met.sum()) > 5
     torch.testing.assert_close((products / weights)[met], expected[met], atol=0.7, rtol=0)
     assert record.part == "surroundings"

@@ -61,7 +61,7 @@ def concatenated(*parts: Gaussians) -> Gaussians:
 
 
 def showcase(planes: Planes | None = None) -> Scene:
-    """Things behind a pane at z = 2, things behind the camera at the origin, and glass on the pane."""
+    """Objects behind a pane at z = 2, objects behind the camera at the origin, and glass on the pane."""
     behind_pane = random_gaussians(14, (0.0, 0.0, 3.5), seed=1)
     in_room = random_gaussians(16, (0.2, 0.1, -1.5), seed=2)
     glass = random_gaussians(12, (0.0, 0.0, 2.0), seed=3, glass=True)
@@ -78,13 +78,13 @@ def in_single_precision(scene: Scene) -> Scene:
 
 
 def shown_panes(planes: Planes, camera: Camera) -> Tensor:
-    """[K, H, W] bool: the pixels that show each pane, the nearest where panes overlap."""
+    """[K, H, W] bool: the pixels that show each pane; where panes overlap, the nearest."""
     index = nearest_hits(panes_in_camera(planes, camera), camera).pane
     return index == torch.arange(len(planes), dtype=torch.int32)[:, None, None]
 
 
 def quat_product(left: Tensor, right: Tensor) -> Tensor:
-    """Rotations `right` [N, 4] followed by the rotation `left` [4]."""
+    """The rotation `left` [4] applied after each of the rotations `right` [N, 4]."""
     w, v = left[0], left[1:]
     rw, rv = right[:, :1], right[:, 1:]
     vector = w * rv + rw * v + torch.linalg.cross(v.expand_as(rv), rv)
