@@ -10,7 +10,7 @@ from glassplat.scene.camera import Camera
 
 
 def brightened_views(base: Tensor, camera: Camera, grey: float, *left: float) -> list[View]:
-    """Photographs [H, W, 3] of something of one grey, each with the left half brighter by so much."""
+    """Photographs [H, W, 3] of a uniformly grey object, each with the left half brighter by the given amount."""
     photos = []
     for brighter in left:
         photo = base.clone()

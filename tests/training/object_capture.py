@@ -1,4 +1,4 @@
-"""A tiny capture of an object before nothing: transparent photographs in the layout of Shiny Blender, on disk."""
+"""A tiny capture of an object without background: transparent photographs in the layout of Shiny Blender, on disk."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def world_from_opengl(angle_rad: float) -> np.ndarray:
 
 
 def seen_normals(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """World normals [H, W, 3] of a ball about the origin, and where it is seen [H, W]."""
+    """World normals [H, W, 3] of a ball about the origin, and the mask [H, W] of its visible pixels."""
     focal = 0.5 * SIZE / math.tan(0.5 * OPENING_ANGLE_RAD)
     steps = (np.arange(SIZE) + 0.5 - SIZE / 2) / focal
     x, y = np.meshgrid(steps, -steps)
@@ -50,7 +50,7 @@ def write_part(root: Path, part: str, angles_rad: np.ndarray) -> None:
         pose = world_from_opengl(angle_rad)
         normals, seen = seen_normals(pose)
         alpha = (255 * seen).astype(np.uint8)[..., None]
-        # What transparent pixels hold must not matter.
+        # Colours of transparent pixels must not matter.
         photo = np.concatenate([np.where(seen[..., None], COLOR, (0, 255, 0)).astype(np.uint8), alpha], axis=-1)
         Image.fromarray(photo).save(root / part / f"r_{index}.png")
         encoded = np.round(255 * (normals + 1) / 2).astype(np.uint8)
@@ -76,6 +76,6 @@ def write_object_capture(root: Path) -> Path:
 
 
 def few_steps(capture: Path, output: Path) -> list[str]:
-    """Options of a run of a few small steps that `train` takes for `deferred` and `traced`."""
+    """Options for a run of a few small steps of `deferred` or `traced`."""
     run = ["--data", str(capture), "--output", str(output), "--iterations", "12", "--least-iterations", "1"]
     return [*run, "--sh-degree", "1", "--texels", "8", "--first-texels", "4"]

@@ -1,4 +1,4 @@
-"""Carrying out an edit of the training state that tells how far it is."""
+"""Helpers that carry out an edit of the training state and collect its progress messages."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from glassplat.training.stage import Work, run_edit
 
 
 def followed(edit: Work | bool | None) -> tuple[list[Working], bool]:
-    """What an edit tells on the way, and whether there was anything to edit."""
+    """The progress messages of an edit, and True if there was anything to edit."""
     messages, work = [], run_edit(edit)
     while True:
         try:
@@ -17,5 +17,5 @@ def followed(edit: Work | bool | None) -> tuple[list[Working], bool]:
 
 
 def finished(edit: Work | bool | None) -> bool:
-    """Whether there was anything to edit."""
+    """True if there was anything to edit."""
     return followed(edit)[1]

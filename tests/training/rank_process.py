@@ -1,7 +1,7 @@
-"""One of several processes that train the tiny capture together, which writes what it has; and how they are started.
+"""One of several processes that train the tiny capture together and save their results; helpers that start them.
 
-`torchrun` starts them as users do. Where a test is not about that, they are forked from a process that has imported
-everything, which takes longer than what most of them do.
+`torchrun` starts them as users do. Where a test does not depend on that, they are forked from a process that has
+imported everything, as importing takes longer than most of their work.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ ONE_THREAD = os.environ | {"NUMBA_NUM_THREADS": "1"}
 
 
 def stages_of(name: str) -> tuple[Stage, ...]:
-    """Stages in which every kind of edit comes up within a few steps."""
+    """Stages in which every kind of edit occurs within a few steps."""
     if name == "planar":
         return planar_stages()
     return RECIPES["splat"](sh_degree=1, strategy="mcmc").stages(seed=0)
 
 
 def trained(name: str, ranks: Ranks, iterations: int) -> tuple[TrainState, list[Message]]:
-    """The state after so many iterations, and what happened."""
+    """The state after the given number of iterations, and all messages."""
     state = TrainState(RECIPES["splat"](sh_degree=1).initialise(tiny_capture()), seed=0)
     messages = train(stages_of(name), tiny_capture(), state, iterations, ranks=ranks)
     return state, list(messages)
@@ -58,10 +58,10 @@ def losses_of(messages: list[Message]) -> list[float]:
 
 
 def forked(target: Callable[..., None], *arguments: Any) -> BaseProcess:
-    """A function in a process of its own that has imported everything, and computes on one thread."""
+    """A function in a separate process that has imported everything and computes on one thread."""
     process = FORKS.Process(target=target, args=arguments)
     with pytest.MonkeyPatch.context() as patch:
-        # The process that all are forked from reads them once.
+        # The parent of all forked processes reads them once.
         patch.setenv("NUMBA_NUM_THREADS", "1")
         patch.setenv("OMP_NUM_THREADS", "1")
         process.start()
@@ -69,7 +69,7 @@ def forked(target: Callable[..., None], *arguments: Any) -> BaseProcess:
 
 
 class ForkedRank:
-    """`python -m ARGUMENTS` in a process that is forked, with the interface of `Popen`; what it says goes to files."""
+    """`python -m ARGUMENTS` in a forked process, with the interface of `Popen`; its output goes to files."""
 
     def __init__(
         self, arguments: list[str], environment: dict[str, str], said: Path, shorter: dict[str, Any] | None = None
@@ -89,7 +89,7 @@ class ForkedRank:
         os.kill(self._process.pid, number)
 
     def communicate(self, timeout: float) -> tuple[str, str]:
-        """What it said on its two outputs, once it has ended."""
+        """Its standard output and standard error, once it has ended."""
         self._process.join(timeout)
         assert self.returncode is not None, f"{self.args} does not end"
         return self._said.with_suffix(".out").read_text(), self._said.with_suffix(".err").read_text()
@@ -113,14 +113,14 @@ def start_apart(
     of_rank_1: Sequence[str] = (),
     shorter: dict[str, Any] | None = None,
 ) -> list[ForkedRank]:
-    """Ranks as so many machines would start them, the second one with further arguments.
+    """Starts ranks as separate machines would, the second one with further arguments.
 
     Args:
         arguments: a module and its arguments.
-        folder: takes what they say.
-        count: how many.
-        of_rank_1: further arguments.
-        shorter: waiting times of `glassplat.training.ranks` in place of its own.
+        folder: receives their output.
+        count: number of ranks.
+        of_rank_1: further arguments of the second rank.
+        shorter: waiting times that replace those of `glassplat.training.ranks`.
     """
     with socket.socket() as found:
         found.bind(("localhost", 0))
@@ -138,7 +138,7 @@ def start_apart(
 
 
 def torchrun(count: int, *arguments: str, timeout: float = LONGEST) -> subprocess.CompletedProcess[str]:
-    """Runs `python -m ARGUMENTS` in so many processes."""
+    """Runs `python -m ARGUMENTS` in `count` processes."""
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}", "-m"]
     return subprocess.run(
         [*command, *arguments], cwd=ROOT, env=ONE_THREAD, capture_output=True, text=True, timeout=timeout, check=False
@@ -146,7 +146,7 @@ def torchrun(count: int, *arguments: str, timeout: float = LONGEST) -> subproces
 
 
 def main() -> None:
-    """Trains as one of the ranks, once for each `NAME:ITERATIONS`: processes that start take longer than this."""
+    """Trains as one of the ranks, once per `NAME:ITERATIONS`, as starting a process takes longer than a training."""
     *trainings, root = sys.argv[1:]
     ranks = join_ranks()
     for training in trainings:

@@ -1,4 +1,4 @@
-"""Edits of the training state that no recipe's test looks at by itself."""
+"""Edits of the training state that are not covered by the tests of a recipe."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_what_no_view_needs_is_removed_with_its_moments() -> None:
 def one_gaussian(
     scales: tuple[float, float, float], opacity: float, quat: tuple[float, ...] = (1, 0, 0, 0)
 ) -> Gaussians:
-    """At (1, 0, 0)."""
+    """One Gaussian at (1, 0, 0)."""
     return Gaussians(
         means=torch.tensor([[1.0, 0.0, 0.0]]),
         quats=torch.tensor([quat], dtype=torch.float32),
@@ -98,7 +98,7 @@ def test_no_gaussian_stays_around_a_camera_though_others_see_it() -> None:
     state, capture = state_with_one_out_of_sight(), tiny_capture()
     row = int(contributions(state.scene, capture.train[0].camera).argmax())
     means = state.scene.primary.means.clone()
-    # Between the last camera and what it looks at, so that the others see it at the side of their pictures.
+    # Between the last camera and its target, so that the others see it at the border of their images.
     means[row] = capture.train[5].camera.center - torch.tensor([0.0, 0.0, 0.3])
     log_scales = state.scene.primary.log_scales.clone()
     log_scales[row] = math.log(0.4)
@@ -112,7 +112,7 @@ def test_no_gaussian_stays_around_a_camera_though_others_see_it() -> None:
 def test_what_is_nearer_to_a_camera_than_any_surface_hangs_in_the_air() -> None:
     means = torch.tensor([[0.0, 0.0, 0.1], [0.0, 0.0, 0.4], [5.0, 0.0, 0.0]])
     places = torch.tensor([[0.0, 0.0, 0.0], [0.0, 9.0, 0.0]])
-    # One point before the first camera is wrong.
+    # One point in front of the first camera is wrong.
     points = torch.tensor([[0.0, 0.0, 0.01], [0.0, 0.1, 2.0], [0.1, 0.0, 2.0], [0.0, 0.0, 30.0]])
     assert floaters_near_cameras(means, places, points).tolist() == [True, False, False]
     assert not floaters_near_cameras(means, places, points[:2]).any()
@@ -185,7 +185,7 @@ def test_thresholds_rise_for_small_photographs(adapts: bool) -> None:
 
 
 def views_of(scene: Scene) -> Dataset:
-    """Ten views of a scene in a half circle, without test views."""
+    """Ten views of a scene from a half circle, without test views."""
     views = []
     for index in range(10):
         angle = math.pi * (index - 4.5) / 10
@@ -226,7 +226,7 @@ def test_a_thing_without_points_is_found_where_the_photographs_of_it_meet() -> N
 
 
 def missing_in(scene: Scene, views: Sequence[View], renderer: Renderer) -> torch.Tensor:
-    """[P, 3] places of what views show and a scene lacks."""
+    """[P, 3] positions of objects that views show and a scene lacks."""
     search = unexplained_positions(scene, views, renderer)
     while True:
         try:
@@ -247,7 +247,7 @@ def test_views_that_ignore_a_place_do_not_say_that_nothing_is_missing_there() ->
 
 
 def test_what_is_missing_is_not_looked_for_in_every_window_by_itself() -> None:
-    """On photographs of two megapixels, windows of their size took half a minute for each."""
+    """On photographs of two megapixels, summing every window separately took half a minute for each."""
     whole = Scene(balls([(0.3, -0.2, 0.1), (0.0, 0.4, 0.0)], [250, 30], -1.8), 2.0)
     ground = Scene(whole.primary.select(torch.tensor([False, True])), 2.0)
     with CountedElements():

@@ -1,4 +1,4 @@
-"""A run ends with the mean over its last pass."""
+"""The result of a run is the mean over its last pass."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checkpoints that are damaged, or of another run."""
+"""Checkpoints that are damaged or belong to another run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.training.tiny_capture import true_scene
 
 
 def trained_state() -> TrainState:
-    """A state with everything that a checkpoint may hold."""
+    """A state with everything that a checkpoint can hold."""
     scene = true_scene()
     parameters = scene.parameters()
     return TrainState(

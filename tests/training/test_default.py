@@ -14,7 +14,7 @@ EXTENT = 2.0
 
 
 def make_gaussians(scales: list[float], opacities: list[float] | None = None) -> Gaussians:
-    """Needles of these lengths, 50 times as long as thick."""
+    """Needles of the given lengths, 50 times as long as thick."""
     count = len(scales)
     return Gaussians(
         means=torch.arange(3.0 * count).reshape(count, 3),
@@ -26,7 +26,7 @@ def make_gaussians(scales: list[float], opacities: list[float] | None = None) ->
 
 
 def seen(gradients: list[float], absgrads: list[float] | None = None) -> ScreenStatistics:
-    """What one view saw; the absolute gradient is six times the gradient unless given."""
+    """Statistics of one view; the absolute gradient is six times the gradient unless given."""
     count = len(gradients)
     absgrads = absgrads or [6 * gradient for gradient in gradients]
     return ScreenStatistics(*(torch.tensor(values).expand(2, -1) for values in (gradients, absgrads, [1.0] * count)))
@@ -46,8 +46,8 @@ def test_views_and_mirror_images_count_apart_and_the_larger_mean_decides() -> No
         seen_here = radii * (gradient != 0).any(dim=-1, keepdim=True)
         statistics.add(Views(gradient, 2 * gradient, seen_here, 200, 100, weight, direct=weight == 1))
     assert statistics.view_count.tolist() == [[3.5, 3.5, 1.5, 2, 0.5], [2, 2, 0, 2, 0]]
-    # Two views see the first, second and fourth directly: 6 in the mean. Three half mirror images show the first three.
-    # They are averaged over two where two views are direct, and the half image of the last one over one.
+    # Two views see the first, second and fourth directly: a mean of 6. Three mirror images of weight 0.5 show the first
+    # three. They are averaged over two if there are two direct views; the single mirror image of the last, over one.
     assert statistics.mean_gradient.tolist() == pytest.approx([6, 10.5, 6, 6, 2])
     assert statistics.mean_absgrad.tolist() == pytest.approx([12, 21, 12, 12, 4])
 

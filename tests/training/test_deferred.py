@@ -1,4 +1,4 @@
-"""The `deferred` recipe: its stages, when propagation ends, a short run, and resuming."""
+"""The `deferred` recipe: its stages, the end of propagation, a short run, and resuming."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def fresh_state(recipe: DeferredRecipe = RECIPE) -> TrainState:
 
 
 def surrounded_state(recipe: DeferredRecipe) -> TrainState:
-    """As the second stage begins."""
+    """A state at the start of the second stage."""
     state, setup = fresh_state(recipe), recipe.stages(seed=0)[1].setup
     assert setup is not None
     finished(setup(state, tiny_capture()))
@@ -182,7 +182,7 @@ def test_raised_opacities_are_held_for_a_while() -> None:
 
 @dataclass(frozen=True)
 class Told(ReflectionMeasure):
-    """Finds what it is told, in this order."""
+    """Returns the given shares, in this order."""
 
     reflects: tuple[float, ...] = ()
     turns: float = 0.0
@@ -204,7 +204,7 @@ def propagated(
     raises_rates_found: bool = False,
     state: TrainState | None = None,
 ) -> tuple[TrainState, list[int]]:
-    """A state after so many intervals of ten steps, of a run of a hundred, and when normals were propagated."""
+    """A state after the given number of intervals of ten steps in a run of a hundred, and the steps of propagation."""
     state, done = state or fresh_state(), []
     when = Every(0.1, stop=schedule.stop, skip_multiples_of=3)
     action = Propagate(
@@ -250,7 +250,7 @@ def test_propagation_ends_when_no_more_reflectors_are_found(
     schedule = PropagationSchedule(end=end, stop=0.9, patience=2)
     state, done = propagated(Told(reflects=tuple(shares), turns=turns), schedule)
     assert state.records[PROPAGATION_ENDED] == ended
-    # From the first reset on, at the intervals that resets leave, until the end.
+    # Starting at the first reset, at the intervals not used by resets, until the end.
     assert done == [step for step in (40, 50, 70, 80) if step < ended]
 
 
@@ -329,7 +329,7 @@ def scene_after(recipe: Any, iterations: int, directory: Path) -> Scene:
 def test_a_run_too_short_for_normals_is_one_of_splat_and_says_so(
     strategy: Strategy, iterations: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    # Of the opacity resets, the first falls into the longer run.
+    # Only the longer run includes an opacity reset, the first one.
     choices: dict[str, Any] = {"sh_degree": 1, "strategy": strategy, "intervals": Intervals(reset_stop=1.0)}
     matte = DeferredRecipe(**choices, least_iterations=iterations + 1, region=(0.0, 0.0, 3.5, 1.0))
     plain = scene_after(SplatRecipe(**choices), iterations, tmp_path / "splat")
@@ -399,7 +399,7 @@ def test_a_reset_leaves_the_steps_to_recover(iterations: int, end: Literal["sett
             if reset.apply(state, capture, clock):
                 done.append(clock.step)
         assert all(iterations - step >= 450 for step in done), ended
-        # Where there is time for it, what propagation has raised is lowered once more.
+        # If time permits, the opacities raised by propagation are reset once more.
         assert max(done, default=0) >= ended or iterations - ended < 2 * 450 + iterations / 15
 
 

@@ -1,4 +1,4 @@
-"""Training creates its tensors where the scene is, which a machine without a GPU can check too."""
+"""Training creates its tensors on the device of the scene, which can be checked without a GPU."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FACTORIES = {
     torch.zeros, torch.ones, torch.empty, torch.full, torch.eye, torch.arange, torch.linspace, torch.tensor,
     torch.rand, torch.randn, torch.from_numpy,
 }  # fmt: skip
-# The kernels of the CPU belong to it; what a run starts from is moved as a whole; data stays in memory.
+# Code for the CPU's kernels, for a run's initial state, which is moved as a whole, and for data, which stays in memory.
 ON_THE_CPU = (
     "/cpu.py",
     "/cpu_",
@@ -36,7 +36,7 @@ ON_THE_CPU = (
 
 
 class WithoutDevice(TorchFunctionMode):
-    """Collects the places of the package that create a tensor without saying where."""
+    """Collects the source lines of the package that create a tensor without a device."""
 
     def __init__(self) -> None:
         super().__init__()

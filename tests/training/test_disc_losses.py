@@ -1,4 +1,4 @@
-"""What keeps discs on one surface."""
+"""Losses that keep discs on a common surface."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ VIEW = tiny_capture().train[0].__class__.in_memory("0.png", CAMERA, photo=torch.
 
 
 def wall(tilt: float = 0.0, *, count: int = 25, turned: float = 0.0, gap: float = 0.0) -> Scene:
-    """Discs in a plane through the origin that is turned about the x axis; `turned` turns each disc besides."""
+    """Discs in a plane through the origin, tilted about the x axis; `turned` rotates each disc further."""
     across = torch.linspace(-2, 2, count, dtype=torch.float64)
     x, y = (grid.flatten() for grid in torch.meshgrid(across, across, indexing="ij"))
     angle = torch.tensor(tilt, dtype=torch.float64)
@@ -46,7 +46,7 @@ def frame_of(scene: Scene) -> Frame:
 def test_normals_of_a_depth_map_are_those_of_its_plane() -> None:
     for tilt in (0.0, 0.5):
         frame = frame_of(wall(tilt))
-        # Where the plane faces the camera, which looks along +z.
+        # Normal of the side of the plane that faces the camera, which looks along +z.
         expected = torch.tensor([0.0, torch.tensor(tilt).sin(), -torch.tensor(tilt).cos()], dtype=torch.float64)
         normals = torch.stack(normals_of_depths(frame.layers["depth"], CAMERA), dim=-1)
         torch.testing.assert_close(normals[10:16, 12:24].mean((0, 1)), expected, atol=0.02, rtol=0)

@@ -1,4 +1,4 @@
-"""`splat` with discs: what it begins with, when its terms count, and that it learns."""
+"""`splat` with discs: its initial discs, the weights of its terms over time, and its learning."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A capture may give its panes as rectangles: no mask is needed then, and nothing is fitted."""
+"""A capture may define its panes as rectangles: it then needs no masks, and nothing is fitted."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PANE = true_scene().planes
 
 @pytest.fixture
 def capture(tmp_path: Path) -> Path:
-    """The tiny capture with its pane as a rectangle and without masks."""
+    """The tiny capture with its pane given as a rectangle and without masks."""
     root = write_tiny_capture(tmp_path / "capture")
     shutil.rmtree(root / "panes")
     write_planes(root / "planes.json", PANE)
@@ -114,7 +114,7 @@ def test_without_masks_and_rectangles_it_says_how_to_mark_panes(capture: Path) -
 
 
 def test_a_mirror_that_is_no_pane_is_refused() -> None:
-    """It would also keep mirrors from being recognised."""
+    """A recipe that names mirrors also disables their detection."""
     recipe = PlanarRecipe(plane_fit=PlaneFit(mirror_labels=(5,)))
     with pytest.raises(PlaneFitError, match="names pane 5; expected some of 1"):
         recipe.initialise(tiny_capture())

@@ -1,4 +1,4 @@
-"""The units and the orientation of a capture's coordinates are arbitrary, and must not show in the result."""
+"""The units and the orientation of a capture's coordinates are arbitrary and must not affect the result."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def moved_capture(scale: float, turn: torch.Tensor) -> Dataset:
     original = tiny_capture()
     views = tuple(moved_view(view, scale, turn) for view in original.train)
     points = PointCloud(scale * original.points.positions @ turn.T, original.points.colors)
-    # The planes are placed by hand below; there are too few masks to fit them, and the check before a run is left out.
+    # The planes are set by hand below: there are too few masks to fit them, and the check before a run is skipped.
     extent = scale * original.extent
     return replace(original, train=views, test=views[:1], points=points, extent=extent, measured_points=False)
 
@@ -78,12 +78,12 @@ def trained(recipe: SplatRecipe | PlanarRecipe, scale: float, turn: torch.Tensor
 
 @cache
 def reference(method: str) -> tuple[Scene, list[float]]:
-    """What is learned in the capture's own units and frame."""
+    """Result of training in the capture's own units and frame."""
     return trained(RECIPES_TRIED[method], 1.0, torch.eye(3))
 
 
 def means_of_tens(losses: list[float]) -> np.ndarray:
-    """The mean loss of ten steps after the other."""
+    """Mean losses of consecutive groups of ten steps."""
     return np.array(losses).reshape(-1, 10).mean(axis=1)
 
 
@@ -93,7 +93,7 @@ def test_units_and_orientation_do_not_matter(method: str, scale: float, turn: to
     scene, losses = reference(method)
     other, other_losses = trained(RECIPES_TRIED[method], scale, turn)
     assert losses[-1] < 0.8 * losses[0]
-    # Adam steps along the axes of the frame, so a turned run is alike and not the same, least of all in single steps.
+    # Adam steps along the axes of the frame, so a rotated run is similar but not identical, above all in single steps.
     assert np.array(other_losses) == pytest.approx(np.array(losses), rel=0.3)
     assert means_of_tens(other_losses) == pytest.approx(means_of_tens(losses), rel=0.05)
     assert len(other.primary) == pytest.approx(len(scene.primary), rel=0.1)

@@ -1,4 +1,4 @@
-"""Trainings on captures with masks: black is left out as elsewhere in the field, and panes are found as before."""
+"""Training on captures with masks: black pixels are ignored as usual in the field, and panes are found as before."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DROPPED = torch.from_numpy(KEPT == 0)
 
 
 def redness(data: Dataset) -> float:
-    """Mean red over green in the renders of `splat`, trained for a moment, where photographs were painted red."""
+    """Mean of red minus green where photographs were painted red, in renders of a briefly trained `splat`."""
     model = Training(data, SplatRecipe(), iterations=500, device="cpu").run()
     images = [model.image(view.name)[DROPPED] for view in data.train]
     return float(torch.cat([image[:, 0] - image[:, 1] for image in images]).mean())

@@ -48,7 +48,7 @@ def rng(seed: int = 0) -> torch.Generator:
 
 
 def composited(opacities: Tensor, sigma: float, line: Tensor) -> Tensor:
-    """Alpha [X] along a line of Gaussians at one place, one blended behind the other."""
+    """Alpha [X] along a line of Gaussians at one position, blended one behind the other."""
     transmittance = torch.ones_like(line)
     for opacity in opacities:
         transmittance = transmittance * (1 - opacity * torch.exp(-0.5 * (line / sigma) ** 2))

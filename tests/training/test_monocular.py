@@ -1,4 +1,4 @@
-"""Estimated normals as a term of the objective."""
+"""Estimated normals as a loss term."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_the_normals_turn_with_a_camera_that_is_corrected(tmp_path: Path) -> Non
     write(tmp_path, "a.npy", all_along((0.0, 0.0, 1.0)))
     term, view, tilted = MonocularNormals(), view_in(tmp_path), torch.tensor([0.3, 0.0, -0.9])
     twist = torch.zeros(6, requires_grad=True)
-    for _ in range(2):  # The second time the file is not read again.
+    for _ in range(2):  # The second time, the file is not read again.
         moving = view.with_camera(moved_camera(view.camera, twist, 1.0))
         (gradient,) = torch.autograd.grad(term(frame_of(tilted), moving, SCENE), twist)
         assert bool(gradient.any())
@@ -73,7 +73,7 @@ def test_views_without_a_file_have_no_such_term(tmp_path: Path, caplog: pytest.L
 
 
 def test_views_in_folders_are_warned_about_too(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Their folder of normals may lie next to that of all photographs."""
+    """Their folder of normals may be stored next to that of all photographs."""
     view = replace(view_in(tmp_path), name="left/a.jpg", image_path=tmp_path / "images" / "left" / "a.jpg")
     (tmp_path / "normals").mkdir()
     with caplog.at_level(logging.WARNING):

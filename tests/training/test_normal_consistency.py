@@ -20,7 +20,7 @@ SCENE = Scene(Gaussians.empty(1), extent=1.0)
 
 
 def oblique_camera() -> Camera:
-    """A camera at the origin that is turned against the world's axes; its cells are 5 pixels wide."""
+    """A camera at the origin, rotated against the world's axes; its cells are 5 pixels wide."""
     turn = math.cos(0.4), math.sin(0.4)
     pose = torch.eye(4, dtype=torch.float64)
     pose[0, [0, 2]], pose[2, [0, 2]] = (
@@ -44,7 +44,7 @@ def test_a_flat_wall_has_its_normal_everywhere(normal: tuple[float, float, float
     normals, trusted = depth_normals(depth, torch.ones_like(depth), camera)
     inner = trusted[1:-1, 1:-1] > 0
     assert normals.shape == (camera.height // cell_side(camera), camera.width // cell_side(camera), 3) and inner.all()
-    # The mean of a depth that is not linear in the pixels bends the wall a little.
+    # Depth is not linear in the pixels, so its mean over a cell bends the wall slightly.
     cosines = normals[1:-1, 1:-1] @ in_world
     assert float(cosines.min()) > math.cos(math.radians(1.0))
 
@@ -65,7 +65,7 @@ def test_edges_and_holes_are_not_trusted() -> None:
     alpha = torch.ones_like(depth)
     alpha[52, 27] = 0.0
     _, trusted = depth_normals(depth, alpha, camera)
-    # The step lies between the cells 19 and 20 of each row, the hole in cell 5 of row 10.
+    # The step lies between cells 19 and 20 of each row, the hole in cell 5 of row 10.
     assert not trusted[:, 19:21].any() and not trusted[9:12, 4:7].any()
     assert trusted[1:8, 1:19].all() and trusted[1:-1, 21:-1].all()
 

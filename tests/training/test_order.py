@@ -1,4 +1,4 @@
-"""Morton order: what it is, that nothing is lost, and that values that are not finite do no harm."""
+"""Morton order: its definition, its completeness, and its robustness to values that are not finite."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_codes_interleave_the_bits_of_the_axes() -> None:
         sum(((int(cell[axis]) >> bit) & 1) << (3 * bit + axis) for bit in range(MORTON_BITS) for axis in range(3))
         for cell in cells
     ]
-    # Half a cell keeps the conversion from rounding across a border.
+    # An offset of half a cell keeps the conversion from rounding across a border.
     means = (cells.double() + torch.where((cells > 0) & (cells < 2**MORTON_BITS - 1), 0.5, 0.0)) * 0.25 - 7
     assert morton_codes(means).tolist() == expected
 

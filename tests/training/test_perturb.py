@@ -1,4 +1,4 @@
-"""Opacity perturbation of what is seen through a pane."""
+"""Opacity perturbation of Gaussians seen through a pane."""
 
 from dataclasses import replace
 from typing import Any

@@ -1,4 +1,4 @@
-"""Exposures are learned with the scene, stored with it, and taken up again."""
+"""Exposures are learned with the scene, stored with it, and restored."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CAPTURE = replace(tiny_capture(), measured_points=False)
 
 
 def darkened(dataset: Dataset) -> Dataset:
-    """The capture with every other photograph darker, and the ones between brighter by as much."""
+    """The capture with every other photograph darker, and those in between brighter by the same amount."""
     views = [
         View.in_memory(v.name, v.camera, photo=(v.photo * (0.7 if index % 2 else 1.3)).clamp(max=255).to(torch.uint8))
         for index, v in enumerate(dataset.train)

@@ -1,4 +1,4 @@
-"""The photographer is put behind the camera when panes are known, learns, is stored and taken up again."""
+"""The photographer is placed behind the camera once panes are known, learned, stored and restored."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MIRROR = pane(2.0, half=2.5, base_reflectance=0.9)
 
 
 def half_of_corner(side: int) -> Planes:
-    """A mirror left or right of the z axis, turned towards it."""
+    """A mirror left or right of the z axis, facing it."""
     return replace(
         pane(2.0, half=1.0, label=1 if side < 0 else 2, base_reflectance=0.9),
         centers=torch.tensor([[side * 1.0, 0.0, 2.0]], dtype=torch.float64),
@@ -50,7 +50,7 @@ CORNER = joined(half_of_corner(-1), half_of_corner(1))
 
 
 def peopled_capture(planes: Planes = MIRROR) -> Dataset:
-    """The capture photographed by somebody."""
+    """The capture with the photographer reflected in its panes."""
     scene, views = peopled_scene(planes), []
     for view in tiny_capture().train:
         with torch.no_grad():
@@ -114,7 +114,7 @@ def test_each_mirror_of_a_corner_shows_the_photographer() -> None:
 
 @pytest.mark.parametrize("planes", [MIRROR, CORNER])
 def test_somebody_is_found_in_the_photographs(planes: Planes) -> None:
-    """With the true room and panes held, the cloud takes the form of who stands there."""
+    """With the true room and panes fixed, the cloud takes the shape of the photographer."""
     dataset, state = peopled_capture(planes), begun(scene=peopled_scene(planes))
     frozen = [
         replace(
@@ -191,7 +191,7 @@ def test_a_run_that_was_interrupted_ends_as_one_that_was_not(tmp_path: Path) -> 
     resumed = load_checkpoint(path)
     for _ in train(planar_stages(), dataset, resumed, 40):
         pass
-    assert len(sizes) > 2  # Nobody, the first cloud, and what densification makes of it.
+    assert len(sizes) > 2  # Zero, the first cloud, and the sizes after densification.
     assert resumed.scene.up == whole.scene.up is not None
     expected = whole.scene.parameters()
     assert resumed.scene.parameters().keys() == expected.keys()

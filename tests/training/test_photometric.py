@@ -1,4 +1,4 @@
-"""The loss that every method shares."""
+"""The loss shared by all methods."""
 
 from __future__ import annotations
 

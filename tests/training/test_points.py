@@ -84,7 +84,7 @@ def interleaved(cell: tuple[int, int, int]) -> int:
 
 @hypothesis.given(st.lists(st.tuples(*[st.integers(0, 2**21 - 1)] * 3), min_size=1, max_size=20))
 def test_order_follows_the_z_curve(cells: list[tuple[int, int, int]]) -> None:
-    corners = [(0, 0, 0), (2**21 - 1,) * 3]  # They make the bounding box the whole grid, so that cells are exact.
+    corners = [(0, 0, 0), (2**21 - 1,) * 3]  # They extend the bounding box to the whole grid, so that cells are exact.
     cells = corners + cells
     points = PointCloud.of(RawPoints.from_arrays(np.array(cells, np.float64), np.zeros((len(cells), 3))))
     placed = [tuple(map(int, mean)) for mean in gaussians_from_points(points).means.tolist()]

@@ -1,4 +1,4 @@
-"""What happens when views show nothing, and when nothing is left to show."""
+"""Views that show no Gaussians, and scenes without any Gaussian left to show."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.training.tiny_capture import place_true_planes, tiny_capture, write_t
 
 
 def looking_away(view: View) -> View:
-    """The view from a place that has everything behind it."""
+    """The view from a camera with the whole scene behind it."""
     pose = view.camera.cam_from_world.clone()
     pose[2, 3] -= 1000
     return replace(view, camera=replace(view.camera, cam_from_world=pose))
@@ -77,7 +77,7 @@ def test_the_loss_of_the_last_gaussian_is_named_and_nothing_is_told_of_that_step
     ruthless = PruneIdle(DefaultDensify(least_contribution=1e9, contribution_moments=(0.5,)))
     messages: list[Message] = []
     with pytest.raises(NoGaussiansError, match="no Gaussians are left after step 6"):
-        # As they come: what was told before the end counts.
+        # Collected one by one, because messages before the end count too.
         for message in train((replace(stage, actions=(ruthless,)),), tiny_capture(), fresh_state(), 12):
             messages.append(message)
     assert max(m.step for m in messages if isinstance(m, StepDone)) == 5
@@ -85,7 +85,7 @@ def test_the_loss_of_the_last_gaussian_is_named_and_nothing_is_told_of_that_step
 
 
 def spoil(capture: Path, how: str) -> None:
-    """Breaks a capture such that little or nothing of it can be seen."""
+    """Changes a capture so that little or nothing of it is visible."""
     settings = json.loads((capture / "transforms.json").read_text())
     for name in ("fl_x", "fl_y"):
         settings[name] *= {"long": 9e4, "short": 2e-3}.get(how, 1)

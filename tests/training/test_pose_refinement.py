@@ -1,4 +1,4 @@
-"""Cameras are corrected with the scene, stored with it, and taken up again; test cameras follow their photographs."""
+"""Cameras are corrected with the scene, stored with it, and restored; test cameras follow their photographs."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ REFINED = PoseRefinement(rate=1e-3)
 
 
 def shaken(dataset: Dataset, numbers: tuple[int, ...] = (2,)) -> Dataset:
-    """The capture with some of its training cameras, and its test cameras, where they were not."""
+    """The capture with some of its training cameras, and its test cameras, moved from their true poses."""
     views = [
         view.with_camera(moved_camera(view.camera, TWIST, dataset.extent)) if number in numbers else view
         for number, view in enumerate(dataset.train)
@@ -59,7 +59,7 @@ def misplacement(camera: Camera, other: Camera) -> float:
 
 
 def pixels_off(camera: Camera, other: Camera) -> float:
-    """Mean distance on screen of what is before both; a turn and a shift may look alike."""
+    """Mean distance on screen of the objects in view; a rotation and a translation may look alike."""
     places = true_scene().primary.means[:14]
     return float((camera.project(places)[0] - other.project(places)[0]).norm(dim=1).mean())
 
@@ -235,7 +235,7 @@ def test_the_model_of_a_training_has_the_cameras_that_its_run_records(tmp_path: 
 
 
 def test_a_camera_in_memory_is_moved_by_what_is_on_another_device() -> None:
-    elsewhere = moved_camera(CAMERA, torch.zeros(6, device="meta"), 1.0)  # A device that every machine has.
+    elsewhere = moved_camera(CAMERA, torch.zeros(6, device="meta"), 1.0)  # A device that exists on every machine.
     assert elsewhere.cam_from_world.device.type == "meta"
 
 

@@ -1,4 +1,4 @@
-"""The recipes as published: the documents name what restores the paper's way, and each such field does it."""
+"""The published recipes: the documents name the options that restore a paper's settings, and each of them does so."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_a_short_run_of_a_preset_learns(method: str, strategy: Any) -> None:
     losses = [message.losses["photometric"] for message in messages if isinstance(message, StepDone)]
     assert len(losses) == state.step == 60
     assert all(torch.isfinite(tensor).all() for tensor in state.scene.parameters().values())
-    # The first and the second pass over the six views, before anything is disturbed.
+    # The first and the second pass over the six views, before any perturbation.
     assert sum(losses[6:12]) < sum(losses[:6])
     done = {message.action for message in messages if isinstance(message, ActionDone)}
     reflective = {"propagate normals"}
@@ -137,7 +137,7 @@ def test_a_short_run_of_a_preset_learns(method: str, strategy: Any) -> None:
 
 
 def planeless(recipe: PlanarRecipe) -> Scene:
-    """The first scene of a recipe, without the trial fit that the few points of the tiny capture do not do for."""
+    """The first scene of a recipe, without the trial fit, for which the tiny capture has too few points."""
     dataset = tiny_capture()
     return Scene(strategy_of(recipe).initial_gaussians(dataset.points, recipe.sh_degree), dataset.extent)
 

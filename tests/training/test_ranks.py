@@ -1,4 +1,4 @@
-"""Several ranks train as one that accumulates their views, and end together."""
+"""Several ranks train like a single one that accumulates their views, and end together."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def train_arguments(capture: Path, output: Path, *more: str, iterations: int = I
 
 @contextmanager
 def running(count: int, *arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """`torchrun` at work, which does not outlive the context."""
+    """A running `torchrun`, terminated on leaving the context."""
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}", "-m"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     with subprocess.Popen([*command, *arguments], cwd=ROOT, env=ONE_THREAD, **pipes) as process:
@@ -64,7 +64,7 @@ def running(count: int, *arguments: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def ranks_of(process: subprocess.Popen[str]) -> list[int]:
-    """The processes that `torchrun` has started, rank by rank."""
+    """The processes started by `torchrun`, in the order of their ranks."""
     found = {}
     for number in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split():
         for entry in Path(f"/proc/{number}/environ").read_bytes().split(b"\0"):
@@ -74,7 +74,7 @@ def ranks_of(process: subprocess.Popen[str]) -> list[int]:
 
 
 def wait_for(path: Path, process: subprocess.Popen[str] | ForkedRank) -> None:
-    """Waits until a file is there."""
+    """Waits until a file exists."""
     end = time.monotonic() + LONGEST
     while not path.is_file():
         assert process.poll() is None, ended(process)
@@ -83,25 +83,25 @@ def wait_for(path: Path, process: subprocess.Popen[str] | ForkedRank) -> None:
 
 
 def ended(process: subprocess.Popen[str] | ForkedRank) -> str:
-    """What a process says until it ends."""
+    """The output of a process until it ends."""
     return "".join(text or "" for text in process.communicate(timeout=LONGEST))
 
 
 def started_apart(arguments: list[str], folder: Path, of_rank_1: list[str]) -> list[subprocess.CompletedProcess[str]]:
-    """Two ranks as two machines would start them, the second one with further arguments; once both have ended."""
+    """Two ranks started as on two machines, the second one with further arguments; returned once both have ended."""
     processes = start_apart(arguments, folder, of_rank_1=of_rank_1)
     spoken = [process.communicate(timeout=LONGEST) for process in processes]
     return [subprocess.CompletedProcess(p.args, p.returncode, *said) for p, said in zip(processes, spoken, strict=True)]
 
 
 def said(done: subprocess.CompletedProcess[str]) -> list[str]:
-    """Lines on standard error that are ours; `torchrun` has its own to say."""
+    """Lines of glassplat on standard error; `torchrun` adds its own."""
     return [line for line in done.stderr.splitlines() if line.startswith(("error:", "stopped:", "usage:"))]
 
 
 @pytest.fixture(scope="module")
 def trained_by(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Path]:
-    """A function that gives the folder of what so many ranks have learned, a folder for each training."""
+    """A function that returns the folder of the results of a number of ranks, with a subfolder for each training."""
 
     @cache
     def folder_of(count: int) -> Path:
@@ -133,14 +133,14 @@ def test_ranks_agree_with_one_process_that_accumulates_their_views(
         assert found.shape == expected.shape, tensor_name
         assert all(torch.equal(other.scene.parameters()[tensor_name], found) for other in others), tensor_name
     for part, statistics in alone.statistics.items():
-        # What panes show counts by what is rendered, and Adam makes whole steps of gradients that are rounding alone.
+        # Views in panes are weighted by rendered values, and Adam takes full steps even where gradients are rounding.
         assert torch.allclose(first.statistics[part].view_count, statistics.view_count, rtol=1e-3), part
         assert torch.allclose(first.statistics[part].gradient_sum, statistics.gradient_sum, rtol=1e-2), part
 
 
 @pytest.mark.parametrize("count", [2, 3])
 def test_gradients_of_ranks_are_the_means_over_their_views(count: int, trained_by: Callable[[int], Path]) -> None:
-    """Moments are linear in the gradients; Adam makes a whole step of a gradient that is rounding alone."""
+    """Moments are linear in the gradients, whereas Adam takes a full step even where a gradient is only rounding."""
     found = load_checkpoint(trained_by(count) / f"planar_{count}" / "0.safetensors").optimizer
     expected = trained("planar", Ranks(batch=count), count)[0].optimizer
     assert found.updates == expected.updates
@@ -161,7 +161,7 @@ def test_a_pass_shows_every_view_once_and_a_stage_ends_where_it_would_alone(coun
 
 @pytest.mark.parametrize("count", [2, 3, 7])
 def test_no_action_is_missed_where_steps_go_over_its_moment(count: int) -> None:
-    """Whether an action that looks for something finds it may depend on the batch; that it looks may not."""
+    """The result of a search may depend on the batch; the search itself must take place."""
     alone, together = (Counter(actions_taken(trained("planar", Ranks(batch=batch), 60)[1])) for batch in (1, count))
     assert together == alone
     assert alone["searching for unnecessary Gaussians"] == 3 and alone["grow SH"] == 1
@@ -172,7 +172,7 @@ def test_a_test_gives_up_before_a_rank_does() -> None:
 
 
 def test_ranks_compare_whatever_an_action_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Comparing needs them all, and what one finds another may not, where numbers are rounded differently."""
+    """Comparing needs all ranks, and where rounding differs, one rank may find something that another does not."""
     settled: list[int] = []
     monkeypatch.setattr(Ranks, "synchronise", lambda self, state: settled.append(state.step))
     trained("splat", Ranks(), 60)
@@ -184,7 +184,7 @@ def test_ranks_compare_whatever_an_action_found(monkeypatch: pytest.MonkeyPatch)
 
 
 def actions_taken(messages: Sequence[Message]) -> Iterator[str]:
-    """What each action says when it begins to look for something, and the rise of harmonics, which finds it always."""
+    """Message of each action that starts a search, and each increase of the SH degree, which always succeeds."""
     for message in messages:
         if isinstance(message, Working) and message.done == 0:
             yield message.what
@@ -204,7 +204,7 @@ def test_learning_rates_grow_by_the_root_of_the_views_and_pauses_count_views() -
 
 
 def test_moments_remember_as_many_views_whatever_the_batch() -> None:
-    """Four views of one gradient, then none: together or one by one, or as many machines change from run to run."""
+    """Four views with the same gradient, then none: together, one by one, or with a rank count that varies."""
     moments = []
     for batches in ((1, 1, 1, 1, 1, 1), (4, 2), (2, 1, 1, 2)):
         parameters, optimizer = {"a": torch.zeros(3, dtype=torch.float64)}, Optimizer()
@@ -267,15 +267,15 @@ def test_the_death_of_a_rank_ends_the_others_with_one_message(rank: int, capture
     with running(2, *arguments) as process:
         wait_for(tmp_path / "run" / "checkpoint.safetensors", process)
         os.kill(ranks_of(process)[rank], signal.SIGKILL)
-        text = ended(process)  # For which it waits less long than a rank for one that lives and is silent.
+        text = ended(process)  # `torchrun` waits less long for it than a rank waits for a silent one.
     assert process.returncode == 1
     ours = [line for line in text.splitlines() if line.startswith(("stopped:", "error:"))]
-    assert len(ours) == (0 if rank == 0 else 1), text  # Of rank 0 `torchrun` tells.
+    assert len(ours) == (0 if rank == 0 else 1), text  # The end of rank 0 is reported by `torchrun`.
     assert load_checkpoint(tmp_path / "run" / "checkpoint.safetensors").step > 0
 
 
 def last_word_before_a_silent_rank(capture: Path, output: Path, *, asked: bool, **shorter: object) -> str:
-    """What the leader says of a rank that is stopped, asked to end meanwhile or not; it saves, and exits with 1."""
+    """The leader's message about a stopped rank, with or without a request to end; it saves and exits with 1."""
     arguments = train_arguments(capture, output, "--checkpoint-every", "0.01", iterations=100_000)
     first, silent = start_apart(arguments, output.parent, shorter=shorter)
     try:

@@ -64,7 +64,7 @@ def test_gradient_conflict_counts_shared_edges_on_panes_only(term: LossFunction,
 
 @BOTH
 def test_where_a_reflection_ends_is_no_edge_of_it(term: LossFunction) -> None:
-    """At the rectangle's rim, where no glass is, and where the next pane begins, with a frame behind each."""
+    """At the rectangle's rim, without glass, and at the border to the next pane, with a frame behind each."""
     right = STEP[..., 0] > 0
     rim = torch.where(right, ALL, -1)
     assert conflict(STEP, FLAT * STEP, rim, EVEN * right, term) == 0
@@ -73,10 +73,10 @@ def test_where_a_reflection_ends_is_no_edge_of_it(term: LossFunction) -> None:
 
 
 def left_in(own: float, held: float, gain: float = 1.0) -> float:
-    """How hard the term pulls a transmission back that has its own texture and holds a share of a reflection."""
+    """Strength of the term's gradient on a transmission with its own texture that holds a share of a reflection."""
     texture, room = (_edges_and_ramps(seed, height=96, width=128) for seed in (2, 3))
     strength = torch.full((96, 128), 0.1)
-    # In linear light, in which a pane adds.
+    # In linear light, in which the reflection of a pane is added.
     transmission = srgb_from_linear(0.2 + 0.5 * own * texture + 0.1 * held * linear_from_srgb(room)).requires_grad_()
     layers = {"without_panes": transmission, "reflection": gain * room, "strength": strength}
     frame = frame_with(**layers, pane=torch.zeros(96, 128, dtype=torch.int32))
@@ -86,12 +86,12 @@ def left_in(own: float, held: float, gain: float = 1.0) -> float:
 
 
 def test_what_is_left_of_a_reflection_is_charged_and_an_edge_of_both_is_not() -> None:
-    """An edge that the transmission has at full strength is its own, even if the reflection has found it as well."""
+    """A full-strength edge of the transmission is its own, even if the reflection contains it as well."""
     assert left_in(0.0, 5.0) < 0.2 * left_in(0.0, 0.5)
 
 
 def test_a_reflection_brighter_than_white_pulls_no_harder() -> None:
-    """Or it would grow brighter and brighter: what it takes from the transmission it has to make up for."""
+    """Otherwise it would grow without limit: light that it takes from the transmission has to be replaced."""
     assert left_in(1.0, 1.0, gain=20.0) <= left_in(1.0, 1.0, gain=1.0)
 
 
@@ -101,7 +101,7 @@ def test_edges_beside_a_rim_still_count() -> None:
 
 
 def test_gradient_conflict_depends_little_on_the_size_of_photographs() -> None:
-    """The same view at four sizes; without the factor the smallest has 14 times the loss of the largest."""
+    """The same view at four sizes; without the factor, the smallest has 14 times the loss of the largest."""
     transmission, reflection = (_edges_and_ramps(seed, height=480, width=640) for seed in (0, 1))
     losses = []
     for shrink in (1, 2, 4, 8):
@@ -112,7 +112,7 @@ def test_gradient_conflict_depends_little_on_the_size_of_photographs() -> None:
 
 
 def _edges_and_ramps(seed: int, *, height: int, width: int) -> Tensor:
-    """A picture of overlapping soft-edged shapes, as natural as a few lines allow: edges at all scales."""
+    """An image of overlapping soft-edged shapes with edges at all scales, as in natural images."""
     generator = torch.Generator().manual_seed(seed)
     y, x = torch.meshgrid(torch.arange(height) / height, torch.arange(width) / height, indexing="ij")
     image = torch.zeros(height, width, 3)

@@ -1,4 +1,4 @@
-"""Terms about the reflection strength of Gaussians."""
+"""Loss terms on the reflection strength of Gaussians."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When stages begin and recurring moments are due."""
+"""Start of stages, and steps at which recurring actions are due."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ def run(state: TrainState, recipe: Any, iterations: int = 20, until: int | None 
 
 
 def in_front(scene: Scene, view: View) -> Tensor:
-    """[N] bool: what the tiny capture's camera shows of the primary Gaussians."""
+    """[N] bool: the primary Gaussians in front of the tiny capture's camera."""
     return view.camera.project(scene.primary.means)[1] > 0
 
 
@@ -102,7 +102,7 @@ def test_resuming_continues_to_the_same_result(recipe: Any, pause: int, tmp_path
 def test_the_strategy_decides_what_happens_to_the_primary_gaussians(recipe: Any) -> None:
     for number, stage in enumerate(recipe.stages(seed=0)):
         kinds = [type(action) for action in stage.actions]
-        # The last stage of `planar` holds its one reset.
+        # The last stage of `planar` contains its only reset.
         assert kinds.count(Relocate) == 1 and kinds.count(ResetOpacity) == (number == 2)
         assert [type(post_step) for post_step in stage.post_steps] == [AddNoise, AverageLast]
         assert all(action.part == "glass" for action in stage.actions if isinstance(action, Densify))
@@ -232,7 +232,7 @@ def test_screen_gradients_are_collected_for_who_densifies_by_them() -> None:
     assert default.densify_until == SplatRecipe().densify.stop
     first, *later = PlanarRecipe(strategy="mcmc").stages(seed=0)
     assert first.densify_until == 0
-    # The glass is densified under either strategy.
+    # The glass is densified with either strategy.
     assert {stage.densify_until for stage in later} == {PlanarRecipe().densify.stop}
 
 

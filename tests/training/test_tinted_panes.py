@@ -1,4 +1,4 @@
-"""Panes that may be tinted begin clear, learn what gets through them, and keep it."""
+"""Panes that may be tinted start clear, learn their transmittance, and keep it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ GLASS = replace(pane(2.0, half=0.8), log_transmittances=torch.tensor([TRUTH], dt
 
 @cache
 def captured(*, tinted: bool) -> Dataset:
-    """The tiny capture through coloured or clear glass, rounded, not cut off: the scene is dark."""
+    """The tiny capture through tinted or clear glass, rounded without clipping, as the scene is dark."""
     planes = GLASS if tinted else replace(GLASS, log_transmittances=None)
     scene, views = in_single_precision(showcase(planes)), []
     for view in tiny_capture().train:
@@ -38,7 +38,7 @@ def captured(*, tinted: bool) -> Dataset:
 
 
 def panes_alone(stage: Stage) -> Stage:
-    """A stage in which only the colour of the panes learns, from the photographs."""
+    """A stage in which only the tint of the panes learns, from the photographs."""
     rates = {"planes.log_transmittances": replace(stage.rates["planes.log_transmittances"], start=0.02)}
     losses = tuple(term for term in stage.losses if term.name in ("photometric", "tint"))
     return replace(stage, rates=rates, losses=losses, setup=None, actions=(), post_steps=stage.post_steps[:1])
@@ -75,7 +75,7 @@ def test_clear_glass_stays_clear() -> None:
 
 
 def test_glass_adds_no_light() -> None:
-    """Photographs that are brighter than the scene leave the glass clear, and free to darken again."""
+    """Photographs brighter than the scene leave the glass clear, and free to darken again."""
     state = clear_state()
     planes = replace(state.scene.planes, log_transmittances=torch.tensor([[0.3, -0.3, 0.0]]))
     state.scene = replace(state.scene, planes=planes)

@@ -1,4 +1,4 @@
-"""The `traced` recipe: its stages, how surroundings begin, grow and are pruned, a short run, and resuming."""
+"""The `traced` recipe: its stages, initialisation, growth and pruning of surroundings, a short run, and resuming."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def fresh_state(recipe: TracedRecipe = RECIPE) -> TrainState:
 
 
 def surrounded_state(start: SurroundingsStart | None = None) -> TrainState:
-    """With surroundings, as their stage begins, but for what was learned before."""
+    """A state with surroundings, as at the start of their stage but without the preceding training."""
     state = fresh_state()
     matte = torch.ones(len(state.scene.primary), dtype=torch.bool)
     AddSurroundings(start or RECIPE.surroundings.start, 1)(state, tiny_capture(), matte)
@@ -290,7 +290,7 @@ def test_a_short_run_of_discs_learns_as_splat_does_with_discs() -> None:
 def test_normals_of_discs_can_learn_from_the_first_step_on() -> None:
     recipe = replace(DISCS, normals_throughout=True, consistency_weight=1.0)
     scene = fresh_state(recipe).scene
-    # Depths count where most of a pixel is covered.
+    # Depths count only where most of a pixel is covered.
     scene = scene.with_parameters({"primary.logit_opacities": torch.full((len(scene.primary),), 3.0)})
     found = differentiate(recipe.stages(0)[0], scene, tiny_capture().train[0], with_absgrad=False)
     assert found.losses["consistency"] > 0 and bool(found.gradients["primary.quats"].any())
@@ -329,7 +329,7 @@ def test_what_is_too_faint_to_be_drawn_learns_to_reflect_an_environment() -> Non
 
 
 def learns_to_reflect(stage: Stage, scene: Scene) -> bool:
-    """Return whether the photograph alone, without the prices on strength, gives strengths a gradient."""
+    """Returns True if the photometric loss alone, without penalties on strength, gives strengths a gradient."""
     photometric = replace(stage, losses=stage.losses[:1])
     found = differentiate(photometric, scene, tiny_capture().train[0], with_absgrad=False)
     return "primary.logit_strength" in found.gradients and bool(found.gradients["primary.logit_strength"].any())

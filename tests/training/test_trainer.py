@@ -1,4 +1,4 @@
-"""The training loop: progress, determinism, resuming, and its refusal of broken losses."""
+"""The training loop: progress, determinism, resuming, and its rejection of invalid losses."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_training_lowers_the_loss() -> None:
 
 
 def test_a_step_does_without_sympy(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Which takes half a second to import, and PyTorch imports it to look at gradients that are given."""
+    """It takes half a second to import, and PyTorch imports it to check given gradients."""
     monkeypatch.setitem(sys.modules, "torch.fx.experimental.symbolic_shapes", None)
     with pytest.raises(ModuleNotFoundError):
         torch.autograd.grad([torch.ones((), requires_grad=True) * 1], [torch.ones(())], [torch.ones(())])

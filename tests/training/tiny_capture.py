@@ -61,7 +61,7 @@ def pane_frame(planes: Planes) -> torch.Tensor:
 
 
 def write_tiny_capture(root: Path) -> Path:
-    """The same on disk as a `transforms.json` capture, all views annotated; returns its folder."""
+    """The same capture written as a `transforms.json` capture, all views annotated; returns its folder."""
     dataset, frames = tiny_capture(), []
     for folder in ("images", "panes"):
         (root / folder).mkdir(parents=True)
