@@ -1,4 +1,4 @@
-"""The numbers that options hold, by the names with which they are typed."""
+"""Numeric options, by the names with which they are typed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from glassplat.options import nested_name, unwrap_annotation
 
 
 def number_fields(kind: type, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Every option of a dataclass and of those in it that holds numbers: its name and the annotation of each number."""
+    """Every numeric option of a dataclass and of the dataclasses in it: its name and the annotation of each number."""
     for field, hint in typing.get_type_hints(kind, include_extras=True).items():
         if typing.get_origin(hint) is not typing.ClassVar:
             yield from _numbers(hint, nested_name(name, field, hint))

@@ -1,4 +1,4 @@
-"""Renders and transparent photographs are laid over the same colour."""
+"""Renders and transparent photographs are blended with the same background colour."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What looks like a mirror is found, and is taken for one that faces as the depths say."""
+"""Mirror-like surfaces are found, and turned into mirrors that face as their depths indicate."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SEARCH = MirrorSearch()
 
 
 def slope(*, discs: bool = False) -> Scene:
-    """A grey wall of 24 x 24 Gaussians that leans back by `TILT_DEG`, each turned in a way of its own."""
+    """A grey wall of 24 x 24 Gaussians that leans back by `TILT_DEG`, each with a random rotation."""
     generator = torch.Generator().manual_seed(0)
     along = torch.linspace(-1, 1, 24)
     x, y = torch.meshgrid(along, along, indexing="xy")
@@ -64,7 +64,7 @@ def camera() -> Camera:
 
 
 def views(*left: float) -> list[View]:
-    """Photographs of the wall, each with the left half brighter by so much."""
+    """Photographs of the wall, each with the left half brighter by the given amount."""
     plain = slope()
     with torch.no_grad():
         base = Splat()(replace(plain, primary=replace(plain.primary, active_sh_degree=0)), camera()).rgb
@@ -83,7 +83,7 @@ def true_normal() -> Tensor:
 
 
 def inner(scene: Scene) -> Tensor:
-    """[N] bool: what lies well inside of the wall."""
+    """[N] bool: Gaussians well inside the wall."""
     return scene.primary.means[:, :2].abs().amax(dim=1) < 0.6
 
 
@@ -121,7 +121,7 @@ def test_depths_tell_which_way_a_surface_faces(discs: bool) -> None:
     scene = slope(discs=discs)
     with torch.no_grad():
         sums = normals_from_views(scene, views(0.0))[inner(scene)]
-    # A disc that is seen edge-on covers no pixel, and some hide behind others.
+    # A disc seen edge-on covers no pixel, and some are hidden by others.
     told = sums.norm(dim=1) > LEAST_NORMAL_LENGTH
     normals = normalize(sums[told], dim=1)
     assert float(told.float().mean()) > 0.8
@@ -174,7 +174,7 @@ def test_a_normal_is_turned_on_the_shortest_way() -> None:
     quats, _ = rotate_to_normals(gaussians, wanted, 0.0)
     before, after = rotation_from_quat(gaussians.quats)[..., 2], rotation_from_quat(quats)[..., 2]
     torch.testing.assert_close((after * wanted).sum(1).abs(), torch.ones(len(wanted)), atol=1e-5, rtol=0)
-    # No further than from one line to the other.
+    # The axis rotates no further than the angle between both lines.
     turn = (after * before).sum(1)
     torch.testing.assert_close(turn, (before * wanted).sum(1).abs(), atol=1e-5, rtol=0)
 

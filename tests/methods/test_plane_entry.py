@@ -1,4 +1,4 @@
-"""What is done with the virtual scene behind a pane when reflections begin."""
+"""Treatment of the virtual scene behind a pane when reflections start."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ PANE = true_scene().planes
 
 
 def state_of(scene: Scene) -> TrainState:
-    """The scene with moments of ones for its means."""
+    """A state with this scene, and moments of one for its means."""
     state = TrainState(scene, seed=0)
     ones = torch.ones_like(scene.primary.means)
     state.optimizer.moments["primary.means"] = (ones, ones.clone())
@@ -103,7 +103,7 @@ def test_a_capture_from_the_front_gets_the_mirrored_points() -> None:
 
 
 def test_few_points_behind_a_pane_say_nothing() -> None:
-    """Three of them would become Gaussians as large as they are apart."""
+    """Three of them would become Gaussians as large as their distances."""
     scene, capture = true_scene(), tiny_capture()
     case = scene.primary.select(scene.primary.means[:, 2] > 1.5)
     behind = virtual_points(capture.points.positions, PANE, [view.camera for view in capture.train]).nonzero()[:3, 0]
@@ -130,7 +130,7 @@ def test_glass_lies_where_a_mirror_has_been_aligned(monkeypatch: pytest.MonkeyPa
 
 
 def split_in_two(whole: Planes) -> Planes:
-    """The pane as two, side by side."""
+    """The pane divided into two adjacent ones."""
     tangent, quarter = whole.axes()[0], 0.5 * whole.half_sizes[:, :1]
     halves = [
         replace(
@@ -155,7 +155,7 @@ def test_panes_side_by_side_get_the_points_of_one() -> None:
         seed_reflection(both, tiny_capture(), front)
     )
     torch.testing.assert_close(both.scene.primary.means, whole.scene.primary.means)
-    # Each by itself would get fewer: the neighbour shows what lies behind it from elsewhere.
+    # Separately they would get fewer: from elsewhere, the neighbour shows objects that lie behind the other.
     cameras = [view.camera for view in tiny_capture().train]
     points = tiny_capture().points.positions
     alone = [int(virtual_points(points, halves.select([row]), cameras).sum()) for row in (0, 1)]
@@ -178,7 +178,7 @@ def test_mirrors_are_named_and_start_at_their_reflectance() -> None:
 
 
 def wall(depth: float) -> Gaussians:
-    """An opaque wall across the view at this depth."""
+    """An opaque wall across the view at the given depth."""
     places = torch.linspace(-2.5, 2.5, 26)
     means = torch.cartesian_prod(places, places, torch.tensor([depth]))
     return solid(means, -1.8)
@@ -200,7 +200,7 @@ def test_what_shows_through_a_wall_behind_glass_is_a_reflection_unless_its_place
     places = (camera_at(x, 0, -0.3) for x in (-0.2, 0.2))
     cameras = [replace(camera, cam_from_world=camera.cam_from_world.float()) for camera in places]
     found = reflections_behind(scene, planes, cameras)
-    # Mirrored, the far one stands behind the cameras, and the near one before them, where they look through.
+    # The mirrored far one lies behind the cameras; the mirrored near one in front of them, where they see empty space.
     assert found.nonzero().flatten().tolist() == [len(primary) - 3]
 
     state = state_of(scene)
@@ -218,7 +218,7 @@ def test_nothing_is_turned_round_where_views_find_no_surface_in_its_place(monkey
     planes = replace(glass.planes, centers=torch.tensor([[0.0, 0, 2]]), raw_normals=torch.tensor([[0.0, 0, -1]]))
     places = (camera_at(x, 0, -0.3) for x in (-0.2, 0.2))
     cameras = [replace(camera, cam_from_world=camera.cam_from_world.float()) for camera in places]
-    # The far one's image lies behind the cameras, that of the other behind a thing that stands next to the pane.
+    # The far one's mirror image lies behind the cameras, the other's behind an object next to the pane.
     far, other, thing = (torch.tensor([place]) for place in ((0.05, 0.0, 6.0), (0.7, 0.0, 3.3), (0.45, 0.0, 0.2)))
 
     def found(*parts: Gaussians) -> list[int]:
@@ -230,7 +230,7 @@ def test_nothing_is_turned_round_where_views_find_no_surface_in_its_place(monkey
     assert found(solid(far), solid(other), solid(thing, -2.5)) == []
     mirrored = torch.tensor([[0.7, 0.0, 0.7]])
     assert found(solid(far), solid(other), solid(mirrored, -2.5)) == [0, 1]
-    # No view looks where the far one would be: whether it is real can be told only if most is always hidden.
+    # No view shows the far one's mirrored position: only being hidden always can tell that it is not real.
     monkeypatch.setattr(material, "MANY_ALWAYS_HIDDEN", 2.0)
     assert found(solid(far), solid(other), solid(mirrored, -2.5)) == [1]
 
@@ -239,14 +239,14 @@ def test_nothing_is_turned_round_where_views_find_no_surface_in_its_place(monkey
     ("often", "always", "looked_at", "confirmed", "expected"),
     [
         (3670, 3360, 1735, 885, True),
-        (1937, 1807, 948, 134, True),  # before what is seen of the room, which is little
+        (1937, 1807, 948, 134, True),  # in front of the visible part of the room, which is small
         (1066, 635, 114, 63, True),
         (300, 280, 0, 0, True),
         (1719, 1185, 264, 6, False),
         (1802, 1501, 1413, 275, False),
         (3379, 1769, 1427, 67, False),
         (1469, 932, 1006, 220, False),
-        (6365, 3256, 36, 36, False),  # a street behind a real front, of which next to nothing is looked at in front
+        (6365, 3256, 36, 36, False),  # a street behind a real front, with hardly any positions viewed in front of it
         (1324, 1130, 35, 34, True),  # photographed from the front
         (1321, 727, 556, 264, True),
     ],

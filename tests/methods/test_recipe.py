@@ -1,4 +1,4 @@
-"""Recipes on the command line and on disk: every number has a range, and what is not a recipe is refused."""
+"""Recipes on the command line and on disk: every number has a range, and invalid recipes are refused."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def ranges_of(hint: Any) -> list[Range]:
 
 
 def outside(hint: Any) -> Iterator[float]:
-    """Numbers that an annotation does not take, just beyond its bounds and far away."""
+    """Numbers that an annotation excludes, just beyond its bounds and far away."""
     (bounds,) = ranges_of(hint)
     whole = unwrap_annotation(hint)[0] is int
     step = 1 if whole else 1e-6
@@ -53,7 +53,7 @@ def test_every_number_has_a_range(kind: type, name: str, hint: Any) -> None:
 
 
 def with_value(options: Any, name: str, value: Any) -> Any:
-    """The options with one that may lie deep in them set."""
+    """The options with one of them, possibly nested, set."""
     outer, _, inner = name.partition(".")
     return dataclasses.replace(
         options, **{outer: with_value(getattr(options, outer), inner, value) if inner else value}
@@ -61,7 +61,7 @@ def with_value(options: Any, name: str, value: Any) -> Any:
 
 
 def like(old: Any, value: float) -> Any:
-    """The number in the shape of an option's value: alone, or as the first of several."""
+    """The number in the shape of an option's value: alone, or as the first element of several."""
     return (value, *old[1:]) if isinstance(old, tuple) and old else value
 
 
@@ -81,7 +81,7 @@ def test_every_number_out_of_its_range_is_refused(method: str) -> None:
             values = [like(old, number)] if not isinstance(old, tuple) else [(*old[:-1], number), (number, *old[1:])]
             for value in values:
                 broken = with_value(recipe, name, value)
-                # Of a tuple of several kinds, another element may take the number.
+                # In a tuple of several kinds, another element may accept the number.
                 if isinstance(old, tuple) and name == "region" and math.isfinite(number):
                     continue
                 with pytest.raises(InputError) as raised:

@@ -1,4 +1,4 @@
-"""Reflections begin: what is there to be mirrored, and what is taken for a mirror."""
+"""Start of reflections: the initial surroundings, and the Gaussians treated as mirrors."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Found = Callable[..., tuple[Tensor, Tensor]]
 
 
 def every_3rd(options: MirrorSearch, scene: Scene, views: object, renderer: object) -> tuple[Tensor, Tensor]:
-    """Takes every third Gaussian for a mirror."""
+    """Treats every third Gaussian as a mirror."""
     rows = torch.arange(len(scene.primary))
     return torch.ones_like(rows, dtype=torch.bool), rows % 3 == 0
 
@@ -44,7 +44,7 @@ def begun(
     near: bool = True,
     reset_sh_degree: bool = False,
 ) -> tuple[TrainState, list[str]]:
-    """A state in which reflections have begun, and what was told on the way."""
+    """A state in which reflections have started, and the messages of the start."""
     state = TrainState(TracedRecipe(sh_degree=1).initialise(tiny_capture()), seed=0)
     state.scene = replace(state.scene, primary=replace(state.scene.primary, active_sh_degree=1))
     ones = {name: torch.ones_like(tensor) for name, tensor in state.scene.primary.tensors().items()}
@@ -75,7 +75,7 @@ def test_the_papers_start_from_hardly_any_reflection() -> None:
     state, _ = begun(every_3rd, MirrorSearch(begin_found=False))
     assert float(state.scene.primary.channels["logit_strength"].max()) < logit(0.01)
     assert all(bool((first == 1).all()) for first, _ in state.optimizer.moments.values())
-    # What looks like a mirror is not copied, all the same.
+    # Mirror-like Gaussians are nevertheless not copied.
     assert len(state.scene.surroundings) < len(state.scene.primary)
 
 

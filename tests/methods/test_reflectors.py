@@ -1,4 +1,4 @@
-"""What reflects, and what looks as if it should, as shares of what the views show."""
+"""Shares of the views that reflect, and that look as if they should."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ GREY = 0.5
 
 
 def two_discs(*, strength: float = 1e-3) -> Scene:
-    """Opaque grey Gaussians left and right of the z axis, the left one of this strength."""
+    """Opaque grey Gaussians left and right of the z axis, the left one with the given strength."""
     gaussians = Gaussians(
         means=torch.tensor([[-0.5, 0.0, 2.0], [0.5, 0.0, 2.0]]),
         quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(2, 1),
@@ -40,7 +40,7 @@ def camera() -> Camera:
 
 
 def views(*left: float) -> list[View]:
-    """Photographs of the discs, each with the left half brighter by so much."""
+    """Photographs of the discs, each with the left half brighter by the given amount."""
     with torch.no_grad():
         base = Deferred()(two_discs(), camera()).layers["base"]
     return brightened_views(base, camera(), GREY, *left)
@@ -72,13 +72,13 @@ def test_a_residual_that_is_the_same_in_all_views_does_not_turn() -> None:
 
 def test_a_residual_that_turns_has_the_spread_of_the_photographs() -> None:
     _, spreads = residual_spreads(two_discs(), views(0.2, -0.2, 0.2, -0.2), Deferred())
-    # A Gaussian's own weights fall off as its colour in the picture does, so that it sees their weighted square.
+    # A Gaussian's own weights fall off like its colour in the image, so that it sees their weighted square.
     assert 0.08 < float(spreads[0]) < 0.2
     assert float(spreads[1]) < 0.01
 
 
 def test_what_views_ignore_says_nothing() -> None:
-    """A residual that is the same wherever it is known does not turn, however many views are masked."""
+    """A residual that is constant wherever it is known does not vary with the view, however many views are masked."""
     plain, *masked = views(0.3, 0.3, 0.3, 0.3)
     everything = torch.ones(SIZE, SIZE, dtype=torch.bool)
     masked = [replace(view, read_ignored=lambda: everything) for view in masked]

@@ -1,4 +1,4 @@
-"""The place that cameras stand around."""
+"""The region that the cameras surround."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The first surroundings: in the box of the scene, and copied from it."""
+"""Initial surroundings: random in the box of the scene, or copied from it."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_every_cell_gets_as_many() -> None:
 def test_their_size_is_the_distance_of_neighbours() -> None:
     found = in_box(cells=8, per_cell=6)
     distances = torch.cdist(found.means, found.means).fill_diagonal_(torch.inf).amin(dim=1)
-    # Neighbours beyond the border are missing, and cells are fuller in one direction than in another.
+    # Neighbours beyond the border are missing, and the density of points differs between directions.
     assert float(found.log_scales.exp().mean()) == pytest.approx(float(distances.mean()), rel=0.2)
 
 
