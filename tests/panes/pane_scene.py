@@ -1,4 +1,4 @@
-"""Panes in the world, cameras that look at them, and the masks and points that these give."""
+"""Panes in the world, cameras that look at them, and the resulting masks and points."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -54,7 +54,7 @@ def camera_from(eye: Sequence[float], target: np.ndarray) -> Camera:
 
 
 def label_image(camera: Camera, panes: Sequence[Pane]) -> torch.Tensor:
-    """[H, W] number of the nearest pane through each pixel, counted from 1; 0 where there is none."""
+    """[H, W] number of the nearest pane along each pixel's ray, counted from 1; 0 where there is none."""
     rays, eye = view_directions(camera).numpy(), camera.center.numpy()
     labels, nearest = np.zeros(rays.shape[:2], dtype=np.uint8), np.full(rays.shape[:2], np.inf)
     for number, pane in enumerate(panes, start=1):
@@ -89,13 +89,13 @@ def frame_bars(pane: Pane, height: float, width: float = 0.06) -> list[Pane]:
 
 
 def framed_scene_of(pane: Pane, height: float, eyes: Sequence[Sequence[float]]) -> Annotations:
-    """Masks of a pane in a frame that stands out towards its normal."""
+    """Masks of a pane in a frame that protrudes along its normal."""
     annotations = scene_of([pane, *frame_bars(pane, height)], eyes)
     return [(camera, torch.where(labels == 1, 1, 0)) for camera, labels in annotations]
 
 
 def frame_and_clutter(panes: Sequence[Pane], *, noise: float = 0.01, frame: int = 80, wall: int = 2000) -> torch.Tensor:
-    """Noisy points on the frames, and many more on a wall behind and in the air."""
+    """Noisy points on the frames, and many more on a wall behind and in free space."""
     rng = np.random.default_rng(0)
     points = []
     for pane in panes:
@@ -109,7 +109,7 @@ def frame_and_clutter(panes: Sequence[Pane], *, noise: float = 0.01, frame: int 
 
 
 def ragged(labels: torch.Tensor, *, amplitude: float, seed: int) -> torch.Tensor:
-    """A mask whose edge wanders by some pixels, with holes in it and specks next to it."""
+    """A mask with an edge displaced by some pixels, with holes in it and specks around it."""
     rng = np.random.default_rng(seed)
     mask = labels.numpy() == 1
     waves = ndimage.gaussian_filter(rng.standard_normal(mask.shape), 2)
@@ -120,7 +120,7 @@ def ragged(labels: torch.Tensor, *, amplitude: float, seed: int) -> torch.Tensor
 
 
 def normal_error(planes: Planes, index: int, pane: Pane) -> float:
-    """Degrees between signed normals."""
+    """Angle in degrees between signed normals."""
     cosine = float(planes.normals[index].double() @ torch.tensor(pane.normal))
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 

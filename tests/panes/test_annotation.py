@@ -11,7 +11,7 @@ WIDTH, HEIGHT = 80, 60
 
 
 def camera_at(x: float) -> Camera:
-    """Looks along +z from (x, 0, 0)."""
+    """A camera at (x, 0, 0) that looks along +z."""
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[0, 3] = -x
     return Camera(matrix, 60.0, 60.0, 40.0, 30.0, WIDTH, HEIGHT)
@@ -58,7 +58,7 @@ def test_rays_through_pixels_project_back_onto_them() -> None:
 
 
 def test_candidates_stay_on_the_edge_in_most_views() -> None:
-    # A pane at z = 2 from x = -0.5 to 0.5: its edges land at 60 / 2 * (-0.5 - x) + 40 in the view from x.
+    # A pane at z = 2 from x = -0.5 to 0.5: its edges project to 60 / 2 * (-0.5 - x) + 40 in the view from x.
     annotations = [(camera_at(x), labels_with(15, 45, int(25 - 30 * x), int(55 - 30 * x))) for x in (-0.4, 0.0, 0.4)]
     on_frame, behind_frame, middle = [-0.5, 0.1, 2.0], [-1.0, 0.1, 4.0], [0.0, 0.0, 2.0]
     points = np.array([on_frame, behind_frame, middle])

@@ -1,4 +1,4 @@
-"""Mask edges on planes: what a frame hides, and what a rectangle's sides do."""
+"""Mask edges on planes: parts hidden by a frame, and the sides of a rectangle."""
 
 from dataclasses import replace
 
@@ -71,7 +71,7 @@ def test_edges_that_enter_an_image_or_leave_it_make_no_plane_surer() -> None:
 
 def test_the_sign_of_turned_edges_does_not_hang_on_the_axes_of_the_plane() -> None:
     views = pane_views(scene_of([FRONT]), 1)
-    # The axes of a plane turn by a right angle where its normal is nearest to another axis of the world.
+    # The axes of a plane rotate by a right angle where another axis of the world becomes the nearest to its normal.
     tilts = 1e-3 * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
     around = move_planes(TRUTH.select(np.zeros(5, dtype=np.int64)), np.tile(FRONT.center, (5, 1)), tilts)
     turns = edge_matches(around, views, edges_per_view=100).misalignments

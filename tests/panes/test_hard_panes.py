@@ -1,4 +1,4 @@
-"""Planes of panes that are hard to measure: few, ragged or oversized masks, bare frames, steep views, cut outlines."""
+"""Planes of panes that are hard to fit: few, ragged or oversized masks, bare frames, steep views, cut outlines."""
 
 from dataclasses import replace
 from typing import Any
@@ -41,7 +41,7 @@ def assert_found(pane: Pane, annotations: Annotations, points: torch.Tensor, *, 
 
 
 def roughened(annotations: Annotations, label: int, *, amplitude: float, seed: int = 0) -> Annotations:
-    """The annotations, one pane's masks of them ragged."""
+    """The annotations with the masks of one pane made ragged."""
 
     def rough(number: int, labels: torch.Tensor) -> torch.Tensor:
         mask = ragged((labels == label).to(torch.uint8), amplitude=amplitude, seed=seed + number)
@@ -69,7 +69,7 @@ WALK = tuple((x, -0.1 + 0.1 * (i % 2), 0.6 - 0.1 * (i % 3)) for i, x in enumerat
 
 
 def walked_past(panes: list[Pane], labels: tuple[int, ...]) -> Annotations:
-    """Masks of a walk past panes and things, each with a label; 0 is no pane."""
+    """Masks of a walk past panes and other objects, each with a label; 0 is not a pane."""
     told = torch.tensor((0, *labels), dtype=torch.uint8)
     cameras = [camera_from(eye, np.array([0.8 * eye[0] + 0.2, -0.1, 2.0])) for eye in WALK]
     return [(camera, told[label_image(camera, panes).long()]) for camera in cameras]
@@ -182,7 +182,7 @@ def test_a_plane_that_one_edge_leaves_free_is_refused_with_what_to_annotate() ->
 
 
 def front_pane(x: float, half_width: float, degrees: float = 0.0) -> Pane:
-    """A pane of a shop front, turned about the vertical by some degrees."""
+    """A pane of a shop front, rotated about the vertical by the given angle."""
     turn = np.radians(degrees)
     normal, tangent = np.array([np.sin(turn), 0, -np.cos(turn)]), np.array([np.cos(turn), 0, np.sin(turn)])
     return Pane(np.array([x, -0.1, 2.0]), normal, tangent, (half_width, 0.5))
@@ -211,7 +211,7 @@ def test_an_ill_measured_pane_of_a_front_is_placed_by_all_masks_together() -> No
 
 
 def muntined(columns: int, rows: int) -> list[Pane]:
-    """A shop front of panes that touch."""
+    """A shop front of adjacent panes."""
     half = 0.8 / columns, 0.5 / rows
     places = [(x, y) for y in range(rows) for x in range(columns)]
     middles = [

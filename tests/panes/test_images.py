@@ -1,4 +1,4 @@
-"""Planes placed by measured points that are mirror images of others."""
+"""Planes estimated from measured points that are mirror images of others."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NOISE = 0.01
 
 
 def things(seed: int, *, low: tuple[float, ...], high: tuple[float, ...], count: int = 400) -> np.ndarray:
-    """[count, 3] points on a dozen balls that stand in a box."""
+    """[count, 3] points on a dozen balls in a box."""
     rng = np.random.default_rng(seed)
     middles, ways = rng.uniform(low, high, (12, 3)), rng.normal(size=(count, 3))
     return middles[rng.integers(12, size=count)] + 0.3 * ways / np.linalg.norm(ways, axis=1, keepdims=True)
@@ -34,14 +34,14 @@ def behind_the_pane(seed: int) -> np.ndarray:
 
 
 def images_of(points: np.ndarray, seed: int) -> np.ndarray:
-    """Half of the points mirrored by the pane, as structure from motion measures them."""
+    """Half of the points mirrored by the pane, as structure from motion reconstructs them."""
     chosen = points[::2]
     mirrored = chosen - 2 * ((chosen - FRONT.center) @ FRONT.normal)[:, None] * FRONT.normal
     return mirrored + np.random.default_rng(seed).normal(scale=NOISE, size=mirrored.shape)
 
 
 def turned(degrees: float, shift: float) -> PlaneEquations:
-    """The pane's plane, turned about an axis in it and moved along its normal."""
+    """The pane's plane, rotated about an axis in it and moved along its normal."""
     angle = np.radians(degrees)
     normal = np.cos(angle) * FRONT.normal + np.sin(angle) * np.array([0.6, 0.8, 0.0])
     return PlaneEquations(normal[None], np.array([normal @ FRONT.center + shift]))
@@ -133,7 +133,7 @@ def test_two_masks_are_enough_where_a_mirror_shows_points(caplog: pytest.LogCapt
 
 
 def test_images_do_not_overrule_masks_that_tell_against_their_plane() -> None:
-    """Masks of a pane that is turned by 12 degrees from the plane that mirrors."""
+    """Masks of a pane that is rotated by 12 degrees from the plane that mirrors the points."""
     other = rotation_from_quat(torch.tensor([0.9945, 0.0, 0.1045, 0.0], dtype=torch.float64)).numpy()
     pane: Pane = replace(FRONT, normal=other @ FRONT.normal, tangent=other @ FRONT.tangent)
     room = before_the_pane(0)

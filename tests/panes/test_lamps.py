@@ -1,4 +1,4 @@
-"""Lamps found by their reflections, and what panes mirror that no photograph shows."""
+"""Lamps found by their reflections, and objects reflected by panes that no photograph shows directly."""
 
 from __future__ import annotations
 

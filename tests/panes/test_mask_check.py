@@ -1,4 +1,4 @@
-"""A mask that belongs to another photograph is named."""
+"""Masks that belong to another photograph are reported by name."""
 
 from __future__ import annotations
 

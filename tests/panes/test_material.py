@@ -1,4 +1,4 @@
-"""Mirrors are told from glass by how the photographs depend on the mirrored scene."""
+"""Mirrors are distinguished from glass by how the photographs depend on the mirrored scene."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def photographs(scene: Scene) -> list[View]:
 
 
 def mirror_labels(scene: Scene, views: Sequence[View]) -> tuple[int, ...]:
-    """Labels of the panes that are mirrors."""
+    """Labels of the panes that are found to be mirrors."""
     photographed = reduced_photographs(scene, views)
     judged = {label: mirror_candidate(scene, label, photographed) for label in scene.planes.labels}
     return tuple(label for label, found in judged.items() if found.is_mirror)
@@ -71,7 +71,7 @@ def test_a_mirror_is_found_and_glass_is_not(base_reflectance: float, expected: t
 
 
 def test_glass_before_darkness_is_no_mirror() -> None:
-    # sRGB is steep where it is dark: an eighth of the light looks like four tenths of the brightness.
+    # sRGB is steep in the dark: an eighth of the light looks like four tenths of the brightness.
     scene = scene_with(0.15)
     before = scene.primary.means[:, 2] < scene.planes.centers[0, 2]
     dark = replace(scene, primary=scene.primary.select(before))
@@ -98,7 +98,7 @@ def test_an_exposure_does_not_turn_a_mirror_into_glass() -> None:
 
 
 def test_a_pane_of_which_hardly_anything_is_known_stays_glass() -> None:
-    """Of a glass front that mirrors what no photograph shows, some spots may well agree with it."""
+    """A glass front may reflect objects that no photograph shows; some spots may agree with the scene by chance."""
     scene = scene_with(0.2)
     found = mirror_candidate(scene, 1, reduced_photographs(scene, photographs(scene_with(0.995))))
     assert found.is_mirror and FEWEST_PIXELS <= found.compared <= found.shown
@@ -107,7 +107,7 @@ def test_a_pane_of_which_hardly_anything_is_known_stays_glass() -> None:
 
 
 def test_a_mirror_is_found_and_put_right_where_its_fitted_plane_is_tilted() -> None:
-    """A plane that is tilted by two degrees mirrors what lies four degrees beside what the photograph shows."""
+    """A plane tilted by two degrees mirrors objects four degrees away from those in the photograph."""
     true, unknown = scene_with(0.995), scene_with(0.2)
     tilt = torch.tensor([[math.tan(math.radians(2.0)), 0.0, 0.0]])
     tilted = replace(unknown, planes=replace(unknown.planes, raw_normals=unknown.planes.normals + tilt))
@@ -120,7 +120,7 @@ def test_a_mirror_is_found_and_put_right_where_its_fitted_plane_is_tilted() -> N
 
 
 def test_a_mirror_stays_where_its_fitted_plane_is_right() -> None:
-    """Aligning moves even a true plane a little, for hardly any gain."""
+    """Aligning moves even a true plane slightly, for hardly any gain."""
     unknown = scene_with(0.2)
     found = mirror_candidate(unknown, 1, reduced_photographs(unknown, photographs(scene_with(0.995))))
     assert found.is_mirror
@@ -174,7 +174,7 @@ def test_local_means_ignore_what_lies_outside_the_region() -> None:
 
 
 def mean_by_pooling(image: torch.Tensor, region: torch.Tensor) -> torch.Tensor:
-    """The definition: every window by itself."""
+    """The definition, which sums every window separately."""
     side = 2 * max(round(MEAN_WINDOW * image.shape[1] / 2), 1) + 1
     inside = region.to(image.dtype)[..., None]
     stacked = torch.cat([image * inside, inside], dim=-1).permute(2, 0, 1)[None]
@@ -192,7 +192,7 @@ def test_local_means_are_those_of_every_window_by_itself(size: tuple[int, int]) 
 
 
 def test_a_large_window_is_no_more_work_than_a_small_one() -> None:
-    """On photographs of 3000 pixels the window has 450 x 450 of them: summed one by one, hours for ten views."""
+    """On photographs of 3000 pixels the window has 450 x 450 pixels: summed one by one, hours for ten views."""
 
     def work(reach: int) -> int:
         with CountedElements() as counted:
@@ -203,7 +203,7 @@ def test_a_large_window_is_no_more_work_than_a_small_one() -> None:
 
 
 class CountedElements(TorchDispatchMode):
-    """Counts the elements that all operations return; none of them may read more for each."""
+    """Counts the elements returned by operations; rejects pooling and convolution, whose work grows with windows."""
 
     elements = 0
 

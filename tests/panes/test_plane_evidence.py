@@ -1,4 +1,4 @@
-"""Which plane is kept where Gaussians and measured points lead to different ones."""
+"""Choice between planes where Gaussians and measured points indicate different ones."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CLOSE = ((-0.15, 0.0, -1.0), (0.15, 0.05, -1.0), (0.0, -0.1, -0.9))
 
 
 def turned(pane: Pane, degrees: float) -> Pane:
-    """The pane turned about the upright axis through its middle."""
+    """The pane rotated about the vertical axis through its centre."""
     cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     rotation = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
     return replace(pane, normal=rotation @ pane.normal, tangent=rotation @ pane.tangent)
@@ -78,7 +78,7 @@ def test_a_plane_behind_an_impossible_frame_is_kept_only_where_there_is_no_other
 
 
 def test_virtual_points_behind_a_mirror_do_not_speak_against_its_plane() -> None:
-    """Nothing lies on the mirror, and everything that was measured in it lies behind."""
+    """There are no points on the mirror, and all points measured through it lie behind it."""
     views = pane_views(scene_of([FRONT]), 1)
     virtual = np.random.default_rng(0).uniform([-2, -1, 2.5], [2, 1, 6], (5000, 3))
     evidence = Objective(views, virtual, EXTENT, 0.01 * EXTENT)
@@ -107,7 +107,7 @@ def with_translation(matrix: torch.Tensor, factor: float) -> torch.Tensor:
 
 
 def test_a_pane_that_fills_the_photographs_is_among_the_first_hypotheses() -> None:
-    """Its masks overlap on almost any plane, so that ranking by it left only planes 24 degrees off."""
+    """Its masks overlap on almost any plane, so that ranking by overlap kept only planes that were 24 degrees off."""
     wide = Pane(np.array([0.5, 0.0, 2.0]), FRONT.normal, FRONT.tangent, (2.2, 0.8))
     eyes = [(-2.0 + 0.5 * number, 0.05 * (-1) ** number, 0.3 + 0.1 * (number % 3)) for number in range(7)]
     cameras = [

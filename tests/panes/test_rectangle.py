@@ -1,4 +1,4 @@
-"""The smallest rectangle around points."""
+"""The smallest rectangle that encloses points."""
 
 import math
 
