@@ -1,4 +1,4 @@
-"""The tree keeps the shape that docs/architecture.md draws: who may import whom, and how large things may grow."""
+"""The code follows the structure in docs/architecture.md: allowed imports between layers, and limits of size."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MEANINGLESS_NAMES = {"utils", "util", "helpers", "helper", "common", "misc"}
 
 @dataclass(frozen=True)
 class Limits:
-    """How large one file and its functions may be; `parameters` is None where the count is free."""
+    """Limits of the size of one file and its functions; `parameters` is None if their number is not limited."""
 
     file_lines: int
     function_lines: int
@@ -51,7 +51,7 @@ def limits_of(path: Path) -> Limits:
 
 
 def rows_of(diagram: str) -> dict[str, int]:
-    """Row of every layer in the first code block of the architecture page; row 0 is the top."""
+    """Row of each layer in the first code block of the architecture page; row 0 is the top."""
     block = diagram.split("```")[1].strip("\n")
     rows: dict[str, int] = {}
     for row, line in enumerate(block.splitlines()):
@@ -67,7 +67,7 @@ def module_of(path: Path) -> str:
 
 
 def layer_of(module: str) -> str | None:
-    """The part of the package a module belongs to; None for the package itself and for foreign modules."""
+    """The layer of the package that a module belongs to; None for the package itself and for foreign modules."""
     parts = module.split(".")
     if parts[0] != PACKAGE or len(parts) == 1 or parts[1].startswith("__"):
         return None
@@ -75,7 +75,7 @@ def layer_of(module: str) -> str | None:
 
 
 def imported_modules(tree: ast.Module, path: Path) -> Iterator[tuple[str, int]]:
-    """Every module that a file imports, at any depth and under TYPE_CHECKING too, with the line."""
+    """Every module imported by a file, at any depth and under TYPE_CHECKING too, with the line."""
     package = path.with_suffix("").parts[:-1]
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -107,7 +107,7 @@ def import_violations(tree: ast.Module, path: Path, rows: Mapping[str, int]) -> 
 
 
 def code_lines(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
-    """Lines of a function without its decorators and without its docstring, which may be a manual page."""
+    """Number of lines of a function without decorators and docstring, which may be a manual page."""
     last = function.end_lineno or function.lineno
     lines = last - function.lineno + 1
     if ast.get_docstring(function, clean=False) is not None:
@@ -127,7 +127,7 @@ def parameter_count(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
 
 
 def size_violations(tree: ast.Module, path: Path, source: str) -> Iterator[str]:
-    """Files and functions that are too long, and functions that take too much."""
+    """Files and functions that are too long, and functions with too many parameters."""
     limits = limits_of(path)
     if (lines := source.count("\n")) > limits.file_lines:
         yield f"{path}: {lines} lines where {limits.file_lines} are the most; split it by what it holds"
@@ -144,14 +144,14 @@ def size_violations(tree: ast.Module, path: Path, source: str) -> Iterator[str]:
 
 
 def name_violations(path: Path) -> Iterator[str]:
-    """File and folder names that say nothing about what is inside."""
+    """File and folder names that do not describe their contents."""
     for part in path.with_suffix("").parts:
         if part.lower() in MEANINGLESS_NAMES:
             yield f"{path}: `{part}` says nothing; name it after what it holds"
 
 
 def violations(path: Path, source: str, rows: Mapping[str, int]) -> list[str]:
-    """Everything wrong with one file, given its path relative to the repository."""
+    """All violations of one file, given its path relative to the repository."""
     tree = ast.parse(source)
     return [*import_violations(tree, path, rows), *size_violations(tree, path, source), *name_violations(path)]
 
@@ -183,7 +183,7 @@ def test_the_diagram_has_kernels_and_scene_side_by_side_at_the_bottom(rows: dict
 
 
 class WithoutTyping(ast.NodeTransformer):
-    """Takes out what is imported for annotations alone."""
+    """Removes imports that are used for annotations only."""
 
     def visit_If(self, node: ast.If) -> ast.AST | None:
         """None for `if TYPE_CHECKING:`."""
@@ -191,7 +191,7 @@ class WithoutTyping(ast.NodeTransformer):
 
 
 def import_graph(sources: Mapping[Path, str]) -> dict[str, set[str]]:
-    """The modules of the package that each of its modules imports when it runs, at any depth."""
+    """The modules of the package that each of its modules imports at run time, at any depth."""
     known = {module_of(path) for path in sources}
     graph: dict[str, set[str]] = {}
     for path, source in sources.items():
@@ -211,7 +211,7 @@ def package_sources() -> dict[Path, str]:
 
 
 def lonely_files(sources: Mapping[Path, str]) -> list[str]:
-    """Small files that only one other imports; the backends of kernels, which are found by name, aside."""
+    """Small files with a single importer, except the backends of kernels, which are found by name."""
     graph = import_graph(sources)
     importers = {module: sum(module in imported for imported in graph.values()) for module in graph}
     return [
@@ -225,7 +225,7 @@ def lonely_files(sources: Mapping[Path, str]) -> list[str]:
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:
-    TopologicalSorter(import_graph(package_sources())).prepare()  # Raises CycleError, and names the circle.
+    TopologicalSorter(import_graph(package_sources())).prepare()  # Raises CycleError, which names the cycle.
 
 
 def test_no_small_file_serves_a_single_other() -> None:
@@ -234,7 +234,7 @@ def test_no_small_file_serves_a_single_other() -> None:
 
 
 def import_share(sources: Mapping[Path, str]) -> float:
-    """Share of the lines that belong to import statements."""
+    """Share of lines that belong to import statements."""
     lines = imports = 0
     for source in sources.values():
         lines += source.count("\n")

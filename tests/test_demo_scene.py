@@ -54,7 +54,7 @@ def test_the_truth_covers_exactly_the_test_views_and_the_masks_only_training_vie
 
 
 def blocks(picture: np.ndarray) -> np.ndarray:
-    """Mean of each block of 4x4 pixels, in which errors of JPEG cancel."""
+    """Mean of each block of 4x4 pixels, which cancels JPEG errors."""
     height, width = (side // 4 for side in picture.shape[:2])
     return picture.reshape(height, 4, width, 4, -1).mean(axis=(1, 3))
 
@@ -72,9 +72,9 @@ def test_the_layers_add_up_to_the_photograph(name: str) -> None:
     )
     strength = blocks(pixels(SCENE / f"gt/strength/{name}.png")) / 65535.0
     composed = (1 - strength) * transmission + strength * reflection
-    # Pictures hold nothing brighter than white.
+    # Images contain nothing brighter than white.
     exposed = pane & (reflection.max(axis=-1) < 0.9) & (transmission.max(axis=-1) < 0.9)
-    # Views that look away from the pane have nothing to compare, and nothing may be claimed.
+    # Views that look away from the pane have nothing to compare.
     assert exposed.any() or not pane.any()
     difference = np.abs(composed - photograph)[exposed]
     assert difference.size == 0 or difference.mean() < 0.005

@@ -1,4 +1,4 @@
-"""The documents keep their promises: links lead somewhere, and the commands they show exist."""
+"""The documents are correct: links resolve, and the commands they show exist."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def shell_lines(page: Path) -> list[str]:
 
 
 def commands(program: str) -> list[list[str]]:
-    """The arguments of every call of a program that the pages show."""
+    """The arguments of every call of a program shown in the pages."""
     words = [shlex.split(line) for page in PAGES for line in shell_lines(page)]
     return [line[line.index(program) + 1 :] for line in words if program in line]
 
@@ -123,13 +123,13 @@ MODULE = re.compile(r"python -m ((?:tools|benchmarks)(?:\.\w+)?)([^`\n|;]*)")
 
 
 def module_calls() -> list[tuple[str, str]]:
-    """Modules of this repository that the pages run, with the options shown; continued lines count as one."""
+    """Modules of this repository that the pages run, with the options shown; continued lines are joined."""
     text = "\n".join(page.read_text(encoding="utf-8").replace("\\\n", " ") for page in PAGES)
     return sorted({(module, option) for module, rest in MODULE.findall(text) for option in options_of(rest)})
 
 
 def options_of(arguments: str) -> list[str]:
-    """The options of a call, of which texts in quotes are none; one empty string where there are none."""
+    """The options of a call outside quoted texts; one empty string if there are none."""
     bare = re.sub(r"\"[^\"]*\"|\s#.*", "", arguments)
     return re.findall(r"(?<=\s)--[a-z][a-z-]*", bare) or [""]
 

@@ -1,4 +1,4 @@
-"""The examples do what they say, on the bundled scene, small and short."""
+"""The examples run as described, on the bundled scene, small and short."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DEMO = Path(glassplat.__file__).parent / "demo_scene"
 
 
 def said_by(example: str, *options: str, folder: Path) -> str:
-    """What an example prints, run in a folder; in this process, which has its kernels at hand."""
+    """Output of an example, run in a folder, in this process, which has already loaded its kernels."""
     path, said = EXAMPLES / example, io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said):
         patch.chdir(folder)
