@@ -1,4 +1,4 @@
-"""A capture of a room with a pane on its wall, whose corners everybody can see, and its server."""
+"""A capture of a room with a pane on its wall, whose corners are visible in all views, and its server."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def write_room(root: Path) -> Path:
 
 
 def write_colmap_room(root: Path, names: Sequence[str]) -> Path:
-    """The same as a COLMAP model that calls the photographs by other names, wherever these lead from `images/`."""
+    """The same as a COLMAP model with other names for the photographs, resolved from `images/`."""
     write_room(root)
     (root / "sparse").mkdir()
     (root / "sparse" / "cameras.txt").write_text("1 PINHOLE 300 220 240 240 150 110\n")
@@ -71,21 +71,21 @@ def write_colmap_room(root: Path, names: Sequence[str]) -> Path:
 
 
 def renamed(document: dict, names: Sequence[str]) -> dict:
-    """A document whose photographs have other names."""
+    """A document whose photographs are renamed."""
     (pane,) = document["panes"]
     corners = [{names[NAMES.index(name)]: place for name, place in places.items()} for places in pane["corners"]]
     return {**document, "panes": [{**pane, "corners": corners}]}
 
 
 def marked_document(views: tuple[int, ...] = (0, 1, 2), **more: object) -> dict:
-    """All corners marked in some views."""
+    """A document with all corners marked in some views."""
     corners = [{NAMES[view]: true_corners(view)[corner].tolist() for view in views} for corner in range(4)]
     pane = {"label": 1, "material": "glass", "shape": "rectangle", "corners": corners, "edges": [{}] * 4, "strokes": {}}
     return {"version": 1, "panes": [pane | more]}
 
 
 def saved(session: Session, document: dict) -> dict:
-    """The answer to a page that has seen all that is saved."""
+    """The answer to a page that has received everything saved so far."""
     return session.save({"document": document, "version": session.describe()["version"]})
 
 
@@ -96,7 +96,7 @@ def room(tmp_path: Path) -> Path:
 
 @contextmanager
 def serving(root: Path) -> Iterator[AnnotationServer]:
-    """A server that runs next to the test."""
+    """A server that runs in the background of the test."""
     with AnnotationServer(open_session(root), 0) as server:
         thread = Thread(target=server.serve_forever, args=(0.02,))
         thread.start()

@@ -1,4 +1,4 @@
-"""GrabCut finds what stands within a rough outline; without it, the page says what to install."""
+"""GrabCut finds the object in a rough outline; without it, the page reports which package to install."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ROUGH = np.array([[60.0, 30], [170, 30], [170, 130], [60, 130]])
 
 
 def hedge_before_a_wall() -> tuple[np.ndarray, np.ndarray]:
-    """A photograph of a green disc before a grey wall, both mottled, and where the disc is."""
+    """A photograph of a green disc in front of a grey wall, both mottled, and the mask of the disc."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     disc = np.hypot(x - 112, y - 78) < 36
     mottle = np.random.default_rng(0).normal(0, 12, (HEIGHT, WIDTH, 1))

@@ -1,4 +1,4 @@
-"""Marks of two pages are put together so that nothing of either is lost."""
+"""Marks of two pages are merged so that nothing of either is lost."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.annotate.conftest import marked_document, saved
 
 
 def document(**panes: str) -> dict:
-    """A document of panes a=1, b=2, ..., each with a text for what is marked of it."""
+    """A document of panes a=1, b=2, ..., each with a text that stands for its marks."""
     return {"version": 1, "panes": [{"label": ord(name) - 96, "marks": marks} for name, marks in panes.items()]}
 
 

@@ -1,4 +1,4 @@
-"""The page in a real browser: corners are clicked, a pane appears, is cut, undone and written; pixels are looked at."""
+"""The page in a real browser: corners are clicked, panes appear, are cut, undone and written; pixels are compared."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ pytestmark = [needs_browser, pytest.mark.usefixtures("one_chromium")]
 
 
 class Page(MarkingPage):
-    """The page for marking, with what tests look at."""
+    """The page for marking, with helpers for the tests."""
 
     @property
     def root(self) -> Path:
         return self.server.session.root
 
     def mark_true(self, view: int) -> None:
-        """Clicks where the corners really are."""
+        """Clicks the true corners."""
         self.mark(view, true_corners(view))
 
     def color_at(self, place: tuple[float, float]) -> np.ndarray:
-        """[3] the colour that the window shows at a place of the photograph."""
+        """[3] the colour that the window shows at a position in the photograph."""
         ((x, y),) = self.on_screen(np.array([place]))
         return self.window.picture()[round(y), round(x)].astype(int)
 
@@ -52,12 +52,12 @@ FULL = "there can be 64 panes at most"
 
 
 def is_blue(color: np.ndarray) -> bool:
-    """Whether the first pane's colour lies over the grey photograph."""
+    """True if the first pane's colour is drawn over the grey photograph."""
     return bool(color[2] > color[0] + 15)
 
 
 def complaints(page: Page) -> list[str]:
-    """What the page complained of; browsers may ask for an icon of their own accord."""
+    """Errors of the page; browsers may request an icon by themselves."""
     return [said for said in page.window.complaints() if not said.startswith("Failed to load resource")]
 
 
@@ -69,7 +69,7 @@ def test_a_pane_is_marked_cut_and_written(page: Page) -> None:
     assert page.window.run("return document.querySelectorAll('#views .suggested').length") > 0
     page.mark_true(1)
     page.mark_true(2)
-    page.show(3)  # Nothing was clicked here: the pane shows where it must be.
+    page.show(3)  # Nothing was clicked here: the pane appears at its predicted position.
     assert is_blue(page.color_at(middle))
     outside = true_corners(3)[0] - (12, 12)
     assert not is_blue(page.color_at(tuple(outside)))
@@ -143,7 +143,7 @@ def test_corners_are_dragged_undone_and_survive_a_reload(page: Page) -> None:
     page.saved()
     dragged = page.document()["corners"][2]["0.png"]
     assert dragged[0] > before[0] + 5 and dragged[1] > before[1] + 2
-    page.window.keys("Control", "z")  # One drag is one step.
+    page.window.keys("Control", "z")  # A drag is one step.
     wait_until(lambda: page.document()["corners"][2]["0.png"] == before, "the corner to be back")
     page.window.press("#redo")
     wait_until(lambda: page.document()["corners"][2]["0.png"] == dragged, "the corner to be dragged again")
@@ -228,7 +228,7 @@ def test_a_touch_that_the_browser_takes_over_lets_go(page: Page) -> None:
     before = page.document()["corners"]
     page.window.run(
         "const [x, y] = arguments[0], canvas = document.getElementById('canvas');"
-        "canvas.setPointerCapture = () => {};"  # It knows no pointer of a script.
+        "canvas.setPointerCapture = () => {};"  # It rejects pointers of a script.
         "for (const [kind, way] of [['down', 0], ['cancel', 0], ['move', 50]])"
         "  canvas.dispatchEvent(new PointerEvent(`pointer${kind}`, { clientX: x + way, clientY: y + way }));",
         page.on_screen(true_corners(0)[:1])[0],
@@ -270,7 +270,7 @@ def test_undo_gives_up_a_line_before_it_takes_back_marks(page: Page) -> None:
 
 @pytest.mark.parametrize("switch", ["Tab", "Control+z", "remove"])
 def test_a_line_does_not_go_over_to_another_pane(switch: str, page: Page) -> None:
-    """However the pane changes; a line that undo has given up is not there to be drawn on either."""
+    """However the pane changes; a line removed by undo cannot be continued either."""
     page.mark_true(0)
     page.window.keys("a")
     page.window.keys("3")
@@ -303,11 +303,11 @@ def test_a_zoomed_photograph_stays_where_it_is_while_the_header_grows(page: Page
     page.window.evaluate("new Promise((next) => requestAnimationFrame(() => requestAnimationFrame(next)))")
     page.window.click(*page.window.run(f"{middle} return [x, y];"))
     page.saved()
-    assert marks() == [1, 0, 0, 0]  # The same one was pressed.
+    assert marks() == [1, 0, 0, 0]  # The same one was dragged.
     page.window.keys("0")
     page.window.run("document.querySelector('header').style.height = '100px'")
     page.window.evaluate("new Promise((next) => requestAnimationFrame(() => requestAnimationFrame(next)))")
-    page.window.click(*page.on_screen([(20, 20)])[0])  # Seen whole, it is fitted again.
+    page.window.click(*page.on_screen([(20, 20)])[0])  # When shown as a whole, it is fitted again.
     page.saved()
     assert page.document()["corners"][1]["0.png"] == pytest.approx([20, 20], abs=1)
 
@@ -326,7 +326,7 @@ def test_space_presses_a_button_that_has_focus(page: Page) -> None:
     page.window.run("document.querySelector('[data-tool=edge]').focus()")
     page.window.keys(" ")
     assert page.window.run(chosen) == "edge"
-    page.window.press("[data-tool=brush]")  # A mouse leaves no focus behind: Space moves the photograph then.
+    page.window.press("[data-tool=brush]")  # A mouse click leaves no focus, so that Space moves the photograph.
     page.window.keys("1")
     page.window.keys(" ")
     assert page.window.run(chosen) == "corner"
@@ -348,7 +348,7 @@ def test_what_changes_while_it_is_saved_is_not_said_to_be_saved(page: Page) -> N
         "  const answer = await asked(...request);"
         "  if (!window.seen) {"
         "    window.seen = 'nothing'; document.getElementById('undo').click();"
-        "    setTimeout(() => { window.seen = document.body.dataset.state }, 60);"  # Before the next sending begins.
+        "    setTimeout(() => { window.seen = document.body.dataset.state }, 60);"  # Before the next request starts.
         "  }"
         "  return answer; };"
     )
@@ -417,7 +417,7 @@ def test_what_another_tab_marks_is_kept_beside_what_is_marked_here(page: Page) -
     page.mark_true(0)
     saved(page.server.session, marked_document(material="mirror"))
     page.show(1)
-    page.window.run(  # Else the first corner may be saved before the last is clicked.
+    page.window.run(  # Otherwise the first corner may be saved before the last one is clicked.
         "window.asked = window.fetch; const whole = new Promise((go) => { window.release = go; });"
         "window.fetch = async (...request) => { await whole; return window.asked(...request); };"
     )
@@ -434,6 +434,6 @@ def test_what_another_tab_marks_is_kept_beside_what_is_marked_here(page: Page) -
     page.saved()
     assert json.loads((page.root / "annotations.json").read_text())["panes"] == both
     page.window.keys("a")
-    page.window.press("#undo")  # What follows can be taken back.
+    page.window.press("#undo")  # Later changes can be undone.
     page.saved()
     assert json.loads((page.root / "annotations.json").read_text())["panes"] == both

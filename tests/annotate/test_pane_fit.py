@@ -1,4 +1,4 @@
-"""Corners and edges that somebody marked in a few photographs give the pane's plane and outline."""
+"""Corners and edges marked by hand in a few photographs determine the pane's plane and outline."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def corner_marks(pane: Pane, cameras: Sequence[NumpyCamera], *, noise: float = 0
 
 
 def normal_off(frame: np.ndarray, pane: Pane) -> float:
-    """Degrees between planes, whichever way they face."""
+    """Angle in degrees between planes, whichever way they face."""
     return float(np.degrees(np.arccos(min(abs(frame[2] @ pane.normal), 1.0))))
 
 
@@ -101,7 +101,7 @@ def test_a_corner_that_one_view_shows_is_enough_beside_three_others() -> None:
 
 
 def edge_marks(pane: Pane, cameras: Sequence[NumpyCamera], edges: Sequence[int], reach: float = 0.7) -> Marks:
-    """Two points on some edges in every view, without any corner."""
+    """Two points on some edges in every view, without any corners."""
     corners = pane.at(U, V)
     found: list[dict[int, np.ndarray]] = [{} for _ in range(4)]
     for number in edges:
@@ -127,7 +127,7 @@ def test_two_edges_give_the_plane_and_as_much_of_the_pane_as_was_marked() -> Non
 
 
 def test_where_a_long_front_ends_may_be_marked_in_one_photograph_only() -> None:
-    """As on a walk along a facade: no photograph next to the one that shows its near end does so too."""
+    """As on a walk along a facade: only one photograph shows its near end."""
     front = Pane(np.array([0.0, 0, 0]), np.array([0.0, 0, 1.0]), np.array([1.0, 0, 0]), (7.0, 1.7))
     walk = {-1.5: -5.5, -2.5: -6.5, -4.0: -7.0, 1.5: -4.0, 5.5: 2.5}
     cameras = [
@@ -155,7 +155,7 @@ def test_where_a_long_front_ends_may_be_marked_in_one_photograph_only() -> None:
 
 
 def test_a_corner_in_one_photograph_says_how_far_a_pane_goes() -> None:
-    """Three sides are marked in every photograph, the fourth by one corner in one of them, far from the first guess."""
+    """Three sides are marked in every photograph, the fourth by a corner in one of them, far from the first guess."""
     wide = replace(FRONT, half_sizes=(2.5, 0.8))
     cameras, corners = cameras_on(wide), wide.at(U, V)
     rng = np.random.default_rng(0)
@@ -186,7 +186,7 @@ def test_edges_of_five_corners_are_fitted_too() -> None:
     cameras = cameras_on(FRONT)
     outline = FRONT.at(np.array([-1, 1, 1, 0.2, -1.0]), np.array([-1, -1, 1, 0.4, 1.0]))
     marks = Marks([{view: camera.project(corner) for view, camera in enumerate(cameras)} for corner in outline])
-    fit = fit_pane(marks, cameras, "rectangle")  # Five corners are no rectangle.
+    fit = fit_pane(marks, cameras, "rectangle")  # Five corners do not form a rectangle.
     np.testing.assert_allclose(fit.shape.corners(), outline, atol=1e-3)
 
 

@@ -1,4 +1,4 @@
-"""What was marked becomes masks and planes that the rest of the package reads."""
+"""Marks become masks and planes that the rest of the package reads."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_a_mask_belongs_to_its_photograph_and_to_no_other_of_a_like_name(names: 
 
 @pytest.mark.parametrize("written", range(6))
 def test_an_interrupt_at_any_file_loses_nothing(written: int, room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Files that are put in their places: the record, three masks, the planes, the record again."""
+    """Files in the order of writing: the record, three masks, the planes, the record again."""
     places: list[str] = []
 
     def replace(source: str, target: str) -> None:
@@ -299,7 +299,7 @@ def test_put_back_restores_no_more_than_there_was() -> None:
 
 @pytest.mark.parametrize("way", [1, -1])
 def test_a_cut_that_crosses_itself_is_cut_whole(way: int) -> None:
-    """As the page shows it: the middle of a pentagram is inside, and so is what two loops hold."""
+    """As the page shows it: the centre of a pentagram is inside, and so is an area enclosed by two loops."""
     angles = way * 2 * 2 * np.pi / 5 * np.arange(5)
     star = 50 + 40 * np.stack([np.sin(angles), -np.cos(angles)], axis=1)
     found = fill_polygon(star, (100, 100))
@@ -356,7 +356,7 @@ def test_the_wrong_order_of_corners_is_called_into_question(room: Path) -> None:
     session = open_session(room)
     document = marked_document()
     _, second, _, fourth = document["panes"][0]["corners"]
-    second[NAMES[0]], fourth[NAMES[0]] = fourth[NAMES[0]], second[NAMES[0]]  # The other way round: no sides cross.
+    second[NAMES[0]], fourth[NAMES[0]] = fourth[NAMES[0]], second[NAMES[0]]  # The reverse order: no sides cross.
     answer = saved(session, document)["panes"][0]
     assert "do not form a rectangle" in answer["message"] or "pixels off" in answer["message"]
 

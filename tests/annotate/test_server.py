@@ -1,4 +1,4 @@
-"""The server answers the browser that was given its key, on this computer, and nobody else."""
+"""The server answers only the browser on this computer that received its key."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def server(room: Path) -> Iterator[AnnotationServer]:
 def ask(
     server: AnnotationServer, path: str, body: Any = None, *, key: str | None = None, **headers: str
 ) -> tuple[int, bytes]:
-    """Status and body of one request; as the page sends it, unless headers say otherwise."""
+    """Status and body of one request, with the headers of the page unless others are given."""
     port = server.server_address[1]
     host = headers.get("Host", f"127.0.0.1:{port}")
     known = {
@@ -54,7 +54,7 @@ def ask(
 
 
 def save(server: AnnotationServer, document: Any, version: str | None = None) -> tuple[int, Any]:
-    """Status and answer of a save, by a page that has seen a version; the newest one if none is given."""
+    """Status and answer of a save by a page that has seen a version, by default the newest one."""
     if version is None:
         version = json.loads(ask(server, "/capture")[1])["version"]
     status, body = ask(server, "/document", {"document": document, "version": version})
@@ -110,7 +110,7 @@ def test_an_outline_that_makes_no_sense_is_refused(outline: dict, server: Annota
 
 @pytest.mark.parametrize("path", ["/photo/0", "/thumbnail/0"])
 def test_no_browser_keeps_a_photograph(path: str, server: AnnotationServer) -> None:
-    """The next capture is served at the same address, and numbers its photographs in the same way."""
+    """The next capture is served at the same address, and its photographs are numbered in the same way."""
     host = f"127.0.0.1:{server.server_address[1]}"
     request = urllib.request.Request(
         f"http://{host}{path}", headers={"Cookie": f"{cookie_name(host)}={server.access.key}"}
@@ -120,10 +120,10 @@ def test_no_browser_keeps_a_photograph(path: str, server: AnnotationServer) -> N
 
 
 def test_another_name_for_this_computer_is_refused(server: AnnotationServer) -> None:
-    """As of a site whose name server points to 127.0.0.1."""
+    """For example, of a site whose name server points to 127.0.0.1."""
     assert ask(server, "/capture", Host="evil.example:80")[0] == 403
     assert ask(server, "/capture", Host="")[0] in (400, 403)
-    for name in ("localhost:9999", "[::1]:9999", "127.0.0.1"):  # Another port, as through SSH.
+    for name in ("localhost:9999", "[::1]:9999", "127.0.0.1"):  # Another port, as with SSH.
         assert ask(server, "/capture", Host=name)[0] == 200
 
 
@@ -203,7 +203,7 @@ def test_more_points_than_fit_are_counted_in_the_refusal(server: AnnotationServe
 
 
 def panes(*labels: int, **more: Any) -> dict:
-    """A document with panes of these labels, marked alike."""
+    """A document with panes of these labels, marked identically."""
     return {"version": 1, "panes": [marked_document(label=label, **more)["panes"][0] for label in labels]}
 
 
@@ -237,7 +237,7 @@ def test_a_body_that_is_too_long_is_not_read(server: AnnotationServer) -> None:
 
 
 def test_nothing_comes_from_elsewhere(server: AnnotationServer) -> None:
-    """No part of the page names an address, and the browser is told to load none."""
+    """No part of the page contains an address, and the browser is forbidden to load any."""
     for path in ("/", "/page.js", "/drawing.js", "/marking.js", "/style.css"):
         status, body = ask(server, path)
         assert status == 200 and b"http:" not in body and b"https:" not in body
