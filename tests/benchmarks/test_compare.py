@@ -1,4 +1,4 @@
-"""Comparisons over scenes: what is run, that it is run once, and what the tables say."""
+"""Comparisons over scenes: their runs, each executed once, and the contents of their tables."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def results(psnr: float, **more: object) -> dict:
 
 
 def measured(**by_run: list[dict]) -> Measured:
-    """Values of runs, by name of method with a scene per entry."""
+    """Values of runs, by the name of a method with an entry per scene."""
     return {
         (f"room-{number}", name.replace("_", ":"), 0): values_of(one)
         for name, ones in by_run.items()
@@ -46,7 +46,7 @@ def measured(**by_run: list[dict]) -> Measured:
 
 
 def row(text: str, *begin: str) -> list[str]:
-    """The cells of the only line that begins with some."""
+    """The cells of the only line that starts with the given ones."""
     (line,) = [line for line in text.splitlines() if line.startswith(f"| {' | '.join(begin)} |")]
     return [cell.strip() for cell in line.strip("|").split("|")]
 
@@ -99,7 +99,7 @@ def test_processes_that_share_an_output_do_nothing_twice_and_take_up_what_a_dead
     assert dead is not None and finished is not None and runs[1].claimed() is None
 
     def elsewhere() -> None:
-        """The other process finishes one of its two runs, and dies in the other."""
+        """The other process finishes one of its two runs and dies during the other."""
         if len(begun) == 4:
             (runs[3].directory / RESULTS).write_text('{"psnr": 2.0}')
             finished.release()
@@ -146,7 +146,7 @@ def test_a_task_is_one_of_so_many(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 
 def kept(folder: Path) -> dict:
-    """The only finished run."""
+    """Results of the only finished run."""
     (one,) = json.loads((folder / "runs" / "results.json").read_text())
     return one
 

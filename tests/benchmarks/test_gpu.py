@@ -1,4 +1,4 @@
-"""The benchmark of the GPU: what can be known of it without one."""
+"""The benchmark of the GPU: the parts that can be tested without one."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_all_parts_together_stay_below_ten_minutes() -> None:
 
 
 def test_the_first_launch_is_checked(monkeypatch: pytest.MonkeyPatch) -> None:
-    # The optimiser's kernel of the CPU stands in for that of the GPU.
+    # The CPU's optimiser kernel stands in for that of the GPU.
     monkeypatch.setattr(torch, "ones", partial(made_on_the_cpu, torch.ones))
     assert "launched" in gpu.launch(argparse.Namespace())
 

@@ -1,4 +1,4 @@
-"""What is measured of the viewer is what it shows."""
+"""The viewer's benchmark measures the images that are displayed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a run's time goes: kernels, what is between them, and what a stage does before its first step."""
+"""Distribution of a run's time: kernels, the time between them, and the work of a stage before its first step."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from glassplat.training.messages import ActionDone, Message, StageEntered, StepD
 
 
 def busy(seconds: float) -> None:
-    """Computes for some processor time."""
+    """Computes for the given processor time."""
     end = time.process_time() + seconds
     while time.process_time() < end:
         pass
@@ -35,7 +35,7 @@ def test_every_second_belongs_to_one_part() -> None:
     assert costs[BEFORE] >= 0.01
     assert costs["blend_float32"] >= 0.02
     assert costs[BETWEEN] >= 0.01
-    # What the stage did before its first step is no part of a step.
+    # The stage's work before its first step does not belong to a step.
     assert "fit_float32" not in costs
     assert abs(costs[TOTAL] - costs[BETWEEN] - costs["blend_float32"]) < 1e-9
 

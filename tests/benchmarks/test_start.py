@@ -1,4 +1,4 @@
-"""How soon a process says something: its first line, and not what comes after it."""
+"""Time until a process prints its first line, excluding everything after it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Timing of whole steps: each number of threads takes its turn in one and the same run."""
+"""Timing of whole steps: all numbers of threads alternate within a single run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_every_number_of_threads_takes_its_turn() -> None:
 
     counts = doublings(numba.config.NUMBA_NUM_THREADS)
     times = step_clocks(run(), rounds=2)
-    # Two rounds are told, after one that only warms up.
+    # Two rounds are reported, after a warm-up round.
     assert {count: len(known) for count, known in times.items()} == dict.fromkeys(counts, 2)
     assert threads == counts * 3
     assert numba.get_num_threads() == numba.config.NUMBA_NUM_THREADS
