@@ -29,7 +29,7 @@ def look_at(center: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 @dataclass
 class TinyCapture:
-    """What to write; every field may be changed before writing."""
+    """Contents of a capture; every field may be changed before writing."""
 
     root: Path
     names: list[str]
@@ -52,7 +52,7 @@ class TinyCapture:
             Image.fromarray(pixels).save(path)
 
     def reconstruction(self) -> Any:
-        """The capture as COLMAP's own data structure; images take the lenses in turn."""
+        """The capture as COLMAP's own data structure; images use the lenses in turn."""
         pycolmap = pytest.importorskip("pycolmap")
         model = pycolmap.Reconstruction()
         for index, (name, parameters) in enumerate(self.lenses):

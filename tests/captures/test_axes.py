@@ -1,4 +1,4 @@
-"""Axes that point the wrong way are noticed, whatever the format."""
+"""Axes that point the wrong way are detected, whatever the format."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LENS = {"fl_x": 30.0, "fl_y": 30.0, "w": 32, "h": 24}
 
 
 def annotated_views(capture, label: int = 1) -> list[View]:
-    """The ring's views, each with a box of pixels about the middle of the image, where the origin is seen."""
+    """The ring's views, each with a box of pixels around the image centre, where the origin is visible."""
     capture.write_colmap()
     views = load_dataset(capture.root).train
     labels = torch.zeros(24, 32, dtype=torch.uint8)

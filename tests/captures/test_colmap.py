@@ -1,4 +1,4 @@
-"""COLMAP captures, written by COLMAP's own code and read by ours."""
+"""COLMAP captures, written by COLMAP's own code and read by glassplat."""
 
 from __future__ import annotations
 
@@ -100,13 +100,13 @@ def test_no_model_is_not_mine(tmp_path: Path) -> None:
     ],
 )
 def test_distorted_photographs_and_masks_are_undistorted(capture, model: str, extra: list[float]) -> None:
-    """What a distorted lens puts on a pixel is found where the resulting pinhole camera projects it."""
+    """A point that a distorted lens images at a pixel is found where the resulting pinhole camera projects it."""
     width, height = capture.size = (160, 120)
     focal = [130.0] if model in ("SIMPLE_RADIAL", "RADIAL") else [130.0, 128.0]
     capture.lenses = [(model, [*focal, 81.0, 58.0, *extra])]
     capture.write_colmap()
     lens = capture.reconstruction().cameras[1]
-    corner = np.array([0.42, -0.3, 1.0])  # Off the axis, where the distortion moves it by several pixels.
+    corner = np.array([0.42, -0.3, 1.0])  # Off the axis, where distortion moves it by several pixels.
     x, y = lens.img_from_cam(corner[None])[0]
     rows, columns = np.mgrid[0:height, 0:width] + 0.5
     blob = ((np.hypot(columns - x, rows - y) < 4) * 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""What all formats share: detection, split, extent, downscaling, transparency, views in memory."""
+"""Features common to all formats: detection, split, extent, downscaling, transparency, views in memory."""
 
 from __future__ import annotations
 

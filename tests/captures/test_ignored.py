@@ -1,4 +1,4 @@
-"""What `masks/` leaves out and `ignore/` marks is neither learned nor measured."""
+"""Pixels excluded by `masks/` or marked in `ignore/` are neither learned nor measured."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def test_frames_name_their_masks(tmp_path: Path) -> None:
 
 
 def name_mask(root: Path, file: str, mask: str = "masks/1.png") -> None:
-    """Has a transforms file name a mask of one photograph."""
+    """Makes a transforms file name a mask of one photograph."""
     settings = json.loads((root / file).read_text())
     next(frame for frame in settings["frames"] if frame["file_path"] == "images/1.png")["mask_path"] = mask
     (root / file).write_text(json.dumps(settings))

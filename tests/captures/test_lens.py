@@ -1,4 +1,4 @@
-"""Lenses without pycolmap, held against it; and what is said where it is missing."""
+"""Lenses without pycolmap, compared with it, and the messages where it is missing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from glassplat.errors import InputError
 @pytest.fixture
 def without_pycolmap(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    monkeypatch.delitem(vars(colmap_library), "pycolmap", raising=False)  # Asking for the attribute would import it.
+    monkeypatch.delitem(vars(colmap_library), "pycolmap", raising=False)  # Reading the attribute would import it.
     pinhole_of.cache_clear()
 
 
@@ -36,7 +36,7 @@ def test_the_table_of_models_is_colmaps() -> None:
     for model, counts in PARAMETER_COUNTS.items():
         camera = pycolmap.Camera(model=model, width=32, height=24, params=[1.0] * counts.total)
         found = [camera.focal_length_idxs(), camera.principal_point_idxs(), camera.extra_params_idxs()]
-        if model == "EQUIRECTANGULAR":  # Its parameters are its size, of no kind.
+        if model == "EQUIRECTANGULAR":  # Its parameters are its size and belong to no group.
             continue
         assert [len(list(indices)) for indices in found] == [counts.focal, counts.principal_point, counts.extra]
 
@@ -64,7 +64,7 @@ def test_a_capture_of_pinholes_needs_no_pycolmap(capture, binary: bool, monkeypa
     capture.lenses = [("SIMPLE_PINHOLE", [40.0, 15.5, 12.5]), ("OPENCV", [30.0, 31.0, 16.0, 12.0, 0, 0, 0, 0])]
     capture.write_colmap(binary=binary)
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    monkeypatch.delitem(vars(colmap_library), "pycolmap", raising=False)  # Asking for the attribute would import it.
+    monkeypatch.delitem(vars(colmap_library), "pycolmap", raising=False)  # Reading the attribute would import it.
     dataset = load_dataset(capture.root)
     lenses = {(view.camera.fx, view.camera.fy) for view in (*dataset.train, *dataset.test)}
     assert lenses == {(40, 40), (30, 31)}

@@ -72,7 +72,7 @@ def test_folder_may_be_left_out_where_the_name_is_unique(capture) -> None:
 
 
 def masks_of(root: Path, masks: list[str], photographs: list[str]) -> dict[str, str]:
-    """Name in `panes/` of each photograph's mask, of masks and photographs of these names."""
+    """Name in `panes/` of the mask found for each photograph, given the names of masks and photographs."""
     for mask in masks:
         path = root / "panes" / mask
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -203,12 +203,12 @@ def test_colour_table_keeps_labels(capture) -> None:
 
 
 def black_and(color: tuple[int, int, int]) -> Image.Image:
-    """A picture of one colour inside on black."""
+    """An image with one colour inside, on black."""
     return Image.fromarray(INSIDE[:, :, None] * np.array(color, dtype=np.uint8))
 
 
 def in_palette(*colors: tuple[int, int, int]) -> Image.Image:
-    """The last colour inside on the first; further ones at the corner."""
+    """The last colour inside, the first outside; further ones in the corner."""
     image = Image.new("P", (WIDTH, HEIGHT))
     image.putpalette([value for color in colors for value in color])
     image.paste(len(colors) - 1, (8, 6, 20, 18))
@@ -218,7 +218,7 @@ def in_palette(*colors: tuple[int, int, int]) -> Image.Image:
 
 
 def opaque_inside(color: tuple[int, int, int] = (0, 90, 0)) -> Image.Image:
-    """One colour everywhere, transparent outside."""
+    """The same colour everywhere, transparent outside."""
     image = Image.new("RGB", (WIDTH, HEIGHT), color)
     image.putalpha(Image.fromarray(INSIDE * 255))
     return image

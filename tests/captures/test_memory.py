@@ -1,4 +1,4 @@
-"""Photographs stay in memory up to a budget, and are read ahead of their step beyond it."""
+"""Photographs stay in memory up to a budget, and beyond it are read ahead of their step."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ WHOLE = 3 * SIZE
 
 @pytest.fixture(autouse=True)
 def room_on_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The tests' own few bytes fit on a disk that is nearly full, too."""
+    """The few bytes of the tests also fit on a disk that is nearly full."""
     monkeypatch.setattr(view_module, "DISK_RESERVE", 0)
 
 
 class Files:
-    """Readers of numbered photographs, which count how often each is read."""
+    """Readers of numbered photographs that count the reads of each."""
 
     def __init__(self, count: int) -> None:
         self.times: Counter[int] = Counter()
@@ -94,7 +94,7 @@ class Failing(io.BytesIO):
 
 @pytest.fixture
 def slow_files(monkeypatch: pytest.MonkeyPatch) -> Files:
-    """Files that cost more to read than a disk does, and more of them than `PixelCache(1)` holds."""
+    """Files that take longer to read than copies on a disk, and more of them than `PixelCache(1)` holds."""
     monkeypatch.setattr(view_module, "DISK_RATE", math.inf)
     return Files(20)
 

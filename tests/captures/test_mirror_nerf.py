@@ -18,7 +18,7 @@ MATRIX = [[30.0, 0, 16], [0, 31.0, 12], [0, 0, 1]]
 
 
 def mirror_mask(capture, index: int) -> np.ndarray:
-    """White about the pixel where the mirror's middle is seen."""
+    """White around the pixel that shows the mirror's centre."""
     x, y, z = capture.poses[index][:3, :3] @ MIRROR + capture.poses[index][:3, 3]
     width, height = capture.size
     u, v = round(30 * width / 32 * x / z + width / 2), round(30 * width / 32 * y / z + height / 2)
@@ -126,7 +126,7 @@ def test_a_measured_principal_point_stays(capture) -> None:
 
 
 def test_a_synthetic_scene(capture) -> None:
-    """Opening angle, no suffixes, a folder per part, masks with a name of their own."""
+    """Opening angle, no suffixes, a folder per part, masks with their own names."""
     names = [f"Image_{i:04d}.png" for i in range(10)]
     for part, which in (("train", slice(0, 8)), ("test", slice(8, 10))):
         capture.names = names
@@ -175,7 +175,7 @@ def test_what_is_no_mirror_nerf_scene(capture) -> None:
 
 
 def test_masks_of_what_to_keep_make_no_mirror_nerf_scene(capture) -> None:
-    """Blender's captures have a validation part, too; and where there are panes, these are in their own folder."""
+    """Blender's captures have a validation part too, and masks of panes are stored in their own folder."""
     write_real(capture)
     assert load_mirror_nerf(capture.root) is not None
     (capture.root / "panes").mkdir()

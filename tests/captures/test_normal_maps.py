@@ -1,4 +1,4 @@
-"""Estimated normals beside photographs: where they are looked for, their axes, and what is refused."""
+"""Estimated normals of photographs: their file names, their axes, and files that are refused."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_what_is_no_map_of_normals_is_refused(tmp_path: Path) -> None:
         write(tmp_path, "a.npy", vectors)
         with pytest.raises(InputError, match=message):
             estimated_normals(view_in(tmp_path))
-    # The second was found by damaging files at random: NumPy evaluates the head as a part of a program.
+    # The second was found by damaging files at random: NumPy evaluates the header as Python source.
     head = b"\x93NUMPY\x01\x00v\x00\xd8'descr': '<f4', 'fortran_order': False, 'shape': (2, 3, 3), }" + b" " * 60
     for damaged in (b"no", head):
         (tmp_path / "normals" / "a.npy").write_bytes(damaged)
@@ -100,7 +100,7 @@ def test_an_archive_by_the_name_of_an_array_is_refused(tmp_path: Path) -> None:
 
 
 def found_in(root: Path, files: list[str], photographs: dict[str, str]) -> dict[str, str]:
-    """Files of normals by name of the photograph, of those that exist; all paths from the root."""
+    """The existing files of normals by the name of the photograph; all paths from the root."""
     for file in files:
         (root / file).parent.mkdir(parents=True, exist_ok=True)
         (root / file).touch()

@@ -17,7 +17,7 @@ MASK_LIKE[6:18, 8:24] = 255
 
 
 def write_blender(capture, parts: tuple[str, ...], beside_test: tuple[str, ...]) -> None:
-    """The same names in every part, file_path without suffix, and more files next to the test photographs."""
+    """The same names in every part, file_path without suffix, and further files next to the test photographs."""
     capture.names = [f"r_{index}.png" for index in range(len(capture.names))]
     for part in parts:
         capture.write_images("RGBA", part)

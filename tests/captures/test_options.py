@@ -1,4 +1,4 @@
-"""Options are what their annotations say, whether they come from the command line or from a file."""
+"""Options satisfy their annotations, whether they come from the command line or from a file."""
 
 from __future__ import annotations
 

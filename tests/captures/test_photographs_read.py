@@ -1,4 +1,4 @@
-"""Broken photographs are found while training begins, whichever part they are in."""
+"""Broken photographs are found while training starts, whichever part they belong to."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PATIENCE = 60
 
 
 def wait_for(check: Callable[[], None], done: Callable[[], bool]) -> None:
-    """Asks until something has happened; what the check raises ends it too."""
+    """Repeats a check until something has happened; an error of the check ends it too."""
     for _ in range(PATIENCE * 100):
         check()
         if done():
@@ -39,7 +39,7 @@ def test_a_photograph_that_is_cut_off_is_found(capture, part: str) -> None:
 
 
 def counting(data: Dataset) -> tuple[Dataset, dict[str, int]]:
-    """The data set with views that count how often they are read."""
+    """The data set with views that count their reads."""
     times: dict[str, int] = {}
 
     def counted(view):

@@ -1,4 +1,4 @@
-"""Random points lie where cameras look, for every kind of capture."""
+"""Random points lie in the region seen by the cameras, for every kind of capture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Captures of transparent panes, as RTR's: a COLMAP model and label masks of a few photographs."""
+"""Captures of transparent panes in the layout of RTR: a COLMAP model and label masks of a few photographs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`transforms.json` in its dialects; COLMAP's loader says what the answer must be."""
+"""`transforms.json` in its dialects; COLMAP's loader provides the expected result."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_frame_overrides_the_file(capture) -> None:
 
 
 def test_blender_scene(capture) -> None:
-    """Separate files, no suffix, nothing but an opening angle, transparency."""
+    """Separate files, no suffix, only an opening angle, transparency."""
     for folder in ("train", "test"):
         capture.write_images("RGBA", folder)
     for folder in ("train", "test"):
