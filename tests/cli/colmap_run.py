@@ -1,4 +1,4 @@
-"""A finished run on a COLMAP capture whose photographs have the names that a test asks for."""
+"""A finished run on a COLMAP capture whose photographs have the names required by a test."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.training.tiny_capture import tiny_capture, true_scene
 
 
 def write_colmap_capture(root: Path, names: Sequence[str]) -> list[Path]:
-    """A text model of the tiny capture's first views under these names; returns the files of the photographs."""
+    """A text model of the tiny capture's first views with these names; returns the files of the photographs."""
     (root / "images").mkdir(parents=True)
     (root / "sparse" / "0").mkdir(parents=True)
     lines, files = [], []
@@ -34,7 +34,7 @@ def write_colmap_capture(root: Path, names: Sequence[str]) -> list[Path]:
 
 
 def write_colmap_run(path: Path, capture: Path) -> Path:
-    """A run directory of the scene that the capture was rendered from."""
+    """A run directory of the scene from which the capture was rendered."""
     directory = RunDirectory(path)
     directory.begin(PlanarRecipe(), RunSettings(str(capture), iterations=1), load_dataset(capture))
     directory.export(true_scene(), step=1)

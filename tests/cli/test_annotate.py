@@ -1,4 +1,4 @@
-"""What `glassplat annotate` refuses, and how its page is opened."""
+"""Inputs refused by `glassplat annotate`, and the opening of its page."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_a_folder_that_is_no_capture_is_refused(tmp_path: Path, capsys: pytest.C
 
 
 def served(room: Path, monkeypatch: pytest.MonkeyPatch, opened: Callable[[str, AnnotationServer], None]) -> None:
-    """Runs the command where there is a screen; its browser is a function of what it is started with."""
+    """Runs the command as with a screen; `opened` receives the address given to the browser, and the server."""
 
     def serve(server: AnnotationServer, poll_interval: float) -> None:
         opened(asked[0], server)
@@ -45,7 +45,7 @@ def served(room: Path, monkeypatch: pytest.MonkeyPatch, opened: Callable[[str, A
 
 
 def test_what_the_browser_is_started_with_lets_nobody_in(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All users of a computer can see it."""
+    """All users of a computer can read command lines."""
 
     def opened(address: str, server: AnnotationServer) -> None:
         assert server.access.key not in address
@@ -59,7 +59,7 @@ def test_what_the_browser_is_started_with_lets_nobody_in(room: Path, monkeypatch
 
 
 def text_of(browser: Browser) -> str:
-    """Text of a page that may be on its way to another one."""
+    """Text of a page that may be navigating to another one."""
     with suppress(RuntimeError):
         return str(browser.evaluate("document.body?.innerText"))
     return ""

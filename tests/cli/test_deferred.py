@@ -1,4 +1,4 @@
-"""`deferred` from end to end on a tiny object: train, evaluate, render every layer, read back what is stored."""
+"""`deferred` from end to end on a tiny object: train, evaluate, render every layer, read the stored result."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LAYERS = ("rgb", "base", "reflection", "strength", "normal", "environment", "dep
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    """A run of a few steps, whose capture knows its environment."""
+    """A run of a few steps on a capture with a true environment."""
     capture = write_object_capture(tmp_path / "ball")
     write_equirect(capture / "environment.exr", 0.2 + 0.6 * torch.rand(8, 16, 3))
     assert main(["train", "deferred", *few_steps(capture, tmp_path / "run")]) == 0
@@ -97,7 +97,7 @@ def test_what_mirrors_nothing_has_no_surroundings_to_exchange(run: Path) -> None
 
 
 def assert_own_colours_are_exported(run: Path) -> None:
-    """What `--layer transmission` writes of a glossy run is its layer `base`, as plain Gaussians, in every format."""
+    """`--layer transmission` of a glossy run exports its layer `base` as plain Gaussians, in every format."""
     output, stored = run.parent / "bare", open_run(run, "cpu")
     formats = ["--formats", "ply", "spz", "glb", "html"]
     assert main(["export", str(run), "--output", str(output), "--layer", "transmission", *formats]) == 0

@@ -1,4 +1,4 @@
-"""`glassplat demo` where it cannot begin."""
+"""`glassplat demo` where it cannot start."""
 
 from __future__ import annotations
 

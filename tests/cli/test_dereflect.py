@@ -1,4 +1,4 @@
-"""`glassplat dereflect`: every photograph, without its reflections, under its own name."""
+"""`glassplat dereflect`: every photograph without its reflections, under its own name."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_the_reflection_is_gone_and_everything_else_is_there(source: str, tmp_pa
         photo, truth = tiny_capture().train[index].photo.numpy(), rendered(without_glass(true_scene()), index).numpy()
         image = read_image(output / f"{index}.png")
         assert largest_difference(photo, truth) > 10
-        # The photographs are exact renders, up to rounding; in the dark a step of one is worth more of them.
+        # The photographs are exact renders up to rounding; in the dark, one grey level is a larger share of the light.
         assert largest_difference(image, truth) <= 6
         elsewhere = (photo == truth).all(axis=2)
         assert largest_difference(image[elsewhere], photo[elsewhere]) <= 1

@@ -1,4 +1,4 @@
-"""How commands end: one readable message and an exit code, whatever was raised."""
+"""Exit of commands: one readable message and an exit code for every exception."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from glassplat.training.loop import TrainingDivergedError
 
 
 class PanicException(BaseException):
-    """As libraries in Rust raise it: no `Exception`."""
+    """The exception of libraries in Rust, which is not an `Exception`."""
 
 
 def endless(number: int) -> int:
@@ -116,7 +116,7 @@ NAME = re.compile(r"the traceback is in (\S+\.log)\. Please report it")
 
 
 def ended(work: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> int:
-    """The exit code of a command that does this."""
+    """The exit code of a command that does the given work."""
     monkeypatch.setattr(Evaluate, "set_up", lambda self: None)
     monkeypatch.setattr(Evaluate, "run", lambda self, console: work())
     return main(["eval", "run"])
@@ -197,7 +197,7 @@ def test_a_library_that_cannot_be_loaded_is_one_line_too(
 
 
 def test_the_errors_known_by_name_are_those_of_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Known by name, so that they need no import; a class that is renamed would be taken for unforeseen.
+    # They are listed by name to avoid imports; a renamed class would be treated as unexpected.
     from glassplat.cli.console import BAD_INPUT_ERRORS as BAD
     from glassplat.cli.console import EXPECTED_FAILURES as FAILED
     from glassplat.cli.console import GPU_OUT_OF_MEMORY
@@ -231,4 +231,4 @@ def test_a_rank_ends_at_once_however_it_ends(
 
 
 class LeftError(BaseException):
-    """The process would have ended here, without Python's own end."""
+    """Stands for the immediate end of the process, without Python's own clean-up."""

@@ -1,4 +1,4 @@
-"""What `glassplat eval` and `demo` show of their results."""
+"""Output of the results of `glassplat eval` and `demo`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`glassplat export`: files that others read, and nothing written where it must not be."""
+"""`glassplat export`: files that other programs read, and no files written where they must not be."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A training whose terminal closes, or which is killed."""
+"""Training whose terminal closes or which is killed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The line that is shown while PyTorch is imported, and where it is not."""
+"""The line shown while PyTorch is imported, and cases without it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def terminal(kind: str = "xterm") -> Console:
 
 
 def standard_error(monkeypatch: pytest.MonkeyPatch, console: Console) -> Console:
-    """The console, on which from now on appears what is written for standard error."""
+    """Redirects output for standard error to the console, and returns it."""
     monkeypatch.setattr("glassplat.cli.console.message_console", lambda *, stderr: console)
     return console
 

@@ -1,4 +1,4 @@
-"""`glassplat info` tells captures, photographs, runs and splat files apart, and what is wrong with them."""
+"""`glassplat info` distinguishes captures, photographs, runs and splat files, and reports their problems."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from tests.training.tiny_capture import true_scene, write_tiny_capture
 
 
 def told(path: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
-    """What is said of a path, and that people are told the same."""
+    """The JSON report of a path, after checking that the text agrees with it."""
     assert main(["info", str(path), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert main(["info", str(path)]) == 0
@@ -131,7 +131,7 @@ def test_a_photograph_of_a_capture_that_is_cut_off_is_named(tmp_path: Path, caps
 
 
 def test_small_photographs_of_a_capture_are_sound(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """They are smaller than those that `prepare` could place."""
+    """They are smaller than photographs that `prepare` could register."""
     capture = shutil.copytree(SCENE, tmp_path / "capture", ignore=shutil.ignore_patterns("panes", "gt"))
     for path in (capture / "images").iterdir():
         with Image.open(path) as image:

@@ -1,4 +1,4 @@
-"""Lines that commands print, with names that somebody else chose."""
+"""Lines printed by commands, with names chosen by others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures stay in `--output` and photographs stay as they are, whatever the photographs are called."""
+"""Images are written only to `--output`, and photographs stay unchanged, whatever their names."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def test_another_capture_is_not_taken_for_it(tmp_path: Path, capsys: pytest.Capt
 def test_a_capture_that_has_lost_a_photograph_is_refused_where_it_is(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Every eighth one is for testing: without the first, those would be tested that were trained on."""
+    """Every eighth one is for testing: without the first, photographs used for training would be tested."""
     run, poses = write_run(tmp_path / "run"), tmp_path / "capture" / "transforms.json"
     found = json.loads(poses.read_text())
     poses.write_text(json.dumps(found | {"frames": found["frames"][1:]}))

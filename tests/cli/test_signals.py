@@ -1,4 +1,4 @@
-"""Ctrl-C, termination and a terminal that closes, at any moment of a command: one line, and nothing half-written."""
+"""Ctrl-C, termination and closing terminals at any moment of a command: one line, and no half-written files."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ WORDS = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "the termin
 
 
 def ended(script: str) -> tuple[int, str, str]:
-    """Exit code, output and errors of a script in a process of its own."""
+    """Exit code, output and errors of a script in a separate process."""
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=100)
     return done.returncode, done.stdout, done.stderr
 
@@ -94,7 +94,7 @@ def test_a_signal_among_the_imports_of_a_command_at_work_is_one_line() -> None:
 
 
 def test_a_signal_after_the_command_ends_the_process_without_a_traceback() -> None:
-    """As the second of two Ctrl-C, while libraries tidy up."""
+    """For example, the second of two Ctrl-C, while libraries clean up."""
     code, out, said = ended(SIGNALLED_AT_THE_END)
     assert (code, said) == (-signal.SIGINT, "") and out.startswith("glassplat ")
 
@@ -146,7 +146,7 @@ def test_an_interrupt_that_a_library_disguises_is_still_an_interrupt(
 
 
 def test_a_signal_that_is_ignored_stays_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
-    # As `nohup` does it with SIGHUP, and a shell with Ctrl-C for what runs in the background.
+    # As `nohup` does with SIGHUP, and a shell with Ctrl-C for background processes.
     def work(self: Evaluate, console: object) -> None:
         for name in ("SIGHUP", "SIGINT"):
             os.kill(os.getpid(), getattr(signal, name))

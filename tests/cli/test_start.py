@@ -1,4 +1,4 @@
-"""The first half second of a command: what is imported for which question, and what each command says of itself."""
+"""The first half second of a command: modules imported for each request, and the help of each command."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ that passes among others passes alone."""
 
 
 class Found(NamedTuple):
-    """Exit code of a command line, what it and those before it imported, and what it said."""
+    """Exit code of a command line, modules imported by it and its predecessors, and its output."""
 
     code: int
     slow: list[str]
@@ -57,7 +57,7 @@ class Found(NamedTuple):
 def found_of(
     lines: Sequence[Sequence[str]], watched: Sequence[str], folder: Path | None = None, before: str = ""
 ) -> list[Found]:
-    """Command lines in one process of their own, which runs a script before, and looks for modules to be watched."""
+    """Runs command lines in a separate process after a script, and records which watched modules are imported."""
     command = [sys.executable, "-c", before + LINES, json.dumps((lines, watched))]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
     assert (done.returncode, done.stderr) == (0, "")
@@ -92,7 +92,7 @@ LATE = [
 
 @pytest.fixture(scope="module")
 def explained() -> dict[str, Found]:
-    """What each command says of itself; those last that may import more than the others."""
+    """The help of each command; commands that may import more than the others come last."""
     names = sorted(COMMANDS, key=lambda name: (name in ("prepare", "annotate"), name != "train", name))
     watched = [*LATE, "glassplat.evaluate.evaluate", "zstandard"]
     return dict(zip(names, found_of([[name, "--help"] for name in names], watched), strict=True))
@@ -142,7 +142,7 @@ REFUSED = {
 
 @pytest.fixture(scope="module")
 def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a capture, two runs and files, as far as they are looked at before PyTorch is there."""
+    """A folder with a capture, two runs and files, as far as they are checked before PyTorch is imported."""
     root = tmp_path_factory.mktemp("places")
     for name in ("capture/images", "begun", "trained", "photographs"):
         (root / name).mkdir(parents=True)
@@ -156,7 +156,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def refused(places: Path) -> dict[str, Found]:
-    """What each command line is answered that can be refused at once."""
+    """Results of the command lines that can be refused at once."""
     return dict(zip(REFUSED, found_of([line.split() for line in REFUSED], ["torch", "numba"], places), strict=True))
 
 
@@ -197,7 +197,7 @@ FIRST_WORDS = {
 
 @pytest.fixture(scope="module")
 def begun(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Found]:
-    """What each command line says until it needs PyTorch, which cannot be imported; each has an output of its own."""
+    """Output of each command line until it needs PyTorch, which cannot be imported; each has its own output folder."""
     folder = tmp_path_factory.mktemp("begun")
     (folder / "splats.ply").write_bytes(b"")
     (folder / "run").mkdir()

@@ -1,4 +1,4 @@
-"""`traced` from end to end on a tiny object: train, evaluate, render every layer, read back what is stored."""
+"""`traced` from end to end on a tiny object: train, evaluate, render every layer, read the stored result."""
 
 from __future__ import annotations
 

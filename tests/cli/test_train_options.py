@@ -1,4 +1,4 @@
-"""The options of the command line: what is out of range ends in one line, and help shows the most common ones."""
+"""The options of the command line: values out of range end in one line, and help shows the most common options."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ WRONG = [
 
 
 def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """The message that a command line ends with."""
+    """The error message that ends a command line."""
     assert main(arguments) == 2
     said = capsys.readouterr()
     assert "Traceback" not in said.out + said.err
@@ -212,12 +212,12 @@ def test_what_a_preset_decides_is_no_option(option: list[str], capsys: pytest.Ca
 
 
 def settings(text: str) -> set[str]:
-    """The options of a help text, a switch counted once."""
+    """The options of a help text, counting each switch once."""
     return {name for name in options(text) if "no-" not in name and not name.startswith("--help")}
 
 
 def options(text: str) -> set[str]:
-    """Those that a help text lists; what it says of one may name another, in backquotes."""
+    """Options listed in a help text; descriptions may mention others, in backquotes."""
     return set(re.findall(r"(?<![\w`-])--[a-z0-9.-]+", text))
 
 

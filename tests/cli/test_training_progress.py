@@ -1,4 +1,4 @@
-"""How a training is followed, in a terminal and in a file."""
+"""Progress of a training, in a terminal and in a file."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def step(number: int, loss: float = 0.25) -> StepDone:
 
 
 class FakeClock:
-    """Moves on by a second whenever it is set to, and never by itself."""
+    """A clock that only moves when a test sets it."""
 
     now = 100.0
 
@@ -48,7 +48,7 @@ class FakeClock:
 
 
 def lines_of(messages: Iterable[Message], seconds: float, plan: Plan = PLAN, **terminal: Any) -> list[str]:
-    """What is written to a file while messages come at a distance in time."""
+    """Lines written to a file while messages arrive at a fixed interval."""
     clock, file = FakeClock(), io.StringIO()
     with TrainingProgress(Console(file=file, width=40, **terminal), plan, clock) as progress:
         for message in messages:
@@ -118,7 +118,7 @@ def test_the_time_left_of_a_cheap_stage_counts_what_the_next_one_costs() -> None
 
 
 def left_after(work: list[Message], seconds: float) -> str:
-    """What is left after a step of half a second that follows work of so many seconds, and ten steps before it."""
+    """Remaining time shown after steps of half a second, work that takes `seconds`, and further steps."""
     clock, file = FakeClock(), io.StringIO()
     with TrainingProgress(Console(file=file, width=40), PLAN, clock) as progress:
         for number in range(1, 101):
@@ -186,7 +186,7 @@ def test_events_are_lines_but_for_frequent_ones() -> None:
 
 
 def terminal(messages: list[Message], error: Exception | None = None) -> str:
-    """What a terminal is sent."""
+    """Output sent to a terminal."""
     file = io.StringIO()
     console = Console(file=file, force_terminal=True, width=150, color_system=None)
     try:

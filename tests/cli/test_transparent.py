@@ -1,4 +1,4 @@
-"""Transparent photographs from end to end: trained, resumed, evaluated and rendered over one background."""
+"""Transparent photographs from end to end: trained, resumed, evaluated and rendered with one background."""
 
 from __future__ import annotations
 

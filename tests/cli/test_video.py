@@ -1,4 +1,4 @@
-"""`glassplat video`: films of a run, and what cannot be filmed."""
+"""`glassplat video`: videos of a run, and runs that cannot be filmed."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def write_capture(folder: Path) -> Dataset:
 
 
 def write_run(path: Path, *, planar: bool = True) -> Path:
-    """A run directory of the scene that the capture was rendered from; the capture lies next to it."""
+    """A run directory of the scene from which the capture was rendered; the capture is stored next to it."""
     data = path.parent / "capture"
     dataset = load_dataset(data) if data.is_dir() else write_capture(data)
     recipe = PlanarRecipe() if planar else SplatRecipe()
