@@ -24,7 +24,7 @@ NAMES = ("a.jpg", "b.jpg", "c.jpg")
 
 @dataclass(frozen=True)
 class RecordedRenderer:
-    """Gives back what it was told for each camera, told apart by fx."""
+    """Returns the recorded frame of each camera, identified by fx."""
 
     frames: dict[float, Frame]
     calls: list[float] = field(default_factory=list)
@@ -34,17 +34,17 @@ class RecordedRenderer:
         return self.frames[camera.fx]
 
     def with_layers(self, **changes: Tensor) -> "RecordedRenderer":
-        """The same with some layers replaced in every frame."""
+        """The same renderer with some layers replaced in every frame."""
         return RecordedRenderer({k: replace(f, layers=dict(f.layers) | changes) for k, f in self.frames.items()})
 
     def without_layers(self) -> "RecordedRenderer":
-        """The same as a method that renders an image and nothing else."""
+        """The same renderer for a method that renders an image and no layers."""
         return RecordedRenderer({k: replace(f, layers={}) for k, f in self.frames.items()})
 
 
 @dataclass(frozen=True)
 class Case:
-    """What a test of the evaluation starts from."""
+    """The inputs of a test of the evaluation."""
 
     dataset: Dataset
     renderer: RecordedRenderer
@@ -52,7 +52,7 @@ class Case:
 
 
 def pane_labels(index: int) -> np.ndarray:
-    """The first view sees two panes, the second one, the third none."""
+    """The first view shows two panes, the second one, the third none."""
     labels = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
     if index < 2:
         labels[4:20, 6:30] = 1
@@ -84,7 +84,7 @@ def true_panes() -> list[dict[str, object]]:
 
 
 def perfect_frame(folder: Path, index: int, name: str) -> Frame:
-    """Layers as the ground truth has them on the panes, the reflection at half its brightness; noise elsewhere."""
+    """Layers equal to the ground truth on the panes, but the reflection at half its brightness; noise elsewhere."""
     stem = Path(name).stem
     read = {kind: np.asarray(Image.open(folder / kind / f"{stem}.png")) for kind in ("trans", "refl")}
     images = {kind: torch.from_numpy(pixels.astype(np.float32) / 255) for kind, pixels in read.items()}

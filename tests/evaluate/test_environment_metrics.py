@@ -23,7 +23,7 @@ TRUTH = 0.1 + 0.6 * torch.rand(64, 128, 3, generator=torch.Generator().manual_se
 
 
 class MeanDifference:
-    """Stands for LPIPS."""
+    """Stands in for LPIPS."""
 
     backbone = "alex"
 

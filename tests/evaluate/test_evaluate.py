@@ -44,7 +44,7 @@ REQUIRED_KEYS = {
 
 @pytest.fixture(autouse=True)
 def _no_lpips(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Results must not depend on what this machine happens to have."""
+    """Results must not depend on the packages installed on this machine."""
     monkeypatch.setattr("glassplat.evaluate.metrics.load_lpips", lambda: "no LPIPS: install it")
 
 
@@ -159,7 +159,7 @@ def test_the_first_frame_is_rendered_once_more_than_it_is_timed(case) -> None:
 
 
 def ball_frame(scene: Scene, camera: Camera) -> Frame:
-    """A ball with normals turned by 90 degrees about z, and a strength 0.1 too high."""
+    """A ball with normals rotated by 90 degrees about z, and a strength 0.1 too high."""
     rays = torch.nn.functional.normalize(view_directions(camera), dim=-1)
     along = -(rays @ camera.center)
     beyond = RADIUS**2 - (camera.center.square().sum() - along.square())
@@ -295,7 +295,7 @@ def test_test_views_are_compared_as_their_neighbours_were_exposed(case) -> None:
     elsewhere = replace(scene, exposures=Exposures(affine, ("train/a1.jpg", "train/z.jpg")))
     assert "scene" in evaluate(elsewhere, case.renderer, case.dataset).results["test_exposures"]
     offsets = [float((e.photographed.photographed - e.frame.rgb).mean()) for e in seen]
-    # Before a1, and twice between a1 and z.
+    # One before a1, and two between a1 and z.
     assert offsets == pytest.approx([0.06, 0.04, 0.04], abs=1e-6)
     expected = [psnr(e.frame.rgb + offset, e.view.photo) for e, offset in zip(seen, offsets, strict=True)]
     assert results["psnr"] == pytest.approx(sum(expected) / 3)

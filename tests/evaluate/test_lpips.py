@@ -1,4 +1,4 @@
-"""LPIPS: what enters torchmetrics, and why there is no distance without it."""
+"""LPIPS: the inputs of torchmetrics, and the reason given when the metric is unavailable."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MODULE = "torchmetrics.image.lpip"
 
 
 def with_metric(monkeypatch: pytest.MonkeyPatch, metric: object) -> None:
-    """Stands for torchmetrics, whose network needs weights from elsewhere."""
+    """Stands in for torchmetrics, whose network needs downloaded weights."""
     for name in ("torchmetrics", "torchmetrics.image", MODULE):
         monkeypatch.setitem(sys.modules, name, ModuleType(name))
     sys.modules[MODULE].LearnedPerceptualImagePatchSimilarity = metric  # type: ignore[attr-defined]
@@ -34,7 +34,7 @@ def test_images_enter_as_batches_between_0_and_1(monkeypatch: pytest.MonkeyPatch
     with_metric(monkeypatch, lambda **options: asked.update(options) or mean_difference)
     lpips = load_lpips()
     assert isinstance(lpips, Lpips) and lpips.backbone == "vgg"
-    assert asked == {"net_type": "vgg", "normalize": True}  # `normalize` says that images are in [0, 1].
+    assert asked == {"net_type": "vgg", "normalize": True}  # `normalize` declares that images are in [0, 1].
     white, grey = torch.full((32, 40, 3), 255, dtype=torch.uint8), torch.full((32, 40, 3), 51, dtype=torch.uint8)
     assert lpips(white, grey) == pytest.approx(0.8)
     assert lpips(white / 255, 1.5 * torch.ones(32, 40, 3)) == 0, "what is brighter than white is white"

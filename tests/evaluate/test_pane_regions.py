@@ -1,4 +1,4 @@
-"""Every method is scored over the same pixels: those of the masks, and of the planes that are fitted to them."""
+"""Every method is scored over the same pixels: those of the masks and of the planes fitted to them."""
 
 from __future__ import annotations
 

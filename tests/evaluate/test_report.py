@@ -40,7 +40,7 @@ from glassplat.scene.panes import Planes
 
 
 class References(HTMLParser):
-    """Collects what a page refers to, and checks that its tags are balanced."""
+    """Collects the references of a page, and checks that its tags are balanced."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -132,7 +132,7 @@ def test_a_name_with_a_line_break_is_drawn_on_one_line(case) -> None:
 
 
 def test_each_row_keeps_the_shape_of_its_pictures() -> None:
-    """Portrait below landscape: 300 x 400 pixels, then 400 x 300."""
+    """A portrait and a landscape image: 300 x 400 pixels, then 400 x 300."""
     rows = [[Panel("a", torch.full((300, 400, 3), 0.5))], [Panel("b", torch.full((400, 300, 3), 0.9))]]
     sheet = compose_sheet(rows, "", "")
     assert sheet.shape[:2] == (2 * MARGIN + TITLE_HEIGHT + 2 * CAPTION_HEIGHT + 300 + 400 + 10, 2 * MARGIN + 400)

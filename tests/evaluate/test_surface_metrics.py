@@ -22,7 +22,7 @@ def frame(**layers: torch.Tensor) -> Frame:
 
 
 def turned(angle_deg: float) -> torch.Tensor:
-    """The true normals turned about y, and shortened as blending does."""
+    """The true normals rotated about y, and shortened as by blending."""
     angle = math.radians(angle_deg) + math.atan2(0.6, 0.8)
     return 0.7 * torch.tensor([math.sin(angle), 0.0, math.cos(angle)]).expand(HEIGHT, WIDTH, 3)
 

@@ -34,7 +34,7 @@ def surface_of(view: View) -> TrueSurface:
 
 
 def rewritten(view: View, mark: str, mode: str) -> None:
-    """The file next to the photograph in another mode."""
+    """Converts the file next to the photograph to another mode."""
     Image.open(beside(view, mark)).convert(mode).save(beside(view, mark))
 
 
@@ -45,7 +45,7 @@ def test_normals_are_in_world_axes_and_of_unit_length(view: View) -> None:
     assert surface.normals is not None
     np.testing.assert_allclose(surface.normals.numpy(), normals * seen[..., None], atol=0.01)
     torch.testing.assert_close(surface.normals.norm(dim=-1)[surface.covered], torch.ones(int(seen.sum())))
-    # What the camera sees faces it, whichever way the axes of its pose are written.
+    # Visible surfaces face the camera, whichever way the axes of its pose are written.
     toward = view.camera.center - RADIUS * surface.normals
     assert ((toward * surface.normals).sum(-1)[surface.covered] > 0).all()
 
@@ -88,7 +88,7 @@ def test_without_alpha_of_their_own_normals_have_the_photograph_s(view: View) ->
     rewritten(view, "_normal", "RGB")
     assert torch.equal(surface_of(view).covered, whole.covered)
     rewritten(view, "", "RGB")
-    # Black is no normal, so the background is told from the surface even then.
+    # Black is not a normal, so the background can be distinguished from the surface even then.
     assert torch.equal(surface_of(view).covered, whole.covered)
 
 
