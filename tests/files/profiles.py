@@ -21,7 +21,7 @@ def srgb_profile() -> bytes:
 
 
 def p3_profile() -> bytes:
-    """Display P3, as telephones embed it: the curve of sRGB with other primaries."""
+    """Display P3, as embedded by phones: the curve of sRGB with other primaries."""
     profile = bytearray(srgb_profile())
     (count,) = struct.unpack_from(">I", profile, 128)
     for index in range(count):

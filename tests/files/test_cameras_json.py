@@ -33,7 +33,7 @@ def test_cameras_come_back(tmp_path: Path) -> None:
     (name, first), (other, _) = read_cameras(tmp_path / "cameras.json")
     assert (name, other) == ("a.jpg", "b.jpg")
     torch.testing.assert_close(first.cam_from_world, pose, atol=1e-6, rtol=0)
-    names = ("fx", "fy", "cx", "cy", "width", "height")  # From Python 3.13 on, cameras cannot be compared as a whole.
+    names = ("fx", "fy", "cx", "cy", "width", "height")  # Since Python 3.13, cameras cannot be compared as a whole.
     assert [getattr(first, name) for name in names] == [getattr(camera, name) for name in names]
 
 

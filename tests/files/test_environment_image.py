@@ -59,7 +59,7 @@ def test_files_that_are_no_panorama_are_named(tmp_path: Path) -> None:
     write_channels(tmp_path / "square.exr", {"RGB": np.zeros((2, 3, 3), np.float32)})
     with pytest.raises(ValueError, match="3 x 2 pixels; expected an equirectangular image, twice as wide as high"):
         read_equirect(tmp_path / "square.exr")
-    whole = bytearray((tmp_path / "square.exr").read_bytes() + bytes(2**16))  # Room for a table of all lines.
+    whole = bytearray((tmp_path / "square.exr").read_bytes() + bytes(2**16))  # Space for a table of all lines.
     window = whole.index(b"dataWindow") + len("dataWindow.box2i.") + 4
     whole[window : window + 16] = np.array([0, 0, 2**16 - 1, 2**15 - 1], "<i4").tobytes()
     (tmp_path / "vast.exr").write_bytes(whole)

@@ -1,4 +1,4 @@
-"""Tables of what a record has to hold."""
+"""Tables of the fields required in a record."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Folders to write into."""
+"""Output folders."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""GLB: what comes back is what went in; another program reads the same; files that lie cost nothing."""
+"""GLB: round trips are exact, another program reads the same, and files with false sizes cost nothing."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def written(folder: Path, gaussians: Gaussians | None = None) -> Path:
 
 
 def edited(path: Path, edit: Callable[[dict[str, Any]], None]) -> Path:
-    """The same file with another document."""
+    """The same file with an edited document."""
     data = path.read_bytes()
     size, kind = CHUNK.unpack_from(data, HEADER.size)
     start = HEADER.size + CHUNK.size

@@ -1,4 +1,4 @@
-"""Image files in and out."""
+"""Reading and writing of image files."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_an_image_is_transparent_where_a_pixel_is(tmp_path: Path, alpha: int) ->
 
 
 def test_orientation_tag_is_not_applied(tmp_path: Path) -> None:
-    """Poses and intrinsics refer to the pixels as stored."""
+    """Poses and intrinsics refer to the stored pixels."""
     exif = Image.Exif()
     exif[0x0112] = 6
     Image.new("RGB", (8, 4)).save(tmp_path / "a.jpg", exif=exif)
@@ -237,7 +237,7 @@ def test_what_the_system_says_of_a_file_is_quoted_alone(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("new", [(4, 6), (5, 3), (7, 9), (15, 12), (1, 1)])
 def test_an_image_is_averaged_over_the_exact_area_of_each_new_pixel(new: tuple[int, int]) -> None:
-    """Held against a grid so fine that every edge of an old and of a new pixel lies on it."""
+    """Compared with a grid fine enough that all edges of old and new pixels lie on it."""
     pixels = np.random.default_rng(0).integers(0, 256, (10, 9, 3), dtype=np.uint8)
     fine = np.kron(pixels.astype(np.float64), np.ones((new[0], new[1], 1)))
     expected = fine.reshape(new[0], 10, new[1], 9, 3).mean(axis=(1, 3))

@@ -1,4 +1,4 @@
-"""JSON that anybody may have written."""
+"""JSON files from arbitrary sources."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_what_is_no_file_is_named(tmp_path: Path) -> None:
         read_json(tmp_path / "absent.json")
     os.symlink(tmp_path / "loop.json", tmp_path / "loop.json")
     (tmp_path / "folder.json").mkdir()
-    os.mkfifo(tmp_path / "pipe.json")  # Nobody writes into it: opening it would wait for ever.
+    os.mkfifo(tmp_path / "pipe.json")  # It has no writer: opening it would wait for ever.
     for name, reason in (
         ("folder", "a folder, a pipe or a device"),
         ("pipe", "a folder, a pipe or a device"),
@@ -81,6 +81,6 @@ def test_what_is_no_file_is_named(tmp_path: Path) -> None:
 
 def test_a_file_of_absurd_size_is_not_read(tmp_path: Path) -> None:
     (tmp_path / "huge.json").touch()
-    os.truncate(tmp_path / "huge.json", 2**40)  # A hole, which takes no room on the disk.
+    os.truncate(tmp_path / "huge.json", 2**40)  # A sparse file, which needs no space on the disk.
     with pytest.raises(ValueError, match=r"huge\.json has 1099511627776 bytes"):
         read_json(tmp_path / "huge.json")

@@ -1,4 +1,4 @@
-"""What a file holds is data: nothing in the package executes it."""
+"""Contents of files are data: nothing in the package executes them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EXECUTING = {
 
 
 def executed(tree: ast.AST) -> Iterator[str]:
-    """Calls of such functions, and options of calls that have the same effect."""
+    """Calls of such functions, and options of calls with the same effect."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Call):
             name = ast.unparse(node.func)

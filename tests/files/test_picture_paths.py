@@ -1,4 +1,4 @@
-"""Pictures named after photographs, whatever these are called."""
+"""Images named after photographs, whatever the names of these."""
 
 from __future__ import annotations
 

@@ -100,7 +100,7 @@ def test_any_order_and_any_format(tmp_path: Path, ply_format: str) -> None:
 
 @pytest.mark.parametrize(("kind", "white"), [("u1", 255), ("f4", 1)])
 def test_plain_colours_stand_in_for_harmonics(tmp_path: Path, kind: str, white: int) -> None:
-    """nerfstudio writes them with `--ply-color-mode rgb`."""
+    """nerfstudio writes such files with `--ply-color-mode rgb`."""
     geometry = [*"xyz", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     row = np.dtype([*((name, "<f4") for name in geometry), *((name, f"<{kind}") for name in ("red", "green", "blue"))])
     rows = np.ones(2, dtype=row)

@@ -42,7 +42,7 @@ def test_a_scene_does_not_take_over_what_an_earlier_one_left(tmp_path: Path) -> 
 
 
 def surrounded() -> Scene:
-    """A scene whose surroundings use fewer harmonics than they hold."""
+    """A scene whose surroundings use fewer SH coefficients than they store."""
     scene = in_single_precision(showcase())
     around = replace(scene.primary, channels={}, active_sh_degree=0)
     return replace(Scene(scene.primary, scene.extent), surroundings=around.select(torch.arange(0, len(around), 2)))

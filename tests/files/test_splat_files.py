@@ -1,4 +1,4 @@
-"""Splats of other programs: read as they mean them, and nothing that is broken comes through."""
+"""Splats of other programs: read with their intended meaning; broken files are refused."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.files.test_spz import shapes, typical
 
 
 def write_compressed(path: Path, gaussians: Gaussians) -> None:
-    """As another program compresses it."""
+    """Compresses the Gaussians with another program."""
     tensors = (gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.logit_opacities)
     means, scales, quats, opacities = (tensor.numpy() for tensor in tensors)
     rest = gaussians.sh[:, 1:].numpy()
@@ -39,7 +39,7 @@ def test_a_compressed_ply_of_another_program_is_read(tmp_path: Path) -> None:
     write_compressed(tmp_path / "a.ply", before)
     written = next(tmp_path.iterdir())
     after = read_splats(written)
-    # The other program sorts them.
+    # The other program reorders them.
     after = after.select(torch.cdist(before.means, after.means).argmin(dim=1))
     torch.testing.assert_close(after.means, before.means, rtol=0, atol=4e-3)
     torch.testing.assert_close(after.log_scales, before.log_scales, rtol=0, atol=1e-2)
@@ -133,7 +133,7 @@ def test_mutated_files_are_read_or_refused(tmp_path_factory: pytest.TempPathFact
 
 
 def forged(gaussians: Gaussians, path: Path) -> Gaussians:
-    """What comes back from a file of gaussforge, which sorts them."""
+    """The Gaussians read back from a file of gaussforge, which reorders them."""
     pytest.importorskip("gaussforge")
     write_with_gaussforge(path, gaussians)
     read = read_splats(path)

@@ -1,4 +1,4 @@
-"""SPZ: what comes back is what went in, up to its precision; another program reads the same; bombs stay packed."""
+"""SPZ: round trips are exact up to its precision, another program reads the same, and bombs are not unpacked."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FLIP = torch.tensor([1.0, -1.0, -1.0])
 
 
 def typical(coefficients: int = 16, count: int = 50) -> Gaussians:
-    """Gaussians within what the format holds."""
+    """Gaussians within the range of the format."""
     gaussians = random_gaussians(coefficients, count=count)
     gaussians = replace(gaussians, active_sh_degree=gaussians.max_sh_degree)
     return gaussians.with_tensors({"sh": (gaussians.sh * 0.25).clamp(-0.9, 0.9)})
@@ -66,13 +66,13 @@ def test_a_second_way_through_changes_nothing(tmp_path: Path) -> None:
     write_spz(tmp_path / "b.spz", first)
     second = read_spz(tmp_path / "b.spz")
     for name, tensor in first.tensors().items():
-        if name != "quats":  # Their largest component is computed anew.
+        if name != "quats":  # Their largest component is recomputed.
             assert torch.equal(tensor, second.tensors()[name]), name
 
 
 @pytest.mark.parametrize("version", [3, 4])
 def test_another_program_reads_the_same_in_its_frame(version: int, tmp_path: Path) -> None:
-    """gsply leaves the frame of the file, in which y and z are turned round."""
+    """gsply keeps the frame of the file, in which y and z are flipped."""
     before = typical()
     write_spz(tmp_path / "a.spz", before, version)
     ours, theirs = read_spz(tmp_path / "a.spz"), gsply.read_spz(str(tmp_path / "a.spz"))
@@ -106,7 +106,7 @@ def test_older_versions_are_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("bits", [0x7C01, 0x7DFF, 0xFC01, 0x7E00], ids=hex)
 def test_a_position_that_is_no_number_is_read_without_a_warning(bits: int, tmp_path: Path) -> None:
-    """Found by `tools/trial.py readers`: NumPy warns of arithmetic with signalling NaNs, which halves may be."""
+    """Found by `tools/trial.py readers`: halves may be signalling NaNs, and NumPy warns of arithmetic with those."""
     half = np.array([bits, 0x3C00, 0x3C00], dtype="<u2").tobytes()
     (tmp_path / "a.spz").write_bytes(packed(1, half, bytes(1 + 3 + 3 + 3)))
     means = read_spz(tmp_path / "a.spz").means[0]
@@ -149,7 +149,7 @@ def test_sizes_that_are_clipped_are_told_of(log_scale: float, caplog: pytest.Log
     before = typical(count=2000)
     spz_bytes(before)
     flat = before.log_scales.clone()
-    flat[:, 2] = -14  # How thin a flat Gaussian is cannot be seen.
+    flat[:, 2] = -14  # The thickness of a flat Gaussian is not visible.
     spz_bytes(before.with_tensors({"log_scales": flat}))
     flat[:2] = log_scale
     spz_bytes(before.with_tensors({"log_scales": flat}))
@@ -201,7 +201,7 @@ def test_damaged_files_get_a_message(data: bytes, words: str, tmp_path: Path) ->
 
 
 def test_bombs_are_not_unpacked(tmp_path: Path) -> None:
-    """A hundred megabytes of zeros behind one Gaussian, in either container."""
+    """A hundred megabytes of zeros after one Gaussian, in either container."""
     zeros = bytes(10**8)
     whole = gzip.compress(HEADER.pack(MAGIC, 3, 1, 0, 12, 0, 0) + zeros, 1, mtime=0)
     stream = zstandard.ZstdCompressor().compress(zeros)

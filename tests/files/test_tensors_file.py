@@ -1,4 +1,4 @@
-"""Tensors with a header, on disks that are full and from files that are foreign."""
+"""Tensors with a header, on full disks and from foreign files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TENSORS = {"a": torch.arange(1000.0), "b": torch.zeros(0, 3)}
 
 @contextmanager
 def no_file_beyond(size: int) -> Iterator[None]:
-    """Files of this process cannot grow beyond so many bytes, as on a disk that is full."""
+    """Limits the size of this process's files, as a full disk would."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
