@@ -1,4 +1,4 @@
-"""What was made in the viewer is written next to the run, under names of which none is taken."""
+"""Results of the viewer are written next to the run, under names that are not taken yet."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Splat files of other programs, which every command takes that needs no photographs."""
+"""Splat files of other programs, which every command accepts that needs no photographs."""
 
 from __future__ import annotations
 

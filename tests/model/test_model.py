@@ -139,7 +139,7 @@ def test_a_mirror_in_a_scene_that_knew_no_panes_shows_what_is_before_it() -> Non
     assert mirror.recipe.method == "planar" and mirror.scene.planes.mirrors == (1,)
     strength, reflection = (mirror.image("2.png", layer) for layer in ("strength", "reflection"))
     assert float(strength.mean()) > 0.8 and float(reflection.std()) > 0.01
-    # Nothing of what is behind shows through between the discs of its glass.
+    # Objects behind the mirror do not show through between the discs of its glass.
     assert (
         float(strength[strength > 0].median()) > 0.999 and float((strength[strength > 0] < 0.99).float().mean()) < 0.1
     )

@@ -1,4 +1,4 @@
-"""`import glassplat`: its names, and that it costs nothing."""
+"""`import glassplat`: its names, and that it imports nothing heavy."""
 
 from __future__ import annotations
 

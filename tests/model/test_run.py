@@ -1,4 +1,4 @@
-"""A whole run: interrupted, resumed, and the files it leaves."""
+"""A whole run: interrupted, resumed, and its output files."""
 
 from __future__ import annotations
 
@@ -68,13 +68,13 @@ def run(
 
 @cache
 def whole() -> Scene:
-    """What a run learns that is not interrupted."""
+    """The result of an uninterrupted run."""
     with TemporaryDirectory() as folder:
         return run(Path(folder) / "run").scene
 
 
 def killed_at(path: Path, stem: str, suffix: str) -> None:
-    """Runs, and is killed before a file is safely on the disk."""
+    """Runs, and kills the process before a file is flushed to the disk."""
     flush = writing._flush_to_disk
 
     def flushed(written: Path) -> None:
@@ -138,7 +138,7 @@ def test_a_run_in_another_thread_cannot_be_asked_but_trains(tmp_path: Path) -> N
 @pytest.mark.parametrize("gone", [OSError(errno.EIO, "Input/output error"), SystemExit(1), KeyboardInterrupt()])
 @pytest.mark.parametrize("asked", [False, True])
 def test_nothing_is_lost_when_nobody_is_there_to_hear_it(gone: BaseException, asked: bool, tmp_path: Path) -> None:
-    """As when a terminal is closed, or `train | head` has seen enough."""
+    """As when a terminal is closed, or `train | head` has read enough."""
 
     def listen(message: Message) -> None:
         if isinstance(message, StepDone) and message.step == 7:
@@ -165,7 +165,7 @@ def test_checkpoints_come_by_time_and_are_told(tmp_path: Path) -> None:
 
 
 def test_never_are_more_than_two_minutes_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Steps, what is edited between them and the writing take their time, too."""
+    """Steps, the edits between them and writing take time too."""
     now, kept = 0.0, [0.0]
 
     def write(path: Path, state: Any) -> None:
@@ -187,7 +187,7 @@ def test_never_are_more_than_two_minutes_lost(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_the_time_of_a_run_is_without_that_of_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The compiler runs once on a machine: with it, a first run would look slower than those after it."""
+    """The compiler runs once on a machine: if it counted, a first run would look slower than later ones."""
     now, compiling = 10.0, 3.0
     monkeypatch.setattr(training, "time", SimpleNamespace(perf_counter=lambda: now))
     monkeypatch.setattr(training, "compile_seconds", lambda: compiling)
@@ -223,7 +223,7 @@ def test_a_log_that_ends_in_the_middle_is_cut_and_goes_on(tail: bytes, tmp_path:
 
 @contextmanager
 def no_room_beyond(size: int) -> Iterator[None]:
-    """Lets no file grow beyond a size, as a disk that is full."""
+    """Limits the size of files, as a full disk would."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
@@ -367,7 +367,7 @@ def test_the_checkpoint_of_another_method_is_not_gone_on_with(tmp_path: Path) ->
 
 
 class Following(Ranks):
-    """As the ranks look from one that does not lead, which is alone all the same."""
+    """A rank that does not lead, although it is alone."""
 
     @property
     def is_leader(self) -> bool:
@@ -389,7 +389,7 @@ def test_a_photograph_that_cannot_be_read_any_more_costs_nothing(
     tmp_path: Path, kind: type[Exception], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gone, memory = threading.Event(), PixelCache(0.0)
-    monkeypatch.setattr("glassplat.captures.view.DISK_RATE", 1e-9)  # Nothing is worth a copy on disk, however busy.
+    monkeypatch.setattr("glassplat.captures.view.DISK_RATE", 1e-9)  # Never copied to disk, however slow the reader.
 
     def guarded(view: View) -> View:
         def read() -> torch.Tensor:
@@ -414,7 +414,7 @@ def test_a_photograph_that_cannot_be_read_any_more_costs_nothing(
 
 
 class Unreadable:
-    """An action that needs a photograph, of which the file is gone."""
+    """An action that needs a photograph whose file has been deleted."""
 
     name = "look"
 
@@ -426,7 +426,7 @@ class Unreadable:
 
 
 def test_a_state_in_the_middle_of_a_change_is_not_saved(tmp_path: Path) -> None:
-    """The step is done, and the actions after it are not."""
+    """The step is done, but the actions after it are not."""
     record: Any = OutputFiles(
         tmp_path / "checkpoint.safetensors", SimpleNamespace(write=lambda message: None), math.inf
     )
@@ -483,7 +483,7 @@ def test_an_option_that_another_version_did_not_have_is_named_when_a_run_is_to_g
 
 def test_a_recipe_of_another_kind_is_named_when_a_run_is_to_go_on(tmp_path: Path) -> None:
     class Own(SplatRecipe):
-        """With other stages, say."""
+        """A recipe that could have other stages."""
 
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, interrupt_at=5)
@@ -492,7 +492,7 @@ def test_a_recipe_of_another_kind_is_named_when_a_run_is_to_go_on(tmp_path: Path
 
 
 def test_a_capture_of_other_photographs_is_not_gone_on_with(tmp_path: Path) -> None:
-    """Other views than before would be held out for testing."""
+    """Views other than before would be held out for testing."""
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, interrupt_at=5)
     before = RunDirectory(tmp_path).checkpoint.read_bytes()

@@ -1,4 +1,4 @@
-"""Run directories that are damaged, or that somebody has worked in."""
+"""Run directories that are damaged or were modified by users."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One training at a time in a folder."""
+"""Only one training at a time can use a folder."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ SETUPS = {
 
 @pytest.mark.parametrize("recipe", SETUPS.values(), ids=SETUPS)
 def test_who_leaves_the_loop_where_a_stage_begins_can_go_on_there(recipe: Any, tmp_path: Path) -> None:
-    """What the stage's setup has made is in the checkpoint, and is not made a second time."""
+    """Results of the stage's setup are in the checkpoint and are not computed a second time."""
     dataset = load_dataset(write_tiny_capture(tmp_path / "capture"))
 
     def training(**options: Any) -> Training:
@@ -183,7 +183,7 @@ def test_a_directory_that_was_moved_away_meanwhile_is_a_run_again(checkpoint_eve
 
 @dataclass(frozen=True)
 class Brighter(SplatRecipe):
-    """One more term, and all else as it is."""
+    """A recipe with one additional loss term."""
 
     def stages(self, seed: int, iterations: int = 30_000) -> tuple[Stage, ...]:
         term = LossTerm("brightness", 10.0, brightness)
@@ -288,7 +288,7 @@ def test_the_precision_that_tensors_have_by_default_changes_nothing(recipe: Any,
 
 @dataclass(frozen=True)
 class Weighted(SplatRecipe):
-    """With an option of its own."""
+    """A recipe with an additional option."""
 
     brightness: float = 10.0
 
@@ -331,7 +331,7 @@ def test_trainings_that_take_turns_leave_signals_as_they_were(tmp_path: Path) ->
     first, second = (iter(training) for training in runs)
     for _ in range(6):
         next(first), next(second)
-    os.kill(os.getpid(), signal.SIGTERM)  # Both are asked, and end after their step.
+    os.kill(os.getpid(), signal.SIGTERM)  # Both receive the request, and end after their step.
     assert all(training.is_stopping for training in runs)
     for messages, training in zip((first, second), runs, strict=True):
         with pytest.raises(SystemExit if callable(before[1]) else KeyboardInterrupt):
