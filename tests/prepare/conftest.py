@@ -1,4 +1,4 @@
-"""Photographs of the bundled scene as people bring them: alone, without poses."""
+"""Photographs of the bundled scene in the form in which users provide them: alone, without poses."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def photographs(tmp_path: Path) -> Path:
 
 
 class Heard(list):
-    """Keeps what a preparation says."""
+    """Records the messages of a preparation."""
 
     def __call__(self, message: Working | Note) -> None:
         self.append(message)

@@ -1,4 +1,4 @@
-"""How often photographs are tried, by how many find their place."""
+"""Number of reconstruction attempts, depending on how many photographs are registered."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from glassplat.training.messages import Working
 
 @dataclass(frozen=True)
 class Group:
-    """In place of a reconstruction of COLMAP."""
+    """Stands in for a reconstruction of COLMAP."""
 
     size: int
 
@@ -28,7 +28,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Matches:
-    """In place of a database."""
+    """Stands in for a database."""
 
     path: Path
     photographs: tuple[Any, ...]

@@ -1,4 +1,4 @@
-"""A database of features that is damaged: an interrupted preparation that goes on from it says so."""
+"""Damaged databases of features: an interrupted preparation that continues from one reports it."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ tables.commit()
 
 
 def test_half_a_picture_of_a_killed_command_is_no_photograph(tmp_path: Path) -> None:
-    """A temporary file that `kill -9` left in the folder, whole or cut off."""
+    """A temporary file left in the folder by `kill -9`, complete or truncated."""
     photographs = []
     for number in range(2):
         path = tmp_path / f"{number}.png"

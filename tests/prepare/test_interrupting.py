@@ -1,4 +1,4 @@
-"""Preparations that are interrupted: COLMAP's threads do not outlive them, and what they leave is told rightly."""
+"""Interrupted preparations: COLMAP's threads end with them, and their remaining files are reported correctly."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def interrupt(*arguments: Any, **options: Any) -> None:
 
 
 def interrupted(photographs: Path, output: Path, capsys: pytest.CaptureFixture[str]) -> str:
-    """What a preparation says that Ctrl-C ended."""
+    """The message of a preparation interrupted by Ctrl-C."""
     assert main(["prepare", str(photographs), "--output", str(output), "--force"]) == 130
     return " ".join(capsys.readouterr().err.split())
 
@@ -87,7 +87,7 @@ def test_an_earlier_capture_is_not_taken_for_this_one(
 
 
 def begun(photographs: Path, output: Path) -> Preparation:
-    """A preparation that was interrupted at its first word."""
+    """A preparation that was interrupted at its first message."""
     task = Preparation(photographs, output)
     with pytest.raises(KeyboardInterrupt):
         prepare(task, interrupt)

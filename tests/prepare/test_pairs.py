@@ -1,4 +1,4 @@
-"""Few photographs are all compared; of many, neighbours and those that look alike."""
+"""A few photographs are all compared; of many, neighbours and similar ones."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from glassplat.prepare.colmap import MOST_EXHAUSTIVE, all_pairs, neighbouring_pa
 
 
 def walk_round(count: int, *, places: int = 30) -> list[np.ndarray]:
-    """Descriptors along a walk that comes back to where it began: each place has features of its own."""
+    """Descriptors along a walk that returns to its start: each position has its own features."""
     rng = np.random.default_rng(0)
     features = rng.integers(0, 120, (count, places, 128))
     shown = [np.concatenate([features[(k + step) % count] for step in range(3)]) for k in range(count)]

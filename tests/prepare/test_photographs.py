@@ -1,4 +1,4 @@
-"""Photographs as devices leave them are read upright, in colour, and named so that masks can be named after them."""
+"""Photographs as stored by devices are read upright, in colour, and named so that masks can be named after them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def notes_of(heard: Heard) -> list[str]:
 
 
 def corner(photograph: Photograph) -> tuple[int, ...]:
-    """The colour near the upper left."""
+    """Colour near the upper left."""
     return tuple(int(value) for value in read_photograph(photograph)[10, 10])
 
 

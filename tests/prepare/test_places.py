@@ -1,4 +1,4 @@
-"""What lies in the way of a preparation is named, and stays as it is."""
+"""Files in the way of a preparation are named and stay unchanged."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_force_replaces_masks_that_were_prepared_and_no_others(tmp_path: Path) -
 @pytest.mark.parametrize("name", ["normals/a.png", "notes.txt", "panes/a.png", "images/a_mask.jpg", "images/b/c.png"])
 def test_force_removes_only_what_was_prepared(tmp_path: Path, name: str) -> None:
     output = tmp_path / "capture"
-    hidden = (".DS_Store", "images/.DS_Store")  # Of macOS, for looking at the folder.
+    hidden = (".DS_Store", "images/.DS_Store")  # macOS creates them when the folder is viewed.
     pictures = ("images/a.jpg", "images/b/c.jpg", "images/wall_mask.jpg")
     for made in (*pictures, *hidden, "sparse/0/cameras.bin", RECORD, PAGE, name):
         (output / made).parent.mkdir(parents=True, exist_ok=True)
@@ -127,7 +127,7 @@ def test_a_mounted_disk_is_no_output(
 
 
 def finish(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Has preparations write an empty capture at once."""
+    """Makes preparations write an empty capture at once."""
     monkeypatch.setattr(preparation, "best_solution", lambda *_: None)
     monkeypatch.setattr(preparation, "make_report", lambda _: Report(3, 3, (), (3,), 9, 0.1, 3.0, 9, (), "", 1, ()))
     monkeypatch.setattr(preparation, "write_capture", lambda _, folder, *__: (folder / "images").mkdir(parents=True))

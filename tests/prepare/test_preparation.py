@@ -1,4 +1,4 @@
-"""Photographs alone become a capture with the right poses, or one message that says why not."""
+"""Photographs alone become a capture with correct poses, or one message with the reason why not."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.prepare.conftest import CONNECTED, Heard, copy_photographs
 
 @pytest.fixture(scope="module")
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The capture that the command makes, once for all that look at it."""
+    """The capture that the command writes, once for all tests that read it."""
     folder = tmp_path_factory.mktemp("prepared")
     source = copy_photographs(folder / "photographs")
     assert main(["prepare", str(source), "--output", str(folder / "the capture")]) == 0
@@ -76,7 +76,7 @@ def test_points_have_the_colours_of_the_photographs(prepared: Path) -> None:
         inside = (pixels >= 0).all(1) & (pixels < pixels.new_tensor(view.photo.shape[1::-1])).all(1) & (depth > 0)
         column, row = pixels[inside].long().T
         differences.append((view.photo[row, column].int() - dataset.points.colors[inside].int()).abs().float().mean())
-    assert float(np.mean(differences)) < 40  # Grey, or the colours of other points, would be twice as far off.
+    assert float(np.mean(differences)) < 40  # Grey, or the colours of other points, would differ by twice as much.
 
 
 def test_the_record_holds_the_report_and_nothing_else_is_left(prepared: Path) -> None:
@@ -99,7 +99,7 @@ def test_a_capture_is_replaced_only_by_force(prepared: Path, capsys: pytest.Capt
 
 
 def test_what_was_interrupted_goes_on(photographs: Path, tmp_path: Path, heard: Heard) -> None:
-    """In each phase, one after the other: what goes on has to come as far as the next."""
+    """Interrupted in each phase in turn: each resumed preparation has to reach the next phase."""
     task = Preparation(photographs, tmp_path / "capture")
     phases = ("extracting features", "matching photographs", "registering the photographs", "undistorting")
     for number, phase in enumerate(phases):
@@ -127,7 +127,7 @@ def test_what_was_interrupted_goes_on(photographs: Path, tmp_path: Path, heard: 
 def test_only_one_sqlite_has_the_database_open_and_progress_is_read_from_it(
     photographs: Path, tmp_path: Path, heard: Heard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Python's beside COLMAP's in one process ends in a bus error, about once in forty runs.
+    # Using Python's SQLite along with COLMAP's in one process ends in a bus error, about once in forty runs.
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("another SQLite opened the database")
 
@@ -148,7 +148,7 @@ def test_the_global_mapper_places_them_too(photographs: Path, tmp_path: Path, he
 def test_photographs_of_two_places_are_refused_with_their_groups(
     photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # A mirrored negative is another place to whoever looks for the same features; the negative, as panes mirror too.
+    # Mirrored negatives share no features with the originals; mere mirror images might, as panes mirror too.
     found = sorted(photographs.iterdir())
     for path in found[6:]:
         path.unlink()

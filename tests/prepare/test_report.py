@@ -1,4 +1,4 @@
-"""The report counts what was placed, and advises where something could be better."""
+"""The report counts the registered photographs, and advises on possible improvements."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from glassplat.prepare.reconstruction import Solution
 
 
 class FakeDatabase:
-    """What a report asks of a database."""
+    """The part of a database that a report uses."""
 
     def __init__(self, count: int, features: int) -> None:
         self.photographs = [Photograph(Path(f"{k}.jpg"), f"{k}.jpg", 640, 480, "", None) for k in range(count)]
@@ -51,7 +51,7 @@ class FakeCamera:
 
 
 class FakeModel:
-    """What a report asks of a reconstruction."""
+    """The part of a reconstruction that a report uses."""
 
     def __init__(self, numbers: range, *, track: float = 5.0, error: float = 0.5, focal: float = 600.0) -> None:
         self.images = {k: FakeImage(k) for k in numbers}

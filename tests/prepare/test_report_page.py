@@ -1,4 +1,4 @@
-"""The report's page shows every photograph, where it was taken, and what lies behind panes; it needs no other file."""
+"""The report's page shows every photograph, its camera, and points behind panes; it needs no other file."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ RECORD: dict[str, Any] = {
 
 
 class Parts(html.parser.HTMLParser):
-    """What a page consists of."""
+    """Collects the elements of a page."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -130,7 +130,7 @@ def test_cameras_in_the_plan_lie_as_they_stood() -> None:
 
 
 def _level(views: list) -> np.ndarray:
-    """[3, 3] what takes the height out."""
+    """[3, 3] projection that removes the height."""
     up = -np.mean([view.camera.cam_from_world[1, :3].double().numpy() for view in views], axis=0)
     up /= np.linalg.norm(up)
     return np.eye(3) - np.outer(up, up)

@@ -1,4 +1,4 @@
-"""Frames of a video: as far apart as the camera moved, the sharpest of each stretch."""
+"""Frames of a video: spaced by the motion of the camera, the sharpest of each stretch."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WIDTH, HEIGHT = 320, 240
 
 
 def film(path: Path, offsets: np.ndarray, *, blurred: range = range(0)) -> Path:
-    """A camera that moves along a wall of blobs, by these many pixels in all at each frame."""
+    """Video of a camera that moves along a wall of blobs; `offsets` are its positions in pixels in each frame."""
     rng = np.random.default_rng(0)
     wall = cv2.GaussianBlur(rng.integers(0, 256, (HEIGHT, 1400, 3), dtype=np.uint8), (0, 0), 2)
     wall = cv2.normalize(wall, None, 0, 255, cv2.NORM_MINMAX)
@@ -31,7 +31,7 @@ def film(path: Path, offsets: np.ndarray, *, blurred: range = range(0)) -> Path:
 
 
 def test_frames_are_spaced_by_motion_not_by_time(tmp_path: Path, heard: Heard) -> None:
-    # It stands, walks for 40 frames, and stands again.
+    # The camera stands still, moves for 40 frames, and stands still again.
     offsets = np.concatenate([np.zeros(30), np.arange(40) * 16, np.full(30, 39 * 16)])
     paths = extract_frames(film(tmp_path / "walk.avi", offsets), tmp_path / "frames", 20, heard)
     numbers = [int(path.stem.split("_")[1]) for path in paths]
@@ -45,7 +45,7 @@ def test_blurred_frames_are_passed_over(tmp_path: Path, heard: Heard) -> None:
     path = film(tmp_path / "walk.avi", np.arange(60) * 8, blurred=blurred)
     numbers = [int(one.stem.split("_")[1]) for one in extract_frames(path, tmp_path / "frames", 15, heard)]
     assert len(numbers) >= 12
-    # A stretch may hold a single frame; chance alone would choose every second time.
+    # A stretch may consist of a single frame; random choice would select a blurred frame half of the time.
     assert sum(number in blurred for number in numbers) <= 1
 
 

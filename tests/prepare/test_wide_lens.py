@@ -1,4 +1,4 @@
-"""What a wide lens did not see of the photographs that `prepare` writes is left out of the capture."""
+"""Pixels that a wide lens did not see, in photographs undistorted by `prepare`, are excluded from the capture."""
 
 from __future__ import annotations
 
