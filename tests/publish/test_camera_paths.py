@@ -1,4 +1,4 @@
-"""Camera paths: smooth, upright, and where the scene is known."""
+"""Camera paths: smooth, upright, and within the known part of the scene."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_an_orbit_stays_in_front_of_what_was_seen_from_one_side() -> None:
     for camera in path:
         assert float(forward(camera)[2]) > 0.8
         assert min(float((camera.center - other.center).norm()) for other in IN_FRONT) < 0.5
-    # In a loop that is both wide and tall, and closed.
+    # A closed loop that is both wide and tall.
     centers = torch.stack([camera.center for camera in path])
     wide, tall, _ = (centers.amax(dim=0) - centers.amin(dim=0)).tolist()
     assert wide > tall > 0.05 and float((centers - centers.roll(1, dims=0)).norm(dim=1).max()) < 0.5 * wide
@@ -110,7 +110,7 @@ def test_no_picture_of_a_path_is_stretched_by_a_camera_on_its_side() -> None:
     tall = Camera.look_at((0.5, 0.0, -1.0), (0.0, 0.0, 0.0), up=UP, width=300, height=400)
     *_, last = path = interpolate_cameras([wide, replace(tall, cx=160.0)], 5)
     assert all(math.isclose(camera.fx, camera.fy) for camera in path)
-    # As wide as the photograph, the middle of its height; 10 pixels aside are more in a larger picture.
+    # As wide as the photograph, centred in height; an offset of 10 pixels is scaled to the larger image.
     scale = 800 / 300
     assert math.isclose(last.fx, scale * tall.fx) and math.isclose(last.cx, 400 + 10 * scale)
     assert (last.width, last.height, last.cy) == (800, 600, 300)

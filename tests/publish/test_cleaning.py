@@ -1,4 +1,4 @@
-"""Floaters go, everything else stays, and units may be changed without a pixel's difference."""
+"""Floaters are removed, everything else stays, and a change of units changes no pixel."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Films hold the pictures that were given, and nothing that only looks like one."""
+"""Videos contain the given frames; invalid files are refused."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PICTURES = [np.full((48, 64, 3), (40 + 20 * k, 100, 200 - 15 * k), dtype=np.uint
 
 
 def mean_colors(path: Path) -> list[np.ndarray]:
-    """Of every picture of a film."""
+    """Mean colour of every frame of a video."""
     if path.suffix == ".mp4":
         film, found = cv2.VideoCapture(str(path)), []
         while (read := film.read())[0]:

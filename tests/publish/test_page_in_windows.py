@@ -1,4 +1,4 @@
-"""The page in windows, frames and browsers of all kinds, and for readers who prefer something."""
+"""The page in windows, frames and browsers of all kinds, and with the preferences of readers."""
 
 from __future__ import annotations
 

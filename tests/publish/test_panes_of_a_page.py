@@ -1,4 +1,4 @@
-"""Several panes in a page: behind one another, side by side, and the nearest alone."""
+"""Several panes in a page: behind one another, adjacent, and only the nearest one."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_only_the_nearest_pane_is_laid_if_asked(tmp_path: Path) -> None:
 
 
 def upright_pane(x: float, label: int, half: float = 0.4) -> Planes:
-    """A pane across the z axis, of those side by side, whose glass reaches into that of its neighbours."""
+    """One of several adjacent panes across the z axis, whose glass overlaps with that of its neighbours."""
     upright = pane(2.0, half=half, label=label)
     center, facing = torch.tensor([[x, 0.0, 2.0]]).double(), torch.tensor([[0.0, 0.0, -1.0]]).double()
     return upright.with_tensors({"centers": center, "raw_normals": facing})
@@ -103,7 +103,7 @@ def test_one_of_many_panes_is_chosen_from_a_list(tmp_path: Path) -> None:
 
 @needs_browser
 def test_a_large_window_with_many_panes_is_drawn_more_coarsely(tmp_path: Path) -> None:
-    """Every pane has its own images of the window; 24 of them would take a gigabyte here."""
+    """Every pane has its own images of the size of the window; 24 of them would need a gigabyte here."""
     panes = joined(*(upright_pane(0.1 * label - 1.2, label, half=0.05) for label in range(1, 25)))
     write_page(tmp_path / "index.html", in_single_precision(showcase(panes)), Planar(), CAMERAS, "many")
     with Browser(tmp_path / "index.html", 2000, 1500) as browser:

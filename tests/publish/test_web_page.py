@@ -1,4 +1,4 @@
-"""The page shows what the renderer shows, asks for nothing, and does what its buttons say."""
+"""The page shows the same images as the renderer, requests nothing, and its buttons work."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ LARGEST_SCRIPT = 72 * 1024
 
 
 def likeness(browser: Browser, scene: Scene, renderer: Planar | Splat, camera: Camera, layer: str = "rgb") -> float:
-    """Of the page's picture and the renderer's, in dB."""
+    """PSNR of the page's image against the renderer's, in dB."""
     with torch.no_grad():
         frame = renderer(scene, camera)
     truth = layer_image(frame, layer)
@@ -80,7 +80,7 @@ def test_every_layer_is_what_the_renderer_shows(opened: Browser, layer: str) -> 
 
 @needs_browser
 def test_what_is_beside_the_picture_is_left_out_unseen(opened: Browser) -> None:
-    """From close by, through a long lens that looks past the middle, most of the scene is outside the picture."""
+    """At close range, through a long lens with an offset centre, most of the scene is outside the image."""
     for _, camera in CAMERAS[:2]:
         near = replace(camera, fx=4 * camera.fx, fy=4 * camera.fy, cx=1.5 * camera.cx, cy=0.5 * camera.cy)
         assert likeness(opened, true_scene(), Planar(), near) > 36
@@ -306,7 +306,7 @@ UNTIL = "const until = async (holds) => { while (!holds()) await new Promise((ne
 
 
 def dusty_scene() -> Scene:
-    """The tiny scene, and many Gaussians in it that are smaller than a pixel."""
+    """The tiny scene with many Gaussians smaller than a pixel added to it."""
     scene = true_scene()
     primary, few = scene.primary, len(scene.primary)
     dust = primary.select(torch.arange(3000) % few)
@@ -348,7 +348,7 @@ def test_fewer_splats_are_drawn_while_something_moves_and_all_at_rest(dusty: Bro
 
 @needs_browser
 def test_the_picture_at_rest_is_that_which_is_drawn_all_at_once(dusty: Browser) -> None:
-    """Refined by few splats at a time; then the pictures of the same camera."""
+    """Refined by a few splats at a time; compared with an image of the same camera drawn at once."""
     dusty.keys("h")
     dusty.evaluate("glassplat.then(({ pace, navigation }) => { pace.most = () => 150; navigation.orbit(0.05, 0.02); })")
     dusty.wait("glassplat.then(({ noted, isRefining }) => noted.at(-1)?.scale < 1 || isRefining())", "a coarse picture")
@@ -390,7 +390,7 @@ def test_a_gesture_interrupts_refinement(dusty: Browser) -> None:
 
 @needs_browser
 def test_a_graphics_card_draws_every_splat_every_time(tmp_path: Path) -> None:
-    """The page takes this machine's processor for one; it then blends in half precision, and draws at once."""
+    """The page treats this machine's processor as one; it then blends in half precision, and draws at once."""
     path = tmp_path / "index.html"
     write_page(path, dusty_scene(), Planar(), CAMERAS, "Dust")
     path.write_text(path.read_text().replace("/swiftshader|", "/a name that none has|").replace("|software|", "|"))
@@ -411,7 +411,7 @@ def test_a_graphics_card_draws_every_splat_every_time(tmp_path: Path) -> None:
         )
         splats, every = browser.evaluate(f"(async () => {{ {drawn} }})()")
         assert splats[-1] == every
-        # On the way, a few come into the picture or leave it with each order; thinned, it would be many.
+        # On the way, a few splats enter or leave the image with each order; thinning would remove many.
         assert all(abs(count - every) < 0.02 * every for count in splats)
 
 
@@ -425,7 +425,7 @@ def test_nothing_is_asked_for_and_nothing_complained_of(opened: Browser) -> None
 
 
 def shining(mirrored: str) -> tuple[Scene, Renderer]:
-    """Things of some thickness that shine, among distant light or, far enough to look distant, near things."""
+    """Glossy objects of some thickness in a distant environment, or among objects so far away that they look distant."""
     scene = in_single_precision(glossy_scene(0.6, size=8))
     scene = replace(scene, environment=Environment(scene.environment.raw.float()))
     flat = scene.primary.log_scales + torch.tensor([0.5, 0.5, -2.0])
@@ -470,7 +470,7 @@ def test_what_shines_mirrors_what_surrounds_it(mirrored: str, tmp_path: Path) ->
             for layer, image in layers.items():
                 image = image if image.dim() == 3 else image[..., None].expand(-1, -1, 3)
                 found = psnr(picture(browser, large, layer), image.float().clamp(0, 1))
-                # A reflection has sharp edges where what is mirrored turns quickly.
+                # Reflections have sharp edges where the reflected direction changes quickly.
                 assert found > (20 if layer == "reflection" else 34), (layer, found)
         shown = browser.evaluate("[...document.querySelectorAll('#dock button')].filter((b) => b.offsetParent).length")
         assert shown == 5, "four layers and the comparison"
@@ -516,10 +516,10 @@ def test_a_page_on_disk_has_to_be_uploaded_before_it_is_embedded(opened: Browser
 
 
 class QuietHandler(SimpleHTTPRequestHandler):
-    """Serves files without saying so."""
+    """Serves files without log messages."""
 
     def log_message(self, *words: object) -> None:
-        """Says nothing."""
+        """Suppresses log messages."""
 
 
 @needs_browser
@@ -559,7 +559,7 @@ def test_a_page_keeps_what_photographs_show_of_more_gaussians_than_it_holds(monk
 
 @pytest.mark.parametrize("extent", [1e-4, 1e4])
 def test_a_page_shows_a_scene_in_any_unit(extent: float, caplog: pytest.LogCaptureFixture) -> None:
-    """In millimetres or kilometres, most Gaussians have sizes that SPZ does not hold."""
+    """In millimetres or kilometres, most Gaussians have sizes outside the range of SPZ."""
     found = []
     for length in (1.0, extent):
         factor = length / true_scene().extent
