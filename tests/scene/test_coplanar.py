@@ -1,4 +1,4 @@
-"""Panes of one glass front are known to lie in one plane."""
+"""Panes of one glass front are recognised as lying in one plane."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from glassplat.scene.panes import Planes, coplanar_groups, name_labels
 
 
 def at(x: float, offset: float = 0.0, turn_deg: float = 0.0, half: float = 0.5, label: int = 1) -> Planes:
-    """A pane in the plane z = 0, or off by an offset and a turn about the vertical axis."""
+    """A pane in the plane z = 0, or displaced by an offset and a rotation about the vertical axis."""
     turn = math.radians(turn_deg)
     return Planes.rectangle((x, 0.0, offset), (math.sin(turn), 0.0, math.cos(turn)), (half, 1.0), label=label)
 
@@ -33,7 +33,7 @@ def test_turned_panes_and_those_before_one_another_are_apart() -> None:
     assert coplanar_groups(front(at(0.0), at(1.0, turn_deg=3)), range(2)) == [[0], [1]]
     assert coplanar_groups(front(at(0.0), at(0.0, offset=0.05)), range(2)) == [[0], [1]]
     assert coplanar_groups(front(at(0.0), at(1.0, turn_deg=0.5)), range(2)) == [[0, 1]]
-    # From the plane of the one, the middle of the other is not off; the other way round it is.
+    # The second centre lies in the plane of the first pane, but not the first centre in the plane of the second.
     assert coplanar_groups(front(at(0.0), at(4.0, turn_deg=0.9)), range(2)) == [[0], [1]]
 
 

@@ -1,4 +1,4 @@
-"""The environment as data, and as a part of a scene."""
+"""The environment as data and as a part of a scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exposures change the colours of the photographs that they belong to, and no others."""
+"""Exposures change the colours of their own photographs, and no others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The photographer's frame goes along with the camera and stands on the ground."""
+"""The photographer's frame follows the camera and stands on the ground."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ UP = (0.36, 0.48, -0.8)
 
 
 def turned(yaw_deg: float, pitch_deg: float, roll_deg: float = 0.0) -> Camera:
-    """A camera that was turned about `UP` and tilted about its own axes."""
+    """A camera rotated about `UP` and tilted about its own axes."""
     x = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor(UP), torch.tensor([1.0, 0.0, 0.0])), dim=0)
     down = -torch.tensor(UP)
     level = torch.stack([x, down, torch.linalg.cross(x, down)], dim=1).double()
@@ -42,7 +42,7 @@ def test_cameras_that_are_tilted_down_tell_where_up_is() -> None:
 
 
 def test_cameras_that_are_tilted_down_on_one_side_of_a_thing_tell_where_up_is() -> None:
-    """Their images stand upright along a direction that is as far from up as they are tilted."""
+    """Their image verticals agree on a direction that deviates from up by their tilt."""
     cameras = [turned(yaw, -30) for yaw in range(-40, 41, 20)]
     assert angle_deg(estimate_up(cameras), UP) < 3
     assert estimate_up(100 * cameras) == pytest.approx(estimate_up(cameras))

@@ -1,4 +1,4 @@
-"""Edits of panes, by what they do to the picture and to the plane."""
+"""Edits of panes, checked by their effect on the image and the plane."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def assert_same(first: Scene, second: Scene) -> None:
 
 
 def two_panes() -> Scene:
-    """A second pane, labelled 7, with glass of its own, far to the side."""
+    """Adds a second pane, labelled 7, with its own glass, far to the side."""
     scene = showcase()
     other = replace(SMALL_PANE, centers=SMALL_PANE.centers + torch.tensor([20.0, 0, 0]), labels=(7,))
     glass = concatenated(scene.glass, random_gaussians(5, (20.0, 0.0, 2.0), seed=9, glass=True))
@@ -157,7 +157,7 @@ def test_a_pane_moves_with_its_own_glass_and_no_other(move: Callable[[Scene], Sc
     assert torch.equal(edited.glass.quats[~own], scene.glass.quats[~own])
 
     def in_pane(glass_of: Scene) -> tuple[torch.Tensor, torch.Tensor]:
-        """Places and axes of the pane's glass in its own frame."""
+        """Positions and axes of the pane's glass in the pane's frame."""
         frame = torch.stack([*(axis[1] for axis in glass_of.planes.axes()), glass_of.planes.normals[1]])
         places = (glass_of.glass.means[own] - glass_of.planes.centers[1]) @ frame.T
         return places, frame @ rotation_from_quat(glass_of.glass.quats[own])
@@ -166,7 +166,7 @@ def test_a_pane_moves_with_its_own_glass_and_no_other(move: Callable[[Scene], Sc
 
 
 def test_panes_that_change_places_take_their_own_glass_along() -> None:
-    """Also where the one passes through the other, whose glass is nearer to it then."""
+    """Even where one pane passes through the other, whose glass is then nearer to it."""
     scene = two_panes()
     own = glass_of_pane(scene, 1)
     (first, second), turn = scene.planes.centers, (1.0, 0.0, 0.0, 0.0)
