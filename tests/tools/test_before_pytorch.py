@@ -1,4 +1,4 @@
-"""The tools import the package before PyTorch, which reads once how threads should wait."""
+"""The tools import the package before PyTorch, which reads only once how threads should wait."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The measure of prose sees what it is there to see, and the pages pass it."""
+"""The check of prose finds what it should, and the pages pass it."""
 
 from __future__ import annotations
 

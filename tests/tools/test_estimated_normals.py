@@ -1,4 +1,4 @@
-"""Estimated normals for synthetic scenes are off by what was asked for, smoothly, and in the file that is read."""
+"""Estimated normals for synthetic scenes have the requested smooth errors, and are stored in the file that is read."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SIZE = 96
 
 
 def hemisphere() -> tuple[np.ndarray, np.ndarray]:
-    """Normals [S, S, 3] of a ball that fills the picture, and where it is [S, S]."""
+    """Normals [S, S, 3] of a ball that fills the image, and its mask [S, S]."""
     y, x = np.meshgrid(*[(np.arange(SIZE) + 0.5) / SIZE * 2 - 1] * 2, indexing="ij")
     inside = x**2 + y**2 < 0.9
     z = np.sqrt(np.maximum(1 - x**2 - y**2, 0))

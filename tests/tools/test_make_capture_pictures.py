@@ -1,4 +1,4 @@
-"""Pictures of pages go into a folder that is made for them."""
+"""Images of pages are written to a folder created for them."""
 
 from __future__ import annotations
 

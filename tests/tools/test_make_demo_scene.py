@@ -1,4 +1,4 @@
-"""The demo scene is made of surfaces that face outwards, with a picture for each, before and behind one free pane."""
+"""The demo scene has surfaces that face outwards, with an image for each, on both sides of one free-standing pane."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_noise_has_mean_0_and_deviation_1_and_repeats() -> None:
 
 def test_every_surface_has_its_picture_and_every_picture_its_surface(monkeypatch: pytest.MonkeyPatch) -> None:
     def averaged(field: Array, sigma: tuple[float, float], mode: str) -> Array:
-        """Smooth as well, and in a hundredth of the time where the filter is as wide as the picture."""
+        """Smooth as well, at a hundredth of the time where the filter is as wide as the image."""
         return uniform_filter(field, [max(1, round(3 * one)) for one in sigma], mode=mode)
 
     monkeypatch.setattr(demo_paint, "gaussian_filter", averaged)
@@ -75,7 +75,7 @@ def test_masks_go_to_training_views_that_show_the_pane() -> None:
 
 @dataclass(frozen=True)
 class Walls:
-    """A white wall behind the pane and a grey one far before it, for the tracer's part in a picture."""
+    """A white wall behind the pane and a grey one far in front of it, to test the tracer's part in an image."""
 
     def seen(self, origins: Array, directions: Array) -> SimpleNamespace:
         inwards = directions[:, 1]

@@ -1,4 +1,4 @@
-"""The ray tracer of panes keeps to the laws of optics, and what it writes is a capture that fits its truth."""
+"""The ray tracer of panes obeys the laws of optics, and its output is a capture that agrees with its truth."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ WINDOW = Pane(1, np.zeros(3), Y, X, (1.0, 1.0))
 
 
 def towards_window(count: int = 200) -> tuple[np.ndarray, np.ndarray]:
-    """Rays from one point, most of which meet the window."""
+    """Rays from one point, most of which hit the window."""
     generator = np.random.default_rng(0)
     directions = np.concatenate([generator.uniform(-0.9, 0.9, (count, 1)), np.ones((count, 1))], axis=1)
     directions = np.concatenate([directions, generator.uniform(-0.9, 0.9, (count, 1))], axis=1)
@@ -95,7 +95,7 @@ def test_the_second_pane_mirrors_what_lies_twice_the_gap_farther(side: float) ->
     seen = Place((ROOM,), (pane,)).seen(-direction, direction, reflections=1)
     once = pane_tracer.reflectance(abs(direction[0, 1]), 1.5)
     passed = once * (1 - once) ** 2
-    # The normal points along y, so that the second pane lies at smaller y: nearer, for who stands there.
+    # The normal points along y, so that the second pane lies at smaller y: nearer, when seen from there.
     first, second = (room.seen(y / direction[:, 1:2] * direction, direction * [1, -1, 1]).radiance for y in (0.0, -gap))
     shares = (passed, once) if side > 0 else (once, passed)
     np.testing.assert_allclose(seen.strength, once + passed)
@@ -144,7 +144,7 @@ def test_a_lamp_lights_what_faces_it_half_as_much_at_its_reach() -> None:
     room = Box((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), plain, room=True)
     ray = np.array([[0.0, -1.0, 0.0]]), Y[None]
     (dark,) = Place((room,), ()).seen(*ray).radiance
-    # The ray ends at y = 2: in front of that the lamp is, and then behind it.
+    # The ray ends at y = 2: the lamp is first in front of that, then behind it.
     lit = [
         Place((room,), (), (Lamp((0.0, y, 0.0), reach=0.5, power=2.0),), ambient=0.0).seen(*ray).radiance[0] / dark
         for y in (1.5, 2.5)
@@ -175,7 +175,7 @@ def test_a_pane_behind_a_pane_returns_light_through_the_first() -> None:
         for start, sign in ((0.0, 1), (0.0, -1))
     )
     share = WINDOW.base_reflectance
-    # Seen head-on the room is the same for both panes; light may be thrown to and fro between them once more.
+    # At normal incidence the room is the same for both panes; light may be reflected between them once more.
     once = (1 - share) ** 2 * behind + (share + (1 - share) ** 2 * share) * front
     more = (1 - share) ** 2 * share**2 * (behind + share * front)
     radiance = Place((ROOM,), (WINDOW, second)).seen(origins, directions, reflections=3).radiance
@@ -193,7 +193,7 @@ def test_what_a_pane_behind_a_pane_returns_is_part_of_the_transmission() -> None
     share = both.strength[:, None]
     assert through.mean() > 0.2
     np.testing.assert_allclose(both.radiance, (1 - share) * both.transmission + share * both.reflection)
-    # But for light thrown to and fro between the panes.
+    # Except for multiple reflections between the panes.
     np.testing.assert_allclose(both.transmission[through], alone.radiance[through], atol=0.02)
     behind = Place((ROOM,), ()).seen(origins, directions).radiance
     assert float(np.abs(both.transmission - behind)[through].mean()) > 0.02
@@ -221,7 +221,7 @@ def test_the_capture_fits_its_truth(tmp_path: Path) -> None:
         panes = Panes(turned["center"] + pose[:3, 3], turned["normal"], halves / sizes[..., None], sizes)
         hits = pane_hits(panes, camera.intrinsics.double(), camera.width, camera.height).pane + 1
         masked = view.pane_labels > 0
-        # Things may stand before a pane; nowhere else is there one.
+        # Objects may occlude a pane, but every labelled pixel lies on one.
         assert (hits[masked] == view.pane_labels[masked]).float().mean() > 0.98
         checked += int(masked.sum())
     assert checked > 200
@@ -249,7 +249,7 @@ def test_the_body_stands_on_the_floor_behind_the_camera_however_that_is_tilted()
     tilt[:3, :3] = Rotation.from_euler("x", -30, degrees=True).as_matrix()
     for pose in (STANDING, STANDING @ tilt):
         np.testing.assert_allclose(upright_frame(pose), STANDING, atol=1e-12)
-        # Downwards: onto the shoulders, from within the torso onto the legs, and past both onto the floor.
+        # Rays downwards: onto the shoulders, from inside the torso onto the legs, and past both onto the floor.
         above = np.array([[0.2, -1.2, 1.1], [0.2, -1.2, 0.45], [0.6, -1.2, 1.1]])
         place = Place((Box((-3.0, -3.0, 0.0), (3.0, 3.0, 3.0), Paint(1), room=True), *photographer(pose)), ())
         distances = place.seen(above, np.broadcast_to([0.0, 0.0, -1.0], above.shape)).distance
@@ -269,7 +269,7 @@ def test_only_mirrored_rays_meet_the_photographer() -> None:
     np.testing.assert_array_equal(seen.radiance[~hit], nobody.radiance[~hit])
     differs = (np.abs(seen.reflection - nobody.reflection) > 1e-9).any(axis=1)
     assert differs.mean() > 0.01
-    # What the window mirrors is what somebody sees who looks at the body from behind the window.
+    # The reflection in the window equals the view of the body from the mirrored position behind the window.
     body_in_room = Place((room, *somebody), ())
     image = body_in_room.seen(origins[hit] * [1, -1, 1], directions[hit] * [1, -1, 1]).radiance
     np.testing.assert_allclose(seen.reflection[hit], image, atol=1e-9)
@@ -349,7 +349,7 @@ def test_silver_mirrors_the_room_as_its_normals_say() -> None:
     points = origins + seen.distance[:, None] * directions
     inside = ((points - SILVER.center) / SILVER.radii)[hit]
     np.testing.assert_allclose((inside**2).sum(axis=1), 1)
-    # The normal halves the angle between both ways, which are in one plane with it.
+    # The normal bisects the angle between both rays, which lie in one plane with it.
     normals = seen.normal[hit]
     onwards = directions[hit] - 2 * (directions[hit] * normals).sum(axis=1, keepdims=True) * normals
     room = Place((ROOM,), ())
@@ -376,7 +376,7 @@ def test_a_mirror_shows_silver_and_what_that_mirrors() -> None:
     mirror = replace(WINDOW, refraction=None)
     seen = Place((ROOM,), (mirror,), silver=(before,)).seen(origins, directions)
     hit = (seen.label == 1) & ~seen.normal.any(axis=1)
-    # On the other side of the mirror's plane the place is the same but for the mirror, in which the silver is seen.
+    # The mirrored rays see the same scene, except for the mirror, which shows the silver.
     eyes, rays = (vectors[hit] * [1, -1, 1] for vectors in (origins, directions))
     starts = eyes - (eyes[:, 1:2] / rays[:, 1:2]) * rays
     image = Place((ROOM,), (mirror,), silver=(before,)).seen(starts, rays, reflections=2)
@@ -392,7 +392,7 @@ def test_the_case_ships_the_surface_of_its_silver(tmp_path: Path) -> None:
     assert surface is not None and surface.normals is not None and surface.strength is not None
     silver = surface.covered
     assert 0.02 < float(silver.float().mean()) < 0.5
-    # It faces the camera that sees it, and reflects where it is.
+    # It faces the camera that sees it, and only its pixels have strengths above one half.
     away = (surface.normals * torch.nn.functional.normalize(view_directions(dataset.test[0].camera), dim=-1)).sum(-1)
     assert float(away[silver].max()) < 0.1
     assert float(surface.strength[silver].min()) >= 0.5

@@ -1,4 +1,4 @@
-"""Reflective scenes: cameras, shapes and surroundings as documented, and the small scene in the tree obeys optics."""
+"""Reflective scenes: cameras, shapes and surroundings as documented; the small scene in the tree obeys optics."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def environment_along(direction: np.ndarray) -> np.ndarray:
 
 
 def ball_points(frame: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rays [S, S, 3] through the pixel centres, unit normals where they meet the ball, and whether they do clearly."""
+    """Rays [S, S, 3] through the pixel centres, unit normals where they hit the ball, and a mask of clear hits."""
     pose = np.array(frame["transform_matrix"])
     focal = 0.5 * SIZE / np.tan(json.loads((BALL / "transforms_test.json").read_text())["camera_angle_x"] / 2)
     x, y = np.meshgrid((np.arange(SIZE) + 0.5 - SIZE / 2) / focal, -(np.arange(SIZE) + 0.5 - SIZE / 2) / focal)
@@ -91,7 +91,7 @@ def test_faces_turn_the_way_their_normals_point(triangles: Triangles) -> None:
     first, second, third = (triangles.positions[triangles.faces[:, corner]] for corner in range(3))
     turned = np.cross(second - first, third - first)
     normals = triangles.normals[triangles.faces].mean(axis=1)
-    # At a pole all but one of a quad's corners coincide, and so one of its two triangles has no area.
+    # At a pole all but one of a quad's corners coincide, so that one of its two triangles has no area.
     has_area = np.linalg.norm(turned, axis=-1) > 1e-12
     assert has_area.mean() > 0.9
     assert ((turned * normals).sum(axis=-1) > 0)[has_area].all()
@@ -202,7 +202,7 @@ def test_the_small_ball_mirrors_its_surroundings(frame: dict) -> None:
     rays, normals, hit = ball_points(frame)
     assert (unit_pixels(BALL / f"{frame['file_path']}_strength.png")[hit] == 1).all()
     mirrored = rays - 2 * (rays * normals).sum(axis=-1, keepdims=True) * normals
-    # Below the horizon the ball shows the ground, which is near.
+    # Below the horizon the ball reflects the ground, which is near.
     sky = hit & (mirrored[..., 2] > 0.05)
     shown = linear_from_srgb(unit_pixels(BALL / f"{frame['file_path']}.png")[..., :3])
     difference = np.abs(shown - environment_along(mirrored))[sky]

@@ -1,4 +1,4 @@
-"""Rooms drawn by chance are the same for the same seed, and can be photographed."""
+"""Randomly drawn rooms are the same for the same seed, and can be photographed."""
 
 from __future__ import annotations
 
@@ -68,5 +68,5 @@ def test_a_drawn_capture_is_read_has_noise_and_clips(tmp_path: Path) -> None:
     noise = read_image(tmp_path / "room/images" / photo.name).astype(float) - clear
     plain = (strength == 0) & (clear > 20).all(axis=2) & (clear < 235).all(axis=2)
     assert plain.sum() > 50
-    # The median is not moved by pixels at the edges of panes.
+    # Pixels at the edges of panes do not affect the median.
     assert np.median(np.abs(noise[plain])) == pytest.approx(1.35, abs=0.7)

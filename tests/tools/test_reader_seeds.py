@@ -1,4 +1,4 @@
-"""The seeds of damaged files are files that are read, and damage gets a message."""
+"""The seeds for damaged files are readable files, and damage leads to a message."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes with near reflections: closed, whole surfaces, things that stand apart on their stand."""
+"""Scenes with near reflections: closed, complete surfaces, and objects that stand apart on their stand."""
 
 from __future__ import annotations
 

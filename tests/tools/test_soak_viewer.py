@@ -1,4 +1,4 @@
-"""The soak test of the viewer, for seconds: everybody is served, also after clicks at random and cut connections."""
+"""The soak test of the viewer, for seconds: all clients are served, even after random clicks and cut connections."""
 
 from __future__ import annotations
 

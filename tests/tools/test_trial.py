@@ -1,4 +1,4 @@
-"""The trial: its cases follow from the seed, and what goes wrong is a fault."""
+"""The trial: its cases follow from the seed, and failures are counted as faults."""
 
 from __future__ import annotations
 
