@@ -1,4 +1,4 @@
-"""In the viewer floaters go before anybody's eyes, and two clicks measure a distance."""
+"""Floaters are removed live in the viewer, and two clicks measure a distance."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ async def until(holds: Callable[[], bool]) -> None:
 
 
 async def stand(client: ViewerClient, inner: Client, place: tuple[float, float, float]) -> None:
-    """Moves the camera, and waits until the server knows."""
+    """Moves the camera, and waits until the server has received the pose."""
     await client.look(position=place, look_at=(place[0], place[1], place[2] + 1))
     center = -torch.tensor(place)
     await until(lambda: (request := inner.request()) is not None and torch.equal(request.cam_from_world[:3, 3], center))
@@ -99,7 +99,7 @@ def test_a_click_is_seen_from_where_the_camera_was() -> None:
             await click(client, 0.25)
             await until(lambda: len(viewer.loop._calls) == 1)
             await stand(client, inner, (0.5, 0.0, 1.0))
-            viewer.start()  # Only now there is a thread that draws.
+            viewer.start()  # The drawing thread starts only here.
             await until(lambda: len(inner._measure._points) == 1)
             np.testing.assert_allclose(inner._measure._points[0], [0.75, 0.0, 3.0], atol=0.05)
 

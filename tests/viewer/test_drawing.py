@@ -1,4 +1,4 @@
-"""What the viewer draws is what the renderer draws of the edited scene."""
+"""The viewer draws the same images of the edited scene as the renderer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Panes are moved with the mouse, keyframes set, and both saved, as a person does it in the browser."""
+"""Panes are moved with the mouse, keyframes set, and both saved, by the steps of a user in the browser."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ def watched(folder: Path) -> Iterator[tuple[Viewer, Client, Browser]]:
 
 
 def click(browser: Browser, text: str) -> None:
-    """Clicks what says just this, wherever it is on the page, as soon as it is there."""
+    """Clicks the element with exactly this text, wherever it is on the page, as soon as it exists."""
     eventually(lambda: browser.run(f"{FIND} if (one) one.click(); return one !== null", text))
 
 
 def press(browser: Browser, text: str, happens: Callable[[], bool]) -> None:
-    """Clicks, again if need be, until it happens: a click right after another message to the server may be lost."""
+    """Clicks, again if necessary, until it happens: a click just after another message to the server may be lost."""
     for _ in range(6):
         click(browser, text)
         with contextlib.suppress(AssertionError):
@@ -70,7 +70,7 @@ def says(browser: Browser, text: str) -> bool:
 
 
 def on_screen(client: Client, point: torch.Tensor) -> tuple[float, float]:
-    """Pixels of the window."""
+    """Projects a point to pixels of the window."""
     camera = client.camera()
     assert camera is not None
     x, y, z = (camera.cam_from_world[:3, :3] @ point + camera.cam_from_world[:3, 3]).tolist()
@@ -78,7 +78,7 @@ def on_screen(client: Client, point: torch.Tensor) -> tuple[float, float]:
 
 
 def unfold(browser: Browser, title: str, content: str) -> None:
-    """Opens a folder of controls; a page that is still being laid out may miss a click."""
+    """Opens a folder of controls; a page whose layout is not finished may miss a click."""
 
     def is_open() -> bool:
         found = browser.run(f"{FIND} return one !== null", content)
@@ -110,12 +110,12 @@ def test_a_person_moves_a_pane_sets_keyframes_and_saves_both(tmp_path: Path) -> 
     assert len(keyframes) == 2
     for camera, expected in zip(keyframes, stood[:2], strict=True):
         torch.testing.assert_close(camera.cam_from_world, expected.cam_from_world, atol=1e-5, rtol=0)
-        # How large the picture is, a browser tells late; the angle is the same in any size.
+        # A browser reports the size of its image late; the angle is the same for all sizes.
         assert abs(camera.fy / camera.height - expected.fy / expected.height) < 1e-3
 
 
 def pane_is_dragged(client: Client, browser: Browser) -> torch.Tensor:
-    """Drags the pane along one of its sides, by an arrow of its gizmo; returns how far [3]."""
+    """Drags the pane along one of its sides, by an arrow of its gizmo; returns the translation [3]."""
     planes = true_scene().planes
     center, side = planes.centers[0], planes.axes()[1][0]
     arrow = HANDLE_SHARE * float(planes.half_sizes[0].mean())
@@ -139,7 +139,7 @@ def pane_is_dragged(client: Client, browser: Browser) -> torch.Tensor:
 
 
 def keyframes_are_set_and_played(client: Client, browser: Browser) -> list[Camera]:
-    """Sets three keyframes, removes one, plays and saves; returns where the browser stood."""
+    """Sets three keyframes, removes one, plays and saves; returns the cameras of the browser."""
     unfold(browser, "Keyframes", "Add this view")
     stood: list[Camera] = []
     for index in (1, 4, 0):
@@ -156,14 +156,14 @@ def keyframes_are_set_and_played(client: Client, browser: Browser) -> list[Camer
 
 
 def error_is_shown(viewer: Viewer, client: Client, browser: Browser) -> None:
-    """The error layer compares with the photograph that is shown beside, and follows edits."""
+    """The error layer compares with the photograph shown next to it, and follows edits."""
     client.go_to_photograph(3)
     eventually(lambda: says(browser, "Nearest photograph: 3.png"))
     pictures: list[np.ndarray] = []
     show = viewer._show
     viewer.loop._show = lambda to, picture, is_sharp: (pictures.append(picture), show(to, picture, is_sharp))
     client._layer.value = "error"
-    # Where the browser stood before, it may tell once more before it obeys.
+    # The browser may report its previous pose once more before it follows.
     eventually(lambda: client.request().compared_photograph == 3)
     eventually(lambda: bool(pictures) and pictures[-1][..., 0].max() <= 5)
     client._panes._glass.value = "mirror"

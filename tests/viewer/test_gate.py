@@ -1,4 +1,4 @@
-"""Who is let in to a viewer, what is heard of it, and what of that can do harm: nothing."""
+"""Access to a viewer: clients that are admitted, messages that are accepted, and limits that keep these harmless."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ PATHS_OUT = (
 
 @pytest.mark.parametrize("path", PATHS_OUT)
 def test_no_path_leads_out_of_the_page_s_folder(path: str, viewer: Viewer) -> None:
-    """viser 1.0 follows every path that it is asked for."""
+    """viser 1.0 follows every requested path."""
     asked: list[Request] = []
     answer = gate.request_filter(viewer.access, lambda connection, request: asked.append(request))
     cookie = f"{cookie_name('localhost:80')}={viewer.access.key}"
@@ -232,7 +232,7 @@ def test_a_window_of_any_shape_gets_a_picture_of_bounded_size(viewer: Viewer) ->
 
 
 def test_a_photograph_that_is_gone_ends_nobody_s_drawing(capfd: pytest.CaptureFixture[str]) -> None:
-    """It is renamed, or its disk unplugged, while somebody looks."""
+    """It is renamed, or its disk unplugged, while a client is connected."""
     gone = False
 
     def photograph() -> torch.Tensor:
@@ -266,7 +266,7 @@ def test_a_photograph_that_is_gone_ends_nobody_s_drawing(capfd: pytest.CaptureFi
 
 
 def test_a_viser_that_cannot_be_guarded_is_not_served(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As should a later one make its server by another function."""
+    """A later version might create its server with another function."""
     stopped: list[bool] = []
 
     class Elsewhere:
@@ -284,7 +284,7 @@ def test_a_viser_that_cannot_be_guarded_is_not_served(monkeypatch: pytest.Monkey
 
 
 def test_a_server_that_ends_leaves_no_connection_open() -> None:
-    """Not even one that it has only just accepted, or that asks for nothing."""
+    """Not even one that was just accepted, or that makes no request."""
 
     async def knocked(turns: int) -> socket.socket:
         async with gate.GuardedServe(lambda connection: asyncio.sleep(0), "127.0.0.1", 0) as server:

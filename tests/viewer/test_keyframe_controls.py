@@ -1,4 +1,4 @@
-"""Keyframes that are set, removed and played at once, as by quick clicks; steps from photograph to photograph."""
+"""Keyframes that are set, removed and played concurrently, as by quick clicks; steps from photograph to photograph."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CAMERAS = [view.camera for view in tiny_capture().train]
 
 
 class Page:
-    """What the controls ask of viser: nothing is shown, and buttons are called by their names."""
+    """The part of viser that the controls use: shows nothing, and maps the names of buttons to their callbacks."""
 
     def __init__(self) -> None:
         self.buttons: dict[str, Callable[[Any], None]] = {}
@@ -104,7 +104,7 @@ def test_nothing_moves_the_camera_once_playing_was_stopped_even_in_the_middle_of
 
 
 def test_steps_lead_past_photographs_from_one_place() -> None:
-    """Standing at one of them, another is as near."""
+    """At the position of one of them, another is equally near."""
     cameras = [(f"{k}.png", camera) for k, camera in enumerate((CAMERAS[0], CAMERAS[0], *CAMERAS[1:3]))]
     photo = torch.zeros(48, 64, 3, dtype=torch.uint8)
     gui, viewpoints = MagicMock(), Viewpoints([camera for _, camera in cameras], 1.0)

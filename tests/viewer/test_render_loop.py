@@ -1,4 +1,4 @@
-"""The render loop: coarse before sharp, nothing stale, everybody in turn, one picture at a time."""
+"""The render loop: coarse before sharp, nothing stale, all clients in turn, one image at a time."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SIZE = (1280, 720)
 
 
 class Recorder:
-    """Draws grey pictures that say what they are of, when it is let; remembers what was shown."""
+    """Draws grey images of the value of their view, once permitted, and records the displayed ones."""
 
     def __init__(self, *, held: bool = False) -> None:
         self.drawn: list[tuple[int, int]] = []
@@ -61,7 +61,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 
 def slow(recorder: Recorder) -> None:
-    """As if a sharp picture took ten times what a coarse one may."""
+    """Makes a sharp image take ten times as long as a coarse one may."""
     recorder.loop._seconds_per_pixel = 1e-6
 
 
@@ -153,7 +153,7 @@ def test_what_is_called_for_is_done_by_the_thread_that_draws() -> None:
 
 
 class Clock:
-    """Time that passes when a picture is drawn, and when it is told to."""
+    """Time that advances when an image is drawn, or when a test sets it."""
 
     def __init__(self) -> None:
         self.now, self.drawing = 0.0, 0.0

@@ -35,7 +35,7 @@ STATE = ViewerState(
 
 
 def eventually(happens: Callable[[], bool], seconds: float = 120) -> None:
-    """Waits for what a browser does in its own time."""
+    """Waits for an asynchronous action of a browser."""
     deadline = time.monotonic() + seconds
     while not happens():
         assert time.monotonic() < deadline, "it did not happen"
@@ -80,7 +80,7 @@ def test_a_browser_is_shown_sharp_pictures_and_may_leave() -> None:
             eventually(lambda: "Layer" in browser.evaluate("document.body.innerText"))
             client.save_scene("mine")
             client.save_keyframes("mine")
-            assert "Edited scene" not in browser.evaluate("document.body.innerText")  # Nobody said where to.
+            assert "Edited scene" not in browser.evaluate("document.body.innerText")  # No output folder was given.
         eventually(lambda: not viewer._clients)
     finally:
         viewer.stop()
@@ -97,7 +97,7 @@ def test_a_port_in_use_gets_a_message(tmp_path: Path, capsys: pytest.CaptureFixt
 
 @needs_browser
 def test_who_waits_for_the_first_picture_is_told_so() -> None:
-    viewer = Viewer(STATE, "127.0.0.1", free_port())  # Nobody draws before it starts.
+    viewer = Viewer(STATE, "127.0.0.1", free_port())  # No thread draws before it starts.
     try:
         with Browser(viewer.address, 400, 300) as browser:
             eventually(lambda: WAITING_NOTIFICATION[1] in browser.evaluate("document.body.innerText"))
@@ -107,7 +107,7 @@ def test_who_waits_for_the_first_picture_is_told_so() -> None:
 
 @needs_browser
 def test_names_in_the_line_above_the_controls_are_text() -> None:
-    # viser runs what stands in braces of its Markdown; a failed save tells a path there.
+    # viser executes expressions in braces in its Markdown; a failed save shows a path there.
     status = "not saved: {globalThis.ran = 1} <b>name</b> *a* _b_ `c` [d](e) \\f"
     viewer = Viewer(STATE, "127.0.0.1", free_port(), buttons={"Pause": lambda: None})
     viewer.start()

@@ -1,4 +1,4 @@
-"""A training that is watched: drawn between its steps, paused, saved, and left alone while nobody looks."""
+"""A training with a viewer: drawn between steps, paused, saved, and not slowed down while no client is connected."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ from tools.viewer_client import ViewerClient
 
 
 class EnoughError(Exception):
-    """Ends a training from within."""
+    """Ends a training from inside."""
 
 
 class Watch:
-    """A training in a thread of its own, with its viewer."""
+    """A training in a separate thread, with its viewer."""
 
     def __init__(self, output: Path) -> None:
         recipe = SplatRecipe(sh_degree=1)
@@ -114,7 +114,7 @@ def test_a_training_is_drawn_paused_and_saved_while_it_goes_on(tmp_path: Path) -
 def test_a_camera_without_a_field_of_view_ends_no_training(
     is_guarded: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is not heard; and it would end its picture only, should the gate let it through."""
+    """Its message is ignored; if the gate let it through, only its own image would fail."""
     if not is_guarded:
         monkeypatch.setattr(gate, "parse_message", lambda data: data)
 
@@ -151,7 +151,7 @@ def test_a_save_that_fails_ends_no_training(tmp_path: Path, monkeypatch: pytest.
 
 @contextmanager
 def port_in_use() -> Iterator[int]:
-    """Takes the port that a server would take; tests that run at the same time may be a moment faster."""
+    """Occupies the port that a server would take, retrying if a test running at the same time takes it first."""
     with socket.socket() as taken:
         while taken.getsockname()[1] == 0:
             with suppress(OSError):
