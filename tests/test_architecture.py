@@ -22,13 +22,13 @@ MOST_FUNCTION_LINES = 60
 MOST_KERNEL_LINES = 120
 MOST_PARAMETERS = 8
 SIGNATURES_OF_OTHERS = {"rasterization"}
-"""Functions that take what those of other programs take."""
+"""Functions with the parameters of other programs' functions."""
 LEAST_FILE_LINES = 60
 """A file with fewer needs two importers."""
 MOST_FILES = 180
-"""Of the package; a new one replaces another, or the reason why not is in the commit that raises this."""
+"""Number of files of the package; a new one replaces another, or the commit that raises this gives the reason."""
 MOST_IMPORT_SHARE = 0.0625
-"""Of the package's lines; viser has 3 %, equinox 5.7 %."""
+"""Share of the package's lines; viser has 3 %, equinox 5.7 %."""
 MEANINGLESS_NAMES = {"utils", "util", "helpers", "helper", "common", "misc"}
 
 

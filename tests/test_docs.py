@@ -24,7 +24,7 @@ MOST_README_LINES = 60
 REPOSITORY = re.compile(
     r"https://(?:github\.com/glassplat/glassplat/blob|raw\.githubusercontent\.com/glassplat/glassplat)/main/"
 )
-"""What PyPI needs before the links of the README, which it shows elsewhere."""
+"""The prefix that PyPI needs in links of the README, which it displays elsewhere."""
 LINK = re.compile(r"\]\(([^)#\s]+)[^)]*\)")
 SHELL_BLOCK = re.compile(r"```sh\n(.*?)```", re.DOTALL)
 

@@ -74,7 +74,7 @@ def test_the_key_becomes_a_cookie_and_leaves_the_address(server: AnnotationServe
 ODD_COOKIES = (
     'prefs={"a":"b"}', "note=hello world", "version=3", "path=/x", "name=Zoë", "a[b]=1", 'q="open', "flag", "=bare",
 )  # fmt: skip
-"""Of other programs on this computer: a browser sends them to every port."""
+"""Cookies of other programs on this computer: a browser sends them to every port."""
 
 
 @pytest.mark.parametrize("odd", ODD_COOKIES)

@@ -25,7 +25,7 @@ def command(tmp_path: Path) -> list[str]:
 
 
 TAKE_TERMINAL = "import os, sys; os.open(os.ttyname(0), os.O_RDWR); os.execv(sys.argv[1], sys.argv[1:])"
-"""Makes standard input the terminal of a new session, whose end is a hang-up; then becomes the command."""
+"""Makes standard input the controlling terminal of a new session, whose end is a hang-up; then becomes the command."""
 
 
 def read_until(descriptor: int, words: bytes) -> None:

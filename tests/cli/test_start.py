@@ -40,8 +40,8 @@ for words in lines:
     found.append((code, slow, commands, said.getvalue(), complained.getvalue()))
 print(json.dumps(found))
 """
-"""Runs command lines one after the other. What one of them imports counts for all that follow as well, so that a line
-that passes among others passes alone."""
+"""Runs command lines one after the other. Modules imported by one of them count for all that follow as well, so that a
+line that passes after others passes alone."""
 
 
 class Found(NamedTuple):
@@ -137,7 +137,7 @@ REFUSED = {
     "info splats.txt": "splats.txt is not a known kind of file",
     "demo --output splats.ply": "splats.ply is a file",
 }
-"""Command lines, and what is said of each without PyTorch."""
+"""Command lines and their error messages without PyTorch."""
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +192,7 @@ FIRST_WORDS = {
     "view splats.ply": "splats.ply: a splat file of 0.0 MB",
     "info splats.ply": "a splat file bytes: 0",
 }
-"""Command lines, and what each says before it needs PyTorch."""
+"""Command lines, and their output before they need PyTorch."""
 
 
 @pytest.fixture(scope="module")

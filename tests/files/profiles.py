@@ -13,7 +13,7 @@ DISPLAY_P3 = {
 }
 """The primaries of Display P3 under D50."""
 IN_P3, IN_SRGB = (250, 60, 40), (255, 20, 3)
-"""One colour as P3 stores it, and as sRGB does."""
+"""The same colour as stored in P3 and in sRGB."""
 
 
 def srgb_profile() -> bytes:

@@ -15,7 +15,7 @@ EXECUTING = {
     "eval", "exec", "compile", "os.system", "os.popen", "pickle.load", "pickle.loads", "marshal.load", "marshal.loads",
     "torch.load", "torch.jit.load",
 }  # fmt: skip
-"""Functions that run what they are given, or can be made to by a file."""
+"""Functions that execute their arguments, or that a file can make execute code."""
 
 
 def executed(tree: ast.AST) -> Iterator[str]:

@@ -125,7 +125,7 @@ def blend_case(dtype: torch.dtype, count: int = 3) -> dict[str, Tensor]:
 
 
 STRENGTH = ("normals", "base_reflectances")
-"""What the strength depends on, but for the mask."""
+"""Inputs of the strength, except for the mask."""
 
 
 def with_gradients(case: dict[str, Tensor], function: Callable[..., BlendedPanes], **switches: object) -> list[Tensor]:

@@ -71,7 +71,7 @@ from numba.np.ufunc import parallel, workqueue
 parallel._check_tbb_version_compatible = lambda: None
 numba.np.ufunc.tbbpool = workqueue
 """
-"""Makes Numba believe that it has found TBB, on a machine that has none."""
+"""Makes Numba believe that it has found TBB, on a machine without it."""
 
 
 def tbb_folder() -> Path | None:

@@ -65,7 +65,7 @@ def test_ragged_masks_with_holes_and_specks_give_the_pane(seed: int) -> None:
 
 
 WALK = tuple((x, -0.1 + 0.1 * (i % 2), 0.6 - 0.1 * (i % 3)) for i, x in enumerate((-0.8, -0.4, 0.0, 0.3, 0.6, 0.9)))
-"""Along a pane that no photograph holds whole."""
+"""Camera positions along a pane that no photograph shows completely."""
 
 
 def walked_past(panes: list[Pane], labels: tuple[int, ...]) -> Annotations:

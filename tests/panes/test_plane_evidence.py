@@ -19,7 +19,7 @@ from tests.panes.pane_scene import FRONT, Pane, camera_from, frame_and_clutter, 
 QUICK = PlaneFit(hypotheses=300, refined=2)
 EXTENT = 3.0
 CLOSE = ((-0.15, 0.0, -1.0), (0.15, 0.05, -1.0), (0.0, -0.1, -0.9))
-"""Places so near one another that masks leave the plane open by some degrees."""
+"""Positions so close together that masks determine the plane only to within some degrees."""
 
 
 def turned(pane: Pane, degrees: float) -> Pane:

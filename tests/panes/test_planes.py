@@ -28,7 +28,7 @@ EXTENT = 3.0
 
 
 SURFACE = ((1.52 - 1) / (1.52 + 1)) ** 2
-"""Reflectance of one surface of clear glass, head-on."""
+"""Reflectance of one surface of clear glass at normal incidence."""
 
 
 def test_three_masks_and_a_sparse_frame_give_the_pane() -> None:

@@ -12,7 +12,7 @@ from glassplat.prepare.photographs import Note
 from glassplat.training.messages import Working
 
 CONNECTED = ("0000", "0001", "0003", "0004", "0006", "0007", "0009", "0010", "0012", "0013")
-"""Of the bundled scene, photographs that show enough of the same."""
+"""Photographs of the bundled scene that overlap sufficiently."""
 
 
 def copy_photographs(folder: Path) -> Path:

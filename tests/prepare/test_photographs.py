@@ -17,7 +17,7 @@ from tests.prepare.conftest import Heard
 
 SIZE = (120, 90)
 TELEPHONE = Path(__file__).parents[1] / "data_files" / "telephone.heic"
-"""Taken upright: a white bar on the left, a green rectangle at the upper right; stored on its side."""
+"""Taken upright: a white bar on the left, a green rectangle at the upper right; stored rotated by a right angle."""
 
 
 def picture(seed: int = 0, size: tuple[int, int] = SIZE) -> Image.Image:

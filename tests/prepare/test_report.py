@@ -61,7 +61,7 @@ class FakeModel:
     def num_reg_images(self) -> int:
         return len(self.images)
 
-    def num_points3D(self) -> int:  # noqa: N802 - As pycolmap calls it.
+    def num_points3D(self) -> int:  # noqa: N802 - Named as in pycolmap.
         return 1000
 
     def compute_mean_track_length(self) -> float:

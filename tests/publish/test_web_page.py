@@ -425,7 +425,7 @@ def test_nothing_is_asked_for_and_nothing_complained_of(opened: Browser) -> None
 
 
 def shining(mirrored: str) -> tuple[Scene, Renderer]:
-    """Glossy objects of some thickness in a distant environment, or among objects so far away that they look distant."""
+    """Glossy objects of some thickness in a distant environment, or among objects far enough away to look distant."""
     scene = in_single_precision(glossy_scene(0.6, size=8))
     scene = replace(scene, environment=Environment(scene.environment.raw.float()))
     flat = scene.primary.log_scales + torch.tensor([0.5, 0.5, -2.0])

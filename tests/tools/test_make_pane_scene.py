@@ -241,7 +241,7 @@ def test_masks_show_every_pane_several_times() -> None:
 
 
 STANDING = np.array([[1.0, 0, 0, 0.1], [0, 0, 1, -1.0], [0, -1, 0, 1.2], [0, 0, 0, 1]])
-"""A camera before the window that looks along +y, 1.2 above the floor."""
+"""A camera in front of the window that looks along +y, 1.2 above the floor."""
 
 
 def test_the_body_stands_on_the_floor_behind_the_camera_however_that_is_tilted() -> None:

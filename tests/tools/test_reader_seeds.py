@@ -12,7 +12,7 @@ import pytest
 from tools.reader_seeds import READERS
 
 WITHOUT_THE_REST = ("scene", "transforms")
-"""Their seeds name files that are not there."""
+"""Their seeds refer to files that do not exist."""
 
 
 @pytest.mark.parametrize("name", READERS)

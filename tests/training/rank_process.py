@@ -32,7 +32,7 @@ from tests.training.tiny_capture import tiny_capture
 
 ROOT = Path(__file__).parents[2]
 LONGEST = 240
-"""Seconds for what takes a few on an idle machine."""
+"""Limit in seconds for work that takes a few on an idle machine."""
 FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(["tests.training.rank_process", "glassplat.cli.train", "torch.distributed"])
 ONE_THREAD = os.environ | {"NUMBA_NUM_THREADS": "1"}

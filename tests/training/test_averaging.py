@@ -19,7 +19,7 @@ from glassplat.training.stage import AverageLast, Clock, Stage, TrainState
 from tests.training.tiny_capture import tiny_capture
 
 ITERATIONS, LAST = 40, 4
-"""The mean reaches over a tenth of a run at most."""
+"""The mean covers at most a tenth of a run."""
 
 
 def stages(passes: float) -> tuple[Stage, ...]:

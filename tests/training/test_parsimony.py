@@ -20,7 +20,7 @@ from glassplat.training.stage import TrainState, decay_tensor
 
 UNUSED: Any = None
 UNTOLD = Frame(torch.zeros(1, 1, 3))
-"""A frame that does not say what it shows."""
+"""A frame without visibility."""
 
 
 def scene_of(opacities: list[float], scale: float, extent: float = 1.0) -> Scene:

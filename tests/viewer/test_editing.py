@@ -26,12 +26,12 @@ from tests.viewer.test_server import eventually
 from tools.browser import Browser
 
 WINDOW = (1200, 700)
-"""So wide that the controls cover no pane."""
+"""Wide enough that the controls do not cover a pane."""
 FIND = """
     const all = [...document.querySelectorAll('body *')].filter(one => one.textContent.trim() === arguments[0]);
     const one = all.length && all[all.length - 1].getBoundingClientRect().height ? all[all.length - 1] : null;
 """
-"""The smallest element that says just this, if it has been laid out."""
+"""The smallest element with exactly this text, if it has been laid out."""
 PHOTOGRAPHS = {view.name: (lambda view=view: view.photo) for view in tiny_capture().train}
 
 

@@ -57,7 +57,7 @@ def test_quick_clicks_at_once_leave_keyframes_that_fit_together() -> None:
         try:
             for _ in range(300):
                 page.buttons[draw.choice(list(page.buttons))](None)
-        except BaseException as error:  # noqa: BLE001 - A thread's error is told by the test.
+        except BaseException as error:  # noqa: BLE001 - A thread's error is reported by the test.
             failures.append(error)
 
     threads = [threading.Thread(target=click, args=(seed,)) for seed in range(4)]

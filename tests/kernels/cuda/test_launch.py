@@ -83,7 +83,7 @@ class Driver:
 
 
 OWN, OTHER, SLOTS, STREAM = 11, 22, 11, 4660
-"""Two contexts, the slots of an array of two dimensions and two numbers, and a stream."""
+"""Two contexts, the number of slots of a two-dimensional array and two numbers, and a stream."""
 
 
 @pytest.fixture

@@ -22,13 +22,13 @@ from tests.kernels.test_screen_statistics import add_views_in_torch
 
 ATEN = torch.ops.aten
 LOOKED_AT = {ATEN._local_scalar_dense.default, ATEN.nonzero.default, ATEN.masked_select.default, ATEN.equal.default}
-"""What gives the program a number, or a size that depends on numbers."""
+"""Operations that return a number to the program, or a size that depends on numbers."""
 FROM_HERE = {ATEN.lift_fresh.default}
-"""What turns the program's numbers into a tensor."""
+"""Operations that turn the program's numbers into a tensor."""
 INDEXED = {ATEN.index.Tensor, ATEN.index_put_.default, ATEN.index_put.default, ATEN._index_put_impl_.default}
 READ = {torch.Tensor.tolist, torch.Tensor.numpy, torch.Tensor.cpu}
 KERNEL_WAITS = {"bin_tiles": 1, "trace_gradients": 1}
-"""How often these functions of CUDA kernels wait; the others never do (`test_waiting.py` looks)."""
+"""Number of waits of these functions of CUDA kernels; the others never wait (`test_waiting.py` checks it)."""
 
 
 class Waits(TorchDispatchMode):
