@@ -290,7 +290,7 @@ def _placement_from_matrix(matrix: Tensor, where: str) -> Placement:
     is_affine = torch.equal(matrix[3], torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64))
     shear = float((unit @ unit.T - torch.eye(3, dtype=torch.float64)).abs().max())
     if not is_affine or not shear < TOLERANCE or float(torch.linalg.det(unit)) < 0:
-        raise ValueError(_not_a_similarity(where))
+        raise ValueError(_similarity_message(where))
     return _checked_placement(
         quat_from_rotation(unit), torch.full((3,), scale, dtype=torch.float64), matrix[:3, 3], where
     )
@@ -300,11 +300,11 @@ def _checked_placement(quat: Tensor, scales: Tensor, shift: Tensor, where: str) 
     scale = float(scales[0])
     is_uniform = bool(((scales - scale).abs() <= TOLERANCE * abs(scale)).all())
     if not (LEAST_NODE_SCALE <= scale <= MOST_SCALE) or not is_uniform or not float(quat.norm()) > TOLERANCE:
-        raise ValueError(_not_a_similarity(where))
+        raise ValueError(_similarity_message(where))
     return Placement(torch.nn.functional.normalize(quat, dim=0), scale, shift)
 
 
-def _not_a_similarity(where: str) -> str:
+def _similarity_message(where: str) -> str:
     return (
         f"{where} skews, mirrors or stretches splats; expected a turn, a shift and one scale: apply the transform first"
     )
@@ -391,24 +391,23 @@ def read_glb(path: Path | str) -> Gaussians:
 
 
 def _glb_bytes(gaussians: Gaussians) -> bytes:
-    turned = rotate_half_turn(
-        replace(gaussians, sh=gaussians.sh[:, : (gaussians.active_sh_degree + 1) ** 2]), HALF_TURN_Z
-    )
-    quats = torch.nn.functional.normalize(turned.quats, dim=1)
+    num_bases = (gaussians.active_sh_degree + 1) ** 2
+    rotated = rotate_half_turn(replace(gaussians, sh=gaussians.sh[:, :num_bases]), HALF_TURN_Z)
+    quats = torch.nn.functional.normalize(rotated.quats, dim=1)
     quats = torch.where(quats.norm(dim=1, keepdim=True) > 0, quats, quats.new_tensor([1.0, 0.0, 0.0, 0.0]))
-    opacities = torch.sigmoid(turned.logit_opacities)
-    diffuse = linear_from_srgb((turned.sh[:, 0] * SH_ZERO + 0.5).clamp(0, 1))
+    opacities = torch.sigmoid(rotated.logit_opacities)
+    diffuse = linear_from_srgb((rotated.sh[:, 0] * SH_ZERO + 0.5).clamp(0, 1))
     writer = GltfWriter()
     attributes = {
-        "POSITION": writer.add(as_numpy(turned.means), bounded=True),
+        "POSITION": writer.add(as_numpy(rotated.means), bounded=True),
         "COLOR_0": writer.add(as_numpy(torch.cat([diffuse, opacities[:, None]], dim=1))),
         ROTATION: writer.add(as_numpy(quats.roll(-1, dims=1))),
-        SCALE: writer.add(as_numpy(turned.deviations)),
+        SCALE: writer.add(as_numpy(rotated.deviations)),
         OPACITY: writer.add(as_numpy(opacities)),
     }
-    for index, name in enumerate(_harmonic_names(turned.sh.shape[1])):
-        attributes[name] = writer.add(as_numpy(turned.sh[:, index]))
-    for name, values in turned.channels.items():
+    for index, name in enumerate(_harmonic_names(rotated.sh.shape[1])):
+        attributes[name] = writer.add(as_numpy(rotated.sh[:, index]))
+    for name, values in rotated.channels.items():
         attributes[CHANNEL + name.upper()] = writer.add(as_numpy(values))
     splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
     primitive = {"mode": POINTS, "attributes": attributes, "extensions": {EXTENSION: splats}}

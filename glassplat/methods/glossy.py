@@ -145,9 +145,8 @@ def _matte_stages(recipe: DeferredRecipe, primitive: Primitive, seed: int, itera
         mcmc=recipe.mcmc,
     )
     first, *later = (replace(stage, name=f"as {stage.name}") for stage in plain.stages(seed, iterations))
-    return replace(
-        first, setup=SkipReflections(iterations, recipe.least_iterations, _environment_setup(recipe))
-    ), *later
+    setup = SkipReflections(iterations, recipe.least_iterations, _environment_setup(recipe))
+    return replace(first, setup=setup), *later
 
 
 def _rates_of_splat(recipe: DeferredRecipe) -> GaussianRates:

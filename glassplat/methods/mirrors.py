@@ -288,12 +288,8 @@ def _surface_axes(gaussians: Gaussians) -> Tensor:
 
 log = logging.getLogger("glassplat.training")
 
-PROPAGATION_ENDED, MOST_REFLECTIVE, LAST_GROWTH, VIEW_DEPENDENT = (
-    "propagation ended",
-    "most reflective",
-    "reflective grew",
-    "turns with the view",
-)
+PROPAGATION_ENDED, MOST_REFLECTIVE = "propagation ended", "most reflective"
+LAST_GROWTH, VIEW_DEPENDENT = "reflective grew", "turns with the view"
 """Keys of `TrainState.records`: step of the end, largest reflected share, step of its last growth, and the
 view-dependent, non-reflective share."""
 OPACITIES_RAISED, OPACITIES_LOWERED = "opacities raised", "opacities lowered"
@@ -425,12 +421,10 @@ class Propagate:
             *center, radius = region
             advice = EMPTY_ADVICE % (radius, *center)
         else:
-            view_dependent = state.records.get(VIEW_DEPENDENT)
-            if view_dependent is None:
-                view_dependent = self.measure.view_dependent_share(state.scene, dataset.train, self.renderer)
-            advice = (MATTE_ADVICE if view_dependent < LEAST_VIEW_DEPENDENT else OVERLOOKED_ADVICE) % (
-                100 * view_dependent
-            )
+            varying = state.records.get(VIEW_DEPENDENT)
+            if varying is None:
+                varying = self.measure.view_dependent_share(state.scene, dataset.train, self.renderer)
+            advice = (MATTE_ADVICE if varying < LEAST_VIEW_DEPENDENT else OVERLOOKED_ADVICE) % (100 * varying)
         log.warning(NOTHING_FOUND, clock.step, AS_SPLAT if self.matte_rates else "", advice)
 
 
@@ -515,7 +509,7 @@ class RefineEnvironment(AtShares):
         environment = state.scene.environment
         if environment.size >= self.largest:
             return False
-        doublings = sum(round(moment * clock.iterations) == clock.step for moment in self.shares)
+        doublings = sum(round(share * clock.iterations) == clock.step for share in self.shares)
         finer = resize_environment(environment, min(2**doublings * environment.size, self.largest))
         state.scene = replace(state.scene, environment=finer)
         return True

@@ -321,9 +321,8 @@ class FillUnseen(AtShares):
             if 0 < len(positions) < actions.MOST_ADDED_SHARE * len(state.scene.primary):
                 colors = (255 * color).round().to(torch.uint8).expand(len(positions), 3)
                 cloud = PointCloud(positions.cpu(), colors.cpu())
-                actions.add_primary_gaussians(
-                    state, actions.seed_gaussians(state.scene.primary, cloud, opacity=0.7, size=0.7 * cell)
-                )
+                seeds = actions.make_seeds(state.scene.primary, cloud, opacity=0.7, size=0.7 * cell)
+                actions.add_primary_gaussians(state, seeds)
                 added += len(positions)
         if added:
             log.info("%d Gaussians added for reflections of unseen parts", added)
@@ -356,7 +355,7 @@ def seed_reflection(state: TrainState, dataset: Dataset, panes: Planes) -> Work:
     if int(virtual.sum()) <= NEIGHBOURS:  # Too few to estimate their size.
         return False
     behind = replace(points, positions=points.positions[virtual], colors=points.colors[virtual])
-    seeds = mirrored_gaussians(actions.seed_gaussians(state.scene.primary, behind), panes.centers[0], panes.normals[0])
+    seeds = mirrored_gaussians(actions.make_seeds(state.scene.primary, behind), panes.centers[0], panes.normals[0])
     actions.add_primary_gaussians(state, seeds)
     log.info(
         "no photograph directly shows what is reflected by %s: %d points behind added as mirror images in front",
@@ -461,7 +460,7 @@ def _adjustment_stage(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> S
         name="2 plane adjustment",
         share=share,
         renderer=_training_renderer(recipe, "planes"),
-        losses=_reflection_stage_terms(recipe, strategy),
+        losses=_shared_terms(recipe, strategy),
         rates=_gaussian_rates(recipe) | plane_rates(),
         actions=(
             *strategy.edits,
@@ -486,7 +485,7 @@ def _joint_stage(recipe: PlanarRecipe, share: float) -> Stage:
         name="3 joint optimisation",
         share=share,
         renderer=_training_renderer(recipe, "all"),
-        losses=_reflection_stage_terms(recipe, strategy),
+        losses=_shared_terms(recipe, strategy),
         rates=_gaussian_rates(recipe)
         | plane_rates(JOINT_RATE_FACTOR)
         | ({"primary.log_intensity": Rate(recipe.rates.intensity)} if recipe.intensity else {}),
@@ -516,9 +515,7 @@ def _glass_post_steps(recipe: PlanarRecipe) -> tuple[PostStep, ...]:
     return (clamp_transmittances,) if recipe.tint else ()
 
 
-def _reflection_stage_terms(
-    recipe: PlanarRecipe, strategy: actions.DensificationStrategy
-) -> tuple[losses.LossTerm, ...]:
+def _shared_terms(recipe: PlanarRecipe, strategy: actions.DensificationStrategy) -> tuple[losses.LossTerm, ...]:
     glass = losses.weighted_terms(
         losses.LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, losses.tint_prior)
     )
@@ -540,9 +537,9 @@ SEED_AFTER_ADJUSTMENT, SEED_AFTER_JOINT = 0.005, 0.003
 for: early, but with known panes, behind which nothing is added."""
 
 
-def _seed_actions(recipe: PlanarRecipe, moment: float) -> tuple[actions.SeedUnexplained, ...]:
+def _seed_actions(recipe: PlanarRecipe, share: float) -> tuple[actions.SeedUnexplained, ...]:
     """The search for missing objects, if enabled."""
-    return (actions.SeedUnexplained((moment,), planar_renderer(recipe)),) if recipe.seed_unexplained else ()
+    return (actions.SeedUnexplained((share,), planar_renderer(recipe)),) if recipe.seed_unexplained else ()
 
 
 MCMC_RESET_AFTER = 0.02
@@ -552,9 +549,9 @@ glass were moved, which needs opaque Gaussians."""
 
 def _mcmc_resets(recipe: PlanarRecipe) -> tuple[actions.ResetOpacity, ...]:
     """The single reset of `mcmc`; `default` has its own."""
-    moment = _joint_start(recipe) + MCMC_RESET_AFTER
+    start = _joint_start(recipe) + MCMC_RESET_AFTER
     # A second one would be after the stop.
-    once = Every(moment, stop=1.5 * moment)
+    once = Every(start, stop=1.5 * start)
     return (actions.ResetOpacity(once),) if recipe.strategy == "mcmc" and recipe.turn_reflections else ()
 
 

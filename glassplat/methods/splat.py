@@ -70,7 +70,7 @@ SEED_AT = (0.105, 0.203)
 def _seed_actions(recipe: SplatRecipe) -> tuple[SeedUnexplained, ...]:
     """The search for missing objects, if enabled."""
     wanted = recipe.seed_unexplained and recipe.primitive == "ellipsoid" and recipe.strategy == "default"
-    return tuple(SeedUnexplained((moment,), _training_renderer(recipe)) for moment in SEED_AT if wanted)
+    return tuple(SeedUnexplained((share,), _training_renderer(recipe)) for share in SEED_AT if wanted)
 
 
 def strategy_of(recipe: MethodRecipe) -> DensificationStrategy:

@@ -60,15 +60,13 @@ def reflective_region(cameras: Sequence[Camera]) -> tuple[float, float, float, f
     return x, y, z, REGION_SHARE * float((found - centers).norm(dim=1).min())
 
 
-def _axis_misses(
-    point: torch.Tensor, centers: torch.Tensor, forward: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+def _axis_misses(point: torch.Tensor, centers: torch.Tensor, axes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """[C] bool: point in front of each camera; and [C] distance of the axis from it, as a share of the camera's
     distance.
     """
     towards = point - centers
-    along = (towards * forward).sum(1)
-    return along > 0, (towards - along[:, None] * forward).norm(dim=1) / towards.norm(dim=1)
+    along = (towards * axes).sum(1)
+    return along > 0, (towards - along[:, None] * axes).norm(dim=1) / towards.norm(dim=1)
 
 
 def _common_point(centers: torch.Tensor, forward: torch.Tensor) -> torch.Tensor | None:

@@ -164,11 +164,8 @@ def depth_normals(depth: Tensor, alpha: Tensor, camera: Camera) -> tuple[Tensor,
     # In a frame with x to the right, y down and z forward, down x along points to the camera.
     normals = torch.nn.functional.normalize(torch.linalg.cross(down, along), dim=-1)
     steepness = _neighbourhood_max(mean_depth) + _neighbourhood_max(-mean_depth)
-    whole = (
-        (_neighbourhood_max(1 - share) == 0)
-        & (steepness < MOST_DEPTH_CHANGE * mean_depth)
-        & (normals.abs().sum(-1) > 0)
-    )
+    whole = (_neighbourhood_max(1 - share) == 0) & (steepness < MOST_DEPTH_CHANGE * mean_depth)
+    whole &= normals.abs().sum(-1) > 0
     rotation = camera.cam_from_world[:3, :3].to(depth)
     return normals @ rotation, whole.to(depth.dtype)
 

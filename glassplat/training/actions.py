@@ -118,7 +118,7 @@ class Densify:
             part=self.part,
             prune_large=self.part in PRUNE_LARGE_PARTS and clock.progress > self.densifier.prune_large_start,
         )
-        replace_in_morton_order(state, edited, moments, self.part)
+        replace_sorted(state, edited, moments, self.part)
         return True
 
 
@@ -178,9 +178,7 @@ class PruneIdle:
         return True
 
 
-def replace_in_morton_order(
-    state: TrainState, gaussians: Gaussians, moments: densify.Moments, part: str = "primary"
-) -> None:
+def replace_sorted(state: TrainState, gaussians: Gaussians, moments: densify.Moments, part: str = "primary") -> None:
     """Replaces a part of the scene and its moments, sorted in Morton order."""
     order = densify.sort_by_morton_code(gaussians.means)
     ordered, moments = densify.apply_edit(gaussians, moments, order, part=part)
@@ -225,7 +223,7 @@ class Relocate:
             cap=mcmc_cap(self.densifier, dataset),
             generator=state.generator(self.name),
         )
-        replace_in_morton_order(state, edited, moments)
+        replace_sorted(state, edited, moments)
         # MCMC does not use screen gradients, but the statistics no longer match the rows.
         state.statistics.pop("primary", None)
         return True
@@ -422,14 +420,12 @@ class SeedUnexplained(AtShares):
         primary = state.scene.primary
         if not 0 < len(cloud) < MOST_ADDED_SHARE * len(primary):
             return False
-        add_primary_gaussians(state, seed_gaussians(primary, cloud, opacity=0.5, size=size))
+        add_primary_gaussians(state, make_seeds(primary, cloud, opacity=0.5, size=size))
         log.info("Gaussians added where photographs agree on a missing object: %d", len(cloud))
         return True
 
 
-def seed_gaussians(
-    primary: Gaussians, points: PointCloud, *, opacity: float = 0.1, size: float | None = None
-) -> Gaussians:
+def make_seeds(primary: Gaussians, points: PointCloud, *, opacity: float = 0.1, size: float | None = None) -> Gaussians:
     """Gaussians from points, like the primary ones; other channels get the median of these.
 
     Args:
@@ -505,12 +501,8 @@ def unexplained_positions(
         direction_sums[rows] += torch.nn.functional.normalize(camera.center - in_view, dim=1) * missing[:, None]
     mean = color_sums / agreeing_views.clamp(min=1)[:, None]
     spread = (square_sums / agreeing_views.clamp(min=1)[:, None] - mean.square()).clamp(min=0).mean(dim=1).sqrt()
-    found = (
-        (agreeing_views >= FEWEST_AGREEING_VIEWS)
-        & (agreeing_views >= LEAST_AGREEING_SHARE * seeing_views)
-        & (spread < MOST_COLOR_DEVIATION)
-    )
-    found &= direction_sums.norm(dim=1) < MOST_MEAN_DIRECTION * agreeing_views
+    found = (agreeing_views >= FEWEST_AGREEING_VIEWS) & (agreeing_views >= LEAST_AGREEING_SHARE * seeing_views)
+    found &= (spread < MOST_COLOR_DEVIATION) & (direction_sums.norm(dim=1) < MOST_MEAN_DIRECTION * agreeing_views)
     cloud = PointCloud(positions[found].cpu(), (255 * mean[found]).round().to(torch.uint8).cpu())
     return cloud, 0.6 * cell
 

@@ -215,19 +215,17 @@ def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     environment_tensors = tensors_with_prefix(tensors, "scene/environment/")
     check_shapes(environment_tensors, {"raw": None} if environment_tensors else {}, "environment")
     environment = Environment(**(environment_tensors or empty.environment.tensors()), region=header["region"])
-    exposure_tensors = tensors_with_prefix(tensors, "scene/exposures/")
-    check_shapes(exposure_tensors, {"affine": (3, 4)} if exposure_tensors else {}, "exposures")
-    pose_tensors = tensors_with_prefix(tensors, "scene/poses/")
-    check_shapes(pose_tensors, {"twists": (6,)} if pose_tensors else {}, "poses")
+    exposures = tensors_with_prefix(tensors, "scene/exposures/")
+    check_shapes(exposures, {"affine": (3, 4)} if exposures else {}, "exposures")
+    poses = tensors_with_prefix(tensors, "scene/poses/")
+    check_shapes(poses, {"twists": (6,)} if poses else {}, "poses")
     return Scene(
-        poses=PoseCorrections(pose_tensors["twists"], tuple(header["corrected"])) if pose_tensors else empty.poses,
+        poses=PoseCorrections(poses["twists"], tuple(header["corrected"])) if poses else empty.poses,
         extent=header["extent"],
         planes=Planes(**planes, labels=header["labels"], mirrors=header["mirrors"]),
         environment=environment,
         up=direction(header["up"], "the header"),
-        exposures=Exposures(exposure_tensors["affine"], tuple(header["photographs"]))
-        if exposure_tensors
-        else empty.exposures,
+        exposures=Exposures(exposures["affine"], tuple(header["photographs"])) if exposures else empty.exposures,
         **sets,
     )
 

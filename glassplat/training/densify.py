@@ -107,7 +107,7 @@ def sort_by_morton_code(means: Tensor) -> Edit:
     return Edit(source, torch.zeros_like(source, dtype=torch.bool))
 
 
-Moments = Mapping[str, tuple[Tensor, Tensor]]
+Moments = dict[str, tuple[Tensor, Tensor]]
 """Adam's first and second moment by dotted parameter name (`primary.means`), shaped like the parameter."""
 
 
@@ -179,9 +179,8 @@ def gaussians_around_cameras(gaussians: Gaussians, positions: Tensor) -> Tensor:
         near = ((position - gaussians.means).norm(dim=1) < reach).nonzero().squeeze(1)
         offset = (position - gaussians.means[near])[:, None] @ rotation_from_quat(gaussians.quats[near])
         squared = (offset.squeeze(1) / gaussians.log_scales[near].exp()).square().sum(dim=1)
-        obstructing[near] |= (
-            torch.sigmoid(gaussians.logit_opacities[near]) * torch.exp(-squared / 2) > LEAST_OBSTRUCTING_OPACITY
-        )
+        opacities = torch.sigmoid(gaussians.logit_opacities[near]) * torch.exp(-squared / 2)
+        obstructing[near] |= opacities > LEAST_OBSTRUCTING_OPACITY
     return obstructing
 
 
@@ -248,7 +247,7 @@ def split(gaussians: Gaussians, index: Tensor, *, generator: torch.Generator) ->
 @torch.no_grad()
 def apply_edit(
     gaussians: Gaussians, moments: Moments, edit: Edit, *, part: str = "primary"
-) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
+) -> tuple[Gaussians, Moments]:
     """The edited Gaussians and moments, without gradients; the arguments are not modified.
 
     Args:
@@ -260,21 +259,17 @@ def apply_edit(
     """
     edited = gaussians.with_tensors({name: edit.edited_tensor(gaussians, name) for name in gaussians.tensors()})
 
-    def edited_rows(moment: Tensor) -> Tensor:
+    def rows_of(moment: Tensor) -> Tensor:
         rows = moment[edit.source]
         rows[edit.fresh] = 0
         return rows
 
     owned = {f"{part}.{name}" for name in gaussians.tensors()}
-    return edited, {
-        name: (edited_rows(m), edited_rows(v)) if name in owned else (m, v) for name, (m, v) in moments.items()
-    }
+    return edited, {name: (rows_of(m), rows_of(v)) if name in owned else (m, v) for name, (m, v) in moments.items()}
 
 
 @torch.no_grad()
-def append(
-    gaussians: Gaussians, moments: Moments, new: Gaussians
-) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
+def append(gaussians: Gaussians, moments: Moments, new: Gaussians) -> tuple[Gaussians, Moments]:
     """The primary Gaussians followed by `new` ones, whose moments are zero.
 
     Raises:
@@ -295,9 +290,7 @@ def append(
 
 
 @torch.no_grad()
-def zero_moments(
-    moments: Moments, names: Collection[str], rows: Tensor | None = None
-) -> dict[str, tuple[Tensor, Tensor]]:
+def zero_moments(moments: Moments, names: Collection[str], rows: Tensor | None = None) -> Moments:
     """The moments with those of some parameters zeroed, because their values were replaced.
 
     Args:
@@ -411,7 +404,7 @@ def densify(
     generator: torch.Generator,
     part: str = "primary",
     prune_large: bool = False,
-) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
+) -> tuple[Gaussians, Moments]:
     """A set of Gaussians and their moments after cloning, splitting and pruning.
 
     Statistics start again at `ScreenStatistics.zeros` afterwards.
@@ -481,7 +474,7 @@ def _select_to_prune(
 @torch.no_grad()
 def reset_opacity(
     gaussians: Gaussians, moments: Moments, *, ceiling: float = 0.01, part: str = "primary"
-) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
+) -> tuple[Gaussians, Moments]:
     """Lowers every opacity to at most `ceiling` and zeroes the moments of opacities (3DGS, Section 5.2). Opacities
     that the photographs support grow back; the other Gaussians are pruned.
     """
@@ -502,7 +495,7 @@ MOST_LOGIT = 16.0
 @torch.no_grad()
 def relocate_and_grow(
     options: McmcDensify, gaussians: Gaussians, moments: Moments, *, cap: int, generator: torch.Generator
-) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
+) -> tuple[Gaussians, Moments]:
     """A set of Gaussians and their moments after relocation and growth, which change renders very little.
 
     Moments are zeroed for moved and new rows, and for the live ones at their new positions, whose opacity and size

@@ -179,10 +179,8 @@ def differentiate_step(
     names = [name for name in state.scene.parameters() if any(name in learning for _, learning, _ in of_views)]
     step = sum_over_ranks(state.scene, results, {part: statistics.get(part) for part in parts}, names, ranks)
     gradients = {name: gradient / len(views) for name, gradient in step.gradients.items()}
-    is_known = not any(unknown for _, _, unknown in of_views)
-    return StepGradients(
-        [losses for losses, _, _ in of_views], gradients, step.statistics, step.visible if is_known else None
-    )
+    visible = None if any(unknown for _, _, unknown in of_views) else step.visible
+    return StepGradients([losses for losses, _, _ in of_views], gradients, step.statistics, visible)
 
 
 def sum_over_ranks(

@@ -306,14 +306,14 @@ class MonocularNormals:
 
     def __call__(self, frame: Frame, view: View, scene: Scene) -> Tensor | None:
         """Loss of a view; None if there are no normals for its photograph."""
-        normals = view.normals
+        normals, name = view.normals, view.name
         if normals is None:
-            folders = view.image_path.parents[: len(PurePosixPath(view.name).parts) + 1]
-            if view.name not in self._without_normals and any((folder / NORMALS_FOLDER).is_dir() for folder in folders):
+            folders = view.image_path.parents[: len(PurePosixPath(name).parts) + 1]
+            if name not in self._without_normals and any((folder / NORMALS_FOLDER).is_dir() for folder in folders):
                 log.warning(
-                    "no normals for %s in the folder %r next to it: it is learned without", view.name, NORMALS_FOLDER
+                    "no normals for %s in the folder %r next to it: it is learned without", name, NORMALS_FOLDER
                 )
-            self._without_normals.add(view.name)
+            self._without_normals.add(name)
             return None
         estimated = rotate_to_world(to_device(normals, frame.rgb.device).to(frame.rgb), view.camera)
         known = (estimated.square().sum(-1) > 0) & (frame.layers["alpha"].detach() > 0.5)

@@ -197,12 +197,9 @@ def state_checksum(state: TrainState) -> int:
     tensors = state.scene.parameters() | {f"mean {name}": mean for name, mean in state.means.items()}
     for name, (first, second) in state.optimizer.moments.items():
         tensors |= {f"first {name}": first, f"second {name}": second}
-    integer_types = {2: torch.int16, 4: torch.int32, 8: torch.int64}
+    ints = {2: torch.int16, 4: torch.int32, 8: torch.int64}
     sums = {
-        name: (
-            tuple(t.shape),
-            int(t.detach().contiguous().view(integer_types[t.element_size()]).sum(dtype=torch.int64)),
-        )
+        name: (tuple(t.shape), int(t.detach().contiguous().view(ints[t.element_size()]).sum(dtype=torch.int64)))
         for name, t in tensors.items()
     }
     optimizer = state.optimizer

@@ -18,13 +18,10 @@ from glassplat.errors import InputError
 from glassplat.kernels.adam import Update, adam
 from glassplat.render.frame import Renderer
 from glassplat.scene.scene import Scene
-from glassplat.training.densify import ScreenStatistics
+from glassplat.training.densify import Moments, ScreenStatistics
 from glassplat.training.losses import LossTerm
 from glassplat.training.messages import Working
 from glassplat.training.options import Rate
-
-Moments = dict[str, tuple[Tensor, Tensor]]
-
 
 BETAS = (0.9, 0.999)
 """Adam's betas, for steps of one view."""

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from glassplat.methods.splat_recipe import SplatRecipe
-from glassplat.training.actions import replace_in_morton_order
+from glassplat.training.actions import replace_sorted
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import train
 from glassplat.training.messages import StepDone
@@ -84,7 +84,7 @@ def test_the_mean_begins_anew_when_gaussians_change_places() -> None:
     state, average = fresh_state(), AverageLast(passes=1)
     average(state, Clock(97, 100, views=10), None)
     backwards = state.scene.primary.select(torch.arange(len(state.scene.primary)).flip(0))
-    replace_in_morton_order(state, backwards.with_tensors({"means": -backwards.means}), {})
+    replace_sorted(state, backwards.with_tensors({"means": -backwards.means}), {})
     expected = state.scene.primary.means
     for step in (98, 99, 100):
         average(state, Clock(step, 100, views=10), None)

@@ -94,7 +94,7 @@ def vector_kind(real: type, lanes: int) -> VectorKind:
     @intrinsic
     def full(typing, value):
         if value == kind.element:
-            return plain_intrinsic(kind, (value,), lambda builder, x: _broadcast(builder, x, kind))
+            return codegen(kind, (value,), lambda builder, x: _broadcast(builder, x, kind))
 
     @intrinsic
     def load(typing, array, at):
@@ -115,7 +115,7 @@ def constant(real: type, values: tuple[float, ...]) -> Intrinsic:
 
     @intrinsic
     def fixed(typing):
-        return plain_intrinsic(kind, (), lambda builder: ir.Constant(llvm_type(kind), [float(real(v)) for v in values]))
+        return codegen(kind, (), lambda builder: ir.Constant(llvm_type(kind), [float(real(v)) for v in values]))
 
     return fixed
 
@@ -152,16 +152,14 @@ def store(typing, array, at, value):
 def select(typing, mask, chosen, other):
     """`chosen` where the mask is set, `other` elsewhere."""
     if isinstance(mask, MaskType) and isinstance(chosen, VectorType) and chosen == other:
-        return plain_intrinsic(chosen, (mask, chosen, other), lambda builder, *arguments: builder.select(*arguments))
+        return codegen(chosen, (mask, chosen, other), lambda builder, *arguments: builder.select(*arguments))
 
 
 def _llvm_extreme(order: str) -> Intrinsic:
     @intrinsic
     def extreme(typing, a, b):
         if isinstance(a, VectorType) and a == b:
-            return plain_intrinsic(
-                a, (a, b), lambda builder, x, y: builder.select(builder.fcmp_ordered(order, x, y), x, y)
-            )
+            return codegen(a, (a, b), lambda builder, x, y: builder.select(builder.fcmp_ordered(order, x, y), x, y))
 
     return extreme
 
@@ -176,7 +174,7 @@ def _llvm_unary(name: str) -> Intrinsic:
     @intrinsic
     def called(typing, value):
         if isinstance(value, VectorType):
-            return plain_intrinsic(value, (value,), lambda builder, x: _call(builder, name, value, x))
+            return codegen(value, (value,), lambda builder, x: _call(builder, name, value, x))
 
     return called
 
@@ -196,14 +194,14 @@ def fraction(typing, value):
         return builder.fsub(x, builder.sitofp(whole, x.type), flags=FLAGS)
 
     if isinstance(value, VectorType):
-        return plain_intrinsic(value, (value,), build)
+        return codegen(value, (value,), build)
 
 
 @intrinsic
 def times_power_of_2(typing, value, exponent):
     """`value` times 2^n, where n is the truncated exponent; undefined where the result is not a normal number."""
     if isinstance(value, VectorType) and value == exponent:
-        return plain_intrinsic(value, (value, exponent), lambda builder, x, y: _times_power_of_2(builder, x, y, value))
+        return codegen(value, (value, exponent), lambda builder, x, y: _times_power_of_2(builder, x, y, value))
 
 
 @intrinsic
@@ -215,14 +213,14 @@ def bits_of(typing, mask):
         return bits if mask.lanes == MASK_BITS else builder.zext(bits, ir.IntType(MASK_BITS))
 
     if isinstance(mask, MaskType):
-        return plain_intrinsic(types.int64, (mask,), build)
+        return codegen(types.int64, (mask,), build)
 
 
 @intrinsic
 def lowest_bit(typing, bits):
     """Index of the lowest bit that is set in an int64; undefined for 0."""
     if bits == types.int64:
-        return plain_intrinsic(types.intp, (bits,), lambda builder, x: builder.cttz(x, ir.Constant(ir.IntType(1), 1)))
+        return codegen(types.intp, (bits,), lambda builder, x: builder.cttz(x, ir.Constant(ir.IntType(1), 1)))
 
 
 @intrinsic
@@ -238,7 +236,7 @@ def sums_of(typing, vectors):
         return parts[0]
 
     if isinstance(vectors, types.UniTuple) and vectors.count == getattr(vectors.dtype, "lanes", 0):
-        return plain_intrinsic(vectors.dtype, (vectors,), build)
+        return codegen(vectors.dtype, (vectors,), build)
 
 
 def shuffle(builder: Any, a: Any, b: Any, order: Any) -> Any:
@@ -264,9 +262,7 @@ def _times_power_of_2(builder: Any, x: Any, exponent: Any, kind: VectorType) -> 
     return builder.bitcast(builder.add(builder.bitcast(x, bits), raised), x.type)
 
 
-def plain_intrinsic(
-    result: Any, arguments: tuple[Any, ...], build: Callable[..., Any]
-) -> tuple[Any, Callable[..., Any]]:
+def codegen(result: Any, arguments: tuple[Any, ...], build: Callable[..., Any]) -> tuple[Any, Callable[..., Any]]:
     """Signature and code generator of an intrinsic that needs only the values of its arguments."""
     return result(*arguments), lambda context, builder, sig, values: build(builder, *values)
 
@@ -379,7 +375,7 @@ def interleave(typing, vectors):
         return cgutils.pack_array(builder, rows, a.type)
 
     if isinstance(vectors, types.UniTuple) and vectors.count == 4 and isinstance(vectors.dtype, VectorType):
-        return plain_intrinsic(vectors, (vectors,), build)
+        return codegen(vectors, (vectors,), build)
 
 
 @intrinsic
@@ -393,7 +389,7 @@ def deinterleave(typing, vectors):
         return cgutils.pack_array(builder, [evens[0], odds[0], evens[1], odds[1]], rows[0].type)
 
     if isinstance(vectors, types.UniTuple) and vectors.count == 4 and isinstance(vectors.dtype, VectorType):
-        return plain_intrinsic(vectors, (vectors,), build)
+        return codegen(vectors, (vectors,), build)
 
 
 def zip_lanes(builder: Any, a: Any, b: Any) -> tuple[Any, Any]:
@@ -418,7 +414,7 @@ def drop_fourths(typing, row):
         return cgutils.pack_struct(builder, [shuffle(builder, x, x, kept[:8]), shuffle(builder, x, x, kept[8:])])
 
     if isinstance(row, VectorType) and row.lanes == ROW:
-        return plain_intrinsic(types.Tuple((VectorType(row.element, 8), VectorType(row.element, 4))), (row,), build)
+        return codegen(types.Tuple((VectorType(row.element, 8), VectorType(row.element, 4))), (row,), build)
 
 
 @intrinsic
@@ -433,7 +429,7 @@ def pad_fourths(typing, eight, four):
         return shuffle(builder, twelve, zeros, order)
 
     if isinstance(eight, VectorType) and (eight.lanes, four) == (8, VectorType(eight.element, 4)):
-        return plain_intrinsic(VectorType(eight.element, ROW), (eight, four), build)
+        return codegen(VectorType(eight.element, ROW), (eight, four), build)
 
 
 @intrinsic
@@ -452,7 +448,7 @@ def split_triples(typing, first, second, third):
         return cgutils.pack_array(builder, columns, a.type)
 
     if isinstance(first, VectorType) and first == second == third:
-        return plain_intrinsic(types.UniTuple(first, 3), (first, second, third), build)
+        return codegen(types.UniTuple(first, 3), (first, second, third), build)
 
 
 @intrinsic
@@ -469,7 +465,7 @@ def join_triples(typing, first, second, third):
         return cgutils.pack_array(builder, rows, a.type)
 
     if isinstance(first, VectorType) and first == second == third:
-        return plain_intrinsic(types.UniTuple(first, 3), (first, second, third), build)
+        return codegen(types.UniTuple(first, 3), (first, second, third), build)
 
 
 @intrinsic
@@ -485,7 +481,7 @@ def transpose(typing, rows):
         return cgutils.pack_array(builder, parts, parts[0].type)
 
     if isinstance(rows, types.UniTuple) and rows.count == getattr(rows.dtype, "lanes", 0):
-        return plain_intrinsic(rows, (rows,), build)
+        return codegen(rows, (rows,), build)
 
 
 def row_loader(real: type, lanes: int) -> Callable[..., Any]:

@@ -221,8 +221,8 @@ class _ShadeEnvironment(torch.autograd.Function):
         cotangents = [gradient.contiguous() for gradient in gradients]
         kernels = kernels_for("environment", reflection.device)
         found = kernels.shade_environment_gradients(inputs, ctx.least_strength, (base, reflection), cotangents)
-        turn = _rotation_gradient(inputs, ctx.least_strength, cotangents) if ctx.needs_input_grad[5] else None
-        return (None, *found, None, turn, None)
+        v_rotation = _rotation_gradient(inputs, ctx.least_strength, cotangents) if ctx.needs_input_grad[5] else None
+        return (None, *found, None, v_rotation, None)
 
 
 def _rotation_gradient(inputs: list[Tensor], least_strength: float, cotangents: list[Tensor]) -> Tensor:
@@ -236,9 +236,9 @@ def _rotation_gradient(inputs: list[Tensor], least_strength: float, cotangents: 
     v_rgb, _, v_reflection = (cotangent[shines] for cotangent in cotangents)
     n, height, width = normals[shines], *alpha.shape
     with torch.enable_grad():
-        turn = world_from_cam.detach().requires_grad_()
-        rays = ray_grid(intrinsics, width, height)[shines] @ turn.T
+        rotation = world_from_cam.detach().requires_grad_()
+        rays = ray_grid(intrinsics, width, height)[shines] @ rotation.T
         mirrored = n.square().sum(-1, keepdim=True) * rays - 2 * (rays * n).sum(-1, keepdim=True) * n
         seen = torch.sigmoid(cube_lookup(texels, mirrored))
-    (found,) = torch.autograd.grad(seen, turn, v_reflection + strength[shines][:, None] * v_rgb)
+    (found,) = torch.autograd.grad(seen, rotation, v_reflection + strength[shines][:, None] * v_rgb)
     return found

@@ -481,12 +481,8 @@ def _normal_gradients(real: type) -> Scalar:
 @cache
 def shade_environment_backward(real: type) -> Kernel:
     """Fills the gradients of blended, alpha and the lookups, and the cells and fractions of each pixel."""
-    cube_positions, position_gradients, normal_gradients = (
-        _cube_positions(real),
-        _position_gradients(real),
-        _normal_gradients(real),
-    )
-    shortest = real(NORMAL_MIN**2)
+    cube_positions, position_gradients = _cube_positions(real), _position_gradients(real)
+    normal_gradients, shortest = _normal_gradients(real), real(NORMAL_MIN**2)
     zero, one = real(0.0), real(1.0)
 
     @kernel("shade_environment_backward", real)

@@ -401,11 +401,9 @@ def shade_environment_backward(real: type) -> Kernel:
             v_share += v * (seen - base[row, column, d])
             v = (v * share + v_reflection[row, column, d]) * seen * (one - seen)
             v_raw[i, d] = v
-            steepness = bilinear_gradient(
-                upper[left, d], upper[left + 1, d], lower[left, d], lower[left + 1, d], along, down
-            )
-            by_column += v * steepness[0]
-            by_row += v * steepness[1]
+            by = bilinear_gradient(upper[left, d], upper[left + 1, d], lower[left, d], lower[left + 1, d], along, down)
+            by_column += v * by[0]
+            by_row += v * by[1]
         v_pixel[STRENGTH_AT] = v_share
         cells_per_u = half * real(side - 2)
         g = from_face(at, by_column * cells_per_u, by_row * cells_per_u)

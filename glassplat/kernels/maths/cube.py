@@ -13,7 +13,7 @@ import numpy as np
 
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import Scalar, blend_maths
-from glassplat.kernels.maths.projection import dot, linear_combination
+from glassplat.kernels.maths.projection import combine, dot
 
 
 class CubeMaths(NamedTuple):
@@ -169,13 +169,13 @@ TWO = np.float32(2.0)
 @inlined
 def mirror_ray(ray, normal):  # type: ignore[no-untyped-def]
     """A ray mirrored by a normal of any length, times the square of that length."""
-    return linear_combination(dot(normal, normal), ray, -TWO * dot(ray, normal), normal)
+    return combine(dot(normal, normal), ray, -TWO * dot(ray, normal), normal)
 
 
 @inlined
 def mirrored_gradient(ray, normal, g):  # type: ignore[no-untyped-def]
     """Gradient of the normal from that of the mirrored ray."""
-    by_square = linear_combination(TWO * dot(ray, g), normal, -TWO * dot(normal, g), ray)
+    by_square = combine(TWO * dot(ray, g), normal, -TWO * dot(normal, g), ray)
     across = -TWO * dot(ray, normal)
     return by_square[0] + across * g[0], by_square[1] + across * g[1], by_square[2] + across * g[2]
 

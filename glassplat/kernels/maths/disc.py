@@ -20,7 +20,7 @@ import numpy as np
 
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
-from glassplat.kernels.maths.projection import cross, dot, dot_products, linear_combination, scaled_sum
+from glassplat.kernels.maths.projection import combine, cross, dot, dot_products, scaled_sum
 
 EDGE_ON = 1e-3
 """Cosine between ray and normal below which a disc is seen edge-on and not intersected."""
@@ -58,18 +58,18 @@ def _disc(real: type) -> RayHitMaths:
         if not slope * slope > edge_on * edge_on * dot(d, d):
             return nowhere, (zero, zero, zero), nowhere
         t = dot(frame[2], offset) / slope
-        x = linear_combination(t, d, -one, offset)
+        x = combine(t, d, -one, offset)
         u, v = dot(frame[0], x), dot(frame[1], x)
         return t, (u, v, zero), u * u + v * v
 
     @inlined
     def intersect_gradient(offset, d, frame, t, q, v_t, v_squared):  # type: ignore[no-untyped-def]
         inverse_slope = one / dot(frame[2], d)
-        x = linear_combination(t, d, -one, offset)
+        x = combine(t, d, -one, offset)
         v_u, v_v = two * v_squared * q[0], two * v_squared * q[1]
-        v_x = linear_combination(v_u, frame[0], v_v, frame[1])
+        v_x = combine(v_u, frame[0], v_v, frame[1])
         along_normal = (v_t + dot(v_x, d)) * inverse_slope
-        v_origin = linear_combination(one, v_x, -along_normal, frame[2])
+        v_origin = combine(one, v_x, -along_normal, frame[2])
         v_d = t * v_origin[0], t * v_origin[1], t * v_origin[2]
         v_frame = (
             (v_u * x[0], v_u * x[1], v_u * x[2]),
@@ -96,7 +96,7 @@ def _ellipsoid(real: type) -> RayHitMaths:
         Across a thin ellipsoid q is a difference of numbers as large as the inverse of its thickness. Gradients
         multiply its rounding error by the same factor again.
         """
-        return linear_combination(one, q, -dot(q, f) / length, f)
+        return combine(one, q, -dot(q, f) / length, f)
 
     @inlined
     def intersect(offset, d, frame):  # type: ignore[no-untyped-def]
@@ -105,7 +105,7 @@ def _ellipsoid(real: type) -> RayHitMaths:
         if not length > zero:
             return nowhere, (zero, zero, zero), nowhere
         t = dot(e, f) / length
-        q = across(linear_combination(t, f, -one, e), f, length)
+        q = across(combine(t, f, -one, e), f, length)
         return t, q, dot(q, q)
 
     @inlined
@@ -116,10 +116,9 @@ def _ellipsoid(real: type) -> RayHitMaths:
         q = across(q, f, length)
         # The derivative of |q| with respect to t is zero, because t minimises |q|.
         by_t = v_t / length
-        v_e = linear_combination(-two * v_squared, q, by_t, f)
-        v_f = linear_combination(
-            two * v_squared * t, q, by_t, (e[0] - two * t * f[0], e[1] - two * t * f[1], e[2] - two * t * f[2])
-        )
+        v_e = combine(-two * v_squared, q, by_t, f)
+        reflected = e[0] - two * t * f[0], e[1] - two * t * f[1], e[2] - two * t * f[2]
+        v_f = combine(two * v_squared * t, q, by_t, reflected)
         v_offset = scaled_sum(v_e, frame[0], frame[1], frame[2])
         v_d = scaled_sum(v_f, frame[0], frame[1], frame[2])
         v_frame = (outer(v_e[0], v_f[0], offset, d), outer(v_e[1], v_f[1], offset, d), outer(v_e[2], v_f[2], offset, d))
@@ -191,7 +190,7 @@ def _map_gradient(real: type) -> Scalar:
 
     @inlined
     def plus(a, b):  # type: ignore[no-untyped-def]
-        return linear_combination(one, a, one, b)
+        return combine(one, a, one, b)
 
     @inlined
     def map_gradient(p, q, m, n, found, inverse_u, inverse_v, fx, fy, g):  # type: ignore[no-untyped-def]
@@ -203,10 +202,10 @@ def _map_gradient(real: type) -> Scalar:
         g_a = g[0] * inverse_u * x, g[1] * inverse_u * y, zero
         g_b = g[2] * inverse_v * x, g[3] * inverse_v * y, zero
         g_slope = -total / slope
-        g_n = linear_combination(g_slope, m, one, (g[4] * x, g[5] * y, zero))
+        g_n = combine(g_slope, m, one, (g[4] * x, g[5] * y, zero))
         g_p = plus(cross(g_b, m), cross(q, g_n))
         g_q = plus(cross(m, g_a), cross(g_n, p))
-        g_m = linear_combination(g_slope, n, one, plus(cross(g_a, q), cross(p, g_b)))
+        g_m = combine(g_slope, n, one, plus(cross(g_a, q), cross(p, g_b)))
         return g_p, g_q, (g_m[0], g_m[1], g_m[2] + total / m[2]), -along_u, -along_v
 
     return map_gradient

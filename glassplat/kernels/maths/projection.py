@@ -30,7 +30,7 @@ def dot(a, b):
 
 
 @inlined
-def linear_combination(s, a, t, b):
+def combine(s, a, t, b):
     """The combination s a + t b."""
     return s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2]
 
@@ -170,8 +170,8 @@ def clamp(x, lowest, highest):
 @inlined
 def footprint(row_x, row_y, row_z, scale_x, scale_y, tangent_x, tangent_y):
     """World vectors (w_x, w_y) whose dot products with a displacement are its pixels on screen."""
-    w_x = linear_combination(scale_x, row_x, -scale_x * tangent_x, row_z)
-    w_y = linear_combination(scale_y, row_y, -scale_y * tangent_y, row_z)
+    w_x = combine(scale_x, row_x, -scale_x * tangent_x, row_z)
+    w_y = combine(scale_y, row_y, -scale_y * tangent_y, row_z)
     return w_x, w_y
 
 
@@ -229,18 +229,14 @@ def _screen_gradients(real: type) -> tuple[Scalar, Scalar]:
     def footprint_gradient(w_x, w_y, v_x, v_y, axes, g_covariance):
         g_xx, g_xy, g_yy, g_determinant = g_covariance
         normal = cross(v_x, v_y)
-        gv_x = linear_combination(
-            one, linear_combination(two * g_xx, v_x, g_xy, v_y), two * g_determinant, cross(v_y, normal)
-        )
-        gv_y = linear_combination(
-            one, linear_combination(g_xy, v_x, two * g_yy, v_y), two * g_determinant, cross(normal, v_x)
-        )
+        gv_x = combine(one, combine(two * g_xx, v_x, g_xy, v_y), two * g_determinant, cross(v_y, normal))
+        gv_y = combine(one, combine(g_xy, v_x, two * g_yy, v_y), two * g_determinant, cross(normal, v_x))
         gw_x = scaled_sum(gv_x, axes[0], axes[1], axes[2])
         gw_y = scaled_sum(gv_y, axes[0], axes[1], axes[2])
         g_axes = (
-            linear_combination(gv_x[0], w_x, gv_y[0], w_y),
-            linear_combination(gv_x[1], w_x, gv_y[1], w_y),
-            linear_combination(gv_x[2], w_x, gv_y[2], w_y),
+            combine(gv_x[0], w_x, gv_y[0], w_y),
+            combine(gv_x[1], w_x, gv_y[1], w_y),
+            combine(gv_x[2], w_x, gv_y[2], w_y),
         )
         return gw_x, gw_y, g_axes
 

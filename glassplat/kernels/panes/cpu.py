@@ -263,12 +263,8 @@ def _blend_run(real: type) -> Scalar:
 @cache
 def blend_panes_forward(real: type) -> Kernel:
     """Fills rgb, reflection and strength."""
-    load, fill_strengths, blend_run, store_triples = (
-        _load(real),
-        _fill_strengths(real),
-        _blend_run(real),
-        _copies(real)[1],
-    )
+    load, fill_strengths = _load(real), _fill_strengths(real)
+    blend_run, store_triples = _blend_run(real), _copies(real)[1]
     load_lanes, zero = vector_kind(real, LANES).load, real(0.0)
 
     @kernel("blend_panes_forward", real)
@@ -347,10 +343,10 @@ def _sum_strength_gradients(real: type) -> Scalar:
             marked, along, length = run[MASK + i], run[ALONG + i], run[LENGTH + i]
             v_raw = run[V_SHARE + i] * marked if (marked > zero) & (run[GAIN + i] <= dazzling) else zero
             by_base, by_cosine = strength_derivatives(law, base, abs(along) / length)
-            slope = v_raw * by_cosine / length
-            slope = slope if along > zero else -slope
-            sum_x += slope * (start + real(np.int32(i))) * inverse_f
-            sum_1 += slope
+            v_along = v_raw * by_cosine / length
+            v_along = v_along if along > zero else -v_along
+            sum_x += v_along * (start + real(np.int32(i))) * inverse_f
+            sum_1 += v_along
             sum_base += v_raw * by_base
         return sum_x, sum_1, sum_base
 
@@ -360,12 +356,8 @@ def _sum_strength_gradients(real: type) -> Scalar:
 @cache
 def blend_panes_backward(real: type) -> Kernel:
     """Fills the gradients of transmission, mask, reflections, normals and base reflectances; all start at zero."""
-    load, fill_strengths, blend_run_gradient, sum_strength_gradients = (
-        _load(real),
-        _fill_strengths(real),
-        _blend_run_gradient(real),
-        _sum_strength_gradients(real),
-    )
+    load, fill_strengths = _load(real), _fill_strengths(real)
+    blend_run_gradient, sum_strength_gradients = _blend_run_gradient(real), _sum_strength_gradients(real)
     load_lanes, (load_triples, store_triples) = vector_kind(real, LANES).load, _copies(real)
     zero = real(0.0)
 
@@ -477,9 +469,9 @@ def layer_derivatives_kernel(real: type) -> Kernel:
                 if linear:
                     lit, bright = linear_of(behind[x]), linear_of(mirror_image[x])
                     light = lit + share[x] * (bright - lit)
-                    slope = encoded_derivative(light, encoded(light))
-                    by_behind *= slope * linear_derivative(behind[x], lit)
-                    by_mirror_image *= slope * linear_derivative(mirror_image[x], bright)
+                    derivative = encoded_derivative(light, encoded(light))
+                    by_behind *= derivative * linear_derivative(behind[x], lit)
+                    by_mirror_image *= derivative * linear_derivative(mirror_image[x], bright)
                 out_through[x] = by_behind if shown[x] else one
                 out_mirrored[x] = by_mirror_image if shown[x] else zero
 
@@ -496,8 +488,8 @@ def sample_derivatives(derivatives: Tensor, near: Tensor, means2d: Tensor, depth
         for axis, size in zip(means2d.unbind(-1), (width, height), strict=True)
     )
     pixels = (rows * width + columns).flatten()
-    surface, slope = (image.flatten().index_select(0, pixels).view_as(depths) for image in (near, derivatives))
-    return torch.where(depths > surface, slope, 1.0)
+    surface, derivative = (image.flatten().index_select(0, pixels).view_as(depths) for image in (near, derivatives))
+    return torch.where(depths > surface, derivative, 1.0)
 
 
 def inside_panes(pane: Tensor, strength: Tensor) -> Tensor:

@@ -337,11 +337,8 @@ def blend_panes_backward(real: type) -> Kernel:
     """Fills the gradients of transmission, mask and reflections, and each pixel's contribution [H, W, 4] to those of
     its pane's normal and base reflectance; all but the first start at zero.
     """
-    pane_strength, strength_derivatives, (_, blend_channel_gradient) = (
-        _pane_strength(real),
-        pane_maths(real).strength_derivatives,
-        build_blend_channel(real),
-    )
+    pane_strength, strength_derivatives = _pane_strength(real), pane_maths(real).strength_derivatives
+    _, blend_channel_gradient = build_blend_channel(real)
     zero, one, dazzling = real(0.0), real(1.0), real(DAZZLING)
 
     @kernel("blend_panes_backward", real, f"{INPUTS} real3 real3 real2 real3 real2 real4 real3")
@@ -375,11 +372,11 @@ def blend_panes_backward(real: type) -> Kernel:
         v_mask[row, column] = v_share * raw
         v_raw = v_share * marked if gain <= dazzling else zero
         by_base, by_cosine = strength_derivatives(law, bases[k], abs(along) / length)
-        slope = v_raw * by_cosine / length
-        slope = slope if along > zero else -slope
-        shares[row, column, 0] = slope * x
-        shares[row, column, 1] = slope * y
-        shares[row, column, 2] = slope
+        v_along = v_raw * by_cosine / length
+        v_along = v_along if along > zero else -v_along
+        shares[row, column, 0] = v_along * x
+        shares[row, column, 1] = v_along * y
+        shares[row, column, 2] = v_along
         shares[row, column, 3] = v_raw * by_base
 
     return backward
@@ -419,9 +416,9 @@ def layer_derivatives_kernel(real: type) -> Kernel:
         if linear:
             lit, bright = linear_of(behind), linear_of(mirror_image)
             light = lit + share * (bright - lit)
-            slope = encoded_derivative(light, encoded(light))
-            by_behind *= slope * linear_derivative(behind, lit)
-            by_mirror_image *= slope * linear_derivative(mirror_image, bright)
+            derivative = encoded_derivative(light, encoded(light))
+            by_behind *= derivative * linear_derivative(behind, lit)
+            by_mirror_image *= derivative * linear_derivative(mirror_image, bright)
         through[row, x], mirrored[row, x] = by_behind, by_mirror_image
 
     return derivatives
@@ -430,14 +427,9 @@ def layer_derivatives_kernel(real: type) -> Kernel:
 def sample_derivatives(derivatives: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
     """As `glassplat.kernels.panes.cpu.sample_derivatives`."""
     found = torch.empty_like(depths)
+    per_splat = means2d.view(-1, 2), depths.view(-1), found.view(-1)
     sample_derivatives_kernel(REAL_OF[depths.dtype])(
-        blocks_for(depths.numel(), THREADS),
-        THREADS,
-        derivatives,
-        near,
-        means2d.view(-1, 2),
-        depths.view(-1),
-        found.view(-1),
+        blocks_for(depths.numel(), THREADS), THREADS, derivatives, near, *per_splat
     )
     return found
 

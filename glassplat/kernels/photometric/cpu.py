@@ -45,7 +45,7 @@ ENTERED = 0  # One row of image, photograph, sum of squares and product,
 BLURRED = ENTERED + 4 * STRIDE  # a plane of each after the blur along the row,
 RESULTS = BLURRED + 4 * PLANE  # four rows of each after the blur down the columns,
 DERIVATIVES = RESULTS + 4 * TOGETHER * STRIDE  # one row of similarity and three derivatives,
-BLURRED_DERIVATIVES = DERIVATIVES + 4 * STRIDE  # and a plane of each slope after the blur along the row.
+BLURRED_DERIVATIVES = DERIVATIVES + 4 * STRIDE  # and a plane of each derivative after the blur along the row.
 SCRATCH = BLURRED_DERIVATIVES + 3 * PLANE
 
 

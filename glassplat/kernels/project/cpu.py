@@ -479,12 +479,8 @@ def build_color_listed(real: type) -> Callable[..., Any]:
 def project_forward(real: type) -> Kernel:
     """Fills means2d, conics, depths, opacities, colors and radii; zeros where a Gaussian is culled."""
     fill_lenses = view_steps(real).fill_lenses
-    list_candidates, place_listed, color_listed = (
-        build_list_candidates(real),
-        build_place_listed(real),
-        build_color_listed(real),
-    )
-    zero, chunk_size = real(0.0), CHUNK
+    list_candidates, place_listed = build_list_candidates(real), build_place_listed(real)
+    color_listed, zero, chunk_size = build_color_listed(real), real(0.0), CHUNK
 
     @kernel("project_forward", real)
     def forward(

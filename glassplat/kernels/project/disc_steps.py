@@ -9,7 +9,7 @@ import numpy as np
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
 from glassplat.kernels.maths.disc import MAP, MOST_LOG_SCALE, crossing_box, disc_maths, outline, reach
-from glassplat.kernels.maths.projection import dot, dot_products, linear_combination, scaled_sum, shape_maths
+from glassplat.kernels.maths.projection import combine, dot, dot_products, scaled_sum, shape_maths
 from glassplat.kernels.project.steps import Footprint, pose
 
 
@@ -134,17 +134,9 @@ def _place_gradient(real: type) -> Scalar:
         p, q, m = tangents(rows, offset, mean, axes)
         across = cross_products(p, q, m)[2]
         fx, fy, inverse = intrinsics[c, 0], intrinsics[c, 1], one / m[2]
+        pixel_map, g_map = disc_map(maps, c, n), disc_map(g_maps, c, n)
         g_p, g_q, g_m, g_u, g_v = map_gradient(
-            p,
-            q,
-            m,
-            across,
-            disc_map(maps, c, n),
-            one / deviations[0],
-            one / deviations[1],
-            fx,
-            fy,
-            disc_map(g_maps, c, n),
+            p, q, m, across, pixel_map, one / deviations[0], one / deviations[1], fx, fy, g_map
         )
         g_x, g_y = g_means2d[c, n, 0] * fx * inverse, g_means2d[c, n, 1] * fy * inverse
         behind = (g_x * m[0] + g_y * m[1]) * inverse
@@ -156,9 +148,9 @@ def _place_gradient(real: type) -> Scalar:
             (side * g_normals[c, n, 0], side * g_normals[c, n, 1], side * g_normals[c, n, 2]),
         )
         g_rows = (
-            linear_combination(g_p[0], axes[0], g_q[0], axes[1]),
-            linear_combination(g_p[1], axes[0], g_q[1], axes[1]),
-            linear_combination(g_p[2], axes[0], g_q[2], axes[1]),
+            combine(g_p[0], axes[0], g_q[0], axes[1]),
+            combine(g_p[1], axes[0], g_q[1], axes[1]),
+            combine(g_p[2], axes[0], g_q[2], axes[1]),
         )
         return g_center, g_rows, g_axes, (g_u, g_v)
 

@@ -13,10 +13,10 @@ from glassplat.kernels.maths.blending import ALPHA_MIN
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.maths.projection import (
     clamp,
+    combine,
     dot,
     dot_products,
     footprint,
-    linear_combination,
     scaled_sum,
     screen_maths,
     shape_maths,
@@ -93,7 +93,7 @@ def _lenses(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
     @inlined
     def skewed(row, row_z, tangent):
         """Length of a unit sphere's footprint in multiples of focal length over depth."""
-        w = linear_combination(one, row, -tangent, row_z)
+        w = combine(one, row, -tangent, row_z)
         return math.sqrt(dot(w, w))
 
     @inlined
@@ -227,8 +227,8 @@ def place_gradients(real: type, free: Callable[..., Any] | None = None) -> Calla
         g_tangent_x, g_tangent_y = fx * g_mean2d[0] + g_held_x, fy * g_mean2d[1] + g_held_y
         g_log_depth = dot(gw_x, w_x) + dot(gw_y, w_y) + g_tangent_x * tangent[0] + g_tangent_y * tangent[1]
         g_position = inverse_depth * g_tangent_x, inverse_depth * g_tangent_y, g_depth - inverse_depth * g_log_depth
-        g_row_x, g_row_y = linear_combination(scale_x, gw_x, zero, gw_x), linear_combination(scale_y, gw_y, zero, gw_y)
-        g_row_z = linear_combination(-scale_x * held[0], gw_x, -scale_y * held[1], gw_y)
+        g_row_x, g_row_y = combine(scale_x, gw_x, zero, gw_x), combine(scale_y, gw_y, zero, gw_y)
+        g_row_z = combine(-scale_x * held[0], gw_x, -scale_y * held[1], gw_y)
         return g_position, (g_row_x, g_row_y, g_row_z), g_axes
 
     return place_gradient
@@ -243,7 +243,7 @@ def camera_sums(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
         for i in range(3):
             g_row = g_rows[0] if i == 0 else (g_rows[1] if i == 1 else g_rows[2])
             g_i = g_position[0] if i == 0 else (g_position[1] if i == 1 else g_position[2])
-            from_row = linear_combination(one, g_row, g_i, mean)
+            from_row = combine(one, g_row, g_i, mean)
             total[4 * i + 0] += np.float64(from_row[0])
             total[4 * i + 1] += np.float64(from_row[1])
             total[4 * i + 2] += np.float64(from_row[2])
@@ -308,16 +308,14 @@ class Footprint(NamedTuple):
 
 def ellipsoids(real: type) -> Footprint:
     """Builds the footprint of ellipsoids, for one at a time."""
-    culled = build_cull(real)[0]
+    shape, culled = view_steps(real).shape, build_cull(real)[0]
 
     @inlined
     def cull(c, n, outputs):
         means2d, conics, depths, opacities, colors, radii = outputs
         culled(n, c, means2d, conics, depths, opacities, colors, radii)
 
-    return Footprint(
-        view_steps(real).shape, cull, build_place(real), _ellipsoid_gradient(real), _finish_ellipsoid(real)
-    )
+    return Footprint(shape, cull, build_place(real), _ellipsoid_gradient(real), _finish_ellipsoid(real))
 
 
 def _ellipsoid_gradient(real: type) -> Callable[..., Any]:
@@ -359,9 +357,9 @@ def _finish_ellipsoid(real: type) -> Callable[..., Any]:
         g_log_scales[n, 1] += dot(axes[1], g_axes[1])
         g_log_scales[n, 2] += dot(axes[2], g_axes[2])
         g_x, g_y, g_z = (
-            linear_combination(dot(axes[0], x), g_axes[0], zero, x),
-            linear_combination(dot(axes[1], y), g_axes[1], zero, y),
-            linear_combination(dot(axes[2], z), g_axes[2], zero, z),
+            combine(dot(axes[0], x), g_axes[0], zero, x),
+            combine(dot(axes[1], y), g_axes[1], zero, y),
+            combine(dot(axes[2], z), g_axes[2], zero, z),
         )
         g_w, g_i, g_j, g_k = unit_quat_gradient(quat, inverse_norm, g_x, g_y, g_z)
         g_quats[n, 0] += g_w
@@ -423,16 +421,16 @@ def build_project_back(real: type, kind: Footprint) -> Callable[..., Any]:
             c, n, mean, shaped, cam_from_world, intrinsics, lens, maps, cotangents
         )
         row_x, row_y, row_z, _ = pose(cam_from_world, c)
-        g_mean = linear_combination(one, g_mean, one, scaled_sum(g_center, row_x, row_y, row_z))
-        ga_x, ga_y = linear_combination(one, ga_x, one, g_axes[0]), linear_combination(one, ga_y, one, g_axes[1])
-        ga_z = linear_combination(one, ga_z, one, g_axes[2])
+        g_mean = combine(one, g_mean, one, scaled_sum(g_center, row_x, row_y, row_z))
+        ga_x, ga_y = combine(one, ga_x, one, g_axes[0]), combine(one, ga_y, one, g_axes[1])
+        ga_z = combine(one, ga_z, one, g_axes[2])
         g_u, g_v, g_opacity = g_u + g_scales[0], g_v + g_scales[1], g_opacity + g_opacities[c, n]
         if needs_camera:
             add_place(total, g_rows, g_center, mean)
         g_color = g_colors[c, n, 0], g_colors[c, n, 1], g_colors[c, n, 2]
         if degree >= 0 and (g_color[0] != zero or g_color[1] != zero or g_color[2] != zero):
             g_view = view_gradient(sh, n, degree, mean, lens, c, g_color, g_sh)
-            g_mean = linear_combination(one, g_mean, one, g_view)
+            g_mean = combine(one, g_mean, one, g_view)
             if needs_camera:
                 add_view(total, cam_from_world, c, g_view)
         return g_mean, g_opacity, (ga_x, ga_y, ga_z), (g_u, g_v)
