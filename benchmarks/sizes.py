@@ -34,7 +34,7 @@ from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.training.actions import Densify
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
-from glassplat.training.densify import ScreenStatistics, sort_by_morton_code
+from glassplat.training.densify import ScreenStatistics, morton_order
 from glassplat.training.options import DefaultDensify
 from glassplat.training.stage import Clock, TrainState
 
@@ -70,7 +70,7 @@ def works_of(count: int, device: torch.device, folder: Path) -> tuple[Works, Wor
 
     once: Works = {
         "densify": densify,
-        "put in order": lambda: sort_by_morton_code(scene.primary.means),
+        "put in order": lambda: morton_order(scene.primary.means),
         "contribution to a view": lambda: contributions(scene, camera),
         "save checkpoint": lambda: save_checkpoint(folder / "state.safetensors", state),
         "read checkpoint": lambda: load_checkpoint(folder / "state.safetensors"),

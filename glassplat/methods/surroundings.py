@@ -19,7 +19,7 @@ from glassplat.scene import logit
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Environment
-from glassplat.training.densify import apply_edit, as_discs, sort_by_morton_code, zero_moments
+from glassplat.training.densify import apply_edit, as_discs, morton_order, zero_moments
 from glassplat.training.messages import Working
 from glassplat.training.options import MirrorSearch, SurroundingsStart
 from glassplat.training.stage import TrainState
@@ -229,7 +229,7 @@ class AddSurroundings:
         parts = [part for part in self._initial_sets(state, dataset, matte) if len(part)]
         # Nothing to copy if everything reflects.
         found = reduce(Gaussians.concat, parts or [self._gaussians_in_box(state, dataset)])
-        ordered, _ = apply_edit(found, {}, sort_by_morton_code(found.means), part="surroundings")
+        ordered, _ = apply_edit(found, {}, morton_order(found.means), part="surroundings")
         state.scene = replace(state.scene, surroundings=ordered)
 
     def _initial_sets(self, state: TrainState, dataset: Dataset, matte: Tensor) -> list[Gaussians]:

@@ -180,7 +180,7 @@ class PruneIdle:
 
 def replace_sorted(state: TrainState, gaussians: Gaussians, moments: densify.Moments, part: str = "primary") -> None:
     """Replaces a part of the scene and its moments, sorted in Morton order."""
-    order = densify.sort_by_morton_code(gaussians.means)
+    order = densify.morton_order(gaussians.means)
     ordered, moments = densify.apply_edit(gaussians, moments, order, part=part)
     state.scene = state.scene.with_gaussians(part, ordered)
     # An empty set has no parameters.

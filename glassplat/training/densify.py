@@ -61,7 +61,7 @@ def gaussians_from_points(
     if not spread > 0:
         raise ValueError(f"spread is {spread}; expected a positive share of the distance between points")
     # In float64, to avoid rounding of the cloud's size.
-    order = sort_by_morton_code(points.positions.double()).source
+    order = morton_order(points.positions.double()).source
     means = points.positions[order]
     count, device = len(points), means.device
     sh = torch.zeros(count, (sh_degree + 1) ** 2, 3, device=device, dtype=torch.float32)
@@ -98,7 +98,7 @@ def _spacing(means: Tensor) -> Tensor:
     return torch.from_numpy(np.maximum(distances[:, 1:].mean(axis=1), SMALLEST_SCALE * extent))
 
 
-def sort_by_morton_code(means: Tensor) -> Edit:
+def morton_order(means: Tensor) -> Edit:
     """The edit that sorts Gaussians at `means` [N, 3] into Morton order; equal positions keep their order.
 
     A tile of an image fetches Gaussians that are close in space, so cache lines and wide loads are used better.

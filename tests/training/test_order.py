@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from glassplat.kernels.trace.bvh import MORTON_BITS, morton_codes
-from glassplat.training.densify import sort_by_morton_code
+from glassplat.training.densify import morton_order
 
 
 def test_the_corners_of_a_cube_come_in_the_order_of_the_curve() -> None:
     corners = torch.tensor([[x, y, z] for z in (0.0, 1.0) for y in (0.0, 1.0) for x in (0.0, 1.0)])
     shuffled = torch.randperm(8, generator=torch.Generator().manual_seed(0))
-    order = sort_by_morton_code(corners[shuffled])
+    order = morton_order(corners[shuffled])
     assert torch.equal(corners[shuffled][order.source], corners)
     assert not bool(order.fresh.any())
 
@@ -32,7 +32,7 @@ def test_codes_interleave_the_bits_of_the_axes() -> None:
 
 def test_neighbours_in_memory_are_near_each_other() -> None:
     means = torch.rand(4000, 3, generator=torch.Generator().manual_seed(2))
-    ordered = means[sort_by_morton_code(means).source]
+    ordered = means[morton_order(means).source]
     steps, random_steps = (m.diff(dim=0).norm(dim=1).mean() for m in (ordered, means))
     assert float(steps) < 0.2 * float(random_steps)
 
@@ -40,12 +40,12 @@ def test_neighbours_in_memory_are_near_each_other() -> None:
 @pytest.mark.parametrize("poison", [float("nan"), float("inf"), -float("inf")])
 def test_what_is_not_finite_comes_last_and_spares_the_others(poison: float) -> None:
     means = torch.rand(50, 3, generator=torch.Generator().manual_seed(3))
-    expected = sort_by_morton_code(means).source
-    beside = sort_by_morton_code(torch.cat([torch.full((1, 3), poison), means])).source
+    expected = morton_order(means).source
+    beside = morton_order(torch.cat([torch.full((1, 3), poison), means])).source
     assert torch.equal(beside[:-1] - 1, expected)
     assert int(beside[-1]) == 0
 
 
 @pytest.mark.parametrize("means", [torch.zeros(0, 3), torch.ones(5, 3), torch.full((4, 3), float("nan"))])
 def test_without_extent_the_order_stays(means: torch.Tensor) -> None:
-    assert sort_by_morton_code(means).source.tolist() == list(range(len(means)))
+    assert morton_order(means).source.tolist() == list(range(len(means)))
