@@ -145,9 +145,7 @@ def check_options(options: Any) -> None:
     try:
         check_value(type(options), options, "")
     except OptionError as error:
-        raise InputError(
-            f"{option_of_field(error.name)} is {short_repr(error.value)}; expected {error.expected}"
-        ) from error
+        raise InputError(f"{as_option(error.name)} is {short_repr(error.value)}; expected {error.expected}") from error
 
 
 def options_from_json(kind: type, value: Any) -> Any:
@@ -159,7 +157,7 @@ def options_from_json(kind: type, value: Any) -> Any:
     return check_value(kind, value, "")
 
 
-def option_of_field(name: str) -> str:
+def as_option(name: str) -> str:
     """The option of the command line that sets a field: `plane_fit.seed` is `--plane-fit.seed`."""
     return "--" + name.replace("_", "-")
 
@@ -194,11 +192,9 @@ def unwrap_annotation(hint: Any) -> tuple[Any, tuple[Requirement, ...]]:
 def expectation(hint: Any, requirements: tuple[Requirement, ...] = ()) -> str:
     """Expected value of this annotation, in words."""
     bounds = " and ".join(requirement.expected for requirement in requirements)
-    return (
-        f"{SCALAR_NAMES[hint]} {bounds}".rstrip()
-        if hint in SCALAR_NAMES
-        else ", ".join(filter(None, (_expected_structure(hint), bounds)))
-    )
+    if hint in SCALAR_NAMES:
+        return f"{SCALAR_NAMES[hint]} {bounds}".rstrip()
+    return ", ".join(filter(None, (_expected_structure(hint), bounds)))
 
 
 def _expected_structure(hint: Any) -> str:
@@ -222,14 +218,12 @@ def _expected_structure(hint: Any) -> str:
 def _convert_value(hint: Any, value: Any, name: str, requirements: tuple[Requirement, ...]) -> Any:
     """The value converted to a type without metadata; requirements are for the message."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return _convert_dataclass(
-            type(value), {field.name: getattr(value, field.name) for field in fields(value)}, name
-        )
+        return _to_dataclass(type(value), {field.name: getattr(value, field.name) for field in fields(value)}, name)
     if dataclasses.is_dataclass(hint):
-        return _convert_dataclass(typing.cast(type, hint), value, name)
+        return _to_dataclass(typing.cast(type, hint), value, name)
     origin = typing.get_origin(hint)
     if origin in UNION_TYPES:
-        return _convert_union(hint, value, name)
+        return _to_union(hint, value, name)
     if origin in CONVERTERS:
         return CONVERTERS[origin](hint, value, name)
     if not _has_type(hint, value):
@@ -256,7 +250,7 @@ def is_finite(value: float) -> bool:
         return False
 
 
-def _convert_dataclass(kind: type, value: Any, name: str) -> Any:
+def _to_dataclass(kind: type, value: Any, name: str) -> Any:
     """An instance of a dataclass from its fields by name."""
     if not isinstance(value, Mapping):
         raise OptionError(name, value, "an object with named values")
@@ -288,7 +282,7 @@ def nested_name(outer: str, field: str, hint: Any) -> str:
     return outer if nameless else f"{outer}.{field}".removeprefix(".")
 
 
-def _convert_union(hint: Any, value: Any, name: str) -> Any:
+def _to_union(hint: Any, value: Any, name: str) -> Any:
     """The value converted to the first type of a union that accepts it."""
     if value is None and type(None) in typing.get_args(hint):
         return None
@@ -307,14 +301,14 @@ def _convert_union(hint: Any, value: Any, name: str) -> Any:
     raise OptionError(name, value, expectation(hint))
 
 
-def _convert_literal(hint: Any, value: Any, name: str) -> Any:
+def _to_literal(hint: Any, value: Any, name: str) -> Any:
     choices = typing.get_args(hint)
     if not any(value == choice and type(value) is type(choice) for choice in choices):
         raise OptionError(name, value, f"one of {', '.join(map(str, choices))}")
     return value
 
 
-def _convert_tuple(hint: Any, value: Any, name: str) -> tuple[Any, ...]:
+def _to_tuple(hint: Any, value: Any, name: str) -> tuple[Any, ...]:
     inner = typing.get_args(hint)
     if not isinstance(value, (list, tuple)) or (inner[-1] is not ... and len(value) != len(inner)):
         raise OptionError(name, value, _expected_structure(hint))
@@ -325,18 +319,14 @@ def _convert_tuple(hint: Any, value: Any, name: str) -> tuple[Any, ...]:
         raise OptionError(name, value, _expected_structure(hint)) from error
 
 
-def _convert_dict(hint: Any, value: Any, name: str) -> dict[Any, Any]:
+def _to_dict(hint: Any, value: Any, name: str) -> dict[Any, Any]:
     keys, values = typing.get_args(hint)
     if not isinstance(value, Mapping):
         raise OptionError(name, value, _expected_structure(hint))
     return {check_value(keys, key, name): check_value(values, element, name) for key, element in value.items()}
 
 
-CONVERTERS: dict[Any, Callable[[Any, Any, str], Any]] = {
-    typing.Literal: _convert_literal,
-    tuple: _convert_tuple,
-    dict: _convert_dict,
-}
+CONVERTERS: dict[Any, Callable[[Any, Any, str], Any]] = {typing.Literal: _to_literal, tuple: _to_tuple, dict: _to_dict}
 
 
 def short_repr(value: Any) -> str:

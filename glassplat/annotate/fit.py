@@ -217,11 +217,9 @@ def mark_residuals(marks: Marks, cameras: Sequence[NumpyCamera], shape: PaneShap
 
 def corner_information(camera: NumpyCamera, shape: PaneShape) -> Array:
     """[F, F] information that a fit would gain if all corners visible in a view were marked."""
-    held = camera.contains(shape.corners())
-    marks = Marks(
-        [{0: pixel} if seen else {} for pixel, seen in zip(camera.project(shape.corners()), held, strict=True)]
-    )
-    if not held.any():
+    pixels, inside = camera.project(shape.corners()), camera.contains(shape.corners())
+    marks = Marks([{0: pixel} if seen else {} for pixel, seen in zip(pixels, inside, strict=True)])
+    if not inside.any():
         return np.zeros((shape.num_parameters, shape.num_parameters))
     jacobian = _jacobian(marks, [camera], shape)
     return jacobian.T @ jacobian

@@ -429,9 +429,8 @@ def _is_self_intersecting(outline: Array) -> bool:
 def _corner_pixels(camera: NumpyCamera, corners: Array) -> list[list[float] | None]:
     """Pixels of corners; None for those behind the camera."""
     pixels = np.round(camera.project(corners), 2).tolist()
-    return [
-        pixel if depth > 0 else None for pixel, depth in zip(pixels, camera.to_camera_axes(corners)[:, 2], strict=True)
-    ]
+    depths = camera.to_camera_axes(corners)[:, 2]
+    return [pixel if depth > 0 else None for pixel, depth in zip(pixels, depths, strict=True)]
 
 
 def open_session(root: Path) -> Session:

@@ -211,9 +211,7 @@ class AlphaMask:
         """[H, W] 1 where a pixel is ignored."""
         with convert_to_input_error():
             pixels = images.read_image(self.path)
-        return (
-            (pixels[:, :, 3] < THRESHOLD).astype(np.uint8) if pixels.shape[2] == 4 else np.zeros_like(pixels[:, :, 0])
-        )
+        return (pixels[:, :, 3] < THRESHOLD).astype(np.uint8) if pixels.shape[2] == 4 else np.zeros_like(pixels[..., 0])
 
 
 IgnoredMask = AlphaMask | KeepMask | PaneMask
@@ -261,26 +259,24 @@ def find_masks(
         panes: pane masks specified by the format, white on the pane; `masks/` then holds pane masks only.
         keep_masks: masks of pixels to keep named by the format; they take precedence over those found by name.
     """
-    ignored = find_ignored(root, photographs)
+    ignored, keep_masks = find_ignored(root, photographs), keep_masks or {}
     if panes is not None:
         # The format assigns files to photographs, and thresholds greys at one half.
         known = _interpret_masks(root, panes, "bright" if polarity == "auto" else polarity, read_mask_at_threshold)
-        return CaptureMasks(known, _join_masks(keep_masks or {}, ignored))
+        return CaptureMasks(known, _join_masks(keep_masks, ignored))
     paths = _match_masks(root / PANE_FOLDER, photographs)
     if not paths and (root / PANE_FOLDER).is_dir():
         raise InputError(f"{root / PANE_FOLDER} holds no mask images; add masks, or remove the folder")
-    masks, warnings = _find_keep_masks(root, photographs, {normpath(path) for path in (keep_masks or {}).values()})
+    masks, warnings = _find_keep_masks(root, photographs, {normpath(path) for path in keep_masks.values()})
     earlier = _pane_masks_reason(root, masks, marked=bool(paths))
     if earlier is not None:
         found = _interpret_masks(root, masks, polarity, read_mask_values)
         renaming = f"{earlier} {next(iter(masks.values())).parent} is read as panes; rename it to {PANE_FOLDER}/."
         warnings = (renaming, *warnings)
-        return CaptureMasks(
-            replace(found, warnings=(*warnings, *found.warnings)), _join_masks(keep_masks or {}, ignored)
-        )
+        return CaptureMasks(replace(found, warnings=(*warnings, *found.warnings)), _join_masks(keep_masks, ignored))
     found = _interpret_masks(root, paths, polarity, read_mask_values) if paths else MaskSet({})
     return CaptureMasks(
-        replace(found, warnings=(*found.warnings, *warnings)), _join_masks({**masks, **(keep_masks or {})}, ignored)
+        replace(found, warnings=(*found.warnings, *warnings)), _join_masks({**masks, **keep_masks}, ignored)
     )
 
 
@@ -351,9 +347,8 @@ def find_ignored(root: Path, photographs: Mapping[str, Path]) -> Mapping[str, Pa
         root: the capture's folder.
         photographs: path of every photograph by name.
     """
-    found = {
-        name: PaneMask(path, inverted=False) for name, path in _match_masks(root / IGNORE_FOLDER, photographs).items()
-    }
+    paths = _match_masks(root / IGNORE_FOLDER, photographs)
+    found = {name: PaneMask(path, inverted=False) for name, path in paths.items()}
     for mask in found.values():
         mask.labels()
     return found

@@ -597,10 +597,8 @@ def read_normals_file(path: Path, camera: Camera) -> Tensor:
             f"{path} is {width}x{height} pixels, its photograph {camera.width}x{camera.height} here, without "
             "the distortion of its lens; expected the same proportions"
         )
-    channels_first = torch.from_numpy(vectors).permute(2, 0, 1)[None]
-    small = torch.nn.functional.interpolate(channels_first, (camera.height, camera.width), mode="area")[0].permute(
-        1, 2, 0
-    )
+    batch = torch.from_numpy(vectors).permute(2, 0, 1)[None]
+    small = torch.nn.functional.interpolate(batch, (camera.height, camera.width), mode="area")[0].permute(1, 2, 0)
     known = small.norm(dim=-1, keepdim=True) > LEAST_LENGTH
     unit = torch.nn.functional.normalize(small, dim=-1) * torch.tensor(CAMERA_FROM_NORMAL_MAP, dtype=torch.float32)
     return torch.where(known, unit, 0)
@@ -627,10 +625,8 @@ def normals_paths(photographs: Mapping[str, Path]) -> dict[str, Path]:
         places = [(base, whole), (base.parent, whole), (path.parent, alone)]
         if stems[path.stem] == 1:
             places += [(path.parent.parent, alone), (base, alone)]
-        folders = [
-            (folder / NORMALS_FOLDER / one.parent, one) for folder, one in places if is_folder(folder / NORMALS_FOLDER)
-        ]
-        names = [folder / stem for folder, one in folders for stem in (one.stem, one.name)]
+        found_in = [(folder / NORMALS_FOLDER, one) for folder, one in places if is_folder(folder / NORMALS_FOLDER)]
+        names = [folder / one.parent / stem for folder, one in found_in for stem in (one.stem, one.name)]
         files = (file.with_name(f"{file.name}{suffix}") for file in names for suffix in NORMALS_SUFFIXES)
         file = next(filter(Path.is_file, files), None)
         if file is not None:

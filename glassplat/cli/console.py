@@ -13,7 +13,6 @@ import gc
 import importlib
 import importlib.metadata
 import io
-import itertools
 import logging
 import os
 import platform
@@ -27,6 +26,7 @@ import traceback
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise, takewhile
 from shlex import quote
 from types import FrameType
 from typing import Any, ClassVar, Literal, NamedTuple, NoReturn
@@ -388,7 +388,7 @@ def _gpu_name() -> str:
 
 def check_arguments(arguments: Sequence[str]) -> None:
     """Refuses empty arguments: an empty path would mean the current folder."""
-    for before, argument in itertools.pairwise(arguments):
+    for before, argument in pairwise(arguments):
         option, is_joined, value = argument.partition("=")
         if argument == "" or (option.startswith("--") and is_joined and not value):
             name = option or before
@@ -431,9 +431,7 @@ def wrong_number_message(output: str, arguments: Sequence[str]) -> str | None:
     names = found[1].split("/")
     place = max((at for at, word in enumerate(arguments) if word.partition("=")[0] in names), default=-1)
     option, _, value = arguments[place].partition("=") if place >= 0 else (names[0], "", "")
-    given = (
-        [value] if value else list(itertools.takewhile(lambda word: not word.startswith("--"), arguments[place + 1 :]))
-    )
+    given = [value] if value else list(takewhile(lambda word: not word.startswith("--"), arguments[place + 1 :]))
     expected = " or ".join(describe_number_types(types.strip("{} ")) for types in found[2].split("|"))
     return f"{option}: expected {expected}, not {' '.join(given)!r}"
 

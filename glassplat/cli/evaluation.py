@@ -101,9 +101,8 @@ def evaluate_run(
         def listen(done: int, total: int) -> None:
             show(Working("aligning the cameras of test views", done, total))
 
-        stored = stored._replace(
-            dataset=scoring.with_aligned_test_views(stored.scene, photographed, stored.dataset, listen)
-        )
+        dataset = scoring.with_aligned_test_views(stored.scene, photographed, stored.dataset, listen)
+        stored = stored._replace(dataset=dataset)
     settings, path = stored.directory.settings(), stored.directory.path
     blend = stored.renderer.blend if isinstance(stored.renderer, Planar) else None
     report = Report(path, stored.dataset, blend)

@@ -170,9 +170,7 @@ def preparation_finding(path: Path) -> Iterator[Finding]:
         source = check_fields(given, {"input": Text()}, str(settings))["input"]
     output = str(path).removesuffix(".partial")
     defaults = Preparation(Path(source), Path(output)).record()
-    changed = {
-        name: given[name] for name in defaults if given.get(name, defaults[name]) != defaults[name] and name != "input"
-    }
+    changed = {key: given[key] for key in defaults if given.get(key, defaults[key]) != defaults[key] and key != "input"}
     options = "".join(f" --{name} {shell_word(str(value))}" for name, value in changed.items())
     finding = Finding("an interrupted preparation", {"of": source})
     finding.problems.append("it is not finished")

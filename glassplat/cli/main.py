@@ -23,7 +23,7 @@ FAILURE_CODE, USAGE_CODE, INTERRUPTED_CODE, BROKEN_PIPE_CODE = 1, 2, 130, 141
 DESCRIPTION = "Gaussian splatting for scenes with window panes, showcases and mirrors."
 
 
-class CommandEntry(NamedTuple):
+class Command(NamedTuple):
     """Entry of the list of commands: module in this package, class, and first sentence of its docstring."""
 
     module: str
@@ -32,38 +32,30 @@ class CommandEntry(NamedTuple):
 
 
 COMMANDS = {
-    "prepare": CommandEntry(
-        "capture", "Prepare", "Estimate the camera poses of photographs and write them as a capture."
-    ),
-    "annotate": CommandEntry(
+    "prepare": Command("capture", "Prepare", "Estimate the camera poses of photographs and write them as a capture."),
+    "annotate": Command(
         "capture",
         "Annotate",
         "Mark the panes of a capture in the browser: their corners in a few photographs, and what occludes them.",
     ),
-    "train": CommandEntry("train", "Train", "Train a scene from photographs."),
-    "eval": CommandEntry("scene", "Evaluate", "Evaluate a run on its test views and write comparison sheets."),
-    "render": CommandEntry(
-        "scene", "Render", "Render the layers of a run from its cameras, with original or edited panes."
-    ),
-    "dereflect": CommandEntry(
+    "train": Command("train", "Train", "Train a scene from photographs."),
+    "eval": Command("scene", "Evaluate", "Evaluate a run on its test views and write comparison sheets."),
+    "render": Command("scene", "Render", "Render the layers of a run from its cameras, with original or edited panes."),
+    "dereflect": Command(
         "scene",
         "Dereflect",
         "Remove the reflections from the photographs of a planar run; writes one PNG per photograph.",
     ),
-    "clean": CommandEntry("scene", "Clean", "Remove floaters from a scene and scale it to metres; writes a new scene."),
-    "view": CommandEntry(
-        "scene", "View", "View a scene in the browser, layer by layer, with original or edited panes."
-    ),
-    "video": CommandEntry(
+    "clean": Command("scene", "Clean", "Remove floaters from a scene and scale it to metres; writes a new scene."),
+    "view": Command("scene", "View", "View a scene in the browser, layer by layer, with original or edited panes."),
+    "video": Command(
         "scene", "Video", "Render a video along a camera path: one layer, several side by side, or a wipe between two."
     ),
-    "export": CommandEntry(
-        "scene",
-        "Export",
-        "Export a scene to PLY, SPZ, GLB or a web page with live panes, along with its panes.",
+    "export": Command(
+        "scene", "Export", "Export a scene to PLY, SPZ, GLB or a web page with live panes, along with its panes."
     ),
-    "info": CommandEntry("info", "Info", "Describe a folder or file, check it, and suggest the next step."),
-    "demo": CommandEntry(
+    "info": Command("info", "Info", "Describe a folder or file, check it, and suggest the next step."),
+    "demo": Command(
         "train",
         "Demo",
         "Train planar and splat on the bundled shop window and compare them; continues an interrupted demo.",

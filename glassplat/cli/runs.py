@@ -198,12 +198,9 @@ def _viewer_listener(command: Train[Any], training: Training, dataset: Dataset, 
     from glassplat.model.watching import WatchedTraining
     from glassplat.viewer.render_loop import LOCALHOST, vacant_port
 
+    port = vacant_port(LOCALHOST)
     watched = WatchedTraining(
-        training,
-        dataset,
-        host=LOCALHOST,
-        port=vacant_port(LOCALHOST),
-        announce=lambda viewer: print_address(viewer, console),
+        training, dataset, host=LOCALHOST, port=port, announce=lambda viewer: print_address(viewer, console)
     )
     try:
         yield watched.handle_message

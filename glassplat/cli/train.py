@@ -252,9 +252,8 @@ class Demo:
         from glassplat.cli.runs import open_run
 
         print_results(console, *(evaluate_run(open_run(folder, self.device)) for folder in self.folders))
-        print_line(
-            console, f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}"
-        )
+        planar = self.output / "planar"
+        print_line(console, f"pictures: {planar / 'index.html'} and {planar / 'sheets'}")
 
     def interrupt_message(self) -> str:
         """Message after an interrupt: the state on disk, and how to continue."""

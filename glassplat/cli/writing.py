@@ -77,9 +77,8 @@ def write_dereflected(command: Dereflect, console: Console) -> None:
     renderer = planar_renderer(stored)
     views = chosen_views(stored.dataset, command.split)
     paths = image_names(stored.dataset)
-    check_targets(
-        command.output, [command.output / paths[view.name] for view in views], photograph_paths(stored.dataset)
-    )
+    targets = [command.output / paths[view.name] for view in views]
+    check_targets(command.output, targets, photograph_paths(stored.dataset))
     if claim_folder(command.output, "dereflect", command.run_directory):
         print_line(console, f"replacing the images of an earlier run of this command in {command.output}")
     for warning in mirror_warnings(stored):
@@ -220,7 +219,7 @@ def write_files(command: Export, console: Console) -> None:
         with convert_to_input_error():
             check_panes(model.scene)
     splats = {kind: command.output / f"{models.EXPORT_STEM}.{kind}" for kind in SPLAT_WRITERS}
-    sidecars = [command.output / name for name in SIDECAR_FILES]
+    sidecars = [command.output / name for name in SIDECARS]
     check_targets(command.output, [*sidecars, *splats.values()], [])
     is_again = claim_folder(command.output, "export", command.scene)
     if is_again:
@@ -242,15 +241,7 @@ def write_files(command: Export, console: Console) -> None:
         _remove_earlier(command, [*sidecars, *splats.values()], written, console)
 
 
-SIDECAR_FILES = (
-    "index.html",
-    PREVIEW,
-    models.GLASS,
-    models.PLANES,
-    models.ENVIRONMENT,
-    models.PANORAMA,
-    models.CAMERAS,
-)
+SIDECARS = ("index.html", PREVIEW, models.GLASS, models.PLANES, models.ENVIRONMENT, models.PANORAMA, models.CAMERAS)
 """Files that `export` may write next to `scene.*`."""
 
 
@@ -263,7 +254,7 @@ def _remove_earlier(command: Export, targets: Sequence[Path], written: Sequence[
     earlier = [path for path in targets if path not in written and os.path.lexists(path) and not path.is_dir()]
     if real_path(scene_source(command.scene)).parent == real_path(command.output):
         edited = command.edits != SceneEdits() or command.layer != "all"
-        earlier = [path for path in earlier if edited and path.name in SIDECAR_FILES]
+        earlier = [path for path in earlier if edited and path.name in SIDECARS]
     for path in earlier:
         path.unlink()
     if earlier:

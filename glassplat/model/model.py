@@ -414,9 +414,8 @@ def save_model(model: Model, path: Path, *, overwrite: bool) -> Path:
         raise InputError(f"{path}: expected a name that ends in {endings}, or a folder's")
     names = (PLANES, GLASS, CAMERAS, *(() if model.scene.environment.is_empty else (ENVIRONMENT, PANORAMA)))
     companions = [path.with_name(name) for name in names] if kind in writing.SPLAT_WRITERS else []
-    found = (
-        [] if overwrite else [str(target) for target in (path, *_differing_files(model, companions)) if target.exists()]
-    )
+    targets = [] if overwrite else [path, *_differing_files(model, companions)]
+    found = [str(target) for target in targets if target.exists()]
     if found:
         raise FileExistsError(
             f"{join_names(found)} already exists; nothing was written. Choose another folder, or overwrite=True"

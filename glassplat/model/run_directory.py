@@ -388,9 +388,8 @@ def check_output(directory: RunDirectory, *, resume: bool) -> None:
     if not is_leader():
         return  # Rank 0 may have started writing.
     check_folder(directory.path)
-    check_links(
-        directory.path, (*RUN_FILES, directory.checkpoint.name, directory.results.name, "point_cloud", "sparse")
-    )
+    links = (*RUN_FILES, directory.checkpoint.name, directory.results.name, "point_cloud", "sparse")
+    check_links(directory.path, links)
     check_unlocked(directory.path)
     if resume:
         directory.check_saved()

@@ -219,9 +219,7 @@ class Run:
         return with_gradients(self._messages())
 
     def _messages(self) -> Generator[Message, None, None]:
-        self._ranks.check_same_settings(
-            shared_settings(self.recipe, self._settings, self._dataset) | {"resume": self._resume}
-        )
+        self._ranks.check_equal(shared_settings(self.recipe, self._settings, self._dataset) | {"resume": self._resume})
         yield from self._run_as_leader() if self._ranks.is_leader else self._run_as_follower()
         self._ranks.exchange()  # Other ranks wait until the leader has written the scene.
 
@@ -649,7 +647,7 @@ class Training:
         self._run.save()
 
     def _in_memory(self) -> Generator[Message, None, None]:
-        self._ranks.check_same_settings(shared_settings(self.recipe, self._settings, self._dataset))
+        self._ranks.check_equal(shared_settings(self.recipe, self._settings, self._dataset))
         if self._state is None:
             yield Working("preparing the first scene", 0, 1)
             first = initial_state(self.recipe, self._settings, self._dataset) if self._ranks.is_leader else None

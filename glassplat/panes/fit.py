@@ -224,9 +224,8 @@ class _PanePlane:
     @property
     def is_undetermined(self) -> bool:
         """Return whether its own masks do not determine its plane reliably."""
-        return isinstance(self.fault, _UndeterminedError) or (
-            self.has_two_views and self.fault is None and not self.is_settled
-        )
+        is_ambiguous = self.fault is None and self.has_two_views and not self.is_settled
+        return is_ambiguous or isinstance(self.fault, _UndeterminedError)
 
 
 def _fit_pane(
@@ -324,9 +323,8 @@ def _place_by_mirror_images(pane: _PanePlane, cloud: Array, cameras: Sequence[Ca
     some = [replace(camera, cam_from_world=camera.cam_from_world.float()) for camera in some]
     panes = _to_planes([outlined], [pane.label], options)
     seen = virtual_points(torch.from_numpy(cloud).float(), panes, some).numpy()
-    images = search.plane_of_mirror_images(
-        pane.plane.planes, outlined.center, cloud[seen], cloud[~seen], pane.evidence.extent
-    )
+    behind, others, extent = cloud[seen], cloud[~seen], pane.evidence.extent
+    images = search.plane_of_mirror_images(pane.plane.planes, outlined.center, behind, others, extent)
     if images is None or not images.is_clear:
         return pane
     plane = masks.FramedPlanes(images.plane, pane.plane.frames)

@@ -548,9 +548,8 @@ def _detect_lamps(scene: Scene, photographs: Sequence[Photograph]) -> Tensor:
         darkest = photograph.pixels.amin(dim=-1)
         shown = gather_pixels(scene, photograph.camera, torch.stack([past & (darkest > CLIPPED), past], dim=-1).float())
         enough = linear_from_srgb(darkest.clamp(0, 1)) > LEAST_GAIN * strength
-        there = gather_mirrored_pixels(
-            scene, photograph.camera, torch.stack([through & enough, through], dim=-1).float()
-        )
+        lit = torch.stack([through & enough, through], dim=-1).float()
+        there = gather_mirrored_pixels(scene, photograph.camera, lit)
         clipped, direct = clipped + shown[:, 0], direct + shown[:, 1]
         bright, mirrored = bright + there[:, 0], mirrored + there[:, 1]
     enough_seen = (direct > FEWEST_SEEN) & (mirrored > FEWEST_SEEN)

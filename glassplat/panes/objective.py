@@ -83,9 +83,8 @@ def edge_matches(planes: PlaneEquations, views: Sequence[PaneView], *, edges_per
         np.concatenate([view.line_plane_normals(*found) for view, *found in zip(views, points, across, strict=True)]),
     )
     found = follow_edges(planes.normals, planes.offsets, cameras_of(views), edges, [view.distance for view in views])
-    return EdgeMatches(
-        found.distances, found.shifts, found.compared, _side_misalignments(planes, found.outward), edges.sources
-    )
+    misalignments = _side_misalignments(planes, found.outward)
+    return EdgeMatches(found.distances, found.shifts, found.compared, misalignments, edges.sources)
 
 
 def _side_misalignments(planes: PlaneEquations, outward: Array) -> Array:
@@ -154,7 +153,7 @@ def pane_centers(planes: PlaneEquations, views: Sequence[PaneView]) -> Array:
     return centers / np.maximum(weight_sums, np.finfo(np.float64).tiny)[:, None]
 
 
-def sample_planes_nearby(
+def sample_nearby(
     planes: PlaneEquations, anchors: Array, count: int, *, tilt: float, shift: Array | float, rng: np.random.Generator
 ) -> PlaneEquations:
     """[H * (1 + count)] each plane followed by `count` random ones around it.
@@ -184,7 +183,7 @@ def move_planes(planes: PlaneEquations, anchors: Array, steps: Array) -> PlaneEq
     return PlaneEquations(tilted, np.einsum("hd,hd->h", tilted, feet) + steps[:, 2])
 
 
-COARSE_TOLERANCE, MIDDLE_TOLERANCE, FINE_TOLERANCE = 0.01, 0.004, 0.002
+COARSE_TOLERANCE, MIDDLE_TOLERANCE, FINE_TOLERANCE = TOLERANCES = (0.01, 0.004, 0.002)
 """Distances between mask edges, in image diagonals, at which their loss is one half."""
 POINTS_WEIGHT = 0.1
 """Weight of the points on a plane relative to the mask edges; they decide where the edges are ambiguous."""

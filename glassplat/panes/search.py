@@ -17,15 +17,15 @@ from glassplat.panes.masks import FramedPlanes, PlaneEquations, join_planes, ran
 from glassplat.panes.objective import (
     COARSE_TOLERANCE,
     EDGE_POINTS,
-    FINE_TOLERANCE,
     MIDDLE_TOLERANCE,
+    TOLERANCES,
     USUAL_FRAME,
     JointObjective,
     Objective,
     Terms,
     move_planes,
     planes_through_masks,
-    sample_planes_nearby,
+    sample_nearby,
 )
 
 Array = NDArray[np.float64]
@@ -152,7 +152,7 @@ AGREEMENT_WEIGHT = 0.1
 POOL_SIZE, LEAST_OF_BEST = 200, 0.5
 """Number of hypotheses with the best mask agreement whose edges are compared, and the share of the best agreement below
 which edges are not considered."""
-KEPT_BY_AREAS, KEPT_BY_EDGES, SAMPLES_PER_PLANE = 12, 6, 30
+KEPT_BY_AREAS, KEPT_BY_EDGES, SAMPLES_EACH = 12, 6, 30
 """Number of hypotheses that are kept for the agreement of masks, and for that of edges, and of the planes tried around
 each of them in each round."""
 SEARCH_ROUNDS = ((0.3, 0.1, 2 * COARSE_TOLERANCE), (0.1, 0.03, COARSE_TOLERANCE))
@@ -189,16 +189,12 @@ def best_plane(objective: Objective, *, hypotheses: int, refine: int, rng: np.ra
     for tilt, shift, tolerance in SEARCH_ROUNDS:
         beam = _follow_beam(beam, objective, (tilt, shift), tolerance, rng)
     # If a pane is occluded in every mask, planes far behind impossibly high frames may fit better than its own.
-    beam = _with_possible_frames(
-        _best_planes(refine_planes(beam, objective, (COARSE_TOLERANCE, MIDDLE_TOLERANCE)), objective), objective
-    )
+    beam = _possible_frames(_best_planes(refine_planes(beam, objective, TOLERANCES[:2]), objective), objective)
     tilt, shift, tolerance = PERTURBATION
     perturbed = _follow_beam(beam, objective, (tilt, shift), tolerance, rng)
-    best_first = np.argsort(contradiction(beam, objective, (COARSE_TOLERANCE, MIDDLE_TOLERANCE)), kind="stable")
+    best_first = np.argsort(contradiction(beam, objective, TOLERANCES[:2]), kind="stable")
     leading = join_planes([beam.select(best_first[:refine]), perturbed.select(np.arange(min(refine, len(perturbed))))])
-    finished = _with_possible_frames(
-        _best_planes(refine_planes(leading, objective, (MIDDLE_TOLERANCE, FINE_TOLERANCE)), objective), objective
-    )
+    finished = _possible_frames(_best_planes(refine_planes(leading, objective, TOLERANCES[1:]), objective), objective)
     return finished.select(np.array([np.argmin(contradiction(finished, objective))]))
 
 
@@ -216,9 +212,7 @@ def best_joint_plane(objective: JointObjective, starts: FramedPlanes, rng: np.ra
         beam = starts.select(np.argsort(costs, kind="stable")[:MOST_STARTS])
     for tilt, shift, tolerance in (*SEARCH_ROUNDS[1:], PERTURBATION):
         beam = join_planes([beam, _follow_beam(beam, objective, (tilt, shift), tolerance, rng)])
-    finished = _with_possible_frames(
-        refine_planes(beam, objective, (COARSE_TOLERANCE, MIDDLE_TOLERANCE, FINE_TOLERANCE)), objective
-    )
+    finished = _possible_frames(refine_planes(beam, objective, TOLERANCES), objective)
     return finished.select(np.array([np.argmin(contradiction(finished, objective))]))
 
 
@@ -239,11 +233,7 @@ def may_share_surface(one: FramedPlanes, other: FramedPlanes, objectives: tuple[
 
 
 def contradiction(
-    planes: FramedPlanes,
-    objective: Evidence,
-    tolerances: tuple[float, ...] = (COARSE_TOLERANCE, MIDDLE_TOLERANCE, FINE_TOLERANCE),
-    *,
-    edges: int = EDGE_POINTS,
+    planes: FramedPlanes, objective: Evidence, tolerances: tuple[float, ...] = TOLERANCES, *, edges: int = EDGE_POINTS
 ) -> Array:
     """[H] evidence against planes: cost, averaged over tolerances, less mask agreement; no unit, near 0 on the pane."""
     costs = [objective.terms(planes, tolerance, edges=edges).cost for tolerance in tolerances]
@@ -264,9 +254,8 @@ def first_hypotheses(objective: Objective, count: int, rng: np.random.Generator)
     usual = USUAL_FRAME * objective.extent
     planes = join_planes([FramedPlanes(part, np.full(len(part), usual)) for part in drawn])
     scores = objective.agreement(planes.planes) + AGREEMENT_WEIGHT * objective.inlier_share(planes.planes)
-    best_first = _best_planes(
-        planes.select(np.argsort(-scores, kind="stable")[:POOL_SIZE]), objective, least=KEPT_BY_AREAS
-    )
+    pool = planes.select(np.argsort(-scores, kind="stable")[:POOL_SIZE])
+    best_first = _best_planes(pool, objective, least=KEPT_BY_AREAS)
     costs = contradiction(best_first, objective, (SEARCH_ROUNDS[0][2],), edges=COARSE_EDGES)
     by_edges = np.argsort(costs, kind="stable")
     by_areas = np.arange(len(best_first))[:KEPT_BY_AREAS]
@@ -279,18 +268,16 @@ def _follow_beam(
     """The best of the planes sampled around each plane of the beam, best first."""
     tilt, shift = spread
     shifts = shift * objective.camera_distance(beam.planes)
-    around = sample_planes_nearby(
-        beam.planes, objective.anchors(beam.planes), SAMPLES_PER_PLANE, tilt=tilt, shift=shifts, rng=rng
-    )
-    factors = np.exp(FRAME_SPREAD * rng.standard_normal((len(beam), 1 + SAMPLES_PER_PLANE)))
+    around = sample_nearby(beam.planes, objective.anchors(beam.planes), SAMPLES_EACH, tilt=tilt, shift=shifts, rng=rng)
+    factors = np.exp(FRAME_SPREAD * rng.standard_normal((len(beam), 1 + SAMPLES_EACH)))
     factors[:, 0] = 1
     family = FramedPlanes(around, (beam.frames[:, None] * factors).ravel())
     costs = objective.terms(family, tolerance, edges=COARSE_EDGES).cost.reshape(factors.shape)
-    best = np.arange(len(beam)) * (1 + SAMPLES_PER_PLANE) + costs.argmin(axis=1)
+    best = np.arange(len(beam)) * (1 + SAMPLES_EACH) + costs.argmin(axis=1)
     return family.select(best[np.argsort(costs.min(axis=1), kind="stable")])
 
 
-def _with_possible_frames(planes: FramedPlanes, objective: Evidence) -> FramedPlanes:
+def _possible_frames(planes: FramedPlanes, objective: Evidence) -> FramedPlanes:
     """The planes whose frames have a possible height; all planes if there are none."""
     kept = np.flatnonzero(_has_possible_frames(planes, objective))
     return planes.select(kept) if len(kept) else planes

@@ -111,10 +111,8 @@ def best_solution(
             enough = least if attempt.features == MANY_FEATURES else max(ENOUGH_REGISTERED, least)
             if best.registered >= enough * len(photographs):
                 break
-            note = (
-                f"{best.registered} of {len(photographs)} photographs are registered; trying again with {attempt.name}"
-            )
-            listen(Note(note))
+            share = f"{best.registered} of {len(photographs)} photographs"
+            listen(Note(f"{share} are registered; trying again with {attempt.name}"))
         database = _match_features(photographs, work, attempt.features, settings, listen)
         models = register_photographs(
             database.path, settings.mapper, attempt.mapping, count=len(photographs), listen=listen

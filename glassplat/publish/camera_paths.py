@@ -41,9 +41,8 @@ def orbit(cameras: Sequence[Camera], extent: float, frames: int) -> list[Camera]
     radius, height = float(flat.norm(dim=1).median()), float(heights.median())
     least = LEAST_LOOP * survey.distance
     if float(facing.norm()) < ALL_AROUND or radius < least:
-        first = (
-            flat[0] if float(flat[0].norm()) > least else torch.linalg.cross(survey.up, least_aligned_axis(survey.up))
-        )
+        is_long = float(flat[0].norm()) > least
+        first = flat[0] if is_long else torch.linalg.cross(survey.up, least_aligned_axis(survey.up))
         aside = torch.nn.functional.normalize(first, dim=0)
         ahead, radius = torch.linalg.cross(survey.up, aside), max(radius, least)
         offsets = [radius * (math.cos(a) * aside + math.sin(a) * ahead) + height * survey.up for a in angles]
@@ -52,10 +51,8 @@ def orbit(cameras: Sequence[Camera], extent: float, frames: int) -> list[Camera]
         right = torch.nn.functional.normalize(torch.linalg.cross(survey.up, arm), dim=0)
         wide, tall = (_loop_radius(arms @ axis, survey.distance) for axis in (right, survey.up))
         offsets = [arm + wide * math.sin(a) * right + tall * math.cos(a) * survey.up for a in angles]
-    return [
-        replace(cameras[0], cam_from_world=look_at(survey.focus + offset, survey.focus, survey.up))
-        for offset in offsets
-    ]
+    poses = [look_at(survey.focus + offset, survey.focus, survey.up) for offset in offsets]
+    return [replace(cameras[0], cam_from_world=pose) for pose in poses]
 
 
 def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:

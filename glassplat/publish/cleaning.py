@@ -50,9 +50,8 @@ class Floaters:
             means = self._gaussians.means.detach().double().cpu()
             found["outside"] = ((means < corners.amin(dim=0)) | (means > corners.amax(dim=0))).any(dim=1)
         if cleaning.isolated:
-            found["isolated"] = self._neighbour_distances > cleaning.isolated * self._largest_scales.clamp(
-                min=float(self._largest_scales.median())
-            )
+            scales = self._largest_scales.clamp(min=float(self._largest_scales.median()))
+            found["isolated"] = self._neighbour_distances > cleaning.isolated * scales
         if cleaning.oversized:
             found["oversized"] = self._largest_scales > cleaning.oversized * self._camera_distances
         return found

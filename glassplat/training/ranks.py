@@ -171,7 +171,7 @@ class Ranks:
         if self.count > 1 and len(set(self.exchange(state_checksum(state)))) > 1:
             vars(state).update(vars(self.broadcast(state, str(state.scene.primary.means.device))))
 
-    def check_same_settings(self, settings: Mapping[str, object]) -> None:
+    def check_equal(self, settings: Mapping[str, object]) -> None:
         """Refuses ranks that were started with different settings.
 
         Args:

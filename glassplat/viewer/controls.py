@@ -141,9 +141,8 @@ class PaneControls:
     def apply(self, request: ViewRequest) -> ViewRequest:
         """The request, with the edits of panes from the controls."""
         sliders = {label: clamp(slider.value, 0.0, 1.0) for label, slider in self._reflectances.items()}
-        changed = [
-            (label, value) for label, value in sliders.items() if value != round(self._initial_reflectances[label], 3)
-        ]
+        initial = self._initial_reflectances
+        changed = [(label, value) for label, value in sliders.items() if value != round(initial[label], 3)]
         moves = [move for gizmo in self._gizmos if (move := gizmo.pane_move()) is not None]
         return replace(
             request,
@@ -371,15 +370,13 @@ class KeyframeControls:
         return f"{count} {'keyframe' if count == 1 else 'keyframes'}" + (", a video needs two" if count < 2 else "")
 
 
-def _play(
-    path: list[Camera], move_camera: Callable[[Camera], None], ended: threading.Event, move_lock: threading.Lock
-) -> None:
-    """Moves along a path until its end or until playback stops; `move_lock` is held during each move."""
+def _play(path: list[Camera], move: Callable[[Camera], None], ended: threading.Event, lock: threading.Lock) -> None:
+    """Moves along a path until its end or until playback stops; `lock` is held during each move."""
     for camera in path:
-        with move_lock:
+        with lock:
             if ended.is_set():
                 return
-            move_camera(camera)
+            move(camera)
         if ended.wait(1 / PLAYED_PER_SECOND):
             return
     ended.set()

@@ -253,9 +253,7 @@ class RenderBudget:
         """Renders as much as there is time for; to be called between two pieces of work."""
         worked = self._clock() - self._since
         self._saved_seconds = min(self._saved_seconds + MOST_SHARE * worked, MOST_SAVED)
-        while (expected := self._loop.expected_seconds()) is not None and self._saved_seconds >= min(
-            expected, MOST_SAVED
-        ):
+        while (needed := self._loop.expected_seconds()) is not None and self._saved_seconds >= min(needed, MOST_SAVED):
             begun = self._clock()
             self._loop.serve()
             self._saved_seconds -= self._clock() - begun

@@ -34,7 +34,7 @@ LARGEST_HEIGHT, MOST_PIXELS = 1080, 4_000_000
 SHARP_QUALITY, COARSE_QUALITY = 90, 60
 LEAST_AHEAD = 0.1
 """Minimum distance from the camera to the point it orbits, as a share of the extent."""
-CLIPPED = (0.01, 1000.0)
+CLIPPING_PLANES = (0.01, 1000.0)
 """Distances between which the browser draws handles and keyframes, in extents; viser's own are in world units."""
 WAITING_NOTIFICATION = ("Rendering", "The first image may take a minute or two: kernels are compiled once per machine.")
 """Title and text of the notification shown until the first image."""
@@ -130,7 +130,7 @@ class Client:
             self._handle.camera.up_direction = tuple(-rotation[1])
             self._handle.camera.position = tuple(position)
             self._handle.camera.look_at = tuple(position + ahead * rotation[2])
-            self._handle.camera.near, self._handle.camera.far = (share * extent for share in CLIPPED)
+            self._handle.camera.near, self._handle.camera.far = (share * extent for share in CLIPPING_PLANES)
             self._handle.camera.fov = 2 * float(np.arctan(camera.height / 2 / camera.fy))
 
     def lay_out(self) -> None:

@@ -19,9 +19,9 @@ from glassplat.options import (
     Positive,
     Range,
     Share,
+    as_option,
     check_options,
     expectation,
-    option_of_field,
     options_from_json,
     unwrap_annotation,
 )
@@ -155,7 +155,7 @@ def test_a_number_of_too_many_digits_to_print_is_refused() -> None:
 
 
 def test_options_are_named_by_the_fields_they_lie_in() -> None:
-    assert option_of_field("plane_fit.mirror_labels") == "--plane-fit.mirror-labels"
+    assert as_option("plane_fit.mirror_labels") == "--plane-fit.mirror-labels"
     names = {name for name, _ in number_fields(Outer)}
     assert names == {"inner.rate", "inner.most", "color", "moments", "by_label", "end_value"}
 

@@ -17,7 +17,7 @@ from glassplat.errors import InputError
 from glassplat.methods.recipe import RECIPES, recipe_from_json, recipe_of, recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import RunDirectory, RunSettings
-from glassplat.options import Range, check_options, option_of_field, unwrap_annotation
+from glassplat.options import Range, as_option, check_options, unwrap_annotation
 from tests.methods.number_fields import number_fields
 
 COMMANDS = [Train, Demo, Render, RunSettings]
@@ -86,7 +86,7 @@ def test_every_number_out_of_its_range_is_refused(method: str) -> None:
                     continue
                 with pytest.raises(InputError) as raised:
                     check_options(broken)
-                assert option_of_field(name) in str(raised.value)
+                assert as_option(name) in str(raised.value)
                 with pytest.raises(InputError, match=r"expected|finite"):
                     recipe_from_json(recipe_to_json(broken))
                 refused += 1
