@@ -289,7 +289,7 @@ def _write_page(command: Export, model: models.Model, console: Console) -> list[
 
 def _write_sidecars(command: Export, scene: Scene, console: Console) -> list[Path]:
     """Writes planes, glass and environment, if present; returns the written files."""
-    written = models.write_companion_files(command.output, scene)
+    written = models.write_sidecars(command.output, scene)
     if len(scene.planes):
         panes = count_noun(len(scene.planes), "pane")
         print_line(console, f"{panes} -> {command.output / models.PLANES}, their shape -> {models.GLASS}")

@@ -413,8 +413,8 @@ def save_model(model: Model, path: Path, *, overwrite: bool) -> Path:
         endings = ", ".join(f".{known}" for known in writing.OUTPUT_FORMATS)
         raise InputError(f"{path}: expected a name that ends in {endings}, or a folder's")
     names = (PLANES, GLASS, CAMERAS, *(() if model.scene.environment.is_empty else (ENVIRONMENT, PANORAMA)))
-    companions = [path.with_name(name) for name in names] if kind in writing.SPLAT_WRITERS else []
-    targets = [] if overwrite else [path, *_differing_files(model, companions)]
+    sidecars = [path.with_name(name) for name in names] if kind in writing.SPLAT_WRITERS else []
+    targets = [] if overwrite else [path, *_differing_files(model, sidecars)]
     found = [str(target) for target in targets if target.exists()]
     if found:
         raise FileExistsError(
@@ -428,20 +428,20 @@ def save_model(model: Model, path: Path, *, overwrite: bool) -> Path:
         writing.write_splats(kind, path, model.scene.primary)
     if lost := unsaved_parts(model, kind):
         log.warning("%s leaves out %s; a folder, saved without a suffix, holds everything", path, ", ".join(lost))
-    write_companion_files(path.parent, model.scene)
+    write_sidecars(path.parent, model.scene)
     if not len(model.scene.planes) and (path.parent / PLANES).exists():
         write_planes(path.parent / PLANES, model.scene.planes)  # Panes of a previous file must not be used.
     write_cameras(path.parent / CAMERAS, model.cameras.items())
     return path
 
 
-def _differing_files(model: Model, companions: Sequence[Path]) -> list[Path]:
+def _differing_files(model: Model, sidecars: Sequence[Path]) -> list[Path]:
     """Existing files next to a splat file that differ from what the model would write."""
-    there = [target for target in companions if target.exists()]
+    there = [target for target in sidecars if target.exists()]
     if not there:
         return []
     with tempfile.TemporaryDirectory() as folder:
-        own = [*write_companion_files(Path(folder), model.scene), Path(folder) / CAMERAS]
+        own = [*write_sidecars(Path(folder), model.scene), Path(folder) / CAMERAS]
         write_cameras(own[-1], model.cameras.items())
         contents = {file.name: file.read_bytes() for file in own}
     if not len(model.scene.planes):  # Panes of an earlier model are removed; its glass stays, but is never read.
@@ -476,7 +476,7 @@ def save_page(model: Model, path: Path, title: str, *, sharing: web_page.Sharing
         web_page.write_page(path, model.scene, model.renderer, tuple(model.viewpoints.items()), title, sharing=sharing)
 
 
-def write_companion_files(folder: Path, scene: Scene) -> list[Path]:
+def write_sidecars(folder: Path, scene: Scene) -> list[Path]:
     """Writes planes, glass and environment, if present; returns the written files."""
     written = []
     if len(scene.planes):
@@ -569,32 +569,32 @@ def scene_extent(gaussians: Gaussians, cameras: NamedCameras) -> float:
 
 
 def _read_panes(file: Path, planes_file: Path | None) -> Planes:
-    companion = file.with_name("planes.json")
-    if planes_file is None and not companion.is_file():
+    sidecar = file.with_name("planes.json")
+    if planes_file is None and not sidecar.is_file():
         if file.with_name(GLASS).is_file():
             log.warning("%s no longer has panes: next to it is %s, but no %s", file, GLASS, PLANES)
         return Planes.empty()
     if planes_file is None and file.stem != EXPORT_STEM:
-        log.info("%s gets the panes of %s; move it to another folder if they are not its panes", file, companion)
-    return read_planes(planes_file or companion)
+        log.info("%s gets the panes of %s; move it to another folder if they are not its panes", file, sidecar)
+    return read_planes(planes_file or sidecar)
 
 
 def _read_glass(file: Path, planes: Planes, *, own: bool) -> Gaussians:
     """The glass stored next to the file, or an even sheet of Gaussians on each pane."""
-    companion = file.with_name("glass.ply")
-    if not len(planes) or not own or not companion.is_file():
+    sidecar = file.with_name("glass.ply")
+    if not len(planes) or not own or not sidecar.is_file():
         return covering_glass(planes)
-    glass, _ = select_drawable(read_gaussians(companion), companion)
+    glass, _ = select_drawable(read_gaussians(sidecar), sidecar)
     if "logit_mark" not in glass.channels:
-        raise InputError(f"{companion} has no property logit_mark; expected glass as `glassplat export` writes it")
+        raise InputError(f"{sidecar} has no property logit_mark; expected glass as `glassplat export` writes it")
     return glass
 
 
 def _read_or_place_cameras(file: Path, gaussians: Gaussians, up: Up) -> NamedCameras:
     if up not in AXES:
         raise InputError(f"up is {up!r}; expected one of {', '.join(AXES)}")
-    companion = file.with_name("cameras.json")
-    cameras = read_cameras(companion) if companion.is_file() else []
+    sidecar = file.with_name("cameras.json")
+    cameras = read_cameras(sidecar) if sidecar.is_file() else []
     return tuple(cameras or web_page.cameras_around(gaussians, torch.tensor(AXES[up], dtype=torch.float64)))
 
 

@@ -239,7 +239,7 @@ def _photograph_paths(folder: Path) -> list[Path]:
     if not paths:
         found = join_names(sorted(path.name for path in files)) or "nothing"
         raise InputError(f"no photograph in {folder}; expected {', '.join(suffixes)} files, found {found}")
-    return sorted(paths, key=lambda path: _natural_order_key(path.relative_to(folder).as_posix()))
+    return sorted(paths, key=lambda path: _natural_sort_key(path.relative_to(folder).as_posix()))
 
 
 def _unreadable_kind(path: Path) -> str | None:
@@ -257,7 +257,7 @@ def _unreadable_kind(path: Path) -> str | None:
     return "HEIC" if start[4:8] == b"ftyp" and start[8:] in HEIF_BRANDS else None
 
 
-def _natural_order_key(name: str) -> tuple[tuple[int, int, str], ...]:
+def _natural_sort_key(name: str) -> tuple[tuple[int, int, str], ...]:
     """Sorting key for natural order: numbers in a name by their value."""
     parts = re.findall(r"\d+|\D+", name)
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts)

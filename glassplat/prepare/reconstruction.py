@@ -15,15 +15,7 @@ from glassplat.captures.cameras import Lens, PixelMap, blank_share, make_lens, u
 from glassplat.captures.masks import IGNORE_FOLDER
 from glassplat.errors import InputError, join_names
 from glassplat.files.images import write_image
-from glassplat.prepare.colmap import (
-    FeatureDatabase,
-    FeatureOptions,
-    LensName,
-    Mapper,
-    MappingOptions,
-    pairs_to_match,
-    register_photographs,
-)
+from glassplat.prepare import colmap
 from glassplat.prepare.photographs import Listener, Note, Photograph, read_photograph
 from glassplat.training.messages import Working
 
@@ -38,17 +30,17 @@ class Attempt:
     """Settings of one attempt; `name` follows "trying again with"."""
 
     name: str
-    features: FeatureOptions
-    mapping: MappingOptions
+    features: colmap.FeatureOptions
+    mapping: colmap.MappingOptions
 
 
-DEFAULT_FEATURES = FeatureOptions(most=4096, least_contrast=1 / 150)
-MANY_FEATURES = FeatureOptions(most=12_000, least_contrast=1 / 600, guided=True)
+DEFAULT_FEATURES = colmap.FeatureOptions(most=4096, least_contrast=1 / 150)
+MANY_FEATURES = colmap.FeatureOptions(most=12_000, least_contrast=1 / 600, guided=True)
 ATTEMPTS = (
-    Attempt("the usual settings", DEFAULT_FEATURES, MappingOptions()),
-    Attempt("lower thresholds for matches between photographs", DEFAULT_FEATURES, MappingOptions(8, 20)),
-    Attempt("three times as many features, including weak ones", MANY_FEATURES, MappingOptions()),
-    Attempt("many features and lower thresholds", MANY_FEATURES, MappingOptions(8, 20)),
+    Attempt("the usual settings", DEFAULT_FEATURES, colmap.MappingOptions()),
+    Attempt("lower thresholds for matches between photographs", DEFAULT_FEATURES, colmap.MappingOptions(8, 20)),
+    Attempt("three times as many features, including weak ones", MANY_FEATURES, colmap.MappingOptions()),
+    Attempt("many features and lower thresholds", MANY_FEATURES, colmap.MappingOptions(8, 20)),
 )
 
 
@@ -63,7 +55,7 @@ class Solution:
         tried: number of attempts made.
     """
 
-    database: FeatureDatabase
+    database: colmap.FeatureDatabase
     models: Sequence[Any]
     attempt: str
     attempts_made: int
@@ -88,8 +80,8 @@ class Settings:
         mapper: incremental or global structure from motion.
     """
 
-    lens: LensName = "simple_radial"
-    mapper: Mapper = "incremental"
+    lens: colmap.LensName = "simple_radial"
+    mapper: colmap.Mapper = "incremental"
 
 
 def image_numbers(model: Any) -> dict[int, Any]:
@@ -114,7 +106,7 @@ def best_solution(
             share = f"{best.registered} of {len(photographs)} photographs"
             listen(Note(f"{share} are registered; trying again with {attempt.name}"))
         database = _match_features(photographs, work, attempt.features, settings, listen)
-        models = register_photographs(
+        models = colmap.register_photographs(
             database.path, settings.mapper, attempt.mapping, count=len(photographs), listen=listen
         )
         tried += 1
@@ -126,15 +118,15 @@ def best_solution(
 
 
 def _match_features(
-    photographs: Sequence[Photograph], work: Path, features: FeatureOptions, settings: Settings, listen: Listener
-) -> FeatureDatabase:
+    photographs: Sequence[Photograph], work: Path, features: colmap.FeatureOptions, settings: Settings, listen: Listener
+) -> colmap.FeatureDatabase:
     """The database of these features, with the pairs selected by `pairs_to_match` matched."""
-    database = FeatureDatabase(work / f"features-{features.most}.db", work / "grey", photographs)
+    database = colmap.FeatureDatabase(work / f"features-{features.most}.db", work / "grey", photographs)
     database.write_images(listen)
     database.create(settings.lens)
     database.extract(features, listen)
     _check_texture(database)
-    database.match(pairs_to_match(database.descriptors()), features, listen)
+    database.match(colmap.pairs_to_match(database.descriptors()), features, listen)
     return database
 
 
@@ -142,7 +134,7 @@ class CannotRegisterError(InputError):
     """Raised when no option can register these photographs, so that partial results are useless."""
 
 
-def _check_texture(database: FeatureDatabase) -> None:
+def _check_texture(database: colmap.FeatureDatabase) -> None:
     counts = database.feature_counts()
     poor = [one.path.name for one, count in zip(database.photographs, counts, strict=True) if count < FEWEST_FEATURES]
     if 2 * len(poor) > len(counts):
