@@ -209,9 +209,8 @@ def _expected_structure(hint: Any) -> str:
         if inner[-1] is ...:
             return f"any number of values, each {expectation(*unwrap_annotation(inner[0]))}"
         kinds = dict.fromkeys(expectation(*unwrap_annotation(part)) for part in inner)
-        return f"{len(inner)} values, " + (
-            f"each {next(iter(kinds))}" if len(kinds) == 1 else f"out of: {'; '.join(kinds)}"
-        )
+        each = f"each {next(iter(kinds))}" if len(kinds) == 1 else f"out of: {'; '.join(kinds)}"
+        return f"{len(inner)} values, {each}"
     return "an object with named values"
 
 
@@ -262,9 +261,8 @@ def _to_dataclass(kind: type, value: Any, name: str) -> Any:
     missing = [field.name for field in fields(kind) if _is_required(field) and field.name not in value]
     if missing:
         raise InputError(f"fields {missing} of {name or 'the options'} are missing")
-    values = {
-        key: check_value(hints[key], value[key], nested_name(name, key, hints[key])) for key in known if key in value
-    }
+    given = [key for key in known if key in value]
+    values = {key: check_value(hints[key], value[key], nested_name(name, key, hints[key])) for key in given}
     instance = kind(**values)
     contradiction = instance.contradiction() if hasattr(instance, "contradiction") else None
     if contradiction:

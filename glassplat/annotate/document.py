@@ -126,11 +126,9 @@ def parse_document(value: Any, where: str) -> tuple[MarkedPane, ...]:
     return panes
 
 
-def _parse_pane(entry: Mapping[str, Any]) -> MarkedPane:
-    strokes = {name: tuple(Stroke(**stroke) for stroke in several) for name, several in entry["strokes"].items()}
-    return MarkedPane(
-        entry["label"], entry["material"], entry["shape"], entry["corners"], entry["edges"], strokes=strokes
-    )
+def _parse_pane(pane: Mapping[str, Any]) -> MarkedPane:
+    strokes = {name: tuple(Stroke(**stroke) for stroke in several) for name, several in pane["strokes"].items()}
+    return MarkedPane(pane["label"], pane["material"], pane["shape"], pane["corners"], pane["edges"], strokes=strokes)
 
 
 def read_document(folder: Path) -> Any:

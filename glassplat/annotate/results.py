@@ -121,9 +121,8 @@ def write_results(root: Path, views: Sequence[View], cameras: Sequence[NumpyCame
     shown = [(view, camera) for view, camera in zip(views, cameras, strict=True) if view.name in marked]
     new = {paths[view.name].as_posix() for view, _ in shown}
     # Written first: after an interrupt, all files are known to be ours.
-    _write_record(
-        folder, earlier | new, [*_read_record(folder)[1], hashlib.sha256(planes_json(planes).encode()).hexdigest()]
-    )
+    digest = hashlib.sha256(planes_json(planes).encode()).hexdigest()
+    _write_record(folder, earlier | new, [*_read_record(folder)[1], digest])
     for view, camera in shown:
         write_image(folder / paths[view.name], resample_to_photograph(view, pane_labels(view.name, camera, panes)))
     for name in earlier - new:

@@ -287,11 +287,8 @@ def _names_on_disk(images: Path, names: list[str]) -> list[str]:
 def _other_models_warning(root: Path, used: Path) -> tuple[str, ...]:
     """Warning of further models: COLMAP splits what it cannot connect, and only one can be trained at a time."""
     sparse = root / "sparse"
-    others = (
-        sorted(p.name for p in sparse.iterdir() if p != used and p.is_dir() and model_suffix(p))
-        if sparse.is_dir()
-        else []
-    )
+    folders = [path for path in sparse.iterdir() if path.is_dir()] if sparse.is_dir() else []
+    others = sorted(folder.name for folder in folders if folder != used and model_suffix(folder))
     if not others:
         return ()
     return (f"{used} is used; there are more models in {sparse} ({join_names(others)}), which are ignored.",)

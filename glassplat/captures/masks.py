@@ -275,9 +275,8 @@ def find_masks(
         warnings = (renaming, *warnings)
         return CaptureMasks(replace(found, warnings=(*warnings, *found.warnings)), _join_masks(keep_masks, ignored))
     found = _interpret_masks(root, paths, polarity, read_mask_values) if paths else MaskSet({})
-    return CaptureMasks(
-        replace(found, warnings=(*found.warnings, *warnings)), _join_masks({**masks, **keep_masks}, ignored)
-    )
+    joined = _join_masks({**masks, **keep_masks}, ignored)
+    return CaptureMasks(replace(found, warnings=(*found.warnings, *warnings)), joined)
 
 
 def _find_keep_masks(

@@ -181,9 +181,8 @@ def hide_advanced_options(options: Any, note: str = "") -> Any:
     values = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
     fields: list[Any] = []
     for name, value in values.items():
-        values[name] = (
-            hide_advanced_options(value) if dataclasses.is_dataclass(value) and has_essentials(type(value)) else value
-        )
+        if dataclasses.is_dataclass(value) and has_essentials(type(value)):
+            values[name] = hide_advanced_options(value)
         if values[name] is not value:
             fields.append((name, type(values[name]), dataclasses.field(default=values[name])))
         elif not is_essential(hints[name]):

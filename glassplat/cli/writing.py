@@ -145,9 +145,8 @@ def _video_cameras(command: Video, model: models.Model) -> list[Camera]:
         if command.keyframes is not None:
             cameras = interpolate_cameras([camera for _, camera in read_cameras(command.keyframes)], frames)
         elif command.path == "interpolate":
-            cameras = interpolate_cameras(
-                select_keyframes([model.cameras[name] for name in sorted(model.cameras, key=natural_sort_key)]), frames
-            )
+            names = sorted(model.cameras, key=natural_sort_key)
+            cameras = interpolate_cameras(select_keyframes([model.cameras[name] for name in names]), frames)
         else:
             cameras = model.orbit(frames)
     return [fit_to_width(camera, command.width + command.width % 2) for camera in cameras]
@@ -193,10 +192,8 @@ def write_clean(command: Clean, console: Console) -> None:
     cleaned, found = model.clean(command.rules)
     summary = ", ".join(f"{count} {rule}" for rule, count in found.items() if count) or "no floaters"
     print_line(console, f"{len(cleaned.scene.primary)} of {len(model.scene.primary)} Gaussians kept; found {summary}")
-    if found["outside"] > len(model.scene.primary) / 2:
-        print_warning(
-            console, f"--box removes {found['outside']} Gaussians, more than half; is it in the scene's own units?"
-        )
+    if (count := found["outside"]) > len(model.scene.primary) / 2:
+        print_warning(console, f"--box removes {count} Gaussians, more than half; is it in the scene's own units?")
     if command.scale is not None:
         *points, metres = command.scale
         factor = metres / math.dist(points[:3], points[3:])

@@ -270,9 +270,8 @@ def evaluate(
     results["seconds_per_frame"] = statistics.median(m.seconds for m in measurements.values())
     results |= metrics.json_values({"peak_memory_mib": peak_memory_mib()})
     results |= metrics.json_values(_mean_metrics([m.metrics for m in measurements.values()]))
-    results |= metrics.json_values(
-        metrics.environment_metrics(metrics.learned_environment(scene), metrics.true_environment(dataset.root), lpips)
-    )
+    environments = metrics.learned_environment(scene), metrics.true_environment(dataset.root)
+    results |= metrics.json_values(metrics.environment_metrics(*environments, lpips))
     results |= _footnotes(results, lpips, regions, gain)
     results["planes"] = metrics.plane_table(scene.planes, truth, dataset.extent, regions.planes)
     if len(scene.planes):

@@ -212,9 +212,8 @@ def compared_pixels(scene: Scene, photograph: Photograph) -> tuple[Tensor, Tenso
     mirrored = mirrored_image(scene, photograph.camera)
     shown = pane_pixels(scene, photograph, mirrored)
     region = shown & (mirrored.coverage > LEAST_COVERAGE)
-    first, second = (
-        subtract_local_mean(linear_from_srgb(image), region)[region] for image in (mirrored.color, photograph.pixels)
-    )
+    images = (mirrored.color, photograph.pixels)
+    first, second = (subtract_local_mean(linear_from_srgb(image), region)[region] for image in images)
     return first, second, int(shown.sum())
 
 

@@ -292,9 +292,8 @@ def page_text(
     kept = f"{len(scene.primary):,}" + (f" of {drawable:,}" if len(scene.primary) < drawable else "")
     subtitle = f"{kept} Gaussians" + (f" · {count} pane{'s' if count > 1 else ''}" if count else "")
     # Glass has no colour, but the SPZ format needs one, so a constant is used.
-    glass = replace(
-        scene.glass, sh=torch.zeros(len(scene.glass), 1, 3, dtype=torch.float32), channels={}, active_sh_degree=0
-    )
+    sh = torch.zeros(len(scene.glass), 1, 3, dtype=torch.float32)
+    glass = replace(scene.glass, sh=sh, channels={}, active_sh_degree=0)
     return fill_template(
         read_asset("page.html"),
         {
@@ -398,11 +397,9 @@ def channel_bytes(scene: Scene) -> tuple[bytes, list[float]]:
     step = (high - low) / 255
     intensities = torch.round((logs - low) / (step or 1)).clamp(0, 255)
     marks = torch.round(255 * torch.sigmoid(scene.glass.channels["logit_mark"]))
-    owners = (
-        nearest_panes(scene.glass.means, scene.planes)
-        if len(scene.planes)
-        else torch.zeros(len(scene.glass), dtype=torch.float32)
-    )
+    owners = torch.zeros(len(scene.glass), dtype=torch.float32)
+    if len(scene.planes):
+        owners = nearest_panes(scene.glass.means, scene.planes)
     parts = [part.to(torch.uint8).numpy().tobytes() for part in (intensities, marks, owners)]
     return b"".join(parts), [low, step]
 

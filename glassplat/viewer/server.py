@@ -173,9 +173,8 @@ class Client:
 
         def work() -> None:
             try:
-                self._measure.add_point(
-                    drawing.surface_point(self._viewer.state.scene, self._viewer.state.renderer, request, direction)
-                )
+                state = self._viewer.state
+                self._measure.add_point(drawing.surface_point(state.scene, state.renderer, request, direction))
             except ValueError as error:
                 self._notify("No point", str(error), "red")
 
