@@ -63,7 +63,7 @@ def test_more_features_only_where_too_few_are_placed(
     def placed(*unused: object, **also: object) -> list[Group]:
         return [Group(size)] if (size := next(left)) else []
 
-    monkeypatch.setattr(reconstruction, "register_photographs", placed)
+    monkeypatch.setattr(colmap, "register_photographs", placed)
     solution = best_solution(photographs, Path("work"), Settings(), least, notes.append)
     assert tried == features
     assert (solution.registered, solution.attempts_made) == (best, len(sizes))
