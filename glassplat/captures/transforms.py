@@ -368,8 +368,7 @@ def _is_blender(settings: Settings) -> bool:
 
 def _surrounds_box(shots: Mapping[str, Shot]) -> bool:
     """Return whether half of the cameras are as far from the cube of `points_in_box` as in the synthetic scenes."""
-    centers = [shot.cam_from_world[:3, :3].T @ shot.cam_from_world[:3, 3] for shot in shots.values()]
-    distance = float(np.median(np.linalg.norm(centers, axis=1)))
+    distance = float(np.median([np.linalg.norm(shot.cam_from_world[:3, 3]) for shot in shots.values()]))
     return BOX_HALF_SIZE < distance < MOST_HALF_SIZES * BOX_HALF_SIZE
 
 

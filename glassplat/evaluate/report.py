@@ -71,8 +71,9 @@ large.addEventListener("click", () => large.close());
 
 NARROWEST_PANEL, WIDEST_PANEL = 280, 640
 MARGIN, GAP = 16, 10
-CAPTION_HEIGHT, TITLE_HEIGHT = 24, 34
 CAPTION_SIZE, TITLE_SIZE = 15, 19
+CAPTION_MARGIN = 9
+CAPTION_HEIGHT, TITLE_HEIGHT = CAPTION_SIZE + CAPTION_MARGIN, 34
 BACKGROUND, TEXT, MUTED_TEXT = (22, 24, 28), (236, 236, 236), (160, 166, 174)
 SMALLEST_STRENGTH_SCALE = 0.05
 COLORED = ("transmission", "base", "reflection", "environment")
@@ -122,7 +123,7 @@ def compose_sheet(
     rows: Sequence[Row], title: str, subtitle: str, *, caption_size: int = CAPTION_SIZE
 ) -> NDArray[np.uint8]:
     """Panels in rows, with captions and a title line; all panels of a row have the size of its first one."""
-    caption_height = caption_size + CAPTION_HEIGHT - CAPTION_SIZE
+    caption_height = caption_size + CAPTION_MARGIN
     sizes = [_panel_size(*next(panel for panel in row if panel).image.shape[1::-1]) for row in rows]
     width = max(len(row) * (size[0] + GAP) - GAP for row, size in zip(rows, sizes, strict=True))
     height = sum(caption_height + size[1] + GAP for size in sizes) - GAP
@@ -218,7 +219,7 @@ def _draw_panel(
     if image.size != size:
         grows = size[0] > image.width
         image = image.resize(size, Image.Resampling.NEAREST if grows else Image.Resampling.LANCZOS)
-    canvas.paste(image, (corner[0], corner[1] + caption_size + CAPTION_HEIGHT - CAPTION_SIZE))
+    canvas.paste(image, (corner[0], corner[1] + caption_size + CAPTION_MARGIN))
     font = ImageFont.load_default(caption_size)
     ImageDraw.Draw(canvas).text((corner[0], corner[1] + 2), _one_line(panel.caption), fill=MUTED_TEXT, font=font)
 
