@@ -431,10 +431,23 @@ def write_tables(output: Path, runs: Sequence[Run]) -> str:
     if not finished:
         return "no run is finished"
     text = tables({(run.scene, run.name, run.seed): values_of(results) for run, results in finished})
+    text += camera_note(finished)
     kept = [{"scene": r.scene, "name": r.name, "train": r.train} | results for r, results in finished]
     for name, content in ((RESULTS, json.dumps(kept, indent=2) + "\n"), ("tables.md", text)):
         write_text(output / name, content)
     return text
+
+
+def camera_note(finished: Sequence[tuple[Run, Mapping[str, Any]]]) -> str:
+    """A note if only some test cameras were aligned, as by default after pose refinement, which raises their scores."""
+    by_cameras: dict[str, list[str]] = {}
+    for run, results in finished:
+        by_cameras.setdefault(results.get("test_cameras") or "not recorded", []).append(run.title)
+    if len(by_cameras) == 1:
+        return ""
+    lines = [f"- {cameras}: {'; '.join(titles)}" for cameras, titles in by_cameras.items()]
+    note = "**Test cameras differ**, so runs are not comparable; repeat `glassplat eval RUN --align always` for all:"
+    return "\n".join([note, "", *lines, ""])
 
 
 def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -213,3 +213,15 @@ def test_variants_are_set_against_their_method_seed_by_seed() -> None:
     text = tables(runs)
     assert row(text, "planar:dark", "1")[2:] == ["-0.25", "0.750", "-0.25"]
     assert row(text, "room-0", "planar")[2] == "30.50 ± 0.71"
+
+
+def test_runs_with_differently_placed_test_cameras_are_not_compared_silently(tmp_path: Path) -> None:
+    (tmp_path / "room").mkdir()
+    given = [str(tmp_path / "room"), "--methods", "splat", "--output", str(tmp_path / "runs")]
+    runs = planned_runs(parsed([*given, "--variant", "splat:poses=--poses.rate 0.0001"]))
+    for run, cameras in zip(runs, ("as the capture has them", "aligned with their photographs"), strict=True):
+        run.directory.mkdir(parents=True)
+        (run.directory / RESULTS).write_text(json.dumps(results(30.0, test_cameras=cameras)))
+    assert "Test cameras differ" not in compare.write_tables(tmp_path / "runs", runs[:1])
+    text = compare.write_tables(tmp_path / "runs", runs)
+    assert "--align always" in text and "- aligned with their photographs: room, splat:poses, seed 0" in text
