@@ -317,10 +317,11 @@ def values_of(results: Mapping[str, Any]) -> dict[Column, float | None]:
     }
 
 
-def mean(values: Iterable[float | None]) -> float | None:
-    """Mean of the known values; None without any."""
+def mean(values: Iterable[float | None], column: Column = IMAGE) -> float | None:
+    """Mean of the known values, None without any; geometric for ratios, so that twice and half average to 1."""
     known = [value for value in values if value is not None]
-    return statistics.fmean(known) if known else None
+    of_known = statistics.geometric_mean if column.is_ratio else statistics.fmean
+    return of_known(known) if known else None
 
 
 def compared(measured: Measured, name: str, baseline: str) -> dict[str, list[Values]]:
@@ -337,7 +338,7 @@ def difference(mine: Values, other: Values) -> dict[Column, float | None]:
     result: dict[Column, float | None] = {}
     for column in COLUMNS:
         a, b = mine[column], other[column]
-        if a is None or b is None or (column.is_ratio and b == 0):
+        if a is None or b is None or (column.is_ratio and 0 in (a, b)):
             result[column] = None
         else:
             result[column] = a / b if column.is_ratio else a - b
@@ -391,14 +392,14 @@ def gain_table(measured: Measured, names: Sequence[str]) -> list[str]:
 
 
 def variant_table(measured: Measured, pairs: Sequence[tuple[str, str]]) -> list[str]:
-    """Mean differences or ratios between a variant and its method, over scenes."""
+    """Mean differences, or geometric means of ratios, between a variant and its method, over scenes."""
     found = {name: compared(measured, name, plain) for name, plain in pairs}
     used = [c for c in COLUMNS if any(v[c] is not None for by in found.values() for vs in by.values() for v in vs)]
     rows = []
     for name, by_scene in found.items():
         images = [mean(v[IMAGE] for v in values) for values in by_scene.values()]
         worst = min((value for value in images if value is not None), default=None)
-        means = [mean(mean(v[column] for v in values) for values in by_scene.values()) for column in used]
+        means = [mean((mean((v[c] for v in values), c) for values in by_scene.values()), c) for c in used]
         cells = [
             written(value, column._replace(style=".3f")) if column.is_ratio else written(value, column, "+")
             for column, value in zip(used, means, strict=True)

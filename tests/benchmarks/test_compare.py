@@ -211,7 +211,7 @@ def test_variants_are_set_against_their_method_seed_by_seed() -> None:
     (differences,) = compared(runs, "planar:dark", "planar").values()
     assert [values[COLUMNS[0]] for values in differences] == [-0.5, 0.0]
     text = tables(runs)
-    assert row(text, "planar:dark", "1")[2:] == ["-0.25", "0.750", "-0.25"]
+    assert row(text, "planar:dark", "1")[2:] == ["-0.25", "0.707", "-0.25"]
     assert row(text, "room-0", "planar")[2] == "30.50 ± 0.71"
 
 
