@@ -82,7 +82,7 @@ def with_aligned_test_views(
     """The capture with each test camera moved to where the scene agrees best with its photograph.
 
     Poses from structure from motion have errors, and a scene whose training cameras were refined does not match the
-    unrefined poses of test views. NeRF--, BARF and nerfstudio align test cameras in the same way.
+    unrefined poses of test views. NeRF-- and BARF align test cameras in the same way; gsplat and nerfstudio do not.
 
     Args:
         scene: trained; not changed.

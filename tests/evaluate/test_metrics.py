@@ -46,6 +46,22 @@ def test_a_worse_image_scores_lower() -> None:
     assert ssim(worse, IMAGE) < ssim(OTHER, IMAGE) < 1
 
 
+def test_ssim_is_that_of_3dgs_with_zeros_around_the_images() -> None:
+    profile = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+    profile /= profile.sum()
+
+    def blurred(pixels: np.ndarray) -> np.ndarray:
+        padded = np.pad(pixels, ((5, 5), (5, 5), (0, 0)))
+        rows = sum(w * padded[i : i + pixels.shape[0]] for i, w in enumerate(profile))
+        return sum(w * rows[:, i : i + pixels.shape[1]] for i, w in enumerate(profile))
+
+    x, y = (quantize(image).double().numpy() / 255 for image in (IMAGE, OTHER))
+    a, b = blurred(x), blurred(y)
+    covariance, variances = blurred(x * y) - a * b, blurred(x * x + y * y) - a * a - b * b
+    similarity = (2 * a * b + 1e-4) * (2 * covariance + 9e-4) / ((a * a + b * b + 1e-4) * (variances + 9e-4))
+    assert ssim(IMAGE, OTHER) == pytest.approx(similarity.mean(), abs=1e-5)
+
+
 def test_gain_recovers_the_factor() -> None:
     targets = [IMAGE.reshape(-1, 3), OTHER.reshape(-1, 3)[:50]]
     assert reflection_gain([0.4 * target for target in targets], targets) == pytest.approx(2.5)
