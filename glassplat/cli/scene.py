@@ -64,7 +64,8 @@ class Render(Command):
         run_directory: directory of the run.
         output: output folder, with a folder per layer; new, or written by this command before.
         layers: rgb, normal, depth, alpha and the layers of the method, such as transmission and reflection; an unknown
-            layer is refused with a list of those available.
+            layer is refused with a list of those available. Depth (camera z, world units) and normals are also written
+            as .npy files.
         split: cameras to render.
         edits: changes to the panes.
         device: rendering device; auto uses an NVIDIA GPU if available.

@@ -33,7 +33,7 @@ from glassplat.publish.camera_paths import fit_to_width, interpolate_cameras, se
 from glassplat.publish.film import check_size, encode_video, side_by_side, wipe_images
 from glassplat.publish.web_page import MOST_GAUSSIANS, PREVIEW, Sharing, check_panes, fits_page, write_preview
 from glassplat.render.frame import check_layers
-from glassplat.render.layers import layer_image
+from glassplat.render.layers import MEASURED, layer_image
 from glassplat.render.planar import Planar, dereflected_photo
 from glassplat.scene.camera import Camera
 from glassplat.scene.corrections import natural_sort_key
@@ -47,7 +47,7 @@ Item = TypeVar("Item")
 
 
 def write_layers(command: Render, console: Console) -> None:
-    """Renders every layer of every view into its file."""
+    """Renders every layer of every view into its image, and the values of depth and normals into an array."""
     stored = open_run(command.run_directory, command.device, command.data)
     check_layers(stored.renderer, stored.scene, command.layers, stored.recipe.method)
     scene = command.edits.apply(stored.scene)
@@ -55,7 +55,8 @@ def write_layers(command: Render, console: Console) -> None:
     views = chosen_views(stored.dataset, command.split)
     paths = image_names(stored.dataset)
     targets = [command.output / layer / paths[view.name] for layer in command.layers for view in views]
-    check_targets(command.output, targets, photograph_paths(stored.dataset))
+    arrays = [path.with_suffix(".npy") for path in targets]
+    check_targets(command.output, [*targets, *arrays], photograph_paths(stored.dataset))
     if claim_folder(command.output, "render", command.run_directory):
         print_line(
             console,
@@ -65,8 +66,11 @@ def write_layers(command: Render, console: Console) -> None:
         for view in track_progress("rendering", views, len(views), progress):
             frame, _ = time_render(renderer, scene, view)
             for layer in command.layers:
-                image = layer_image(frame, layer)
-                write_image(command.output / layer / paths[view.name], image)
+                target = command.output / layer / paths[view.name]
+                write_image(target, layer_image(frame, layer))
+                if layer in MEASURED:
+                    with atomic_write(target.with_suffix(".npy")) as temporary:
+                        np.save(temporary, frame.layers[layer].float().cpu().numpy())
     made = f"{count_noun(len(views), 'view')} x {count_noun(len(command.layers), 'layer')}"
     print_line(console, f"{made} -> {command.output}")
 

@@ -41,6 +41,8 @@ LABEL_COLORS = (
     (213, 94, 0),
     (160, 160, 160),
 )
+MEASURED = ("normal", "depth", "median_depth")
+"""Layers whose values are not colours; `glassplat render` also writes them as arrays."""
 ERROR_SCALE = 0.2
 """Colour error drawn brightest; fixed, so that images can be compared."""
 COVERED = 0.5
