@@ -283,7 +283,7 @@ def machine_memory() -> float:
         whole = UNKNOWN_MEMORY
     for path in memory_limits():
         with suppress(OSError, ValueError):  # No such file, or its limit is `max`.
-            whole = min(whole, float(path.read_text()))
+            whole = min(whole, float(path.read_text("utf-8")))
     return whole
 
 

@@ -94,7 +94,7 @@ def serialised(compiled: Callable[..., Any]) -> Callable[..., Any]:
 prefer_openmp()
 keep_freed_memory()
 
-COMPILER_SOURCE = "".join(Path(__file__).with_name(name).read_text() for name in ("cpu.py", "cpu_vector.py"))
+COMPILER_SOURCE = "".join(Path(__file__).with_name(name).read_text("utf-8") for name in ("cpu.py", "cpu_vector.py"))
 """Source of this file and of the vector operators, which kernels do not reference by name. It is part of the cache key,
 along with a kernel's own code."""
 
