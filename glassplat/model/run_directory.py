@@ -11,6 +11,7 @@ import json
 import logging
 import os
 import re
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -97,6 +98,7 @@ class RunSettings:
         seed: random seed.
         device: training device.
         mask_polarity: value of black-and-white masks that marks panes.
+        photographs: the checksum of the photographs with which the run began; empty if unknown.
     """
 
     data: str
@@ -105,6 +107,14 @@ class RunSettings:
     seed: Seed = 0
     device: str = "cpu"
     mask_polarity: Polarity = "auto"
+    photographs: str = ""
+
+
+def photographs_checksum(dataset: Dataset) -> str:
+    """A checksum of the sizes of the photographs' files, which copies keep; empty without files."""
+    paths = {view.name: view.image_path for view in (*dataset.train, *dataset.test)}
+    sizes = [(name, path.stat().st_size) for name, path in sorted(paths.items()) if path.is_file()]
+    return f"{zlib.crc32(repr(sizes).encode()):08x}" if sizes else ""
 
 
 EVALUATION_FILES = ("per_view.json", "sheets", "uses.png", "index.html")
@@ -223,7 +233,7 @@ class RunDirectory:
 
         make_folder(self.path)
         write_text(self.path / "recipe.json", recipe_to_json(recipe) + "\n")
-        self.write_settings(settings)
+        self.write_settings(dataclasses.replace(settings, photographs=photographs_checksum(dataset)))
         write_cameras(self.path / "cameras.json", [(v.name, v.camera) for v in (*dataset.train, *dataset.test)])
 
     def write_settings(self, settings: RunSettings) -> None:

@@ -305,7 +305,8 @@ def resumed_state(
     # A run may be resumed on another device, and its capture may have moved.
     written = directory.settings()
     has_moved = written.data != settings.data and directory.has_cameras_of(dataset)
-    recorded = replace(written, device=settings.device, data=settings.data if has_moved else written.data)
+    data = settings.data if has_moved else written.data
+    recorded = replace(written, device=settings.device, data=data, photographs="")
     # Compared as written: `recipe()` gives what an earlier version did not have its present default.
     if recorded != settings or directory.recipe_as_written() != json.loads(recipe_to_json(recipe)):
         changes = option_changes(vars(recorded), vars(settings)) + recipe_changes(directory, recipe)
@@ -314,6 +315,12 @@ def resumed_state(
             "Repeat the original options, with the version of glassplat that began it, or choose another --output"
         )
     directory.check_photographs(dataset)
+    if written.photographs not in ("", run_directory.photographs_checksum(dataset)):
+        log.warning(
+            "photographs of %s have changed since this run began (their files have other sizes); if they look "
+            "different, train again",
+            dataset.root,
+        )
     state = load_checkpoint(
         directory.checkpoint, method=recipe.method, seed=settings.seed, iterations=settings.iterations
     )
@@ -333,7 +340,7 @@ def shared_settings(recipe: Any, settings: run_directory.RunSettings, dataset: D
     """Options, versions and capture of a run, which must agree on all ranks; only the folder may differ."""
     views = (*dataset.train, *dataset.test)
     shapes = [(v.name, v.camera.intrinsics.tolist(), v.camera.cam_from_world.tolist(), v.is_annotated) for v in views]
-    sizes = [view.image_path.stat().st_size if view.image_path.is_file() else 0 for view in views]
+    sizes = run_directory.photographs_checksum(dataset)
     contents = zlib.crc32(repr((shapes, sizes)).encode(), zlib.crc32(dataset.points.positions.numpy().tobytes()))
     of_settings = {name: value for name, value in vars(settings).items() if name not in ("data", "device")}
     return {

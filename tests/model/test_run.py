@@ -471,6 +471,19 @@ def test_a_run_goes_on_where_its_capture_has_moved_and_not_with_another(tmp_path
     assert directory.settings() == moved
 
 
+def test_changed_photographs_are_warned_about_on_resuming(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    capture, directory = write_tiny_capture(tmp_path / "capture"), RunDirectory(tmp_path / "run")
+    settings = replace(SETTINGS, data=str(capture))
+    for change in (False, True):
+        if change:
+            first = capture / "images" / "0.png"
+            first.write_bytes((capture / "images" / "1.png").read_bytes() + b"0")
+        else:
+            Run(RECIPE, settings, directory, load_dataset(capture), resume=False).run_to_end(lambda message: None)
+        Run(RECIPE, settings, directory, load_dataset(capture), resume=True).run_to_end(lambda message: None)
+        assert ("have changed since this run began" in caplog.text) == change
+
+
 def test_an_option_that_another_version_did_not_have_is_named_when_a_run_is_to_go_on(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, interrupt_at=5)
