@@ -25,6 +25,9 @@ log = logging.getLogger("glassplat.panes")
 LEAST_MATCHING, LEAST_OF_MEDIAN = 0.3, 0.5
 """Minimum share of a mask's outline that must meet the others, absolute and relative to the median over the masks."""
 EDGES_PER_VIEW = 100
+FARTHEST_ORIGIN = 1e5
+"""Distance of the cameras from the origin, in the distances between them, beyond which no mask is called wrong: there,
+single precision moves cameras by a percent of these distances."""
 
 
 def report_masks(label: int, plane: masks.FramedPlanes, views: Sequence[masks.PaneView]) -> None:
@@ -38,7 +41,9 @@ def report_masks(label: int, plane: masks.FramedPlanes, views: Sequence[masks.Pa
         "pane %d: %d masks, which overlap by %.2f to %.2f on its plane", label, len(views), min(overlap), max(overlap)
     )
     outliers = outlier_masks(matching).nonzero()[0]
-    if len(outliers):
+    centers = np.stack([view.center for view in views])
+    is_far = np.linalg.norm(centers.mean(axis=0)) > FARTHEST_ORIGIN * np.ptp(centers, axis=0).max()
+    if len(outliers) and not is_far:
         log.warning(
             "pane %d: %d of its %d masks do not fit the others, their outlines hardly meet on any plane: %s; "
             "check that each belongs to its photograph, and that label %d is the same flat pane in it",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from glassplat.panes import PlaneFit
-from glassplat.panes.fit import fit_planes, matching_outline_shares, outlier_masks
+from glassplat.panes.fit import fit_planes, matching_outline_shares, outlier_masks, report_masks
 from glassplat.panes.masks import FramedPlanes, PlaneEquations, pane_views
 from tests.panes.pane_scene import EYES, FRONT, Annotations, Pane, frame_and_clutter, scene_of
 
@@ -43,6 +43,20 @@ def test_a_post_before_the_pane_is_no_wrong_mask(caplog: pytest.LogCaptureFixtur
     post = Pane(np.array([0.7, -0.1, 1.3]), FRONT.normal, FRONT.tangent, (0.08, 2.0))
     annotations = [(camera, labels.where(labels == 1, 0)) for camera, labels in scene_of([FRONT, post], PLACES)]
     assert warnings_of(annotations, caplog) == []
+
+
+@pytest.mark.parametrize(("offset", "count"), [(0.0, 0), (1e4, 1), (2e6, 0)])
+def test_masks_are_not_called_wrong_where_poses_are_imprecise(
+    offset: float, count: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    views = pane_views(scene_of([FRONT], PLACES), 1)
+    for view in views[:3]:
+        view.cam_from_world[:3, 3] += 0.3 * (offset > 0)
+    for view in views:
+        view.cam_from_world[:3, 3] -= view.cam_from_world[:3, :3] @ [0, 0, offset]
+    distance = FRONT.normal @ (FRONT.center + np.array([0, 0, offset]))
+    report_masks(1, FramedPlanes(PlaneEquations(FRONT.normal[None], np.array([distance])), np.zeros(1)), views)
+    assert caplog.text.count("do not fit") == count
 
 
 def test_views_without_any_outline_say_nothing() -> None:
