@@ -31,16 +31,16 @@ class PlyElement:
 
     name: str
     count: int
-    properties: tuple[tuple[str, str | None], ...]
+    properties: dict[str, str | None]
 
     @property
     def has_lists(self) -> bool:
         """Return whether rows may differ in length, so that the table cannot be skipped or read at once."""
-        return any(kind is None for _, kind in self.properties)
+        return None in self.properties.values()
 
     def row_type(self, byte_order: str) -> np.dtype:
         """Data type of a packed row in a binary file."""
-        return np.dtype([(name, byte_order + str(kind)) for name, kind in self.properties])
+        return np.dtype([(name, byte_order + str(kind)) for name, kind in self.properties.items()])
 
 
 @dataclass(frozen=True)
@@ -134,9 +134,9 @@ def read_header(stream: BinaryIO, path: Path) -> PlyHeader:
         if words[0] == "format" and len(words) == 3 and words[1] in BYTE_ORDERS:
             ply_format = words[1]
         elif words[0] == "element" and len(words) == 3 and words[2].isdigit():
-            elements.append(PlyElement(words[1], int(words[2]), ()))
+            elements.append(PlyElement(words[1], int(words[2]), {}))
         elif words[0] == "property" and elements:
-            elements[-1] = _add_property(elements[-1], words, path)
+            _add_property(elements[-1], words, path)
         else:
             raise ValueError(f"cannot read the line {' '.join(words)!r} in the header of {path}; the file is damaged")
     if not ply_format:
@@ -161,19 +161,18 @@ def _header_lines(stream: BinaryIO, path: Path) -> list[list[str]]:
     )
 
 
-def _add_property(element: PlyElement, words: list[str], path: Path) -> PlyElement:
+def _add_property(element: PlyElement, words: list[str], path: Path) -> None:
     is_list = len(words) == 5 and words[1] == "list"
     is_scalar = len(words) == 3 and words[1] in SCALAR_TYPES
     if not (is_list or is_scalar):
         raise ValueError(
             f"cannot read the property line {' '.join(words)!r} in the header of {path}; the file is damaged"
         )
-    if words[-1] in dict(element.properties):
+    if words[-1] in element.properties:
         raise ValueError(
             f"property {words[-1]!r} appears twice in element {element.name!r} of {path}; expected each once"
         )
-    kind = SCALAR_TYPES[words[1]] if is_scalar else None
-    return PlyElement(element.name, element.count, (*element.properties, (words[-1], kind)))
+    element.properties[words[-1]] = SCALAR_TYPES[words[1]] if is_scalar else None
 
 
 def _read_binary(
@@ -192,7 +191,7 @@ def _read_binary(
         raise _truncation_error(path, element, complete)
     stream.seek(skipped, os.SEEK_CUR)
     rows = np.fromfile(stream, dtype=row_type, count=element.count)
-    return {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name, _ in element.properties}
+    return {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name in element.properties}
 
 
 def _read_ascii(
@@ -212,7 +211,7 @@ def _read_ascii(
         raise ValueError(f"{path} contains something that is not a number ({error}); the file is damaged") from error
     return {
         name: _convert_to_declared_type(values[:, i], str(kind), name, path)
-        for i, (name, kind) in enumerate(element.properties)
+        for i, (name, kind) in enumerate(element.properties.items())
     }
 
 
