@@ -162,6 +162,23 @@ def test_a_corner_that_only_the_fit_knows_can_be_dragged(page: Page) -> None:
     assert "2.png" in page.document()["corners"][1]
 
 
+def test_only_a_plane_certain_to_half_a_degree_is_green(page: Page) -> None:
+    for view, count in enumerate((0, 0, 1)):
+        page.mark_true(view)
+        assert page.window.run("return document.querySelectorAll('#panes .good').length") == count, page.said()
+
+
+def test_a_corner_keeps_its_distance_from_the_pointer(page: Page) -> None:
+    page.mark_true(0)
+    page.mark_true(1)
+    for view in (0, 2):  # Marked there, or known from the fit.
+        page.show(view)
+        ((x, y),) = page.on_screen(true_corners(view)[1:2])
+        page.window.drag([(x + 5, y + 4), (x + 7, y + 4), (x + 5, y + 4)])
+        page.saved()
+        assert np.allclose(page.document()["corners"][1][f"{view}.png"], true_corners(view)[1], atol=0.5)
+
+
 def test_there_are_at_most_64_panes_and_each_has_its_colour_and_is_shown(page: Page) -> None:
     for _ in range(62):
         page.window.keys("a")

@@ -165,14 +165,14 @@ function drawPanes() {
   }));
 }
 
-const SURE = 2; // degrees
+const GOOD = 0.5, SURE = 2; // degrees
 const degrees = (angle) => `${angle.toFixed(angle < 1 ? 2 : 1)}°`;
 const counted = (number, noun) => `${number} ${noun}${number === 1 ? "" : "s"}`;
 
 function judgement(answer) {
   if (!answer) return [];
   if (!answer.solved) return [[answer.message, "poor"]];
-  const lines = [[`marks fit to ${answer.error.toFixed(1)} pixels; the plane is uncertain by ${degrees(answer.uncertainty)}`, answer.uncertainty < SURE ? "good" : "poor"]];
+  const lines = [[`marks fit to ${answer.error.toFixed(1)} pixels; the plane is uncertain by ${degrees(answer.uncertainty)}`, answer.uncertainty < GOOD ? "good" : answer.uncertainty < SURE ? "" : "poor"]];
   if (answer.message) lines.push([answer.message, "poor"]);
   const best = answer.next[0];
   if (best && answer.uncertainty > 0.3) lines.push([`marking ${capture.views[best.view].name} would make it ${degrees(best.uncertainty)}`, ""]);
@@ -226,14 +226,16 @@ function pressed(event) {
 
 function pressCorner(place) {
   const reach = REACH / drawing.scale;
-  let number = drawing.cornerAt(marking.pane, answers[marking.active], place, reach);
-  if (number < 0) number = marking.nextCorner(view().name, skipped.corner);
+  const name = view().name, answer = answers[marking.active], pressed = drawing.cornerAt(marking.pane, answer, place, reach);
+  const number = pressed < 0 ? marking.nextCorner(name, skipped.corner) : pressed;
   if (number === null) return;
   gestures += 1;
-  drag = { kind: "corner", number, gesture: `drag ${gestures}` };
+  const marked = marking.pane.corners[number]?.[name];
+  const at = pressed < 0 ? place : marked || answer.corners[current][number];
+  // A corner keeps its distance from the pointer.
+  drag = { kind: "corner", number, gesture: `drag ${gestures}`, by: [at[0] - place[0], at[1] - place[1]] };
   // Pressing a corner that only the fit knows here says that it is in the right place.
-  const known = marking.pane.corners[number];
-  if (!known || !(view().name in known)) marking.setCorner(view().name, number, place, drag.gesture);
+  if (!marked) marking.setCorner(name, number, at, drag.gesture);
 }
 
 function pressPolygon(place) {
@@ -249,7 +251,7 @@ function moved(event) {
     return;
   }
   if (drag.kind === "move") { drawing.move([at[0] - drag.at[0], at[1] - drag.at[1]]); drag.at = at; }
-  else if (drag.kind === "corner") marking.setCorner(view().name, drag.number, place, drag.gesture);
+  else if (drag.kind === "corner") marking.setCorner(view().name, drag.number, [place[0] + drag.by[0], place[1] + drag.by[1]], drag.gesture);
   else if (drag.kind === "edge") pending.points[1] = place;
   else if (distance(pending.points[pending.points.length - 1], place) * drawing.scale > 3) pending.points.push(place);
   draw();
