@@ -9,7 +9,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -97,6 +97,9 @@ class WorkFolder:
         try:
             yield
         finally:
+            if lock.is_locked:  # Before the release: whoever locks a removed file, tries again.
+                with suppress(OSError):
+                    os.unlink(lock.lock_file)
             lock.release()
 
     def begin(self, settings: Mapping[str, Any], *, resume: bool, force: bool) -> bool:

@@ -152,8 +152,14 @@ def test_an_output_may_be_a_link_or_the_current_folder(
 
 @pytest.mark.parametrize("option", ["--force", "--resume"])
 def test_a_capture_that_another_preparation_makes_is_left_to_it(
-    option: str, photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    option: str,
+    photographs: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    (tmp_path / "locks").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "locks"))
     workplace = WorkFolder(tmp_path / "capture")
     with workplace.lock():
         workplace.begin({}, resume=False, force=False)
@@ -162,5 +168,7 @@ def test_a_capture_that_another_preparation_makes_is_left_to_it(
         assert (workplace.folder / "settings.json").is_file()
         with WorkFolder(tmp_path / "other").lock():
             pass
+        assert len(list((tmp_path / "locks").glob("*.lock"))) == 1
     with workplace.lock():
         pass
+    assert not list((tmp_path / "locks").glob("*.lock"))
