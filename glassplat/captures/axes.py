@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from glassplat.captures.view import View
+from glassplat.captures.view import View, sample_evenly
 from glassplat.scene.camera import Camera
 from glassplat.scene.panes import in_image
 
-Item = TypeVar("Item")
 LEAST_SEEN = 0.05
 """Largest share that counts as nothing seen; some stray points lie in front of a camera with either axes."""
 MOST_SEEN = 0.5
@@ -75,8 +74,8 @@ def axes_evidence(views: Sequence[View], measured: Tensor | None) -> AxesEvidenc
 
 def evidence_of_points(cameras: Sequence[Camera], points: Tensor) -> AxesEvidence:
     """Evaluates the axes by measured points [P, 3], each of which was visible to some camera."""
-    some_cameras = [_to_float64(camera) for camera in _sample_evenly(cameras, MOST_CAMERAS)]
-    some_points = points[_even_indices(len(points), MOST_POINTS)].double()
+    some_cameras = [_to_float64(camera) for camera in sample_evenly(cameras, MOST_CAMERAS)]
+    some_points = points[sample_evenly(range(len(points)), MOST_POINTS)].double()
     return AxesEvidence(
         _share_of_points(some_cameras, some_points),
         _share_of_points([flip_axes(camera) for camera in some_cameras], some_points),
@@ -90,7 +89,7 @@ def evidence_of_masks(views: Sequence[View]) -> AxesEvidence | None:
     None if the views are inconclusive: no pane is visible in three of them, or the rays are parallel. At most 24 views
     are read.
     """
-    annotated = _sample_evenly([view for view in views if view.is_annotated], MOST_MASKS)
+    annotated = sample_evenly([view for view in views if view.is_annotated], MOST_MASKS)
     shares = [
         (len(sightings), _share_of_masks(sightings), _share_of_masks([_flip_sighting(s) for s in sightings]))
         for sightings in _sightings(annotated).values()
@@ -115,15 +114,6 @@ def flip_axes(camera: Camera) -> Camera:
 
 def _to_float64(camera: Camera) -> Camera:
     return replace(camera, cam_from_world=camera.cam_from_world.double())
-
-
-def _even_indices(count: int, most: int) -> Tensor:
-    """Up to `most` evenly spread indices below `count`."""
-    return torch.linspace(0, count - 1, min(count, most), dtype=torch.float32).round().long()
-
-
-def _sample_evenly(items: Sequence[Item], most: int) -> list[Item]:
-    return [items[int(index)] for index in _even_indices(len(items), most)]
 
 
 def _share_of_points(cameras: Sequence[Camera], points: Tensor) -> float:

@@ -33,6 +33,8 @@ def test_points_tell_which_way_the_cameras_look(capture) -> None:
     assert (right.as_read, right.flipped) == (1.0, 0.0)
     assert (wrong.as_read, wrong.flipped) == (0.0, 1.0)
     assert wrong.contradicts and not right.contradicts
+    many = points[:1].expand(2**24 + 4, 3)  # The last index is not a float32.
+    assert evidence_of_points(cameras[:1], many) == evidence_of_points(cameras[:1], points[:1])
 
 
 def test_masks_tell_it_too(capture) -> None:
