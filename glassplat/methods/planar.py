@@ -306,9 +306,10 @@ class LightLamps(AtShares):
 
 @dataclass(frozen=True)
 class FillUnseen(AtShares):
-    """Adds Gaussians for reflections of objects that no photograph shows directly and the scene lacks."""
+    """Adds Gaussians, up to a cap if any, for reflections of objects that no photograph shows and the scene lacks."""
 
     shares: tuple[float, ...] = FILL_UNSEEN_AT
+    cap: int | None = None
     name: str = "fill unseen"
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
@@ -318,7 +319,7 @@ class FillUnseen(AtShares):
         for done, panes in enumerate(glass_panes):
             yield Working(f"searching for what {name_panes(panes, 'pane')} can reflect", done, len(glass_panes))
             positions, color, cell = material.unseen_positions(state.scene, panes, cameras)
-            if 0 < len(positions) < actions.MOST_ADDED_SHARE * len(state.scene.primary):
+            if actions.may_add(len(positions), state.scene.primary, self.cap):
                 colors = (255 * color).round().to(torch.uint8).expand(len(positions), 3)
                 cloud = PointCloud(positions.cpu(), colors.cpu())
                 seeds = actions.make_seeds(state.scene.primary, cloud, opacity=0.7, size=0.7 * cell)
@@ -497,7 +498,7 @@ def _joint_stage(recipe: PlanarRecipe, share: float) -> Stage:
             actions.Densify(recipe.densify, part="glass"),
             *strategy.resets,
             *_mcmc_resets(recipe),
-            *((FillUnseen(),) if recipe.seed_reflections else ()),
+            *((FillUnseen(cap=strategy.cap),) if recipe.seed_reflections else ()),
             actions.PerturbOpacity(perturb_at, recipe.perturbation.amplitude, recipe.perturbation.bounds),
         ),
         post_steps=(*_glass_post_steps(recipe), *strategy.post_steps),
@@ -539,7 +540,8 @@ for: early, but with known panes, behind which nothing is added."""
 
 def _seed_actions(recipe: PlanarRecipe, share: float) -> tuple[actions.SeedUnexplained, ...]:
     """The search for missing objects, if enabled."""
-    return (actions.SeedUnexplained((share,), planar_renderer(recipe)),) if recipe.seed_unexplained else ()
+    seed = actions.SeedUnexplained((share,), planar_renderer(recipe), strategy_of(recipe).cap)
+    return (seed,) if recipe.seed_unexplained else ()
 
 
 MCMC_RESET_AFTER = 0.02

@@ -70,7 +70,8 @@ SEED_AT = (0.105, 0.203)
 def _seed_actions(recipe: SplatRecipe) -> tuple[SeedUnexplained, ...]:
     """The search for missing objects, if enabled."""
     wanted = recipe.seed_unexplained and recipe.primitive == "ellipsoid" and recipe.strategy == "default"
-    return tuple(SeedUnexplained((share,), _training_renderer(recipe)) for share in SEED_AT if wanted)
+    cap = recipe.densify.cap
+    return tuple(SeedUnexplained((share,), _training_renderer(recipe), cap) for share in SEED_AT if wanted)
 
 
 def strategy_of(recipe: MethodRecipe) -> DensificationStrategy:

@@ -409,20 +409,28 @@ class SeedUnexplained(AtShares):
 
     Attributes:
         renderer: renders the scene as in the photographs.
+        cap: maximum number of Gaussians, beyond which none are added; None for no limit.
     """
 
     renderer: Renderer
+    cap: int | None = None
     name: str = "seed unexplained"
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
         """Edits `state` if necessary, and yields its progress."""
         cloud, size = yield from unexplained_positions(state.scene, dataset.train, self.renderer)
         primary = state.scene.primary
-        if not 0 < len(cloud) < MOST_ADDED_SHARE * len(primary):
+        if not may_add(len(cloud), primary, self.cap):
             return False
         add_primary_gaussians(state, make_seeds(primary, cloud, opacity=0.5, size=size))
         log.info("Gaussians added where photographs agree on a missing object: %d", len(cloud))
         return True
+
+
+def may_add(count: int, primary: Gaussians, cap: int | None) -> bool:
+    """Return whether to add a number of Gaussians: some, few for a scene that is learned, and within the cap if any."""
+    total = len(primary) + count
+    return 0 < count < MOST_ADDED_SHARE * len(primary) and (cap is None or total <= cap)
 
 
 def make_seeds(primary: Gaussians, points: PointCloud, *, opacity: float = 0.1, size: float | None = None) -> Gaussians:

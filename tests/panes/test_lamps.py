@@ -184,6 +184,8 @@ def test_what_a_pane_mirrors_unseen_is_filled_once() -> None:
     scene = scene_of(wall(4.0), wall(-3.0, 120).select(wall(-3.0).means[:, 0] < 1))
     state, action = state_of(scene), FillUnseen((0.5,))
     state.statistics["primary"] = ScreenStatistics(*torch.ones(3, 2, len(scene.primary)))
+    full = replace(action, cap=len(scene.primary))
+    assert not finished(full.apply(state, capture_of(scene), Clock(50, 100, 5)))
     assert finished(action.apply(state, capture_of(scene), Clock(50, 100, 5)))
     added = len(state.scene.primary) - len(scene.primary)
     for sums in state.statistics["primary"].sums:

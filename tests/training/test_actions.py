@@ -211,7 +211,9 @@ def test_a_thing_without_points_is_found_where_the_photographs_of_it_meet() -> N
     state, capture = TrainState(Scene(ground, 2.0), seed=0), views_of(whole)
     means = torch.ones_like(ground.means)
     state.optimizer.moments["primary.means"] = (means, means.clone())
-    action = SeedUnexplained((0.2,), Splat())
+    full = SeedUnexplained((0.2,), Splat(), cap=len(ground) + 5)
+    assert not finished(full.apply(state, capture, Clock(20, 100, 10))) and len(state.scene.primary) == len(ground)
+    action = SeedUnexplained((0.2,), Splat(), cap=2 * len(ground))
     assert action.due(Clock(20, 100, 10)) and not action.due(Clock(21, 100, 10))
     assert finished(action.apply(state, capture, Clock(20, 100, 10)))
     added = state.scene.primary.means[len(ground) :]
