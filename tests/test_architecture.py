@@ -228,7 +228,7 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
     TopologicalSorter(import_graph(package_sources())).prepare()  # Raises CycleError, which names the cycle.
 
 
-def test_no_small_file_serves_a_single_other() -> None:
+def test_no_small_file_has_a_single_importer() -> None:
     found = lonely_files(package_sources())
     assert not found, "\n" + "\n".join(found)
 
@@ -339,6 +339,6 @@ def test_a_long_file_is_found() -> None:
 
 
 @pytest.mark.parametrize("path", ["glassplat/render/utils.py", "tests/helpers/x.py", "tools/Common.py"])
-def test_a_name_that_says_nothing_is_found(path: str) -> None:
+def test_meaningless_file_names_are_found(path: str) -> None:
     (message,) = violations(Path(path), "", SMALL_ROWS)
     assert re.search(r"`(utils|helpers|Common)` says nothing", message)

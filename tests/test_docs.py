@@ -47,7 +47,7 @@ def test_the_readme_fits_on_one_screen() -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_lead_to_files_that_exist(page: Path) -> None:
+def test_links_point_to_existing_files(page: Path) -> None:
     targets = LINK.findall(page.read_text())
     absolute = [REPOSITORY.sub("", target) for target in targets if REPOSITORY.match(target)]
     relative = [target for target in targets if "://" not in target]
@@ -81,7 +81,7 @@ def test_make_has_every_target_shown(arguments: list[str]) -> None:
 PYTHON_BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
 
 
-def test_the_term_of_a_recipe_of_ones_own_leaves_out_stages_without_depths() -> None:
+def test_the_loss_term_of_a_custom_recipe_skips_stages_without_depths() -> None:
     blocks = PYTHON_BLOCK.findall((ROOT / "docs" / "python.md").read_text(encoding="utf-8"))
     (block,) = [block for block in blocks if "LossTerm" in block]
     names = {"glassplat": glassplat, "dataclasses": dataclasses}
@@ -97,7 +97,7 @@ def test_the_term_of_a_recipe_of_ones_own_leaves_out_stages_without_depths() -> 
 @pytest.mark.parametrize(
     ("recipe", "layer"), [("SplatRecipe", "depth"), ("DeferredRecipe", "depth"), ("SplatRecipe", "normal")]
 )
-def test_the_term_of_a_recipe_of_ones_own_counts_in_every_step(recipe: str, layer: str) -> None:
+def test_the_loss_term_of_a_custom_recipe_counts_in_every_step(recipe: str, layer: str) -> None:
     blocks = PYTHON_BLOCK.findall((ROOT / "docs" / "python.md").read_text(encoding="utf-8"))
     (block,) = [block for block in blocks if "LossTerm" in block]
     names = {"glassplat": glassplat, "dataclasses": dataclasses}

@@ -62,7 +62,7 @@ def test_panes_are_edited(place: Path) -> None:
     assert "2 panes" in said and (place / "edited" / "page.html").is_file() and (place / "edited" / "run").is_dir()
 
 
-def test_gradients_lead_back(place: Path) -> None:
+def test_the_gradient_example_lowers_its_loss(place: Path) -> None:
     said = said_by("4_gradients.py", "runs/place", "--downscale", "12", "--steps", "21", folder=place)
     losses = [float(number) for number in re.findall(r"loss (0\.\d+)", said)]
     assert losses[-1] < losses[0]
@@ -116,7 +116,7 @@ def slope(pretrain):
 """
 
 
-def test_a_network_that_cannot_be_fetched_is_one_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unavailable_network_ends_with_one_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*place: str, **options: object) -> None:
         raise RuntimeError("It looks like there is no internet connection")
 
@@ -127,7 +127,7 @@ def test_a_network_that_cannot_be_fetched_is_one_message(tmp_path: Path, monkeyp
         said_by("5_estimated_normals.py", "--data", str(DEMO), folder=tmp_path)
 
 
-def test_estimated_normals_lie_where_they_are_read(tmp_path: Path) -> None:
+def test_estimated_normals_are_written_where_they_are_read(tmp_path: Path) -> None:
     capture, hub = shutil.copytree(DEMO, tmp_path / "capture"), tmp_path / "hub"
     hub.mkdir()
     (hub / "hubconf.py").write_text(HUB)

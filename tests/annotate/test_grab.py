@@ -29,7 +29,7 @@ def covered(pieces: list[np.ndarray]) -> np.ndarray:
     return np.any(masks, axis=0)
 
 
-def test_the_thing_is_found_within_a_rough_outline() -> None:
+def test_the_object_is_found_within_a_rough_outline() -> None:
     photo, disc = hedge_before_a_wall()
     pieces = grab_outlines(photo, ROUGH)
     wrong = covered(pieces) != disc
@@ -37,14 +37,14 @@ def test_the_thing_is_found_within_a_rough_outline() -> None:
     np.testing.assert_array_equal(pieces[0], grab_outlines(photo, ROUGH)[0])
 
 
-def test_large_photographs_are_looked_at_smaller() -> None:
+def test_large_photographs_are_shown_reduced() -> None:
     photo, disc = hedge_before_a_wall()
     large = np.kron(photo, np.ones((6, 6, 1), dtype=np.uint8))
     pieces = [piece / 6 for piece in grab_outlines(large, 6 * ROUGH)]
     assert (covered(pieces) != disc).sum() < 0.05 * disc.sum()
 
 
-def test_where_nothing_stands_out_the_outline_stays() -> None:
+def test_an_outline_without_contrast_is_unchanged() -> None:
     photo = np.full((HEIGHT, WIDTH, 3), 120, dtype=np.uint8)
     everywhere = covered(grab_outlines(photo, ROUGH))
     assert (everywhere & ~fill_polygon(ROUGH, (WIDTH, HEIGHT))).sum() == 0 and everywhere.any()
@@ -57,13 +57,13 @@ def test_an_outline_that_leaves_the_photograph_is_cut_there() -> None:
     assert (found[:, 91:] != disc[:, 91:]).sum() < 0.05 * disc.sum()
 
 
-def test_an_outline_beside_the_photograph_is_refused() -> None:
+def test_an_outline_outside_the_photograph_is_refused() -> None:
     photo, _ = hedge_before_a_wall()
     with pytest.raises(InputError, match="lies outside the photograph"):
         grab_outlines(photo, ROUGH + np.array([1000, 0]))
 
 
-def test_without_opencv_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_opencv_is_reported_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> None:
         raise ImportError(name)
 

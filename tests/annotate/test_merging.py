@@ -49,7 +49,7 @@ def test_more_panes_than_fit_are_refused() -> None:
 
 
 @pytest.mark.parametrize("has_folder_locks", [True, False])
-def test_two_programs_that_save_at_the_same_moment_drop_nothing(
+def test_concurrent_saves_of_two_programs_lose_nothing(
     room: Path, monkeypatch: pytest.MonkeyPatch, *, has_folder_locks: bool
 ) -> None:
     if not has_folder_locks:

@@ -103,7 +103,7 @@ def test_a_pane_is_marked_cut_and_written(page: Page) -> None:
     )
 
 
-def test_what_stands_before_the_pane_is_found_within_a_rough_outline(room: Path) -> None:
+def test_occluders_are_found_within_a_rough_outline(room: Path) -> None:
     picture = room / "images" / NAMES[0]
     pixels = read_image(picture).copy()
     x, y = true_corners(0).mean(axis=0).astype(int)
@@ -152,7 +152,7 @@ def test_corners_are_dragged_undone_and_survive_a_reload(page: Page) -> None:
     assert page.document()["corners"][2]["0.png"] == dragged
 
 
-def test_a_corner_that_only_the_fit_knows_can_be_dragged(page: Page) -> None:
+def test_a_fitted_corner_without_a_mark_can_be_dragged(page: Page) -> None:
     page.mark_true(0)
     page.mark_true(1)
     page.show(2)
@@ -200,7 +200,7 @@ def test_shift_and_tab_lead_to_the_buttons(page: Page) -> None:
     assert page.window.run("return document.activeElement.tagName") == "BUTTON"
 
 
-def test_a_narrow_window_has_room_for_the_photograph(room: Path) -> None:
+def test_the_photograph_fits_a_narrow_window(room: Path) -> None:
     with marking_page(room, width=390, height=844) as opened:
         page = Page(opened.window, opened.server)
         page.mark_true(0)
@@ -240,7 +240,7 @@ def test_the_mark_under_the_pointer_is_removed_after_a_drag(page: Page) -> None:
     assert [len(places) for places in page.document()["corners"]] == [0, 1, 1, 1]
 
 
-def test_a_touch_that_the_browser_takes_over_lets_go(page: Page) -> None:
+def test_a_cancelled_touch_ends_the_drag(page: Page) -> None:
     page.mark_true(0)
     before = page.document()["corners"]
     page.window.run(
@@ -254,7 +254,7 @@ def test_a_touch_that_the_browser_takes_over_lets_go(page: Page) -> None:
     assert page.document()["corners"] == before
 
 
-def test_a_corner_too_many_of_a_polygon_can_be_removed(page: Page) -> None:
+def test_a_surplus_polygon_corner_can_be_removed(page: Page) -> None:
     page.window.run(
         "const shape = document.querySelector('select[title=shape]');"
         "shape.value = 'polygon'; shape.dispatchEvent(new Event('change'));"
@@ -267,7 +267,7 @@ def test_a_corner_too_many_of_a_polygon_can_be_removed(page: Page) -> None:
     assert "pixels; the plane is uncertain by" in page.said()
 
 
-def test_undo_gives_up_a_line_before_it_takes_back_marks(page: Page) -> None:
+def test_undo_cancels_an_unfinished_line_before_it_undoes_marks(page: Page) -> None:
     page.mark_true(0)
     page.window.keys("3")
     for place in page.on_screen(true_corners(0)[:3]):
@@ -286,7 +286,7 @@ def test_undo_gives_up_a_line_before_it_takes_back_marks(page: Page) -> None:
 
 
 @pytest.mark.parametrize("switch", ["Tab", "Control+z", "remove"])
-def test_a_line_does_not_go_over_to_another_pane(switch: str, page: Page) -> None:
+def test_an_unfinished_line_is_dropped_when_the_pane_changes(switch: str, page: Page) -> None:
     """However the pane changes; a line removed by undo cannot be continued either."""
     page.mark_true(0)
     page.window.keys("a")
@@ -329,7 +329,7 @@ def test_a_zoomed_photograph_stays_where_it_is_while_the_header_grows(page: Page
     assert page.document()["corners"][1]["0.png"] == pytest.approx([20, 20], abs=1)
 
 
-def test_space_is_let_go_when_the_window_loses_focus(page: Page) -> None:
+def test_the_space_key_is_released_when_the_window_loses_focus(page: Page) -> None:
     page.show(0)
     page.window.run("document.body.dispatchEvent(new KeyboardEvent('keydown', { key: ' ', bubbles: true }))")
     page.window.run("window.dispatchEvent(new Event('blur'))")
@@ -349,7 +349,7 @@ def test_space_presses_a_button_that_has_focus(page: Page) -> None:
     assert page.window.run(chosen) == "corner"
 
 
-def test_edges_do_where_no_corner_shows(page: Page) -> None:
+def test_edges_suffice_where_no_corner_is_visible(page: Page) -> None:
     for view in (0, 1, 2):
         corners = true_corners(view)
         ends = [(corners[k], corners[(k + 1) % 4]) for k in range(4)]
@@ -358,7 +358,7 @@ def test_edges_do_where_no_corner_shows(page: Page) -> None:
     assert is_blue(page.color_at(tuple(true_corners(3).mean(axis=0))))
 
 
-def test_what_changes_while_it_is_saved_is_not_said_to_be_saved(page: Page) -> None:
+def test_changes_during_saving_are_not_reported_as_saved(page: Page) -> None:
     page.mark_true(0)
     page.window.run(
         "const asked = window.fetch; window.fetch = async (...request) => {"
@@ -381,7 +381,7 @@ ENDED = "Promise.reject(new TypeError('Failed to fetch'))"
 
 
 @pytest.mark.parametrize(("answer", "text"), [(REFUSED, "the disk is full"), (ENDED, "the command has ended")])
-def test_what_the_server_refuses_is_not_said_to_be_saved(answer: str, text: str, page: Page) -> None:
+def test_refused_changes_are_not_reported_as_saved(answer: str, text: str, page: Page) -> None:
     page.mark_true(0)
     page.window.run(f"window.asked = window.fetch; window.fetch = async () => {answer}")
     page.window.press("#undo")
@@ -397,7 +397,7 @@ def test_what_the_server_refuses_is_not_said_to_be_saved(answer: str, text: str,
     assert [len(places) for places in page.document()["corners"]] == [1, 1, 1, 0]
 
 
-def test_what_is_not_to_be_seen_is_skipped(page: Page) -> None:
+def test_hidden_corners_are_skipped(page: Page) -> None:
     for view, hidden in ((0, 1), (1, 3), (2, 0)):
         corners: list = list(true_corners(view))
         corners[hidden] = None
@@ -430,7 +430,7 @@ def test_done_ends_the_command(page: Page) -> None:
     assert page.window.run(f"{text} return text.getBoundingClientRect().height") < 30  # One line.
 
 
-def test_what_another_tab_marks_is_kept_beside_what_is_marked_here(page: Page) -> None:
+def test_marks_of_two_tabs_are_merged(page: Page) -> None:
     page.mark_true(0)
     saved(page.server.session, marked_document(material="mirror"))
     page.show(1)

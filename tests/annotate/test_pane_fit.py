@@ -55,7 +55,7 @@ def test_exact_marks_give_the_pane(pane: Pane, shape: str) -> None:
 
 
 @pytest.mark.parametrize("count", [2, 3])
-def test_the_error_of_the_plane_is_as_large_as_the_doubt_says(count: int) -> None:
+def test_the_error_of_the_plane_matches_its_uncertainty(count: int) -> None:
     cameras = cameras_on(FRONT, EYES[:count])
     fits = [fit_pane(corner_marks(FRONT, cameras, noise=0.37, seed=seed), cameras, "rectangle") for seed in range(30)]
     errors = np.array([normal_off(fit.shape.axes, FRONT) for fit in fits])
@@ -63,7 +63,7 @@ def test_the_error_of_the_plane_is_as_large_as_the_doubt_says(count: int) -> Non
     assert 0.3 * uncertainty < np.sqrt((errors**2).mean()) < 2 * uncertainty
 
 
-def test_another_view_lowers_the_doubt_as_foretold() -> None:
+def test_marking_the_suggested_view_lowers_the_uncertainty_as_predicted() -> None:
     cameras = cameras_on(FRONT)
     two = fit_pane(corner_marks(FRONT, cameras[:2], noise=0.2), cameras[:2], "rectangle")
     three = fit_pane(corner_marks(FRONT, cameras, noise=0.2), cameras, "rectangle")
@@ -90,7 +90,7 @@ def test_one_wrong_mark_moves_the_plane_little(shape: str) -> None:
     assert max(fit.errors, key=fit.errors.__getitem__) == 2
 
 
-def test_a_corner_that_one_view_shows_is_enough_beside_three_others() -> None:
+def test_a_fourth_corner_may_be_marked_in_one_view_only() -> None:
     cameras = cameras_on(FRONT)
     marks = corner_marks(FRONT, cameras)
     kept = {1: marks.corners[3][1]}
@@ -126,7 +126,7 @@ def test_two_edges_give_the_plane_and_as_much_of_the_pane_as_was_marked() -> Non
     assert sizes[0] == pytest.approx(1.6, rel=0.02)
 
 
-def test_where_a_long_front_ends_may_be_marked_in_one_photograph_only() -> None:
+def test_the_ends_of_a_long_front_may_be_marked_in_one_photograph_only() -> None:
     """As on a walk along a facade: only one photograph shows its near end."""
     front = Pane(np.array([0.0, 0, 0]), np.array([0.0, 0, 1.0]), np.array([1.0, 0, 0]), (7.0, 1.7))
     walk = {-1.5: -5.5, -2.5: -6.5, -4.0: -7.0, 1.5: -4.0, 5.5: 2.5}
@@ -154,7 +154,7 @@ def test_where_a_long_front_ends_may_be_marked_in_one_photograph_only() -> None:
     np.testing.assert_allclose(fit.shape.corners(), corners, atol=0.5)
 
 
-def test_a_corner_in_one_photograph_says_how_far_a_pane_goes() -> None:
+def test_a_corner_marked_in_one_photograph_bounds_the_pane() -> None:
     """Three sides are marked in every photograph, the fourth by a corner in one of them, far from the first guess."""
     wide = replace(FRONT, half_sizes=(2.5, 0.8))
     cameras, corners = cameras_on(wide), wide.at(U, V)
@@ -174,7 +174,7 @@ def test_a_corner_in_one_photograph_says_how_far_a_pane_goes() -> None:
 
 
 @pytest.mark.parametrize("elsewhere", [0, 1, 3])
-def test_a_corner_marked_at_another_one_is_fitted_badly_and_not_refused(elsewhere: int) -> None:
+def test_a_swapped_corner_gives_a_poor_fit_without_an_error(elsewhere: int) -> None:
     cameras = cameras_on(FRONT)
     places = list(corner_marks(FRONT, cameras).corners)
     places[2] = {0: places[elsewhere][0]}
@@ -198,7 +198,7 @@ def test_edges_of_five_corners_are_fitted_too() -> None:
         ({0: 4, 1: 2}, "2 corners are known from two positions, expected at least 3"),
     ],
 )
-def test_too_few_marks_say_what_is_missing(kept: dict[int, int], expected: str) -> None:
+def test_too_few_marks_are_refused_with_what_is_missing(kept: dict[int, int], expected: str) -> None:
     cameras = cameras_on(FRONT)
     marks = corner_marks(FRONT, cameras)
     some = Marks(

@@ -64,7 +64,7 @@ def test_the_material_is_kept(material: str, room: Path) -> None:
     assert planes is not None and planes.mirrors == ((1,) if material == "mirror" else ())
 
 
-def test_what_stands_before_the_pane_is_cut_out(room: Path) -> None:
+def test_occluders_are_cut_out(room: Path) -> None:
     left = [[0, 0], [150, 0], [150, 220], [0, 220]]
     stroke = {"kind": "polygon", "effect": "cut", "radius": 1, "points": left}
     finish(room, marked_document(strokes={"0.png": [stroke], "3.png": [stroke]}))
@@ -91,7 +91,7 @@ def test_a_record_that_names_other_files_removes_none(room: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["panes", "panes/sub", "panes/0.png", "annotations.json", "planes.json"])
-def test_a_link_out_of_a_capture_replaces_and_removes_nothing(name: str, room: Path, tmp_path: Path) -> None:
+def test_links_out_of_a_capture_are_not_followed(name: str, room: Path, tmp_path: Path) -> None:
     finish(room, marked_document())
     is_folder, elsewhere = not Path(name).suffix, tmp_path / "elsewhere"
     if (room / name).exists():
@@ -157,7 +157,7 @@ def test_an_interrupt_at_any_file_loses_nothing(written: int, room: Path, monkey
         open_session(room)
 
 
-def test_masks_of_the_format_or_in_another_folder_were_not_made_here(room: Path) -> None:
+def test_masks_not_made_by_annotate_are_refused(room: Path) -> None:
     (room / "masks").mkdir()
     Image.new("L", (300, 220), 1).save(room / "masks" / "0.png")
     with pytest.raises(InputError, match="marked by masks that were not made by `glassplat annotate`"):
@@ -183,7 +183,7 @@ def test_the_last_pane_can_be_unmarked(unmarked: dict, tmp_path: Path) -> None:
         finish(root, unmarked)
 
 
-def test_unmarking_removes_nothing_that_was_not_written_here(room: Path) -> None:
+def test_unmarking_removes_only_own_files(room: Path) -> None:
     nothing = {"version": 1, "panes": []}
     finish(room, marked_document())
     with pytest.raises(InputError, match="no pane is known yet"):
@@ -203,7 +203,7 @@ def test_unmarking_removes_nothing_that_was_not_written_here(room: Path) -> None
 
 
 @pytest.mark.parametrize("changed", ["before", "since"])
-def test_planes_that_somebody_else_wrote_are_not_replaced(changed: str, room: Path) -> None:
+def test_planes_of_other_programs_are_not_replaced(changed: str, room: Path) -> None:
     if changed == "since":
         finish(room, marked_document())
         assert finish(room, marked_document()), "what was made here is"
@@ -216,14 +216,14 @@ def test_planes_that_somebody_else_wrote_are_not_replaced(changed: str, room: Pa
     assert finish(room, marked_document())["masks"] == NAMES[:3]
 
 
-def test_a_record_of_earlier_versions_tells_of_masks_only(room: Path) -> None:
+def test_a_record_of_an_earlier_version_lists_masks_only(room: Path) -> None:
     finish(room, marked_document())
     (room / "panes" / "annotated.json").write_text(json.dumps(NAMES[:3]))
     assert "planes.json stays" in finish(room, {"version": 1, "panes": []})["told"]
     assert not (room / "panes").exists() and (room / "planes.json").exists()
 
 
-def test_what_another_program_has_saved_is_what_is_written(room: Path) -> None:
+def test_marks_saved_by_another_program_are_written(room: Path) -> None:
     session = open_session(room)
     saved(session, marked_document())
     (room / "annotations.json").write_text(json.dumps(marked_document((0, 1, 2, 3))))
@@ -279,7 +279,7 @@ def test_an_outline_that_passes_the_camera_keeps_its_edges_straight() -> None:
     assert 0.1 < truth.mean() < 0.9 and (mask != truth).mean() < 1e-3
 
 
-def test_put_back_restores_no_more_than_there_was() -> None:
+def test_the_restore_brush_stays_within_the_pane() -> None:
     mask = np.zeros((40, 40), dtype=bool)
     mask[10:30, 10:30] = True
     (pane,) = parse_document(
@@ -298,7 +298,7 @@ def test_put_back_restores_no_more_than_there_was() -> None:
 
 
 @pytest.mark.parametrize("way", [1, -1])
-def test_a_cut_that_crosses_itself_is_cut_whole(way: int) -> None:
+def test_a_self_intersecting_cut_is_filled_completely(way: int) -> None:
     """As the page shows it: the centre of a pentagram is inside, and so is an area enclosed by two loops."""
     angles = way * 2 * 2 * np.pi / 5 * np.arange(5)
     star = 50 + 40 * np.stack([np.sin(angles), -np.cos(angles)], axis=1)
@@ -316,7 +316,7 @@ def test_an_edge_of_a_polygon_costs_its_rows_and_not_their_pixels() -> None:
     assert most < 5 * 900 * 600, "two bytes a pixel for the turns and one for the mask"
 
 
-def test_masks_of_bent_photographs_are_bent_too(room: Path) -> None:
+def test_masks_are_undistorted_with_their_photographs(room: Path) -> None:
     transforms = json.loads((room / "transforms.json").read_text()) | {"k1": -0.2, "k2": 0.02, "p1": 0.0, "p2": 0.0}
     (room / "transforms.json").write_text(json.dumps(transforms))
     view = load_dataset(room).train[0]
@@ -336,7 +336,7 @@ def test_the_command_needs_a_capture(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "is not a readable capture" in " ".join(capsys.readouterr().err.split())
 
 
-def test_photographs_without_poses_are_told_what_makes_a_capture_of_them(
+def test_info_suggests_prepare_for_photographs_without_poses(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "photographs"
@@ -352,7 +352,7 @@ def test_a_damaged_document_is_named(room: Path) -> None:
         open_session(room)
 
 
-def test_the_wrong_order_of_corners_is_called_into_question(room: Path) -> None:
+def test_a_wrong_order_of_corners_gets_a_warning(room: Path) -> None:
     session = open_session(room)
     document = marked_document()
     _, second, _, fourth = document["panes"][0]["corners"]
@@ -361,7 +361,7 @@ def test_the_wrong_order_of_corners_is_called_into_question(room: Path) -> None:
     assert "do not form a rectangle" in answer["message"] or "pixels off" in answer["message"]
 
 
-def test_the_suggested_photograph_lowers_the_doubt(room: Path) -> None:
+def test_the_suggested_photograph_lowers_the_uncertainty(room: Path) -> None:
     session = open_session(room)
     two = saved(session, marked_document((0, 2)))["panes"][0]
     best = two["next"][0]
@@ -391,7 +391,7 @@ CROSSED = ((0, 0), (1, 2), (2, 1), (3, 3))
 
 
 @pytest.mark.parametrize("shape", ["rectangle", "polygon"])
-def test_sides_that_cross_are_told_of(shape: str, room: Path) -> None:
+def test_crossing_sides_are_reported(shape: str, room: Path) -> None:
     document = marked_document(shape=shape)
     session, corners = open_session(room), document["panes"][0]["corners"]
     assert saved(session, document)["panes"][0]["message"] == ""

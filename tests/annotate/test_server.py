@@ -78,7 +78,7 @@ ODD_COOKIES = (
 
 
 @pytest.mark.parametrize("odd", ODD_COOKIES)
-def test_cookies_of_other_programs_do_not_lock_out(odd: str, server: AnnotationServer) -> None:
+def test_cookies_of_other_programs_do_not_block_access(odd: str, server: AnnotationServer) -> None:
     name = cookie_name(f"127.0.0.1:{server.server_address[1]}")
     for value, status in ((server.access.key, 200), ("guessed", 403)):
         ours = f"{name}={value}"
@@ -87,7 +87,7 @@ def test_cookies_of_other_programs_do_not_lock_out(odd: str, server: AnnotationS
 
 
 @pytest.mark.parametrize("path", ["/", "/page.js", "/capture", "/photo/0", "/thumbnail/0", "/nothing"])
-def test_without_the_key_there_is_nothing(path: str, server: AnnotationServer) -> None:
+def test_requests_without_the_key_get_nothing(path: str, server: AnnotationServer) -> None:
     for key in ("", "guessed"):
         assert ask(server, path, key=key)[0] == 403
     assert ask(server, "/document", {}, key="guessed")[0] == 403
@@ -109,7 +109,7 @@ def test_an_outline_that_makes_no_sense_is_refused(outline: dict, server: Annota
 
 
 @pytest.mark.parametrize("path", ["/photo/0", "/thumbnail/0"])
-def test_no_browser_keeps_a_photograph(path: str, server: AnnotationServer) -> None:
+def test_photographs_are_not_cached_by_browsers(path: str, server: AnnotationServer) -> None:
     """The next capture is served at the same address, and its photographs are numbered in the same way."""
     host = f"127.0.0.1:{server.server_address[1]}"
     request = urllib.request.Request(
@@ -128,7 +128,7 @@ def test_another_name_for_this_computer_is_refused(server: AnnotationServer) -> 
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "", "http://127.0.0.1:1"])
-def test_what_other_sites_send_is_refused(origin: str, server: AnnotationServer) -> None:
+def test_requests_of_other_sites_are_refused(origin: str, server: AnnotationServer) -> None:
     for path in ("/document", "/results", "/close"):
         assert ask(server, path, marked_document(), Origin=origin)[0] == 403
     assert not server.is_finished
@@ -137,7 +137,7 @@ def test_what_other_sites_send_is_refused(origin: str, server: AnnotationServer)
 @pytest.mark.parametrize(
     "path", ["/photo/99", "/photo/-1", "/photo/..%2f..%2fetc%2fpasswd", "/photo/../annotations.json", "/etc/passwd"]
 )
-def test_no_path_leads_to_a_file(path: str, server: AnnotationServer) -> None:
+def test_the_server_serves_no_files_from_disk(path: str, server: AnnotationServer) -> None:
     assert ask(server, path)[0] == 404
 
 
@@ -147,7 +147,7 @@ def test_photographs_are_jpegs(server: AnnotationServer) -> None:
         assert status == 200 and body.startswith(b"\xff\xd8")
 
 
-def test_a_document_is_saved_and_answered(server: AnnotationServer) -> None:
+def test_saving_a_document_returns_the_fits(server: AnnotationServer) -> None:
     status, body = save(server, marked_document())
     answer = body["panes"][0]
     assert status == 200 and answer["solved"] and answer["error"] < 0.1
@@ -185,7 +185,7 @@ def too_many_corners() -> dict:
         ({"version": 1, "panes": marked_document()["panes"] * 2}, 400),
     ],
 )
-def test_nonsense_changes_nothing(body: Any, status: int, server: AnnotationServer) -> None:
+def test_invalid_messages_change_nothing(body: Any, status: int, server: AnnotationServer) -> None:
     save(server, marked_document())
     if isinstance(body, bytes):
         found, answer = ask(server, "/document", body)
@@ -223,7 +223,7 @@ def test_the_save_of_a_second_tab_drops_nothing_of_the_first(server: AnnotationS
     assert on_disk(server) == answer["document"]
 
 
-def test_what_another_program_has_marked_counts_too(server: AnnotationServer) -> None:
+def test_marks_of_another_program_are_included(server: AnnotationServer) -> None:
     _, answer = save(server, panes(1))
     (server.session.root / "annotations.json").write_text(json.dumps(panes(1, 2)))
     status, refused = save(server, panes(1, 3), answer["version"])
@@ -236,20 +236,20 @@ def test_a_body_that_is_too_long_is_not_read(server: AnnotationServer) -> None:
         assert ask(server, "/document", b"{}", **{"Content-Length": length})[0] == 413
 
 
-def test_nothing_comes_from_elsewhere(server: AnnotationServer) -> None:
+def test_the_page_loads_nothing_external(server: AnnotationServer) -> None:
     """No part of the page contains an address, and the browser is forbidden to load any."""
     for path in ("/", "/page.js", "/drawing.js", "/marking.js", "/style.css"):
         status, body = ask(server, path)
         assert status == 200 and b"http:" not in body and b"https:" not in body
 
 
-def test_done_ends_it(room: Path) -> None:
+def test_done_ends_the_server(room: Path) -> None:
     with serving(room) as server:
         assert ask(server, "/close", {})[0] == 200
         assert server.is_finished
 
 
-def test_a_port_in_use_says_what_to_do(room: Path) -> None:
+def test_a_port_in_use_is_refused_with_advice(room: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

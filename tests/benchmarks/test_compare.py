@@ -76,7 +76,7 @@ def test_runs_are_trained_and_evaluated_once_and_failures_stop_no_other(
         main([*arguments, "--iterations", "9"])
 
 
-def test_processes_that_share_an_output_do_nothing_twice_and_take_up_what_a_dead_one_leaves(
+def test_processes_share_the_work_in_an_output_and_resume_that_of_dead_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("a", "b", "c", "d"):
@@ -110,7 +110,7 @@ def test_processes_that_share_an_output_do_nothing_twice_and_take_up_what_a_dead
     assert main(arguments) == 0 and len(begun) == 6
 
 
-def test_a_run_whose_folder_cannot_be_written_stops_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unwritable_run_folder_does_not_stop_other_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
     scenes = [str(tmp_path / name) for name in ("a", "b")]
@@ -128,7 +128,7 @@ def test_a_run_whose_folder_cannot_be_written_stops_no_other(tmp_path: Path, mon
     assert runs[0].claimed() is not None and runs[1].results() == {"psnr": 1.0}
 
 
-def test_a_failure_elsewhere_is_told_and_not_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failure_on_another_rank_is_reported_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "room").mkdir()
     (run,) = planned_runs(parsed([str(tmp_path / "room"), "--methods", "splat", "--output", str(tmp_path / "runs")]))
     run.directory.mkdir(parents=True)
@@ -139,7 +139,7 @@ def test_a_failure_elsewhere_is_told_and_not_repeated(tmp_path: Path, monkeypatc
     assert run.failed_since(time.time() + 120) is None
 
 
-def test_a_task_is_one_of_so_many(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_task_number_out_of_range_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main([str(tmp_path), "--task", "3", "--of", "3"])
     assert "--task is 3, of 3; expected a number from 0 on, below --of" in capsys.readouterr().err
@@ -151,7 +151,7 @@ def kept(folder: Path) -> dict:
     return one
 
 
-def test_a_begun_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_started_run_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "room").mkdir()
     options = parsed([str(tmp_path / "room"), "--methods", "planar", "--output", str(tmp_path / "runs")])
     (run,) = planned_runs(options)
@@ -176,7 +176,7 @@ def test_variants_are_of_a_method_or_of_all_but_the_baseline() -> None:
         named_options(["planar"], ["dark=--a", "dark=--b"])
 
 
-def test_scenes_are_named_by_what_tells_them_apart(tmp_path: Path) -> None:
+def test_scenes_are_named_by_their_distinguishing_folders(tmp_path: Path) -> None:
     folders = [tmp_path / "a" / "room", tmp_path / "b" / "room"]
     for folder in folders:
         folder.mkdir(parents=True)

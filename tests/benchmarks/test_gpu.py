@@ -30,7 +30,7 @@ sys.exit(main())
 """
 
 
-def test_without_a_gpu_it_says_so_in_one_line_and_needs_pytorch_alone() -> None:
+def test_the_gpu_benchmark_without_a_gpu_ends_with_one_line() -> None:
     environment = os.environ | {"CUDA_VISIBLE_DEVICES": "", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", ONLY_PYTORCH]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
@@ -54,7 +54,7 @@ def test_the_bound_is_the_scarcer_of_arithmetic_and_memory() -> None:
 RESULTS = {"method": "planar", "iterations": 7000, "seed": 0, "downscale": 1.0, "psnr": 30.25, "lpips": "no weights"}
 
 
-def test_the_quality_stands_beside_that_of_the_same_run_on_the_cpu() -> None:
+def test_the_quality_is_listed_with_that_of_the_cpu_run() -> None:
     recorded = RESULTS | {"psnr": 30.3, "train_seconds": 900.0}
     text = beside_the_cpu(RESULTS, recorded, 70.0, Path("captures/showcase")).markdown()
     assert "planar on showcase, 7,000 iterations" in text
@@ -63,13 +63,13 @@ def test_the_quality_stands_beside_that_of_the_same_run_on_the_cpu() -> None:
     assert "lpips" not in text
 
 
-def test_without_the_cpus_run_it_names_the_command() -> None:
+def test_a_missing_cpu_run_is_reported_with_the_command() -> None:
     text = beside_the_cpu(RESULTS, {}, 70.0, Path("captures/showcase")).markdown()
     assert "`glassplat train planar --data captures/showcase --output runs/cpu --iterations 7000 --device cpu`" in text
     assert "| psnr | 30.250 |  |  |" in text
 
 
-def test_another_run_is_not_compared() -> None:
+def test_a_cpu_run_with_other_settings_is_refused() -> None:
     with pytest.raises(ValueError, match=r"the run on the CPU is .*'iterations': 300"):
         beside_the_cpu(RESULTS, RESULTS | {"iterations": 300}, 70.0, Path("showcase"))
 
@@ -86,7 +86,7 @@ def test_the_peak_is_measured_with_multiply_adds() -> None:
     assert "mul.f32" not in text
 
 
-def test_a_part_that_fails_or_hangs_leaves_the_others(
+def test_a_failing_or_hanging_part_does_not_affect_the_others(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     ran: list[list[str]] = []
@@ -127,7 +127,7 @@ def made_on_the_cpu(make: Callable[..., torch.Tensor], *size: int, device: str) 
     return make(*size)
 
 
-def test_a_gsplat_that_was_not_built_costs_no_timing_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_timings_work_without_a_built_gsplat(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*args: object) -> None:
         raise ImportError("no module named csrc")
 

@@ -40,7 +40,7 @@ def test_every_second_belongs_to_one_part() -> None:
     assert abs(costs[TOTAL] - costs[BETWEEN] - costs["blend_float32"]) < 1e-9
 
 
-def test_the_table_tells_what_a_step_takes_on_average() -> None:
+def test_the_table_lists_the_mean_duration_of_a_step() -> None:
     table = parts_table({"only": {STEPS: 2, BEFORE: 3.0, TOTAL: 0.4, BETWEEN: 0.1, "blend_float32": 0.3}}, "A run")
     assert table.rows == [
         ("steps", "2"),

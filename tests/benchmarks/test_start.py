@@ -14,11 +14,11 @@ def test_a_process_is_ended_with_its_first_line() -> None:
     assert 0 < heard.seconds < time.perf_counter() - begin
 
 
-def test_a_process_that_says_nothing_is_no_failure() -> None:
+def test_a_silent_process_is_not_a_failure() -> None:
     assert first_line(["-c", "pass"]).text == ""
 
 
-def test_each_command_has_a_row_with_what_it_says() -> None:
+def test_each_command_has_a_row_with_its_summary() -> None:
     (row,) = start_times([["train", "splat", "--data", "nothing-here", "--output", "{output}"]], rounds=1).rows
     assert row[0] == "`train splat --data nothing-here --output OUTPUT`"
     assert "nothing-here" in row[2]

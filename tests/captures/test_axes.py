@@ -25,7 +25,7 @@ def annotated_views(capture, label: int = 1) -> list[View]:
     return [View.in_memory(v.name, v.camera, photo=v.photo, pane_labels=labels) for v in views]
 
 
-def test_points_tell_which_way_the_cameras_look(capture) -> None:
+def test_points_determine_the_viewing_direction_of_the_cameras(capture) -> None:
     cameras = [view.camera for view in annotated_views(capture)]
     points = torch.from_numpy(capture.points).float()
     right = evidence_of_points(cameras, points)
@@ -37,7 +37,7 @@ def test_points_tell_which_way_the_cameras_look(capture) -> None:
     assert evidence_of_points(cameras[:1], many) == evidence_of_points(cameras[:1], points[:1])
 
 
-def test_masks_tell_it_too(capture) -> None:
+def test_masks_determine_the_viewing_direction_of_the_cameras(capture) -> None:
     views = annotated_views(capture)
     right = evidence_of_masks(views)
     assert right is not None and (right.as_read, right.flipped) == (1.0, 0.0)
@@ -45,7 +45,7 @@ def test_masks_tell_it_too(capture) -> None:
     assert wrong is not None and (wrong.as_read, wrong.flipped) == (0.0, 1.0) and wrong.contradicts
 
 
-def test_two_masks_or_parallel_rays_tell_nothing(capture) -> None:
+def test_two_masks_or_parallel_rays_are_no_evidence(capture) -> None:
     views = annotated_views(capture)
     assert evidence_of_masks(views[:2]) is None
     assert evidence_of_masks([views[0]] * 5) is None
@@ -57,7 +57,7 @@ def test_flipping_twice_is_the_identity(capture) -> None:
     assert torch.equal(flip_axes(flip_axes(camera)).cam_from_world, camera.cam_from_world)
 
 
-def test_transforms_in_opencv_axes_are_refused_with_points_to_tell(capture) -> None:
+def test_transforms_in_opencv_axes_are_refused_by_points(capture) -> None:
     capture.write_images()
     frames = capture.frames()
     for frame in frames:
@@ -69,7 +69,7 @@ def test_transforms_in_opencv_axes_are_refused_with_points_to_tell(capture) -> N
         load_dataset(capture.root)
 
 
-def test_transforms_in_opencv_axes_are_refused_with_masks_to_tell(capture) -> None:
+def test_transforms_in_opencv_axes_are_refused_by_masks(capture) -> None:
     capture.write_images()
     frames = capture.frames()
     for frame in frames:

@@ -69,14 +69,14 @@ def test_several_cameras_and_nested_names(capture) -> None:
     assert (second.fx, second.fy, second.cx, second.cy) == (40.0, 40.0, 15.5, 12.5)
 
 
-def test_binary_wins_and_other_models_are_mentioned(capture) -> None:
+def test_a_binary_model_is_preferred_and_others_are_mentioned(capture) -> None:
     capture.write_colmap(binary=True)
     capture.write_colmap(binary=False, folder="sparse/1")
     found = load(capture.root)
     assert "(1)" in found.warnings[0]
 
 
-def test_frames_next_to_a_model_are_not_passed_over_in_silence(capture) -> None:
+def test_frames_next_to_a_model_are_mentioned(capture) -> None:
     capture.write_colmap()
     assert load_dataset(capture.root).warnings == ()
     capture.write_transforms({"frames": capture.frames()})
@@ -84,7 +84,7 @@ def test_frames_next_to_a_model_are_not_passed_over_in_silence(capture) -> None:
     assert "COLMAP model" in warning and "is read, and not transforms.json" in warning
 
 
-def test_no_model_is_not_mine(tmp_path: Path) -> None:
+def test_a_folder_without_a_model_is_not_claimed_by_the_reader(tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     assert load_colmap(tmp_path) is None
 
@@ -143,7 +143,7 @@ def test_missing_photographs_are_counted_and_named(capture) -> None:
 
 
 @pytest.mark.parametrize("on_disk", ["NFC", "NFD"])
-def test_accents_are_the_same_however_they_are_written(capture, on_disk: Literal["NFC", "NFD"]) -> None:
+def test_unicode_normalisation_does_not_matter(capture, on_disk: Literal["NFC", "NFD"]) -> None:
     in_model: Literal["NFC", "NFD"] = "NFD" if on_disk == "NFC" else "NFC"
     capture.names = [normalize(in_model, f"f\u00fcr/\u00e9 {index}.png") for index in range(10)]
     capture.write_colmap()
@@ -221,7 +221,7 @@ def test_damaged_text_is_named(capture, name: str, line: str, message: str) -> N
 
 
 @pytest.mark.parametrize("binary", [True, False])
-def test_a_name_that_is_no_utf8_is_shown(capture, *, binary: bool) -> None:
+def test_a_name_that_is_not_utf8_is_shown(capture, *, binary: bool) -> None:
     path = next(capture.write_colmap(binary=binary).glob("images.*"))
     path.write_bytes(path.read_bytes().replace(b"0002.png", b"caf\xe9.png"))
     with pytest.raises(
@@ -288,7 +288,7 @@ def test_a_text_model_may_come_from_another_system(capture) -> None:
     assert torch.equal(after.points.positions, before.points.positions)
 
 
-def test_a_model_without_photographs_beside_masks_is_named(capture) -> None:
+def test_a_model_without_photographs_next_to_its_masks_is_named(capture) -> None:
     folder = capture.write_colmap()
     capture.write_mask("panes/0001.png", np.ones((24, 32), dtype=np.uint8))
     (folder / "images.bin").write_bytes(bytes(8))
@@ -304,7 +304,7 @@ def test_photographs_of_another_aspect_are_refused(capture) -> None:
         load_dataset(capture.root)
 
 
-def test_photograph_that_is_no_image_is_named(capture) -> None:
+def test_a_photograph_that_is_not_an_image_is_named(capture) -> None:
     capture.write_colmap()
     (capture.root / "images" / "0003.png").write_bytes(b"not an image")
     with pytest.raises(InputError, match=r"0003\.png as an image"):

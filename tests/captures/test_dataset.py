@@ -24,7 +24,7 @@ def test_every_eighth_image_by_name_is_held_out(capture) -> None:
     assert data.split == "every 8th image by name"
 
 
-def test_a_path_that_no_run_can_record_is_refused(capture) -> None:
+def test_a_path_that_is_not_unicode_is_refused(capture) -> None:
     with pytest.raises(InputError, match=r"caf.* is not valid UTF-8; rename"):
         load_dataset(capture.root / "caf\udce9")
 
@@ -134,7 +134,7 @@ def test_missing_folder(tmp_path: Path) -> None:
         load_dataset(tmp_path / "nowhere")
 
 
-def test_unknown_format_says_what_was_looked_for_and_found(tmp_path: Path) -> None:
+def test_an_unknown_format_is_refused_with_what_was_found(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"Looked for: a COLMAP model .*transforms\.json.* Found: nothing"):
         load_dataset(tmp_path)
     (tmp_path / "scan.e57").write_text("")
@@ -199,6 +199,6 @@ def test_view_in_memory(capture) -> None:
     assert View.in_memory("rendered.png", camera, photo=photo).pane_labels is None
 
 
-def test_a_folder_whose_name_is_too_long_is_not_there() -> None:
+def test_a_folder_with_a_too_long_name_counts_as_missing() -> None:
     with pytest.raises(FileNotFoundError, match="no folder"):
         load_dataset("a" * 5000)

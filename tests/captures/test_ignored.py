@@ -45,7 +45,7 @@ def somewhere() -> torch.Tensor:
     return ignored
 
 
-def test_masks_of_what_is_ignored_are_read_beside_those_of_panes(tmp_path: Path) -> None:
+def test_ignore_masks_are_read_in_addition_to_pane_masks(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path / "capture")
     write_ignored(root, "1.png", (slice(0, 10), slice(0, 20)))
     write_ignored(root, "2_mask.png", (slice(0, 28), slice(30, 40)))
@@ -59,7 +59,7 @@ def test_masks_of_what_is_ignored_are_read_beside_those_of_panes(tmp_path: Path)
 
 
 @pytest.mark.parametrize("size", [(40, 28), (25, 18), (20, 14), (13, 9)])
-def test_nothing_of_what_is_cut_out_is_seen_in_a_reduced_photograph(size: tuple[int, int], tmp_path: Path) -> None:
+def test_excluded_pixels_do_not_bleed_into_a_reduced_photograph(size: tuple[int, int], tmp_path: Path) -> None:
     rows, columns = np.mgrid[:28, :40]
     inside = (rows - 13.3) ** 2 + (columns - 19.1) ** 2 < 11.0**2
     path, pixel_map = tmp_path / "0.png", PixelMap(None, *size)
@@ -88,7 +88,7 @@ DROPPED = torch.from_numpy(KEPT == 0)
 @pytest.mark.parametrize(
     "name", ["masks/1.png.png", "masks/1.png", "masks/1_mask.png", "masks/1.jpg", "images/1_mask.png"]
 )
-def test_what_is_black_in_masks_is_left_out_under_any_name(tmp_path: Path, name: str) -> None:
+def test_black_mask_pixels_are_excluded_for_any_mask_name(tmp_path: Path, name: str) -> None:
     root = write_tiny_capture(tmp_path / "capture")
     write_shades(root / name, KEPT)
     found = ignored_of(root)
@@ -96,7 +96,7 @@ def test_what_is_black_in_masks_is_left_out_under_any_name(tmp_path: Path, name:
     assert load_dataset(root).pane_labels == (1,), "the panes are those of panes/"
 
 
-def test_masks_of_one_bit_of_sixteen_of_transparency_and_of_a_palette_leave_out_alike(tmp_path: Path) -> None:
+def test_masks_of_every_pixel_format_exclude_the_same_pixels(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path / "capture")
     transparent = np.dstack([np.full((28, 40, 3), 90, dtype=np.uint8), KEPT])
     soft = KEPT.copy()
@@ -110,7 +110,7 @@ def test_masks_of_one_bit_of_sixteen_of_transparency_and_of_a_palette_leave_out_
     assert all(torch.equal(ignored, DROPPED) for ignored in found.values())
 
 
-def test_masks_that_leave_out_most_are_questioned_and_those_that_leave_nothing_refused(tmp_path: Path) -> None:
+def test_masks_that_exclude_most_pixels_warn_and_all_pixels_are_refused(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path / "capture")
     names = [path.name for path in (root / "images").iterdir()]
     write_shades(root / "masks/1.png", KEPT)
@@ -126,7 +126,7 @@ def test_masks_that_leave_out_most_are_questioned_and_those_that_leave_nothing_r
     assert any("inverted" in text for text in load_dataset(root).warnings)
 
 
-def test_both_kinds_of_masks_of_a_photograph_leave_out(tmp_path: Path) -> None:
+def test_both_kinds_of_masks_exclude_pixels(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path / "capture")
     write_shades(root / "masks/1.png", KEPT)
     write_ignored(root, "1.png", (slice(24, 28), slice(0, 40)))
@@ -156,7 +156,7 @@ def name_mask(root: Path, file: str, mask: str = "masks/1.png") -> None:
     (root / file).write_text(json.dumps(settings))
 
 
-def test_masks_that_frames_name_are_no_panes_whatever_their_values(tmp_path: Path) -> None:
+def test_masks_named_by_frames_are_never_panes(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path / "capture")
     shutil.rmtree(root / "panes")
     write_shades(root / "masks/1.png", KEPT > 0)
@@ -196,7 +196,7 @@ def test_masks_of_photographs_without_a_pose_are_mentioned(tmp_path: Path) -> No
         load_dataset(root)
 
 
-def test_a_capture_of_earlier_versions_keeps_its_panes_and_says_so_once(tmp_path: Path) -> None:
+def test_a_capture_of_an_earlier_version_keeps_its_panes_with_one_message(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path / "capture")
     now = load_dataset(root)
     (root / "panes").rename(root / "masks")
@@ -209,7 +209,7 @@ def test_a_capture_of_earlier_versions_keeps_its_panes_and_says_so_once(tmp_path
     assert any("1 mask belongs to no photograph (elsewhere.png)" in text for text in load_dataset(root).warnings)
 
 
-def test_black_and_white_panes_of_earlier_versions_are_known_by_their_planes(tmp_path: Path) -> None:
+def test_black_and_white_panes_of_earlier_versions_are_recognised_by_their_planes(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path / "capture")
     shutil.rmtree(root / "panes")
     write_shades(root / "masks/1.png", 255 - KEPT)
@@ -225,7 +225,7 @@ def test_labels_of_panes_in_both_folders_are_refused(tmp_path: Path) -> None:
         load_dataset(root)
 
 
-def test_what_masks_leave_out_has_no_gradient(tmp_path: Path) -> None:
+def test_masked_pixels_have_no_gradient(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path / "capture")
     write_shades(root / "masks/1.png.png", KEPT)
     view = next(view for view in load_dataset(root).train if view.name == "1.png")
@@ -234,7 +234,7 @@ def test_what_masks_leave_out_has_no_gradient(tmp_path: Path) -> None:
     assert not bool(gradient[DROPPED].any()) and bool(gradient[~DROPPED].any(dim=1).all())
 
 
-def test_masks_that_belong_to_no_photograph_are_refused(tmp_path: Path) -> None:
+def test_masks_without_a_photograph_are_refused(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path / "capture")
     write_ignored(root, "passer-by.png", (slice(0, 1), slice(0, 1)))
     with pytest.raises(InputError, match=r"masks in .*ignore match no photograph: passer-by\.png"):
@@ -326,7 +326,7 @@ def test_the_right_half_begins_in_the_middle(monkeypatch: pytest.MonkeyPatch) ->
     assert results["psnr"] < 40 < 45 < results["right_half_psnr"]
 
 
-def test_ignored_pixels_do_not_tell_mirrors_from_glass() -> None:
+def test_ignored_pixels_are_no_evidence_for_mirrors() -> None:
     view = tiny_capture().train[0]
     camera = replace(camera_at(0.0, 0.0, -0.3), cam_from_world=camera_at(0.0, 0.0, -0.3).cam_from_world.float())
     solid = true_scene().primary

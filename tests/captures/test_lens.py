@@ -51,7 +51,7 @@ def test_a_lens_is_rescaled_as_colmap_does_it(model: str) -> None:
 
 
 @pytest.mark.parametrize("quat", [(1.0, 0.0, 0.0, 0.0), (0.1, -0.7, 0.5, 0.5), (0.0, 0.6, 0.0, -0.8)])
-def test_a_quaternion_is_the_rotation_that_colmap_means(quat: tuple[float, ...]) -> None:
+def test_quaternions_follow_the_convention_of_colmap(quat: tuple[float, ...]) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     found = pose_matrix(ModelImage("0000.jpg", 1, quat, (1.0, 2.0, 3.0)))
     w, x, y, z = quat
@@ -72,14 +72,14 @@ def test_a_capture_of_pinholes_needs_no_pycolmap(capture, binary: bool, monkeypa
 
 @pytest.mark.usefixtures("without_pycolmap")
 @pytest.mark.parametrize("model", [name for name in PARAMETER_COUNTS if "PINHOLE" not in name])
-def test_a_lens_that_bends_names_the_extra_that_straightens_it(model: str) -> None:
+def test_a_distorting_lens_names_the_extra_that_undistorts_it(model: str) -> None:
     assert model not in PERSPECTIVE or example(model).parameters[-1]
     with pytest.raises(InputError, match=r"pip install 'glassplat\[prepare\]'"):
         pinhole_of(example(model))
 
 
 @pytest.mark.parametrize("downscale", [1, 2])
-def test_what_a_strong_barrel_lens_did_not_see_is_left_out(capture, downscale: int) -> None:
+def test_pixels_outside_a_strong_barrel_lens_are_excluded(capture, downscale: int) -> None:
     capture.size = (160, 120)
     capture.lenses = [("SIMPLE_RADIAL", [75.0, 80.0, 60.0, -0.3]), ("SIMPLE_RADIAL", [160.0, 80.0, 60.0, -0.1])]
     capture.write_colmap()

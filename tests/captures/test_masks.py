@@ -97,7 +97,7 @@ def masks_of(root: Path, masks: list[str], photographs: list[str]) -> dict[str, 
         ("left/1.png", ["/x/left/1.jpg", "/x/right/1.jpg"], "/x/left/1.jpg"),
     ],
 )
-def test_an_exact_name_wins(tmp_path: Path, mask: str, photographs: list[str], owner: str) -> None:
+def test_an_exact_name_is_preferred(tmp_path: Path, mask: str, photographs: list[str], owner: str) -> None:
     assert masks_of(tmp_path, [mask], photographs) == {owner: mask}
 
 
@@ -135,13 +135,13 @@ def test_masks_in_a_linked_folder_are_found(tmp_path: Path) -> None:
     assert masks_of(tmp_path, ["2.png"], ["left/1.jpg", "2.jpg"]) == {"left/1.jpg": "left/1.png", "2.jpg": "2.png"}
 
 
-def test_masks_of_hidden_photographs_are_not(tmp_path: Path) -> None:
+def test_masks_of_hidden_photographs_are_ignored(tmp_path: Path) -> None:
     assert masks_of(tmp_path, [".cam/1.png", ".cam/2-checkpoint.png"], [".cam/1.jpg", "2.jpg"]) == {
         ".cam/1.jpg": ".cam/1.png"
     }
 
 
-def test_a_photograph_is_no_mask_of_the_one_next_to_it(capture) -> None:
+def test_a_photograph_is_not_taken_for_a_mask_of_another(capture) -> None:
     capture.names[:3] = ["wall.png", "wall_mask.png", "door.png"]
     capture.write_colmap()
     capture.write_mask("images/door_mask.png", INSIDE * 255)
@@ -151,7 +151,7 @@ def test_a_photograph_is_no_mask_of_the_one_next_to_it(capture) -> None:
     np.testing.assert_array_equal(ignored["door.png"].numpy() == 0, INSIDE == 1)
 
 
-def test_a_name_that_does_for_two_photographs_is_refused_with_one_that_does_for_one(tmp_path: Path) -> None:
+def test_an_ambiguous_photograph_name_is_refused_with_an_unambiguous_one(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"could belong to a\.jpg, a\.png; call it a\.jpg\.png, or after another"):
         masks_of(tmp_path, ["a.tif"], ["a.jpg", "a.png"])
 
@@ -264,7 +264,7 @@ def test_greys_of_a_palette_are_shades(capture) -> None:
     np.testing.assert_array_equal(labels_of(load_dataset(capture.root, mask_polarity="bright")), shades >= 128)
 
 
-def test_a_palette_whose_0_is_a_colour_is_refused(capture) -> None:
+def test_a_palette_whose_entry_0_is_not_black_is_refused(capture) -> None:
     capture.write_colmap()
     (capture.root / "panes").mkdir()
     in_palette((200, 0, 0), (0, 200, 0), (0, 0, 0)).save(capture.root / "panes" / "0001.png")
@@ -292,7 +292,7 @@ def test_values_that_are_neither_labels_nor_white_are_refused(capture, pixels: n
 
 
 @pytest.mark.parametrize("name", ["panes", "panes/0001.png", "masks", "masks/0001.png"])
-def test_a_link_to_nowhere_is_named(capture, name: str) -> None:
+def test_a_broken_link_is_named(capture, name: str) -> None:
     capture.write_colmap()
     (capture.root / name).parent.mkdir(exist_ok=True)
     (capture.root / name).symlink_to("/nowhere")
@@ -300,7 +300,7 @@ def test_a_link_to_nowhere_is_named(capture, name: str) -> None:
         load_dataset(capture.root)
 
 
-def test_a_mask_of_one_pixel_is_no_reduced_mask(capture) -> None:
+def test_a_mask_of_one_pixel_is_not_taken_for_a_reduced_mask(capture) -> None:
     capture.write_colmap()
     capture.write_mask("panes/0001.png", np.ones((1, 1), dtype=np.uint8))
     with pytest.raises(InputError, match="is 1x1 pixels, its photograph 32x24"):
@@ -358,7 +358,7 @@ def test_a_mask_in_colour_takes_little_memory(tmp_path: Path) -> None:
     assert most < 16 * 2048 * 1024, "bytes a pixel, of arrays of ours; Pillow's own are not counted"
 
 
-def test_labels_beside_black_and_white_are_refused(capture) -> None:
+def test_labels_mixed_with_black_and_white_are_refused(capture) -> None:
     capture.write_colmap()
     capture.write_mask("panes/0001.png", INSIDE)
     capture.write_mask("panes/0002.png", INSIDE * 255)
@@ -388,7 +388,7 @@ def test_masks_of_one_bit_have_a_polarity_next_to_those_of_eight(capture) -> Non
             np.testing.assert_array_equal(labels_of(data, name), expected)
 
 
-def test_stated_polarity_does_not_touch_label_images(capture) -> None:
+def test_stated_polarity_does_not_apply_to_label_images(capture) -> None:
     capture.write_colmap()
     capture.write_mask("panes/0001.png", INSIDE)
     data = load_dataset(capture.root, mask_polarity="dark")

@@ -50,7 +50,7 @@ class Files:
         return read
 
 
-def test_what_fits_is_read_once() -> None:
+def test_photographs_that_fit_in_memory_are_read_once() -> None:
     files, memory = Files(10), PixelCache(math.inf, largest=SIZE)
     for _ in range(3):
         assert [int(memory.get(source)[0, 0]) for source in files.sources] == list(range(10))
@@ -58,7 +58,7 @@ def test_what_fits_is_read_once() -> None:
     assert not memory.is_full
 
 
-def test_a_share_stays_where_not_all_fits_and_memory_is_bounded() -> None:
+def test_part_of_the_photographs_stays_cached_within_the_memory_limit() -> None:
     files, memory = Files(100), PixelCache(60 * WHOLE, largest=SIZE)
     for _ in range(3):
         for source in files.sources:
@@ -69,7 +69,7 @@ def test_a_share_stays_where_not_all_fits_and_memory_is_bounded() -> None:
     assert sum(times == 1 for times in files.times.values()) >= 40
 
 
-def test_a_step_reads_what_it_needs_also_where_there_is_no_room() -> None:
+def test_a_step_reads_its_photograph_even_beyond_the_memory_limit() -> None:
     files, memory = Files(4), PixelCache(1, largest=SIZE)
     assert [int(memory.get(source)[0, 0]) for source in files.sources] == [0, 1, 2, 3]
     assert memory.get(files.sources[3]) is memory.get(files.sources[3])
@@ -99,7 +99,7 @@ def slow_files(monkeypatch: pytest.MonkeyPatch) -> Files:
     return Files(20)
 
 
-def test_what_was_costly_and_has_no_room_is_read_once_and_then_from_disk(slow_files: Files, tmp_path: Path) -> None:
+def test_slow_photographs_beyond_the_budget_are_cached_on_disk(slow_files: Files, tmp_path: Path) -> None:
     memory = PixelCache(1, largest=SIZE)
     with memory.cache_on_disk(tmp_path):
         for _ in range(3):
@@ -120,7 +120,7 @@ def test_masks_come_back_from_disk_as_they_were(slow_files: Files, tmp_path: Pat
         assert memory.get(mask).dtype == torch.bool
 
 
-def test_what_is_cheap_to_read_does_not_go_to_the_disk(
+def test_photographs_that_are_fast_to_read_are_not_cached_on_disk(
     slow_files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(view_module, "DISK_RATE", 1e-9)
@@ -132,7 +132,7 @@ def test_what_is_cheap_to_read_does_not_go_to_the_disk(
 
 
 @pytest.mark.parametrize("what", ["full", "gone", "breaks", "cut off"])
-def test_a_disk_without_room_or_with_errors_costs_time_only(
+def test_a_failing_disk_cache_changes_no_result(
     what: str, slow_files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     memory, folder = PixelCache(1, largest=SIZE), tmp_path
@@ -151,7 +151,7 @@ def test_a_disk_without_room_or_with_errors_costs_time_only(
     assert set(slow_files.times.values()) == {2}
 
 
-def test_a_disk_on_which_nothing_more_fits_gets_its_room_back(slow_files: Files, tmp_path: Path) -> None:
+def test_a_full_disk_cache_frees_its_space(slow_files: Files, tmp_path: Path) -> None:
     memory = PixelCache(1, largest=SIZE)
     with memory.cache_on_disk(tmp_path):
         numbers(memory, slow_files)
@@ -164,7 +164,7 @@ def test_a_disk_on_which_nothing_more_fits_gets_its_room_back(slow_files: Files,
         assert numbers(memory, slow_files) == list(range(20))
 
 
-def test_reading_ahead_saves_the_wait_and_two_who_ask_read_once() -> None:
+def test_concurrent_requests_share_one_read() -> None:
     files, memory, gate = Files(1), PixelCache(math.inf), Event()
     slow = PixelSource(lambda: gate.wait(30) and torch.zeros(1))
     memory.read_ahead(slow)
@@ -179,7 +179,7 @@ def test_reading_ahead_saves_the_wait_and_two_who_ask_read_once() -> None:
     assert files.times == {0: 1}
 
 
-def test_what_cannot_be_read_is_an_error_where_it_is_asked_for_and_not_before() -> None:
+def test_an_unreadable_file_raises_an_error_at_its_use() -> None:
     def broken() -> torch.Tensor:
         raise InputError("cut off")
 
@@ -219,7 +219,7 @@ def test_the_machine_has_memory_and_processes_share_it(monkeypatch: pytest.Monke
 @pytest.mark.parametrize("file", ["memory.max", "memory/memory.limit_in_bytes"])
 @pytest.mark.parametrize("group", ["", "slurm/job_7"])
 @pytest.mark.parametrize("limited", ["", "slurm"])
-def test_a_container_or_a_job_may_take_less_than_the_machine_has(
+def test_memory_limits_of_containers_and_jobs_are_respected(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, file: str, group: str, limited: str
 ) -> None:
     folder, _, name = file.rpartition("/")

@@ -81,7 +81,7 @@ def test_poses_that_fit_neither_axes_are_refused(capture) -> None:
         load_dataset(capture.root)
 
 
-def test_without_masks_to_tell_the_axes_are_assumed(capture) -> None:
+def test_axes_are_assumed_without_evidence(capture) -> None:
     write_real(capture)
     for name in capture.names[2:]:
         (capture.root / "masks" / name).unlink()
@@ -90,7 +90,7 @@ def test_without_masks_to_tell_the_axes_are_assumed(capture) -> None:
     assert any("OpenGL is assumed" in warning for warning in data.warnings)
 
 
-def test_points_tell_the_axes_where_there_are_too_few_masks(capture) -> None:
+def test_points_determine_the_axes_if_there_are_too_few_masks(capture) -> None:
     write_real(capture, axes="opencv")
     for name in capture.names[2:]:
         (capture.root / "masks" / name).unlink()
@@ -153,7 +153,7 @@ def test_masks_split_their_greys_at_one_half(capture) -> None:
     np.testing.assert_array_equal(load_dataset(capture.root).train[0].pane_labels.numpy(), ramp >= 128)
 
 
-def test_the_validation_part_is_tested_on_where_there_is_no_test_part(capture) -> None:
+def test_the_validation_split_replaces_a_missing_test_split(capture) -> None:
     write_real(capture, parts={"train": slice(0, 8), "val": slice(6, 10)})
     data = load_dataset(capture.root)
     assert len(data.train) == 6 and len(data.test) == 4
@@ -167,7 +167,7 @@ def test_photographs_without_their_folder_are_found_in_images(capture) -> None:
     assert load_dataset(capture.root).train[0].name == "frame_00000.jpg"
 
 
-def test_what_is_no_mirror_nerf_scene(capture) -> None:
+def test_folders_that_are_no_mirror_nerf_scene_are_not_claimed(capture) -> None:
     assert load_mirror_nerf(capture.root) is None
     write_real(capture)
     (capture.root / "masks").rename(capture.root / "elsewhere")

@@ -67,11 +67,11 @@ def test_larger_maps_are_averaged_and_holes_stay_holes(tmp_path: Path) -> None:
     assert int(found[: SIZE // 2].count_nonzero()) == 0 and bool((found[SIZE // 2 :, :, 2] == -1).all())
 
 
-def test_without_a_file_there_are_none(tmp_path: Path) -> None:
+def test_photographs_without_a_file_have_no_normals(tmp_path: Path) -> None:
     assert estimated_normals(view_in(tmp_path)) is None
 
 
-def test_what_is_no_map_of_normals_is_refused(tmp_path: Path) -> None:
+def test_invalid_normal_maps_are_refused(tmp_path: Path) -> None:
     for vectors, message in [
         (
             np.zeros((SIZE, 2 * SIZE, 3), dtype=np.float32),
@@ -117,7 +117,7 @@ def test_the_folder_of_a_photograph_is_a_part_of_its_name(tmp_path: Path, folder
     assert found_in(tmp_path, files, FOLDERS) == dict(zip(FOLDERS, files, strict=True))
 
 
-def test_a_name_that_two_photographs_have_is_that_of_neither(tmp_path: Path) -> None:
+def test_a_duplicate_photograph_name_matches_neither(tmp_path: Path) -> None:
     found = found_in(tmp_path, ["images/normals/2.png", "images/normals/3.png"], FOLDERS)
     assert found == {"left/3.png": "images/normals/3.png"}
 

@@ -45,12 +45,12 @@ def test_photographs_of_both_parts_keep_names_of_their_own(blender: Dataset) -> 
     assert blender.split == "shipped with the data"
 
 
-def test_what_lies_beside_a_photograph_is_no_mask(blender: Dataset) -> None:
+def test_files_next_to_a_photograph_are_no_masks(blender: Dataset) -> None:
     assert blender.pane_labels == ()
     assert not any(view.is_annotated for view in (*blender.train, *blender.test))
 
 
-def test_objects_start_from_random_points_in_their_box(blender: Dataset) -> None:
+def test_objects_without_points_start_from_random_points_in_their_box(blender: Dataset) -> None:
     positions = blender.points.positions
     assert len(positions) == 100_000
     assert 1.29 < positions.abs().max() <= 1.3
@@ -74,7 +74,7 @@ def test_transparent_photographs_are_laid_over_white(blender: Dataset) -> None:
 
 
 @pytest.mark.parametrize("downscale", [1.0, 2.0])
-def test_reduced_copies_of_the_photographs_are_left_alone(capture, downscale: float) -> None:
+def test_reduced_copies_of_the_photographs_are_ignored(capture, downscale: float) -> None:
     capture.names = [f"_DSC{8700 + index}.JPG" for index in range(10)]
     capture.write_colmap()
     full = capture.size

@@ -63,7 +63,7 @@ GOOD = {
 }
 
 
-def test_what_json_holds_becomes_the_options() -> None:
+def test_json_values_become_options() -> None:
     made = options_from_json(Outer, GOOD)
     inner = Inner(2.0, 5)
     assert made == Outer("n", inner, False, (0, 0.5, 1), (0.1, 0.1, 0.9), "b", {}, Path("y"), 0.25)
@@ -154,7 +154,7 @@ def test_a_number_of_too_many_digits_to_print_is_refused() -> None:
         options_from_json(Inner, {"most": 10**5000})
 
 
-def test_options_are_named_by_the_fields_they_lie_in() -> None:
+def test_options_are_named_by_their_fields() -> None:
     assert as_option("plane_fit.mirror_labels") == "--plane-fit.mirror-labels"
     names = {name for name, _ in number_fields(Outer)}
     assert names == {"inner.rate", "inner.most", "color", "moments", "by_label", "end_value"}

@@ -32,7 +32,7 @@ def test_panes_are_labelled_in_the_annotated_photographs_only(capture, binary: b
             np.testing.assert_array_equal(view.pane_labels.numpy(), label_mask())
 
 
-def test_the_same_masks_beside_a_transforms_file(capture) -> None:
+def test_masks_next_to_a_transforms_file_are_read_the_same(capture) -> None:
     capture.write_images()
     capture.write_transforms({"fl_x": 30.0, "w": 32, "h": 24, "frames": capture.frames()})
     capture.write_mask("panes/0003.png", label_mask())

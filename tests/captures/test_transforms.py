@@ -153,7 +153,7 @@ def test_priors_that_are_not_used_are_named(capture, prior: str) -> None:
 
 @pytest.mark.parametrize("name", ["points3d.ply", "sparse_pc.ply", "cloud.ply"])
 @pytest.mark.parametrize("binary", [True, False])
-def test_points_beside_the_file(capture, name: str, binary: bool) -> None:
+def test_points_next_to_the_file_are_read(capture, name: str, binary: bool) -> None:
     settings = {"ply_file_path": name} if name == "cloud.ply" else {}
     capture.root.mkdir()
     path = capture.root / name
@@ -197,7 +197,7 @@ def test_random_points_are_where_the_cameras_look(capture) -> None:
     assert first.positions.mean(0).norm() < 0.05
 
 
-def test_not_mine(tmp_path) -> None:
+def test_foreign_formats_are_not_claimed_by_the_reader(tmp_path) -> None:
     assert load_transforms(tmp_path) is None
 
 
@@ -282,7 +282,7 @@ def test_pose_of_three_rows_and_rounded_rotation(capture) -> None:
 
 
 @pytest.mark.parametrize("content", ["{", "[1, 2]", '{"frames": 3}'])
-def test_file_that_is_no_transforms(capture, content: str) -> None:
+def test_a_file_that_is_not_transforms_json_is_refused(capture, content: str) -> None:
     capture.root.mkdir()
     (capture.root / "transforms.json").write_text(content)
     with pytest.raises(InputError, match=r"transforms\.json"):
@@ -302,7 +302,7 @@ def test_points_of_the_model_next_to_frames_of_nerfstudio_are_mentioned(capture)
     assert len(load_dataset(folder).points) == len(capture.points), "the folder can be read as it is said"
 
 
-def test_ply_that_is_no_point_cloud(capture) -> None:
+def test_a_ply_that_is_not_a_point_cloud_is_refused(capture) -> None:
     capture.root.mkdir()
     (capture.root / "points3d.ply").write_text("not a ply\n")
     with pytest.raises(InputError, match=r"points3d\.ply"):
@@ -356,7 +356,7 @@ def test_photographs_elsewhere_with_one_name_in_two_folders_have_their_folders_n
 
 
 @pytest.mark.parametrize("shares", [{"fl_x": 0.9, "fl_y": 1.3, "cx": 0.47, "cy": 0.54}, {"cx": 0.5, "cy": 0.5}])
-def test_shares_of_the_image_are_not_taken_for_pixels(capture, shares: dict[str, float]) -> None:
+def test_intrinsics_given_as_shares_of_the_image_are_refused(capture, shares: dict[str, float]) -> None:
     with pytest.raises(InputError, match="look like shares of its sides: multiply fl_x and cx by the width"):
         load(capture, **shares)
 
@@ -368,7 +368,7 @@ def test_an_opening_angle_of_a_frame_goes_before_the_length_of_the_file(capture)
     assert lengths[0] == pytest.approx((40.0, 40.0)) and lengths[1] == (30.0, 31.0)
 
 
-def test_the_validation_part_is_tested_on_where_there_is_no_test_part(capture) -> None:
+def test_the_validation_split_replaces_a_missing_test_split(capture) -> None:
     capture.write_images()
     capture.write_transforms({**LENS, "frames": capture.frames()[:-1]}, file_name="transforms_train.json")
     capture.write_transforms({**LENS, "frames": capture.frames()[-1:]}, file_name="transforms_val.json")
@@ -387,7 +387,7 @@ def test_photographs_of_the_validation_part_are_not_trained_on(capture) -> None:
     assert [view.name for view in data.train] == capture.names[:-2]
 
 
-def test_a_validation_part_whose_photographs_are_away_is_left_alone(capture) -> None:
+def test_a_validation_split_without_photographs_is_ignored(capture) -> None:
     capture.write_images()
     gone = [{**frame, "file_path": f"gone/{index}.png"} for index, frame in enumerate(capture.frames())]
     capture.write_transforms({**LENS, "frames": capture.frames()}, file_name="transforms_train.json")

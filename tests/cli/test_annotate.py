@@ -23,7 +23,7 @@ def room(tmp_path: Path) -> Path:
     return write_room(tmp_path / "room")
 
 
-def test_a_folder_that_is_no_capture_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_that_is_not_a_capture_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code = main(["annotate", str(tmp_path / "nothing"), "--no-open-browser"])
     said = capsys.readouterr()
     told = " ".join((said.out + said.err).split())
@@ -44,7 +44,7 @@ def served(room: Path, monkeypatch: pytest.MonkeyPatch, opened: Callable[[str, A
     assert main(["annotate", str(room), "--port", "0"]) == 0
 
 
-def test_what_the_browser_is_started_with_lets_nobody_in(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_url_of_the_started_browser_grants_no_access(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All users of a computer can read command lines."""
 
     def opened(address: str, server: AnnotationServer) -> None:

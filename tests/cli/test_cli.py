@@ -111,7 +111,7 @@ def test_bad_input_ends_with_one_message(tmp_path: Path, capsys: pytest.CaptureF
     assert not (tmp_path / "run").exists()
 
 
-def test_planar_without_masks_says_what_to_annotate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_planar_without_masks_is_refused_with_advice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capture = tmp_path / "capture"
     shutil.copytree(SCENE, capture, ignore=shutil.ignore_patterns("panes", "gt"))
     options = ["--output", str(tmp_path / "run"), "--downscale", "12", "--iterations", "20"]

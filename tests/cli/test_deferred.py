@@ -41,7 +41,7 @@ def test_it_is_measured_against_true_normals_strength_and_environment(run: Path)
         assert results[name] is not None and results[name] > 0, name
 
 
-def test_a_run_too_short_to_reflect_tells_its_user_and_can_be_measured_and_rendered(
+def test_a_run_too_short_for_reflections_warns_and_can_be_evaluated_and_rendered(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     capture, run = write_object_capture(tmp_path / "ball"), tmp_path / "run"
@@ -90,7 +90,7 @@ def test_surroundings_can_be_exchanged(run: Path, capsys: pytest.CaptureFixture[
     assert "no panorama at" in " ".join(capsys.readouterr().err.split())
 
 
-def test_what_mirrors_nothing_has_no_surroundings_to_exchange(run: Path) -> None:
+def test_exchanging_surroundings_needs_a_reflective_scene(run: Path) -> None:
     scene = replace(open_run(run, "cpu").scene, environment=Environment.empty())
     with pytest.raises(InputError, match="nothing in the run reflects an environment"):
         SceneEdits(surroundings=run.parent / "red.png").apply(scene)

@@ -31,7 +31,7 @@ def largest_difference(image: np.ndarray, target: np.ndarray) -> int:
 
 
 @pytest.mark.parametrize("source", ["photo", "render"])
-def test_the_reflection_is_gone_and_everything_else_is_there(source: str, tmp_path: Path) -> None:
+def test_only_the_reflection_is_removed(source: str, tmp_path: Path) -> None:
     run, output = write_run(tmp_path / "run"), tmp_path / "clean"
     assert main(["dereflect", str(run), "--output", str(output), "--source", source]) == 0
     assert names(output) == [f"{index}.png" for index in range(6)]
@@ -63,7 +63,7 @@ def test_a_split_can_be_chosen(split: str, expected: list[str], tmp_path: Path) 
     assert names(tmp_path / "clean") == expected
 
 
-def test_a_splat_run_is_told_what_to_train(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_dereflect_of_a_splat_run_suggests_training_planar(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = write_run(tmp_path / "run", planar=False)
     assert main(["dereflect", str(run), "--output", str(tmp_path / "clean")]) == 2
     text = message(capsys)
@@ -84,7 +84,9 @@ def test_photographs_are_never_overwritten(tmp_path: Path, capsys: pytest.Captur
     assert {path.name: path.read_bytes() for path in images.iterdir()} == before
 
 
-def test_its_own_folder_is_written_again_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_output_folder_of_the_same_command_is_reused_with_a_message(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run, output = write_run(tmp_path / "run"), tmp_path / "clean"
     command = ["dereflect", str(run), "--output", str(output), "--split", "test"]
     assert main(command) == 0
@@ -94,7 +96,7 @@ def test_its_own_folder_is_written_again_and_says_so(tmp_path: Path, capsys: pyt
     assert main(["render", str(run), "--output", str(output)]) == 2
 
 
-def test_a_folder_belongs_to_who_wrote_it(tmp_path: Path) -> None:
+def test_a_folder_belongs_to_the_command_that_wrote_it(tmp_path: Path) -> None:
     assert claim_folder(tmp_path / "new", "render", Path("run")) is False
     assert claim_folder(tmp_path / "new", "render", Path("run")) is True
     (tmp_path / "new" / RECORD).write_text("[broken")

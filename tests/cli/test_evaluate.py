@@ -49,7 +49,7 @@ def test_numbers_have_their_units_and_a_dash_has_its_reason(capsys: pytest.Captu
     assert "normal_error" not in said
 
 
-def test_several_runs_say_whose_number_is_missing(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_table_of_several_runs_names_missing_values(capsys: pytest.CaptureFixture[str]) -> None:
     assert result_notes(PLANAR, SPLAT)[0] == f"planar: no lpips: {NO_WEIGHTS}"
     said = shown(capsys, PLANAR, SPLAT)
     assert "31.23 dB" in said and "29.00 dB" in said
@@ -58,7 +58,7 @@ def test_several_runs_say_whose_number_is_missing(capsys: pytest.CaptureFixture[
     assert result_notes(aligned) == ["cameras of test views: aligned with their photographs"]
 
 
-def test_the_errors_of_a_pane_say_of_what_they_are() -> None:
+def test_errors_of_a_pane_are_printed_with_their_quantities() -> None:
     expected = "R0 0.040 (error 0.001), normal off by 0.25°, centre by 0.31 % of the extent"
     assert plane_text(KNOWN_PLANE) == expected
 

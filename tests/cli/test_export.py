@@ -39,7 +39,7 @@ def test_all_that_the_scene_has_is_written(tmp_path: Path) -> None:
     torch.testing.assert_close(read_spz(output / "scene.spz").means, scene.primary.means, rtol=0, atol=1e-4)
 
 
-def test_what_a_file_leaves_out_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_lists_what_a_file_leaves_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run, output = write_run(tmp_path / "run"), tmp_path / "an export"
     assert main(["export", str(run), "--output", str(output), "--formats", "ply", "spz"]) == 0
     told = capsys.readouterr().out
@@ -47,7 +47,7 @@ def test_what_a_file_leaves_out_is_said(tmp_path: Path, capsys: pytest.CaptureFi
     assert "scene.ply leaves out" not in told
 
 
-def test_names_that_are_no_text_are_titles(tmp_path: Path) -> None:
+def test_names_that_are_not_unicode_are_escaped_in_titles(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run").rename(tmp_path / os.fsdecode(b"caf\xe9"))
     for title in ([], ["--title", os.fsdecode(b"Caf\xe9"), "--credit", os.fsdecode(b"\xe9")]):
         assert main(["export", str(run), "--output", str(tmp_path / "out"), "--formats", "html", *title]) == 0
@@ -88,7 +88,7 @@ def test_another_program_reads_the_ply(tmp_path: Path) -> None:
         ("--as-mirror 4", "no pane 4"),
     ],
 )
-def test_what_makes_no_sense_is_refused(
+def test_invalid_options_are_refused(
     options: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, output = write_run(tmp_path / "run"), tmp_path / "out"
@@ -97,7 +97,7 @@ def test_what_makes_no_sense_is_refused(
     assert not output.exists()
 
 
-def test_foreign_folders_and_missing_runs_are_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_foreign_folders_and_missing_runs_are_ignored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run, output = write_run(tmp_path / "run"), tmp_path / "out"
     output.mkdir()
     (output / "scene.ply").write_text("mine")
@@ -109,7 +109,9 @@ def test_foreign_folders_and_missing_runs_are_left_alone(tmp_path: Path, capsys:
 
 
 @pytest.mark.parametrize("options", ["--remove-glass", "--layer transmission"])
-def test_nothing_of_an_earlier_scene_is_left(options: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_files_of_an_earlier_scene_are_removed(
+    options: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     output = exported(tmp_path, "--formats", "ply", "spz", "html", "--url", "https://example.org")
     (output / "notes.txt").write_text("mine")
     again = ["export", str(tmp_path / "run"), "--output", str(output), "--formats", "ply", *options.split()]
@@ -122,7 +124,7 @@ def test_nothing_of_an_earlier_scene_is_left(options: str, tmp_path: Path, capsy
     assert not len(load(output).scene.planes)
 
 
-def test_another_scene_takes_no_panes_over(tmp_path: Path) -> None:
+def test_exporting_another_scene_removes_the_earlier_panes(tmp_path: Path) -> None:
     output = exported(tmp_path, "--formats", "ply", "spz")
     splat = write_run(tmp_path / "splat", planar=False)
     assert main(["export", str(splat), "--output", str(output), "--formats", "spz"]) == 0
@@ -141,7 +143,7 @@ def test_a_folder_is_exported_onto_itself(tmp_path: Path) -> None:
     assert torch.equal(load(output).scene.primary.means, true_scene().primary.means)
 
 
-def test_more_panes_than_a_page_shows_are_told_before_anything_is_written(
+def test_too_many_panes_for_a_page_are_refused_before_writing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     model = load(write_run(tmp_path / "run"), device="cpu")

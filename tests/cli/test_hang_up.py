@@ -34,7 +34,7 @@ def read_until(descriptor: int, words: bytes) -> None:
         seen += os.read(descriptor, 4096)
 
 
-def test_a_terminal_that_closes_costs_nothing(tmp_path: Path) -> None:
+def test_a_closed_terminal_loses_no_progress(tmp_path: Path) -> None:
     mine, its = pty.openpty()
     arguments = [sys.executable, "-c", TAKE_TERMINAL, *command(tmp_path)]
     with subprocess.Popen(arguments, stdin=its, stdout=its, stderr=its, start_new_session=True) as process:
@@ -46,7 +46,7 @@ def test_a_terminal_that_closes_costs_nothing(tmp_path: Path) -> None:
     assert not list((tmp_path / "run").glob(".*.tmp*"))
 
 
-def test_what_was_killed_before_it_saved_says_how_to_go_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_killed_before_saving_reports_how_to_continue(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with subprocess.Popen(command(tmp_path), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
         assert process.stdout is not None
         read_until(process.stdout.fileno(), b"loss")

@@ -30,21 +30,21 @@ def shown(console: Console) -> str:
     return console.file.getvalue()
 
 
-def test_a_terminal_shows_a_line_that_is_gone_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_terminal_shows_a_transient_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, MODULE, raising=False)
     console = standard_error(monkeypatch, terminal())
     assert import_pytorch_module(MODULE).__name__ == MODULE
     assert shown(console) == f"{LOADING_LINE}\r\x1b[2K"
 
 
-def test_what_is_there_is_not_announced(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_existing_kernels_are_not_announced(monkeypatch: pytest.MonkeyPatch) -> None:
     console = standard_error(monkeypatch, terminal())
     assert import_pytorch_module("glassplat.cli.console").LOADING_LINE is LOADING_LINE
     assert shown(console) == ""
 
 
 @pytest.mark.parametrize("make", [lambda: Console(file=io.StringIO()), lambda: terminal("dumb")])
-def test_a_file_or_a_terminal_that_erases_nothing_gets_no_such_line(
+def test_a_file_or_a_dumb_terminal_gets_no_transient_line(
     make: Callable[[], Console], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delitem(sys.modules, MODULE, raising=False)
@@ -53,7 +53,7 @@ def test_a_file_or_a_terminal_that_erases_nothing_gets_no_such_line(
     assert shown(console) == ""
 
 
-def test_the_line_is_gone_before_an_error_is_printed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_progress_line_is_erased_before_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     console = standard_error(monkeypatch, terminal())
     with pytest.raises(ModuleNotFoundError):
         import_pytorch_module("glassplat.no_such_module")

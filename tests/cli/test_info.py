@@ -52,7 +52,7 @@ def test_a_capture_is_described_with_its_panes(capsys: pytest.CaptureFixture[str
     assert any("train planar" in line for line in found["next"])
 
 
-def test_a_capture_without_masks_is_to_be_annotated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_suggests_annotating_a_capture_without_masks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(SCENE, tmp_path / "my capture", ignore=shutil.ignore_patterns("panes", "gt"))
     found = told(tmp_path / "my capture", capsys)
     assert found["facts"]["panes"] == "none marked"
@@ -68,7 +68,7 @@ def test_estimated_normals_are_counted(tmp_path: Path, capsys: pytest.CaptureFix
     assert told(capture, capsys)["facts"]["normals"].startswith("estimated for 3 training photographs")
 
 
-def test_the_share_that_masks_leave_out_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_share_excluded_by_masks_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capture = write_tiny_capture(tmp_path / "capture")
     (capture / "ignore").mkdir()
     for name in ("1.png", "2.png"):
@@ -87,7 +87,7 @@ def test_photographs_are_to_be_prepared(tmp_path: Path, capsys: pytest.CaptureFi
     assert any("glassplat prepare" in line for line in found["next"])
 
 
-def test_a_video_is_looked_into(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_video_is_described(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     offsets = np.linspace(0, 40, 12)
     found = told(film(tmp_path / "a walk.avi", offsets), capsys)
     assert found["kind"] == "a video" and found["healthy"] and found["facts"]["frames"] == 12
@@ -98,7 +98,7 @@ def test_a_video_is_looked_into(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "OpenCV cannot read a frame of it" in found["problems"][0]
 
 
-def test_without_opencv_a_video_is_told_by_its_name(
+def test_videos_are_recognised_by_name_without_opencv(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
@@ -107,7 +107,7 @@ def test_without_opencv_a_video_is_told_by_its_name(
     assert found["kind"] == "a video, by its name" and "needs OpenCV" in found["problems"][0]
 
 
-def test_photographs_that_prepare_would_refuse_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_names_photographs_that_prepare_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "photographs"
     folder.mkdir()
     for path in sorted((SCENE / "images").iterdir())[:25]:
@@ -130,7 +130,7 @@ def test_a_photograph_of_a_capture_that_is_cut_off_is_named(tmp_path: Path, caps
     ]
 
 
-def test_small_photographs_of_a_capture_are_sound(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_small_photographs_of_a_capture_are_valid(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """They are smaller than photographs that `prepare` could register."""
     capture = shutil.copytree(SCENE, tmp_path / "capture", ignore=shutil.ignore_patterns("panes", "gt"))
     for path in (capture / "images").iterdir():
@@ -140,14 +140,14 @@ def test_small_photographs_of_a_capture_are_sound(tmp_path: Path, capsys: pytest
     assert "are scaled copies of the calibrated ones" in scaled
 
 
-def test_a_folder_of_few_photographs_is_said_to_be_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_of_few_photographs_gets_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "few").mkdir()
     shutil.copy(SCENE / "images" / "0000.jpg", tmp_path / "few")
     (tmp_path / "few" / "._0000.jpg").write_bytes(b"what a Mac leaves on foreign disks")
     assert told(tmp_path / "few", capsys)["problems"] == ["only 1 photograph; 30 or more work better"]
 
 
-def test_what_was_interrupted_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_suggests_resuming_an_interrupted_preparation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "my capture.partial").mkdir()
     (tmp_path / "my capture.partial" / "settings.json").write_text('{"input": "photographs"}')
     found = told(tmp_path / "my capture.partial", capsys)
@@ -162,7 +162,7 @@ def test_what_was_interrupted_goes_on(tmp_path: Path, capsys: pytest.CaptureFixt
         assert "report it" not in capsys.readouterr().err
 
 
-def test_a_finished_run_whose_scene_is_damaged_says_what_is_wrong(
+def test_a_finished_run_with_a_damaged_scene_is_reported_with_the_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_tiny_capture(tmp_path / "capture")
@@ -182,7 +182,7 @@ def test_a_finished_run_whose_scene_is_damaged_says_what_is_wrong(
     assert told(run, capsys)["problems"] == [] and (run / "cameras.json").is_file()
 
 
-def test_an_interrupted_run_says_its_step_and_the_command_that_goes_on(
+def test_an_interrupted_run_prints_its_step_and_the_resume_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_tiny_capture(tmp_path / "a capture")
@@ -204,7 +204,7 @@ def test_an_interrupted_run_says_its_step_and_the_command_that_goes_on(
     assert told(tmp_path / "run", capsys)["facts"]["trained to"] == 12
 
 
-def test_what_is_for_programs_has_no_colours_and_no_line_of_the_log_in_it(tmp_path: Path) -> None:
+def test_machine_readable_output_has_no_colours_and_no_log_lines(tmp_path: Path) -> None:
     capture = write_tiny_capture(tmp_path / "capture")
     command = [sys.executable, "-m", "glassplat", "info", str(capture), "--json"]
     colourful = os.environ | {"FORCE_COLOR": "1", "COLUMNS": "40"}
@@ -212,7 +212,7 @@ def test_what_is_for_programs_has_no_colours_and_no_line_of_the_log_in_it(tmp_pa
     assert json.loads(done.stdout)["path"] == str(capture) and "pane 1: " in done.stderr
 
 
-def test_a_run_is_described_and_misses_its_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_describes_a_run_with_a_missing_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = write_run(tmp_path / "my run")
     found = told(run, capsys)
     assert found["kind"] == "a planar run" and found["facts"]["panes"].startswith("1 (R0")
@@ -222,7 +222,7 @@ def test_a_run_is_described_and_misses_its_capture(tmp_path: Path, capsys: pytes
     assert told(run / "point_cloud" / "iteration_1", capsys)["kind"] == "an exported scene"
 
 
-def test_a_run_without_a_scene_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_without_a_scene_is_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = write_run(tmp_path / "run")
     shutil.rmtree(run / "point_cloud")
     (run / "checkpoint.safetensors").write_bytes(b"")
@@ -240,7 +240,7 @@ def test_a_scene_without_a_capture_is_described(tmp_path: Path, capsys: pytest.C
     assert [line.split()[1] for line in found["next"]] == ["view", "export"]
 
 
-def test_an_exported_folder_tells_its_panes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_lists_the_panes_of_an_exported_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "an export"
     export = ["export", str(write_run(tmp_path / "run")), "--output", str(output), "--formats", "ply"]
     assert main([*export, "--as-mirror", "1"]) == 0
@@ -251,7 +251,7 @@ def test_an_exported_folder_tells_its_panes(tmp_path: Path, capsys: pytest.Captu
     assert main(["info", str(output)]) == 2
 
 
-def test_a_folder_of_runs_is_none_of_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_of_runs_is_not_taken_for_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     demo = tmp_path / "a demo"
     write_run(demo / "planar")
     write_run(demo / "splat", planar=False)
@@ -282,7 +282,7 @@ def test_splat_files_are_counted_and_judged(suffix: str, tmp_path: Path, capsys:
     assert told(path, capsys)["problems"] == ["100% of the Gaussians are nearly invisible"]
 
 
-def test_gaussians_without_a_finite_place_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_gaussians_without_a_finite_position_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     gaussians = small(true_scene().primary)
     nowhere = gaussians.with_tensors({"means": torch.full_like(gaussians.means, torch.nan)})
     write_gaussians(tmp_path / "splat.ply", nowhere)
@@ -301,7 +301,7 @@ def test_glass_without_colours_has_no_degree(tmp_path: Path, capsys: pytest.Capt
     ("name", "expected"),
     [("nowhere", "does not exist"), ("notes.txt", "not a known kind of file"), ("empty", "not a known kind of folder")],
 )
-def test_what_is_not_known_is_said_to_be(
+def test_unrecognised_paths_are_refused(
     name: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "notes.txt").write_text("")
@@ -310,7 +310,7 @@ def test_what_is_not_known_is_said_to_be(
     assert expected in " ".join(capsys.readouterr().err.split())
 
 
-def test_a_damaged_capture_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_damaged_capture_is_refused_with_the_reason(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(SCENE, tmp_path / "capture")
     (tmp_path / "capture" / "images" / "0000.jpg").unlink()
     assert main(["info", str(tmp_path / "capture")]) == 2

@@ -47,7 +47,7 @@ def test_names_are_shown_as_they_are(text: str, capsys: pytest.CaptureFixture[st
 
 
 @pytest.mark.parametrize("text", AWKWARD)
-def test_a_console_that_reads_markup_shows_them_too(text: str) -> None:
+def test_names_with_markup_are_printed_literally(text: str) -> None:
     file = io.StringIO()
     print_line(Console(file=file), text)
     assert file.getvalue() == f"{text}\n"
@@ -63,7 +63,7 @@ def test_a_console_that_reads_markup_shows_them_too(text: str) -> None:
         ("größer ± 1°", "größer ± 1°"),
     ],
 )
-def test_what_no_terminal_should_get_is_written_out(text: str, shown: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_control_characters_are_escaped(text: str, shown: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert printable(text) == shown
     print_error("stopped", text)
     assert "".join(capsys.readouterr().err.split()) == "".join(f"stopped: {shown}".split())
@@ -76,7 +76,7 @@ def test_a_terminal_breaks_lines_itself() -> None:
     assert terminal.file.getvalue() == command + "\n"
 
 
-def test_a_leading_dash_begins_no_option() -> None:
+def test_a_path_with_a_leading_dash_is_no_option() -> None:
     assert [shell_word(path) for path in ("-run", "a run", "run-1")] == ["./-run", "'a run'", "run-1"]
 
 
@@ -88,7 +88,7 @@ def test_tables_show_names_as_they_are(capsys: pytest.CaptureFixture[str]) -> No
     assert all(name in shown for name in ("[bold]", "[/x]", ":smile:"))
 
 
-def test_what_is_logged_and_warned_of_is_a_line_each(
+def test_each_log_message_and_warning_is_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(logging.getLogger(), "handlers", [])
@@ -110,7 +110,9 @@ def test_what_is_logged_and_warned_of_is_a_line_each(
     ]
 
 
-def test_a_command_says_the_same_line_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_command_prints_a_repeated_line_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(logging.getLogger(), "handlers", [])
     panes = logging.getLogger("glassplat.panes")
     for _ in range(2):

@@ -65,7 +65,7 @@ def test_a_picture_has_the_same_name_whichever_views_are_asked_for(tmp_path: Pat
 
 @pytest.mark.parametrize("command", ["dereflect", "render"])
 @pytest.mark.parametrize("link", ["file", "folder", "record"])
-def test_a_link_in_the_output_leads_nowhere(
+def test_links_out_of_the_output_are_refused(
     link: str, command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, output = write_run(tmp_path / "run"), tmp_path / "output"
@@ -90,9 +90,7 @@ def test_a_link_in_the_output_leads_nowhere(
 
 
 @pytest.mark.parametrize("name", ["results.json", "sheets", "sheets/0.png", "log.jsonl"])
-def test_a_link_in_the_run_of_somebody_else_leads_nowhere(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_links_out_of_a_run_are_refused(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run, mine = write_run(tmp_path / "run"), tmp_path / "mine" / "0.png"
     for path in (mine, run / "checkpoint.safetensors"):
         path.parent.mkdir(exist_ok=True)
@@ -131,7 +129,7 @@ def test_an_output_that_is_a_link_to_a_folder_is_that_folder(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("name", ["file", "file/below", "nowhere"])
 @pytest.mark.parametrize("command", ["dereflect", "render", "train", "demo"])
-def test_an_output_that_can_be_no_folder_is_one_message(
+def test_an_impossible_output_folder_ends_with_one_message(
     command: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, capture = write_run(tmp_path / "run"), str(tmp_path / "capture")
@@ -162,7 +160,7 @@ def test_a_capture_that_has_moved_is_found_again(
     assert main([*options, "--data", str(moved), "--device", "cpu"]) == 0
 
 
-def test_another_capture_is_not_taken_for_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluating_with_another_capture_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = write_run(tmp_path / "run")
     write_colmap_capture(tmp_path / "other", [f"other{index}.png" for index in range(5)])
     assert main(["eval", str(run), "--data", str(tmp_path / "other")]) == 2
@@ -171,7 +169,7 @@ def test_another_capture_is_not_taken_for_it(tmp_path: Path, capsys: pytest.Capt
 
 
 @pytest.mark.parametrize("command", ["dereflect", "render", "eval"])
-def test_a_capture_that_has_lost_a_photograph_is_refused_where_it_is(
+def test_a_capture_with_a_missing_photograph_is_refused(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Every eighth one is for testing: without the first, photographs used for training would be tested."""

@@ -53,7 +53,7 @@ def test_edits_reach_the_picture(options: str, scene: Scene, tmp_path: Path) -> 
         ("--as-mirror 1 --reflectance 1 0.5", "give one of the two"),
     ],
 )
-def test_edits_that_make_no_sense_write_nothing(
+def test_invalid_edits_write_nothing(
     options: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = write_run(tmp_path / "run")
@@ -102,7 +102,7 @@ def test_layers_that_a_method_lacks_are_refused_before_anything_is_rendered(
         ("dereflect --split test", "taking reflections off", "1 image without reflections -> "),
     ],
 )
-def test_a_log_is_told_how_far_it_is(
+def test_progress_is_printed_to_a_log(
     command: str,
     work: str,
     end: str,

@@ -110,7 +110,7 @@ def test_pycolmap_can_be_loaded_in_another_thread() -> None:
 
 
 @pytest.mark.parametrize("number", CODES)
-def test_a_signal_while_running_says_what_is_left_and_removes_what_is_half_written(
+def test_a_signal_reports_the_saved_state_and_removes_partial_files(
     number: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     def work(self: Evaluate, console: object) -> None:
@@ -145,7 +145,7 @@ def test_an_interrupt_that_a_library_disguises_is_still_an_interrupt(
     assert capsys.readouterr().err.startswith("interrupted; ")
 
 
-def test_a_signal_that_is_ignored_stays_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_ignored_signal_stays_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
     # As `nohup` does with SIGHUP, and a shell with Ctrl-C for background processes.
     def work(self: Evaluate, console: object) -> None:
         for name in ("SIGHUP", "SIGINT"):
@@ -172,7 +172,7 @@ def test_a_command_can_run_in_another_thread(monkeypatch: pytest.MonkeyPatch) ->
     assert codes == [0]
 
 
-def test_each_command_says_what_it_leaves_behind(tmp_path: Path) -> None:
+def test_each_command_describes_its_output(tmp_path: Path) -> None:
     run, output = tmp_path / "run", tmp_path / "output"
     train = Train(SplatRecipe(), tmp_path, run)
     commands = [

@@ -75,7 +75,7 @@ def test_the_list_of_commands_needs_none_of_the_libraries() -> None:
         assert all(name in found.out + found.err for name in COMMANDS) or arguments == ["--version"]
 
 
-def test_the_version_tells_what_a_report_of_a_bug_needs() -> None:
+def test_version_prints_what_a_bug_report_needs() -> None:
     done = subprocess.run([sys.executable, "-m", "glassplat", "--version"], capture_output=True, text=True, check=True)
     for name, version in (("glassplat", glassplat.__version__), ("PyTorch", metadata.version("torch"))):
         assert f"{name} {version}, " in done.stdout
@@ -99,7 +99,7 @@ def explained() -> dict[str, Found]:
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
-def test_a_command_does_not_wait_for_what_it_may_never_need(name: str, explained: dict[str, Found]) -> None:
+def test_a_command_imports_optional_modules_only_on_demand(name: str, explained: dict[str, Found]) -> None:
     assert explained[name].code == 0
     allowed = {"glassplat.evaluate.evaluate", "zstandard"} if name != "train" else set()
     allowed |= {"pycolmap"} if name in ("prepare", "annotate") else set()
@@ -161,7 +161,7 @@ def refused(places: Path) -> dict[str, Found]:
 
 
 @pytest.mark.parametrize("line", REFUSED)
-def test_what_can_be_refused_at_once_is_refused_without_pytorch(line: str, refused: dict[str, Found]) -> None:
+def test_simple_errors_are_reported_without_importing_pytorch(line: str, refused: dict[str, Found]) -> None:
     found = refused[line]
     assert (found.code, found.slow) == (2, [])
     assert REFUSED[line] in " ".join(found.err.split()) and found.err.startswith("error: ")
@@ -230,7 +230,7 @@ def test_a_command_imports_no_other(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_the_list_says_of_a_command_what_the_command_does(name: str) -> None:
+def test_the_list_of_commands_matches_their_descriptions(name: str) -> None:
     described = inspect.getdoc(command_class(name)) or ""
     assert described.splitlines()[0] == COMMANDS[name].summary
 
@@ -295,7 +295,7 @@ def test_output_that_is_closed_full_or_narrow_changes_no_exit_code(line: str, ex
 
 
 @pytest.mark.parametrize("words", [["--help"], ["info", str(Path(glassplat.__file__).parent / "demo_scene")]])
-def test_a_reader_that_leaves_ends_the_command_in_silence(words: list[str]) -> None:
+def test_a_closed_pipe_ends_the_command_silently(words: list[str]) -> None:
     read, write = os.pipe()
     os.close(read)
     command = [sys.executable, "-m", "glassplat", *words]

@@ -44,7 +44,7 @@ def test_it_is_measured_and_every_layer_can_be_rendered(run: Path, capsys: pytes
     assert "traced renders no layer mask" in capsys.readouterr().err
 
 
-def test_discs_have_a_median_depth_beside_all_other_layers(tmp_path: Path) -> None:
+def test_discs_have_a_median_depth_in_addition_to_all_other_layers(tmp_path: Path) -> None:
     capture, run, output = write_object_capture(tmp_path / "ball"), tmp_path / "run", tmp_path / "layers"
     options = [*few_steps(capture, run), "--surroundings.start.cells", "3", "--primitive", "disc"]
     assert main(["train", "traced", *options]) == 0
@@ -62,7 +62,7 @@ def test_the_stored_scene_is_the_trained_one(run: Path) -> None:
         assert torch.equal(stored.parameters()[name], tensor), name
 
 
-def test_a_run_that_lost_its_surroundings_says_so(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_without_its_surroundings_is_reported(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = run / "point_cloud" / "iteration_12"
     (folder / "surroundings.ply").unlink()
     assert main(["eval", str(run)]) == 2
@@ -70,7 +70,7 @@ def test_a_run_that_lost_its_surroundings_says_so(run: Path, capsys: pytest.Capt
 
 
 @pytest.mark.parametrize("mirrors", ["both", "surroundings"])
-def test_a_panorama_takes_the_place_of_near_surroundings_too(run: Path, mirrors: str) -> None:
+def test_a_panorama_also_replaces_near_surroundings(run: Path, mirrors: str) -> None:
     panorama = run.parent / "red.png"
     write_equirect(panorama, torch.tensor([1.0, 0.0, 0.0]).expand(8, 16, 3))
     stored = open_run(run, "cpu")
@@ -82,7 +82,7 @@ def test_a_panorama_takes_the_place_of_near_surroundings_too(run: Path, mirrors:
     assert seen[..., 0].min() > 0.95 and seen[..., 1:].max() < 0.05
 
 
-def test_broken_normals_beside_the_photographs_are_named(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_broken_normals_next_to_the_photographs_are_named(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capture = run.parent / "ball"
     (capture / "train" / "normals").mkdir()
     shutil.copy(capture / "transforms_train.json", capture / "train" / "normals" / "r_0.npy")

@@ -70,7 +70,7 @@ def test_a_limit_of_another_strategy_is_refused(tmp_path: Path, capsys: pytest.C
 
 
 @pytest.mark.parametrize("arguments", WRONG, ids=" ".join)
-def test_a_wrong_option_ends_with_one_message(
+def test_an_invalid_option_ends_with_one_message(
     arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     method, option, *_ = arguments
@@ -95,7 +95,7 @@ def test_a_wrong_option_ends_with_one_message(
     ],
     ids=str,
 )
-def test_what_only_python_sets_is_checked_as_well(recipe: Any, named: str) -> None:
+def test_fields_set_only_in_python_are_checked(recipe: Any, named: str) -> None:
     with pytest.raises(InputError, match=f"{named} is .*expected"):
         check_options(recipe)
 
@@ -111,7 +111,9 @@ def test_what_only_python_sets_is_checked_as_well(recipe: Any, named: str) -> No
     ],
     ids=" ".join,
 )
-def test_so_do_those_of_other_commands(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_of_other_commands_out_of_range_are_refused(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     (option,) = [word for word in arguments if word.startswith("--")][-1:]
     message = refused(arguments, capsys)
     assert option in message and "expected" in message
@@ -143,7 +145,7 @@ def help_of(arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatc
 
 
 @pytest.mark.parametrize("method", RECIPES)
-def test_help_shows_what_most_runs_need_and_says_how_to_see_the_rest(
+def test_help_shows_essential_options_and_names_the_option_for_the_rest(
     method: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     brief = help_of([method, "--help"], capsys, monkeypatch)
@@ -155,14 +157,16 @@ def test_help_shows_what_most_runs_need_and_says_how_to_see_the_rest(
     assert len(settings(brief)) <= 25 and len(settings(full)) <= 60
 
 
-def test_how_to_see_the_rest_is_said_once(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_help_names_the_option_for_all_options_once(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert help_of(["planar", "--help"], capsys, monkeypatch).count("These are the most common options") == 1
     listed = help_of(["--help"], capsys, monkeypatch)
     assert "These are the most common options" not in listed and "the most common ones" in " ".join(listed.split())
 
 
 @pytest.mark.parametrize("method", list(RECIPES))
-def test_help_speaks_of_options_and_not_of_what_lies_behind_them(
+def test_help_mentions_options_and_no_internal_names(
     method: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown = help_of([method, "--help-advanced"], capsys, monkeypatch) + help_of(["--help"], capsys, monkeypatch)
@@ -206,7 +210,7 @@ def test_the_help_of_the_method_is_named_next_to_what_is_missing(capsys: pytest.
 @pytest.mark.parametrize(
     "option", [["--intervals.opacity", "0.1"], ["--densify.split-by", "absgrad"], ["--blend", "srgb"]]
 )
-def test_what_a_preset_decides_is_no_option(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_fields_set_by_a_preset_are_no_options(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     message = refused(["train", "planar", "--data", str(SCENE), "--output", "y", *option], capsys)
     assert f"no option {option[0]}" in message
 

@@ -90,7 +90,7 @@ def test_every_set_of_gaussians_counts() -> None:
     assert "1520 Gaussians" in lines[-1]
 
 
-def test_how_long_a_run_takes_is_said_once_and_counts_the_dearer_steps_to_come() -> None:
+def test_the_duration_of_a_run_is_printed_once_and_includes_slower_stages() -> None:
     plan = Plan((250, 1000), (1.0, 9.0), "shorter with an NVIDIA GPU")
     steps = [step(number) for number in range(1, 31)]
     forecasts = [line for line in lines_of(steps, 1.0, plan) if line.startswith("about")]
@@ -134,15 +134,15 @@ def left_after(work: list[Message], seconds: float) -> str:
 
 
 @pytest.mark.parametrize("work", [[Working("fitting planes", 0, 2)] * 2, [StageEntered(100, "2", COUNTS)]])
-def test_what_takes_long_at_the_beginning_of_a_stage_is_no_part_of_the_speed(work: list[Message]) -> None:
+def test_long_work_at_the_start_of_a_stage_is_excluded_from_the_speed(work: list[Message]) -> None:
     assert left_after(work, 300.0) == left_after([], 0.0) == "7 min left"
 
 
-def test_what_begins_a_stage_is_no_part_of_the_speed_even_if_it_is_short() -> None:
+def test_short_work_at_the_start_of_a_stage_is_excluded_from_the_speed() -> None:
     assert left_after([Working("fitting planes", 0, 1), StageEntered(100, "2", COUNTS)], 4.0) == "7 min left"
 
 
-def test_what_recurs_between_steps_is_part_of_the_speed() -> None:
+def test_recurring_work_between_steps_counts_for_the_speed() -> None:
     assert left_after([Working("searching for unnecessary Gaussians", 0, 2)], 4.0) == "8 min left"
 
 
@@ -156,7 +156,7 @@ def test_every_method_has_a_plan(method: str, tmp_path: Path) -> None:
     assert plan.shortcuts.endswith("or an NVIDIA GPU")
 
 
-def test_what_takes_long_between_steps_is_shown() -> None:
+def test_long_work_between_steps_is_shown() -> None:
     lines = lines_of([Working("fitting planes to the masks", 0, 1), step(7), *BUSY], 1.0)
     assert lines[0] == "step 0: fitting planes to the masks"
     busy = [line for line in lines if "unnecessary Gaussians" in line]
@@ -164,11 +164,11 @@ def test_what_takes_long_between_steps_is_shown() -> None:
     assert all(re.fullmatch(r"step 7: searching for unnecessary Gaussians, \d+ of 40 done", line) for line in busy)
 
 
-def test_what_is_quick_between_steps_is_not() -> None:
+def test_quick_work_between_steps_is_not_shown() -> None:
     assert lines_of([step(1), *BUSY], 0.01) == []
 
 
-def test_a_checkpoint_is_named_in_the_next_line_and_makes_none() -> None:
+def test_a_checkpoint_is_reported_in_the_next_progress_line() -> None:
     messages: list[Message] = [CheckpointWritten(3), *(step(number) for number in range(4, 10))]
     lines = lines_of(messages, 1.0)
     assert lines
@@ -200,7 +200,7 @@ def terminal(messages: list[Message], error: Exception | None = None) -> str:
     return file.getvalue()
 
 
-def test_an_error_before_the_first_step_stands_below_no_bar() -> None:
+def test_an_error_before_the_first_step_shows_no_progress_bar() -> None:
     shown = terminal([Working("preparing the first scene", 0, 1)], ValueError("broken"))
     assert shown == "preparing the first scene\n"
 
@@ -212,7 +212,7 @@ def test_the_bar_shows_loss_count_work_and_checkpoint() -> None:
     assert "searching for unnecessary Gaussians 12/40" in terminal([step(499), *BUSY[:13]])
 
 
-def test_a_closed_terminal_does_not_hide_why_a_run_ends() -> None:
+def test_the_reason_for_the_end_of_a_run_survives_a_closed_terminal() -> None:
     class Closed(io.StringIO):
         is_closed = False
 
@@ -232,7 +232,7 @@ def test_a_closed_terminal_does_not_hide_why_a_run_ends() -> None:
     file.is_closed = False
 
 
-def test_a_training_into_a_file_says_how_it_goes(
+def test_a_training_logged_to_a_file_reports_progress(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(training_progress, "FIRST_INTERVAL", 0.0)

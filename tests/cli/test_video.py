@@ -23,7 +23,7 @@ SHORT = ["--seconds", "0.4", "--fps", "10", "--width", "64"]
         ("--as-mirror 1", (64, 44)),
     ],
 )
-def test_a_film_has_its_layers_in_every_picture(options: str, size: tuple[int, int], tmp_path: Path) -> None:
+def test_every_frame_of_a_video_shows_all_layers(options: str, size: tuple[int, int], tmp_path: Path) -> None:
     run, film = write_run(tmp_path / "run"), tmp_path / "film.webp"
     assert main(["video", str(run), "--output", str(film), *SHORT, *options.split()]) == 0
     with Image.open(film) as pictures:
@@ -70,7 +70,7 @@ def test_an_interrupted_film_leaves_nothing(
         ("--output film.gif --fps 60", "at most 50 frames per second, not 60"),
     ],
 )
-def test_what_makes_no_sense_is_refused_before_anything_is_rendered(
+def test_invalid_values_are_refused_before_rendering(
     options: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = write_run(tmp_path / "run")
@@ -82,7 +82,7 @@ def test_what_makes_no_sense_is_refused_before_anything_is_rendered(
     assert not list(tmp_path.glob("film.*")) and (tmp_path / "there.webp").read_text() == "mine"
 
 
-def test_a_link_to_nothing_is_in_the_way_of_a_film_until_it_is_forced(
+def test_a_broken_link_at_the_output_of_a_video_is_refused_unless_forced(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, film = write_run(tmp_path / "run"), tmp_path / "film.gif"

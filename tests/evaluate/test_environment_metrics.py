@@ -75,7 +75,7 @@ def test_black_maps() -> None:
 
 
 @pytest.mark.parametrize("shape", [(64, 64, 3), (128, 64, 3), (64, 128), (0, 0, 3), (64, 128, 4)])
-def test_what_is_no_panorama_is_refused(shape: tuple[int, ...]) -> None:
+def test_invalid_panoramas_are_refused(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"true environment as a panorama \[H, 2H, 3\]"):
         environment_psnr(TRUTH, torch.zeros(shape))
 
@@ -91,7 +91,7 @@ def test_lpips_sees_equalised_maps() -> None:
     assert environment_lpips(TRUTH, TRUTH, "no LPIPS: install it") == "no LPIPS"
 
 
-def test_what_is_missing_is_the_reason() -> None:
+def test_the_reason_names_what_is_missing() -> None:
     names = {"environment_psnr", "environment_gain", "environment_lpips"}
     found = environment_metrics(0.5 * TRUTH, TRUTH, "no weights")
     assert set(found) == names
@@ -116,7 +116,7 @@ def test_a_broken_environment_is_named(tmp_path: Path) -> None:
         true_environment(tmp_path)
 
 
-def test_a_scene_that_knows_its_environment_matches_it() -> None:
+def test_a_scene_with_a_known_environment_matches_it() -> None:
     scene = Scene(Gaussians.empty(1), extent=1.0)
     assert learned_environment(scene) is None
     environment = Environment.random(8, generator=torch.Generator().manual_seed(0))

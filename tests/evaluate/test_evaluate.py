@@ -169,7 +169,7 @@ def ball_frame(scene: Scene, camera: Camera) -> Frame:
     return Frame(torch.ones_like(normals), {"normal": 0.5 * turned, "strength": strength})
 
 
-def test_surfaces_are_compared_with_what_lies_beside_the_photographs(tmp_path: Path) -> None:
+def test_surfaces_are_compared_with_ground_truth_next_to_the_photographs(tmp_path: Path) -> None:
     dataset = load_dataset(write_object_capture(tmp_path / "ball"))
     seen: list[EvaluatedView] = []
     evaluation = evaluate(Scene(Gaussians.empty(1), 1.0), ball_frame, dataset, listen=seen.append)
@@ -186,7 +186,7 @@ def test_surfaces_are_compared_with_what_lies_beside_the_photographs(tmp_path: P
     assert "normal_error_deg_reason" not in evaluation.results
 
 
-def test_without_true_surfaces_the_reason_is_said(case) -> None:
+def test_missing_true_surfaces_are_reported_with_a_reason(case) -> None:
     results = evaluate(case.scene, case.renderer, case.dataset).results
     assert results["normal_error_deg_reason"] == "there are no true normals for the photograph"
     assert results["strength_error_reason"] == "there is no true strength for the photograph"
@@ -212,7 +212,7 @@ def test_no_test_views_are_refused(case) -> None:
         evaluate(case.scene, case.renderer, replace(case.dataset, test=()))
 
 
-def test_lpips_is_taken_with_its_backbone(case, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lpips_is_loaded_with_its_backbone(case, monkeypatch: pytest.MonkeyPatch) -> None:
     class Constant:
         backbone = "alex"
 
@@ -277,7 +277,7 @@ def test_a_perfect_view_does_not_hide_the_mean_of_the_others(case) -> None:
     assert alone["psnr"] is None and "infinite" in alone["psnr_reason"]
 
 
-def test_peak_memory_is_a_number_where_the_system_tells_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_peak_memory_is_measured_where_supported(monkeypatch: pytest.MonkeyPatch) -> None:
     peak = peak_memory_mib()
     assert isinstance(peak, float) and 50 < peak < 1e6
     monkeypatch.setitem(sys.modules, "resource", None)

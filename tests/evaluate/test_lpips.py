@@ -58,13 +58,13 @@ def test_images_of_different_sizes_are_refused() -> None:
         Lpips(mean_difference)(torch.zeros(32, 32, 3), torch.zeros(32, 33, 3))
 
 
-def test_without_torchmetrics_the_reason_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_torchmetrics_is_reported_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torchmetrics", None)
     assert load_lpips() == "pip install 'glassplat[lpips]'"
 
 
 @pytest.mark.parametrize("error", [RuntimeError("operator torchvision::nms does not exist"), OSError("no network")])
-def test_what_keeps_torchmetrics_from_loading_is_the_reason(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_import_error_of_torchmetrics_is_the_reason(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(**options: object) -> None:
         raise error
 

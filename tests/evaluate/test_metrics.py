@@ -74,7 +74,7 @@ def test_gain_is_the_least_squares_one() -> None:
     assert errors[1] < min(errors[0], errors[2])
 
 
-def test_a_lamp_that_is_brighter_than_white_does_not_darken_what_it_stands_in() -> None:
+def test_overexposed_lamps_do_not_bias_the_reflection_gain() -> None:
     light = 0.5 * IMAGE.reshape(-1, 3)
     light[:7] = 20.0
     assert reflection_gain([light], [light.clamp(0, 1)]) == pytest.approx(1.0)
@@ -104,7 +104,7 @@ def test_bad_arguments_are_refused() -> None:
         quantize(torch.tensor([1]))
 
 
-def test_a_photograph_of_another_exposure_is_met_after_correction() -> None:
+def test_an_exposure_correction_matches_the_photograph() -> None:
     image = torch.rand(12, 20, 3, generator=torch.Generator().manual_seed(4)) * 0.5 + 0.2
     photo = image @ torch.tensor([[1.2, 0.0, 0.1], [0.0, 0.9, 0.0], [0.05, 0.0, 1.0]]) + 0.02
     assert psnr(image, photo) < 30 < 45 < psnr(correct_colors(image, photo), photo)

@@ -22,7 +22,7 @@ from tests.training.tiny_capture import tiny_capture, true_scene, write_tiny_cap
 NOTHING_RENDERED = Frame(torch.zeros(0), {})
 
 
-def test_a_mask_says_where_the_pane_is() -> None:
+def test_a_mask_marks_the_pane() -> None:
     regions = marked_regions(pane(2.0, half=0.1))
     view = tiny_capture().train[0]
     region = regions.find(view, NOTHING_RENDERED, None)
@@ -30,7 +30,7 @@ def test_a_mask_says_where_the_pane_is() -> None:
     assert torch.equal(region, view.pane_labels > 0)
 
 
-def test_without_a_mask_the_fitted_plane_says_it() -> None:
+def test_the_fitted_plane_gives_the_region_without_a_mask() -> None:
     view = tiny_capture().train[1]
     assert view.pane_labels is None
     region = marked_regions(true_scene().planes).find(view, NOTHING_RENDERED, None)
@@ -51,7 +51,7 @@ def test_methods_are_measured_over_the_same_pixels(tmp_path: Path) -> None:
     assert "from the plane of the masks" in plane_text(plane)
 
 
-def test_an_evaluation_says_how_far_it_is(tmp_path: Path) -> None:
+def test_an_evaluation_reports_progress(tmp_path: Path) -> None:
     write_tiny_capture(tmp_path / "capture")
     run, steps = open_run(write_run(tmp_path / "run")), []
     evaluate_run(run, align="always", show=steps.append)
@@ -64,7 +64,7 @@ def test_an_evaluation_says_how_far_it_is(tmp_path: Path) -> None:
     ]
 
 
-def test_where_the_masks_lead_nowhere_the_method_says_it(tmp_path: Path) -> None:
+def test_regions_are_rendered_if_masks_give_no_plane(tmp_path: Path) -> None:
     path = write_run(tmp_path / "run")
     assert pane_regions(open_run(path).dataset, "auto") is RENDERED_REGIONS
 
@@ -83,7 +83,7 @@ def test_the_truth_comes_first_and_masks_on_request(tmp_path: Path) -> None:
     assert pane_regions(dataset, "masks").planes is not None
 
 
-def test_a_plane_that_turned_is_told_from_that_of_the_masks() -> None:
+def test_the_drift_of_a_plane_from_the_masks_is_measured() -> None:
     marked = pane(2.0, half=0.8)
     normal, angle = marked.normals[0], math.radians(5)
     sideways = torch.nn.functional.normalize(

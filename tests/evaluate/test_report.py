@@ -109,13 +109,13 @@ def test_captions_of_uses_have_no_dashes_that_the_font_joins(
     assert "pane as a mirror (glassplat render)" in captions and not any("--" in caption for caption in captions)
 
 
-def test_without_a_pane_in_view_there_are_no_uses_to_show(case, tmp_path: Path) -> None:
+def test_uses_are_omitted_without_a_visible_pane(case, tmp_path: Path) -> None:
     unseen = replace(case, renderer=case.renderer.with_layers(strength=torch.zeros(32, 48)))
     assert "uses.png" not in references(written_report(unseen, tmp_path / "run"))
     assert not (tmp_path / "run" / "uses.png").exists()
 
 
-def test_panels_lie_where_their_captions_say(case) -> None:
+def test_panels_are_below_their_captions(case) -> None:
     frame, view = case.renderer.frames[40.0], case.dataset.test[0]
     sheet = comparison_sheet(frame, view.photo, None, title="a")
     top, factor = MARGIN + TITLE_HEIGHT + CAPTION_HEIGHT, 6
@@ -173,7 +173,7 @@ def test_true_normals_and_strength_stand_below_what_was_rendered(case) -> None:
     assert panel_at(without_layers, 1, 1)[0, 0].tolist() == [128, 128, 255]
 
 
-def test_what_has_no_normal_is_grey() -> None:
+def test_pixels_without_a_normal_are_grey() -> None:
     normals = torch.tensor([[0.0, 0.0, 0.0], [float("nan"), 0.0, 1.0], [-2.0, 1.0, 0.0]])
     assert normal_colors(normals).tolist() == [[0.5, 0.5, 0.5], [0.5, 0.5, 1.0], [0.0, 1.0, 0.5]]
 
@@ -205,7 +205,7 @@ def test_missing_values_are_dashes_with_their_reason() -> None:
     assert '<div title="no &quot;weights&quot;"><b>-</b><span>LPIPS</span></div>' in page
 
 
-def test_the_page_says_why_a_number_is_missing_and_what_the_others_mean() -> None:
+def test_the_page_explains_missing_numbers_and_metrics() -> None:
     reason = "no weights in <folder>"
     results = {"psnr": 30.0, "lpips": None, "lpips_reason": reason, "reflection_gain": 1.25, "planes": [{"label": 1}]}
     page = overview_page(results, {}, {})

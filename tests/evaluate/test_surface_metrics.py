@@ -43,7 +43,7 @@ def test_only_covered_pixels_count_and_reflective_ones_apart() -> None:
 
 
 @pytest.mark.parametrize("value", [0.0, math.nan, math.inf])
-def test_a_normal_without_direction_counts_as_a_guess(value: float) -> None:
+def test_a_zero_normal_counts_as_unknown(value: float) -> None:
     normal = turned(0.0).clone()
     normal[2:10] = value
     assert surface_metrics(frame(normal=normal), PHOTO, TRUTH)["normal_error_deg"] == pytest.approx(45.0, abs=1e-4)
@@ -61,7 +61,7 @@ def test_strength_error_is_absolute_and_of_the_covered_pixels() -> None:
     assert surface_metrics(frame(strength=rendered), PHOTO, TRUTH)["strength_error"] == pytest.approx(0.05, abs=1e-6)
 
 
-def test_what_is_missing_is_the_reason() -> None:
+def test_the_reason_names_what_is_missing() -> None:
     both = frame(normal=turned(1.0), strength=STRENGTH)
     assert surface_metrics(frame(), PHOTO, TRUTH) == {
         "reflective_psnr": pytest.approx(0.0),
@@ -88,7 +88,7 @@ def test_the_image_is_measured_where_it_is_a_reflection() -> None:
     assert metrics["reflective_psnr"] == pytest.approx(20.0, abs=0.2)
 
 
-def test_slivers_do_not_count() -> None:
+def test_mask_slivers_are_ignored() -> None:
     both = frame(normal=turned(1.0), strength=STRENGTH)
     sliver = TrueSurface(COVERED & (torch.arange(WIDTH) < 6), TRUTH.normals, STRENGTH)
     assert surface_metrics(both, PHOTO, sliver)["normal_error_deg"] == "fewer than 100 pixels show a surface"

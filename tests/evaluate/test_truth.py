@@ -23,7 +23,7 @@ def write_view(folder: Path, stem: str, labels: np.ndarray) -> None:
 LABELS = np.array([[1, 1, 2, 2, 0, 0], [1, 1, 2, 0, 0, 0]], dtype=np.uint8)
 
 
-def test_no_folder_is_no_truth() -> None:
+def test_a_missing_folder_means_no_truth() -> None:
     assert load_truth(None) is None
 
 

@@ -10,7 +10,7 @@ import pytest
 from glassplat.files.writing import atomic_write
 
 
-def test_replaces_the_file_and_leaves_nothing_else(tmp_path: Path) -> None:
+def test_a_write_replaces_the_file_and_leaves_no_other(tmp_path: Path) -> None:
     target = tmp_path / "new" / "folder" / "results.json"
     for content in ("first", "second"):
         with atomic_write(target) as temporary:
@@ -21,7 +21,7 @@ def test_replaces_the_file_and_leaves_nothing_else(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [RuntimeError("interrupted"), KeyboardInterrupt()])
-def test_failure_keeps_the_old_file(tmp_path: Path, error: BaseException) -> None:
+def test_a_failed_write_keeps_the_old_file(tmp_path: Path, error: BaseException) -> None:
     target = tmp_path / "scene.ply"
     target.write_text("old")
     with pytest.raises(type(error)), atomic_write(target) as temporary:
@@ -55,7 +55,7 @@ def test_follows_a_symbolic_link(tmp_path: Path) -> None:
     assert (tmp_path / "real.json").read_text() == "new"
 
 
-def test_a_name_may_be_as_long_as_names_may_be(tmp_path: Path) -> None:
+def test_names_of_maximum_length_are_accepted(tmp_path: Path) -> None:
     target = tmp_path / f"{'x' * 251}.png"
     with atomic_write(target) as temporary:
         temporary.write_text("content")
@@ -70,7 +70,7 @@ def test_writers_that_pick_a_format_see_the_suffix_of_a_link(tmp_path: Path) -> 
     assert (tmp_path / "disk" / "film").read_text() == "new"
 
 
-def test_an_error_without_a_number_is_told_without_one(tmp_path: Path) -> None:
+def test_an_oserror_without_errno_is_reported(tmp_path: Path) -> None:
     with (
         pytest.raises(OSError, match=r"^could not write .* \(a library said so\); the previous"),
         atomic_write(tmp_path / "a"),

@@ -24,7 +24,7 @@ def test_entries_give_the_pose_of_the_camera_in_the_world(tmp_path: Path) -> Non
     torch.testing.assert_close(world_from_cam @ pose, torch.eye(4), atol=1e-6, rtol=0)
 
 
-def test_cameras_come_back(tmp_path: Path) -> None:
+def test_cameras_round_trip(tmp_path: Path) -> None:
     pose = torch.eye(4)
     pose[:3, :3] = rotation_from_quat(torch.tensor([0.9, 0.1, -0.3, 0.2]))
     pose[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
@@ -59,7 +59,7 @@ def test_a_colmap_model_has_positions_in_any_unit(unit: float, tmp_path: Path) -
         ({"img_name": None}, "img_name of camera 1"),
     ],
 )
-def test_what_is_no_camera_is_refused(change: dict, words: str, tmp_path: Path) -> None:
+def test_invalid_cameras_are_refused(change: dict, words: str, tmp_path: Path) -> None:
     whole = {"img_name": "a", "width": 8, "height": 6, "position": [0, 0, 0], "fx": 8, "fy": 8}
     whole["rotation"] = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
     path = tmp_path / "cameras.json"

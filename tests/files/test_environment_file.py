@@ -13,7 +13,9 @@ def noise(size: int = 3) -> Environment:
 
 
 @pytest.mark.parametrize("region", [None, (0.1, -2.0, 1e-7, 3.3)])
-def test_an_environment_survives_bit_for_bit(tmp_path: Path, region: tuple[float, float, float, float] | None) -> None:
+def test_an_environment_round_trips_bit_for_bit(
+    tmp_path: Path, region: tuple[float, float, float, float] | None
+) -> None:
     for raw in (noise().raw.requires_grad_(), noise(1).raw.double(), Environment.empty().raw):
         write_environment(tmp_path / "environment.safetensors", Environment(raw, region))
         read = read_environment(tmp_path / "environment.safetensors")

@@ -20,7 +20,7 @@ def write_channels(path: Path, channels: dict[str, np.ndarray]) -> None:
 
 
 @pytest.mark.parametrize(("suffix", "tolerance"), [(".exr", 1e-6), (".EXR", 1e-6), (".png", 0.5 / 255 + 1e-6)])
-def test_a_panorama_survives(tmp_path: Path, suffix: str, tolerance: float) -> None:
+def test_a_panorama_round_trips(tmp_path: Path, suffix: str, tolerance: float) -> None:
     image = panorama()
     image[0, 0], image[0, 1] = 0, 1
     write_equirect(tmp_path / f"sky{suffix}", image)
@@ -46,7 +46,7 @@ def test_half_floats_transparency_and_light_brighter_than_white_are_read(tmp_pat
     torch.testing.assert_close(read[1], torch.full((4, 3), 0.7353570), atol=1e-5, rtol=0)
 
 
-def test_files_that_are_no_panorama_are_named(tmp_path: Path) -> None:
+def test_files_that_are_not_a_panorama_are_named(tmp_path: Path) -> None:
     write_equirect(tmp_path / "sky.exr", panorama(40))
     whole = (tmp_path / "sky.exr").read_bytes()
     for name, contents in (("half.exr", whole[: len(whole) // 2]), ("text.exr", b"no image"), ("empty.exr", b"")):

@@ -7,7 +7,7 @@ from glassplat.files.sidecars import read_corrections, write_corrections
 from glassplat.scene.corrections import Exposures
 
 
-def test_what_was_written_is_read(tmp_path: Path) -> None:
+def test_written_files_are_read(tmp_path: Path) -> None:
     affine = torch.randn(3, 3, 4, generator=torch.Generator().manual_seed(0))
     write_corrections(tmp_path / "exposures.json", Exposures(affine, ("a.png", "b/c.png", "ü.png")))
     found = read_corrections(tmp_path / "exposures.json", Exposures)

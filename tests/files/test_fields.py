@@ -39,7 +39,7 @@ CASES: list[tuple[Field, list[Any], list[Any]]] = [
 
 
 @pytest.mark.parametrize(("kind", "good", "bad"), CASES)
-def test_a_field_takes_what_it_says_and_nothing_else(kind: Field, good: list[Any], bad: list[Any]) -> None:
+def test_a_field_accepts_only_values_of_its_type(kind: Field, good: list[Any], bad: list[Any]) -> None:
     for value in good:
         read = kind.read(value, "it")
         assert read == (tuple(value) if isinstance(value, list) else value)
@@ -66,7 +66,7 @@ def test_numbers_are_read_in_one_type() -> None:
         (Nullable(Text()), "a text that is not empty, or null"),
     ],
 )
-def test_what_was_expected_reads_well(kind: Field, text: str) -> None:
+def test_expectations_in_messages_are_readable(kind: Field, text: str) -> None:
     assert kind.expected == text
 
 

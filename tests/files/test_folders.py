@@ -12,7 +12,7 @@ from glassplat.files.writing import SPLAT_WRITERS, check_folder, make_folder, sc
 
 
 @pytest.mark.parametrize("name", ["new", "new/below/it", "there", "link"])
-def test_a_folder_is_made_where_there_can_be_one(name: str, tmp_path: Path) -> None:
+def test_a_folder_is_created_if_possible(name: str, tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "there")
     check_folder(tmp_path / name)
@@ -22,7 +22,7 @@ def test_a_folder_is_made_where_there_can_be_one(name: str, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("name", ["file", "file/below", "file/a/b", "nowhere", "nowhere/below", "loop", "x" * 300])
-def test_what_is_in_the_way_is_named_once(name: str, tmp_path: Path) -> None:
+def test_obstructing_files_are_named_once(name: str, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("kept")
     (tmp_path / "nowhere").symlink_to(tmp_path / "gone")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
@@ -32,7 +32,7 @@ def test_what_is_in_the_way_is_named_once(name: str, tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "loop", "nowhere"]
 
 
-def test_where_a_name_is_too_long_no_folder_above_it_is_left(tmp_path: Path) -> None:
+def test_a_too_long_name_leaves_no_parent_folder(tmp_path: Path) -> None:
     with pytest.raises(NotADirectoryError, match="too long"):
         make_folder(tmp_path / "new" / ("x" * 300))
     assert not (tmp_path / "new").exists()

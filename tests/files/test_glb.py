@@ -50,7 +50,7 @@ def edited(path: Path, edit: Callable[[dict[str, Any]], None]) -> Path:
 
 
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
-def test_what_is_written_comes_back(coefficients: int, tmp_path: Path) -> None:
+def test_written_values_are_read_back(coefficients: int, tmp_path: Path) -> None:
     before = typical(coefficients)
     after = read_glb(written(tmp_path, before))
     assert after.active_sh_degree == before.max_sh_degree and not after.channels
@@ -62,7 +62,7 @@ def test_what_is_written_comes_back(coefficients: int, tmp_path: Path) -> None:
     torch.testing.assert_close(after.quats, torch.nn.functional.normalize(before.quats, dim=1))
 
 
-def test_channels_come_back_bit_for_bit(tmp_path: Path) -> None:
+def test_channels_round_trip_bit_for_bit(tmp_path: Path) -> None:
     values = torch.linspace(-3, 2, len(typical()))
     before = replace(typical(), channels={"log_intensity": values, "logit_strength": values.flip(0)})
     path = written(tmp_path, before)
@@ -73,7 +73,7 @@ def test_channels_come_back_bit_for_bit(tmp_path: Path) -> None:
     assert hasattr(attributes, "_GLASSPLAT_LOG_INTENSITY"), "other programs leave alone what begins with an underscore"
 
 
-def test_what_all_gaussians_have_is_no_channel(tmp_path: Path) -> None:
+def test_standard_attributes_are_no_channels(tmp_path: Path) -> None:
     def rename(document: dict[str, Any]) -> None:
         attributes = document["meshes"][0]["primitives"][0]["attributes"]
         attributes["_GLASSPLAT_LOG_SCALES"] = attributes.pop("_GLASSPLAT_LOG_INTENSITY")
@@ -119,7 +119,7 @@ def test_a_channel_of_another_length_is_refused(tmp_path: Path) -> None:
         write_glb(tmp_path / "b.glb", replace(before, channels={"log_X": before.logit_opacities}))
 
 
-def test_discs_come_back_as_discs(tmp_path: Path) -> None:
+def test_discs_are_read_back_as_discs(tmp_path: Path) -> None:
     before = replace(typical(), log_scales=typical().log_scales[:, :2].contiguous())
     after = read_glb(written(tmp_path, before))
     assert after.are_discs
@@ -162,7 +162,7 @@ def test_another_program_reads_what_the_extension_promises(tmp_path: Path) -> No
     )
 
 
-def test_what_another_program_wrote_is_read() -> None:
+def test_files_of_another_program_are_read() -> None:
     before, after = typical(count=3), read_glb(FOREIGN)
     torch.testing.assert_close(after.means, before.means)
     torch.testing.assert_close(after.sh, before.sh)
@@ -296,7 +296,9 @@ LIES = {
 
 
 @pytest.mark.parametrize(("edit", "message"), LIES.values(), ids=LIES)
-def test_a_document_that_lies_is_refused(edit: Callable[[dict[str, Any]], None], message: str, tmp_path: Path) -> None:
+def test_an_inconsistent_document_is_refused(
+    edit: Callable[[dict[str, Any]], None], message: str, tmp_path: Path
+) -> None:
     path = edited(written(tmp_path), edit)
     with pytest.raises(ValueError, match=message):
         read_glb(path)
@@ -311,7 +313,7 @@ def test_one_mesh_shown_over_and_over_is_refused(tmp_path: Path) -> None:
         read_glb(edited(written(tmp_path, typical(count=1000)), repeat))
 
 
-def test_logarithmic_scales_of_drafts_are_told(tmp_path: Path) -> None:
+def test_logarithmic_scales_of_drafts_are_reported(tmp_path: Path) -> None:
     path = written(tmp_path)
     data = bytearray(path.read_bytes())
     gltf = pygltflib.GLTF2().load_binary(str(path))

@@ -28,7 +28,7 @@ GENERATOR = np.random.default_rng(0)
 
 
 @pytest.mark.parametrize("shape", [(5, 7), (5, 7, 1), (5, 7, 3), (5, 7, 4)])
-def test_eight_bits_survive(tmp_path: Path, shape: tuple[int, ...]) -> None:
+def test_eight_bit_images_round_trip(tmp_path: Path, shape: tuple[int, ...]) -> None:
     pixels = GENERATOR.integers(0, 256, shape, dtype=np.uint8)
     write_image(tmp_path / "a.png", pixels)
     read = read_image(tmp_path / "a.png")
@@ -131,16 +131,14 @@ def test_an_image_too_large_to_decode_is_named_with_its_size(tmp_path: Path) -> 
         (np.full((3, 4), -1, dtype=np.int32), "values from -1 to -1; expected colours"),
     ],
 )
-def test_values_of_which_nothing_says_what_is_white_are_refused(
-    tmp_path: Path, values: np.ndarray, message: str
-) -> None:
+def test_mask_values_of_unknown_scale_are_refused(tmp_path: Path, values: np.ndarray, message: str) -> None:
     Image.fromarray(values).save(tmp_path / "a.tif", icc_profile=p3_profile())
     for read in (open_image, read_image, read_colors, read_image_float):
         with pytest.raises(ValueError, match=rf"a\.tif as an image \(it holds {message}"):
             read(tmp_path / "a.tif")
 
 
-def test_a_program_in_an_image_is_not_run(tmp_path: Path) -> None:
+def test_code_embedded_in_an_image_is_not_executed(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 4 3\nshowpage\n")
     with pytest.raises(ValueError, match=r"a\.png as an image"):
         read_image(tmp_path / "a.png")
@@ -171,7 +169,7 @@ def test_colours_of_another_profile_become_srgb(tmp_path: Path, mode: str) -> No
 
 
 @pytest.mark.parametrize(("index", "expected"), [("R03", (230, 79, 56)), ("R98", (200, 80, 60))])
-def test_adobe_rgb_that_only_tags_tell_of_becomes_srgb(tmp_path: Path, index: str, expected: tuple) -> None:
+def test_adobe_rgb_marked_only_by_exif_becomes_srgb(tmp_path: Path, index: str, expected: tuple) -> None:
     exif = Image.Exif()
     exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.IFD.Interop] = {ExifTags.Interop.InteropIndex: index}
     Image.new("RGB", (16, 16), (200, 80, 60)).save(tmp_path / "a.jpg", quality=100, subsampling=0, exif=exif)
@@ -191,13 +189,13 @@ def test_greys_of_a_colour_profile_stay_grey(tmp_path: Path, mode: str) -> None:
     ids=["none", "sRGB", "empty", "noise", "P3 cut off", "sRGB cut off"],
 )
 @pytest.mark.parametrize("mode", ["RGB", "CMYK"])
-def test_without_another_profile_colours_stay_as_they_are(tmp_path: Path, profile: bytes | None, mode: str) -> None:
+def test_colours_without_another_profile_are_unchanged(tmp_path: Path, profile: bytes | None, mode: str) -> None:
     pixels = GENERATOR.integers(0, 256, (40, 30, 3), dtype=np.uint8)
     Image.fromarray(pixels).convert(mode).save(tmp_path / "a.tif", icc_profile=profile)
     np.testing.assert_array_equal(read_colors(tmp_path / "a.tif"), read_image(tmp_path / "a.tif"))
 
 
-def test_a_profile_of_colours_is_none_of_inks(tmp_path: Path) -> None:
+def test_an_rgb_profile_is_ignored_for_cmyk(tmp_path: Path) -> None:
     Image.new("CMYK", (5, 4), (9, 99, 200, 3)).save(tmp_path / "a.tif", icc_profile=p3_profile())
     np.testing.assert_array_equal(read_colors(tmp_path / "a.tif"), read_image(tmp_path / "a.tif"))
 
@@ -229,7 +227,7 @@ def test_images_that_cannot_be_written(tmp_path: Path, name: str, image, error: 
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_what_the_system_says_of_a_file_is_quoted_alone(tmp_path: Path) -> None:
+def test_system_errors_about_a_file_are_quoted_alone(tmp_path: Path) -> None:
     (tmp_path / "a.png").mkdir()
     with pytest.raises(ValueError, match=r"^cannot read .*a\.png as an image \(Is a directory\); replace"):
         read_image(tmp_path / "a.png")

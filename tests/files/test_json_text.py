@@ -63,7 +63,7 @@ def test_numbers_of_any_length_are_numbers() -> None:
     assert beyond == float("inf")
 
 
-def test_what_is_no_file_is_named(tmp_path: Path) -> None:
+def test_paths_that_are_not_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"absent\.json does not exist"):
         read_json(tmp_path / "absent.json")
     os.symlink(tmp_path / "loop.json", tmp_path / "loop.json")

@@ -33,7 +33,7 @@ def executed(tree: ast.AST) -> Iterator[str]:
 @pytest.mark.parametrize(
     "source", ["eval(text)", "torch.load(path)", "np.load(path, allow_pickle=True)", "run(command, shell=True)"]
 )
-def test_what_executes_is_found(source: str) -> None:
+def test_calls_that_execute_code_are_found(source: str) -> None:
     assert list(executed(ast.parse(source)))
 
 

@@ -43,7 +43,7 @@ NAMES = st.lists(st.lists(PARTS, min_size=1, max_size=4).map("/".join).filter(bo
 
 
 @given(NAMES)
-def test_no_picture_leaves_its_folder_or_stands_in_anothers_way(names: list[str]) -> None:
+def test_images_stay_in_their_folder_and_never_collide(names: list[str]) -> None:
     for paths in (
         list(image_paths(names).values()),
         [Path(name) for name in flat_image_names(names).values()],

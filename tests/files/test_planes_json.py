@@ -39,7 +39,7 @@ def tinted_planes() -> Planes:
 
 
 @pytest.mark.parametrize("planes", [random_planes(0), random_planes(1), random_planes(3), tinted_planes()])
-def test_planes_survive_bit_for_bit(tmp_path: Path, planes: Planes) -> None:
+def test_planes_round_trip_bit_for_bit(tmp_path: Path, planes: Planes) -> None:
     write_planes(tmp_path / "planes.json", planes)
     read = read_planes(tmp_path / "planes.json")
     assert read.labels == planes.labels and read.mirrors == planes.mirrors
@@ -48,7 +48,7 @@ def test_planes_survive_bit_for_bit(tmp_path: Path, planes: Planes) -> None:
         assert torch.equal(read.tensors()[name], tensor), name
 
 
-def test_a_perfect_mirror_survives(tmp_path: Path) -> None:
+def test_a_perfect_mirror_round_trips(tmp_path: Path) -> None:
     planes = random_planes(1).with_tensors({"logit_reflectances": torch.tensor([30.0])})
     write_planes(tmp_path / "planes.json", planes)
     assert json.loads((tmp_path / "planes.json").read_text())[0]["base_reflectance"] == 1.0

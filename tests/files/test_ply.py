@@ -37,7 +37,7 @@ def write_ply(path: Path, ply_format: str, names: list[str], body: bytes, count:
 
 @pytest.mark.parametrize("coefficients", [0, 1, 4, 9, 16])
 @pytest.mark.parametrize("channels", [(), ("log_intensity", "logit_mark"), ("logit_strength",)])
-def test_every_tensor_survives_bit_for_bit(tmp_path: Path, coefficients: int, channels: tuple[str, ...]) -> None:
+def test_every_tensor_round_trips_bit_for_bit(tmp_path: Path, coefficients: int, channels: tuple[str, ...]) -> None:
     original = random_gaussians(coefficients, channels)
     write_gaussians(tmp_path / "a.ply", original)
     read = read_gaussians(tmp_path / "a.ply")
@@ -48,7 +48,7 @@ def test_every_tensor_survives_bit_for_bit(tmp_path: Path, coefficients: int, ch
     assert read.active_sh_degree == max(original.max_sh_degree, 0)
 
 
-def test_special_values_survive(tmp_path: Path) -> None:
+def test_special_values_round_trip(tmp_path: Path) -> None:
     original = random_gaussians(1)
     original.logit_opacities[:4] = torch.tensor([float("inf"), -0.0, 1e-42, 3.4e38])
     write_gaussians(tmp_path / "a.ply", original)
@@ -123,26 +123,26 @@ def test_doubles_and_an_element_in_front_are_read(tmp_path: Path) -> None:
     assert read_gaussians(tmp_path / "a.ply").means.tolist() == [[0.0, 1.0, 2.0]]
 
 
-def test_a_truncated_file_says_how_much_is_there(tmp_path: Path) -> None:
+def test_a_truncated_file_is_refused_with_the_number_of_rows(tmp_path: Path) -> None:
     write_gaussians(tmp_path / "a.ply", random_gaussians(1))
     (tmp_path / "a.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-5])
     with pytest.raises(ValueError, match="announces 7 rows of 'vertex', but only 6 are complete; copy or export"):
         read_gaussians(tmp_path / "a.ply")
 
 
-def test_a_truncated_text_file_says_how_much_is_there(tmp_path: Path) -> None:
+def test_a_truncated_text_file_is_refused_with_the_number_of_rows(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", "ascii", PLAIN, b"0 1 2 3 4 5 6 7 8 9 10\n0 1 2", 2)
     with pytest.raises(ValueError, match="announces 2 rows of 'vertex', but only 1 are complete"):
         read_gaussians(tmp_path / "a.ply")
 
 
-def test_an_absurd_count_is_refused_before_memory_is_asked_for(tmp_path: Path) -> None:
+def test_an_absurd_count_is_refused_before_memory_is_allocated(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", "binary_little_endian", PLAIN, b"", 10**15)
     with pytest.raises(ValueError, match="only 0 are complete"):
         read_gaussians(tmp_path / "a.ply")
 
 
-def test_a_compressed_file_says_how_to_export_it(tmp_path: Path) -> None:
+def test_an_unsupported_compressed_file_is_refused_with_an_export_hint(tmp_path: Path) -> None:
     header = "ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\nelement vertex 1\n"
     header += "".join(f"property uint packed_{name}\n" for name in ("position", "rotation", "scale", "color"))
     (tmp_path / "a.ply").write_bytes(header.encode() + b"end_header\n" + bytes(20))
@@ -160,13 +160,13 @@ def test_a_compressed_file_says_how_to_export_it(tmp_path: Path) -> None:
         ([*PLAIN, "x"], "property 'x' appears twice"),
     ],
 )
-def test_a_foreign_file_says_what_is_missing(tmp_path: Path, names: list[str], message: str) -> None:
+def test_a_foreign_file_is_refused_with_what_is_missing(tmp_path: Path, names: list[str], message: str) -> None:
     write_ply(tmp_path / "a.ply", "binary_little_endian", names, bytes(4 * len(names)), 1)
     with pytest.raises(ValueError, match=message):
         read_gaussians(tmp_path / "a.ply")
 
 
-def test_a_mesh_is_called_a_mesh(tmp_path: Path) -> None:
+def test_a_mesh_is_refused_as_a_mesh(tmp_path: Path) -> None:
     header = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
     header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n3 0 0 0\n"
     (tmp_path / "a.ply").write_text(header)
@@ -220,7 +220,7 @@ def test_a_channel_that_could_not_be_read_back_is_refused(tmp_path: Path) -> Non
     assert not list(tmp_path.iterdir())
 
 
-def test_what_all_gaussians_have_is_no_channel(tmp_path: Path) -> None:
+def test_standard_attributes_are_no_channels(tmp_path: Path) -> None:
     write_gaussians(tmp_path / "a.ply", random_gaussians(4, ("log_intensity",)))
     data = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "a.ply").write_bytes(data.replace(b"float log_intensity", b"float log_scales"))

@@ -20,7 +20,7 @@ def lit(size: int = 3) -> Environment:
 
 @pytest.mark.parametrize("panes", [False, True])
 @pytest.mark.parametrize("environment", [Environment.empty(), lit()])
-def test_a_scene_survives_bit_for_bit(tmp_path: Path, panes: bool, environment: Environment) -> None:
+def test_a_scene_round_trips_bit_for_bit(tmp_path: Path, panes: bool, environment: Environment) -> None:
     whole = in_single_precision(showcase())
     scene = replace(whole if panes else Scene(whole.primary, whole.extent), environment=environment)
     write_scene(tmp_path, scene)
@@ -48,7 +48,7 @@ def surrounded() -> Scene:
     return replace(Scene(scene.primary, scene.extent), surroundings=around.select(torch.arange(0, len(around), 2)))
 
 
-def test_surroundings_survive_bit_for_bit(tmp_path: Path) -> None:
+def test_surroundings_round_trip_bit_for_bit(tmp_path: Path) -> None:
     scene = surrounded()
     write_scene(tmp_path, scene)
     read = read_scene(tmp_path)
@@ -58,7 +58,7 @@ def test_surroundings_survive_bit_for_bit(tmp_path: Path) -> None:
     assert not read.surroundings.channels
 
 
-def test_surroundings_that_are_lost_or_foreign_are_missed(tmp_path: Path) -> None:
+def test_lost_or_foreign_surroundings_are_reported(tmp_path: Path) -> None:
     write_scene(tmp_path, surrounded())
     header = json.loads((tmp_path / "scene.json").read_text())
     (tmp_path / "scene.json").write_text(json.dumps(header | {"surroundings_sh_degree": 3}))
@@ -76,7 +76,7 @@ def test_a_damaged_environment_is_named(tmp_path: Path) -> None:
         read_scene(tmp_path)
 
 
-def test_an_exported_environment_can_be_looked_at(tmp_path: Path) -> None:
+def test_an_exported_environment_can_be_viewed(tmp_path: Path) -> None:
     scene = replace(in_single_precision(showcase()), environment=lit(4))
     folder = RunDirectory(tmp_path).export(scene, step=7)
     shown = read_equirect(folder / "environment.png")
@@ -90,7 +90,7 @@ def test_an_exported_environment_can_be_looked_at(tmp_path: Path) -> None:
     ("part", "name", "value"),
     [("point_cloud", "sh", torch.nan), ("point_cloud", "log_intensity", 100.0), ("glass", "logit_mark", torch.inf)],
 )
-def test_values_that_no_image_survives_are_named(tmp_path: Path, part: str, name: str, value: float) -> None:
+def test_values_too_large_for_rendering_are_named(tmp_path: Path, part: str, name: str, value: float) -> None:
     scene = in_single_precision(showcase())
     gaussians = scene.primary if part == "point_cloud" else scene.glass
     broken = gaussians.tensors()[name].clone()

@@ -66,7 +66,7 @@ def test_a_splat_file_is_read(tmp_path: Path) -> None:
     )
 
 
-def test_the_first_bytes_say_what_a_file_is(tmp_path: Path) -> None:
+def test_file_types_are_recognised_by_their_first_bytes(tmp_path: Path) -> None:
     write_gaussians(tmp_path / "a.spz", typical())
     write_spz(tmp_path / "b.ply", typical(), 4)
     assert torch.equal(read_splats(tmp_path / "a.spz").means, typical().means)
@@ -74,7 +74,7 @@ def test_the_first_bytes_say_what_a_file_is(tmp_path: Path) -> None:
     assert torch.equal(with_intensity(typical()).channels["log_intensity"], torch.zeros(50))
 
 
-def test_what_cannot_be_drawn_is_left_out_and_counted(tmp_path: Path) -> None:
+def test_invalid_gaussians_are_left_out_and_counted(tmp_path: Path) -> None:
     gaussians = typical()
     gaussians.means[3], gaussians.quats[5], gaussians.log_scales[7, 1] = torch.nan, 0, 200
     gaussians.sh[9, 4, 1], gaussians.logit_opacities[11] = torch.inf, torch.inf
@@ -104,7 +104,7 @@ def compressed_header(count: int, chunks: int, kind: str = "uint") -> bytes:
         ("a.ply", compressed_header(1, 1, "int") + bytes(64), "expected uint"),
     ],
 )
-def test_files_that_lie_get_a_message(name: str, data: bytes, words: str, tmp_path: Path) -> None:
+def test_files_with_false_sizes_are_refused(name: str, data: bytes, words: str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(data)
     with pytest.raises(ValueError, match=words):
         read_splats(tmp_path / name)
@@ -142,7 +142,7 @@ def forged(gaussians: Gaussians, path: Path) -> Gaussians:
 
 @pytest.mark.parametrize("length", [0.3, 1.0, 3.0])
 @pytest.mark.parametrize("kind", ["sog", "ksplat"])
-def test_rotations_of_any_length_survive_other_programs_files(tmp_path: Path, kind: str, length: float) -> None:
+def test_rotations_of_any_length_round_trip_in_foreign_files(tmp_path: Path, kind: str, length: float) -> None:
     before = typical(count=200)
     before = before.with_tensors({"quats": length * torch.nn.functional.normalize(before.quats, dim=1)})
     after = forged(before, tmp_path / f"a.{kind}")

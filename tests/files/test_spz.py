@@ -44,7 +44,7 @@ def packed(version: int, *sections: bytes, count: int = 1, degree: int = 0, bits
 
 @pytest.mark.parametrize("version", [3, 4])
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
-def test_what_is_written_comes_back(version: int, coefficients: int, tmp_path: Path) -> None:
+def test_written_values_are_read_back(version: int, coefficients: int, tmp_path: Path) -> None:
     before = typical(coefficients)
     write_spz(tmp_path / "a.spz", before, version)
     after = read_spz(tmp_path / "a.spz")
@@ -60,7 +60,7 @@ def test_what_is_written_comes_back(version: int, coefficients: int, tmp_path: P
     assert float((unit * after.quats).sum(1).abs().min()) > 1 - 1e-5
 
 
-def test_a_second_way_through_changes_nothing(tmp_path: Path) -> None:
+def test_rewriting_a_file_changes_nothing(tmp_path: Path) -> None:
     write_spz(tmp_path / "a.spz", typical())
     first = read_spz(tmp_path / "a.spz")
     write_spz(tmp_path / "b.spz", first)
@@ -105,7 +105,7 @@ def test_older_versions_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("bits", [0x7C01, 0x7DFF, 0xFC01, 0x7E00], ids=hex)
-def test_a_position_that_is_no_number_is_read_without_a_warning(bits: int, tmp_path: Path) -> None:
+def test_a_nan_position_is_read_without_a_warning(bits: int, tmp_path: Path) -> None:
     """Found by `tools/trial.py readers`: halves may be signalling NaNs, and NumPy warns of arithmetic with those."""
     half = np.array([bits, 0x3C00, 0x3C00], dtype="<u2").tobytes()
     (tmp_path / "a.spz").write_bytes(packed(1, half, bytes(1 + 3 + 3 + 3)))
@@ -145,7 +145,7 @@ def test_what_cannot_be_written_is_refused(change: dict, words: str, tmp_path: P
 
 
 @pytest.mark.parametrize("log_scale", [-12.0, 8.0])
-def test_sizes_that_are_clipped_are_told_of(log_scale: float, caplog: pytest.LogCaptureFixture) -> None:
+def test_clipped_sizes_are_reported(log_scale: float, caplog: pytest.LogCaptureFixture) -> None:
     before = typical(count=2000)
     spz_bytes(before)
     flat = before.log_scales.clone()
@@ -159,7 +159,7 @@ def test_sizes_that_are_clipped_are_told_of(log_scale: float, caplog: pytest.Log
     assert "4.5e-05 to 379 units; those of 0.5 % of" in caplog.text and "`glassplat clean --scale`" in caplog.text
 
 
-def test_positions_that_are_rounded_by_more_than_a_gaussian_are_told_of(caplog: pytest.LogCaptureFixture) -> None:
+def test_positions_rounded_by_more_than_a_gaussian_are_reported(caplog: pytest.LogCaptureFixture) -> None:
     far = typical().means.clone()
     spz_bytes(typical())
     assert not caplog.messages
@@ -194,7 +194,7 @@ def streamed(count: int, table: list[tuple[int, int]], body: bytes = b"", offset
         (streamed(1, [(3, 9), (1, 1), (1, 3), (1, 3), (1, 4)], b"xxxxxxx"), "section 0"),
     ],
 )  # fmt: skip
-def test_damaged_files_get_a_message(data: bytes, words: str, tmp_path: Path) -> None:
+def test_damaged_files_are_refused_with_a_message(data: bytes, words: str, tmp_path: Path) -> None:
     (tmp_path / "a.spz").write_bytes(data)
     with pytest.raises(ValueError, match=words):
         read_spz(tmp_path / "a.spz")

@@ -40,14 +40,14 @@ def no_file_beyond(size: int) -> Iterator[None]:
         ("Error while serializing: HeaderTooLarge", None),
     ],
 )
-def test_a_full_disk_is_known_by_its_number_whoever_says_so(said: str, number: int | None) -> None:
+def test_a_full_disk_is_recognised_by_its_errno(said: str, number: int | None) -> None:
     error = system_error(said)
     assert (error.errno, error.filename) == (number, None) and said in str(error)
     assert describe_os_error(error).endswith("free some space, then repeat the command") == (number is not None)
 
 
 @pytest.mark.parametrize("name", ["a.safetensors", "a.exr"])
-def test_what_the_system_says_keeps_its_number(name: str, tmp_path: Path) -> None:
+def test_system_errors_keep_their_errno(name: str, tmp_path: Path) -> None:
     with no_file_beyond(4000), pytest.raises(OSError, match=r"could not write .* are unchanged") as caught:
         if name == "a.exr":
             write_equirect(tmp_path / name, torch.rand(64, 128, 3))
@@ -56,7 +56,7 @@ def test_what_the_system_says_keeps_its_number(name: str, tmp_path: Path) -> Non
     assert caught.value.errno == errno.EFBIG
 
 
-def test_tensors_and_header_survive(tmp_path: Path) -> None:
+def test_tensors_and_header_round_trip(tmp_path: Path) -> None:
     path = tmp_path / "a.safetensors"
     write_tensors(path, TENSORS, {"format": "x-1", "step": 3})
     with open_tensors(path, "x-1", "an x") as file:
@@ -65,7 +65,7 @@ def test_tensors_and_header_survive(tmp_path: Path) -> None:
     assert read.keys() == TENSORS.keys() and all(torch.equal(read[name], TENSORS[name]) for name in read)
 
 
-def test_a_full_disk_is_an_error_of_the_system_and_keeps_the_older_file(tmp_path: Path) -> None:
+def test_a_full_disk_raises_oserror_and_keeps_the_older_file(tmp_path: Path) -> None:
     path = tmp_path / "a.safetensors"
     write_tensors(path, TENSORS, {"format": "x-1"})
     before = path.read_bytes()
@@ -74,7 +74,7 @@ def test_a_full_disk_is_an_error_of_the_system_and_keeps_the_older_file(tmp_path
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
 
 
-def test_the_file_may_be_read_by_whom_other_files_may_be(tmp_path: Path) -> None:
+def test_the_file_has_the_usual_permissions(tmp_path: Path) -> None:
     before = os.umask(0o027)
     try:
         write_tensors(tmp_path / "a.safetensors", TENSORS, {})
@@ -134,7 +134,7 @@ def test_a_file_that_is_cut_off_is_named(tmp_path: Path, kept: int) -> None:
         pass
 
 
-def test_what_is_no_file_is_named(tmp_path: Path) -> None:
+def test_paths_that_are_not_files_are_named(tmp_path: Path) -> None:
     with (
         pytest.raises(FileNotFoundError, match="absent does not exist"),
         open_tensors(tmp_path / "absent", "x-1", "an x"),
@@ -144,7 +144,7 @@ def test_what_is_no_file_is_named(tmp_path: Path) -> None:
         pass
 
 
-def test_a_long_reason_is_cut_short(tmp_path: Path) -> None:
+def test_a_long_reason_is_truncated(tmp_path: Path) -> None:
     header = b'{"a": {"dtype": "F32", "shape": "%s"}}' % (b"x" * 5000)
     (tmp_path / "a.safetensors").write_bytes(len(header).to_bytes(8, "little") + header)
     with (
@@ -155,7 +155,7 @@ def test_a_long_reason_is_cut_short(tmp_path: Path) -> None:
     assert len(str(caught.value)) < 500 + len(str(tmp_path))
 
 
-def test_a_folder_whose_name_is_no_text_is_read_again(tmp_path: Path) -> None:
+def test_a_folder_whose_name_is_not_unicode_can_be_read(tmp_path: Path) -> None:
     folder = tmp_path / os.fsdecode(b"caf\xe9")
     write_tensors(folder / "a.safetensors", {"a": torch.ones(2)}, {"format": "x"})
     with open_tensors(folder / "a.safetensors", "x", "a test") as opened:

@@ -87,7 +87,7 @@ def test_ellipses_of_all_shapes(longest: float, shortest: float, excess: float) 
     assert_hardly_more(bin_tiles(splats, WIDTH, HEIGHT), reference_bin_tiles(splats, WIDTH, HEIGHT), excess)
 
 
-def test_no_pixel_is_lost_beside_the_image_border_or_at_coverage_of_just_one_level() -> None:
+def test_tiles_cover_pixels_at_the_image_border_and_at_the_minimum_coverage() -> None:
     """Opacities around 1/255 give dots that reach at most one pixel centre."""
     opacities = 1 / 255 + 1e-5 * draw(500, seed=3)
     centers = torch.randint(-1, 46, (500, 2), generator=torch.Generator().manual_seed(1)) + 0.5
@@ -142,7 +142,7 @@ def test_no_tile_is_active() -> None:
 
 
 @pytest.mark.parametrize(("cameras", "count"), [(0, 0), (0, 7), (2, 0), (1, 1)])
-def test_hardly_anything_to_bin(cameras: int, count: int) -> None:
+def test_few_splats_to_bin(cameras: int, count: int) -> None:
     splats = projected_splats(count, cameras)
     ours = bin_tiles(splats, WIDTH, HEIGHT)
     assert_consistent(ours)
@@ -150,7 +150,7 @@ def test_hardly_anything_to_bin(cameras: int, count: int) -> None:
     assert len(ours.splat_offsets) == cameras * count + 1
 
 
-def test_splats_that_are_not_finite_are_left_out() -> None:
+def test_splats_that_are_not_finite_are_skipped() -> None:
     splats = random_ellipses(40, 5.0, 2.0)
     expected = lists(bin_tiles(splats, WIDTH, HEIGHT))
     victims = {3: "means2d", 8: "opacities", 20: "radii"}

@@ -115,7 +115,7 @@ def test_the_process_that_compiles_runs_the_same_kernels_as_the_next_one(tmp_pat
     assert first == second
 
 
-def test_a_disk_that_refuses_costs_the_cache_and_nothing_else(tmp_path: Path) -> None:
+def test_a_disk_error_disables_only_the_cache(tmp_path: Path) -> None:
     script = tmp_path / "small_kernel.py"
     refuse = """
 from numba.core.caching import FunctionCache
@@ -184,7 +184,7 @@ def test_equal_sources_have_equal_fingerprints() -> None:
         ("start=0", "start=1"),
     ],
 )
-def test_whatever_a_kernel_is_made_from_changes_its_fingerprint(old: str, new: str) -> None:
+def test_every_input_of_a_kernel_changes_its_fingerprint(old: str, new: str) -> None:
     assert old in KERNEL_SOURCE
     changed = KERNEL_SOURCE.replace(old, new)
     assert fingerprint(made_from(KERNEL_SOURCE), "fast") != fingerprint(made_from(changed), "fast")
@@ -220,7 +220,7 @@ def test_the_compiler_options_change_the_fingerprint() -> None:
 
 
 @pytest.mark.parametrize("value", [{"a": 1}, [1.0], numba.njit(lambda x: x)], ids=["dict", "list", "compiled kernel"])
-def test_a_value_whose_changes_would_go_unnoticed_is_refused(value: object) -> None:
+def test_a_mutable_kernel_constant_is_refused(value: object) -> None:
     def compiled() -> object:
         return value
 

@@ -135,7 +135,7 @@ def test_without_a_home_they_are_kept_among_the_temporary_files_with_one_warning
 
 
 @pytest.mark.parametrize("home", ["/dev/null", "~", "relative"])
-def test_a_home_that_is_none_leaves_no_folder_where_the_command_runs(
+def test_a_missing_home_creates_no_folder_in_the_working_directory(
     machine: Machine, home: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     here = machine.root / "here"
@@ -162,7 +162,7 @@ def test_a_temporary_folder_that_others_can_write_is_not_trusted(machine: Machin
     assert "cannot cache compiled kernels" in said
 
 
-def test_where_nothing_can_be_written_a_kernel_is_compiled_and_one_line_says_so(machine: Machine) -> None:
+def test_a_kernel_is_compiled_with_a_message_if_the_cache_is_unwritable(machine: Machine) -> None:
     machine.closed.append(machine.root)
     compilations, (said,) = machine.run()
     assert compilations == 1
@@ -171,7 +171,7 @@ def test_where_nothing_can_be_written_a_kernel_is_compiled_and_one_line_says_so(
 
 
 @pytest.mark.parametrize("warmed", ["package", "home", "chosen"])
-def test_kernels_that_lie_ready_are_used_where_nothing_can_be_written(
+def test_stored_kernels_are_used_if_nothing_can_be_written(
     machine: Machine, warmed: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if warmed == "chosen":
@@ -190,7 +190,7 @@ def test_a_chosen_folder_that_cannot_be_written_is_named(machine: Machine, monke
     assert said.startswith("NUMBA_CACHE_DIR is /dev/null/cache, which cannot be written; compiled kernels are kept in")
 
 
-def test_a_chosen_folder_does_not_hide_what_lies_beside_the_sources(
+def test_a_chosen_cache_folder_does_not_hide_kernels_next_to_the_sources(
     machine: Machine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     machine.closed.clear()

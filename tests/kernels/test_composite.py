@@ -96,7 +96,7 @@ def assert_close(found: dict[str, Tensor], expected: dict[str, Tensor], toleranc
         (1, 40, 10, 9, (17, 50)),
     ],
 )
-def test_kernel_matches_its_twin(
+def test_kernel_matches_the_reference(
     random_splats: MakeSplats, dtype: torch.dtype, tolerance: float,
     cameras: int, count: int, glass: int, channels: int, size: tuple[int, int],
 ) -> None:  # fmt: skip
@@ -109,7 +109,7 @@ def test_kernel_matches_its_twin(
 @pytest.mark.parametrize(
     ("cameras", "count", "glass", "channels", "channel"), [(1, 0, 0, 4, 3), (2, 80, 20, 4, 3), (1, 60, 5, 9, 6)]
 )
-def test_deviation_matches_its_twin(
+def test_deviation_matches_the_reference(
     random_splats: MakeSplats, dtype: torch.dtype, tolerance: float, through_mean: bool,
     cameras: int, count: int, glass: int, channels: int, channel: int,
 ) -> None:  # fmt: skip
@@ -122,7 +122,7 @@ def test_deviation_matches_its_twin(
     assert_close(found, with_gradients(case, composite_twin), tolerance)
 
 
-def test_asking_for_the_deviation_changes_nothing_else(random_splats: MakeSplats) -> None:
+def test_requesting_the_deviation_changes_nothing_else(random_splats: MakeSplats) -> None:
     case = blend(random_splats((1, 80), (40, 37), dtype=torch.float32), (40, 37), channels=4, glass=20)
     plain, asked = case(composite), deviating(case, 3, through_mean=False)(composite)
     assert all(torch.equal(a, b) for a, b in zip(plain[:3], asked[:3], strict=True))
@@ -160,7 +160,7 @@ def test_two_layers_deviate_by_their_weighted_distance_from_the_mean() -> None:
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-4), (torch.float64, 1e-12)])
-def test_an_opaque_pile_stops_where_its_twin_stops(
+def test_opaque_splats_end_a_pixel_where_the_reference_ends_it(
     random_splats: MakeSplats, dtype: torch.dtype, tolerance: float
 ) -> None:
     splats = random_splats((1, 200), (24, 20), dtype=dtype, opacities=(0.8, 1.0), sigmas=(5.0, 20.0))
@@ -211,7 +211,7 @@ def test_a_needle_whose_determinant_cancels_in_single_precision_is_drawn() -> No
     assert_close(found, expected, 1e-3)
 
 
-def test_a_pile_of_glass_leaves_finite_gradients(random_splats: MakeSplats) -> None:
+def test_many_glass_layers_have_finite_gradients(random_splats: MakeSplats) -> None:
     splats = random_splats((1, 60), (20, 20), dtype=torch.float32, opacities=(0.98, 1.0), sigmas=(20.0, 30.0))
     case = blend(splats, (20, 20), glass=60)
     found = with_gradients(case, composite)
@@ -261,7 +261,7 @@ def test_the_value_of_absgrad_changes_nothing(random_splats: MakeSplats) -> None
     assert all(torch.equal(plain[name], with_absgrad[name]) for name in plain)
 
 
-def test_asking_for_absgrad_changes_no_other_gradient(random_splats: MakeSplats) -> None:
+def test_requesting_absgrad_changes_no_other_gradient(random_splats: MakeSplats) -> None:
     case = blend(random_splats((1, 30), (20, 20), dtype=torch.float32), (20, 20))
     channels = case.channels.requires_grad_()
     asked = torch.autograd.grad(case._replace(absgrad=case.absgrad.requires_grad_())(composite).image.sum(), channels)
@@ -336,7 +336,7 @@ def test_a_primary_splat_in_front_hides_glass() -> None:
     torch.testing.assert_close(masks["behind"], torch.full((1, 16, 16), 0.5 * 0.8 * 0.4), atol=1e-4, rtol=0)
 
 
-def test_a_channel_that_is_not_a_number_stays_in_its_tiles(random_splats: MakeSplats) -> None:
+def test_a_nan_channel_affects_only_its_tiles(random_splats: MakeSplats) -> None:
     size = (80, 80)
     case = blend(random_splats((1, 60), size, dtype=torch.float32, sigmas=(1.0, 3.0)), size)
     clean = case(composite).image

@@ -111,7 +111,7 @@ def assert_close(found: dict[str, Tensor], expected: dict[str, Tensor], toleranc
     ("cameras", "count", "channels", "size"),
     [(1, 0, 3, (20, 20)), (1, 1, 1, (16, 16)), (1, 40, 1, (37, 29)), (2, 80, 6, (40, 33)), (1, 60, 9, (17, 50))],
 )
-def test_kernel_matches_its_twin(
+def test_kernel_matches_the_reference(
     dtype: torch.dtype,
     tolerance: float,
     low_pass: float,
@@ -129,7 +129,7 @@ def test_kernel_matches_its_twin(
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-3), (torch.float64, 1e-10)])
-def test_an_opaque_pile_stops_where_its_twin_stops(dtype: torch.dtype, tolerance: float) -> None:
+def test_opaque_splats_end_a_pixel_where_the_reference_ends_it(dtype: torch.dtype, tolerance: float) -> None:
     case = case_of(scattered(300, size=-0.3, opacity=4.0, dtype=dtype), cameras_of(1, (24, 20), dtype))
     found = with_gradients(case, composite_discs)
     assert float(found["alpha"].min()) > 0.99
@@ -174,7 +174,7 @@ def layered(count: int) -> RawGaussians:
     return raw._replace(quats=quats, log_scales=raw.log_scales.clamp(max=-2.2))
 
 
-def test_primary_rays_meet_what_is_rasterised_without_low_pass() -> None:
+def test_primary_rays_match_rasterisation_without_low_pass_filter() -> None:
     raw, cameras = layered(60), cameras_of(1, (48, 40))
     found = project_discs(raw, cameras, sh_degree=0, near=NEAR)
     bins = bin_tiles(found.outlines, 48, 40)
@@ -232,7 +232,7 @@ def test_one_surface_has_no_distortion_however_it_is_tilted() -> None:
     assert float(found.distortion.max()) < 1e-15 and float(found.depth.std()) > 0.1
 
 
-def test_a_disc_from_its_edge_is_a_spot_of_the_low_pass() -> None:
+def test_a_disc_seen_edge_on_is_drawn_by_the_low_pass_filter() -> None:
     tilt = [math.cos(math.pi / 4 - 2e-3), math.sin(math.pi / 4 - 2e-3), 0.0, 0.0]
     case = case_of(one_disc(quats=tilt, log_scales=[-3.0, -3.0], logit_opacities=9.0), facing_camera())
     found = case(composite_discs)
@@ -243,7 +243,7 @@ def test_a_disc_from_its_edge_is_a_spot_of_the_low_pass() -> None:
     )
 
 
-def test_what_lies_before_the_near_plane_is_not_seen() -> None:
+def test_gaussians_before_the_near_plane_are_invisible() -> None:
     tilt = [math.cos(0.75), math.sin(0.75), 0.0, 0.0]
     case = case_of(one_disc(quats=tilt, log_scales=[2.0, 2.0], logit_opacities=9.0), facing_camera((40, 64)))
     assert not case.discs.outlines.conics.any()
@@ -302,7 +302,7 @@ def test_a_disc_with_broken_geometry_is_not_drawn(field: str, value: float) -> N
     assert not found["v_channels"][0, victim].any()
 
 
-def test_a_channel_that_is_not_a_number_stays_in_its_tiles() -> None:
+def test_a_nan_channel_affects_only_its_tiles() -> None:
     case = case_of(scattered(60, size=-3.0, dtype=torch.float32), cameras_of(1, (80, 80), torch.float32))
     clean = case(composite_discs).image
     victim = int((case.discs.opacities[0] > 0.5).nonzero()[0])

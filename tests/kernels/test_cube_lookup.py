@@ -30,7 +30,7 @@ def with_gradients(function: Callable[..., Tensor], texels: Tensor, directions: 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-5), (torch.float64, 1e-12)])
 @pytest.mark.parametrize(("size", "depth", "count"), [(1, 3, 200), (2, 1, 200), (7, 3, 2000), (16, 5, 1), (4, 3, 0)])
-def test_lookup_matches_its_twin(dtype: torch.dtype, tolerance: float, size: int, depth: int, count: int) -> None:
+def test_lookup_matches_the_reference(dtype: torch.dtype, tolerance: float, size: int, depth: int, count: int) -> None:
     texels, directions = normal(6, size, size, depth, seed=1, dtype=dtype), normal(count, 3, seed=2, dtype=dtype)
     found, expected = (with_gradients(f, texels, directions) for f in (cube_lookup, twin))
     for tensor, other in zip(found, expected, strict=True):
@@ -66,7 +66,7 @@ def test_a_step_changes_the_map_by_no_more_than_its_steepest_slope() -> None:
     assert bool((change <= steepest * (moved - directions).norm(dim=-1)).all())
 
 
-def test_at_a_corner_three_texels_share_alike() -> None:
+def test_three_texels_contribute_equally_at_a_corner() -> None:
     texels = normal(6, 3, 3, 1, seed=10)
     corner = torch.tensor([[1.0, -1.0, 1.0]], dtype=torch.float64)
     # Faces +x (columns y, rows z), -y (columns z, rows x) and +z (columns x, rows y).
@@ -74,7 +74,7 @@ def test_at_a_corner_three_texels_share_alike() -> None:
     torch.testing.assert_close(cube_lookup(texels, corner), three.mean(0)[None])
 
 
-def test_texels_are_met_at_their_centres() -> None:
+def test_lookups_at_texel_centres_return_texels() -> None:
     size = 4
     texels = normal(6, size, size, 2, seed=11)
     centers = (2 * torch.arange(size, dtype=torch.float64) + 1) / size - 1
@@ -92,7 +92,7 @@ def test_a_constant_map_shows_its_constant() -> None:
     torch.testing.assert_close(found, texels[0, 0, :1].expand(500, 3))
 
 
-def test_a_map_of_directions_shows_the_direction_asked_for() -> None:
+def test_a_map_of_directions_returns_the_requested_direction() -> None:
     size = 64
     centers = (2 * torch.arange(size, dtype=torch.float64) + 1) / size - 1
     rows, columns = torch.meshgrid(centers, centers, indexing="ij")
@@ -119,7 +119,7 @@ def test_the_length_of_a_direction_has_no_effect() -> None:
 
 
 @pytest.mark.parametrize("bad", [[0.0, 0.0, 0.0], [float("nan"), 1.0, 0.0], [float("inf"), float("inf"), 0.0]])
-def test_where_there_is_no_direction_the_result_is_nan_and_others_are_spared(bad: list[float]) -> None:
+def test_a_zero_direction_gives_nan_and_does_not_affect_others(bad: list[float]) -> None:
     texels = normal(6, 3, 3, 2, seed=17)
     directions = torch.cat([torch.tensor([bad], dtype=torch.float64), normal(3, 3, seed=18)])
     for function in (cube_lookup, twin):

@@ -30,7 +30,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     return monkeypatch
 
 
-def test_auto_takes_the_gpu_and_says_so(gpu: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_auto_selects_the_gpu_and_logs_it(gpu: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO):
         assert chosen_device("auto") == torch.device("cuda", 0)
     assert "running on A GPU" in caplog.text
@@ -39,7 +39,7 @@ def test_auto_takes_the_gpu_and_says_so(gpu: pytest.MonkeyPatch, caplog: pytest.
 
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:1", "", None, 0])
-def test_other_devices_are_refused_and_not_taken_for_auto(gpu: pytest.MonkeyPatch, name: Any) -> None:
+def test_other_devices_are_refused(gpu: pytest.MonkeyPatch, name: Any) -> None:
     assert chosen_device(torch.device("cpu")) == torch.device("cpu")
     with pytest.raises(ValueError, match=f"device is '{name}'; expected auto, cpu or cuda"):
         chosen_device(name)
@@ -89,7 +89,7 @@ def test_a_gpu_that_is_too_old_is_explained(gpu: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("driver", [13000, 13040, 14010])
-def test_a_driver_of_the_compilers_version_or_newer_will_do(gpu: pytest.MonkeyPatch, driver: int) -> None:
+def test_a_driver_at_least_as_new_as_the_compiler_is_accepted(gpu: pytest.MonkeyPatch, driver: int) -> None:
     gpu.setattr(devices, "driver_version", lambda: driver)
     assert cuda_problem() is None
 
@@ -127,7 +127,7 @@ def test_missing_bindings_are_explained(gpu: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.skipif(importlib.util.find_spec("numba_cuda") is None, reason="numba-cuda is not installed")
-def test_what_is_installed_is_seen() -> None:
+def test_installed_packages_are_detected() -> None:
     assert devices.bindings_major() in (12, 13)
     assert not devices.has_library("nvfatbin") or devices.has_library("nvvm")
 

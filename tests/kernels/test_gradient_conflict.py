@@ -43,7 +43,7 @@ def test_sobel_is_the_sobel_operator() -> None:
 @pytest.mark.parametrize("size", [(3, 3), (3, 20), (17, 4), (40, 53)])
 @pytest.mark.parametrize("cell", [1, 5])
 @pytest.mark.parametrize("has_strength", [False, True])
-def test_kernel_matches_its_twin(
+def test_kernel_matches_the_reference(
     dtype: torch.dtype, tolerance: float, size: tuple[int, int], cell: int, has_strength: bool
 ) -> None:
     images = (*pictures(*size, dtype), *([torch.full(size, 0.3, dtype=dtype)] if has_strength else []))
@@ -73,7 +73,7 @@ def test_edges_that_only_happen_to_meet_count_little_in_cells() -> None:
 
 
 @pytest.mark.parametrize(("held", "counted"), [(0.1, 1.0), (2.0, 1.0), (3.0, 0.5), (4.0, 0.0), (10.0, 0.0)])
-def test_a_cell_counts_as_far_as_a_pane_could_have_left_it(held: float, counted: float) -> None:
+def test_cells_are_weighted_by_the_reflection_that_a_pane_can_leave(held: float, counted: float) -> None:
     """At a uniform brightness, where linear light is sRGB times a factor."""
     generator = torch.Generator().manual_seed(5)
     edges = 1e-4 * torch.rand(12, 12, 3, generator=generator, dtype=torch.float64)

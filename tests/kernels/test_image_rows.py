@@ -25,7 +25,7 @@ def blended(dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
     return draw(13, 21, 4, dtype=dtype) * alpha[..., None], alpha
 
 
-def test_depths_are_means_where_anything_is() -> None:
+def test_depths_are_means_in_covered_pixels() -> None:
     image, alpha = blended()
     depth, shown = mean_depth(image[..., 3], alpha), alpha > 1e-6
     assert bool((depth[~shown] == 0).all()) and int((~shown).sum()) > 30
@@ -53,7 +53,7 @@ def test_the_background_is_seen_through_what_is_before_it(background: tuple[floa
     torch.testing.assert_close(over_background(image[..., :3], alpha, background), image[..., :3] + through)
 
 
-def test_no_gradient_of_the_coverage_is_made_up() -> None:
+def test_clipped_coverage_has_no_gradient() -> None:
     """On black, colours do not depend on coverage: the pass that blended them is spared a gradient."""
     image, alpha = (tensor.requires_grad_() for tensor in blended())
     colors = over_background(image[..., :3], alpha, (0.0, 0.0, 0.0))

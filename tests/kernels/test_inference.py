@@ -13,7 +13,7 @@ from glassplat.scene.camera import constant
 from tests.training.tiny_capture import tiny_capture, true_scene
 
 
-def test_a_frame_in_inference_mode_spoils_no_training_after_it() -> None:
+def test_rendering_in_inference_mode_does_not_affect_later_training() -> None:
     for made_once in (constant, _color, _whole_images):
         made_once.cache_clear()
     scene, view = true_scene(), tiny_capture().train[0]

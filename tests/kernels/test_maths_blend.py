@@ -18,7 +18,7 @@ def test_exp2_is_accurate_where_coverage_counts(real: type, tolerance: float) ->
 
 @pytest.mark.parametrize("real", [np.float32, np.float64])
 @pytest.mark.parametrize("t", [-100.0, -1e30, -math.inf, math.nan])
-def test_exp2_ends_in_nothing(real: type, t: float) -> None:
+def test_exp2_underflows_to_zero(real: type, t: float) -> None:
     assert 0 <= float(blend_maths(real).exp2(real(t))) < 1e-20
 
 
@@ -38,7 +38,7 @@ def test_rows_in_range_are_those_with_coverage(real: type, xx: float, xy: float,
 
 @pytest.mark.parametrize("broken", [0, 1, 2, 3])
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_broken_splats_reach_nothing(broken: int, value: float) -> None:
+def test_broken_splats_cover_no_tile(broken: int, value: float) -> None:
     maths = blend_maths(np.float32)
     inputs = [np.float32(v) for v in (0.5, 0.1, 0.5, 0.7)]
     inputs[broken] = np.float32(value)
@@ -47,7 +47,7 @@ def test_broken_splats_reach_nothing(broken: int, value: float) -> None:
     assert first == last or (value == math.inf and broken in (0, 2))
 
 
-def test_a_splat_without_a_place_reaches_nothing() -> None:
+def test_a_splat_without_a_position_covers_no_tile() -> None:
     row_range = blend_maths(np.float32).row_range
     for center in (math.nan, math.inf, -math.inf):
         first, last = row_range(np.float32(center), np.float32(5), 16)

@@ -128,6 +128,6 @@ def test_no_digits_are_lost_from_almost_no_reflectance_to_almost_all(dtype: torc
 
 
 @pytest.mark.parametrize("fresnel", LAWS)
-def test_slopes_match_finite_differences(fresnel: Fresnel) -> None:
+def test_derivatives_match_finite_differences(fresnel: Fresnel) -> None:
     leaves = [tensor.requires_grad_() for tensor in grid((0.01, 0.077, 0.3, 0.95), (0.1, 0.3, 0.6, 0.9))]
     assert torch.autograd.gradcheck(lambda *pair: strengths(*pair, fresnel), leaves, eps=1e-7, rtol=1e-5)

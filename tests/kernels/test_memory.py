@@ -47,12 +47,12 @@ def test_freed_memory_is_used_again() -> None:
     assert pages_again(kept, MALLOC_TRIM_THRESHOLD_="1000000") > PAGES / 2
 
 
-def test_who_sets_glibc_decides(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_environment_variables_of_glibc_take_precedence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GLIBC_TUNABLES", "glibc.malloc.trim_threshold=1000000")
     assert not keep_freed_memory()
 
 
-def test_another_c_library_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_allocator_settings_apply_to_glibc_only(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in CHOSEN_BY_USER:
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr("ctypes.CDLL", lambda name: object())

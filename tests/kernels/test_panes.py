@@ -40,7 +40,7 @@ def random_panes(count: int, dtype: torch.dtype, seed: int = 0) -> tuple[Panes, 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("count", [0, 1, 3, 8])
 @pytest.mark.parametrize("masked", [False, True])
-def test_hits_match_their_twin(dtype: torch.dtype, count: int, masked: bool) -> None:
+def test_hits_match_the_reference(dtype: torch.dtype, count: int, masked: bool) -> None:
     panes, intrinsics = random_panes(count, dtype)
     generator = torch.Generator().manual_seed(1)
     mask = (torch.rand(HEIGHT, WIDTH, generator=generator) > 0.9).to(dtype) if masked else None
@@ -73,7 +73,7 @@ def test_panes_on_a_ray_come_nearest_first_and_each_once() -> None:
     assert bool((after.depth[~there] == torch.inf).all())
 
 
-def test_of_coincident_panes_one_is_met() -> None:
+def test_a_ray_hits_one_of_two_coincident_panes() -> None:
     panes, intrinsics = random_panes(1, torch.float32)
     twice = Panes(*(tensor.repeat(2, *[1] * (tensor.ndim - 1)) for tensor in panes))
     first = pane_hits(twice, intrinsics, WIDTH, HEIGHT)
@@ -142,7 +142,7 @@ def with_gradients(case: dict[str, Tensor], function: Callable[..., BlendedPanes
 @pytest.mark.parametrize("fresnel", LAWS)
 @pytest.mark.parametrize("intensity", [True, False])
 @pytest.mark.parametrize("linear", [True, False])
-def test_blend_matches_its_twin(
+def test_blend_matches_the_reference(
     dtype: torch.dtype, tolerance: float, fresnel: Fresnel, intensity: bool, linear: bool
 ) -> None:
     case = blend_case(dtype)
@@ -177,7 +177,7 @@ def test_blend_gradients_match_finite_differences(name: str, fresnel: Fresnel) -
 
 
 @pytest.mark.parametrize("linear", [True, False])
-def test_the_reflection_of_a_lamp_tells_nothing_of_the_strength(linear: bool) -> None:
+def test_lamp_reflections_are_no_evidence_for_the_strength(linear: bool) -> None:
     case = blend_case(torch.float64)
     case["reflections"][..., :3], case["reflections"][..., 3] = 0.5, 0.0
     case["reflections"][:, :, ::2, 3] = 9.0
@@ -194,7 +194,7 @@ def test_the_reflection_of_a_lamp_tells_nothing_of_the_strength(linear: bool) ->
 
 
 @pytest.mark.parametrize("fresnel", ["pane", "none"])
-def test_where_there_is_no_pane_the_image_is_the_transmission_bit_for_bit(fresnel: Fresnel) -> None:
+def test_pixels_without_a_pane_equal_the_transmission_bit_for_bit(fresnel: Fresnel) -> None:
     case = blend_case(torch.float32)
     case["base_reflectances"][1] = 0
     result = blend_panes(**case, fresnel=fresnel)

@@ -36,7 +36,7 @@ def with_gradients(
 @pytest.mark.parametrize(
     "size", [(1, 1), (3, 20), (40, 7), (33, 80), (70, 97), (ROWS + 3, COLUMNS // 3 + 2), (2 * ROWS + 1, 172)]
 )
-def test_kernel_matches_its_twin(dtype: torch.dtype, tolerance: float, size: tuple[int, int]) -> None:
+def test_kernel_matches_the_reference(dtype: torch.dtype, tolerance: float, size: tuple[int, int]) -> None:
     image, target = pictures(*size, dtype)
     means, *gradients = with_gradients(photometric, image, target)
     expected_means, *expected_gradients = with_gradients(photometric_twin, image, target)
@@ -51,7 +51,7 @@ def test_gradient_matches_finite_differences() -> None:
     assert torch.autograd.gradcheck(lambda x: photometric(x, target), image.requires_grad_(), eps=1e-6, atol=1e-8)
 
 
-def test_an_image_that_equals_the_photograph_is_perfect_and_nothing_pulls() -> None:
+def test_an_image_equal_to_the_photograph_has_no_loss_and_no_gradient() -> None:
     target = torch.arange(256, dtype=torch.uint8).reshape(16, 16, 1).expand(16, 16, 3)
     (l1, ssim), by_l1, by_sum = with_gradients(photometric, target.float() / 255, target)
     assert float(l1) == 0
@@ -84,7 +84,7 @@ def test_a_pixel_that_is_not_a_number_is_not_hidden() -> None:
     assert all(mean.isnan() for mean in photometric(image, target))
 
 
-def test_poison_stays_within_the_reach_of_the_window() -> None:
+def test_nan_spreads_only_within_the_window() -> None:
     image, target = pictures(40, 40, torch.float32)
     image[20, 20] = torch.inf
     _, _, gradient = with_gradients(photometric, image, target)

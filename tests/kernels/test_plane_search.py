@@ -91,7 +91,7 @@ def test_followed_edges_are_those_of_the_definition(views: list[PaneView], plane
     assert sum(np.array(seen) > 100) > 40
 
 
-def test_where_a_distance_is_unknown_so_is_what_is_followed_there(views: list[PaneView]) -> None:
+def test_edges_are_unknown_where_distances_are_unknown(views: list[PaneView]) -> None:
     plane = PlaneEquations(FRONT.normal[None], np.array([FRONT.normal @ FRONT.center]))
     known = edge_matches(plane, views, edges_per_view=60)
     blind = replace(views[1], distance=np.full(views[1].distance.shape, np.nan))

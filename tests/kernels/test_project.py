@@ -50,7 +50,7 @@ def assert_parallel(ours: Tensor, theirs: Tensor, tolerance: float, name: str) -
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("coefficients", "degree"), [(16, 3), (9, 2), (16, 1), (1, 0), (0, 0)])
-def test_values_and_gradients_agree_with_the_twin(dtype: torch.dtype, coefficients: int, degree: int) -> None:
+def test_values_and_gradients_agree_with_the_reference(dtype: torch.dtype, coefficients: int, degree: int) -> None:
     gaussians = random_gaussians(700, coefficients=coefficients, dtype=dtype)
     cameras = random_cameras(3, clip=True, dtype=dtype)
     ours = project(gaussians, cameras, sh_degree=degree, near=NEAR)
@@ -66,7 +66,7 @@ def test_values_and_gradients_agree_with_the_twin(dtype: torch.dtype, coefficien
 
 @pytest.mark.parametrize("count", [0, 1])
 @pytest.mark.parametrize("num_cameras", [0, 1, 2])
-def test_hardly_anything_to_project(count: int, num_cameras: int) -> None:
+def test_few_gaussians_to_project(count: int, num_cameras: int) -> None:
     gaussians, cameras = random_gaussians(count), random_cameras(num_cameras)
     ours = project(gaussians, cameras, sh_degree=3, near=NEAR)
     theirs = reference_project(gaussians, cameras, sh_degree=3, near=NEAR)
@@ -101,7 +101,7 @@ def test_the_ellipse_follows_the_tangent_only_near_the_image() -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_poisoned_gaussian_culls_only_itself(dtype: torch.dtype) -> None:
+def test_a_gaussian_with_nan_culls_only_itself(dtype: torch.dtype) -> None:
     clean = random_gaussians(60, dtype=dtype)
     cameras = random_cameras(2, dtype=dtype)
     expected = project(clean, cameras, sh_degree=3, near=NEAR)

@@ -45,7 +45,7 @@ def assert_near(ours: Tensor, theirs: Tensor, tolerance: float, name: str) -> No
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("coefficients", "degree"), [(16, 3), (1, 0), (0, 0)])
-def test_values_and_gradients_agree_with_the_twin(dtype: torch.dtype, coefficients: int, degree: int) -> None:
+def test_values_and_gradients_agree_with_the_reference(dtype: torch.dtype, coefficients: int, degree: int) -> None:
     discs, cameras = (
         random_discs(700, coefficients=coefficients, dtype=dtype),
         random_cameras(3, clip=True, dtype=dtype),
@@ -82,7 +82,7 @@ def test_gradients_agree_with_finite_differences() -> None:
     assert torch.autograd.gradcheck(outputs, (*discs, cameras.cam_from_world), eps=1e-6, atol=1e-5, rtol=1e-4)
 
 
-def test_the_map_leads_to_where_the_ray_meets_the_disc() -> None:
+def test_the_map_gives_the_intersection_of_ray_and_disc() -> None:
     """Compared with the intersection solved in world space, for rays through pixels around each disc's centre."""
     discs, cameras = random_discs(200), random_cameras(1)
     found = project_discs(discs, cameras, sh_degree=0, near=NEAR)
@@ -116,7 +116,7 @@ def test_normals_face_the_camera() -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_poisoned_disc_culls_only_itself(dtype: torch.dtype) -> None:
+def test_a_disc_with_nan_culls_only_itself(dtype: torch.dtype) -> None:
     clean, cameras = random_discs(60, dtype=dtype), random_cameras(2, dtype=dtype)
     expected = project_discs(clean, cameras, sh_degree=3, near=NEAR)
     seen = (expected.radii[..., 0] > 0).all(dim=0).nonzero()[:, 0]
@@ -161,7 +161,7 @@ CULLED = {
 
 
 @pytest.mark.parametrize("changes", CULLED.values(), ids=CULLED.keys())
-def test_what_cannot_be_seen_is_culled(changes: dict[str, list[float]]) -> None:
+def test_invisible_discs_are_culled(changes: dict[str, list[float]]) -> None:
     assert float(project_discs(one_disc(), front_camera(), sh_degree=0, near=NEAR).radii[0, 0, 0]) > 0
     disc = one_disc(**changes)
     for function in (project_discs, twin):
@@ -179,7 +179,7 @@ def test_a_disc_across_the_near_plane_may_cover_the_whole_image() -> None:
     assert found.radii[0, 0].tolist() == [WIDTH, HEIGHT]
 
 
-def test_a_disc_across_the_near_plane_is_culled_where_all_behind_the_plane_lies_beside_the_image() -> None:
+def test_a_disc_across_the_near_plane_is_culled_if_its_visible_part_is_outside_the_image() -> None:
     """No culled disc is visible: a camera with a much wider image draws nothing within the window."""
     generator = torch.Generator().manual_seed(4)
     means = torch.randn(400, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.4, 0.4, 0.2]) + 0.3

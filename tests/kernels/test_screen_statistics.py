@@ -51,7 +51,7 @@ def test_visible_views_count_in_device_coordinates() -> None:
 @pytest.mark.parametrize("direct", [False, True])
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize(("cameras", "count"), [(1, 2500), (3, 40), (1, 1), (2, 0)])
-def test_agrees_with_its_twin(
+def test_agrees_with_the_reference(
     cameras: int, count: int, weighted: bool, direct: bool, dtype: torch.dtype, tolerance: float
 ) -> None:
     views = some_views(cameras, count, dtype, weighted=weighted, direct=direct)
@@ -64,7 +64,7 @@ def test_agrees_with_its_twin(
         add_views_in_torch(expected, views)
 
 
-def test_what_no_view_sees_adds_nothing_whatever_its_gradient() -> None:
+def test_unseen_gaussians_add_nothing_to_statistics() -> None:
     broken = torch.full((1, 4, 2), torch.nan)
     radii = torch.tensor([[[0.0, 0.0], [0.0, 3.0], [torch.nan, 1.0], [-1.0, 1.0]]])
     sums = added(Views(broken, broken, radii, 40, 30))

@@ -60,7 +60,7 @@ def with_gradients(
     ("height", "width", "size"), [(23, 29, 6), (1, 1, 1), (0, 5, 2), (8, 9, 1), (3, 100, 5), (2, 128, 4)]
 )
 @pytest.mark.parametrize("least_strength", [0.0, 0.5])
-def test_shading_matches_its_twin(
+def test_shading_matches_the_reference(
     dtype: torch.dtype, tolerance: float, height: int, width: int, size: int, least_strength: float
 ) -> None:
     case = shade_case(dtype, height, width, size)
@@ -130,7 +130,7 @@ def test_before_black_the_base_is_the_blended_colour_bit_for_bit() -> None:
     assert torch.equal(shade_environment(**case).base, case["blended"][..., :3])
 
 
-def test_pixels_that_reflect_too_little_are_the_base_and_the_others_stay_as_they_were() -> None:
+def test_weakly_reflecting_pixels_show_the_base_colour() -> None:
     case = shade_case(torch.float32)
     dull = case["blended"][..., STRENGTH] < 0.5
     assert bool(dull.any()) and not bool(dull.all())
@@ -154,7 +154,7 @@ def test_the_length_and_the_sign_of_a_normal_do_not_matter() -> None:
 
 
 @pytest.mark.parametrize("poison", [float("nan"), float("inf")])
-def test_a_normal_that_is_not_finite_is_heard_of_and_others_are_spared(poison: float) -> None:
+def test_a_nan_normal_gives_nan_and_does_not_affect_others(poison: float) -> None:
     case = shade_case(torch.float32)
     case["blended"][5, 15, NORMAL] = torch.tensor([0.1, poison, 0.2])
     case["blended"][5, 15, STRENGTH] = 0.5
@@ -163,7 +163,7 @@ def test_a_normal_that_is_not_finite_is_heard_of_and_others_are_spared(poison: f
         assert bool(rgb[5, 15].isnan().all()) and int(rgb.isnan().sum()) == 3
 
 
-def test_poisoned_texels_are_heard_of() -> None:
+def test_nan_texels_give_nan() -> None:
     case = shade_case(torch.float32)
     case["texels"][:] = float("nan")
     lit = (case["blended"][..., NORMAL] != 0).any(-1)

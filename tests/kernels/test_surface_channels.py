@@ -45,7 +45,9 @@ def with_gradients(function: Callable[..., Tensor], case: list[Tensor]) -> list[
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-6), (torch.float64, 1e-13)])
 @pytest.mark.parametrize("count", [0, 1, 400])
 @pytest.mark.parametrize("extra", [0, 2])
-def test_channels_and_gradients_match_their_twin(dtype: torch.dtype, tolerance: float, count: int, extra: int) -> None:
+def test_channels_and_gradients_match_the_reference(
+    dtype: torch.dtype, tolerance: float, count: int, extra: int
+) -> None:
     case = gaussians(count, dtype, extra)
     for tensor, other in zip(with_gradients(surface_channels, case), with_gradients(twin, case), strict=True):
         torch.testing.assert_close(tensor, other, rtol=tolerance, atol=tolerance)
@@ -81,7 +83,7 @@ def test_channels_lie_where_shading_reads_them() -> None:
     assert torch.equal(channels[:, :SURFACE_CHANNELS], surface_channels(*case[:EXTRA]))
 
 
-def test_what_is_not_seen_adds_nothing() -> None:
+def test_hidden_gaussians_add_nothing() -> None:
     case = gaussians(100, torch.float32)
     hidden = case[RADII][:, 0] == 0
     assert bool(hidden.any())

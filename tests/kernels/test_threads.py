@@ -113,7 +113,7 @@ def printed(tmp_path: Path, script: str, **environment: str) -> list[str]:
     return [line for line in done.stdout.splitlines() if not line.startswith("compil")]
 
 
-def test_a_tbb_that_happens_to_be_there_is_not_used_and_the_log_says_so_once(tmp_path: Path) -> None:
+def test_an_installed_tbb_is_not_used_and_logged_once(tmp_path: Path) -> None:
     said, result = printed_with_tbb(tmp_path, TWO_KERNELS)
     layer = result.split()[-1]
     assert layer in ("omp", "workqueue")
@@ -121,7 +121,7 @@ def test_a_tbb_that_happens_to_be_there_is_not_used_and_the_log_says_so_once(tmp
     assert result.startswith("[4.0, 4.0]")
 
 
-def test_tbb_stays_out_when_the_environment_changes_before_the_first_kernel(tmp_path: Path) -> None:
+def test_tbb_is_not_loaded_if_the_environment_changes_before_the_first_kernel(tmp_path: Path) -> None:
     # Numba then reads all its variables again, and forgets those set in between.
     change = 'import os\nos.environ["NUMBA_DEVELOPER_MODE"] = "0"\n'
     *_, result = printed_with_tbb(tmp_path, change + ONE_KERNEL)
@@ -131,7 +131,7 @@ def test_tbb_stays_out_when_the_environment_changes_before_the_first_kernel(tmp_
 @pytest.mark.parametrize(
     "asked", [{"NUMBA_THREADING_LAYER": "tbb"}, {"NUMBA_THREADING_LAYER_PRIORITY": "tbb omp workqueue"}], ids=str
 )
-def test_who_asks_for_tbb_gets_it(tmp_path: Path, asked: dict[str, str]) -> None:
+def test_tbb_is_used_on_request(tmp_path: Path, asked: dict[str, str]) -> None:
     said, result = printed_with_tbb(tmp_path, ONE_KERNEL, **asked)
     assert said == "kernels run on 2 threads of TBB"
     assert result == "tbb"
@@ -145,7 +145,7 @@ def test_two_python_threads_may_use_kernels_on_the_work_queue(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(("layer", "locked"), [("omp", False), ("tbb", False), ("workqueue", True)])
-def test_only_the_work_queue_costs_a_lock(layer: str, locked: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_work_queue_uses_a_lock(layer: str, locked: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     def compiled(value: int) -> bool:
         return value == 1 and threads._work_queue_lock.locked()
 

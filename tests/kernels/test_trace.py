@@ -60,7 +60,7 @@ def with_gradients(function: Callable[..., Traced], gaussians: RawGaussians, ray
 @pytest.mark.parametrize(
     ("count", "num_rays", "degree"), [(0, 5, 0), (1, 3, 1), (9, 0, 2), (600, 700, 3), (70, 300, 0)]
 )
-def test_what_rays_meet_and_its_gradients_match_the_twin(
+def test_trace_and_gradients_match_the_reference(
     scales: int, dtype: torch.dtype, tolerance: float, count: int, num_rays: int, degree: int
 ) -> None:
     gaussians, rays = cloud(count, scales, dtype=dtype), rays_around(num_rays, dtype=dtype)
@@ -137,7 +137,7 @@ def test_threads_do_not_change_a_bit(scales: int) -> None:
 @pytest.mark.parametrize("scales", [DISCS, ELLIPSOIDS])
 @pytest.mark.parametrize("poison", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("which", range(5))
-def test_a_gaussian_that_is_not_finite_is_not_met(scales: int, poison: float, which: int) -> None:
+def test_rays_miss_a_gaussian_that_is_not_finite(scales: int, poison: float, which: int) -> None:
     gaussians, rays = cloud(40, scales), rays_around(50)
     others = RawGaussians(*(torch.cat([x[:7], x[8:]]) for x in gaussians))
     bad = RawGaussians(*(x.clone() for x in gaussians))
@@ -151,7 +151,7 @@ def test_a_gaussian_that_is_not_finite_is_not_met(scales: int, poison: float, wh
 @pytest.mark.parametrize(
     "direction", [(0.0, 0.0, 0.0), (math.nan, 0.0, 1.0), (math.inf, 0.0, 0.0), (1e200, 1e200, 0.0)]
 )
-def test_a_ray_that_is_none_meets_nothing(direction: tuple[float, float, float]) -> None:
+def test_an_invalid_ray_hits_nothing(direction: tuple[float, float, float]) -> None:
     gaussians, rays = cloud(40, DISCS, size=0.0), rays_around(3)
     rays.directions[1] = torch.tensor(direction)
     found = with_gradients(trace, gaussians, rays, 1)
@@ -176,7 +176,7 @@ def ray(origin: tuple[float, ...], direction: tuple[float, ...]) -> Rays:
     return Rays(torch.tensor([origin], dtype=torch.float64), torch.tensor([direction], dtype=torch.float64))
 
 
-def test_a_disc_is_met_where_its_plane_is() -> None:
+def test_rays_hit_a_disc_in_its_plane() -> None:
     found = traced(one_disc(), ray((1.0, 0.0, 0.0), (0.0, 0.0, 4.0)), sh_degree=0)
     alpha = math.exp(-0.5)
     assert float(found.alphas) == pytest.approx(alpha)
@@ -191,11 +191,11 @@ def test_coverage_is_clamped_and_ends_at_three_deviations() -> None:
 
 
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 2.0), (0.0, 0.0, 3.0)])
-def test_what_lies_behind_the_origin_or_at_it_is_not_met(origin: tuple[float, ...]) -> None:
+def test_rays_hit_nothing_behind_or_at_their_origin(origin: tuple[float, ...]) -> None:
     assert int(traced(one_disc(), ray(origin, (0.0, 0.0, 1.0)), sh_degree=0).hits) == 0
 
 
-def test_a_disc_seen_from_its_edge_is_not_met() -> None:
+def test_rays_miss_a_disc_seen_edge_on() -> None:
     assert int(traced(one_disc(), ray((-2.0, 0.0, 2.0), (1.0, 0.0, 1e-5)), sh_degree=0).hits) == 0
 
 
@@ -205,7 +205,7 @@ def test_hits_before_the_near_distance_are_left_out() -> None:
     assert int(traced(one_disc(), along, sh_degree=0, near=2.1).hits) == 0
 
 
-def test_nothing_is_met_behind_what_is_opaque() -> None:
+def test_rays_end_at_opaque_gaussians() -> None:
     row = RawGaussians(*(x.repeat(50, *(1,) * (x.dim() - 1)) for x in one_disc()))
     row.means[:, 2] = torch.linspace(1, 5, 50)
     # Each transmits a hundredth of the light: the third would reduce it to less than 1e-4.
@@ -221,7 +221,7 @@ def test_equal_distances_keep_the_order_of_the_gaussians() -> None:
     torch.testing.assert_close(found.colors, expected.colors)
 
 
-def test_a_disc_of_no_size_is_a_point_that_rays_miss() -> None:
+def test_rays_miss_a_disc_of_size_zero() -> None:
     point = one_disc(log_scales=torch.full((1, 2), -800.0))
     found = with_gradients(trace, point, ray((0.1, 0.0, 0.0), (0.0, 0.0, 1.0)), 0)
     assert int(found[3]) == 0 and all(bool(x.isfinite().all()) for x in found)

@@ -40,7 +40,7 @@ def test_a_background_of_the_recipe_stays(recipe: Any) -> None:
     assert backgrounds_of(chosen) == {GREEN}
 
 
-def test_transparent_photographs_go_over_white_by_default() -> None:
+def test_transparent_photographs_are_composited_over_white_by_default() -> None:
     assert photo_background(SplatRecipe()) == WHITE
 
 

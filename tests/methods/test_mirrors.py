@@ -87,7 +87,7 @@ def inner(scene: Scene) -> Tensor:
     return scene.primary.means[:, :2].abs().amax(dim=1) < 0.6
 
 
-def test_what_looks_different_from_different_sides_looks_like_a_mirror() -> None:
+def test_view_dependent_surfaces_look_like_a_mirror() -> None:
     scene = slope()
     seen, found = mirror_lookalikes(SEARCH, scene, views(0.2, -0.2, 0.2, -0.2), Splat())
     x = scene.primary.means[:, 0]
@@ -103,11 +103,11 @@ def test_a_residual_spreads_by_its_standard_deviation() -> None:
     torch.testing.assert_close(shown, 4 * residual_spreads(plain, views(0.0), Splat())[0])
 
 
-def test_what_is_the_same_from_every_side_does_not_however_wrong_it_is() -> None:
+def test_view_independent_errors_do_not_look_like_a_mirror() -> None:
     assert not bool(mirror_lookalikes(SEARCH, slope(), views(0.2, 0.2, 0.2), Splat())[1].any())
 
 
-def test_mirrors_are_looked_for_in_the_region_and_where_something_is_seen() -> None:
+def test_mirrors_are_searched_in_the_region_and_among_visible_gaussians() -> None:
     scene = slope()
     elsewhere = replace(scene, environment=replace(scene.environment, region=(9.0, 0.0, 0.0, 1.0)))
     assert not bool(mirror_lookalikes(SEARCH, elsewhere, views(0.2, -0.2), Splat())[1].any())
@@ -117,7 +117,7 @@ def test_mirrors_are_looked_for_in_the_region_and_where_something_is_seen() -> N
 
 
 @pytest.mark.parametrize("discs", [False, True])
-def test_depths_tell_which_way_a_surface_faces(discs: bool) -> None:
+def test_depths_determine_the_side_of_a_surface(discs: bool) -> None:
     scene = slope(discs=discs)
     with torch.no_grad():
         sums = normals_from_views(scene, views(0.0))[inner(scene)]
@@ -139,7 +139,7 @@ def test_a_surface_counts_by_the_cosine_at_which_it_is_seen() -> None:
 
 
 @pytest.mark.parametrize("estimated", [True, False])
-def test_estimated_normals_say_it_before_depths_do(tmp_path: Path, estimated: bool) -> None:
+def test_estimated_normals_determine_the_side_before_depths_do(tmp_path: Path, estimated: bool) -> None:
     scene, elsewhere = slope(), torch.tensor([0.6, 0.0, -0.8])
     (tmp_path / NORMALS_FOLDER).mkdir()
     in_picture = (elsewhere * torch.tensor(CAMERA_FROM_NORMAL_MAP)).expand(SIZE, SIZE, 3)
@@ -152,7 +152,7 @@ def test_estimated_normals_say_it_before_depths_do(tmp_path: Path, estimated: bo
     assert float((normal_axes(made) @ expected).abs().min()) > math.cos(math.radians(8))
 
 
-def test_what_was_found_becomes_a_flat_mirror_and_nothing_else_changes() -> None:
+def test_a_found_mirror_becomes_flat_and_nothing_else_changes() -> None:
     scene = slope()
     chosen = inner(scene) & (scene.primary.means[:, 0] < 0)
     mirrors = turn_into_mirrors(SEARCH, scene, views(0.0), chosen)

@@ -55,7 +55,7 @@ def mirrored(points: torch.Tensor) -> torch.Tensor:
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def test_what_is_behind_a_mirror_moves_to_its_front() -> None:
+def test_gaussians_behind_a_mirror_move_to_its_front() -> None:
     scene = true_scene()
     state = state_of(scene)
     mirror_virtual_gaussians(state, tiny_capture(), PANE)
@@ -69,7 +69,7 @@ def test_what_is_behind_a_mirror_moves_to_its_front() -> None:
     assert not bool(first_moment[-moved:].any()) and bool((first_moment[:-moved] == 1).all())
 
 
-def test_a_capture_that_shows_the_room_needs_no_seeds() -> None:
+def test_no_seeds_are_added_if_the_photographs_show_the_room() -> None:
     scene = true_scene()
     room = scene.primary.with_tensors({"logit_opacities": torch.full((len(scene.primary),), 6.0)})
     room = room.with_tensors({"log_scales": torch.full((len(room), 3), 0.5)})
@@ -102,7 +102,7 @@ def test_a_capture_from_the_front_gets_the_mirrored_points() -> None:
     assert bool(torch.isclose(added[:, None], points, atol=1e-5).all(dim=-1).any(dim=1).all())
 
 
-def test_few_points_behind_a_pane_say_nothing() -> None:
+def test_few_points_behind_a_pane_are_no_evidence() -> None:
     """Three of them would become Gaussians as large as their distances."""
     scene, capture = true_scene(), tiny_capture()
     case = scene.primary.select(scene.primary.means[:, 2] > 1.5)
@@ -111,7 +111,7 @@ def test_few_points_behind_a_pane_say_nothing() -> None:
     assert not finished(seed_reflection(state_of(replace(scene, primary=case)), replace(capture, points=few), PANE))
 
 
-def test_glass_lies_where_a_mirror_has_been_aligned(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_glass_lies_on_the_plane_of_an_aligned_mirror(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = true_scene()
     state = state_of(replace(scene, planes=Planes.empty(), glass=scene.glass.select(torch.zeros(0).long())))
 
@@ -191,7 +191,7 @@ def solid(means: torch.Tensor, log_scale: float = -3.0) -> Gaussians:
     return gaussians.with_tensors({"means": means, "log_scales": torch.full((len(means), 3), log_scale)})
 
 
-def test_what_shows_through_a_wall_behind_glass_is_a_reflection_unless_its_place_in_front_is_seen_to_be_empty() -> None:
+def test_gaussians_behind_a_wall_are_reflections_unless_the_space_in_front_is_empty() -> None:
     tilted = in_single_precision(showcase(pane(2.0, half=0.8)))
     planes = replace(tilted.planes, centers=torch.tensor([[0.0, 0, 2]]), raw_normals=torch.tensor([[0.0, 0, -1]]))
     far, near, before = (torch.tensor([place]) for place in ((0.05, 0.0, 6.0), (0.05, 0.0, 3.8), (0.75, 0.0, 1.0)))
@@ -213,7 +213,7 @@ def test_what_shows_through_a_wall_behind_glass_is_a_reflection_unless_its_place
     assert not finished(action.apply(state, dataset, Clock(25, 100, 1)))
 
 
-def test_nothing_is_turned_round_where_views_find_no_surface_in_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reflections_without_a_surface_in_front_are_not_turned(monkeypatch: pytest.MonkeyPatch) -> None:
     glass = in_single_precision(showcase(pane(2.0, half=0.8)))
     planes = replace(glass.planes, centers=torch.tensor([[0.0, 0, 2]]), raw_normals=torch.tensor([[0.0, 0, -1]]))
     places = (camera_at(x, 0, -0.3) for x in (-0.2, 0.2))

@@ -46,7 +46,7 @@ def test_reflective_gaussians_grow_along_their_surface_only() -> None:
     torch.testing.assert_close(change, expected)
 
 
-def test_what_was_replaced_forgets_its_moments_and_nothing_else_does() -> None:
+def test_only_replaced_gaussians_reset_their_moments() -> None:
     _, kept = propagate_normals(NormalPropagation(), gaussians(), moments())
     emptied = {name for name, (first, second) in kept.items() if not first.any() and not second.any()}
     assert emptied == {"primary.logit_opacities", "primary.logit_strength", "primary.log_scales"}

@@ -95,7 +95,7 @@ def test_every_number_out_of_its_range_is_refused(method: str) -> None:
 
 @pytest.mark.parametrize("preset", ["glassplat", "paper"])
 @pytest.mark.parametrize("method", RECIPES)
-def test_recipes_are_within_their_ranges_and_survive_their_file(method: str, preset: Any) -> None:
+def test_recipes_are_within_their_ranges_and_round_trip(method: str, preset: Any) -> None:
     recipe = recipe_of(method, preset)
     check_options(recipe)
     assert recipe_from_json(recipe_to_json(recipe)) == recipe
@@ -144,7 +144,7 @@ def edited(**fields: Any) -> str:
     ],
     ids=lambda text: text[:40],
 )
-def test_what_is_not_a_recipe_is_refused_in_one_message(text: str, tmp_path: Path) -> None:
+def test_invalid_recipes_are_refused_with_one_message(text: str, tmp_path: Path) -> None:
     with pytest.raises(InputError) as raised:
         recipe_from_json(text)
     assert len(str(raised.value)) < 1000 and "\n" not in str(raised.value)
@@ -153,7 +153,7 @@ def test_what_is_not_a_recipe_is_refused_in_one_message(text: str, tmp_path: Pat
         RunDirectory(tmp_path).recipe()
 
 
-def test_files_that_are_no_text_are_refused(tmp_path: Path) -> None:
+def test_files_that_are_not_text_are_refused(tmp_path: Path) -> None:
     for name, read in (("recipe.json", RunDirectory.recipe), ("settings.json", RunDirectory.settings)):
         (tmp_path / name).write_bytes(b"\xff\xfe{}")
         with pytest.raises(InputError, match=name):

@@ -57,7 +57,7 @@ def begun(
     return state, [message.what for message in messages]
 
 
-def test_what_looks_like_a_mirror_becomes_one_and_the_rest_is_what_it_mirrors() -> None:
+def test_mirror_like_gaussians_become_mirrors_and_the_rest_surroundings() -> None:
     state, told = begun(every_3rd)
     count = len(state.scene.primary)
     chosen = torch.arange(count) % 3 == 0
@@ -79,7 +79,7 @@ def test_the_papers_start_from_hardly_any_reflection() -> None:
     assert len(state.scene.surroundings) < len(state.scene.primary)
 
 
-def test_without_anything_near_and_without_a_search_no_mirrors_are_looked_for() -> None:
+def test_mirrors_are_not_searched_without_near_surroundings() -> None:
     state, told = begun(every_3rd, MirrorSearch(begin_found=False), near=False)
     assert told == [] and not state.scene.environment.is_empty and not len(state.scene.surroundings)
 
@@ -103,9 +103,7 @@ def test_mirrors_are_searched_for_but_not_in_the_papers(kind: type[DeferredRecip
 @pytest.mark.parametrize(
     ("found", "begin_found", "degree"), [(every_3rd, True, 0), (nothing, True, 1), (every_3rd, False, 1)]
 )
-def test_what_colors_have_learnt_of_mirrors_is_left_out_if_there_are_any(
-    found: Found, begin_found: bool, degree: int
-) -> None:
+def test_harmonics_are_reset_if_mirrors_are_found(found: Found, begin_found: bool, degree: int) -> None:
     state, _ = begun(found, MirrorSearch(begin_found=begin_found), reset_sh_degree=True)
     assert state.scene.primary.active_sh_degree == degree
     assert begun(found, MirrorSearch(begin_found=begin_found))[0].scene.primary.active_sh_degree == 1

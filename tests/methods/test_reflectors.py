@@ -47,12 +47,12 @@ def views(*left: float) -> list[View]:
 
 
 @pytest.mark.parametrize("strength", [1e-3, 0.1, 0.5, 0.9])
-def test_what_reflects_counts_by_its_strength_and_by_what_is_seen_of_it(strength: float) -> None:
+def test_reflectors_are_weighted_by_strength_and_visibility(strength: float) -> None:
     share = ReflectionMeasure().reflective_share(two_discs(strength=strength), views(0, 0))
     assert share == pytest.approx((strength + 1e-3) / 2, abs=1e-3)
 
 
-def test_what_lies_elsewhere_does_not_count() -> None:
+def test_gaussians_outside_the_region_do_not_count() -> None:
     scene = two_discs(strength=0.9)
     scene = replace(scene, environment=replace(scene.environment, region=(-0.5, 0.0, 2.0, 0.3)))
     assert in_region(scene).tolist() == [True, False]
@@ -63,21 +63,21 @@ def test_what_lies_elsewhere_does_not_count() -> None:
     assert ReflectionMeasure().reflective_share(nowhere, views(0)) == 0.0
 
 
-def test_a_residual_that_is_the_same_in_all_views_does_not_turn() -> None:
+def test_a_constant_residual_has_no_spread() -> None:
     shown, spreads = residual_spreads(two_discs(), views(0.3, 0.3, 0.3, 0.3), Deferred())
     torch.testing.assert_close(shown, 4 * contributions(two_discs(), camera()))
     assert spreads.max() < 0.01
     assert ReflectionMeasure().view_dependent_share(two_discs(), views(0.3, 0.3), Deferred()) == 0.0
 
 
-def test_a_residual_that_turns_has_the_spread_of_the_photographs() -> None:
+def test_a_view_dependent_residual_has_the_spread_of_the_photographs() -> None:
     _, spreads = residual_spreads(two_discs(), views(0.2, -0.2, 0.2, -0.2), Deferred())
     # A Gaussian's own weights fall off like its colour in the image, so that it sees their weighted square.
     assert 0.08 < float(spreads[0]) < 0.2
     assert float(spreads[1]) < 0.01
 
 
-def test_what_views_ignore_says_nothing() -> None:
+def test_ignored_pixels_are_no_evidence() -> None:
     """A residual that is constant wherever it is known does not vary with the view, however many views are masked."""
     plain, *masked = views(0.3, 0.3, 0.3, 0.3)
     everything = torch.ones(SIZE, SIZE, dtype=torch.bool)
@@ -87,7 +87,7 @@ def test_what_views_ignore_says_nothing() -> None:
     assert spreads.max() < 0.01
 
 
-def test_only_what_does_not_reflect_yet_can_be_overlooked() -> None:
+def test_reflective_surfaces_do_not_count_as_view_dependent() -> None:
     turning = views(0.3, -0.3, 0.3, -0.3)
     assert ReflectionMeasure().view_dependent_share(two_discs(), turning, Deferred()) == pytest.approx(0.5, abs=1e-3)
     assert ReflectionMeasure().view_dependent_share(two_discs(strength=0.9), turning, Deferred()) == 0.0

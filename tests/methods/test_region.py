@@ -31,7 +31,7 @@ def ring(center: torch.Tensor, radius: float, *, turned: bool = False, miss: flo
     return cameras
 
 
-def test_cameras_round_a_thing_find_it() -> None:
+def test_cameras_around_an_object_determine_its_region() -> None:
     center = torch.tensor([3.0, -1.0, 2.0])
     region = reflective_region(ring(center, 2.0))
     assert region is not None
@@ -47,11 +47,11 @@ def test_the_region_scales_with_the_capture(scale: float) -> None:
     assert scaled == pytest.approx([scale * x for x in small], rel=1e-3)
 
 
-def test_cameras_that_look_outwards_have_none() -> None:
+def test_cameras_looking_outwards_have_no_reflective_region() -> None:
     assert reflective_region(ring(torch.zeros(3), 2.0, turned=True)) is None
 
 
-def test_cameras_that_look_all_over_the_place_have_none() -> None:
+def test_cameras_looking_in_all_directions_have_no_reflective_region() -> None:
     assert reflective_region(ring(torch.zeros(3), 2.0, miss=2.0)) is None
 
 
@@ -70,7 +70,7 @@ def test_a_third_of_the_cameras_may_look_elsewhere() -> None:
     assert region[3] == pytest.approx(reflective_region(around)[3], rel=1e-3)  # type: ignore[index]
 
 
-def test_more_than_the_smaller_part_may_not() -> None:
+def test_no_more_than_the_minority_may_disagree() -> None:
     around = ring(torch.zeros(3), 2.0)
     away = ring(torch.zeros(3), 2.0, turned=True)
     assert reflective_region([*around[:8], *away]) is None

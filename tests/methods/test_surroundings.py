@@ -25,7 +25,7 @@ def in_box(**options: int) -> Gaussians:
     )
 
 
-def test_a_few_points_far_away_do_not_widen_the_box() -> None:
+def test_distant_outliers_do_not_enlarge_the_box() -> None:
     positions = 2 * torch.rand(2000, 3, generator=torch.Generator().manual_seed(0)) - 1
     positions[:4] *= 1e4
     middle = torch.tensor([3.0, -5.0, 0.0])

@@ -23,7 +23,7 @@ from tests.files.test_spz import typical
 from tests.training.tiny_capture import tiny_capture, true_scene
 
 
-def test_what_was_exported_comes_back(tmp_path: Path) -> None:
+def test_exported_scenes_are_read_back(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
     assert main(["export", str(run), "--output", str(tmp_path / "out"), "--formats", "ply", "spz"]) == 0
     for kind, precision in (("ply", 0.0), ("spz", 2**-18)):
@@ -90,7 +90,7 @@ def test_panes_can_be_given_by_hand(tmp_path: Path) -> None:
     assert float(strength.max()) > 0.1
 
 
-def test_a_file_goes_through_export_with_its_panes_and_its_up(tmp_path: Path) -> None:
+def test_export_keeps_the_panes_and_the_up_direction_of_a_file(tmp_path: Path) -> None:
     write_gaussians(tmp_path / "a.ply", typical())
     command = ["export", str(tmp_path / "a.ply"), "--formats", "ply", "--device", "cpu"]
     panes = ["--planes", str(given_by_hand(tmp_path / "mine.json"))]
@@ -106,7 +106,7 @@ def test_panes_are_for_splat_files(tmp_path: Path) -> None:
         load(write_run(tmp_path / "run"), device="cpu", planes=tmp_path / "mine.json")
 
 
-def test_what_cannot_be_drawn_is_left_out_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_invalid_gaussians_are_left_out_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     means = typical().means.clone()
     means[1] = float("nan")
     write_gaussians(tmp_path / "a.ply", typical().with_tensors({"means": means}))
@@ -116,7 +116,7 @@ def test_what_cannot_be_drawn_is_left_out_and_counted(tmp_path: Path, caplog: py
 
 
 @pytest.mark.parametrize("suffix", SPLAT_SUFFIXES)
-def test_hostile_files_get_one_message(suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_malicious_files_end_with_one_message(suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / f"a{suffix}"
     file.write_bytes(b"\x00" * 31)
     assert main(["export", str(file), "--output", str(tmp_path / "scene")]) == 2
@@ -152,7 +152,7 @@ def test_lossy_formats_keep_every_gaussian_near_its_place(suffix: str, tmp_path:
 
 
 @pytest.mark.parametrize("suffix", GAUSSFORGE_SUFFIXES)
-def test_without_gaussforge_it_is_said_how_to_get_it(
+def test_a_missing_gaussforge_is_reported_with_the_remedy(
     suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "gaussforge", None)

@@ -83,7 +83,7 @@ def test_every_layer_is_an_image(tmp_path: Path) -> None:
         whole.render("nobody.png")
 
 
-def test_everything_public_is_told_in_one_line() -> None:
+def test_every_public_object_has_a_repr_of_one_line() -> None:
     whole = model()
     data = tiny_capture()
     for thing in (whole, whole.scene, whole.cameras["2.png"], whole.render("2.png"), data, data.train[0]):
@@ -125,7 +125,7 @@ def test_edits_are_new_models() -> None:
         whole.without_pane(7)
 
 
-def test_one_pane_of_two_is_taken_out_with_its_glass() -> None:
+def test_one_of_two_panes_is_removed_with_its_glass() -> None:
     two = model().with_pane((3.0, 0.0, 2.0), (0.0, 0.0, 1.0), (0.5, 0.4))
     assert two.panes == (1, 2) and len(two.scene.glass) > len(model().scene.glass)
     assert float(two.scene.planes.base_reflectances[1]) == pytest.approx(CLEAR_GLASS)
@@ -133,7 +133,7 @@ def test_one_pane_of_two_is_taken_out_with_its_glass() -> None:
     assert back.panes == (1,) and torch.equal(back.scene.glass.means, model().scene.glass.means)
 
 
-def test_a_mirror_in_a_scene_that_knew_no_panes_shows_what_is_before_it() -> None:
+def test_a_mirror_added_to_a_scene_without_panes_reflects_it() -> None:
     plain = bare()
     mirror = plain.with_pane((0.0, 0.0, 1.5), (0.0, 0.0, -1.0), (2.0, 2.0), base_reflectance=1)
     assert mirror.recipe.method == "planar" and mirror.scene.planes.mirrors == (1,)
@@ -159,20 +159,20 @@ def test_a_mirror_in_a_scene_that_knew_no_panes_shows_what_is_before_it() -> Non
         ((0.0, 1.0), (1.0, 1.0), None, "expected 3, 3, 3 and 2"),
     ],
 )
-def test_a_pane_that_is_none_is_refused(normal: tuple, half_sizes: tuple, tangent: tuple | None, message: str) -> None:
+def test_an_invalid_pane_is_refused(normal: tuple, half_sizes: tuple, tangent: tuple | None, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         model().with_pane((0.0, 0.0, 0.0), normal, half_sizes, tangent=tangent)
 
 
 @pytest.mark.parametrize("label", [0, -1, 256])
-def test_a_label_that_no_file_can_hold_is_refused(label: int) -> None:
+def test_a_label_beyond_the_range_of_files_is_refused(label: int) -> None:
     with pytest.raises(ValueError, match=rf"the labels \[{label}\]; expected 1 to 255"):
         bare().with_pane((0.0, 0.0, 1.5), (0.0, 0.0, -1.0), (2.0, 2.0), label=label)
     assert bare().with_pane((0.0, 0.0, 1.5), (0.0, 0.0, -1.0), (2.0, 2.0), label=255).panes == (255,)
 
 
 @pytest.mark.parametrize(("name", "tolerance"), [("a.ply", 1e-6), ("a.spz", 0.1), ("folder", 0.0)])
-def test_what_is_saved_is_loaded_again(name: str, tolerance: float, tmp_path: Path) -> None:
+def test_saved_models_are_loaded_again(name: str, tolerance: float, tmp_path: Path) -> None:
     whole = model()
     path = whole.save(tmp_path / "out" / name)
     again = glassplat.load(path, device="cpu")
@@ -216,7 +216,7 @@ NO_PANES, PLAIN = {"planes": Planes.empty()}, PlanarRecipe(background=(0.0, 0.0,
         ("a.glb", SplatRecipe(background=(0.0, 0.0, 0.0)), NO_PANES | DISCS, None),
     ],
 )
-def test_what_a_splat_file_leaves_out_is_said(
+def test_saving_lists_what_a_splat_file_leaves_out(
     name: str, recipe: Any, parts: dict, lost: str | None, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     whole = model()
@@ -226,7 +226,7 @@ def test_what_a_splat_file_leaves_out_is_said(
     assert caplog.messages == ([] if lost is None else [expected])
 
 
-def test_a_folder_that_is_no_saved_model_is_never_replaced(tmp_path: Path) -> None:
+def test_a_folder_that_is_not_a_saved_model_is_never_replaced(tmp_path: Path) -> None:
     (tmp_path / "photographs").mkdir()
     (tmp_path / "photographs" / "a.jpg").touch()
     with pytest.raises(FileExistsError, match=r"not empty; nothing was written. Choose a new folder$"):
@@ -235,14 +235,14 @@ def test_a_folder_that_is_no_saved_model_is_never_replaced(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("normal", [(1.0, 0.0, 0.0), (0.0, 0.0, -2.0), (1.0, -0.2, 0.5)])
-def test_the_first_side_of_a_pane_is_level_unless_said_otherwise(normal: tuple[float, float, float]) -> None:
+def test_the_first_side_of_a_pane_is_horizontal_by_default(normal: tuple[float, float, float]) -> None:
     pane = bare().with_pane((0.0, 0.0, 1.5), normal, (2.0, 1.0)).scene.planes
     assert abs(float(pane.tangents[0, 1])) < 0.05, "the cameras of this scene are held upright, y down"
     flat = bare().with_pane((0.0, 1.0, 0.0), (0.0, 1.0, 0.0), (2.0, 1.0)).scene.planes
     assert abs(float(flat.normals[0] @ flat.tangents[0])) < 1e-5
 
 
-def test_a_model_without_cameras_is_looked_at_from_around_it() -> None:
+def test_a_model_without_cameras_gets_an_orbit() -> None:
     blind = dataclasses.replace(model(), cameras={})
     assert len(blind.orbit(3)) == 3 and len(blind.viewpoints) > 1
     assert blind.clean()[1].keys() == model().clean()[1].keys()
@@ -250,7 +250,7 @@ def test_a_model_without_cameras_is_looked_at_from_around_it() -> None:
     viewer.stop()
 
 
-def test_a_model_of_nothing_says_so() -> None:
+def test_an_empty_model_is_described_as_empty() -> None:
     nothing = model().with_scene(Scene(Gaussians.empty(1, channels=("log_intensity",)), 1.0))
     with pytest.raises(InputError, match="cannot be cleaned; expected at least one"):
         nothing.clean()
@@ -272,7 +272,7 @@ def test_a_model_without_cameras_is_saved_as_a_file_and_as_no_folder(tmp_path: P
     assert len(glassplat.load(blind.save(tmp_path / "a.ply"), device="cpu").cameras) > 0
 
 
-def test_panes_of_what_was_there_are_not_taken_over(tmp_path: Path) -> None:
+def test_panes_of_an_overwritten_file_are_not_reused(tmp_path: Path) -> None:
     model().save(tmp_path / "a.ply")
     with pytest.raises(FileExistsError, match=r"planes\.json"):
         bare().save(tmp_path / "b.ply")
@@ -283,7 +283,7 @@ def test_panes_of_what_was_there_are_not_taken_over(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["environment.png", "environment.json"])
-def test_an_environment_that_is_there_is_not_overwritten_unasked(name: str, tmp_path: Path) -> None:
+def test_an_existing_environment_is_not_overwritten(name: str, tmp_path: Path) -> None:
     whole = model()
     mirroring = whole.with_scene(dataclasses.replace(whole.scene, environment=Environment(torch.zeros(6, 4, 4, 3))))
     (tmp_path / name).write_text("somebody's")
@@ -303,12 +303,12 @@ def test_a_model_is_saved_as_a_page_and_as_nothing_unknown(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("name", ["none", "none.ply"])
-def test_what_is_not_there_is_named(name: str, tmp_path: Path) -> None:
+def test_missing_files_are_named(name: str, tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=f"{name} does not exist; expected a run"):
         glassplat.load(tmp_path / name)
 
 
-def test_a_camera_looks_where_it_should() -> None:
+def test_a_camera_points_at_its_target() -> None:
     camera = Camera.look_at((0, -1, -4), (0, 0, 0), up=(0, -1, 0), width=64, height=48)
     pixel, depth = camera.project(torch.tensor([[0.0, 0.0, 0.0], [0.0, -0.5, 0.0], [0.5, 0.0, 0.0]]))
     torch.testing.assert_close(pixel[0], torch.tensor([32.0, 24.0]), atol=1e-4, rtol=0)
@@ -338,7 +338,7 @@ def test_photographs_over_another_background_are_not_measured() -> None:
     assert model().evaluate(black)["psnr"] > 40
 
 
-def test_metrics_are_of_what_photographs_show_somebody_in_the_glass_too() -> None:
+def test_metrics_compare_with_photographs_including_the_photographer() -> None:
     plain = model()
     drawn = random_gaussians(40, (0.0, 0.0, 0.0), seed=5)
     somebody = drawn.with_tensors({name: tensor.float() for name, tensor in drawn.tensors().items()})
@@ -362,7 +362,7 @@ def test_gaussians_of_a_model_are_plain_data() -> None:
             one.concat(other)
 
 
-def test_what_holds_tensors_is_told_from_its_copies() -> None:
+def test_objects_with_tensors_differ_from_their_copies() -> None:
     whole = model()
     parts = whole.scene.primary, whole.scene.planes, whole.cameras["2.png"], tiny_capture().points
     for thing in (whole, whole.scene, *parts):
@@ -419,7 +419,7 @@ def test_a_background_is_a_colour(renderer: type) -> None:
         renderer((0.1, 0.2, 0.3, 0.4))
 
 
-def test_a_view_in_memory_is_kept_and_what_is_no_tensor_and_no_angle_is_refused() -> None:
+def test_views_in_memory_are_pickled_and_invalid_arguments_refused() -> None:
     scene, camera = true_scene(), model().cameras["2.png"]
     with pytest.raises(TypeError, match="means is a ndarray; expected a tensor"):
         dataclasses.replace(scene.primary, means=scene.primary.means.numpy())

@@ -20,7 +20,7 @@ def test_importing_the_package_imports_none_of_the_libraries() -> None:
     assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
-def test_the_names_are_told_alike_in_all_three_places() -> None:
+def test_names_are_listed_consistently_in_all_three_places() -> None:
     homed = {name: f"glassplat.{module}" for module, names in glassplat.NAMES_BY_MODULE.items() for name in names}
     tree = ast.parse(Path(glassplat.__file__).read_text())
     typed = {
@@ -43,6 +43,6 @@ def test_every_name_is_there_and_documented(name: str) -> None:
     assert bare == []
 
 
-def test_a_name_that_does_not_exist_is_refused_with_those_that_do() -> None:
+def test_an_unknown_name_is_refused_with_the_known_ones() -> None:
     with pytest.raises(AttributeError, match=r"no attribute 'Trainer'; it has load, .*InputError"):
         glassplat.Trainer  # noqa: B018

@@ -88,7 +88,7 @@ def killed_at(path: Path, stem: str, suffix: str) -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no process is killed there")
 @pytest.mark.parametrize(("stem", "suffix"), [(".point_cloud.", ".ply"), (".scene.", ".json")])
-def test_what_a_killed_run_left_half_written_goes(tmp_path: Path, stem: str, suffix: str) -> None:
+def test_partial_files_of_a_killed_run_are_removed(tmp_path: Path, stem: str, suffix: str) -> None:
     process = forked(killed_at, tmp_path / "run", stem, suffix)
     process.join(LONGEST)
     assert process.exitcode == -signal.SIGKILL
@@ -119,7 +119,7 @@ def assert_same(first: Scene, second: Scene) -> None:
         assert torch.equal(tensor, second.parameters()[name]), name
 
 
-def test_a_hang_up_that_is_ignored_stays_ignored(tmp_path: Path) -> None:
+def test_an_ignored_sighup_stays_ignored(tmp_path: Path) -> None:
     previous = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         assert run(tmp_path, interrupt_at=5, by=signal.SIGHUP).step == 12
@@ -127,7 +127,7 @@ def test_a_hang_up_that_is_ignored_stays_ignored(tmp_path: Path) -> None:
         signal.signal(signal.SIGHUP, previous)
 
 
-def test_a_run_in_another_thread_cannot_be_asked_but_trains(tmp_path: Path) -> None:
+def test_training_works_outside_the_main_thread(tmp_path: Path) -> None:
     states: list[Any] = []
     thread = threading.Thread(target=lambda: states.append(run(tmp_path)))
     thread.start()
@@ -137,7 +137,7 @@ def test_a_run_in_another_thread_cannot_be_asked_but_trains(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("gone", [OSError(errno.EIO, "Input/output error"), SystemExit(1), KeyboardInterrupt()])
 @pytest.mark.parametrize("asked", [False, True])
-def test_nothing_is_lost_when_nobody_is_there_to_hear_it(gone: BaseException, asked: bool, tmp_path: Path) -> None:
+def test_a_failing_listener_loses_no_progress(gone: BaseException, asked: bool, tmp_path: Path) -> None:
     """As when a terminal is closed, or `train | head` has read enough."""
 
     def listen(message: Message) -> None:
@@ -153,7 +153,7 @@ def test_nothing_is_lost_when_nobody_is_there_to_hear_it(gone: BaseException, as
     assert_same(run(tmp_path, resume=True).scene, whole())
 
 
-def test_checkpoints_come_by_time_and_are_told(tmp_path: Path) -> None:
+def test_checkpoints_are_written_by_time_and_reported(tmp_path: Path) -> None:
     often: list[Message] = []
     run(tmp_path / "often", checkpoint_every=1e-9, heard=often)
     assert [m.step for m in often if isinstance(m, CheckpointWritten)] == list(range(1, 13))
@@ -164,7 +164,7 @@ def test_checkpoints_come_by_time_and_are_told(tmp_path: Path) -> None:
     assert '"CheckpointWritten"' in log and '"Working"' not in log
 
 
-def test_never_are_more_than_two_minutes_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_checkpoints_are_at_most_two_minutes_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps, the edits between them and writing take time too."""
     now, kept = 0.0, [0.0]
 
@@ -186,7 +186,7 @@ def test_never_are_more_than_two_minutes_lost(monkeypatch: pytest.MonkeyPatch) -
     assert len(kept) > 10
 
 
-def test_the_time_of_a_run_is_without_that_of_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_training_time_excludes_compilation(monkeypatch: pytest.MonkeyPatch) -> None:
     """The compiler runs once on a machine: if it counted, a first run would look slower than later ones."""
     now, compiling = 10.0, 3.0
     monkeypatch.setattr(training, "time", SimpleNamespace(perf_counter=lambda: now))
@@ -198,7 +198,7 @@ def test_the_time_of_a_run_is_without_that_of_the_compiler(monkeypatch: pytest.M
     assert state.seconds == 100 + 20 - 7
 
 
-def test_a_run_says_from_where_it_goes_on(tmp_path: Path) -> None:
+def test_a_resumed_run_reports_its_first_step(tmp_path: Path) -> None:
     heard: list[Message] = []
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, interrupt_at=5, heard=heard)
@@ -210,7 +210,7 @@ def test_a_run_says_from_where_it_goes_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("tail", [b'{"message": "StepDone", "st', b"\0" * 4000, b"[" * 9000, b"\xff\xfe\n[]\n7\n{}\n"])
-def test_a_log_that_ends_in_the_middle_is_cut_and_goes_on(tail: bytes, tmp_path: Path) -> None:
+def test_a_truncated_log_is_repaired_and_continued(tail: bytes, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, interrupt_at=11)
     log = RunDirectory(tmp_path).log
@@ -248,12 +248,12 @@ def test_a_full_disk_leaves_the_last_checkpoint(tmp_path: Path) -> None:
     assert_same(run(tmp_path, resume=True).scene, whole())
 
 
-def test_a_disk_too_full_for_the_log_is_told(tmp_path: Path) -> None:
+def test_a_disk_too_full_for_the_log_is_reported(tmp_path: Path) -> None:
     with no_room_beyond(0), pytest.raises(OSError, match="could not write"):
         run(tmp_path)
 
 
-def test_nothing_saved_is_nothing_to_go_on_from(tmp_path: Path) -> None:
+def test_resuming_without_a_checkpoint_is_refused(tmp_path: Path) -> None:
     directory, heard = RunDirectory(tmp_path / "run"), list[Message]()
     with pytest.raises(InputError, match=r"nothing was saved yet in .*; start again without --resume"):
         run(directory.path, resume=True)
@@ -273,7 +273,7 @@ def test_nothing_saved_is_nothing_to_go_on_from(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "name", ["cameras.json", "settings.json", "recipe.json", "index.html", "results.json", "point_cloud/iteration_7/x"]
 )
-def test_files_of_somebody_else_are_not_overwritten(name: str, tmp_path: Path) -> None:
+def test_foreign_files_are_not_overwritten(name: str, tmp_path: Path) -> None:
     file = tmp_path / name
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text("{}")
@@ -304,7 +304,7 @@ def test_a_run_too_short_for_its_stages_is_refused_before_anything_is_written(tm
     assert not (tmp_path / "run").exists()
 
 
-def test_a_scene_that_cannot_be_begun_leaves_no_folder(tmp_path: Path) -> None:
+def test_a_scene_that_cannot_be_initialised_leaves_no_folder(tmp_path: Path) -> None:
     bare = replace(tiny_capture(), pane_labels=())
     with pytest.raises(PlaneFitError, match="needs to know the panes"):
         Run(PlanarRecipe(), SETTINGS, RunDirectory(tmp_path / "run"), bare, resume=False).run_to_end(print)
@@ -326,7 +326,7 @@ def test_the_training_time_is_read_without_the_tensors(tmp_path: Path, monkeypat
 
 
 @pytest.mark.parametrize("content", [b"", b"no checkpoint at all"])
-def test_the_time_of_a_broken_checkpoint_is_not_guessed(content: bytes, tmp_path: Path) -> None:
+def test_a_broken_checkpoint_has_no_training_time(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "broken").write_bytes(content)
     with pytest.raises(InputError, match="truncated or not a checkpoint"):
         read_progress(tmp_path / "broken")
@@ -353,7 +353,7 @@ def test_a_broken_test_photograph_ends_a_run_at_the_start(tmp_path: Path) -> Non
         Run(RECIPE, RunSettings("", 10**6), RunDirectory(tmp_path / "run"), dataset, resume=False).run_to_end(listen)
 
 
-def test_the_checkpoint_of_another_method_is_not_gone_on_with(tmp_path: Path) -> None:
+def test_resuming_a_checkpoint_of_another_method_is_refused(tmp_path: Path) -> None:
     run(tmp_path)
     state = load_checkpoint(RunDirectory(tmp_path).checkpoint)
     for changed, message in (
@@ -385,7 +385,7 @@ def test_a_rank_that_does_not_lead_saves_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", [InputError, FileNotFoundError])
-def test_a_photograph_that_cannot_be_read_any_more_costs_nothing(
+def test_an_unreadable_photograph_ends_training_with_a_checkpoint(
     tmp_path: Path, kind: type[Exception], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gone, memory = threading.Event(), PixelCache(0.0)
@@ -449,7 +449,7 @@ def test_a_state_in_the_middle_of_a_change_is_not_saved(tmp_path: Path) -> None:
         (DeferredRecipe(), SETTINGS, "method was splat and is deferred"),
     ],
 )
-def test_other_options_are_named_when_a_run_is_to_go_on(recipe: Any, settings: Any, told: str, tmp_path: Path) -> None:
+def test_resuming_names_changed_options(recipe: Any, settings: Any, told: str, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, interrupt_at=5)
     with pytest.raises(InputError) as caught:
@@ -457,7 +457,7 @@ def test_other_options_are_named_when_a_run_is_to_go_on(recipe: Any, settings: A
     assert f" was started with other options: {told}; expected the same to resume it. Repeat" in str(caught.value)
 
 
-def test_a_run_goes_on_where_its_capture_has_moved_and_not_with_another(tmp_path: Path) -> None:
+def test_a_run_resumes_with_its_moved_capture_only(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, interrupt_at=5)
     moved, capture, directory = replace(SETTINGS, data="elsewhere"), tiny_capture(), RunDirectory(tmp_path)
@@ -484,7 +484,7 @@ def test_changed_photographs_are_warned_about_on_resuming(tmp_path: Path, caplog
         assert ("have changed since this run began" in caplog.text) == change
 
 
-def test_an_option_that_another_version_did_not_have_is_named_when_a_run_is_to_go_on(tmp_path: Path) -> None:
+def test_resuming_names_an_option_that_the_earlier_version_lacked(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, interrupt_at=5)
     written = json.loads((tmp_path / "recipe.json").read_text())
@@ -494,7 +494,7 @@ def test_an_option_that_another_version_did_not_have_is_named_when_a_run_is_to_g
         run(tmp_path, resume=True)
 
 
-def test_a_recipe_of_another_kind_is_named_when_a_run_is_to_go_on(tmp_path: Path) -> None:
+def test_resuming_with_another_kind_of_recipe_is_refused(tmp_path: Path) -> None:
     class Own(SplatRecipe):
         """A recipe that could have other stages."""
 
@@ -504,7 +504,7 @@ def test_a_recipe_of_another_kind_is_named_when_a_run_is_to_go_on(tmp_path: Path
         Run(Own(sh_degree=1), SETTINGS, RunDirectory(tmp_path), tiny_capture(), resume=True).run_to_end(print)
 
 
-def test_a_capture_of_other_photographs_is_not_gone_on_with(tmp_path: Path) -> None:
+def test_resuming_with_other_photographs_is_refused(tmp_path: Path) -> None:
     """Views other than before would be held out for testing."""
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, interrupt_at=5)
@@ -518,12 +518,12 @@ def test_a_capture_of_other_photographs_is_not_gone_on_with(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     "recipe", [RECIPE, PlanarRecipe(fresnel="none", weights=ReflectionWeights(depth=0.0), background=(1.0, 1.0, 1.0))]
 )
-def test_a_recipe_survives_its_file(recipe: Any) -> None:
+def test_a_recipe_round_trips_through_its_file(recipe: Any) -> None:
     assert recipe_from_json(recipe_to_json(recipe)) == recipe
     assert recipe_from_json(recipe_to_json(recipe)) != replace(recipe, sh_degree=0)
 
 
-def test_a_recipe_with_a_choice_that_there_is_no_more_is_refused() -> None:
+def test_a_recipe_with_a_removed_choice_is_refused() -> None:
     text = recipe_to_json(PlanarRecipe()).replace('"fresnel": "pane"', '"fresnel": true')
     with pytest.raises(InputError, match="fresnel is True; expected one of pane, schlick, none"):
         recipe_from_json(text)
@@ -543,7 +543,7 @@ def test_a_second_signal_interrupts_unless_torchrun_may_have_passed_it_on(
         assert request.requested
 
 
-def test_a_capture_whose_poses_were_found_again_is_not_gone_on_with(tmp_path: Path) -> None:
+def test_resuming_with_reestimated_poses_is_refused(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, interrupt_at=5)
     before = RunDirectory(tmp_path).checkpoint.read_bytes()

@@ -33,7 +33,7 @@ def edit(path: Path, **changes: Any) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
-def test_copies_of_a_scene_under_other_names_are_left_alone(run: Path) -> None:
+def test_copies_of_a_scene_under_other_names_are_kept(run: Path) -> None:
     for name in ("iteration_abc", "iteration_1 (copy)", "iteration_-3", "iteration_2.5", "iteration_1_old", "best"):
         shutil.copytree(run / SCENE, run / "point_cloud" / name)
     (run / "point_cloud/iteration_7").write_text("a file")
@@ -67,7 +67,7 @@ def test_a_damaged_scene_header_is_named(run: Path, content: str, message: str) 
 
 @pytest.mark.parametrize("name", ["scene.json", "point_cloud.ply", "glass.ply", "planes.json"])
 @pytest.mark.parametrize("damage", ["missing", "folder"])
-def test_a_lost_file_of_a_scene_is_named(run: Path, name: str, damage: str) -> None:
+def test_a_missing_file_of_a_scene_is_named(run: Path, name: str, damage: str) -> None:
     (run / SCENE / name).unlink()
     if damage == "folder":
         (run / SCENE / name).mkdir()
@@ -136,7 +136,7 @@ def test_damaged_settings_are_named(run: Path, changes: dict[str, Any], message:
 
 
 @pytest.mark.parametrize("content", [b"", b"[]", b"null", b"{}", b"\xff\xfe", b"[" * 10**5])
-def test_settings_that_are_none_are_named(run: Path, content: bytes) -> None:
+def test_invalid_settings_are_named(run: Path, content: bytes) -> None:
     (run / "settings.json").write_bytes(content)
     with pytest.raises(InputError, match=r"settings\.json"):
         RunDirectory(run).settings()

@@ -21,7 +21,7 @@ with run_lock(Path(sys.argv[1])):
 """
 
 
-def test_a_second_one_is_refused_until_the_first_ends(tmp_path: Path) -> None:
+def test_a_second_training_is_refused_until_the_first_ends(tmp_path: Path) -> None:
     with run_lock(tmp_path):
         for refused in (run_lock(tmp_path).__enter__, lambda: check_unlocked(tmp_path)):
             with pytest.raises(InputError, match="another training is writing"):
@@ -31,7 +31,7 @@ def test_a_second_one_is_refused_until_the_first_ends(tmp_path: Path) -> None:
         pass
 
 
-def test_a_killed_process_leaves_no_lock_behind(tmp_path: Path) -> None:
+def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
     with subprocess.Popen(
         [sys.executable, "-c", HOLD, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
@@ -43,12 +43,12 @@ def test_a_killed_process_leaves_no_lock_behind(tmp_path: Path) -> None:
     check_unlocked(tmp_path)
 
 
-def test_looking_makes_no_file(tmp_path: Path) -> None:
+def test_reading_creates_no_file(tmp_path: Path) -> None:
     check_unlocked(tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_system_without_locks_is_used_without(
+def test_training_works_on_a_file_system_without_locks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def unsupported(descriptor: int, operation: int) -> None:

@@ -32,7 +32,7 @@ def steps(training: Training) -> list[int]:
     return [message.step for message in training if isinstance(message, StepDone)]
 
 
-def test_a_training_in_memory_can_be_watched_and_gone_on_with() -> None:
+def test_a_training_in_memory_can_be_viewed_and_continued() -> None:
     training = Training(tiny_capture(), RECIPE, iterations=6, device="cpu")
     assert training.step == 0
     with pytest.raises(RuntimeError, match="has not started"):
@@ -58,7 +58,7 @@ def test_the_same_run_in_memory_and_in_a_directory(tmp_path: Path) -> None:
     assert [type(message).__name__ for message in heard[:3]] == ["Working", "RunBegun", "StageEntered"]
 
 
-def test_who_leaves_the_loop_can_go_on_where_it_was_left(tmp_path: Path) -> None:
+def test_iteration_can_continue_after_a_break(tmp_path: Path) -> None:
     def training(**options: bool) -> Training:
         return Training(tiny_capture(), RECIPE, iterations=6, device="cpu", output=tmp_path / "run", **options)
 
@@ -82,7 +82,7 @@ SETUPS = {
 
 
 @pytest.mark.parametrize("recipe", SETUPS.values(), ids=SETUPS)
-def test_who_leaves_the_loop_where_a_stage_begins_can_go_on_there(recipe: Any, tmp_path: Path) -> None:
+def test_iteration_can_continue_after_a_break_at_a_stage(recipe: Any, tmp_path: Path) -> None:
     """Results of the stage's setup are in the checkpoint and are not computed a second time."""
     dataset = load_dataset(write_tiny_capture(tmp_path / "capture"))
 
@@ -99,9 +99,7 @@ def test_who_leaves_the_loop_where_a_stage_begins_can_go_on_there(recipe: Any, t
     assert all(torch.equal(tensor, whole[name]) for name, tensor in found.items())
 
 
-def test_a_pane_that_was_marked_after_the_planes_were_fitted_is_told_of(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_pane_marked_after_the_plane_fit_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     dataset = load_dataset(write_tiny_capture(tmp_path / "capture"))
     options: Any = {"iterations": 10, "device": "cpu", "output": tmp_path / "run"}
     for message in Training(dataset, PANES, **options):
@@ -112,7 +110,7 @@ def test_a_pane_that_was_marked_after_the_planes_were_fitted_is_told_of(
     assert "fitted before pane 2 was marked" in caplog.text
 
 
-def test_masks_that_make_no_pane_cost_nothing_that_was_learned_before(tmp_path: Path) -> None:
+def test_masks_without_a_plane_end_training_with_a_checkpoint(tmp_path: Path) -> None:
     dataset = replace(load_dataset(write_tiny_capture(tmp_path / "capture")), measured_points=False)
 
     def elsewhere(number: int) -> Tensor:
@@ -131,7 +129,7 @@ def test_masks_that_make_no_pane_cost_nothing_that_was_learned_before(tmp_path: 
     assert torch.equal(resumed.model.scene.primary.means, whole.scene.primary.means)
 
 
-def test_a_training_that_goes_on_can_be_left_and_gone_on_with_again(tmp_path: Path) -> None:
+def test_a_resumed_training_can_be_stopped_and_resumed_again(tmp_path: Path) -> None:
     def training(**options: bool) -> Training:
         return Training(tiny_capture(), RECIPE, iterations=6, device="cpu", output=tmp_path / "run", **options)
 
@@ -147,7 +145,7 @@ def test_a_training_that_goes_on_can_be_left_and_gone_on_with_again(tmp_path: Pa
     assert torch.equal(resumed.model.scene.primary.means, whole.scene.primary.means)
 
 
-def test_a_listener_that_fails_where_a_stage_begins_loses_nothing(tmp_path: Path) -> None:
+def test_a_listener_that_fails_at_the_start_of_a_stage_loses_no_progress(tmp_path: Path) -> None:
     def listen(message: Message) -> None:
         if isinstance(message, StageEntered):
             raise ConnectionError("nobody listens")
@@ -195,7 +193,7 @@ def brightness(frame: Frame, view: View, scene: Scene) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("given", [lambda rgb: 0.5, lambda rgb: rgb, lambda rgb: rgb.mean()[None]])
-def test_a_loss_term_that_is_no_number_is_named(given: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_nan_loss_term_is_named(given: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(globals(), "brightness", lambda frame, view, scene: given(frame.rgb))
     with pytest.raises(
         ValueError, match=r"the loss term 'brightness' gave .*; expected a tensor of one number, or None"
@@ -203,7 +201,7 @@ def test_a_loss_term_that_is_no_number_is_named(given: Any, monkeypatch: pytest.
         list(Training(tiny_capture(), Brighter(), iterations=4, device="cpu"))
 
 
-def test_a_recipe_of_ones_own_is_trained() -> None:
+def test_a_custom_recipe_is_trained() -> None:
     losses = []
     for message in Training(tiny_capture(), Brighter(), iterations=4, device="cpu"):
         if isinstance(message, StepDone):
@@ -212,7 +210,7 @@ def test_a_recipe_of_ones_own_is_trained() -> None:
     assert losses[-1]["brightness"] < losses[0]["brightness"]
 
 
-def test_a_loss_term_with_a_name_that_is_taken_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_loss_term_with_a_duplicate_name_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Brighter, "stages", lambda self, seed, iterations: twice(SplatRecipe.stages(self, seed)))
     with pytest.raises(ValueError, match=r"loss terms .*; expected another name for each"):
         Training(tiny_capture(), Brighter(), iterations=4, device="cpu")
@@ -222,7 +220,7 @@ def twice(stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
     return tuple(replace(stage, losses=(*stage.losses, *stage.losses)) for stage in stages)
 
 
-def test_what_cannot_be_trained_is_refused_at_once(tmp_path: Path) -> None:
+def test_untrainable_input_is_refused_at_once(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="dataset is 'captures/shop'; expected what"):
         Training("captures/shop", "splat")
     with pytest.raises(InputError, match="there is no method 'nerf'; expected splat, planar"):
@@ -260,7 +258,7 @@ def test_a_training_learns_where_gradients_are_switched_off(switched_off: Any) -
     assert not training.model.scene.primary.means.is_inference()
 
 
-def test_photographs_first_looked_at_without_gradients_can_be_learned_from(tmp_path: Path) -> None:
+def test_photographs_first_used_without_gradients_can_be_trained_on(tmp_path: Path) -> None:
     dataset = load_dataset(write_tiny_capture(tmp_path / "capture"))
     with torch.inference_mode():
         assert all(float(view.photo.float().mean()) > 0 for view in dataset.train)
@@ -293,9 +291,7 @@ class Weighted(SplatRecipe):
     brightness: float = 10.0
 
 
-def test_a_run_of_a_recipe_of_ones_own_is_gone_on_with_and_loaded(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_run_of_a_custom_recipe_is_resumed_and_loaded(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     def training(recipe: Any, **options: bool) -> Training:
         return Training(tiny_capture(), recipe, iterations=4, device="cpu", output=tmp_path / "run", **options)
 
@@ -314,7 +310,7 @@ def test_a_run_of_a_recipe_of_ones_own_is_gone_on_with_and_loaded(
     assert "of a custom recipe, 'Weighted'; read as SplatRecipe" in caplog.text
 
 
-def test_a_training_that_is_run_again_keeps_what_it_has_trained(tmp_path: Path) -> None:
+def test_running_a_finished_training_again_keeps_its_scene(tmp_path: Path) -> None:
     training = Training(tiny_capture(), RECIPE, iterations=4, device="cpu", output=tmp_path / "run")
     first = training.run().scene.primary.means.clone()
     assert torch.equal(training.run().scene.primary.means, first) and training.step == 4
@@ -325,7 +321,7 @@ def test_a_training_that_is_run_again_keeps_what_it_has_trained(tmp_path: Path) 
     assert other.step == 0
 
 
-def test_trainings_that_take_turns_leave_signals_as_they_were(tmp_path: Path) -> None:
+def test_alternating_trainings_restore_signal_handlers(tmp_path: Path) -> None:
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     runs = [Training(tiny_capture(), RECIPE, iterations=6, device="cpu", output=tmp_path / name) for name in "ab"]
     first, second = (iter(training) for training in runs)

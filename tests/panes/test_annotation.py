@@ -30,7 +30,7 @@ def test_edge_runs_between_pixels_and_not_along_the_image_border() -> None:
     assert len(view.edge) == 40 + 60
 
 
-def test_signed_distance_is_zero_on_the_edge_and_exact_beside_it() -> None:
+def test_signed_distance_is_zero_on_the_edge_and_exact_next_to_it() -> None:
     view = pane_view(camera_at(0), labels_with(10, 50, 20, 60), 1)
     pixels = np.array([[20.0, 30.0], [23.0, 30.0], [15.5, 30.0], [40.0, 50.0], [40.0, 52.25]])
     assert view.edge_distances(pixels) == pytest.approx([0, 3, -4.5, 0, -2.25])

@@ -61,7 +61,7 @@ def test_doubt_is_small_where_all_sides_are_seen_and_large_where_one_is() -> Non
     assert tilt_uncertainty(planes, Objective(level, *nothing), 0.004)[0] > np.radians(10)
 
 
-def test_edges_that_enter_an_image_or_leave_it_make_no_plane_surer() -> None:
+def test_edges_cut_by_the_image_border_do_not_reduce_the_uncertainty() -> None:
     views = pane_views(scene_of([FRONT], [*EYES, (0.9, -0.5, 0.9), (-0.5, 0.4, 1.0)]), 1)
     steps = 1e-3 * np.random.default_rng(0).standard_normal((40, 3))
     around = move_planes(TRUTH.select(np.zeros(40, dtype=np.int64)), np.tile(FRONT.center, (40, 1)), steps)
@@ -69,7 +69,7 @@ def test_edges_that_enter_an_image_or_leave_it_make_no_plane_surer() -> None:
     assert doubts.max() < 1.1 * doubts.min()
 
 
-def test_the_sign_of_turned_edges_does_not_hang_on_the_axes_of_the_plane() -> None:
+def test_the_sign_of_rotated_edges_does_not_depend_on_the_axes_of_the_plane() -> None:
     views = pane_views(scene_of([FRONT]), 1)
     # The axes of a plane rotate by a right angle where another axis of the world becomes the nearest to its normal.
     tilts = 1e-3 * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])

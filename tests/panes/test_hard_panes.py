@@ -50,7 +50,7 @@ def roughened(annotations: Annotations, label: int, *, amplitude: float, seed: i
     return [(camera, rough(number, labels)) for number, (camera, labels) in enumerate(annotations)]
 
 
-def test_a_high_frame_seen_from_beyond_it_does_not_move_the_plane() -> None:
+def test_a_protruding_frame_does_not_move_the_plane() -> None:
     beyond = ((2.6, 0.0, 0.3), (-1.9, 0.4, 0.6), (0.2, 0.2, -1.2))
     assert_found(FRONT, framed_scene_of(FRONT, 0.12, beyond), BARE, degrees=1, percent=1)
 
@@ -83,7 +83,7 @@ def test_the_edges_of_a_post_before_a_pane_do_not_turn_its_plane(depth: float, h
     assert normal_error(planes, 0, pane) < 0.5
 
 
-def test_the_bars_of_a_window_place_it_where_no_photograph_shows_where_it_ends() -> None:
+def test_glazing_bars_determine_the_plane_of_a_window_without_visible_ends() -> None:
     window = Pane(np.array([0.0, -0.1, 2.0]), FRONT.normal, FRONT.tangent, (9.0, 9.0))
     bars = [Pane(np.array([x, -0.1, 2.0]), FRONT.normal, FRONT.tangent, (0.03, 9.0)) for x in (-0.9, -0.1, 0.7)]
     bars += [Pane(np.array([0.0, y, 2.0]), FRONT.normal, FRONT.bitangent, (0.03, 9.0)) for y in (-0.5, 0.4)]
@@ -169,7 +169,7 @@ def test_masks_that_fill_their_images_are_refused_with_what_to_annotate() -> Non
         fit_planes(BARE[:0], annotations, extent=EXTENT, options=QUICK)
 
 
-def test_a_plane_that_one_edge_leaves_free_is_refused_with_what_to_annotate() -> None:
+def test_a_plane_undetermined_by_one_edge_is_refused_with_advice() -> None:
     wide = Pane(np.array([0.0, -10.3, 2.0]), FRONT.normal, FRONT.tangent, (10.0, 10.0))
     cameras = [camera_from(eye, FRONT.center) for eye in EYES]
     annotations = [(camera, label_image(camera, [wide])) for camera in cameras]
@@ -188,7 +188,7 @@ def front_pane(x: float, half_width: float, degrees: float = 0.0) -> Pane:
     return Pane(np.array([x, -0.1, 2.0]), normal, tangent, (half_width, 0.5))
 
 
-def test_a_pane_that_its_masks_leave_open_is_placed_by_its_neighbour_in_the_same_front() -> None:
+def test_an_ambiguous_pane_takes_the_plane_of_its_neighbour() -> None:
     panes = [front_pane(-0.5, 0.45), front_pane(0.2, 0.1)]
     annotations = scene_of(panes, (*EYES, (0.3, 0.6, -1.1)))
     coarse = roughened(annotations, 2, amplitude=1.0)
@@ -220,7 +220,7 @@ def muntined(columns: int, rows: int) -> list[Pane]:
     return [replace(FRONT, center=middle, half_sizes=half) for middle in middles]
 
 
-def test_a_front_of_many_panes_lies_in_one_plane_found_by_steps_no_larger_than_those_of_few(
+def test_many_coplanar_panes_are_fitted_with_small_steps(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     terms, work = JointObjective.terms, []
@@ -300,7 +300,7 @@ def test_masks_from_nearly_one_place_are_warned_of_with_what_to_annotate(caplog:
     assert "aside.jpg should show it well" in warning
 
 
-def test_a_pane_that_two_views_show_is_placed_by_its_neighbour_in_the_same_front() -> None:
+def test_a_pane_in_two_views_takes_the_plane_of_its_neighbour() -> None:
     panes = [front_pane(-0.5, 0.45), front_pane(0.35, 0.15)]
     annotations = scene_of(panes, (*EYES, (0.3, 0.6, -1.1), (0.5, 0.5, -1.0)))
     both, first = annotations[:2], [(camera, labels * (labels == 1)) for camera, labels in annotations[2:]]

@@ -77,11 +77,11 @@ def test_images_among_three_times_as_many_real_points_place_the_plane(seed: int)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_points_that_are_no_images_place_nothing(seed: int) -> None:
+def test_points_without_mirror_images_determine_no_plane(seed: int) -> None:
     assert not searched(turned(0, 0), behind_the_pane(seed), before_the_pane(seed)).is_clear
 
 
-def test_a_plane_that_has_the_images_already_stays() -> None:
+def test_a_plane_that_explains_the_mirror_images_is_kept() -> None:
     room = before_the_pane(0)
     found = searched(turned(0.1, 0), images_of(room, 0), room)
     assert found.before > 0.5 * found.pairs
@@ -132,7 +132,7 @@ def test_two_masks_are_enough_where_a_mirror_shows_points(caplog: pytest.LogCapt
     assert "two annotated views alone" not in caplog.text
 
 
-def test_images_do_not_overrule_masks_that_tell_against_their_plane() -> None:
+def test_mirror_images_do_not_overrule_contradicting_masks() -> None:
     """Masks of a pane that is rotated by 12 degrees from the plane that mirrors the points."""
     other = rotation_from_quat(torch.tensor([0.9945, 0.0, 0.1045, 0.0], dtype=torch.float64)).numpy()
     pane: Pane = replace(FRONT, normal=other @ FRONT.normal, tangent=other @ FRONT.tangent)

@@ -100,9 +100,7 @@ def test_the_image_of_a_lamp_is_found_and_the_lamp_gets_its_radiance() -> None:
         pytest.param([shining(panel(LAMP))], [shining(panel(LAMP)), panel((0.2, 0.3, 3.0))], id="an image elsewhere"),
     ],
 )
-def test_nothing_is_taken_for_a_lamp_that_need_not_be_one(
-    photographed: list[Gaussians], first: list[Gaussians]
-) -> None:
+def test_no_lamp_is_found_without_need(photographed: list[Gaussians], first: list[Gaussians]) -> None:
     scene = scene_of(wall(4.0), *first)
     assert mirrored_lamps(scene, scene.planes, photographs_of(scene_of(wall(4.0), *photographed))) is None
 
@@ -125,7 +123,7 @@ def test_places_are_found_where_a_pane_mirrors_nothing_and_nowhere_else() -> Non
     assert len(unseen_positions(closed, closed.planes, CAMERAS).positions) == 0
 
 
-def test_places_lie_at_the_end_of_the_room_where_the_mirrored_camera_sees_the_hole() -> None:
+def test_unseen_positions_lie_at_the_end_of_the_room_behind_the_hole() -> None:
     pane = Planes.rectangle((0.1, 0.0, 2.0), (0.2, -0.1, -1.0), (0.8, 0.6))
     view, hole, middle = camera(0.3), torch.zeros(120, 160, dtype=torch.bool), torch.tensor([0.1, 0.2, -0.3])
     hole[30:70, 60:140] = True
@@ -154,7 +152,7 @@ def capture_of(scene: Scene) -> Dataset:
     return Dataset(Path("made"), tuple(views), (), points, scene.extent, pane_labels=(1,))
 
 
-def test_lamps_are_lit_at_their_moments_and_their_images_go() -> None:
+def test_lamps_are_brightened_at_their_moments_and_their_images_removed() -> None:
     capture = capture_of(scene_of(wall(4.0), shining(panel(LAMP))))
     state, action = state_of(scene_of(wall(4.0), panel(LAMP), panel(IMAGE))), LightLamps((0.4, 0.6))
     assert [step for step in range(101) if action.due(Clock(step, 100, 5))] == [40, 60]
@@ -169,7 +167,7 @@ def test_lamps_are_lit_at_their_moments_and_their_images_go() -> None:
     assert not finished(action.apply(state_of(mirrors), capture, Clock(40, 100, 5)))
 
 
-def test_lamps_that_are_lit_when_gaussians_grow_do_not_keep_them_from_it() -> None:
+def test_brightening_lamps_does_not_prevent_densification() -> None:
     capture = capture_of(scene_of(wall(4.0), shining(panel(LAMP))))
     state = state_of(scene_of(wall(4.0), panel(LAMP), panel(IMAGE)))
     state.statistics["primary"] = ScreenStatistics(*torch.ones(3, 2, len(state.scene.primary)))
@@ -180,7 +178,7 @@ def test_lamps_that_are_lit_when_gaussians_grow_do_not_keep_them_from_it() -> No
     assert len(state.scene.primary) > 1.5 * left
 
 
-def test_what_a_pane_mirrors_unseen_is_filled_once() -> None:
+def test_unseen_reflected_parts_are_filled_once() -> None:
     scene = scene_of(wall(4.0), wall(-3.0, 120).select(wall(-3.0).means[:, 0] < 1))
     state, action = state_of(scene), FillUnseen((0.5,))
     state.statistics["primary"] = ScreenStatistics(*torch.ones(3, 2, len(scene.primary)))

@@ -26,7 +26,7 @@ def warnings_of(annotations: Annotations, caplog: pytest.LogCaptureFixture) -> l
     return [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
 
 
-def test_masks_that_fit_are_reported_and_nobody_is_warned(caplog: pytest.LogCaptureFixture) -> None:
+def test_consistent_masks_are_logged_without_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     assert warnings_of(scene_of([FRONT], PLACES), caplog) == []
 
 
@@ -39,7 +39,7 @@ def test_masks_that_changed_places_are_named(caplog: pytest.LogCaptureFixture) -
     assert "photo1.jpg" in warning and "photo4.jpg" in warning and "photo0.jpg" not in warning
 
 
-def test_a_post_before_the_pane_is_no_wrong_mask(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_post_in_front_of_the_pane_is_not_reported(caplog: pytest.LogCaptureFixture) -> None:
     post = Pane(np.array([0.7, -0.1, 1.3]), FRONT.normal, FRONT.tangent, (0.08, 2.0))
     annotations = [(camera, labels.where(labels == 1, 0)) for camera, labels in scene_of([FRONT, post], PLACES)]
     assert warnings_of(annotations, caplog) == []
@@ -59,14 +59,14 @@ def test_masks_are_not_called_wrong_where_poses_are_imprecise(
     assert caplog.text.count("do not fit") == count
 
 
-def test_views_without_any_outline_say_nothing() -> None:
+def test_views_without_an_outline_are_no_evidence() -> None:
     (camera, labels), *others = scene_of([FRONT])
     views = pane_views([(camera, labels.new_ones(labels.shape)), *others], 1)
     plane = FramedPlanes(PlaneEquations(FRONT.normal[None], np.array([FRONT.normal @ FRONT.center])), np.zeros(1))
     assert not outlier_masks(matching_outline_shares(plane, views)[1:]).any()
 
 
-def test_the_odd_ones_are_told_from_what_meets_nothing() -> None:
+def test_outliers_are_distinguished_from_masks_without_comparison() -> None:
     assert outlier_masks(np.array([0.9, 0.1, np.nan, 0.8])).tolist() == [False, True, False, False]
     assert outlier_masks(np.array([0.2, 0.1, 0.1])).all()
     assert not outlier_masks(np.full(3, np.nan)).any()

@@ -70,7 +70,7 @@ def test_a_mirror_is_found_and_glass_is_not(base_reflectance: float, expected: t
     assert mirror_labels(unknown, views) == expected
 
 
-def test_glass_before_darkness_is_no_mirror() -> None:
+def test_glass_in_front_of_darkness_is_no_mirror() -> None:
     # sRGB is steep in the dark: an eighth of the light looks like four tenths of the brightness.
     scene = scene_with(0.15)
     before = scene.primary.means[:, 2] < scene.planes.centers[0, 2]
@@ -97,7 +97,7 @@ def test_an_exposure_does_not_turn_a_mirror_into_glass() -> None:
     assert mirror_labels(replace(scene_with(0.2), exposures=exposures), dark) == (1,)
 
 
-def test_a_pane_of_which_hardly_anything_is_known_stays_glass() -> None:
+def test_a_pane_with_little_evidence_stays_glass() -> None:
     """A glass front may reflect objects that no photograph shows; some spots may agree with the scene by chance."""
     scene = scene_with(0.2)
     found = mirror_candidate(scene, 1, reduced_photographs(scene, photographs(scene_with(0.995))))
@@ -144,7 +144,7 @@ def test_photographs_are_reduced_with_all_that_belongs_to_them() -> None:
     assert not found.valid[:2].any() and found.valid[2:].all()
 
 
-def test_a_view_without_a_mask_tells_as_well() -> None:
+def test_views_without_masks_are_evidence_for_mirrors() -> None:
     views = [replace(view, read_pane_labels=None) for view in photographs(scene_with(0.995))]
     assert mirror_labels(scene_with(0.2), views) == (1,)
 
@@ -191,7 +191,7 @@ def test_local_means_are_those_of_every_window_by_itself(size: tuple[int, int]) 
     torch.testing.assert_close(subtract_local_mean(image, region), expected, atol=1e-6, rtol=0)
 
 
-def test_a_large_window_is_no_more_work_than_a_small_one() -> None:
+def test_the_work_of_window_sums_does_not_depend_on_the_window() -> None:
     """On photographs of 3000 pixels the window has 450 x 450 pixels: summed one by one, hours for ten views."""
 
     def work(reach: int) -> int:

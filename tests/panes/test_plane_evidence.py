@@ -50,7 +50,7 @@ def test_the_measured_points_win_where_gaussians_mislead(caplog: pytest.LogCaptu
     assert caplog.text.count("; kept") == 1
 
 
-def test_gaussians_decide_where_measured_points_lead_to_no_plane(caplog: pytest.LogCaptureFixture) -> None:
+def test_gaussians_determine_the_plane_if_measured_points_do_not(caplog: pytest.LogCaptureFixture) -> None:
     annotations = scene_of([FRONT], CLOSE)
     with caplog.at_level(logging.DEBUG, "glassplat.panes"):
         planes = fit_planes(MEASURED, annotations, extent=EXTENT, measured=torch.zeros(0, 3), options=QUICK)
@@ -77,7 +77,7 @@ def test_a_plane_behind_an_impossible_frame_is_kept_only_where_there_is_no_other
     assert highest_scoring_plane(1, fits[:1], evidence) is high
 
 
-def test_virtual_points_behind_a_mirror_do_not_speak_against_its_plane() -> None:
+def test_virtual_points_behind_a_mirror_do_not_contradict_its_plane() -> None:
     """There are no points on the mirror, and all points measured through it lie behind it."""
     views = pane_views(scene_of([FRONT]), 1)
     virtual = np.random.default_rng(0).uniform([-2, -1, 2.5], [2, 1, 6], (5000, 3))

@@ -53,7 +53,7 @@ def test_every_label_gets_its_own_pane() -> None:
     assert planes.base_reflectances.tolist() == pytest.approx([2 * SURFACE / (1 + SURFACE), 0.999], rel=1e-3)
 
 
-def test_a_pane_photographed_all_the_way_round_is_found() -> None:
+def test_a_pane_photographed_from_all_sides_is_found() -> None:
     behind = ((0.4, 0.2, 4.6), (-0.9, -0.3, 4.2))
     annotations = scene_of([FRONT], (*EYES, *behind))
     assert all(bool((labels == 1).any()) for _, labels in annotations)

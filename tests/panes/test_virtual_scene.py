@@ -14,7 +14,7 @@ def test_only_what_is_seen_through_the_mirror_is_virtual() -> None:
     assert virtual_points(points, pane(2.0, half=0.5), CAMERAS).tolist() == [True, False, False, False]
 
 
-def test_what_most_views_see_past_the_mirror_stays() -> None:
+def test_points_visible_past_the_mirror_are_kept() -> None:
     point = torch.tensor([[0.1, 0.0, 3.0]], dtype=torch.float64)
     beside = [camera_at(1.4, 0.0, 0.0), camera_at(1.5, 0.1, 0.0)]
     assert virtual_points(point, pane(2.0, half=0.3), CAMERAS[:2] + beside[:1]).tolist() == [True]

@@ -31,7 +31,7 @@ def test_a_database_that_is_cut_off_is_named(tmp_path: Path, kept: float) -> Non
         database.feature_counts()
 
 
-def test_a_name_that_is_missing_is_damage_too(tmp_path: Path) -> None:
+def test_a_missing_name_counts_as_damage(tmp_path: Path) -> None:
     database = features(tmp_path)
     script = f"""
 import sqlite3
@@ -49,7 +49,7 @@ tables.commit()
         database.feature_counts()
 
 
-def test_half_a_picture_of_a_killed_command_is_no_photograph(tmp_path: Path) -> None:
+def test_a_partial_image_of_a_killed_command_is_ignored(tmp_path: Path) -> None:
     """A temporary file left in the folder by `kill -9`, complete or truncated."""
     photographs = []
     for number in range(2):
@@ -68,7 +68,7 @@ def test_half_a_picture_of_a_killed_command_is_no_photograph(tmp_path: Path) -> 
     assert len(counts) == 2 and (counts > 0).all()
 
 
-def test_a_full_disk_and_errors_of_others_stay_what_they_are(tmp_path: Path) -> None:
+def test_a_full_disk_and_other_errors_keep_their_types(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="No space left"), check_database(tmp_path):
         raise RuntimeError("SQLite error: database or disk is full")
     with pytest.raises(RuntimeError, match="of another kind"), check_database(tmp_path):

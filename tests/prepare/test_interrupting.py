@@ -47,7 +47,7 @@ def test_an_interrupt_waits_until_the_work_has_ended() -> None:
     assert ended
 
 
-def test_work_that_ends_tells_its_result_and_what_it_raised() -> None:
+def test_finished_work_returns_its_result_or_raises() -> None:
     assert run_interruptible(lambda token: 5) == 5
 
     def failing(token: Any) -> None:
@@ -67,7 +67,7 @@ def interrupted(photographs: Path, output: Path, capsys: pytest.CaptureFixture[s
     return " ".join(capsys.readouterr().err.split())
 
 
-def test_a_capture_that_misses_its_page_is_said_to_be_whole(
+def test_a_capture_without_its_report_page_is_complete(
     photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(capture, "prepare", lambda *arguments, **options: SimpleNamespace(lines=lambda: []))
@@ -77,7 +77,7 @@ def test_a_capture_that_misses_its_page_is_said_to_be_whole(
     assert f"the capture in {output} is complete; `glassplat info '{output}' --page '{output / PAGE}'` writes" in told
 
 
-def test_an_earlier_capture_is_not_taken_for_this_one(
+def test_an_earlier_capture_is_not_reported_as_the_result(
     photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "capture").mkdir()
@@ -111,7 +111,7 @@ def edit(folder: Path) -> None:
     ("change", "names"),
     [(exchange, r"Bild ä 0000\.jpg, new\.jpg\)"), (edit, r": Bild ä 0000\.jpg\)")],
 )
-def test_work_on_other_photographs_is_not_gone_on_with(
+def test_resuming_work_on_other_photographs_is_refused(
     change: Callable[[Path], None], names: str, photographs: Path, tmp_path: Path, heard: Heard
 ) -> None:
     task = begun(photographs, tmp_path / "capture")
@@ -125,7 +125,7 @@ def test_work_on_other_photographs_is_not_gone_on_with(
         prepare(task, interrupt, resume=True)
 
 
-def test_work_outlives_photographs_that_cannot_be_read_for_a_moment(
+def test_work_survives_temporarily_unreadable_photographs(
     photographs: Path, tmp_path: Path, heard: Heard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     task = begun(photographs, tmp_path / "capture")
@@ -141,9 +141,7 @@ def test_work_outlives_photographs_that_cannot_be_read_for_a_moment(
     assert not features.parent.exists()
 
 
-def test_work_that_does_not_name_its_photographs_is_not_gone_on_with(
-    photographs: Path, tmp_path: Path, heard: Heard
-) -> None:
+def test_resuming_work_without_recorded_photographs_is_refused(photographs: Path, tmp_path: Path, heard: Heard) -> None:
     task = begun(photographs, tmp_path / "capture")
     settings = tmp_path / "capture.partial" / "settings.json"
     settings.write_text(json.dumps(task.record()))
@@ -151,7 +149,7 @@ def test_work_that_does_not_name_its_photographs_is_not_gone_on_with(
         prepare(task, heard, resume=True)
 
 
-def test_another_video_of_the_same_name_is_not_gone_on_with(tmp_path: Path, heard: Heard) -> None:
+def test_resuming_with_another_video_of_the_same_name_is_refused(tmp_path: Path, heard: Heard) -> None:
     video = film(tmp_path / "walk.avi", np.arange(5) * 8)
     task = begun(video, tmp_path / "capture")
     film(video, np.arange(6) * 8)

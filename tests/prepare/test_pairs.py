@@ -24,7 +24,7 @@ def test_few_photographs_are_all_compared() -> None:
     assert len(pairs_to_match([np.zeros((0, 128), np.uint8)] * MOST_EXHAUSTIVE)) == MOST_EXHAUSTIVE * 79 // 2
 
 
-def test_of_many_a_loop_is_closed_by_what_looks_alike() -> None:
+def test_loops_are_closed_by_similar_photographs() -> None:
     count = 100
     descriptors = walk_round(count)
     pairs = set(pairs_to_match(descriptors))
@@ -34,7 +34,7 @@ def test_of_many_a_loop_is_closed_by_what_looks_alike() -> None:
     assert all(one > other for one, other in pairs)
 
 
-def test_the_likest_share_features() -> None:
+def test_the_most_similar_photographs_share_features() -> None:
     found = {frozenset(pair) for pair in similar_pairs(walk_round(60))}
     assert all(frozenset((k, (k + 1) % 60)) in found for k in range(60))
 

@@ -87,7 +87,7 @@ def test_every_kind_of_pixel_becomes_colour(mode: str, tmp_path: Path, heard: He
 
 
 @pytest.mark.parametrize("mode", ["RGBA", "LA", "P", "RGB"])
-def test_what_was_cut_out_is_black(mode: str, tmp_path: Path, heard: Heard) -> None:
+def test_cut_out_parts_are_black(mode: str, tmp_path: Path, heard: Heard) -> None:
     folder = three(tmp_path / "in")
     pixels = np.full((90, 120, 4), 200, dtype=np.uint8)
     pixels[:, :, 3] = np.repeat([0, 128, 255], 40)
@@ -130,7 +130,7 @@ def test_photographs_are_reduced_and_the_focal_length_with_them(tmp_path: Path, 
     assert found(folder, heard)["0.png"].focal is None
 
 
-def test_devices_are_told_apart(tmp_path: Path, heard: Heard) -> None:
+def test_devices_are_distinguished(tmp_path: Path, heard: Heard) -> None:
     folder = three(tmp_path / "in")
     for seed, model in enumerate(("one", "one", "other"), start=5):
         exif = Image.Exif()
@@ -167,7 +167,7 @@ def test_numbers_are_sorted_by_value_and_folders_stay(tmp_path: Path, heard: Hea
     assert names == [*flat, "left/0.jpg", "left/1.jpg", "left/2.jpg", "left/10.jpg"]
 
 
-def test_masks_next_to_photographs_are_no_photographs(tmp_path: Path, heard: Heard) -> None:
+def test_masks_next_to_photographs_are_not_taken_for_photographs(tmp_path: Path, heard: Heard) -> None:
     folder = three(tmp_path / "in")
     for seed, name in enumerate(("1_mask.jpg", "2_mask.png", "wall_mask.png"), start=5):
         picture(seed).save(folder / name)
@@ -180,7 +180,7 @@ def test_masks_next_to_photographs_are_no_photographs(tmp_path: Path, heard: Hea
     assert note.startswith(f"Skipped masks, recognised by their names or folders: {names}. They are not copied")
 
 
-def test_folders_of_the_input_itself_are_not_asked(tmp_path: Path, heard: Heard) -> None:
+def test_the_names_of_parent_folders_do_not_matter(tmp_path: Path, heard: Heard) -> None:
     assert len(found(three(tmp_path / "masks" / "panes"), heard)) == 3
     assert not notes_of(heard)
 
@@ -199,7 +199,7 @@ def test_names_differ_without_suffix_too(tmp_path: Path) -> None:
     assert all(name.endswith(".jpg") and "\n" not in name for name in names.values())
 
 
-def test_names_that_are_no_text_can_be_written(tmp_path: Path, heard: Heard) -> None:
+def test_names_that_are_not_unicode_can_be_written(tmp_path: Path, heard: Heard) -> None:
     folder = three(tmp_path / "in")
     for seed, name in enumerate((b"caf\xe9.png", b"caf\xea.png"), start=7):
         picture(seed).save(tmp_path / "x.png")
@@ -215,7 +215,7 @@ def test_the_same_photograph_counts_once(tmp_path: Path, heard: Heard) -> None:
     assert notes_of(heard) == ["Skipped duplicates: copy.png (as 1.png)."]
 
 
-def test_of_the_same_photographs_the_one_with_the_shorter_name_stays(tmp_path: Path, heard: Heard) -> None:
+def test_duplicate_photographs_keep_the_shorter_name(tmp_path: Path, heard: Heard) -> None:
     folder = three(tmp_path / "in")
     for name in ("IMG 9 copy 2.png", "IMG 9 copy.png", "IMG 9.png", "IMG 8.png"):
         picture(9 - (name == "IMG 8.png")).save(folder / name)

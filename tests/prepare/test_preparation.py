@@ -98,7 +98,7 @@ def test_a_capture_is_replaced_only_by_force(prepared: Path, capsys: pytest.Capt
     assert (prepared / "sparse" / "0" / "images.bin").read_bytes() == before
 
 
-def test_what_was_interrupted_goes_on(photographs: Path, tmp_path: Path, heard: Heard) -> None:
+def test_info_suggests_resuming_an_interrupted_preparation(photographs: Path, tmp_path: Path, heard: Heard) -> None:
     """Interrupted in each phase in turn: each resumed preparation has to reach the next phase."""
     task = Preparation(photographs, tmp_path / "capture")
     phases = ("extracting features", "matching photographs", "registering the photographs", "undistorting")
@@ -140,7 +140,7 @@ def test_only_one_sqlite_has_the_database_open_and_progress_is_read_from_it(
         assert told == sorted(told) and len(set(told)) > 2 and told[-1] >= 0.9 * total
 
 
-def test_the_global_mapper_places_them_too(photographs: Path, tmp_path: Path, heard: Heard) -> None:
+def test_the_global_mapper_registers_the_photographs_too(photographs: Path, tmp_path: Path, heard: Heard) -> None:
     task = Preparation(photographs, tmp_path / "capture", settings=Settings(mapper="global"))
     assert prepare(task, heard).registered >= 8
 

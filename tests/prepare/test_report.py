@@ -75,7 +75,7 @@ def report(models: list[Any], *, count: int = 10, features: int = 3000) -> Any:
     return make_report(Solution(FakeDatabase(count, features), models, "the usual settings", 1))  # type: ignore[arg-type]
 
 
-def test_names_that_are_no_text_can_be_read_again(tmp_path: Path) -> None:
+def test_names_that_are_not_unicode_can_be_read_back(tmp_path: Path) -> None:
     solution = Solution(FakeDatabase(4, 3000), [FakeModel(range(3))], "", 1)  # type: ignore[arg-type]
     folder = tmp_path / os.fsdecode(b"caf\xe9")
     solution.database.photographs[3] = Photograph(folder / os.fsdecode(b"\xe9.jpg"), "_.jpg", 640, 480, "", None)
@@ -86,13 +86,13 @@ def test_names_that_are_no_text_can_be_read_again(tmp_path: Path) -> None:
     assert r"take more photographs around \xe9.jpg" in found["report"]["advice"][0]
 
 
-def test_a_good_preparation_needs_no_advice() -> None:
+def test_a_complete_preparation_gets_no_advice() -> None:
     found = report([FakeModel(range(10))])
     assert found.registered_share == 1 and found.groups == (10,) and found.advice == () and found.missing == ()
     assert found.lines()[0].startswith("10 of 10 photographs registered, with")
 
 
-def test_photographs_that_were_placed_twice_are_no_second_group() -> None:
+def test_photographs_registered_twice_form_no_second_group() -> None:
     assert report([FakeModel(range(10)), FakeModel(range(3, 7)), FakeModel(range(2))]).groups == (10,)
 
 
@@ -112,12 +112,12 @@ def test_two_places_are_two_groups() -> None:
         ({}, 200, "only 200 features"),
     ],
 )
-def test_what_is_poor_is_said(model: dict[str, float], features: int, expected: str) -> None:
+def test_poor_reconstructions_get_advice(model: dict[str, float], features: int, expected: str) -> None:
     (line,) = report([FakeModel(range(10), **model)], features=features).advice
     assert expected in line
 
 
-def test_nothing_placed_is_reported_too() -> None:
+def test_a_reconstruction_without_photographs_is_reported() -> None:
     found = report([])
     assert found.registered == 0 and found.points == 0 and len(found.missing) == 10
 

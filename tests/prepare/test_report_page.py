@@ -97,7 +97,7 @@ def test_a_foreign_file_is_not_overwritten(capture: Path, tmp_path: Path) -> Non
     assert target.read_text() == "mine"
 
 
-def test_a_capture_of_others_has_no_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_capture_that_prepare_did_not_make_has_no_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", str(SCENE), "--page", str(tmp_path / "page.html")]) == 2
     told = capsys.readouterr()
     assert "was not made by `glassplat prepare`" in told.err and not told.out, "before it is looked through"
@@ -115,7 +115,7 @@ def test_a_record_without_a_report_is_named(record: object, tmp_path: Path) -> N
     assert not (tmp_path / PAGE).exists()
 
 
-def test_cameras_in_the_plan_lie_as_they_stood() -> None:
+def test_cameras_in_the_plan_have_their_positions() -> None:
     dataset = load_dataset(SCENE)
     views = sorted(dataset.train, key=lambda view: view.name)
     drawing = plan_svg(views, dataset.points, np.zeros(len(dataset.points), dtype=bool), None)

@@ -40,7 +40,7 @@ def test_frames_are_spaced_by_motion_not_by_time(tmp_path: Path, heard: Heard) -
     assert all(image_size(path) == (WIDTH, HEIGHT) for path in paths)
 
 
-def test_blurred_frames_are_passed_over(tmp_path: Path, heard: Heard) -> None:
+def test_blurred_frames_are_skipped(tmp_path: Path, heard: Heard) -> None:
     blurred = range(1, 60, 2)
     path = film(tmp_path / "walk.avi", np.arange(60) * 8, blurred=blurred)
     numbers = [int(one.stem.split("_")[1]) for one in extract_frames(path, tmp_path / "frames", 15, heard)]
@@ -49,7 +49,7 @@ def test_blurred_frames_are_passed_over(tmp_path: Path, heard: Heard) -> None:
     assert sum(number in blurred for number in numbers) <= 1
 
 
-def test_frames_that_are_there_stay(tmp_path: Path, heard: Heard) -> None:
+def test_existing_frames_are_kept(tmp_path: Path, heard: Heard) -> None:
     path = film(tmp_path / "walk.avi", np.arange(60) * 8)
     first = extract_frames(path, tmp_path / "frames", 15, heard)
     times = {one: one.stat().st_mtime_ns for one in first}
@@ -59,7 +59,7 @@ def test_frames_that_are_there_stay(tmp_path: Path, heard: Heard) -> None:
     assert all(one.stat().st_mtime_ns == times[one] for one in first if one != first[3])
 
 
-def test_the_sharpest_of_each_stretch_is_chosen() -> None:
+def test_the_sharpest_frame_of_each_segment_is_chosen() -> None:
     footage = FrameStatistics(np.array([0.0, 0.01, 0.03, 0.05, 0.051, 0.09]), np.array([1.0, 5.0, 2.0, 1.0, 3.0, 1.0]))
     assert chosen_frames(footage, 3).tolist() == [1, 4, 5]
 
@@ -70,7 +70,7 @@ def test_no_more_frames_than_wanted_are_chosen(most: int) -> None:
 
 
 @pytest.mark.parametrize("still", [True, False])
-def test_a_video_of_nothing_is_refused(still: bool, tmp_path: Path, heard: Heard) -> None:
+def test_an_empty_video_is_refused(still: bool, tmp_path: Path, heard: Heard) -> None:
     path = tmp_path / "nothing.avi"
     if still:
         film(path, np.zeros(40))
@@ -81,7 +81,9 @@ def test_a_video_of_nothing_is_refused(still: bool, tmp_path: Path, heard: Heard
         extract_frames(path, tmp_path / "frames", 15, heard)
 
 
-def test_without_opencv_it_says_what_to_install(tmp_path: Path, heard: Heard, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_opencv_is_reported_with_the_remedy(
+    tmp_path: Path, heard: Heard, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def missing(name: str) -> None:
         raise ImportError(name)
 

@@ -19,7 +19,7 @@ __all__ = ["capture"]
 
 
 @pytest.mark.parametrize(("distortion", "wide"), [(-0.3, True), (-0.05, False)])
-def test_what_a_wide_lens_did_not_see_is_left_out(
+def test_pixels_outside_a_wide_lens_are_excluded(
     capture: TinyCapture, distortion: float, wide: bool, tmp_path: Path, heard: Heard
 ) -> None:
     capture.size = (160, 120)

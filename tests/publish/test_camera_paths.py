@@ -29,7 +29,7 @@ def forward(camera: Camera) -> torch.Tensor:
     return camera.cam_from_world[2, :3].double()
 
 
-def test_a_survey_finds_what_all_look_at() -> None:
+def test_the_survey_finds_the_common_focus_point() -> None:
     survey = survey_capture(AROUND, 1.0)
     middle = torch.stack([camera.center for camera in AROUND]).mean(0).double()
     down = (survey.focus - middle) @ survey.up
@@ -105,7 +105,7 @@ def test_pictures_of_a_film_have_even_sides_and_the_shape_of_the_camera(width: i
     assert math.isclose(fitted.fy / fitted.height, camera.fy / 600) and math.isclose(fitted.cx, width / 2)
 
 
-def test_no_picture_of_a_path_is_stretched_by_a_camera_on_its_side() -> None:
+def test_a_portrait_camera_does_not_stretch_frames_of_a_path() -> None:
     wide = Camera.look_at((0.0, 0.0, -1.0), (0.0, 0.0, 0.0), up=UP, width=800, height=600)
     tall = Camera.look_at((0.5, 0.0, -1.0), (0.0, 0.0, 0.0), up=UP, width=300, height=400)
     *_, last = path = interpolate_cameras([wide, replace(tall, cx=160.0)], 5)

@@ -50,7 +50,7 @@ def with_one(gaussians: Gaussians, mean: tuple[float, float, float], deviation: 
         ((0.0, 0.0, 0.5), 0.8, "oversized"),
     ],
 )
-def test_a_floater_is_found_by_one_rule_and_the_wall_by_none(mean, deviation: float, rule: str) -> None:
+def test_the_rules_find_the_floater_and_not_the_wall(mean, deviation: float, rule: str) -> None:
     floaters = Floaters(with_one(wall(), mean, deviation), CAMERA)
     for name, found in floaters.masks(Cleaning()).items():
         assert found.nonzero().flatten().tolist() == ([144] if name == rule else [])
@@ -58,7 +58,7 @@ def test_a_floater_is_found_by_one_rule_and_the_wall_by_none(mean, deviation: fl
     assert not any(bool(found.any()) for found in floaters.masks(off).values())
 
 
-def test_a_large_gaussian_far_away_stays() -> None:
+def test_a_distant_large_gaussian_is_kept() -> None:
     found = Floaters(with_one(wall(), (0.0, 0.0, 40.0), 12.0), CAMERA).masks(Cleaning())
     assert not any(bool(gone.any()) for gone in found.values())
 

@@ -45,7 +45,7 @@ def test_every_picture_is_in_the_film(suffix: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("suffix", "fps"), [*((".gif", fps) for fps in (1, 24, 30, 50)), *((".webp", fps) for fps in (7, 24, 60, 120))]
 )
-def test_a_film_takes_as_long_as_its_pictures_per_second_say(suffix: str, fps: int, tmp_path: Path) -> None:
+def test_the_duration_of_a_video_follows_its_frame_rate(suffix: str, fps: int, tmp_path: Path) -> None:
     path = tmp_path / f"film{suffix}"
     encode_video(path, iter(PICTURES * 8), count=48, fps=fps)
     with Image.open(path) as film:
@@ -69,7 +69,7 @@ def test_pictures_of_a_webp_do_not_stay_in_memory(tmp_path: Path, monkeypatch: p
     assert len(made) == 48 and most <= 3
 
 
-def test_what_is_no_film_is_refused(tmp_path: Path) -> None:
+def test_invalid_videos_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="avi is not a video name"):
         check_encoder(tmp_path / "film.avi", 10)
     with pytest.raises(ValueError, match=r"at most 50 frames per second, not 51; lower --fps"):

@@ -56,9 +56,7 @@ BEGIN = "await display.begin();"
         ("window.DecompressionStream", "window.nothing", "too old; try a current"),
     ],
 )
-def test_a_picture_that_the_browser_cannot_show_is_not_lost_in_silence(
-    broken: str, by: str, message: str, tmp_path: Path
-) -> None:
+def test_an_image_that_the_browser_cannot_show_is_reported(broken: str, by: str, message: str, tmp_path: Path) -> None:
     page = page_text(true_scene(), Planar(), CAMERAS, "Lost")
     assert page.count(broken) == 1
     (tmp_path / "index.html").write_text(page.replace(broken, by))
@@ -80,7 +78,7 @@ def test_preferences_of_the_reader_count(tmp_path: Path) -> None:
 
 
 @needs_browser
-def test_a_frame_that_holds_the_page_as_text_keeps_it(tmp_path: Path) -> None:
+def test_the_page_works_in_a_srcdoc_frame(tmp_path: Path) -> None:
     page = script_json(page_text(true_scene(), Planar(), CAMERAS, "Framed"))
     frame = "<iframe allow=\"fullscreen 'none'\"></iframe>"
     (tmp_path / "outer.html").write_text(f"{frame}<script>document.querySelector('iframe').srcdoc = {page}</script>")

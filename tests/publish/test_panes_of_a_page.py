@@ -29,7 +29,7 @@ SPLATS_OF_MASKS = """glassplat.then(async ({ navigation, lensOf, ordersOf }) => 
 
 
 @needs_browser
-def test_panes_behind_panes_and_scenes_without_any(tmp_path: Path) -> None:
+def test_panes_behind_panes_and_scenes_without_panes(tmp_path: Path) -> None:
     panes = joined(pane(2.0, half=0.8), pane(3.0, half=0.9, label=2))
     tint = torch.tensor([[-0.6, -0.1, -0.4], [0.0, -0.5, 0.0]], dtype=torch.float64)
     two = in_single_precision(showcase(replace(panes, log_transmittances=tint)))
@@ -42,7 +42,7 @@ def test_panes_behind_panes_and_scenes_without_any(tmp_path: Path) -> None:
 
 
 @needs_browser
-def test_only_the_nearest_pane_is_laid_if_asked(tmp_path: Path) -> None:
+def test_only_the_nearest_pane_is_blended_on_request(tmp_path: Path) -> None:
     scene, renderer = in_single_precision(vitrine(1, 2)), Planar(nearest_only=True)
     write_page(tmp_path / "index.html", scene, renderer, CAMERAS, "nearest")
     with Browser(tmp_path / "index.html", 320, 240) as browser:
@@ -61,7 +61,7 @@ def upright_pane(x: float, label: int, half: float = 0.4) -> Planes:
 
 
 @needs_browser
-def test_panes_side_by_side_do_not_fade_where_they_adjoin(tmp_path: Path) -> None:
+def test_adjacent_panes_do_not_fade_at_their_common_edge(tmp_path: Path) -> None:
     panes = joined(*(upright_pane(x, label) for label, x in enumerate((-0.8, 0.0, 0.8), start=1)))
     scene, renderer = in_single_precision(showcase(panes)), Planar()
     write_page(tmp_path / "index.html", scene, renderer, CAMERAS, "three")
@@ -114,7 +114,7 @@ def test_a_large_window_with_many_panes_is_drawn_more_coarsely(tmp_path: Path) -
 
 @needs_browser
 @pytest.mark.parametrize("label", [1, 2])
-def test_a_pane_without_glass_does_not_reflect_by_that_of_another(label: int, tmp_path: Path) -> None:
+def test_a_pane_without_glass_does_not_use_the_glass_of_another(label: int, tmp_path: Path) -> None:
     panes = joined(pane(2.0, half=0.8), pane(3.0, half=0.9, label=2))
     scene = in_single_precision(showcase(panes))
     scene = replace(scene, glass=covering_glass(scene.planes.select([label - 1])))
@@ -126,7 +126,7 @@ def test_a_pane_without_glass_does_not_reflect_by_that_of_another(label: int, tm
 
 
 @needs_browser
-def test_a_pane_that_is_taken_away_takes_its_glass_with_it(tmp_path: Path) -> None:
+def test_removing_a_pane_removes_its_glass(tmp_path: Path) -> None:
     scene = in_single_precision(showcase(joined(pane(2.0, half=0.8), pane(3.0, half=0.9, label=2))))
     between = scene.primary.select(torch.tensor([0])).with_tensors(
         {

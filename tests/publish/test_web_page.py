@@ -79,7 +79,7 @@ def test_every_layer_is_what_the_renderer_shows(opened: Browser, layer: str) -> 
 
 
 @needs_browser
-def test_what_is_beside_the_picture_is_left_out_unseen(opened: Browser) -> None:
+def test_splats_outside_the_image_are_skipped(opened: Browser) -> None:
     """At close range, through a long lens with an offset centre, most of the scene is outside the image."""
     for _, camera in CAMERAS[:2]:
         near = replace(camera, fx=4 * camera.fx, fy=4 * camera.fy, cx=1.5 * camera.cx, cy=0.5 * camera.cy)
@@ -112,7 +112,7 @@ def test_the_first_view_looks_past_the_middle_as_its_photograph_does(tmp_path: P
 
 
 @needs_browser
-def test_the_buttons_do_what_they_say(opened: Browser) -> None:
+def test_the_buttons_work(opened: Browser) -> None:
     camera = CAMERAS[1][1]
     plain = picture(opened, camera)
     opened.keys("m")
@@ -157,7 +157,7 @@ def test_keys_of_a_slider_stay_its_own_and_others_work(opened: Browser) -> None:
 
 
 @needs_browser
-def test_a_key_that_is_held_switches_once(opened: Browser) -> None:
+def test_a_held_key_toggles_once(opened: Browser) -> None:
     pressed = "document.body.dispatchEvent(new KeyboardEvent('keydown', { key: 'c', bubbles: true, repeat: REPEAT }))"
     compares = []
     for repeat in ("false", "true", "true", "false"):
@@ -249,7 +249,7 @@ def test_people_stay_near_the_photographs(opened: Browser) -> None:
 
 @needs_browser
 @pytest.mark.parametrize("notch", [0.12, -0.12])
-def test_a_drag_goes_on_from_where_the_wheel_came_to_its_limit(notch: float, opened: Browser) -> None:
+def test_a_drag_continues_after_the_wheel_reached_its_limit(notch: float, opened: Browser) -> None:
     turned = """glassplat.then(({ navigation, scene }) => {
       navigation.flyTo(scene.views[scene.first]);
       navigation.advance(1);
@@ -285,7 +285,7 @@ def test_the_address_may_name_a_photograph_as_it_is_typed(tmp_path: Path) -> Non
 
 
 @needs_browser
-def test_a_camera_that_looks_straight_down_is_not_turned_up_by_a_touch(opened: Browser) -> None:
+def test_a_touch_does_not_tilt_a_camera_that_looks_straight_down(opened: Browser) -> None:
     up = torch.tensor(opened.evaluate("glassplat.then(({ scene }) => scene.up)"), dtype=torch.float32)
     right = torch.nn.functional.normalize(torch.tensor([0.0, -up[2], up[1]]), dim=0)
     rows = [*right.tolist(), *torch.linalg.cross(-up, right).tolist(), *(-up).tolist()]
@@ -324,7 +324,7 @@ def dusty(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 
 @needs_browser
-def test_fewer_splats_are_drawn_while_something_moves_and_all_at_rest(dusty: Browser) -> None:
+def test_fewer_splats_are_drawn_during_motion(dusty: Browser) -> None:
     moved = (
         UNTIL
         + """
@@ -347,7 +347,7 @@ def test_fewer_splats_are_drawn_while_something_moves_and_all_at_rest(dusty: Bro
 
 
 @needs_browser
-def test_the_picture_at_rest_is_that_which_is_drawn_all_at_once(dusty: Browser) -> None:
+def test_the_final_image_equals_the_image_drawn_at_once(dusty: Browser) -> None:
     """Refined by a few splats at a time; compared with an image of the same camera drawn at once."""
     dusty.keys("h")
     dusty.evaluate("glassplat.then(({ pace, navigation }) => { pace.most = () => 150; navigation.orbit(0.05, 0.02); })")
@@ -389,7 +389,7 @@ def test_a_gesture_interrupts_refinement(dusty: Browser) -> None:
 
 
 @needs_browser
-def test_a_graphics_card_draws_every_splat_every_time(tmp_path: Path) -> None:
+def test_a_gpu_draws_all_splats_in_every_frame(tmp_path: Path) -> None:
     """The page treats this machine's processor as one; it then blends in half precision, and draws at once."""
     path = tmp_path / "index.html"
     write_page(path, dusty_scene(), Planar(), CAMERAS, "Dust")
@@ -416,7 +416,7 @@ def test_a_graphics_card_draws_every_splat_every_time(tmp_path: Path) -> None:
 
 
 @needs_browser
-def test_nothing_is_asked_for_and_nothing_complained_of(opened: Browser) -> None:
+def test_the_page_requests_nothing_and_logs_no_errors(opened: Browser) -> None:
     opened.drag([(100, 100), (160, 120)])
     opened.keys("Right")
     assert {address.split(":")[0] for address in opened.requests()} <= {"file", "data", "blob"}
@@ -446,7 +446,7 @@ def shining(mirrored: str) -> tuple[Scene, Renderer]:
 
 
 @pytest.mark.parametrize("mirrored", ["distant", "near"])
-def test_what_is_mirrored_is_the_same_in_double_precision(mirrored: str) -> None:
+def test_reflections_agree_in_double_precision(mirrored: str) -> None:
     scene, renderer = shining(mirrored)
     double = scene.with_parameters({name: tensor.double() for name, tensor in scene.parameters().items()})
     faces = [bytearray(cube_bytes(each, renderer.page_settings())) for each in (scene, double)]
@@ -456,7 +456,7 @@ def test_what_is_mirrored_is_the_same_in_double_precision(mirrored: str) -> None
 
 @needs_browser
 @pytest.mark.parametrize("mirrored", ["distant", "near"])
-def test_what_shines_mirrors_what_surrounds_it(mirrored: str, tmp_path: Path) -> None:
+def test_glossy_objects_reflect_their_surroundings(mirrored: str, tmp_path: Path) -> None:
     scene, renderer = shining(mirrored)
     poses = [camera_at(x, y, 0.0) for x, y in ((0.1, -0.2), (-0.4, 0.3))]
     cameras = [(f"{k}.png", replace(at, cam_from_world=at.cam_from_world.float())) for k, at in enumerate(poses)]
@@ -571,7 +571,7 @@ def test_a_page_shows_a_scene_in_any_unit(extent: float, caplog: pytest.LogCaptu
 
 
 @pytest.mark.parametrize("broken", ["cameras", "values"])
-def test_what_cannot_be_shown_is_refused(broken: str, tmp_path: Path) -> None:
+def test_scenes_that_cannot_be_shown_are_refused(broken: str, tmp_path: Path) -> None:
     scene = true_scene()
     cameras = [] if broken == "cameras" else CAMERAS
     if broken == "values":

@@ -22,7 +22,7 @@ def test_without_panes_they_add_up_to_the_coverage() -> None:
     torch.testing.assert_close(contributions(scene, CAMERA).sum(), coverage.sum())
 
 
-def test_what_is_seen_in_the_pane_alone_counts() -> None:
+def test_gaussians_seen_only_in_the_pane_count() -> None:
     scene = showcase()
     direct, with_panes = (contributions(s, CAMERA) for s in (replace(scene, planes=Planes.empty()), scene))
     assert bool((with_panes >= direct).all())
@@ -30,7 +30,7 @@ def test_what_is_seen_in_the_pane_alone_counts() -> None:
     assert float(direct[behind_the_camera].max()) == 0 and float(with_panes[behind_the_camera].max()) > 1
 
 
-def test_what_adds_nothing_can_go() -> None:
+def test_gaussians_without_contribution_can_be_removed() -> None:
     scene = showcase()
     means = scene.primary.means.clone()
     means[0] = torch.tensor([50.0, 0.0, 1.0])
@@ -41,7 +41,7 @@ def test_what_adds_nothing_can_go() -> None:
     torch.testing.assert_close(Planar()(left, CAMERA).rgb, Planar()(scene, CAMERA).rgb)
 
 
-def test_they_leave_no_graph() -> None:
+def test_contributions_leave_no_autograd_graph() -> None:
     scene = showcase()
     means = scene.primary.means.requires_grad_()
     found = contributions(replace(scene, primary=scene.primary.with_tensors({"means": means})), CAMERA)

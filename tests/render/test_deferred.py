@@ -65,7 +65,7 @@ def test_a_flat_mirror_shows_the_environment_in_the_mirrored_direction(tilt: flo
     torch.testing.assert_close(normals, -normal.expand_as(normals), atol=1e-6, rtol=0)
 
 
-def test_without_strength_it_is_splat() -> None:
+def test_zero_strength_equals_splat() -> None:
     scene, camera = glossy(1e-12), camera_at(0.1, 0.0, 0.0)
     plain = Splat()(scene, camera)
     frame = Deferred()(scene, camera)
@@ -119,7 +119,7 @@ def test_gradients_reach_everything_that_learns() -> None:
     assert all(bool(gradient.abs().max() > 0) for gradient in found)
 
 
-def test_the_environment_layer_is_what_lies_behind_each_pixel() -> None:
+def test_the_environment_layer_shows_the_environment_behind_each_pixel() -> None:
     scene, camera = glossy(), rolled(camera_at(0.1, 0.0, 0.0))
     layer = Deferred(environment=True)(scene, camera).layers["environment"]
     row, column = 3, 31

@@ -55,7 +55,7 @@ def case(
 
 @pytest.mark.parametrize("glass", [CLEAR, torch.tensor([0.6, 0.9, 0.7])], ids=["clear", "tinted"])
 @pytest.mark.parametrize("blend", BLENDS)
-def test_detail_that_the_scene_does_not_hold_survives(blend: Blend, glass: torch.Tensor) -> None:
+def test_detail_missing_from_the_scene_is_kept(blend: Blend, glass: torch.Tensor) -> None:
     frame, photo, truth = case(0.1, blend, glass=glass)
     result = dereflected_photo(frame, photo, blend).float() / 255
     torch.testing.assert_close(result, truth, rtol=0, atol=2.5 / 255)
@@ -71,13 +71,13 @@ def test_without_a_pane_the_photograph_stays_bit_for_bit() -> None:
 
 
 @pytest.mark.parametrize("reflection", [0.0, 0.3], ids=["of a dark room", "of a bright one"])
-def test_where_most_light_is_reflected_the_render_takes_over(reflection: float) -> None:
+def test_the_render_replaces_photographs_under_strong_reflections(reflection: float) -> None:
     frame, photo, _ = case(0.95, "linear", reflection)
     result = dereflected_photo(frame, photo, "linear")
     assert torch.equal(result[:, :12], uint8(frame.layers["without_panes"])[:, :12])
 
 
-def test_where_the_photograph_is_clipped_under_a_reflection_the_render_takes_over() -> None:
+def test_the_render_replaces_photographs_clipped_by_a_reflection() -> None:
     frame, photo, _ = case(0.1, "linear", reflection=1.0)
     white = torch.full_like(photo, 255)
     result = dereflected_photo(frame, white, "linear")
@@ -91,7 +91,7 @@ def test_a_clipped_pixel_without_visible_reflection_is_kept() -> None:
     assert int(result.min()) == 255
 
 
-def test_too_bright_a_model_of_the_reflection_leaves_no_black_holes() -> None:
+def test_an_overestimated_reflection_leaves_no_black_pixels() -> None:
     frame, photo, _ = case(0.3, "linear", reflection=0.3)
     glaring = model(frame.layers["without_panes"], torch.ones(*SIZE, 3), frame.layers["share"], "linear")
     result = dereflected_photo(glaring, photo // 2, "linear")
@@ -100,7 +100,7 @@ def test_too_bright_a_model_of_the_reflection_leaves_no_black_holes() -> None:
     )
 
 
-def test_the_way_from_trust_to_distrust_has_no_steps() -> None:
+def test_dereflection_changes_smoothly_with_the_strength() -> None:
     frame, photo, _ = case(0.1, "linear")
     rising = torch.linspace(0.01, 0.99, SIZE[1]).expand(*SIZE)
     flat = torch.full_like(photo, 120)
@@ -125,7 +125,7 @@ def test_the_mirror_made_of_layers_is_the_mirror_rendered(blend: Blend, half: fl
     torch.testing.assert_close(as_mirror_image(renderer(scene, camera), blend), rendered, rtol=1e-3, atol=1e-4)
 
 
-def test_what_the_exposure_made_of_the_photograph_is_left_as_it_is() -> None:
+def test_dereflected_photographs_keep_their_exposure() -> None:
     frame, photo, truth = case(0.1, "linear")
     affine = torch.zeros(1, 3, 4)
     affine[0, :, :3], affine[0, :, 3] = torch.diag(torch.tensor([-0.3, -0.2, -0.25])), torch.tensor([0.02, 0.0, -0.01])
@@ -143,7 +143,7 @@ def test_what_the_exposure_made_of_the_photograph_is_left_as_it_is() -> None:
     assert float((unaware - expected)[:, :16].abs().mean()) > 0.005
 
 
-def test_the_photographer_is_taken_off_too() -> None:
+def test_the_photographer_is_removed_too() -> None:
     frame, photo, truth = case(0.1, "linear", reflection=0.6)
     room = torch.full((*SIZE, 3), 0.2)
     nobody = model(frame.layers["without_panes"], room, frame.layers["share"], "linear")

@@ -32,13 +32,13 @@ def faces_only() -> Environment:
     return Environment(colors.expand(6, 4, 4, 3).contiguous())
 
 
-def test_texel_directions_are_where_the_lookup_meets_texels() -> None:
+def test_lookups_in_texel_directions_return_texels() -> None:
     environment = smooth(5)
     found = cube_lookup(environment.raw, texel_directions(5).float())
     torch.testing.assert_close(found, environment.raw)
 
 
-def test_a_panorama_lies_as_the_conventions_say() -> None:
+def test_a_panorama_is_oriented_as_the_conventions_say() -> None:
     directions = panorama_directions(32)
     torch.testing.assert_close(directions.norm(dim=-1), torch.ones(32, 64, dtype=torch.float64))
     panorama = equirect_from_environment(faces_only(), 32)
@@ -52,7 +52,7 @@ def test_a_panorama_lies_as_the_conventions_say() -> None:
 
 
 @pytest.mark.parametrize("height", [8, 32, 50])
-def test_a_panorama_leads_back_to_its_environment(height: int) -> None:
+def test_a_panorama_converts_back_to_its_environment(height: int) -> None:
     environment = smooth()
     back = environment_from_equirect(equirect_from_environment(environment, height), SIZE)
     difference = torch.sigmoid(back.raw) - torch.sigmoid(environment.raw)

@@ -90,7 +90,7 @@ def test_the_mirror_image_is_that_of_a_body_at_the_camera(up: Direction | None, 
     assert float((mirrored.layers["reflection"] - nobody.layers["reflection"]).abs().max()) > 0.1
 
 
-def test_nobody_is_seen_but_in_panes() -> None:
+def test_the_photographer_is_visible_only_in_panes() -> None:
     scene = photographed()
     ahead = replace(scene.photographer, means=scene.photographer.means + torch.tensor([0.0, 0.0, 1.5]))
     frame, nobody = PRESENT(replace(scene, photographer=ahead), CAMERA), Planar()(scene, CAMERA)
@@ -99,14 +99,14 @@ def test_nobody_is_seen_but_in_panes() -> None:
     assert frame.direct is not None and nobody.direct is not None and torch.equal(frame.direct, nobody.direct)
 
 
-def test_what_stands_on_the_other_side_of_the_pane_is_not_mirrored() -> None:
+def test_objects_behind_the_pane_are_not_mirrored() -> None:
     scene = photographed()
     beyond = replace(scene.photographer, means=scene.photographer.means + torch.tensor([0.0, 0.0, 8.0]))
     frame = PRESENT(replace(scene, photographer=beyond), CAMERA)
     assert torch.equal(frame.rgb, Planar()(scene, CAMERA).rgb)
 
 
-def test_new_views_show_nobody_unless_asked() -> None:
+def test_new_views_omit_the_photographer_by_default() -> None:
     scene = photographed()
     absent, beside, present = (Planar(photographer=mode)(scene, CAMERA) for mode in ("absent", "beside", "present"))  # type: ignore[arg-type]
     empty = Planar()(replace(scene, photographer=Gaussians.empty()), CAMERA)
@@ -115,7 +115,7 @@ def test_new_views_show_nobody_unless_asked() -> None:
     assert not torch.equal(present.rgb, absent.rgb)
 
 
-def test_layers_recombine_with_somebody_in_them() -> None:
+def test_layers_recombine_with_a_photographer() -> None:
     frame = PRESENT(photographed(), CAMERA)
     strength = frame.layers["strength"][..., None]
     behind, reflected = (linear_from_srgb(frame.layers[name]) for name in ("transmission", "reflection"))
@@ -123,7 +123,7 @@ def test_layers_recombine_with_somebody_in_them() -> None:
     torch.testing.assert_close(linear_from_srgb(frame.rgb), expected, rtol=1e-4, atol=2e-5)
 
 
-def test_a_scene_without_panes_shows_nobody() -> None:
+def test_a_scene_without_panes_shows_no_photographer() -> None:
     scene = photographed()
     bare = replace(scene, planes=type(scene.planes).empty())
     assert torch.equal(PRESENT(bare, CAMERA).rgb, Planar()(bare, CAMERA).rgb)
@@ -152,7 +152,7 @@ def test_gradients_match_finite_differences_through_the_whole_renderer(name: str
             torch.testing.assert_close((gradient * step).sum(), numerical, rtol=2e-4, atol=1e-5)
 
 
-def test_while_planes_are_adjusted_the_photographer_learns_and_the_room_does_not() -> None:
+def test_only_the_photographer_is_trained_during_plane_adjustment() -> None:
     scene = photographed()
     means, body_means = (
         scene.parameters()[n].clone().requires_grad_() for n in ("primary.means", "photographer.means")

@@ -92,7 +92,9 @@ def test_a_pane_with_nothing_before_it_reflects_the_background(
 
 @pytest.mark.parametrize("blend", ["srgb", "linear"])
 @pytest.mark.parametrize("background", BACKGROUNDS)
-def test_things_of_intensity_one_are_mirrored_as_they_are(background: tuple[float, float, float], blend: Blend) -> None:
+def test_gaussians_of_intensity_one_are_mirrored_unchanged(
+    background: tuple[float, float, float], blend: Blend
+) -> None:
     scene = showcase()
     plain = scene.primary.with_tensors({"log_intensity": torch.zeros_like(scene.primary.means[:, 0])})
     scene = replace(scene, primary=plain)
@@ -101,7 +103,7 @@ def test_things_of_intensity_one_are_mirrored_as_they_are(background: tuple[floa
     torch.testing.assert_close(with_intensity, without, atol=1e-5, rtol=1e-5)
 
 
-def test_what_panes_need_of_gaussians_is_named_where_it_is_missing() -> None:
+def test_channels_required_by_panes_are_named_if_missing() -> None:
     scene = showcase()
     for part, channel in (("primary", "log_intensity"), ("glass", "logit_mark")):
         lacking = scene.with_gaussians(part, replace(scene.gaussian_sets()[part], channels={}))
@@ -155,7 +157,7 @@ def test_the_sign_of_the_normal_does_not_matter() -> None:
     torch.testing.assert_close(Planar()(flipped, CAMERA).rgb, Planar()(scene, CAMERA).rgb)
 
 
-def test_what_is_seen_directly_or_as_a_mirror_image_is_visible() -> None:
+def test_gaussians_seen_directly_or_mirrored_are_visible() -> None:
     scene, away = showcase(), camera_at(0.0, 0.0, 10.0)
     depths = CAMERA.project(scene.primary.means)[1]
     frame, without_panes, nothing = (
@@ -282,7 +284,7 @@ def test_reflections_are_the_layers_before_each_background_wherever_panes_have_m
         assert bool(found.any()) == (count > 0)
 
 
-def test_deviation_is_there_when_asked_for() -> None:
+def test_the_deviation_is_computed_on_request() -> None:
     frame = Planar(deviation=True)(showcase(), CAMERA)
     assert float(frame.layers["deviation"].sum()) > 0
     assert "deviation" not in Planar()(showcase(), CAMERA).layers
@@ -294,6 +296,6 @@ def test_detached_cuts_every_tensor_off() -> None:
     assert not detach_gaussians(trainable).means.requires_grad
 
 
-def test_a_space_to_blend_in_that_there_is_not_is_refused() -> None:
+def test_an_unknown_blend_space_is_refused() -> None:
     with pytest.raises(ValueError, match="blend is 'Linear'; expected one of"):
         Planar(blend="Linear")  # type: ignore[arg-type]

@@ -172,7 +172,7 @@ def test_opaque_and_flat_gaussians_are_drawn() -> None:
     assert float(alpha.max()) > 0.98
 
 
-def test_what_reaches_no_farther_than_the_clip_is_left_out() -> None:
+def test_gaussians_within_the_clip_distance_are_skipped() -> None:
     assert not bool(plain(radius_clip=1e4)[1].any())
 
 
@@ -203,12 +203,12 @@ def test_radii_are_of_what_is_drawn(eps2d: float) -> None:
         ({"backgrounds": torch.rand(3)}, r"\[3\]; expected \[2, 3\]"),
     ],
 )
-def test_what_is_not_supported_is_refused(changed: dict, message: str) -> None:
+def test_unsupported_arguments_are_refused(changed: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         plain(**changed)
 
 
-def test_a_size_is_a_whole_number_of_any_kind() -> None:
+def test_a_size_may_be_any_integer_type() -> None:
     assert torch.equal(plain(width=torch.tensor(WIDTH))[0], plain()[0])
     with pytest.raises(TypeError, match="'float' object cannot be interpreted as an integer"):
         plain(height=float(HEIGHT))

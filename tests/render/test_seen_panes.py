@@ -73,7 +73,7 @@ def test_the_layers_are_those_of_the_nearest_pane() -> None:
     torch.testing.assert_close(both.layers["transmission"][seen], back.rgb[seen])
 
 
-def test_where_the_nearest_pane_cannot_be_seen_the_layers_are_those_of_the_next() -> None:
+def test_layers_skip_an_invisible_nearest_pane() -> None:
     scene = vitrine(1, 2)
     unmarked = scene.glass.channels["logit_mark"].clone()
     unmarked[:12] = -80
@@ -113,7 +113,7 @@ def test_the_order_in_which_panes_are_listed_does_not_matter() -> None:
         torch.testing.assert_close(frames[1].layers[name], layer)
 
 
-def test_panes_change_places_for_a_camera_on_the_other_side() -> None:
+def test_the_order_of_panes_depends_on_the_side_of_the_camera() -> None:
     half_turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
     half_turn[2, 3] = 6.0
     other = replace(CAMERA, cam_from_world=half_turn)
@@ -151,7 +151,7 @@ def test_any_number_of_panes_may_stand_one_behind_another(count: int) -> None:
     torch.testing.assert_close(1 - share, passed)
 
 
-def test_panes_beside_each_other_are_rendered_as_ever() -> None:
+def test_adjacent_panes_are_rendered_independently() -> None:
     left, right = (pane(2.0, half=0.4, label=label) for label in (1, 2))
     right = right.with_tensors({"centers": right.centers + torch.tensor([1.2, 0.0, 0.0])})
     seen = seen_panes(planes := joined(left, right), CAMERA, nearest_hits(panes_in_camera(planes, CAMERA), CAMERA))
@@ -201,14 +201,14 @@ def test_gradients_match_finite_differences(name: str) -> None:
     torch.testing.assert_close((gradient * direction).sum(), slope, rtol=1e-4, atol=1e-5)
 
 
-def test_what_a_pane_mirrors_only_through_another_counts_as_seen() -> None:
+def test_objects_reflected_through_another_pane_count_as_visible() -> None:
     scene = vitrine(1, 2)
     both, front = (contributions(scene_of, CAMERA) for scene_of in (scene, replace(scene, planes=FRONT)))
     between = slice(30, None)
     assert float((both - front)[between].max()) > 0.5
 
 
-def test_the_conflict_of_edges_does_not_ask_the_farther_reflection(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_edge_conflict_ignores_the_farther_reflection(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("glassplat.render.panes.LEAST_VISIBILITY", 0.0)
     scene = vitrine(1, 2)
     frame = Planar()(scene, CAMERA)

@@ -50,7 +50,7 @@ def test_a_wall_faces_the_camera_across_its_shortest_axes(sign: float) -> None:
 
 
 @pytest.mark.parametrize("renderer", [Splat(), Planar()], ids=["splat", "planar"])
-def test_a_frame_has_normals_only_where_they_are_asked_for(renderer: Renderer) -> None:
+def test_a_frame_has_normals_only_on_request(renderer: Renderer) -> None:
     glass = random_gaussians(20, (0.0, 0.0, 2.0), seed=2, glass=True)
     scene = replace(wall(1.0), planes=pane(2.0), glass=glass)
     camera = camera_at(0, 0, 0)
@@ -75,13 +75,13 @@ def test_discs_keep_their_own_normals(renderer: Splat) -> None:
     [(Splat(depth=False), wall(1.0)), (Deferred(depth=False), glossy(0.5))],
     ids=["splat", "deferred"],
 )
-def test_a_renderer_without_depths_has_them_where_they_are_asked_for(renderer: Renderer, scene: Scene) -> None:
+def test_a_renderer_without_depths_adds_them_on_request(renderer: Renderer, scene: Scene) -> None:
     camera = camera_at(0, 0, 0)
     expected = replace(renderer, depth=True)(scene, camera).layers["depth"]
     assert "depth" not in renderer.with_layers(["rgb"])(scene, camera).layers
     assert torch.equal(renderer.with_layers(["depth"])(scene, camera).layers["depth"], expected)
 
 
-def test_what_the_renderer_needs_is_still_looked_for() -> None:
+def test_channels_required_by_the_renderer_are_checked() -> None:
     with pytest.raises(ValueError, match="logit_mark"):
         Planar().check(replace(wall(1.0), glass=random_gaussians(3, (0.0, 0.0, 2.0), seed=2)))

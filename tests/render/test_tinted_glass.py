@@ -54,7 +54,7 @@ def test_what_is_behind_is_darker_by_the_transmittance_and_nothing_else_changes(
     assert bool((frame.layers["tint"][outside] == 1).all())
 
 
-def test_of_panes_that_reflect_nothing_the_tint_is_all_that_is_left() -> None:
+def test_panes_without_reflection_only_tint() -> None:
     planes = of_glass(pane(2.0, half=0.8).concat(pane(1.2, half=0.5, label=2)))
     planes = planes.with_tensors({"logit_reflectances": torch.full((2,), -50.0, dtype=torch.float64)})
     layers = (frame := Planar(blend="srgb")(showcase(planes), CAMERA)).layers

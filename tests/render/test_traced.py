@@ -62,7 +62,7 @@ def test_a_flat_mirror_shows_what_the_mirrored_camera_sees() -> None:
 
 @pytest.mark.parametrize("extent", [1.0, 4.0])
 @pytest.mark.parametrize("share", [0.9, 1.1])
-def test_a_ray_meets_nothing_of_the_surface_that_it_leaves(extent: float, share: float) -> None:
+def test_a_reflected_ray_does_not_hit_its_own_surface(extent: float, share: float) -> None:
     """A white sheet in front of the mirror stands for the mirror's own copy in the surroundings."""
     distance = share * START_PER_EXTENT * extent
     shift = torch.tensor([0.0, 0.0, -distance], dtype=torch.float64)
@@ -106,7 +106,7 @@ def test_discs_have_gradients_too() -> None:
     assert {"distortion", "median_depth"} <= frame.layers.keys()
 
 
-def test_without_strength_it_is_the_base_bit_for_bit() -> None:
+def test_zero_strength_equals_the_base_bit_for_bit() -> None:
     scene = glossy()
     dull = replace(
         scene, primary=replace(scene.primary, channels={"logit_strength": torch.full((14,), -800.0).double()})
@@ -124,7 +124,7 @@ def test_layers_recombine() -> None:
     assert float(frame.layers["reflection"].max()) > 0.05
 
 
-def test_densification_is_told_how_far_away_rays_meet_things() -> None:
+def test_densification_receives_the_distances_of_ray_hits() -> None:
     """On a wide mirror, the mean position of reflecting pixels does not show where a single object is reflected."""
     origins = torch.tensor([[-5.0, 0, 0], [5.0, 0, 0], [5.0, 0, 1.0]], dtype=torch.float64)
     directions = torch.tensor([[0.0, 0, 1.0]] * 3, dtype=torch.float64)
@@ -143,7 +143,7 @@ def test_densification_is_told_how_far_away_rays_meet_things() -> None:
     torch.testing.assert_close(products[:2] / weights[:2], torch.tensor([2.0, 2.5], dtype=torch.float64))
 
 
-def test_pixels_that_reflect_less_than_asked_keep_their_base() -> None:
+def test_pixels_below_the_minimum_strength_keep_their_base_colour() -> None:
     frame = Traced(least_strength=0.2)(glossy(), camera_at(0.0, 0.0, 0.0))
     faint = frame.layers["strength"] <= 0.2
     assert bool(faint.any()) and not bool(faint.all())
@@ -244,7 +244,7 @@ def test_an_environment_of_one_colour_is_a_background() -> None:
     torch.testing.assert_close(found.rgb, plain.rgb, atol=1e-3, rtol=0)
 
 
-def test_where_no_ray_is_traced_the_environment_alone_is_mirrored() -> None:
+def test_pixels_without_a_traced_ray_reflect_the_environment() -> None:
     scene, camera = lit(glossy()), camera_at(0.0, 0.0, 0.0)
     some, every = Traced(least_strength=0.2)(scene, camera), Traced()(scene, camera)
     distant = Deferred()(scene, camera)
@@ -255,7 +255,7 @@ def test_where_no_ray_is_traced_the_environment_alone_is_mirrored() -> None:
     torch.testing.assert_close(some.rgb[seen], distant.rgb[seen], atol=1e-6, rtol=0)
 
 
-def test_a_frame_with_absgrad_says_how_far_away_the_surroundings_were_met() -> None:
+def test_a_frame_with_absgrad_records_distances_of_the_surroundings() -> None:
     scene, camera = glossy(), camera_at(0.0, 0.0, 0.0)
     assert Traced()(scene, camera).space == ()
     frame = Traced()(scene, camera, with_absgrad=True)
@@ -279,7 +279,7 @@ def test_contributions_of_surroundings_are_their_share_of_the_image() -> None:
     assert bool((found >= 0).all()) and float(found.max()) > 0.01
 
 
-def test_a_view_of_nothing_reflects_nothing() -> None:
+def test_an_empty_view_has_no_reflection() -> None:
     scene = glossy()
     away = replace(camera_at(0.0, 0.0, 0.0), cam_from_world=torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double())
     for each in (scene, lit(scene)):

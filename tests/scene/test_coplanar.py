@@ -29,7 +29,7 @@ def test_panes_between_posts_are_one_group_the_largest_first() -> None:
     assert coplanar_groups(planes, []) == []
 
 
-def test_turned_panes_and_those_before_one_another_are_apart() -> None:
+def test_rotated_and_overlapping_panes_have_separate_planes() -> None:
     assert coplanar_groups(front(at(0.0), at(1.0, turn_deg=3)), range(2)) == [[0], [1]]
     assert coplanar_groups(front(at(0.0), at(0.0, offset=0.05)), range(2)) == [[0], [1]]
     assert coplanar_groups(front(at(0.0), at(1.0, turn_deg=0.5)), range(2)) == [[0, 1]]
@@ -48,7 +48,7 @@ def test_the_unit_of_length_does_not_matter(unit: float) -> None:
         assert coplanar_groups(scaled, range(2)) == expected
 
 
-def test_the_side_from_which_a_pane_was_marked_does_not_matter() -> None:
+def test_the_marked_side_of_a_pane_does_not_matter() -> None:
     assert coplanar_groups(front(at(0.0), at(1.0, turn_deg=180)), range(2)) == [[0, 1]]
 
 

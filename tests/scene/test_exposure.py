@@ -64,7 +64,7 @@ def test_a_view_without_a_transform_gets_the_mean_of_its_neighbours() -> None:
     assert len(Exposures.neutral().interpolate("a")) == 0
 
 
-def test_what_an_exposure_does_can_be_undone() -> None:
+def test_an_exposure_can_be_inverted() -> None:
     exposures = Exposures(0.2 * drawn(2, 3, 4, seed=1), ("a", "b"))
     image = drawn(4, 5, 3)
     torch.testing.assert_close(exposures.apply_inverse(exposures.apply(image, "b"), "b"), image)

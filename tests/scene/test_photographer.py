@@ -34,14 +34,14 @@ def angle_deg(direction: tuple[float, float, float], other: tuple[float, float, 
     return float(torch.rad2deg(torch.acos(cosine.clamp(-1, 1))))
 
 
-def test_cameras_that_are_tilted_down_tell_where_up_is() -> None:
+def test_cameras_tilted_down_determine_the_up_direction() -> None:
     cameras = [turned(yaw, -40 + (yaw % 7)) for yaw in range(0, 360, 25)]
     assert angle_deg(estimate_up(cameras), UP) < 0.5
     wobbly = [turned(yaw, -40, 3 * (-1) ** (yaw % 2)) for yaw in range(0, 360, 25)]
     assert angle_deg(estimate_up(wobbly), UP) < 1.5
 
 
-def test_cameras_that_are_tilted_down_on_one_side_of_a_thing_tell_where_up_is() -> None:
+def test_cameras_tilted_down_on_one_side_determine_the_up_direction() -> None:
     """Their image verticals agree on a direction that deviates from up by their tilt."""
     cameras = [turned(yaw, -30) for yaw in range(-40, 41, 20)]
     assert angle_deg(estimate_up(cameras), UP) < 3
@@ -59,7 +59,7 @@ def test_cameras_that_look_straight_down_look_away_from_up(wobble_deg: float) ->
     assert math.hypot(*estimate_up(cameras)) == pytest.approx(1)
 
 
-def test_cameras_that_contradict_each_other_tell_the_usual_direction() -> None:
+def test_contradictory_cameras_give_the_default_up_direction() -> None:
     assert estimate_up([turned(0, 0), turned(0, 180)]) == DEFAULT_UP
 
 

@@ -73,13 +73,13 @@ def test_a_mirror_hides_what_is_behind_it() -> None:
 
 
 @pytest.mark.parametrize("reflectance", [0.0, 0.25, 1.0])
-def test_the_reflectance_is_what_was_asked_for(reflectance: float) -> None:
+def test_the_reflectance_is_set_as_requested(reflectance: float) -> None:
     edited = with_reflectance(two_panes(), 7, reflectance)
     assert edited.planes.base_reflectances.tolist() == pytest.approx([0.3, reflectance], abs=1e-12)
     assert bool(torch.isfinite(edited.planes.logit_reflectances).all())
 
 
-def test_a_mirror_that_is_given_a_lower_reflectance_is_none_any_more() -> None:
+def test_a_mirror_with_a_lower_reflectance_becomes_glass() -> None:
     mirrors = as_mirrors(two_panes(), [1, 7])
     edited = with_reflectance(mirrors, 7, 0.25)
     logits = edited.planes.logit_reflectances.clone().requires_grad_()
@@ -129,7 +129,7 @@ def test_a_turn_and_a_step_are_a_tilt_and_a_shift() -> None:
     assert torch.equal(edited.glass.means[:12], scene.glass.means[:12])
 
 
-def test_there_and_back_is_the_identity() -> None:
+def test_the_round_trip_is_the_identity() -> None:
     scene = showcase()
     back = shift_pane(shift_pane(tilt_pane(tilt_pane(scene, 1, 12.0, -5.0), 1, -12.0, 5.0), 1, 0.3), 1, -0.3)
     torch.testing.assert_close(back.planes.raw_normals, scene.planes.raw_normals)
@@ -178,7 +178,7 @@ def test_panes_that_change_places_take_their_own_glass_along() -> None:
     torch.testing.assert_close(edited.glass.means, scene.glass.means + moved)
 
 
-def test_the_scene_that_is_edited_stays_as_it_is() -> None:
+def test_edits_do_not_change_the_original_scene() -> None:
     scene, untouched = showcase(), showcase()
     for edit in (lambda: as_mirrors(scene, [1]), lambda: tilt_pane(scene, 1, 5, 5), lambda: shift_pane(scene, 1, 1.0)):
         edit()

@@ -19,7 +19,7 @@ def test_a_rotation_comes_back_from_its_quaternion(seed: int, nonzero: list[bool
     torch.testing.assert_close(rotation_from_quat(found), rotation)
 
 
-def test_what_is_done_to_intrinsics_stays_with_whoever_does_it() -> None:
+def test_returned_intrinsics_are_copies() -> None:
     camera = camera_at(0.0, 0.0, 0.0)
     before = camera.intrinsics.tolist()
     camera.intrinsics[0] = 1.0

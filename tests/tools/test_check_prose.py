@@ -34,7 +34,7 @@ def test_sizes_are_limited() -> None:
     assert len(list(check_prose.size_complaints("", {"page": "word " * 21 + "."}))) == 1
 
 
-def test_riddles_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unclear_expressions_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(check_prose, "ROOT", tmp_path)
     path = tmp_path / "code.py"
     functions = 'def asked():\n    """Whether it is so."""\n\n\ndef told():\n    """Whatever."""\n'

@@ -31,7 +31,7 @@ def test_turns_keep_lengths_and_turn_by_their_own() -> None:
 
 
 @pytest.mark.parametrize("error", [2.0, 10.0, 20.0])
-def test_estimates_are_off_by_what_was_asked_for(error: float) -> None:
+def test_estimated_normals_have_the_requested_error(error: float) -> None:
     normals, coverage = hemisphere()
     off = []
     for seed in range(20):

@@ -50,7 +50,7 @@ def test_every_surface_has_its_picture_and_every_picture_its_surface(monkeypatch
     assert all(picture.min() >= 0 and picture.max() <= 1 for picture in painted.values())
 
 
-def test_nothing_stands_in_the_pane() -> None:
+def test_no_object_intersects_the_pane() -> None:
     for shape in SHAPES:
         x, y, z = shape.vertices[shape.faces].reshape(-1, 3, 3).transpose(2, 0, 1)
         over = (
@@ -102,7 +102,7 @@ def test_layers_add_up_in_every_pixel_even_at_the_edge_of_the_pane() -> None:
     assert (layers["reflection"].max(axis=(0, 1)) < 0.2 + 1e-12).all()
 
 
-def test_some_points_lie_where_the_pane_shows_what_it_mirrors() -> None:
+def test_some_points_lie_behind_the_pane_at_mirror_images() -> None:
     positions, colors = sparse_points(Walls(), camera_poses(12), 2000)
     behind = positions[:, 1] > DEPTH + 0.1
     assert 0.02 < behind.mean() < 0.4

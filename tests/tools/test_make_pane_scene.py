@@ -37,7 +37,7 @@ def towards_window(count: int = 200) -> tuple[np.ndarray, np.ndarray]:
     return np.broadcast_to([0.1, -1.0, 0.2], directions.shape), directions
 
 
-def test_a_ray_ends_at_the_first_thing() -> None:
+def test_a_ray_ends_at_the_first_object() -> None:
     place = Place((ROOM, Ball((0.0, 1.0, 0.0), 0.25, Paint(2)), Box((-0.5, 1.5, -0.5), (0.5, 1.7, 0.5), Paint(3))), ())
     origins = np.array([[0.0, -1.0, 0.0], [0.4, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.3, 0.0]])
     distance = place.seen(origins, np.broadcast_to(Y, origins.shape)).distance
@@ -88,7 +88,7 @@ def test_double_glazing_mirrors_twice_as_much() -> None:
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_the_second_pane_mirrors_what_lies_twice_the_gap_farther(side: float) -> None:
+def test_the_second_pane_reflects_at_twice_the_gap(side: float) -> None:
     gap, room = 0.1, Place((ROOM,), ())
     pane = replace(WINDOW, second=SecondPane(gap, 0.0))
     direction = np.array([[0.3, side, 0.2]]) / np.linalg.norm([0.3, side, 0.2])
@@ -152,7 +152,7 @@ def test_a_lamp_lights_what_faces_it_half_as_much_at_its_reach() -> None:
     np.testing.assert_allclose(lit, [[1.0] * 3, [0.0] * 3], atol=1e-9)
 
 
-def test_a_cylinder_is_met_at_its_side_and_its_lid() -> None:
+def test_rays_hit_a_cylinder_at_its_side_and_its_cap() -> None:
     place = Place((ROOM, Cylinder((-0.5, -0.5, -1.0), (0.5, 0.5, 0.5), Paint(3))), ())
     origins = np.array([[0.0, -1.5, 0.0], [0.3, -1.5, 0.0], [0.3, 0.2, 1.5], [0.45, 0.45, 1.5]])
     directions = np.array([[0.0, 1, 0], [0, 1, 0], [0, 0, -1], [0, 0, -1]])
@@ -184,7 +184,7 @@ def test_a_pane_behind_a_pane_returns_light_through_the_first() -> None:
     np.testing.assert_allclose(radiance, swapped)
 
 
-def test_what_a_pane_behind_a_pane_returns_is_part_of_the_transmission() -> None:
+def test_the_reflection_of_a_pane_behind_a_pane_is_part_of_the_transmission() -> None:
     second = replace(WINDOW, label=2, center=np.array([0.0, 0.5, 0.0]))
     origins, directions = towards_window()
     both = Place((ROOM,), (WINDOW, second)).seen(origins, directions)
@@ -256,7 +256,7 @@ def test_the_body_stands_on_the_floor_behind_the_camera_however_that_is_tilted()
         np.testing.assert_allclose(distances, [1.1 - (1.2 - 0.18), 0.45 - (1.2 - 0.8), 1.1])
 
 
-def test_only_mirrored_rays_meet_the_photographer() -> None:
+def test_only_mirrored_rays_hit_the_photographer() -> None:
     room = Box((-2.0, -2.0, 0.0), (2.0, 2.0, 2.5), Paint(1), room=True)
     window = replace(WINDOW, center=np.array([0.0, 0.0, 1.2]))
     somebody = photographer(STANDING)
@@ -275,7 +275,7 @@ def test_only_mirrored_rays_meet_the_photographer() -> None:
     np.testing.assert_allclose(seen.reflection[hit], image, atol=1e-9)
 
 
-def test_what_is_carried_keeps_its_texture() -> None:
+def test_carried_objects_keep_their_texture() -> None:
     turn = np.eye(4)
     turn[:3, :3], turn[:3, 3] = Rotation.from_euler("xyz", [20, 50, -10], degrees=True).as_matrix(), [0.3, -0.2, 0.1]
     ball = Ball((0.0, 1.0, 0.0), 0.25, Paint(2))
@@ -286,7 +286,7 @@ def test_what_is_carried_keeps_its_texture() -> None:
     np.testing.assert_allclose(after, before, atol=1e-9)
 
 
-def test_layers_are_those_without_a_photographer_and_beside_them_with_one(tmp_path: Path) -> None:
+def test_ground_truth_layers_exclude_the_photographer(tmp_path: Path) -> None:
     arguments = Arguments(tmp_path / "peopled", width=24, views=9, masks=1, points=10, window=True, photographer=True)
     main(arguments)
     main(replace(arguments, output=tmp_path / "empty", photographer=False))
@@ -302,7 +302,7 @@ def test_layers_are_those_without_a_photographer_and_beside_them_with_one(tmp_pa
     assert (peopled / "images/0000.png").read_bytes() != (empty / "images/0000.png").read_bytes()
 
 
-def test_those_who_walk_by_are_in_the_masks_that_tell_of_them_and_in_no_test_view(tmp_path: Path) -> None:
+def test_passers_by_are_masked_and_absent_from_test_views(tmp_path: Path) -> None:
     arguments = Arguments(tmp_path / "passed", width=32, views=10, masks=1, points=10, window=True, passers_by=1.0)
     main(arguments)
     main(replace(arguments, output=tmp_path / "empty", passers_by=0.0))
@@ -319,7 +319,7 @@ def test_those_who_walk_by_are_in_the_masks_that_tell_of_them_and_in_no_test_vie
     assert shown >= 2
 
 
-def test_nobody_walks_through_walls_or_the_camera() -> None:
+def test_passers_by_avoid_walls_and_the_camera() -> None:
     room, camera = Box((-2.0, -2.0, 0.0), (2.0, 2.0, 2.5), Paint(1), room=True), np.array([0.5, 0.2, 1.4])
     generator = np.random.default_rng(0)
     places = []
@@ -340,7 +340,7 @@ def test_a_scene_is_not_overwritten(tmp_path: Path) -> None:
 SILVER = Silver((0.0, 1.0, 0.0), (0.9, 0.5, 0.8))
 
 
-def test_silver_mirrors_the_room_as_its_normals_say() -> None:
+def test_the_silver_object_reflects_the_room_by_its_normals() -> None:
     place = Place((ROOM,), (), silver=(SILVER,))
     origins, directions = towards_window()
     seen = place.seen(origins, directions)
@@ -357,7 +357,7 @@ def test_silver_mirrors_the_room_as_its_normals_say() -> None:
     np.testing.assert_array_equal(seen.radiance[~hit], room.seen(origins, directions).radiance[~hit])
 
 
-def test_normals_of_silver_are_those_of_its_depths() -> None:
+def test_normals_of_the_silver_object_match_its_depths() -> None:
     eye = np.array([0.1, -1.0, 0.2])
     ray = np.array([0.02, 1.0, -0.1])
     steps = ray + 1e-5 * np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1]])

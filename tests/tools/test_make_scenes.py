@@ -132,7 +132,7 @@ def test_all_shapes_and_coatings_are_drawn() -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_drawn_things_stand_side_by_side_on_their_stand(seed: int) -> None:
+def test_drawn_objects_stand_side_by_side(seed: int) -> None:
     scene = draw_scene(seed)
     points = [body.triangles.positions for body in scene.bodies]
     assert all(np.abs(positions).max() < 1.3 for positions in points) and scene.stand.radius < 1.3
@@ -151,7 +151,7 @@ def test_drawn_surroundings_can_be_rendered() -> None:
     assert all(picture.std() > 0.05 for picture in pictures)
 
 
-def test_points_come_with_a_scene_where_they_are_asked_for(tmp_path: Path) -> None:
+def test_points_are_written_with_a_scene_on_request(tmp_path: Path) -> None:
     folder = tmp_path / "ball"
     shutil.copytree(BALL, folder)
     write_points(500, folder)

@@ -26,7 +26,7 @@ def test_a_seed_draws_the_same_place_every_time_and_another_one_does_not() -> No
 
 
 @pytest.mark.parametrize("seed", [21, 22, 23, 24])
-def test_cameras_stand_clear_of_everything_and_see_every_pane_and_lamps(seed: int) -> None:
+def test_cameras_keep_clear_of_objects_and_see_every_pane_and_lamps(seed: int) -> None:
     drawn = draw_place(seed, VIEWS)
     assert all(is_clear(drawn.place, pose[:3, 3]) for pose in drawn.poses)
     assert drawn.room is not None
@@ -45,7 +45,7 @@ def test_seeds_take_turns_at_settings() -> None:
     assert "free-standing" in words[0] and "shop" in words[1] and "in a wall" in words[2]
 
 
-def test_nothing_is_clear_inside_of_a_thing_or_beside_a_pane() -> None:
+def test_positions_inside_objects_or_next_to_panes_are_not_clear() -> None:
     place = draw_place(7, 1).place
     pane = place.panes[0]
     assert not is_clear(place, pane.center + 0.5 * CLEARANCE * pane.normal)
@@ -55,7 +55,7 @@ def test_nothing_is_clear_inside_of_a_thing_or_beside_a_pane() -> None:
         assert not is_clear(place, middle[:3])
 
 
-def test_a_drawn_capture_is_read_has_noise_and_clips(tmp_path: Path) -> None:
+def test_a_drawn_capture_can_be_read_with_noise_and_clipping(tmp_path: Path) -> None:
     arguments = Arguments(tmp_path / "room", width=48, views=16, masks=5, points=300, drawn=22, noise=2.0)
     main(arguments)
     dataset = load_dataset(tmp_path / "room")

@@ -21,7 +21,7 @@ def test_faces_turn_the_way_their_normals_point(name: NearScene) -> None:
 
 
 @pytest.mark.parametrize("name", NEAR_SCENES)
-def test_everything_stands_on_the_ground_within_the_box_of_points(name: NearScene) -> None:
+def test_objects_stand_on_the_ground_within_the_box_of_points(name: NearScene) -> None:
     scene = near_scene(name)
     for body in scene.bodies:
         positions = body.triangles.positions
@@ -30,14 +30,14 @@ def test_everything_stands_on_the_ground_within_the_box_of_points(name: NearScen
 
 
 @pytest.mark.parametrize("name", NEAR_SCENES)
-def test_one_thing_mirrors_and_comes_first(name: NearScene) -> None:
+def test_the_reflective_object_comes_first(name: NearScene) -> None:
     coatings = [body.coating for body in near_scene(name).bodies]
     assert coatings[0] not in MATTE and all(coating in MATTE for coating in coatings[1:])
     assert len(coatings) > 2
 
 
 @pytest.mark.parametrize("name", NEAR_SCENES)
-def test_nothing_stands_in_what_mirrors(name: NearScene) -> None:
+def test_no_object_intersects_a_mirror(name: NearScene) -> None:
     mirror, *others = (body.triangles.positions for body in near_scene(name).bodies)
     for positions in others:
         nearest = min(float(np.linalg.norm(mirror - point, axis=1).min()) for point in positions[::7])

@@ -28,7 +28,7 @@ def test_photographs_differ_by_their_factors_and_nothing_else_does(tmp_path: Pat
         assert (capture / path).read_bytes() == (tmp_path / "copy" / path).read_bytes()
 
 
-def test_cameras_are_moved_by_as_much_as_was_asked(tmp_path: Path) -> None:
+def test_cameras_are_perturbed_by_the_requested_amount(tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
     turns = Rotation.random(200, random_state=1)
     lines = ["# comment"]
@@ -46,7 +46,7 @@ def test_cameras_are_moved_by_as_much_as_was_asked(tmp_path: Path) -> None:
     np.testing.assert_allclose(wobbles.std(axis=0), 0.01, rtol=0.15)
 
 
-def test_passers_by_are_where_their_masks_say_and_in_no_test_view(tmp_path: Path) -> None:
+def test_passers_by_match_their_masks_and_avoid_test_views(tmp_path: Path) -> None:
     capture = write_tiny_capture(tmp_path / "capture")
     shutil.copytree(capture, tmp_path / "copy")
     add_passers_by(tmp_path / "copy", 1.0, np.random.default_rng(2))
@@ -60,7 +60,7 @@ def test_passers_by_are_where_their_masks_say_and_in_no_test_view(tmp_path: Path
     assert (capture / "images/0.png").read_bytes() == (tmp_path / "copy/images/0.png").read_bytes()
 
 
-def test_a_capture_with_transforms_is_exposed_and_shaken_too(tmp_path: Path) -> None:
+def test_exposure_and_pose_noise_apply_to_transforms_captures(tmp_path: Path) -> None:
     capture = write_object_capture(tmp_path / "capture")
     factors = spoil(capture, tmp_path / "copy", 0.5, 0.1, np.random.default_rng(3))
     assert len(factors) == sum(len(frames_of(capture, split)) for split in ("train", "test"))

@@ -22,7 +22,7 @@ def test_every_class_has_cases(name: str) -> None:
     assert callable(trial.trial_of(name))
 
 
-def test_faults_are_said_and_counted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_faults_are_printed_and_counted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
         assert place.is_dir() and not list(place.iterdir())
         yield from (Case(str(number), "broken" if number == seed else "") for number in range(cases))
@@ -33,7 +33,7 @@ def test_faults_are_said_and_counted(monkeypatch: pytest.MonkeyPatch, capsys: py
     assert tried("readers", 3, 5, minutes=0)[0] == 1
 
 
-def test_damaged_files_of_a_seed_are_the_same_and_get_messages(tmp_path: Path) -> None:
+def test_damaged_files_follow_from_the_seed_and_are_refused_with_a_message(tmp_path: Path) -> None:
     found = []
     for place in (tmp_path / "a", tmp_path / "b"):
         place.mkdir()
@@ -42,7 +42,7 @@ def test_damaged_files_of_a_seed_are_the_same_and_get_messages(tmp_path: Path) -
     assert not [case for case in found[0] if case.fault]
 
 
-def test_a_reader_that_fails_is_a_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_crashing_reader_counts_as_a_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def read(path: Path) -> None:
         raise TypeError("not foreseen")
 
@@ -63,7 +63,7 @@ def test_a_command_is_run_and_killed() -> None:
     assert run(["--help"], sent=Sent(signal.SIGKILL, 0.0)).code is None
 
 
-def test_a_picture_of_poison_is_finite_or_refused() -> None:
+def test_invalid_values_give_a_finite_image_or_an_error() -> None:
     whats = []
     for number in itertools.count():
         what, work = picture(random.Random(f"0 {number}"))

@@ -48,7 +48,7 @@ def state_with_one_out_of_sight() -> TrainState:
     return state
 
 
-def test_what_no_view_needs_is_removed_with_its_moments() -> None:
+def test_unneeded_gaussians_are_removed_with_their_moments() -> None:
     state, action = state_with_one_out_of_sight(), PruneIdle(DefaultDensify(least_contribution=1e-3))
     before = state.scene.primary.means
     gathered = torch.arange(2 * len(before), dtype=torch.float32).reshape(2, -1)
@@ -94,7 +94,7 @@ def test_fog_is_what_is_opaque_where_a_camera_stands(gaussian: Gaussians, expect
     assert not gaussians_around_cameras(gaussian, far).any()
 
 
-def test_no_gaussian_stays_around_a_camera_though_others_see_it() -> None:
+def test_gaussians_around_a_camera_are_removed_even_if_others_see_them() -> None:
     state, capture = state_with_one_out_of_sight(), tiny_capture()
     row = int(contributions(state.scene, capture.train[0].camera).argmax())
     means = state.scene.primary.means.clone()
@@ -109,7 +109,7 @@ def test_no_gaussian_stays_around_a_camera_though_others_see_it() -> None:
     assert row not in state.optimizer.moments["primary.means"][0][:, 0].long().tolist()
 
 
-def test_what_is_nearer_to_a_camera_than_any_surface_hangs_in_the_air() -> None:
+def test_gaussians_nearer_to_a_camera_than_any_surface_are_in_mid_air() -> None:
     means = torch.tensor([[0.0, 0.0, 0.1], [0.0, 0.0, 0.4], [5.0, 0.0, 0.0]])
     places = torch.tensor([[0.0, 0.0, 0.0], [0.0, 9.0, 0.0]])
     # One point in front of the first camera is wrong.
@@ -121,7 +121,7 @@ def test_what_is_nearer_to_a_camera_than_any_surface_hangs_in_the_air() -> None:
 @pytest.mark.parametrize(
     ("needed", "measured", "stays"), [(0.0005, True, True), (0.00005, True, False), (0.00005, False, True)]
 )
-def test_what_hangs_before_a_camera_stays_only_if_a_view_needs_it(needed: float, measured: bool, stays: bool) -> None:
+def test_gaussians_in_front_of_a_camera_stay_only_if_needed(needed: float, measured: bool, stays: bool) -> None:
     state, capture = state_with_one_out_of_sight(), tiny_capture()
     means = state.scene.primary.means.clone()
     means[5] = capture.train[5].camera.center - torch.tensor([0.0, 0.0, 0.01])
@@ -139,7 +139,7 @@ def test_what_hangs_before_a_camera_stays_only_if_a_view_needs_it(needed: float,
     assert (5 in state.optimizer.moments["primary.means"][0][:, 0].long().tolist()) == stays
 
 
-def test_idle_gaussians_are_looked_for_at_the_moments_that_were_asked_for() -> None:
+def test_idle_gaussians_are_pruned_at_the_configured_moments() -> None:
     def due(densifier: DefaultDensify) -> list[int]:
         return [step for step in range(1, 101) if PruneIdle(densifier).due(Clock(step, 100, 5))]
 
@@ -163,7 +163,7 @@ def test_photographs_limit_the_number_of_gaussians(densifier: DefaultDensify, li
     assert densify_cap(densifier, capture) == (densifier.cap if limit is None else round(limit * pixels))
 
 
-def test_a_set_grows_to_its_limit_and_no_further() -> None:
+def test_a_set_grows_up_to_its_cap() -> None:
     state, capture = TrainState(SplatRecipe(sh_degree=1).initialise(tiny_capture()), seed=0), tiny_capture()
     count = len(state.scene.primary)
     ones = torch.ones(2, count)
@@ -203,7 +203,7 @@ def balls(centers: list[tuple[float, float, float]], colors: list[int], log_scal
     return made.with_tensors({"log_scales": torch.full((len(centers), 3), log_scale)})
 
 
-def test_a_thing_without_points_is_found_where_the_photographs_of_it_meet() -> None:
+def test_an_object_without_points_is_found_by_its_photographs() -> None:
     side = torch.linspace(-1.5, 1.5, 50).tolist()
     ground = balls([(x, 1.0, z) for x in side for z in side], [90] * 2500, -3.0)
     lamp = balls([(0.3, -0.2, 0.1)], [250], -1.8)
@@ -237,7 +237,7 @@ def missing_in(scene: Scene, views: Sequence[View], renderer: Renderer) -> torch
             return end.value[0].positions
 
 
-def test_views_that_ignore_a_place_do_not_say_that_nothing_is_missing_there() -> None:
+def test_views_that_ignore_a_position_are_no_evidence_against_missing_objects() -> None:
     whole = Scene(balls([(0.3, -0.2, 0.1), (0.0, 0.4, 0.0)], [250, 30], -1.8), 2.0)
     ground = Scene(whole.primary.select(torch.tensor([False, True])), 2.0)
     views = list(views_of(whole).train)
@@ -248,7 +248,7 @@ def test_views_that_ignore_a_place_do_not_say_that_nothing_is_missing_there() ->
     assert len(missing_in(ground, views, Splat())) > 0.9 * len(found) > 5
 
 
-def test_what_is_missing_is_not_looked_for_in_every_window_by_itself() -> None:
+def test_missing_objects_are_searched_with_window_sums() -> None:
     """On photographs of two megapixels, summing every window separately took half a minute for each."""
     whole = Scene(balls([(0.3, -0.2, 0.1), (0.0, 0.4, 0.0)], [250, 30], -1.8), 2.0)
     ground = Scene(whole.primary.select(torch.tensor([False, True])), 2.0)
@@ -277,14 +277,14 @@ def test_nothing_is_added_where_the_scene_explains_the_photographs() -> None:
     assert state.scene is whole
 
 
-def test_where_most_is_missing_nothing_is_added() -> None:
+def test_nothing_is_added_to_a_scene_that_is_mostly_missing() -> None:
     whole = Scene(balls([(0.3, -0.2, 0.1), (0.0, 0.4, 0.0)], [250, 200], -1.8), 2.0)
     state = TrainState(Scene(whole.primary.select(torch.tensor([False, True])), 2.0), seed=0)
     assert len(missing_in(state.scene, views_of(whole).train, Splat())) > 5
     assert not finished(SeedUnexplained((0.2,), Splat()).apply(state, views_of(whole), Clock(20, 100, 10)))
 
 
-def test_what_a_pane_mirrors_is_not_found_behind_it() -> None:
+def test_reflections_are_not_found_as_missing_objects_behind_a_pane() -> None:
     planes = Planes.rectangle((0.0, 0.0, 0.5), (0.0, 0.0, -1.0), (3.0, 3.0))
     room = balls([(0.0, 0.0, -1.2)], [250], -1.5)
     mirror = planes.with_tensors({"logit_reflectances": torch.logit(torch.tensor([0.9]))})

@@ -55,7 +55,7 @@ def test_the_scene_is_the_mean_of_the_last_steps() -> None:
     assert not state.records
 
 
-def test_what_does_not_change_keeps_every_bit() -> None:
+def test_averaging_keeps_constant_tensors_bit_for_bit() -> None:
     averaged = run(fresh_state(), passes=1)
     assert torch.equal(averaged[-1]["primary.log_intensity"], averaged[0]["primary.log_intensity"])
 
@@ -70,7 +70,7 @@ def test_a_resumed_run_ends_with_the_same_mean(pause: int, tmp_path: Path) -> No
         assert torch.equal(tensor, resumed[-1][name]), name
 
 
-def test_the_mean_begins_anew_when_the_set_of_gaussians_changes() -> None:
+def test_the_mean_restarts_when_the_set_of_gaussians_changes() -> None:
     state, average = fresh_state(), AverageLast(passes=1)
     average(state, Clock(97, 100, views=10), None)
     fewer = state.scene.primary.select(torch.arange(len(state.scene.primary)) > 2)
@@ -80,7 +80,7 @@ def test_the_mean_begins_anew_when_the_set_of_gaussians_changes() -> None:
     assert torch.equal(state.scene.primary.means, fewer.means)
 
 
-def test_the_mean_begins_anew_when_gaussians_change_places() -> None:
+def test_the_mean_restarts_when_gaussians_are_reordered() -> None:
     state, average = fresh_state(), AverageLast(passes=1)
     average(state, Clock(97, 100, views=10), None)
     backwards = state.scene.primary.select(torch.arange(len(state.scene.primary)).flip(0))

@@ -57,7 +57,7 @@ def rewrite(path: Path, edit: Callable[[dict[str, Any], dict[str, Tensor]], None
     save_file(tensors, path, metadata={"glassplat": json.dumps(header)})
 
 
-def test_a_state_survives(checkpoint: Path) -> None:
+def test_a_state_round_trips(checkpoint: Path) -> None:
     written, read = trained_state(), load_checkpoint(checkpoint)
     for key in ("method", "seed", "step", "seconds", "records"):
         assert getattr(read, key) == getattr(written, key), key
@@ -68,14 +68,14 @@ def test_a_state_survives(checkpoint: Path) -> None:
         assert torch.equal(read.optimizer.moments[name][1], torch.ones_like(tensor)), name
 
 
-def test_what_becomes_of_the_file_changes_no_state_that_was_read(checkpoint: Path) -> None:
+def test_a_loaded_state_does_not_depend_on_its_file(checkpoint: Path) -> None:
     written, read = trained_state().scene.parameters(), load_checkpoint(checkpoint).scene.parameters()
     with checkpoint.open("r+b") as file:
         file.write(bytes(checkpoint.stat().st_size))
     assert all(torch.equal(read[name], tensor) for name, tensor in written.items())
 
 
-def test_tinted_panes_survive(tmp_path: Path) -> None:
+def test_tinted_panes_round_trip(tmp_path: Path) -> None:
     state, tint = trained_state(), -torch.rand(1, 3)
     state.scene = replace(state.scene, planes=replace(state.scene.planes, log_transmittances=tint))
     save_checkpoint(tmp_path / "checkpoint.safetensors", state)
@@ -84,7 +84,7 @@ def test_tinted_panes_survive(tmp_path: Path) -> None:
     )
 
 
-def test_surroundings_survive(tmp_path: Path) -> None:
+def test_surroundings_round_trip(tmp_path: Path) -> None:
     scene = true_scene()
     around = replace(scene.primary, channels={}, active_sh_degree=0)
     save_checkpoint(tmp_path / "checkpoint", TrainState(replace(scene, surroundings=around), seed=3))
@@ -139,7 +139,7 @@ NEEDED = ["step", "seed", "seconds", "extent", "labels", "active_sh_degree", "up
 
 
 @pytest.mark.parametrize("key", NEEDED)
-def test_what_lacks_in_the_header_is_named(checkpoint: Path, key: str) -> None:
+def test_fields_missing_from_the_header_are_named(checkpoint: Path, key: str) -> None:
     rewrite(checkpoint, lambda header, _: header.pop(key))
     with pytest.raises(InputError, match=f"the header of .* has no {key}; expected"):
         read_progress(checkpoint)
@@ -168,7 +168,7 @@ TENSORS: list[tuple[str, Any, str]] = [
 
 
 @pytest.mark.parametrize(("name", "tensor", "message"), TENSORS)
-def test_tensors_that_make_no_state_are_named(checkpoint: Path, name: str, tensor: Any, message: str) -> None:
+def test_tensors_that_form_no_state_are_named(checkpoint: Path, name: str, tensor: Any, message: str) -> None:
     def edit(_: dict[str, Any], tensors: dict[str, Tensor]) -> None:
         tensors.pop(name) if tensor is None else tensors.update({name: tensor})
 

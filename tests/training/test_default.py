@@ -91,7 +91,7 @@ def test_transparent_gaussians_are_pruned_together_with_their_moments() -> None:
     assert torch.equal(moments["primary.means"][0], gaussians.means[[0, 2]] + 1)
 
 
-def test_large_ones_are_pruned_only_when_asked() -> None:
+def test_large_gaussians_are_pruned_only_on_request() -> None:
     gaussians = make_gaussians([0.21, 0.19])
     assert len(edited(DefaultDensify(), gaussians, seen([0.0, 0.0]))) == 2
     after = edited(DefaultDensify(), gaussians, seen([0.0, 0.0]), prune_large=True)

@@ -112,7 +112,7 @@ def test_colours_turn_with_the_view_only_after_propagation() -> None:
     assert degrees[13] == 0 and degrees[20] == 1
 
 
-def test_the_log_tells_only_of_what_was_done() -> None:
+def test_the_log_lists_only_completed_actions() -> None:
     done = [(m.step, m.action) for m in run(fresh_state()) if isinstance(m, ActionDone)]
     grown = [step for step, action in done if action == "grow SH"]
     propagated = [step for step, action in done if action == "propagate normals"]
@@ -262,7 +262,7 @@ def test_propagation_ends_when_no_more_reflectors_are_found(
         (0.004, 0.3, "30 % of the visible scene .* --iterations"),
     ],
 )
-def test_where_nothing_reflects_the_rates_rise_and_the_log_says_so(
+def test_scenes_without_reflections_raise_the_rates_with_a_log_message(
     share: float, turns: float, said: str | None, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level("INFO", logger="glassplat.training"):
@@ -289,7 +289,7 @@ def test_a_region_without_gaussians_is_named(caplog: pytest.LogCaptureFixture) -
     assert "no Gaussian lies in the sphere outside which nothing reflects, of radius 2 around (50, 0, 0.5)" in warning
 
 
-def test_rates_that_stay_are_not_said_to_rise(caplog: pytest.LogCaptureFixture) -> None:
+def test_unchanged_rates_are_not_logged(caplog: pytest.LogCaptureFixture) -> None:
     schedule, told = PropagationSchedule(end="fixed", stop=0.5), Told(reflects=(0.0,))
     action = Propagate(Every(0.1, stop=0.5), NormalPropagation(), schedule, Deferred(), measure=told)
     action.apply(fresh_state(), tiny_capture(), Clock(50, 100, 5))
@@ -297,7 +297,7 @@ def test_rates_that_stay_are_not_said_to_rise(caplog: pytest.LogCaptureFixture) 
 
 
 @pytest.mark.parametrize("recipe", [DeferredRecipe(), TracedRecipe(), TracedRecipe(raise_rates_found=False)])
-def test_where_something_reflects_the_rates_rise_if_that_is_asked_for(
+def test_scenes_with_reflections_raise_the_rates_on_request(
     recipe: DeferredRecipe | TracedRecipe,
 ) -> None:
     (action,) = (action for action in recipe.stages(seed=0)[1].actions if isinstance(action, Propagate))
@@ -308,7 +308,7 @@ def test_where_something_reflects_the_rates_rise_if_that_is_asked_for(
     assert state.records[PROPAGATION_ENDED] > 10
 
 
-def test_where_nothing_reflects_the_rates_are_those_of_splat() -> None:
+def test_scenes_without_reflections_use_the_rates_of_splat() -> None:
     own, splat = DeferredRecipe(), SplatRecipe()
     reflection = own.stages(seed=0)[1]
     (action,) = (action for action in reflection.actions if isinstance(action, Propagate))
@@ -326,7 +326,7 @@ def scene_after(recipe: Any, iterations: int, directory: Path) -> Scene:
 
 
 @pytest.mark.parametrize(("strategy", "iterations"), [("default", 760), ("mcmc", 120)])
-def test_a_run_too_short_for_normals_is_one_of_splat_and_says_so(
+def test_a_run_too_short_for_normals_trains_as_splat_with_a_message(
     strategy: Strategy, iterations: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     # Only the longer run includes an opacity reset, the first one.
@@ -353,7 +353,7 @@ def test_a_run_long_enough_for_normals_has_all_stages(tmp_path: Path) -> None:
     assert bool((strengths != logit(recipe.first_strength)).any())
 
 
-def test_the_rates_of_a_short_run_are_splats_unless_published_ones_are_asked_for() -> None:
+def test_short_runs_use_the_rates_of_splat_by_default() -> None:
     def rates(recipe: Any) -> Any:
         return recipe.stages(0, 3000)[0].rates
 
@@ -475,7 +475,7 @@ def test_propagation_ends_in_runs_of_any_length(iterations: int) -> None:
     assert state.records[PROPAGATION_ENDED] == pytest.approx(0.61 * iterations, abs=0.5)
 
 
-def test_the_recipe_survives_json() -> None:
+def test_the_recipe_round_trips_through_json() -> None:
     assert recipe_from_json(recipe_to_json(RECIPE)) == RECIPE
 
 
@@ -489,7 +489,7 @@ def test_estimated_normals_count_from_when_things_reflect(recipe: DeferredRecipe
     assert weights(replace(recipe, monocular_weight=0.0)) == [[], [], []]
 
 
-def test_mirrors_are_looked_for_after_enough_steps_however_short_the_run() -> None:
+def test_mirrors_are_searched_after_a_minimum_of_steps_in_short_runs() -> None:
     def steps(recipe: DeferredRecipe | TracedRecipe, iterations: int) -> int:
         stages = recipe.stages(0, iterations)
         assert sum(stage.share for stage in stages) == pytest.approx(1)

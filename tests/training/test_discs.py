@@ -79,7 +79,7 @@ def test_a_short_run_learns(strategy: Any) -> None:
     assert set(messages[-1].losses) >= {"photometric", "distortion", "normals"}
 
 
-def test_a_checkpoint_of_discs_goes_on_with_the_same_result(tmp_path: Path) -> None:
+def test_resuming_discs_from_a_checkpoint_gives_the_same_result(tmp_path: Path) -> None:
     recipe, dataset = short(DISCS), tiny_capture()
     whole = TrainState(recipe.initialise(dataset), seed=0)
     for message in train(recipe.stages(0), dataset, whole, 30):

@@ -100,7 +100,7 @@ def test_composed_edit_equals_one_after_the_other() -> None:
         assert torch.equal(stepwise[1][f"primary.{name}"][1], at_once[1][f"primary.{name}"][1])
 
 
-def test_edits_leave_the_input_and_autograd_alone() -> None:
+def test_edits_do_not_change_the_input_or_autograd_state() -> None:
     gaussians = make_gaussians(3)
     trainable = gaussians.with_tensors({"means": gaussians.means.clone().requires_grad_()})
     before = trainable.means.detach().clone()
@@ -135,7 +135,7 @@ def test_forget_zeroes_only_what_was_replaced() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_empty_sets_survive_every_edit(count: int) -> None:
+def test_empty_sets_are_valid_in_every_edit(count: int) -> None:
     gaussians = make_gaussians(count)
     nothing = torch.zeros(0, dtype=torch.int64)
     edit = split(gaussians, nothing, generator=torch.Generator().manual_seed(0)).then(clone(count, nothing))

@@ -64,7 +64,7 @@ def test_glass_of_unknown_reflectance_starts_where_the_options_say_and_known_gla
         assert float(planes.base_reflectances) == pytest.approx(expected)
 
 
-def test_panes_that_only_masks_name_are_fitted_beside_it() -> None:
+def test_panes_named_only_by_masks_are_fitted_in_addition() -> None:
     other = replace(PANE, labels=(2,), centers=PANE.centers + torch.tensor([0.0, 0.0, 0.5]))
     points = torch.cat([tiny_capture().points.positions, pane_frame(PANE)])
     cloud = PointCloud(points, torch.zeros(len(points), 3, dtype=torch.uint8))
@@ -76,7 +76,7 @@ def test_panes_that_only_masks_name_are_fitted_beside_it() -> None:
 
 
 @pytest.mark.parametrize("mirror", [True, False])
-def test_what_the_capture_calls_a_mirror_is_one(mirror: bool) -> None:
+def test_mirrors_declared_by_the_capture_are_mirrors(mirror: bool) -> None:
     given = replace(PANE, mirrors=PANE.labels if mirror else ())
     scene = replace(true_scene(), planes=Planes.empty(), glass=true_scene().glass.select(torch.zeros(0).long()))
     state = TrainState(scene, seed=0)
@@ -107,13 +107,13 @@ def test_a_damaged_file_is_named(capture: Path) -> None:
         load_dataset(capture)
 
 
-def test_without_masks_and_rectangles_it_says_how_to_mark_panes(capture: Path) -> None:
+def test_a_capture_without_panes_is_refused_with_advice(capture: Path) -> None:
     (capture / "planes.json").unlink()
     with pytest.raises(PlaneFitError, match="glassplat annotate"):
         PlanarRecipe().initialise(load_dataset(capture))
 
 
-def test_a_mirror_that_is_no_pane_is_refused() -> None:
+def test_a_mirror_that_is_not_a_pane_is_refused() -> None:
     """A recipe that names mirrors also disables their detection."""
     recipe = PlanarRecipe(plane_fit=PlaneFit(mirror_labels=(5,)))
     with pytest.raises(PlaneFitError, match="names pane 5; expected some of 1"):

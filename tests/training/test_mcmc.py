@@ -82,7 +82,7 @@ def test_extreme_opacities_stay_finite() -> None:
         assert (shrink <= 1e-6).all()
 
 
-def test_the_dead_end_up_where_the_live_are_and_share_their_contribution() -> None:
+def test_dead_gaussians_are_relocated_to_live_ones_and_share_their_opacity() -> None:
     before = make_gaussians([0.9, 0.001, 0.4, 0.005, 0.002, 0.6])
     after, _ = relocate_and_grow(OPTIONS, before, {}, cap=0, generator=rng())
     live = [0, 2, 5]
@@ -133,7 +133,7 @@ def test_growth_is_a_twentieth_up_to_the_cap(cap: int, expected: int) -> None:
     assert all((after.means[row] == before.means).all(dim=1).any() for row in range(100, expected))
 
 
-def test_a_place_takes_no_more_than_the_sum_is_exact_for() -> None:
+def test_relocations_per_gaussian_are_limited_to_the_exact_sum() -> None:
     before = make_gaussians([0.8] + [0.001] * 200)
     after, _ = relocate_and_grow(OPTIONS, before, {}, cap=0, generator=rng())
     together = (after.means == before.means[0]).all(dim=1)
@@ -144,7 +144,7 @@ def test_a_place_takes_no_more_than_the_sum_is_exact_for() -> None:
 
 
 @pytest.mark.parametrize("opacities", [[], [0.001], [0.001, 0.002, 0.004]], ids=["none", "one dead", "all dead"])
-def test_without_live_ones_nothing_happens(opacities: list[float]) -> None:
+def test_relocation_without_live_gaussians_does_nothing(opacities: list[float]) -> None:
     before = make_gaussians(opacities)
     after, moments = relocate_and_grow(OPTIONS, before, make_moments(before), cap=100, generator=rng())
     for name, tensor in before.tensors().items():
@@ -153,7 +153,7 @@ def test_without_live_ones_nothing_happens(opacities: list[float]) -> None:
     assert sgld_noise(OPTIONS, before, rate=1e-4, extent=1.0, generator=rng()).shape == before.means.shape
 
 
-def test_a_single_live_one_is_doubled() -> None:
+def test_a_single_live_gaussian_is_duplicated() -> None:
     before = make_gaussians([0.75])
     after, _ = relocate_and_grow(OPTIONS, before, {}, cap=100, generator=rng())
     assert torch.sigmoid(after.logit_opacities).tolist() == pytest.approx([0.5, 0.5])
@@ -177,7 +177,7 @@ def test_the_same_seed_gives_the_same_set_and_another_seed_another() -> None:
     assert torch.equal(noises[0], noises[1]) and not torch.equal(noises[0], noises[2])
 
 
-def test_noise_leaves_opaque_ones_alone_and_follows_its_gate() -> None:
+def test_noise_moves_only_transparent_gaussians() -> None:
     gaussians = make_gaussians([0.99, 0.005, 0.5])
     noise = sgld_noise(OPTIONS, gaussians, rate=1.6e-4, extent=1.0, generator=rng())
     assert torch.equal(gaussians.means[0] + noise[0], gaussians.means[0])

@@ -38,7 +38,7 @@ def test_neighbours_in_memory_are_near_each_other() -> None:
 
 
 @pytest.mark.parametrize("poison", [float("nan"), float("inf"), -float("inf")])
-def test_what_is_not_finite_comes_last_and_spares_the_others(poison: float) -> None:
+def test_values_that_are_not_finite_are_sorted_last(poison: float) -> None:
     means = torch.rand(50, 3, generator=torch.Generator().manual_seed(3))
     expected = morton_order(means).source
     beside = morton_order(torch.cat([torch.full((1, 3), poison), means])).source

@@ -54,7 +54,7 @@ def test_gradients_reach_the_raw_values() -> None:
     assert scene.primary.log_scales.grad.flatten().tolist() == pytest.approx([0.3 / 6] * 6)
 
 
-def test_what_a_view_does_not_show_directly_is_left_alone() -> None:
+def test_gaussians_not_directly_visible_are_unchanged() -> None:
     scene = scene_of([0.2, 0.6, 0.7], scale=0.3)
     frame = replace(UNTOLD, direct=torch.tensor([True, False, True]), mirrored=torch.tensor([False, True, True]))
     opacity, scale = mean_opacity(frame, UNUSED, scene), mean_scale(frame, UNUSED, scene)
@@ -92,7 +92,7 @@ def test_every_stage_of_planar_holds_harmonics_of_the_primary_gaussians_alone() 
         assert {name: rate.penalty for name, rate in stage.rates.items() if rate.penalty} == {"primary.sh": 0.3}
 
 
-def test_a_step_takes_off_what_no_photograph_asks_for() -> None:
+def test_the_view_dependence_weight_shrinks_harmonics() -> None:
     (stage,) = SplatRecipe(view_dependence_weight=0.1).stages(seed=0)
     state = TrainState(scene_of([0.5, 0.5], scale=0.3), seed=0)
     state.scene = replace(state.scene, primary=state.scene.primary.with_tensors({"sh": torch.full((2, 9, 3), 0.2)}))

@@ -52,13 +52,13 @@ def trained(recipe: SplatRecipe, steps: int = 240) -> TrainState:
     return state
 
 
-def test_dark_photographs_are_told_from_bright_ones() -> None:
+def test_dark_photographs_are_distinguished_from_bright_ones() -> None:
     affine = trained(SplatRecipe(exposure=LEARNED)).scene.exposures.values
     brightness = affine[:, :, :3].sum(dim=(1, 2)) / 3
     assert bool((brightness[1::2] < brightness[::2] - 0.2).all())
 
 
-def test_what_all_photographs_have_in_common_is_left_to_the_scene() -> None:
+def test_the_common_exposure_is_left_to_the_scene() -> None:
     affine = trained(SplatRecipe(exposure=LEARNED)).scene.exposures.values
     assert float(affine.abs().max()) > 0.05
     assert float(affine.mean(dim=0).abs().max()) < 1e-6
@@ -76,7 +76,7 @@ def test_every_stage_of_every_method_learns_them(method: str, iterations: int) -
 
 @pytest.mark.parametrize("method", RECIPES)
 @pytest.mark.parametrize("iterations", [3000, 30_000])
-def test_switched_off_nothing_knows_of_them(method: str, iterations: int) -> None:
+def test_no_corrections_are_stored_if_switched_off(method: str, iterations: int) -> None:
     recipe = RECIPES[method](exposure=OFF)
     assert not any("exposures.affine" in stage.rates for stage in recipe.stages(0, iterations))
     assert len(recipe.initialise(CAPTURE).exposures) == 0

@@ -95,7 +95,7 @@ def test_stages_with_panes_show_and_teach_the_photographer() -> None:
     assert PlanarRecipe(photographer=LEARNED).renderer().photographer == "absent"
 
 
-def test_switched_off_nothing_knows_of_anybody() -> None:
+def test_no_photographer_is_stored_if_switched_off() -> None:
     for stage in PlanarRecipe().stages(0):
         assert not any("photographer" in name for name in stage.rates)
         assert not isinstance(stage.setup, AddPhotographer)
@@ -113,7 +113,7 @@ def test_each_mirror_of_a_corner_shows_the_photographer() -> None:
 
 
 @pytest.mark.parametrize("planes", [MIRROR, CORNER])
-def test_somebody_is_found_in_the_photographs(planes: Planes) -> None:
+def test_the_photographer_is_learned_from_the_photographs(planes: Planes) -> None:
     """With the true room and panes fixed, the cloud takes the shape of the photographer."""
     dataset, state = peopled_capture(planes), begun(scene=peopled_scene(planes))
     frozen = [
@@ -135,7 +135,7 @@ def test_somebody_is_found_in_the_photographs(planes: Planes) -> None:
     assert sum(after[-6:]) < 0.6 * sum(before)
 
 
-def test_somebody_is_stored_with_the_scene_and_in_checkpoints(tmp_path: Path) -> None:
+def test_the_photographer_is_stored_with_the_scene_and_in_checkpoints(tmp_path: Path) -> None:
     state = TrainState(peopled_scene(), 0)
     write_scene(tmp_path / "scene", state.scene)
     save_checkpoint(tmp_path / "checkpoint.safetensors", state)
@@ -145,7 +145,7 @@ def test_somebody_is_stored_with_the_scene_and_in_checkpoints(tmp_path: Path) ->
             assert torch.equal(scene.parameters()[name], tensor), name
 
 
-def test_a_photographer_who_has_vanished_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_a_removed_photographer_has_no_effect(tmp_path: Path) -> None:
     state = begun()
     faint = state.scene.photographer.with_tensors({"logit_opacities": torch.full((60,), -9.0)})
     state.scene = replace(state.scene, photographer=faint)

@@ -118,7 +118,7 @@ def test_a_view_keeps_its_photograph_when_its_camera_moves() -> None:
     assert len(read) == 1 and view.with_camera(CAMERA).camera is CAMERA and view.camera is not CAMERA
 
 
-def test_a_camera_that_is_off_finds_its_place() -> None:
+def test_a_perturbed_camera_converges_to_its_pose() -> None:
     dataset = shaken(tiny_capture())
     recipe = SplatRecipe(poses=REFINED)
     scene = with_neutral_corrections(recipe, true_scene(), dataset)
@@ -174,7 +174,7 @@ def test_a_test_camera_is_aligned_in_the_colours_of_its_photograph() -> None:
     assert pixels_off(found, true.camera) < 0.15 * pixels_off(start.camera, true.camera)
 
 
-def test_where_nothing_is_in_sight_the_camera_stays() -> None:
+def test_a_camera_without_visible_gaussians_keeps_its_pose() -> None:
     view = tiny_capture().test[0]
     away = view.with_camera(moved_camera(view.camera, torch.tensor([0.0, 0, 0, 0, 0, -50.0]), 2.0))
     assert misplacement(aligned_camera(true_scene(), Planar(), away), away.camera) < 1e-6

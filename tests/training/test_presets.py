@@ -52,7 +52,7 @@ def test_the_table_of_a_page_is_that_of_the_preset(method: str) -> None:
 
 @pytest.mark.parametrize("preset", ["glassplat", "paper"])
 @pytest.mark.parametrize("method", RECIPES)
-def test_what_learns_once_learns_to_the_end(method: str, preset: Any) -> None:
+def test_trainable_tensors_stay_trainable(method: str, preset: Any) -> None:
     stages = recipe_of(method, preset).stages(0)
     for before, after in pairwise(stages):
         assert before.rates.keys() <= after.rates.keys(), after.name
@@ -60,7 +60,7 @@ def test_what_learns_once_learns_to_the_end(method: str, preset: Any) -> None:
 
 @pytest.mark.parametrize("iterations", [500, 7000])
 @pytest.mark.parametrize("method", RECIPES)
-def test_what_is_due_at_a_moment_is_an_action_of_the_stage_then(method: str, iterations: int) -> None:
+def test_actions_belong_to_the_stage_of_their_moment(method: str, iterations: int) -> None:
     stages = recipe_of(method).stages(0, iterations)
     starts = stage_starts(stages, iterations)
     planned, acting = set(), set()
@@ -156,7 +156,7 @@ def moments(stages: tuple[Stage, ...], kind: type, iterations: int) -> list[list
     ]
 
 
-def test_large_gaussians_are_split_by_the_gradient_if_asked() -> None:
+def test_large_gaussians_are_split_by_the_gradient_on_request() -> None:
     gaussians = make_gaussians([0.5, 0.5])
     # The gradients of the first cancel; the second has a gradient and a small absolute one.
     statistics = seen([1e-5, 1e-3], absgrads=[1e-2, 1.1e-3])
@@ -179,7 +179,7 @@ def test_densification_can_keep_its_interval_whatever_the_views() -> None:
 
 
 @pytest.mark.parametrize(("adapts", "clones"), [(True, False), (False, True)])
-def test_thresholds_rise_on_small_photographs_if_asked(adapts: bool, clones: bool) -> None:
+def test_thresholds_rise_on_small_photographs_on_request(adapts: bool, clones: bool) -> None:
     gaussians = make_gaussians([0.001] * 2)
     state = TrainState(Scene(gaussians, 2.0), seed=0)
     state.statistics["primary"] = seen([4e-4, 1e-5])
@@ -188,7 +188,7 @@ def test_thresholds_rise_on_small_photographs_if_asked(adapts: bool, clones: boo
 
 
 @pytest.mark.parametrize(("step", "left"), [(3000, 2), (3100, 1)])
-def test_what_is_too_large_goes_once_opacities_have_been_reset(step: int, left: int) -> None:
+def test_oversized_gaussians_are_pruned_after_the_opacity_reset(step: int, left: int) -> None:
     state = TrainState(Scene(make_gaussians([0.01, 0.5]), 2.0), seed=0)
     state.statistics["primary"] = seen([0.0, 0.0])
     Densify(DefaultDensify.published()).apply(state, tiny_capture(), Clock(step, 30_000, 6))
@@ -211,7 +211,7 @@ def test_noise_and_regularisers_of_mcmc_can_reach_everything() -> None:
         assert torch.equal(gradient != 0, expected)
 
 
-def test_the_published_perturbations_and_resets_meet_in_no_stage() -> None:
+def test_published_perturbations_and_resets_share_no_stage() -> None:
     stages = PlanarRecipe.paper().stages(0)
     assert moments(stages, ResetOpacity, 30_000) == [[3000], [6000], [9000, 12_000]]
     perturbed = moments(stages, PerturbOpacity, 30_000)
@@ -251,7 +251,7 @@ def test_perturbed_opacities_stay_within_their_bounds() -> None:
     assert bool(((opacities < 0.001) | (opacities > 0.999)).any()) and bool(opacities.isfinite().all())
 
 
-def test_only_the_nearest_pane_reflects_if_asked() -> None:
+def test_only_the_nearest_pane_reflects_on_request() -> None:
     scene = vitrine(1, 2)
     nearest, every = (Planar(nearest_only=asked)(scene, CAMERA) for asked in (True, False))
     assert torch.equal(nearest.layers["transmission"], nearest.layers["without_panes"])
@@ -309,7 +309,7 @@ def test_positions_can_stop_to_slow_down_before_the_end() -> None:
     assert rate.at(0.5, 1.0) == rate.at(0.9, 1.0) == pytest.approx(1e-4)
 
 
-def test_a_region_is_looked_for_only_if_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_region_is_searched_only_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("glassplat.methods.surroundings.reflective_region", lambda cameras: (0.0, 0.0, 0.0, 1.0))
 
     def region(**options: Any) -> Any:
@@ -324,7 +324,7 @@ def test_a_region_is_looked_for_only_if_asked(monkeypatch: pytest.MonkeyPatch) -
     assert region(find_region=False, region=(1.0, 2.0, 3.0, 4.0)) == (1.0, 2.0, 3.0, 4.0)
 
 
-def test_a_matte_scene_keeps_the_published_rates_if_asked() -> None:
+def test_a_matte_scene_keeps_the_published_rates_on_request() -> None:
     def factors(asked: bool) -> Any:
         (action,) = [
             a for a in DeferredRecipe(raise_rates_matte=asked).stages(0)[1].actions if isinstance(a, Propagate)

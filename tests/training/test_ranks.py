@@ -167,7 +167,7 @@ def test_no_action_is_missed_where_steps_go_over_its_moment(count: int) -> None:
     assert alone["searching for unnecessary Gaussians"] == 3 and alone["grow SH"] == 1
 
 
-def test_a_test_gives_up_before_a_rank_does() -> None:
+def test_a_test_times_out_before_a_rank() -> None:
     assert timedelta(seconds=LONGEST) < COLLECTIVE_TIMEOUT
 
 
@@ -239,7 +239,7 @@ def test_one_process_of_torchrun_learns_the_same_bits_as_without(capture: Path, 
     assert files[0].read_bytes() == files[1].read_bytes()
 
 
-def test_a_run_that_is_asked_to_end_goes_on_with_another_number_of_ranks(capture: Path, tmp_path: Path) -> None:
+def test_an_interrupted_run_resumes_with_another_number_of_ranks(capture: Path, tmp_path: Path) -> None:
     arguments = train_arguments(capture, tmp_path / "run", "--checkpoint-every", "0.01", iterations=100_000)
     checkpoint = tmp_path / "run" / "checkpoint.safetensors"
     with running(2, *arguments) as process:
@@ -295,12 +295,12 @@ def last_word_before_a_silent_rank(capture: Path, output: Path, *, asked: bool, 
     return ours[0]
 
 
-def test_a_rank_that_is_asked_to_end_does_not_wait_long_for_a_silent_one(capture: Path, tmp_path: Path) -> None:
+def test_a_terminated_rank_waits_briefly_for_the_others(capture: Path, tmp_path: Path) -> None:
     said = last_word_before_a_silent_rank(capture, tmp_path / "run", asked=True, TERMINATION_TIMEOUT=3.0)
     assert "asked to stop" in said
 
 
-def test_a_rank_that_falls_silent_is_given_up_and_what_was_trained_is_saved(capture: Path, tmp_path: Path) -> None:
+def test_training_is_saved_when_a_rank_stops_responding(capture: Path, tmp_path: Path) -> None:
     said = last_word_before_a_silent_rank(
         capture, tmp_path / "run", asked=False, COLLECTIVE_TIMEOUT=timedelta(seconds=15)
     )
@@ -328,7 +328,7 @@ def test_ranks_that_disagree_end_with_one_message_of_rank_0(
     assert not (tmp_path / "run").exists()
 
 
-def test_what_stands_in_the_way_of_rank_0_ends_all(capture: Path, tmp_path: Path) -> None:
+def test_an_output_error_of_rank_0_ends_all_ranks(capture: Path, tmp_path: Path) -> None:
     (tmp_path / "run").write_text("in the way")
     done = started_apart(train_arguments(capture, tmp_path / "run"), tmp_path, [])
     assert [process.returncode for process in done] == [2, 2]

@@ -63,7 +63,7 @@ def test_gradient_conflict_counts_shared_edges_on_panes_only(term: LossFunction,
 
 
 @BOTH
-def test_where_a_reflection_ends_is_no_edge_of_it(term: LossFunction) -> None:
+def test_the_border_of_a_pane_is_no_edge_of_the_reflection(term: LossFunction) -> None:
     """At the rectangle's rim, without glass, and at the border to the next pane, with a frame behind each."""
     right = STEP[..., 0] > 0
     rim = torch.where(right, ALL, -1)
@@ -85,17 +85,17 @@ def left_in(own: float, held: float, gain: float = 1.0) -> float:
     return float(gradient.norm())
 
 
-def test_what_is_left_of_a_reflection_is_charged_and_an_edge_of_both_is_not() -> None:
+def test_remaining_reflection_edges_are_penalised_and_shared_edges_are_not() -> None:
     """A full-strength edge of the transmission is its own, even if the reflection contains it as well."""
     assert left_in(0.0, 5.0) < 0.2 * left_in(0.0, 0.5)
 
 
-def test_a_reflection_brighter_than_white_pulls_no_harder() -> None:
+def test_an_overexposed_reflection_has_a_bounded_gradient() -> None:
     """Otherwise it would grow without limit: light that it takes from the transmission has to be replaced."""
     assert left_in(1.0, 1.0, gain=20.0) <= left_in(1.0, 1.0, gain=1.0)
 
 
-def test_edges_beside_a_rim_still_count() -> None:
+def test_edges_next_to_a_rim_still_count() -> None:
     narrow = torch.where(torch.arange(9) >= 2, ALL, -1)
     assert conflict(STEP, STEP, narrow, EVEN) == conflict(STEP, STEP, ALL, EVEN)
 
@@ -149,7 +149,7 @@ def test_mask_loss_applies_to_annotated_views_only() -> None:
     torch.testing.assert_close(annotated, torch.tensor(0.5 * 0.75 + 0.5 * 0.25))
 
 
-def test_whoever_stands_before_a_pane_leaves_no_hole_in_it() -> None:
+def test_people_in_front_of_a_pane_leave_no_hole_in_it() -> None:
     mask = torch.full((8, 9), 0.25, requires_grad=True)
     labels = torch.ones(8, 9, dtype=torch.uint8)
     ignored = torch.zeros(8, 9, dtype=torch.bool)

@@ -31,12 +31,12 @@ def scene_of(region: tuple[float, float, float, float] | None) -> Scene:
     return Scene(primary, 1.0, environment=environment)
 
 
-def test_the_price_of_reflecting_is_the_mean_strength() -> None:
+def test_the_strength_regulariser_is_the_mean_strength() -> None:
     assert mean_strength(UNUSED, UNUSED, scene_of(None)).item() == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(("radius", "expected"), [(2.0, 0.9), (0.5, 0.7), (9.0, 0.0)])
-def test_outside_of_the_region_is_what_lies_beyond_its_radius(radius: float, expected: float) -> None:
+def test_positions_beyond_the_radius_are_outside_the_region(radius: float, expected: float) -> None:
     found = strength_outside(UNUSED, UNUSED, scene_of((0.0, 0.0, 0.0, radius)))
     assert found is not None and found.item() == pytest.approx(expected)
 

@@ -43,7 +43,7 @@ def test_two_moments_interleave() -> None:
     assert perturbed == [10, 20, 40, 50, 70, 80, 100] and reset == [30, 60, 90]
 
 
-def test_a_rate_decays_exponentially_and_scales_with_the_extent() -> None:
+def test_a_learning_rate_decays_exponentially_and_scales_with_the_extent() -> None:
     rate = Rate(1e-2, 1e-4, per_extent=True)
     assert rate.at(0.0, 5.0) == pytest.approx(5e-2)
     assert rate.at(0.5, 5.0) == pytest.approx(5e-3)
@@ -51,7 +51,7 @@ def test_a_rate_decays_exponentially_and_scales_with_the_extent() -> None:
     assert Rate(1e-3).at(0.7, 5.0) == 1e-3
 
 
-def test_short_runs_raise_the_rates_that_say_so() -> None:
+def test_short_runs_raise_only_the_marked_rates() -> None:
     rate = Rate(1e-2, 1e-4, short_run_power=0.5)
     for progress in (0.0, 0.4, 1.0):
         assert rate.at(progress, 1.0, 7500) == pytest.approx(2 * rate.at(progress, 1.0, 30_000))
@@ -60,7 +60,7 @@ def test_short_runs_raise_the_rates_that_say_so() -> None:
 
 
 @pytest.mark.parametrize("recipe", [SplatRecipe(), PlanarRecipe(), DeferredRecipe()], ids=lambda recipe: recipe.method)
-def test_a_run_has_room_for_every_stage_from_the_length_that_is_asked_for(recipe: Any) -> None:
+def test_the_minimum_length_of_a_run_fits_every_stage(recipe: Any) -> None:
     stages = recipe.stages(seed=0)
     for iterations in range(1, 40):
         if not stages_without_step(stages, iterations):
@@ -83,7 +83,7 @@ def test_a_stage_without_a_share_is_missed_only_for_what_it_begins_with() -> Non
         check_length(stages(print), 2)
 
 
-def test_a_stage_with_hardly_any_share_is_not_looked_for_for_ever() -> None:
+def test_the_minimum_length_for_a_tiny_stage_is_found_quickly() -> None:
     stages: Any = tuple(SimpleNamespace(name=f"{share}", share=share, setup=None) for share in (0.5, 1e-12, 0.5))
     with pytest.raises(InputError, match="are too few for the stage '1e-12'; expected at least") as caught:
         check_length(stages, 1000)
@@ -97,7 +97,7 @@ def slow_edit(found: bool) -> Work:
 
 
 @pytest.mark.parametrize("found", [True, False])
-def test_an_edit_tells_how_far_it_is_or_is_done_at_once(found: bool) -> None:
+def test_an_edit_reports_progress_or_returns_at_once(found: bool) -> None:
     assert followed(slow_edit(found)) == ([Working("editing", 0, 2), Working("editing", 1, 2)], found)
     assert followed(found) == ([], found)
     assert followed(None) == ([], False)

@@ -113,7 +113,7 @@ def test_the_strategy_decides_what_happens_to_the_primary_gaussians(recipe: Any)
 
 
 @pytest.mark.parametrize("iterations", [251, 1234, 7_000])
-def test_planar_resets_opacities_once_reflections_are_turned_round(iterations: int) -> None:
+def test_planar_resets_opacities_after_turning_reflections(iterations: int) -> None:
     joint = PlanarRecipe(strategy="mcmc").stages(seed=0)[-1]
     clocks = [Clock(step, iterations, views=10) for step in range(1, iterations + 1)]
     turned, cleared = (
@@ -162,7 +162,7 @@ def test_the_noise_moves_what_the_view_shows(visible: list[bool] | None) -> None
     assert moved == (visible or [True] * 4)
 
 
-def test_a_step_hands_on_what_its_view_shows() -> None:
+def test_a_step_passes_on_the_visible_gaussians() -> None:
     (stage,) = RECIPES[0].stages(seed=0)
     scene, view = fresh_state(RECIPES[0]).scene, tiny_capture().train[0]
     visible = differentiate(stage, scene, view, with_absgrad=False).visible
@@ -222,11 +222,11 @@ def test_weights_and_noise_of_zero_are_left_out() -> None:
 
 
 @BOTH
-def test_a_recipe_survives_its_file(recipe: Any) -> None:
+def test_a_recipe_round_trips_through_its_file(recipe: Any) -> None:
     assert recipe_from_json(recipe_to_json(recipe)) == recipe
 
 
-def test_screen_gradients_are_collected_for_who_densifies_by_them() -> None:
+def test_screen_gradients_are_collected_only_for_densification_by_them() -> None:
     sampled, default = (SplatRecipe(strategy=strategy).stages(seed=0)[0] for strategy in ("mcmc", "default"))
     assert sampled.densify_until == 0
     assert default.densify_until == SplatRecipe().densify.stop

@@ -95,7 +95,7 @@ def test_a_short_run_learns(recipe: TracedRecipe) -> None:
     }
 
 
-def test_near_and_distant_things_are_mirrored_from_one_moment_on() -> None:
+def test_near_and_distant_reflections_start_at_the_same_step() -> None:
     messages = run(RECIPE, fresh_state())
     entered = {m.stage: m.counts.get("surroundings", 0) for m in messages if isinstance(m, StageEntered)}
     assert list(entered) == ["1 bootstrap", "2 reflection", "3 refinement"]
@@ -104,7 +104,7 @@ def test_near_and_distant_things_are_mirrored_from_one_moment_on() -> None:
     assert sum(stage.share for stage in RECIPE.stages(0)) == pytest.approx(1)
 
 
-def test_with_surroundings_alone_there_is_no_environment_to_refine() -> None:
+def test_surroundings_alone_need_no_refinement_of_an_environment() -> None:
     actions = [action for stage in PAPER.stages(0) for action in stage.actions]
     assert not any(isinstance(action, RefineEnvironment) for action in actions)
     (propagate,) = [action for action in PAPER.stages(0)[1].actions if isinstance(action, Propagate)]
@@ -146,7 +146,7 @@ def test_a_resumed_run_ends_in_the_same_scene(tmp_path: Path) -> None:
         assert torch.equal(second.scene.parameters()[name], tensor), name
 
 
-def test_a_short_run_is_one_of_splat() -> None:
+def test_a_short_run_trains_as_splat() -> None:
     recipe = replace(RECIPE, least_iterations=41)
     state = fresh_state(recipe)
     messages = list(train(recipe.stages(0, 40), tiny_capture(), state, 40))
@@ -155,7 +155,7 @@ def test_a_short_run_is_one_of_splat() -> None:
     recipe.renderer().check(state.scene)
 
 
-def test_recipes_survive_as_json() -> None:
+def test_recipes_round_trip_as_json() -> None:
     for recipe in (RECIPE, TracedRecipe.paper()):
         assert recipe_from_json(recipe_to_json(recipe)) == recipe
 
@@ -169,7 +169,7 @@ def test_surroundings_are_copied_spread_or_both() -> None:
 
 
 @pytest.mark.parametrize("source", ["box", "both"])
-def test_mirrors_are_looked_for_only_where_something_depends_on_them(source: Literal["box", "both"]) -> None:
+def test_mirrors_are_searched_only_if_needed(source: Literal["box", "both"]) -> None:
     start = replace(RECIPE.surroundings.start, source=source)
     recipe = replace(RECIPE, surroundings=replace(RECIPE.surroundings, start=start))
     state, setup = fresh_state(), recipe.stages(seed=0)[1].setup
@@ -178,7 +178,7 @@ def test_mirrors_are_looked_for_only_where_something_depends_on_them(source: Lit
     assert len(state.scene.surroundings)
 
 
-def test_copies_keep_their_harmonics_beside_the_box() -> None:
+def test_copies_keep_their_harmonics_outside_the_box() -> None:
     state = fresh_state()
     primary = replace(state.scene.primary, active_sh_degree=1)
     state.scene = replace(state.scene, primary=primary)
@@ -187,7 +187,7 @@ def test_copies_keep_their_harmonics_beside_the_box() -> None:
     assert len(state.scene.surroundings) == 40 + len(primary) and state.scene.surroundings.active_sh_degree == 1
 
 
-def test_where_everything_reflects_there_is_nothing_to_copy() -> None:
+def test_a_fully_reflective_scene_has_no_surroundings_to_copy() -> None:
     state = fresh_state()
     nothing = torch.zeros(len(state.scene.primary), dtype=torch.bool)
     AddSurroundings(SurroundingsStart("scene", cells=2), 1)(state, tiny_capture(), nothing)
@@ -203,7 +203,7 @@ def test_gradients_in_space_count_by_half_the_distance() -> None:
     assert statistics.view_count.tolist() == [[2.0, 0.0, 2.0]] * 2
 
 
-def test_a_step_gathers_gradients_of_what_rays_met() -> None:
+def test_a_step_accumulates_gradients_of_hit_gaussians() -> None:
     state = surrounded_state()
     strong = {"logit_strength": torch.full((len(state.scene.primary),), 1.0)}
     state.scene = replace(state.scene, primary=replace(state.scene.primary, channels=strong))
@@ -216,7 +216,7 @@ def test_a_step_gathers_gradients_of_what_rays_met() -> None:
     assert not differentiate(stage, state.scene, tiny_capture().train[0], with_absgrad=False).space
 
 
-def test_what_reflections_never_show_is_pruned() -> None:
+def test_surroundings_never_reflected_are_pruned() -> None:
     state = surrounded_state()
     strong = {"logit_strength": torch.full((len(state.scene.primary),), 1.0)}
     state.scene = replace(state.scene, primary=replace(state.scene.primary, channels=strong))
@@ -318,7 +318,7 @@ def test_what_hardly_reflects_learns_to_without_an_environment() -> None:
     assert recipe.renderer().least_strength == 0.02
 
 
-def test_what_is_too_faint_to_be_drawn_learns_to_reflect_an_environment() -> None:
+def test_faint_surfaces_learn_to_reflect_an_environment() -> None:
     state = surrounded_state()
     faint = {"logit_strength": torch.full((len(state.scene.primary),), -7.0)}
     primary = replace(state.scene.primary, channels=faint)
@@ -335,7 +335,7 @@ def learns_to_reflect(stage: Stage, scene: Scene) -> bool:
     return "primary.logit_strength" in found.gradients and bool(found.gradients["primary.logit_strength"].any())
 
 
-def test_actions_leave_surroundings_alone_that_are_gone() -> None:
+def test_actions_ignore_removed_surroundings() -> None:
     state = surrounded_state()
     state.scene = replace(state.scene, surroundings=Gaussians.empty())
     part, clock = "surroundings", Clock(32, 40, 6)

@@ -55,7 +55,7 @@ def test_training_lowers_the_loss() -> None:
     assert sum(s.loss for s in steps[-6:]) < 0.6 * sum(s.loss for s in steps[:6])
 
 
-def test_a_step_does_without_sympy(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_does_not_import_sympy(monkeypatch: pytest.MonkeyPatch) -> None:
     """It takes half a second to import, and PyTorch imports it to check given gradients."""
     monkeypatch.setitem(sys.modules, "torch.fx.experimental.symbolic_shapes", None)
     with pytest.raises(ModuleNotFoundError):
@@ -164,7 +164,7 @@ def test_resuming_continues_to_the_same_result(pause: int, tmp_path: Path) -> No
 
 @pytest.mark.parametrize("is_saved", [False, True])
 @pytest.mark.parametrize("begins", [0, 4])
-def test_a_setup_is_carried_out_once_whoever_leaves_after_it(begins: int, is_saved: bool, tmp_path: Path) -> None:
+def test_a_setup_runs_once(begins: int, is_saved: bool, tmp_path: Path) -> None:
     def grow(state: TrainState, dataset: object) -> None:
         state.scene.primary.log_scales.add_(0.1)
 
@@ -183,7 +183,7 @@ def test_a_setup_is_carried_out_once_whoever_leaves_after_it(begins: int, is_sav
 
 
 @pytest.mark.parametrize("pause", [3, 5])
-def test_a_stage_that_is_over_early_leaves_its_steps_to_the_next(pause: int, tmp_path: Path) -> None:
+def test_a_stage_that_ends_early_leaves_its_steps_to_the_next(pause: int, tmp_path: Path) -> None:
     def grow(state: TrainState, dataset: object) -> None:
         state.scene.primary.log_scales.add_(0.1)
 

@@ -30,7 +30,7 @@ def wall_scene() -> Scene:
     return Scene(gaussians, 1.0)
 
 
-def test_a_request_takes_out_what_is_not_kept() -> None:
+def test_a_request_renders_without_removed_gaussians() -> None:
     scene = model().scene
     kept = torch.arange(len(scene.primary)) % 2 == 0
     request = ViewRequest(POSE, 1.0, 1.0, kept=kept)
@@ -40,7 +40,7 @@ def test_a_request_takes_out_what_is_not_kept() -> None:
     )
 
 
-def test_a_point_lies_where_the_wall_is_and_nowhere_beside_it() -> None:
+def test_points_lie_on_the_wall() -> None:
     splat = viewer_state(replace(model(), scene=wall_scene()), {}).renderer
     request = ViewRequest(POSE, 1.0, 1.0)
     for aside in (0.0, 0.2, -0.25):
@@ -86,7 +86,7 @@ async def click(client: ViewerClient, aside: float) -> None:
     )
 
 
-def test_a_click_is_seen_from_where_the_camera_was() -> None:
+def test_a_click_uses_the_camera_at_the_time_of_the_click() -> None:
     viewer = Viewer(viewer_state(replace(model(), scene=wall_scene()), {}), "127.0.0.1", free_port())
 
     async def work() -> None:
@@ -109,7 +109,7 @@ def test_a_click_is_seen_from_where_the_camera_was() -> None:
         viewer.stop()
 
 
-def test_two_clicks_are_measured_and_floaters_go_and_come_back() -> None:
+def test_two_clicks_measure_a_distance_and_floaters_are_toggled() -> None:
     viewer = Viewer(viewer_state(replace(model(), scene=wall_scene()), {}), "127.0.0.1", free_port())
     viewer.start()
 

@@ -32,7 +32,7 @@ EDITS = {
 
 
 @pytest.mark.parametrize(("asked", "scene"), EDITS.values(), ids=EDITS)
-def test_a_request_is_the_render_of_the_edited_scene(asked: ViewRequest, scene: object) -> None:
+def test_a_request_renders_the_edited_scene(asked: ViewRequest, scene: object) -> None:
     picture = draw_image(true_scene(), Planar(), asked, 40)
     with torch.no_grad():
         truth = Planar()(scene, asked.camera(40)).rgb
@@ -45,7 +45,7 @@ def test_every_layer_is_a_picture(layer: str) -> None:
     assert draw_image(true_scene(), Planar(), replace(REQUEST, layer=layer), 24).shape == (24, 34, 3)
 
 
-def test_what_is_not_wished_for_keeps_every_bit() -> None:
+def test_edits_that_are_not_requested_change_no_bit() -> None:
     for name, tensor in edit_scene(true_scene(), REQUEST).parameters().items():
         assert torch.equal(tensor, true_scene().parameters()[name]), name
 
@@ -63,7 +63,7 @@ def test_a_layer_that_is_drawn_on_request_is_drawn() -> None:
     assert np.abs(surroundings / 255 - truth.clamp(0, 1).numpy()).max() < 0.003
 
 
-def test_the_error_is_none_where_the_photograph_is_the_render_and_follows_edits() -> None:
+def test_the_error_layer_is_black_for_an_exact_render_and_follows_edits() -> None:
     view = tiny_capture().train[1]
     wide = replace(REQUEST, aspect=3.0)
     same = draw_error_map(true_scene(), Planar(), wide, 4000, view.camera, view.photo, name=view.name)
@@ -104,7 +104,7 @@ def test_gain_brightens_what_is_mirrored() -> None:
     torch.testing.assert_close(brighter.exp(), 2 * true_scene().primary.channels["log_intensity"].exp())
 
 
-def test_the_browser_s_camera_is_ours() -> None:
+def test_the_camera_of_the_browser_converts_exactly() -> None:
     rotation, center = POSE[:3, :3].double().numpy(), tiny_capture().train[1].camera.center.double().numpy()
     x, y, z, w = Rotation.from_matrix(rotation.T).as_quat()
     torch.testing.assert_close(cam_from_world(np.array([w, x, y, z]), center), POSE, atol=1e-6, rtol=0)

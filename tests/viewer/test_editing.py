@@ -91,7 +91,7 @@ def unfold(browser: Browser, title: str, content: str) -> None:
 
 
 @needs_browser
-def test_a_person_moves_a_pane_sets_keyframes_and_saves_both(tmp_path: Path) -> None:
+def test_panes_and_keyframes_are_edited_and_saved_in_the_browser(tmp_path: Path) -> None:
     with watched(tmp_path) as (viewer, client, browser):
         step = pane_is_dragged(client, browser)
         unfold(browser, "Edited scene", "Save as a run")

@@ -62,7 +62,7 @@ def with_client(viewer: Viewer, work: Callable[[ViewerClient], Awaitable[None]])
     ],
     ids=str,
 )
-def test_a_stranger_is_not_let_in(stranger: dict[str, Any], viewer: Viewer) -> None:
+def test_a_request_without_the_key_is_refused(stranger: dict[str, Any], viewer: Viewer) -> None:
     async def tried() -> int:
         try:
             async with ViewerClient(viewer.address, **stranger):
@@ -119,7 +119,7 @@ def test_every_file_of_the_page_is_served(viewer: Viewer) -> None:
         assert not file.is_file() or page(viewer.address, path, Cookie=cookie)[0] == 200, path
 
 
-def test_others_may_look_by_any_name_where_the_host_says_so() -> None:
+def test_any_host_name_is_accepted_if_the_server_is_public() -> None:
     viewer = Viewer(STATE, "0.0.0.0", free_port())
     viewer.start()
     try:
@@ -149,7 +149,7 @@ BAD_CAMERAS = [
 
 
 @pytest.mark.parametrize("change", BAD_CAMERAS, ids=str)
-def test_a_camera_out_of_bounds_is_not_heard(change: dict[str, Any]) -> None:
+def test_a_camera_out_of_bounds_is_ignored(change: dict[str, Any]) -> None:
     assert parse_message(msgspec.msgpack.encode(CAMERA)) is not None
     assert parse_message(msgspec.msgpack.encode(CAMERA | change)) is None
 
@@ -165,17 +165,17 @@ def test_a_camera_out_of_bounds_is_not_heard(change: dict[str, Any]) -> None:
         msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "a", "updates": {}}),
     ],
 )  # fmt: skip
-def test_what_is_no_message_of_a_page_is_not_heard(message: str | bytes) -> None:
+def test_unknown_messages_are_ignored(message: str | bytes) -> None:
     assert parse_message(message) is None
 
 
-def test_every_message_that_is_heard_is_one_of_viser_s_with_these_fields() -> None:
+def test_every_accepted_message_exists_in_viser_with_these_fields() -> None:
     kinds = viser._messages.Message._subclass_from_type_string()
     for name, fields in MESSAGES.items():
         assert set(fields) <= set(kinds[name].__dataclass_fields__), name
 
 
-def test_a_client_that_sends_nonsense_harms_nobody(
+def test_invalid_messages_of_a_client_do_not_affect_others(
     viewer: Viewer, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     async def work(client: ViewerClient) -> None:
@@ -231,7 +231,7 @@ def test_a_window_of_any_shape_gets_a_picture_of_bounded_size(viewer: Viewer) ->
         viewer.loop._show = show
 
 
-def test_a_photograph_that_is_gone_ends_nobody_s_drawing(capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_photograph_does_not_stop_the_viewer(capfd: pytest.CaptureFixture[str]) -> None:
     """It is renamed, or its disk unplugged, while a client is connected."""
     gone = False
 
@@ -265,7 +265,7 @@ def test_a_photograph_that_is_gone_ends_nobody_s_drawing(capfd: pytest.CaptureFi
     assert "Traceback" not in "".join(capfd.readouterr())
 
 
-def test_a_viser_that_cannot_be_guarded_is_not_served(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unsupported_version_of_viser_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """A later version might create its server with another function."""
     stopped: list[bool] = []
 

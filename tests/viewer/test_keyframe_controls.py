@@ -74,7 +74,7 @@ def test_quick_clicks_at_once_leave_keyframes_that_fit_together() -> None:
     assert moves and len(went) == moves
 
 
-def test_there_is_a_most() -> None:
+def test_the_number_of_keyframes_is_limited() -> None:
     page = Page()
     controls = KeyframeControls(page, 1.0, lambda: CAMERAS[0])
     controls.lay_out(lambda camera: None, None)
@@ -83,7 +83,7 @@ def test_there_is_a_most() -> None:
     assert len(controls.keyframes) == MOST_KEYFRAMES
 
 
-def test_nothing_moves_the_camera_once_playing_was_stopped_even_in_the_middle_of_a_move() -> None:
+def test_stopping_playback_stops_the_camera_at_once() -> None:
     page, began, moved = Page(), threading.Event(), list[Camera]()
 
     def go(camera: Camera) -> None:

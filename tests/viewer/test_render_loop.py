@@ -80,7 +80,7 @@ def test_a_port_of_any_address_of_this_machine_is_checked(host: str) -> None:
             check_port(host, taken.getsockname()[1])
 
 
-def test_a_coarse_picture_comes_first_and_a_sharp_one_follows() -> None:
+def test_a_coarse_image_is_followed_by_a_sharp_one() -> None:
     recorder = Recorder(held=True)
     slow(recorder)
     recorder.loop.submit(1, 7, SIZE)
@@ -92,7 +92,7 @@ def test_a_coarse_picture_comes_first_and_a_sharp_one_follows() -> None:
     assert sharp == SIZE[1] and coarse < sharp and coarse * SIZE[0] / SIZE[1] >= LEAST_WIDTH - 1
 
 
-def test_what_is_drawn_quickly_is_sharp_at_once() -> None:
+def test_fast_images_are_drawn_sharp_at_once() -> None:
     recorder = Recorder()
     recorder.loop.submit(1, 7, (640, 360))
     wait_until(lambda: bool(recorder.shown))
@@ -100,7 +100,7 @@ def test_what_is_drawn_quickly_is_sharp_at_once() -> None:
     assert recorder.shown == [(1, 7, True)]
 
 
-def test_pictures_of_the_past_are_not_shown() -> None:
+def test_outdated_images_are_not_shown() -> None:
     recorder = Recorder(held=True)
     recorder.loop.submit(1, 1, SIZE)
     wait_until(lambda: len(recorder.drawn) == 1)
@@ -124,7 +124,7 @@ def test_clients_take_turns_and_one_picture_is_drawn_at_a_time() -> None:
     assert recorder.most_at_once == 1
 
 
-def test_who_has_gone_is_forgotten_and_errors_end_nothing() -> None:
+def test_disconnected_clients_are_removed_and_errors_stop_nothing() -> None:
     recorder = Recorder(held=True)
     recorder.loop.submit(1, 1, SIZE)
     wait_until(lambda: len(recorder.drawn) == 1)
@@ -137,7 +137,7 @@ def test_who_has_gone_is_forgotten_and_errors_end_nothing() -> None:
     assert {client for client, *_ in recorder.shown} == {3}
 
 
-def test_what_is_called_for_is_done_by_the_thread_that_draws() -> None:
+def test_requests_run_in_the_drawing_thread() -> None:
     recorder = Recorder(held=True)
     threads: list[str] = []
     recorder.loop.submit(1, 1, SIZE)
@@ -177,7 +177,7 @@ def test_drawing_takes_its_share_of_the_time_and_no_more() -> None:
     assert 0.5 * MOST_SHARE < clock.drawing / clock.now <= MOST_SHARE
 
 
-def test_what_is_called_for_waits_for_no_saved_time() -> None:
+def test_requests_are_not_delayed_by_the_frame_budget() -> None:
     clock = Clock()
     done: list[bool] = []
     clock.loop.schedule(lambda: done.append(True))
@@ -185,7 +185,7 @@ def test_what_is_called_for_waits_for_no_saved_time() -> None:
     assert done and clock.loop.expected_seconds() is None
 
 
-def test_a_picture_that_takes_longer_than_can_be_saved_is_drawn_all_the_same() -> None:
+def test_a_slow_image_is_drawn_beyond_the_time_budget() -> None:
     clock = Clock()
     clock.loop._seconds_per_pixel = 1e-3
     clock.loop.submit(1, 1, SIZE)

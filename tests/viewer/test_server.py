@@ -62,7 +62,7 @@ def test_handles_are_drawn_in_any_unit(extent: float) -> None:
 
 
 @needs_browser
-def test_a_browser_is_shown_sharp_pictures_and_may_leave() -> None:
+def test_a_browser_shows_sharp_images_and_may_disconnect() -> None:
     viewer = Viewer(STATE, "127.0.0.1", free_port())
     viewer.start()
     shown: list[bool] = []
@@ -96,7 +96,7 @@ def test_a_port_in_use_gets_a_message(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 @needs_browser
-def test_who_waits_for_the_first_picture_is_told_so() -> None:
+def test_a_message_is_shown_until_the_first_image() -> None:
     viewer = Viewer(STATE, "127.0.0.1", free_port())  # No thread draws before it starts.
     try:
         with Browser(viewer.address, 400, 300) as browser:

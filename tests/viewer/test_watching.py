@@ -86,7 +86,7 @@ def stands_still(training: Training) -> bool:
 
 
 @needs_browser
-def test_a_training_is_drawn_paused_and_saved_while_it_goes_on(tmp_path: Path) -> None:
+def test_a_running_training_is_drawn_paused_and_saved(tmp_path: Path) -> None:
     with watch(tmp_path / "run") as found:
         eventually(lambda: bool(found.viewers) and found.training.step > 20)
         (viewer,) = found.viewers
@@ -160,7 +160,7 @@ def port_in_use() -> Iterator[int]:
         yield taken.getsockname()[1]
 
 
-def test_a_training_that_nobody_watches_says_where_to_look(
+def test_a_training_without_clients_prints_the_address_of_its_viewer(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     serve, hosts = gate.guarded_server, list[str]()
@@ -180,7 +180,7 @@ def test_a_training_that_nobody_watches_says_where_to_look(
 
 
 @pytest.mark.parametrize("rank", [0, 1])
-def test_of_several_ranks_the_first_one_is_watched(rank: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_viewer_shows_the_first_rank(rank: int, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in (("TORCHELASTIC_RUN_ID", "test"), ("WORLD_SIZE", "2"), ("RANK", str(rank))):
         monkeypatch.setenv(name, value)
     begun: list[bool] = []

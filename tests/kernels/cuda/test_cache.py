@@ -106,7 +106,7 @@ def test_a_kernel_is_announced_then_cached_for_other_processes(
     assert printed_by(script, NUMBA_CACHE_DIR=str(tmp_path), PYTHONPATH=root) == first
 
 
-def test_the_key_tells_apart_whatever_changes_the_machine_code(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cache_key_depends_on_everything_that_changes_the_machine_code(monkeypatch: pytest.MonkeyPatch) -> None:
     plain = images().key(CAPABILITY)
     assert images().key(CAPABILITY) == plain
     others = [
@@ -171,7 +171,7 @@ def test_another_kernel_that_was_written_at_the_same_time_is_not_loaded(
     assert compiled == 1 and made(images(2.0), caplog) == (code, 0)
 
 
-def test_where_the_package_cannot_be_written_machine_code_lies_elsewhere(
+def test_machine_code_is_stored_elsewhere_if_the_package_is_read_only(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     (folder / "file").touch()  # No user, not even root, can create a folder in it.
@@ -234,7 +234,7 @@ def test_the_loader_gets_what_the_disk_has(monkeypatch: pytest.MonkeyPatch, capl
     assert caplog.messages == []
 
 
-def test_the_key_tells_apart_which_instruction_a_kernel_asks_for() -> None:
+def test_the_cache_key_depends_on_requested_instructions() -> None:
     def key(maths: Callable[[type], Any]) -> str:
         instruction = maths(np.float32)
 

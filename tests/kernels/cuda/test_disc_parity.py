@@ -69,7 +69,7 @@ def test_composite_discs(count: int, cameras: int, channels: int, low_pass: floa
     check_blending(case_of(raw, cameras_of(cameras, SIZE, dtype), channels=channels, low_pass=low_pass))
 
 
-def test_an_opaque_pile_of_discs_spans_buckets() -> None:
+def test_many_opaque_discs_span_buckets() -> None:
     case = case_of(scattered(many(80, 900), size=-0.3, opacity=1.0), cameras_of(1, (17, 3)))
     assert int(case.bins.tile_offsets.diff().max()) > 32
     check_blending(case)

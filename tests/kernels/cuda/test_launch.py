@@ -191,7 +191,7 @@ def test_a_thread_without_the_gpus_context_borrows_it(gpu: Driver) -> None:
     assert gpu.contexts == [OTHER]
 
 
-def test_what_the_driver_refuses_is_named(gpu: Driver) -> None:
+def test_errors_of_the_driver_are_named(gpu: Driver) -> None:
     gpu.refusal = 701
     with pytest.raises(RuntimeError, match=r"nothing_float32 failed on the GPU: CUDA_ERROR_LAUNCH_OUT_OF_RESOURCES"):
         declared()(5, 64, torch.zeros(3, 2), 1, True)
@@ -215,7 +215,7 @@ def test_shapes_of_one_launch_are_not_those_of_the_next(gpu: Driver) -> None:
     [torch.zeros(2, 3, dtype=torch.float64), torch.zeros(3), torch.zeros(3, 2).T],
     ids=["type", "rank", "order"],
 )
-def test_what_a_kernel_does_not_take_is_refused(gpu: Driver, tensor: torch.Tensor) -> None:
+def test_unsupported_kernel_arguments_are_refused(gpu: Driver, tensor: torch.Tensor) -> None:
     with pytest.raises(TypeError, match="expected contiguous array"):
         declared()(1, 32, tensor, 1, True)
     assert gpu.launches == []

@@ -98,7 +98,7 @@ def test_images_of_any_shape(width: int, height: int) -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_hardly_any_gaussians(count: int) -> None:
+def test_few_gaussians(count: int) -> None:
     tensors = gaussians(count, size=0.3)
     found = rendered(tensors, 50, 30, device=DEVICE, dtype=torch.float32)
     expected = rendered(tensors, 50, 30, device=CPU, dtype=torch.float64)
@@ -129,7 +129,7 @@ def check_bins(bins: TileBins) -> None:
     assert torch.equal(bins.pair_splats[bins.pair_slots.long()].long(), owners)
 
 
-def test_rays_of_a_gpu_meet_what_they_meet_on_the_cpu() -> None:
+def test_rays_hit_the_same_on_gpu_and_cpu() -> None:
     part = Gaussians(*(tensor.float() for tensor in gaussians(2000, size=0.05)), active_sh_degree=3)
     origins, directions = torch.zeros(100, 3), torch.tensor([0.0, 0.0, 1.0]) + 0.3 * draw(100, 3, seed=9).float()
     on_cpu = traced_surroundings(part, origins, directions, 0.0)

@@ -66,7 +66,7 @@ def test_pane_hits(masked: bool, dtype: torch.dtype) -> None:
 
 @pytest.mark.parametrize("linear", [False, True])
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_layer_slopes(linear: bool, dtype: torch.dtype) -> None:
+def test_layer_derivatives(linear: bool, dtype: torch.dtype) -> None:
     strength = draw(HEIGHT, WIDTH, seed=1).to(dtype).sigmoid()
     layers = [1.2 * draw(HEIGHT, WIDTH, 3, seed=seed).to(dtype).sigmoid() - 0.1 for seed in (2, 3)]
     where = draw(HEIGHT, WIDTH, seed=4) > 0
@@ -77,7 +77,7 @@ def test_layer_slopes(linear: bool, dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_slopes_at(dtype: torch.dtype) -> None:
+def test_sample_derivatives(dtype: torch.dtype) -> None:
     """At centres inside the image, far outside it and at NaN, in front of and behind the surface."""
     slopes, near = (draw(HEIGHT, WIDTH, seed=seed).to(dtype) for seed in (1, 2))
     means, depths = 30 * draw(2, many(20, 2000), 2, seed=3).to(dtype), draw(2, many(20, 2000), seed=4).to(dtype)
@@ -150,7 +150,7 @@ def test_panes_in_camera(dtype: torch.dtype) -> None:
         close(value, want)
 
 
-def test_no_pane_is_hit_where_there_is_none() -> None:
+def test_pixels_without_a_pane_hit_none() -> None:
     panes, intrinsics = two_panes(torch.float64)
     none = Panes(*(tensor[:0].to(DEVICE) for tensor in panes))
     found = panes_operation.pane_hits(none, intrinsics.to(DEVICE), WIDTH, HEIGHT)

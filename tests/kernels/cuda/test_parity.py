@@ -126,7 +126,7 @@ def test_bin_tiles(random_splats: SplatMaker, masked: bool, dtype: torch.dtype) 
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_bin_tiles_of_hardly_any_splats(random_splats: SplatMaker, count: int) -> None:
+def test_bin_tiles_of_few_splats(random_splats: SplatMaker, count: int) -> None:
     splats = random_splats((1, count), (WIDTH, HEIGHT))
     found = tiles_operation.bin_tiles(on_device(splats), WIDTH, HEIGHT)
     assert listed(tiles_twin.bin_tiles(splats, WIDTH, HEIGHT)) <= listed(found)
@@ -153,7 +153,7 @@ def dots(cameras: int, count: int, size: tuple[int, int]) -> Splats:
     ],
     ids=str,
 )  # fmt: skip
-def test_bins_are_those_of_the_twin_where_there_is_one_answer(
+def test_unambiguous_bins_equal_those_of_the_reference(
     cameras: int, count: int, size: tuple[int, int], active: str
 ) -> None:
     splats = dots(cameras, count, size)
@@ -442,14 +442,14 @@ def test_the_result_has_the_same_bits_every_time(random_splats: SplatMaker) -> N
         assert torch.equal(first, second)
 
 
-def test_raw_gaussians_are_left_as_they_were() -> None:
+def test_raw_gaussians_are_not_modified() -> None:
     gaussians = RawGaussians(*(tensor.detach().to(DEVICE) for tensor in random_gaussians(4)))
     before = [tensor.clone() for tensor in gaussians]
     project_operation.project(gaussians, on_device(random_cameras(1)), sh_degree=3, near=0.1)
     assert all(torch.equal(tensor, copy) for tensor, copy in zip(gaussians, before, strict=True))
 
 
-def test_what_gradients_need_is_stored_only_for_them_and_freed_with_the_image(
+def test_intermediate_tensors_are_stored_only_for_gradients_and_freed_with_the_image(
     random_splats: SplatMaker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     splats = on_device(random_splats((1, 3), (4, 2)))

@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[3]
     ],
     ids=" ".join,
 )
-def test_every_kernel_agrees_with_its_twin_in_the_simulator(tests: tuple[str, ...]) -> None:
+def test_every_kernel_agrees_with_the_reference_in_the_simulator(tests: tuple[str, ...]) -> None:
     files = [f"tests/kernels/cuda/{name}" for name in tests]
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *files]
     environment = os.environ | {"NUMBA_ENABLE_CUDASIM": "1", "OMP_NUM_THREADS": "1"}

@@ -43,11 +43,11 @@ def mirrored(waits: bool) -> Tensor:
     return found
 
 
-def test_what_all_have_written_is_read_behind_a_barrier() -> None:
+def test_shared_values_are_visible_after_a_barrier() -> None:
     assert mirrored(True).view(2, -1).tolist() == [[b + i for i in reversed(range(THREADS))] for b in (0, 100)]
 
 
-def test_a_missing_barrier_shows() -> None:
+def test_a_missing_barrier_is_detected() -> None:
     assert 0.3 < float((mirrored(False) == -1).double().mean()) < 0.7
 
 

@@ -49,9 +49,7 @@ def check(gaussians: RawGaussians, rays: Rays, degree: int) -> list[Tensor]:
 @pytest.mark.parametrize(
     ("count", "num_rays", "degree"), [(0, 5, 0), (1, 3, 1), (9, 0, 2), (many(70, 600), many(9, 700), 3)]
 )
-def test_what_rays_meet_and_its_gradients(
-    scales: int, dtype: torch.dtype, count: int, num_rays: int, degree: int
-) -> None:
+def test_trace_and_gradients(scales: int, dtype: torch.dtype, count: int, num_rays: int, degree: int) -> None:
     check(cloud(count, scales, dtype=dtype), rays_around(num_rays, dtype=dtype), degree)
 
 
@@ -74,7 +72,7 @@ def test_hits_that_are_not_kept_are_found_again(scales: int, monkeypatch: pytest
     assert all(torch.equal(a, b) for a, b in zip(kept, with_gradients(trace, gaussians, rays, 1), strict=True))
 
 
-def test_a_gaussian_that_more_rays_meet_than_a_warp_has_lanes() -> None:
+def test_a_gaussian_hit_by_more_rays_than_a_warp_has_lanes() -> None:
     disc = one_disc(logit_opacities=torch.zeros(1))
     disc = disc._replace(sh=torch.randn(1, 4, 3, generator=torch.Generator().manual_seed(5)).double())
     across = torch.linspace(-0.5, 0.5, 70, dtype=torch.float64)
@@ -98,13 +96,13 @@ def test_gradients_match_finite_differences(scales: int) -> None:
 
 
 @pytest.mark.parametrize("which", range(5))
-def test_a_gaussian_that_is_not_finite_is_not_met(which: int) -> None:
+def test_rays_miss_a_gaussian_that_is_not_finite(which: int) -> None:
     gaussians, rays = cloud(20, DISCS), rays_around(4)
     gaussians[which][7] = math.nan
     assert all(bool(x.isfinite().all()) for x in check(gaussians, rays, 1))
 
 
-def test_a_ray_that_is_none_meets_nothing() -> None:
+def test_an_invalid_ray_hits_nothing() -> None:
     gaussians, rays = cloud(20, DISCS, size=0.0), rays_around(5)
     for r, bad in enumerate([(0.0, 0.0, 0.0), (math.nan, 0.0, 1.0), (math.inf, 0.0, 0.0), (1e200, 1e200, 0.0)]):
         rays.directions[r] = torch.tensor(bad)
@@ -114,7 +112,7 @@ def test_a_ray_that_is_none_meets_nothing() -> None:
 
 
 @pytest.mark.parametrize("changes", [{"log_scales": torch.full((1, 2), -800.0)}, {"quats": torch.zeros(1, 4)}])
-def test_a_disc_without_size_or_orientation_is_not_met(changes: dict[str, Tensor]) -> None:
+def test_rays_miss_a_disc_without_size_or_orientation(changes: dict[str, Tensor]) -> None:
     found = with_gradients(trace, on_device(one_disc(**changes)), on_device(ray((0.1, 0, 0), (0, 0, 1))), 0)
     assert int(found[3]) == 0 and all(bool(x.isfinite().all()) for x in found)
 
@@ -127,7 +125,7 @@ def test_equal_distances_keep_the_order_of_the_gaussians() -> None:
 
 
 @pytest.mark.parametrize("scales", [DISCS, ELLIPSOIDS])
-def test_short_directions_meet_the_same(scales: int) -> None:
+def test_the_length_of_a_ray_direction_does_not_matter(scales: int) -> None:
     gaussians, rays = cloud(many(30, 600), scales, dtype=torch.float32), rays_around(many(9, 700), dtype=torch.float32)
     own, expected = on_device(gaussians), twin(gaussians, rays, None, sh_degree=0, near=0.0)
     found = trace(own, on_device(Rays(rays.origins, 2.0**-61 * rays.directions)), bvh_of(own), sh_degree=0, near=0.0)

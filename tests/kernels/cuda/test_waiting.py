@@ -46,7 +46,7 @@ def step(recipe: PlanarRecipe | SplatRecipe, stage: int, scene: Scene, view: Vie
     return waits.places
 
 
-def test_a_splat_frame_waits_for_the_number_of_its_pairs_alone(waits: Waits) -> None:
+def test_a_splat_frame_synchronizes_once(waits: Waits) -> None:
     scene, view = true_scene(), tiny_capture().train[0]
     waits.places.clear()
     for _ in range(2):
@@ -56,7 +56,7 @@ def test_a_splat_frame_waits_for_the_number_of_its_pairs_alone(waits: Waits) -> 
     assert waits.places == ["kernel bin_tiles"]
 
 
-def test_a_planar_frame_waits_for_two_lists_and_for_which_panes_it_shows(waits: Waits) -> None:
+def test_a_planar_frame_synchronizes_three_times(waits: Waits) -> None:
     scene, view = true_scene(), tiny_capture().train[0]
     for _ in range(2):
         waits.places.clear()
@@ -71,7 +71,7 @@ def test_a_planar_frame_waits_for_two_lists_and_for_which_panes_it_shows(waits: 
 
 
 @pytest.mark.parametrize("annotated", [True, False])
-def test_a_planar_step_waits_four_times(waits: Waits, annotated: bool) -> None:
+def test_a_planar_step_synchronizes_four_times(waits: Waits, annotated: bool) -> None:
     view = next(view for view in tiny_capture().train if view.is_annotated == annotated)
     places = step(PlanarRecipe(), 2, true_scene(), view, waits)
     assert len(places) == 4, places
@@ -79,12 +79,12 @@ def test_a_planar_step_waits_four_times(waits: Waits, annotated: bool) -> None:
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
-def test_a_splat_step_waits_twice(waits: Waits, strategy: str) -> None:
+def test_a_splat_step_synchronizes_twice(waits: Waits, strategy: str) -> None:
     places = step(SplatRecipe(strategy=strategy), 0, true_scene(), tiny_capture().train[0], waits)
     assert len(places) == 2, places
 
 
-def test_the_stand_in_sees_what_waits(waits: Waits) -> None:
+def test_the_stand_in_counts_synchronizations(waits: Waits) -> None:
     values, mask = torch.arange(4.0), torch.tensor([True, False, True, False])
     source = "\n".join(
         [
@@ -103,7 +103,7 @@ def test_the_stand_in_sees_what_waits(waits: Waits) -> None:
     assert waits.places == []
 
 
-def test_the_cuda_kernels_wait_where_the_stand_in_says() -> None:
+def test_the_cuda_kernels_synchronize_as_counted_by_the_stand_in() -> None:
     found: dict[str, int] = {}
     for path in sorted(path for path in KERNELS.glob("*/cuda*.py") if path.parent.name != "backend"):
         for function in ast.parse(path.read_text()).body:
@@ -114,7 +114,7 @@ def test_the_cuda_kernels_wait_where_the_stand_in_says() -> None:
     assert found == KERNEL_WAITS
 
 
-def test_what_is_left_out_on_a_gpu_gives_the_same_statistics(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_terms_skipped_on_a_gpu_do_not_change_statistics(monkeypatch: pytest.MonkeyPatch) -> None:
     def differentiated() -> tuple[dict[str, float], dict[str, Tensor], list[Tensor]]:
         found = differentiate(
             PlanarRecipe().stages(seed=0)[2], true_scene(), tiny_capture().train[0], with_absgrad=True

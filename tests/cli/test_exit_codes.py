@@ -144,7 +144,7 @@ def test_a_failure_is_explained_with_code_1(
 
 
 @pytest.mark.parametrize(("work", "words"), UNFORESEEN, ids=lambda value: getattr(value, "__name__", None))
-def test_what_nobody_foresaw_is_one_line_and_a_file_with_the_traceback(
+def test_unexpected_errors_end_with_one_line_and_a_traceback_file(
     work: Callable[[], None],
     words: str,
     monkeypatch: pytest.MonkeyPatch,
@@ -164,16 +164,16 @@ def test_what_nobody_foresaw_is_one_line_and_a_file_with_the_traceback(
     assert len(saved) < 100_000
 
 
-def test_where_no_file_can_be_written_the_line_says_where_the_error_was(
+def test_an_unexpected_error_names_its_location_if_no_file_can_be_written(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", "/dev/null")
     assert ended(raising(KeyError("x")), monkeypatch) == 1
     said = capsys.readouterr().err
-    assert re.search(r"raised in \S*test_endings.py, line \d+\n$", said) and said.count("\n") == 1
+    assert re.search(r"raised in \S*test_exit_codes.py, line \d+\n$", said) and said.count("\n") == 1
 
 
-def test_a_report_that_fails_itself_is_one_line(
+def test_a_failing_crash_report_is_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def no_memory(error: BaseException) -> None:
@@ -184,7 +184,7 @@ def test_a_report_that_fails_itself_is_one_line(
     assert capsys.readouterr().err == "stopped: out of memory\n"
 
 
-def test_a_library_that_cannot_be_loaded_is_one_line_too(
+def test_a_library_that_cannot_be_loaded_ends_with_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     def broken(name: str) -> type:
@@ -196,7 +196,7 @@ def test_a_library_that_cannot_be_loaded_is_one_line_too(
     assert capsys.readouterr().err == "stopped: libtorch_cpu.so: cannot enable executable stack\n"
 
 
-def test_the_errors_known_by_name_are_those_of_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_listed_errors_are_those_of_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     # They are listed by name to avoid imports; a renamed class would be treated as unexpected.
     from glassplat.cli.console import BAD_INPUT_ERRORS as BAD
     from glassplat.cli.console import EXPECTED_FAILURES as FAILED
@@ -210,7 +210,7 @@ def test_the_errors_known_by_name_are_those_of_the_package(monkeypatch: pytest.M
 @pytest.mark.parametrize(
     ("raised", "expected"), [(None, 0), (SystemExit(2), 2), (InputError("x"), 2), (KeyboardInterrupt(), 130)]
 )
-def test_a_rank_ends_at_once_however_it_ends(
+def test_a_rank_ends_at_once_in_every_case(
     raised: BaseException | None, expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def run(command: object) -> None:

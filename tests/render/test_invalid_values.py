@@ -34,7 +34,7 @@ def test_a_value_that_cannot_be_drawn_is_refused_by_its_name(method: str, name: 
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_any_other_poison_leaves_a_finite_picture(method: str) -> None:
+def test_other_invalid_values_leave_a_finite_image(method: str) -> None:
     renderer, scene = rendered(method)
     refused = {name for other, name, _ in UNDRAWABLE if other == method}
     for name, tensor in scene.parameters().items():
@@ -47,7 +47,7 @@ def test_any_other_poison_leaves_a_finite_picture(method: str) -> None:
             assert bool(torch.isfinite(frame.rgb).all()), (name, value)
 
 
-def test_a_value_that_is_spoilt_after_it_was_drawn_is_refused() -> None:
+def test_a_value_that_becomes_invalid_later_is_refused() -> None:
     renderer, scene = rendered("planar")
     camera = tiny_capture().train[1].camera
     changed = scene.primary.channels["log_intensity"].detach().clone()
@@ -84,6 +84,6 @@ def test_a_camera_needs_a_pose_and_whole_pixels() -> None:
 
 
 @pytest.mark.parametrize("name", ["cx", "cy"])
-def test_a_camera_has_its_middle_somewhere(name: str) -> None:
+def test_a_camera_may_have_any_principal_point(name: str) -> None:
     with pytest.raises(ValueError, match="expected finite numbers"):
         replace(tiny_capture().train[1].camera, **{name: math.nan})

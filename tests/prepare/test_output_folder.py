@@ -20,7 +20,7 @@ def refused(source: Path, output: Path, capsys: pytest.CaptureFixture[str]) -> s
     return " ".join(capsys.readouterr().err.split())
 
 
-def test_a_folder_that_holds_something_else_stays(
+def test_a_folder_with_other_contents_is_kept(
     photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "mine").mkdir()
@@ -30,7 +30,7 @@ def test_a_folder_that_holds_something_else_stays(
     assert (tmp_path / "mine" / "diary.txt").read_text() == "dear diary"
 
 
-def test_something_else_in_the_place_of_work_stays(
+def test_foreign_files_in_the_work_folder_are_kept(
     photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "capture.partial").mkdir()
@@ -46,13 +46,13 @@ def test_the_output_may_not_lie_among_the_photographs(photographs: Path, capsys:
     assert len(list(photographs.iterdir())) == 10
 
 
-def test_a_file_that_is_no_video_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_that_is_not_a_video_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "notes.txt").write_text("")
     assert "expected a folder of photographs, or a video" in refused(tmp_path / "notes.txt", tmp_path / "c", capsys)
     assert "no folder or video" in refused(tmp_path / "nowhere", tmp_path / "c", capsys)
 
 
-def test_photographs_that_cannot_be_used_leave_nothing_behind(
+def test_unusable_photographs_leave_no_files(
     photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (photographs / "broken.jpg").write_bytes(b"\xff\xd8\xff\xe0 cut off")
@@ -60,7 +60,7 @@ def test_photographs_that_cannot_be_used_leave_nothing_behind(
     assert sorted(path.name for path in tmp_path.iterdir()) == [photographs.name]
 
 
-def test_too_little_texture_says_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_too_little_texture_is_reported_with_advice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from PIL import Image
 
     (tmp_path / "in").mkdir()
@@ -79,7 +79,7 @@ def test_photographs_that_cannot_be_used_leave_no_folder(tmp_path: Path) -> None
     assert not (tmp_path / "new").exists()
 
 
-def test_a_link_to_itself_is_no_place_for_a_capture(
+def test_a_link_to_itself_is_refused_as_output(
     photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
@@ -117,7 +117,7 @@ def test_force_removes_only_what_was_prepared(tmp_path: Path, name: str) -> None
     WorkFolder(output).begin({}, resume=False, force=True)
 
 
-def test_a_mounted_disk_is_no_output(
+def test_a_mount_point_is_refused_as_output(
     photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "disk").mkdir()
@@ -151,7 +151,7 @@ def test_an_output_may_be_a_link_or_the_current_folder(
 
 
 @pytest.mark.parametrize("option", ["--force", "--resume"])
-def test_a_capture_that_another_preparation_makes_is_left_to_it(
+def test_a_second_preparation_of_the_same_output_is_refused(
     option: str,
     photographs: Path,
     tmp_path: Path,

@@ -22,7 +22,7 @@ def some_pixels(height: int, width: int) -> Tensor:
     return torch.rand(height, width, generator=torch.Generator().manual_seed(2)) > 0.5
 
 
-def test_slopes_are_finite_differences_of_the_image() -> None:
+def test_image_derivatives_match_finite_differences() -> None:
     (strength, behind, reflected), step = grey_layers(), 1e-6
 
     def image(transmission: Tensor, reflection: Tensor) -> Tensor:
@@ -38,14 +38,14 @@ def test_slopes_are_finite_differences_of_the_image() -> None:
     assert float(torch.stack([through, mirrored]).amax()) < 1
 
 
-def test_slopes_in_srgb_are_the_strength_and_its_rest() -> None:
+def test_derivatives_in_srgb_are_the_strength_and_its_complement() -> None:
     (strength, *layers), where = grey_layers(), some_pixels(5, 7)
     through, mirrored = layer_derivatives(strength, *layers, where, linear=False)
     torch.testing.assert_close(through, torch.where(where, 1 - strength, 1.0))
     torch.testing.assert_close(mirrored, torch.where(where, strength, 0.0))
 
 
-def test_a_reflection_weighs_more_the_darker_it_is_behind_the_pane() -> None:
+def test_the_derivative_by_the_reflection_falls_with_the_brightness_behind() -> None:
     grey, where = torch.linspace(0.1, 0.9, 9, dtype=torch.float64)[None], torch.ones(1, 9, dtype=torch.bool)
     behind = grey[..., None].expand(-1, -1, 3)
     strength = torch.full_like(grey, 0.1)
@@ -58,7 +58,7 @@ def test_a_reflection_weighs_more_the_darker_it_is_behind_the_pane() -> None:
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 3e-5), (torch.float64, 1e-11)])
 @pytest.mark.parametrize("linear", [False, True])
 @pytest.mark.parametrize("size", [(1, 1), (33, 70)])
-def test_agrees_with_its_twin(size: tuple[int, int], linear: bool, dtype: torch.dtype, tolerance: float) -> None:
+def test_agrees_with_the_reference(size: tuple[int, int], linear: bool, dtype: torch.dtype, tolerance: float) -> None:
     generator = torch.Generator().manual_seed(0)
     strength = torch.rand(size, generator=generator, dtype=torch.float64).to(dtype)
     layers = [1.3 * torch.rand(*size, 3, generator=generator, dtype=torch.float64).to(dtype) - 0.1 for _ in range(2)]
@@ -68,7 +68,7 @@ def test_agrees_with_its_twin(size: tuple[int, int], linear: bool, dtype: torch.
         torch.testing.assert_close(own, wanted, rtol=tolerance, atol=tolerance)
 
 
-def test_what_is_left_out_may_be_anything() -> None:
+def test_excluded_pixels_may_have_any_value() -> None:
     broken = torch.full((4, 6), torch.nan)
     layers = broken[..., None].expand(-1, -1, 3)
     through, mirrored = layer_derivatives(broken, layers, layers, torch.zeros(4, 6, dtype=torch.bool), linear=True)
@@ -95,7 +95,7 @@ def test_bad_input_is_refused(change: dict[str, Tensor], error: type[Exception],
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_slopes_are_read_at_centres_behind_the_surface(dtype: torch.dtype) -> None:
+def test_gradients_are_sampled_at_centres_behind_the_surface(dtype: torch.dtype) -> None:
     derivatives = torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]], dtype=dtype)
     near = torch.tensor([[2.0, 2.0, torch.inf], [2.0, 2.0, 2.0]], dtype=dtype)
     nan, inf = torch.nan, torch.inf

@@ -72,7 +72,7 @@ def test_only_whole_passes_are_judged() -> None:
         visibility.record(nothing, 11)
 
 
-def test_the_loss_of_the_last_gaussian_is_named_and_nothing_is_told_of_that_step() -> None:
+def test_losing_the_last_gaussian_is_an_error_without_a_step_message() -> None:
     (stage,) = stages_of(SplatRecipe())
     ruthless = PruneIdle(DefaultDensify(least_contribution=1e9, contribution_moments=(0.5,)))
     messages: list[Message] = []
@@ -98,7 +98,7 @@ def spoil(capture: Path, how: str) -> None:
 
 @pytest.mark.parametrize("how", ["long", "short", "far points", "one point", "few pixels"])
 @pytest.mark.parametrize("method", ["splat", "deferred"])
-def test_a_capture_that_shows_nothing_is_one_message(
+def test_a_capture_without_content_ends_with_one_message(
     method: str, how: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     capture, run = write_tiny_capture(tmp_path / "capture"), tmp_path / "run"

@@ -25,7 +25,7 @@ from tests.training.tiny_capture import tiny_capture, true_scene
 CAMERAS = [view.camera for view in tiny_capture().train]
 
 
-def test_an_edited_scene_is_a_run_of_its_own_that_knows_the_photographs(tmp_path: Path) -> None:
+def test_an_edited_scene_is_saved_as_a_run_with_its_capture(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     loaded = glassplat.load(run, device="cpu")
@@ -42,7 +42,7 @@ def test_an_edited_scene_is_a_run_of_its_own_that_knows_the_photographs(tmp_path
     assert {path: path.read_bytes() for path in before} == before
 
 
-def test_nothing_is_written_over(tmp_path: Path) -> None:
+def test_existing_files_are_not_overwritten(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
     writer = FolderWriter(glassplat.load(run, device="cpu"), tmp_path)
     recipe = (run / "recipe.json").read_bytes()
@@ -70,7 +70,7 @@ def test_no_name_leads_out_of_the_folder(name: str, tmp_path: Path) -> None:
     assert not [*tmp_path.iterdir()]
 
 
-def test_who_looks_from_another_machine_saves_nothing_unless_a_folder_is_named(tmp_path: Path) -> None:
+def test_remote_clients_save_only_into_a_named_folder(tmp_path: Path) -> None:
     here = View(tmp_path / "scene")
     elsewhere = replace(here, host="0.0.0.0")
     assert is_local(here.host) and make_writer(here, model()) is not None

@@ -29,7 +29,7 @@ def wait_for(check: Callable[[], None], done: Callable[[], bool]) -> None:
 
 
 @pytest.mark.parametrize("part", ["train", "test"])
-def test_a_photograph_that_is_cut_off_is_found(capture, part: str) -> None:
+def test_a_truncated_photograph_is_found(capture, part: str) -> None:
     capture.write_colmap()
     data = load_dataset(capture.root)
     view = getattr(data, part)[-1]
