@@ -250,11 +250,13 @@ def await_leader() -> None:
 
 
 def exit_rank(code: int) -> None:
-    """Ends the process immediately if it is one of several; else does nothing.
+    """Ends the process immediately if it is one of several or was interrupted; else does nothing.
 
-    Python's cleanup is skipped: PyTorch sometimes aborts when connections close while another rank still communicates.
+    Python's cleanup is skipped: COLMAP aborts in it after a second Ctrl-C, if one of its threads is still at work, and
+    PyTorch sometimes aborts when connections close while another rank still communicates.
     """
-    if is_launched() and "torch.distributed" in sys.modules:
+    was_interrupted = code > 128  # As shells report signals.
+    if was_interrupted or (is_launched() and "torch.distributed" in sys.modules):
         with suppress(OSError, ValueError):
             sys.stdout.flush()
             sys.stderr.flush()
