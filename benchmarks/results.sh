@@ -31,7 +31,7 @@ for seed in {245..254}; do
 done
 
 compare facade "$data/facade" --options "--downscale 2"
-compare facade-seed1 "$data/facade" --methods planar --seeds 1 --options "--downscale 2"
+compare facade-seed1 "$data/facade" --methods splat --seeds 1 --options "--downscale 2"
 compare screen "$data/screen"
 compare fox "$data/fox" --methods splat --options "--downscale 4"
 compare scenes "$data"/{showcase,corner,mirror,front}
