@@ -114,7 +114,7 @@ def test_data_in_memory_are_trained_on() -> None:
     shots = [(view.camera, view.photo) for view in tiny.train]
     names = {"glassplat": glassplat, "Path": Path, "shots": shots, **vars(tiny.points)}
     exec(block, names)
-    model = glassplat.Training(names["dataset"], "splat", iterations=2).run()
+    model = glassplat.Training(names["own"], "splat", iterations=2).run()
     again = model.with_parameters(model.scene.tensors())
     assert len(model.cameras) == 6 and torch.equal(again.image("0.png"), model.image("0.png"))
 
