@@ -397,14 +397,15 @@ def check_arguments(arguments: Sequence[str]) -> None:
 
 def closest_words(word: str, known: Iterable[str]) -> list[str]:
     """The known word closest to a mistyped one, if any is close."""
-    return difflib.get_close_matches(word, list(known), n=1, cutoff=0.7)
+    return difflib.get_close_matches(word, list(known), n=1)
 
 
 def unknown_name_message(what: str, word: str, known: Iterable[str], command: str) -> str:
     """Message about an unknown command or method, with the closest one, all of them, and their help."""
     meant = closest_words(word, known)
     guess = f"did you mean {meant[0]}? There are" if meant else "expected one of"
-    return f"there is no {what} {word!r}; {guess} {', '.join(known)}: see {command}"
+    wrong = f"there is no {what} {word!r}" if word else f"a {what} is missing"
+    return f"{wrong}; {guess} {', '.join(known)}: see {command}"
 
 
 BOX_DRAWING = re.compile(r"\x1b\[[0-9;]*m|[│─╭╮╰╯]|-{5,}")

@@ -1,4 +1,4 @@
-"""The command line: `glassplat prepare | annotate | train | eval | render | dereflect | clean | export | info | demo`.
+"""The command line `glassplat`, with the commands in `COMMANDS`.
 
 A command's module is imported only when the command is chosen, so that the list of commands appears at once and Ctrl-C
 works from the start. PyTorch and the code that does the work are imported by the command's method `set_up`, after its
@@ -238,9 +238,9 @@ def unknown_option_message(name: str, options: list[str], unknown: list[str]) ->
         methods = [method for method in RECIPES if [method] != chosen and option in options_in_help(name, [method])]
     known = options_in_help(name, chosen)
     meant = closest_words(option, known) or [other for other in known if option.strip("-") in other][:3]
-    guess = f"; did you mean {' or '.join(meant)}?" if meant else ""
-    elsewhere = f"; it is an option of {' and '.join(methods)}" if methods else ""
-    return f"{' '.join([command, *chosen])} has no option {option}{elsewhere or guess}; {help_pointer(name, options)}"
+    guess = f"; did you mean {' or '.join(meant)}?" if meant else ";"
+    elsewhere = f"; it is an option of {' and '.join(methods)};" if methods else ""
+    return f"{' '.join([command, *chosen])} has no option {option}{elsewhere or guess} {help_pointer(name, options)}"
 
 
 def options_in_help(name: str, words: list[str]) -> list[str]:

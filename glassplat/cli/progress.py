@@ -28,8 +28,8 @@ FORECAST_STEPS, FORECAST_SECONDS = 10, 5.0
 """Steps and seconds before the duration of the run is estimated; the first step, which may compile, is excluded."""
 LONG_SECONDS = 600.0
 """For longer runs, the estimate suggests how to shorten them."""
-FREQUENT_ACTIONS = ("densify", "grow")
-"""Prefixes of actions that are too frequent to be printed."""
+SILENT_ACTIONS = ("densify", "grow", "seed", "turn", "light", "fill")
+"""Prefixes of actions that are not printed: they are too frequent, or log a sentence of their own."""
 
 
 @dataclass
@@ -171,7 +171,7 @@ class TrainingProgress:
             self._speed.enter_stage()
             counts = ", ".join(f"{number} {name}" for name, number in message.counts.items())
             self._print_line(f"step {message.step}: stage {message.stage}, {counts}")
-        elif isinstance(message, messages.ActionDone) and not message.action.startswith(FREQUENT_ACTIONS):
+        elif isinstance(message, messages.ActionDone) and not message.action.startswith(SILENT_ACTIONS):
             self._print_line(f"step {message.step}: {message.action}")
         elif isinstance(message, messages.Working):
             self._speed.work()

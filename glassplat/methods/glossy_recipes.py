@@ -57,7 +57,7 @@ class GlossyOptions(MethodRecipe):
         monocular_weight: weight of the difference between normals and estimated ones in `normals/` next to the
             photographs, if there are any (3DGS-DR: none; EnvGS: 0.01).
         propagation: normal propagation and colour sabotage.
-        schedule: schedule of both.
+        schedule: schedule of propagation and sabotage.
         least_iterations: length of the shortest run with reflections. In a shorter one, colours could not adapt to the
             reflections; it trains like `splat`.
         raise_rates_matte: raise the learning rates to those of `splat` once nothing reflective was found, and in runs
@@ -65,9 +65,8 @@ class GlossyOptions(MethodRecipe):
         raise_rates_found: raise them after propagation even if something reflects; earlier, high rates would corrupt
             its normals.
         propagation_interval: steps between densifications during propagation; None keeps `densify.interval`.
-        rates: learning rates of the Gaussians; in short runs they are higher before and after propagation
-            (`raise_rates_matte`, `raise_rates_found`), but not during it, which would corrupt normals
-            (lab/training.md).
+        rates: learning rates of the Gaussians; in short runs they are higher before and after propagation, but not
+            during it, which would corrupt normals.
         reflection_rates: learning rates of strength and environment.
     """
 

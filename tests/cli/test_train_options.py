@@ -170,21 +170,22 @@ def test_help_mentions_options_and_no_internal_names(
     method: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown = help_of([method, "--help-advanced"], capsys, monkeypatch) + help_of(["--help"], capsys, monkeypatch)
-    assert not re.search("train_options|find_region|`plane_fit|`per_pixel", shown)
+    assert not re.search("train_options|find_region|`plane_fit|`per_pixel|`raise_rates|lab/|of both", shown)
 
 
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
-        ("train traced --data x --output y --iteratons 5", ["did you mean --iterations?", "train traced --help-adv"]),
+        ("train traced --data x --output y --iteratons 5", ["--iterations? all options", "train traced --help-adv"]),
         ("train planar --data x --output y --iteration 5", ["did you mean --iterations?", "train planar --help-adv"]),
         ("train planar --data x --output y --means 5", ["did you mean --rates.means?"]),
-        ("train splat --data x --output y --tint", ["--tint; it is an option of planar;"]),
+        ("train splat --data x --output y --tint", ["--tint; it is an option of planar; all options"]),
         ("train planer --data x --output y", ["no method 'planer'; did you mean planar?", "glassplat train --help"]),
         ("train planar more --data x --output y", ["glassplat train takes no further argument 'more'"]),
         ("tarin planar --data x --output y", ["no command 'tarin'; did you mean train?"]),
         ("--versoin", ["no command '--versoin'; expected one of prepare", "see glassplat --help"]),
-        ("", ["no command ''; expected one of prepare"]),
+        ("", ["a command is missing; expected one of prepare"]),
+        ("evaluate x", ["no command 'evaluate'; did you mean eval?"]),
         ("tidy x", ["no command 'tidy'; expected one of prepare, annotate, train"]),
         ("render x --output y --lyers z", ["glassplat render has no option --lyers; did you mean --layers?"]),
         ("train planar --data x --output y --iterations abc", ["--iterations: expected a whole number, not 'abc';"]),

@@ -175,8 +175,9 @@ def test_a_checkpoint_is_reported_in_the_next_progress_line() -> None:
     assert all(line.endswith("left, saved at step 3") or "estimating the remaining" in line for line in lines)
 
 
-def test_events_are_lines_but_for_frequent_ones() -> None:
-    actions = [ActionDone(5, name, COUNTS) for name in ("densify primary", "grow SH", "reset opacity")]
+def test_events_are_lines_but_for_frequent_ones_and_those_with_a_log_line() -> None:
+    names = ("densify primary", "grow SH", "seed unexplained", "reset opacity")
+    actions = [ActionDone(5, name, COUNTS) for name in names]
     lines = lines_of([RunBegun(0, 1000, anew=True), StageEntered(0, "1 [stage]", COUNTS), *actions], 0.0)
     assert lines == [
         "warning: replacing an earlier run in this folder, which was never saved",
