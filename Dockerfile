@@ -1,4 +1,4 @@
-# glassplat for the CPU, with the kernels of `splat` and `planar` compiled; others are at their first use:
+# glassplat for the CPU, with the kernels of `splat` and `planar` compiled; the others compile on first use:
 #
 #     docker build --tag splats .
 #     docker run --rm --volume "$PWD:/work" splats demo --output runs/demo
@@ -10,7 +10,7 @@ ARG PYTORCH_INDEX=https://download.pytorch.org/whl/cpu
 COPY . /source
 RUN pip install --no-cache-dir --extra-index-url "$PYTORCH_INDEX" "/source[all]" && rm -r /source
 
-# The kernels lie beside the installed package, where every user of the image may read them and only root may write.
+# The kernels lie in the installed package, where every user of the image may read them and only root may write.
 RUN glassplat demo --iterations 8 --output /tmp/demo && rm -r /tmp/demo
 ENV HOME=/tmp
 

@@ -212,7 +212,7 @@ def _describe_gaussians(gaussians: Gaussians, finding: Finding) -> None:
         finding.problems.append("it holds no Gaussian")
         return
     if gaussians.max_sh_degree >= 0:
-        finding.facts["degree of harmonics"] = gaussians.max_sh_degree
+        finding.facts["SH degree"] = gaussians.max_sh_degree
     finite = torch.isfinite(gaussians.means).all(dim=1)
     if not bool(finite.all()):
         finding.problems.append(f"{int((~finite).sum())} Gaussians have non-finite positions; they are not drawn")

@@ -110,8 +110,8 @@ def planar_renderer(stored: StoredRun) -> Planar:
         return replace(renderer, photographer="present")
     data = "CAPTURE" if stored.directory.import_record.is_file() else shell_word(stored.directory.settings().data)
     raise InputError(
-        f"{stored.directory.path} is a {stored.recipe.method} run without panes, which has no reflections; "
-        f"train one with pane masks: glassplat train planar --data {data} --output RUN"
+        f"{stored.directory.path} is a {stored.recipe.method} run without panes; reflections are removed from "
+        f"panes only: glassplat train planar --data {data} --output RUN"
     )
 
 

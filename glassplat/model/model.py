@@ -464,7 +464,7 @@ def unsaved_parts(model: Model, kind: str) -> list[str]:
     if kind not in FORMATS_WITH_CHANNELS and len(scene.planes) and logs is not None and bool(logs.any()):
         lost.append("the intensity of Gaussians in panes")
     if len(scene.surroundings) or not scene.environment.is_empty:
-        lost.append("what shiny things mirror")
+        lost.append("what glossy surfaces mirror")
     if kind == "spz" and scene.primary.are_discs:
         lost.append("that Gaussians are discs")
     return [*lost, "the photographer"] if len(scene.photographer) else lost

@@ -230,9 +230,9 @@ def _photograph_paths(folder: Path) -> list[Path]:
     if unreadable:
         kinds = "/".join(sorted(set(unreadable.values())))
         raise InputError(
-            f"{len(unreadable)} photographs in {folder} are {kinds} files, which cannot be read "
-            f"({join_names(list(unreadable))}); save them as JPEG and remove these (a phone does so if its "
-            "camera is set to 'most compatible'). To read HEIC: pip install 'glassplat[heic]'"
+            f"{folder} holds {kinds} files, which cannot be read: {join_names(list(unreadable))}; save them "
+            "as JPEG and remove these (a phone does so if its camera is set to 'most compatible'). "
+            "To read HEIC: pip install 'glassplat[heic]'"
         )
     suffixes = (*images.IMAGE_SUFFIXES, *(images.HEIF_SUFFIXES if images.can_read_heif() else ()))
     paths = [path for path in files if path.suffix.lower() in suffixes]

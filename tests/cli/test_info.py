@@ -294,7 +294,7 @@ def test_glass_without_colours_has_no_degree(tmp_path: Path, capsys: pytest.Capt
     glass = true_scene().glass
     write_gaussians(tmp_path / "glass.ply", glass)
     facts = told(tmp_path / "glass.ply", capsys)["facts"]
-    assert facts["Gaussians"] == len(glass) and "degree of harmonics" not in facts
+    assert facts["Gaussians"] == len(glass) and "SH degree" not in facts
 
 
 @pytest.mark.parametrize(
