@@ -95,6 +95,8 @@ def _load_capture(root: Path) -> Capture:
     names = sorted(path.name for path in root.iterdir())
     found = join_names(names, limit=8) or "nothing"
     message = f"{root} is not a readable capture. Looked for: {looked_for}. Found: {found}."
-    if any(Path(name).suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) for name in names):
+    if "recipe.json" in names:
+        message += " This is a run; expected a capture, such as the one that `glassplat info` shows for it"
+    elif any(Path(name).suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) for name in names):
         message += f" Photographs become a capture by: glassplat prepare {shlex.quote(str(root))} --output CAPTURE"
     raise UnknownFormatError(message)

@@ -344,6 +344,10 @@ def test_info_suggests_prepare_for_photographs_without_poses(
     (folder / "1.HEIC").write_bytes(b"")
     assert main(["annotate", str(folder)]) == 2
     assert f"glassplat prepare {folder} --output CAPTURE" in " ".join(capsys.readouterr().err.split())
+    (folder / "recipe.json").touch()
+    assert main(["annotate", str(folder)]) == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert "This is a run" in told and "prepare" not in told
 
 
 def test_a_damaged_document_is_named(room: Path) -> None:
