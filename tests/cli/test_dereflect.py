@@ -67,7 +67,7 @@ def test_dereflect_of_a_splat_run_suggests_training_planar(tmp_path: Path, capsy
     run = write_run(tmp_path / "run", planar=False)
     assert main(["dereflect", str(run), "--output", str(tmp_path / "clean")]) == 2
     text = message(capsys)
-    assert "splat run" in text and "glassplat train planar --data" in text
+    assert "splat run" in text and "removed from panes only: glassplat train planar --data" in text
     assert not (tmp_path / "clean").exists()
 
 
