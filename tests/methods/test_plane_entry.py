@@ -191,13 +191,19 @@ def solid(means: torch.Tensor, log_scale: float = -3.0) -> Gaussians:
     return gaussians.with_tensors({"means": means, "log_scales": torch.full((len(means), 3), log_scale)})
 
 
-def test_gaussians_behind_a_wall_are_reflections_unless_the_space_in_front_is_empty() -> None:
-    tilted = in_single_precision(showcase(pane(2.0, half=0.8)))
-    planes = replace(tilted.planes, centers=torch.tensor([[0.0, 0, 2]]), raw_normals=torch.tensor([[0.0, 0, -1]]))
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (30.0, -20.0, 50.0)], ids=["near", "far from the origin"])
+def test_gaussians_behind_a_wall_are_reflections_unless_the_space_in_front_is_empty(
+    origin: tuple[float, float, float],
+) -> None:
+    tilted, middle = in_single_precision(showcase(pane(2.0, half=0.8))), torch.tensor(origin)
+    planes = replace(
+        tilted.planes, centers=torch.tensor([[0.0, 0, 2]]) + middle, raw_normals=torch.tensor([[0.0, 0, -1]])
+    )
     far, near, before = (torch.tensor([place]) for place in ((0.05, 0.0, 6.0), (0.05, 0.0, 3.8), (0.75, 0.0, 1.0)))
     primary = concatenated(wall(3.0), solid(far), solid(near), solid(before))
+    primary = primary.with_tensors({"means": primary.means + middle})
     scene = replace(tilted, primary=primary, planes=planes)
-    places = (camera_at(x, 0, -0.3) for x in (-0.2, 0.2))
+    places = (camera_at(origin[0] + x, origin[1], origin[2] - 0.3) for x in (-0.2, 0.2))
     cameras = [replace(camera, cam_from_world=camera.cam_from_world.float()) for camera in places]
     found = reflections_behind(scene, planes, cameras)
     # The mirrored far one lies behind the cameras; the mirrored near one in front of them, where they see empty space.
@@ -208,7 +214,7 @@ def test_gaussians_behind_a_wall_are_reflections_unless_the_space_in_front_is_em
     action = TurnReflections((0.25,))
     assert action.due(Clock(25, 100, 1)) and not action.due(Clock(26, 100, 1))
     assert finished(action.apply(state, dataset, Clock(25, 100, 1)))
-    torch.testing.assert_close(state.scene.primary.means[-1], torch.tensor([0.05, 0.0, -2.0]))
+    torch.testing.assert_close(state.scene.primary.means[-1] - middle, torch.tensor([0.05, 0.0, -2.0]))
     assert len(state.scene.primary) == len(primary)
     assert not finished(action.apply(state, dataset, Clock(25, 100, 1)))
 

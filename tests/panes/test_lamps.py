@@ -30,6 +30,7 @@ from tests.training.progress_of import finished
 LAMP = (0.9, 0.0, 1.0)
 IMAGE = (0.9, 0.0, 3.0)
 RADIANCE = 6.0
+RED = (255, 60, 60)
 
 
 def camera(x: float) -> Camera:
@@ -41,14 +42,13 @@ def camera(x: float) -> Camera:
 CAMERAS = [camera(x) for x in (-0.3, -0.1, 0.0, 0.1, 0.3)]
 
 
-def gaussians(means: Tensor, color: int, log_scale: float) -> Gaussians:
-    made = gaussians_from_points(
-        PointCloud(means, torch.full_like(means, color).to(torch.uint8)), sh_degree=0, opacity=0.99
-    )
+def gaussians(means: Tensor, color: int | tuple[int, int, int], log_scale: float) -> Gaussians:
+    colors = torch.tensor(color, dtype=torch.uint8).expand(means.shape).clone()
+    made = gaussians_from_points(PointCloud(means, colors), sh_degree=0, opacity=0.99)
     return made.with_tensors({"means": means, "log_scales": torch.full((len(means), 3), log_scale)})
 
 
-def panel(center: tuple[float, float, float], color: int = 255) -> Gaussians:
+def panel(center: tuple[float, float, float], color: int | tuple[int, int, int] = 255) -> Gaussians:
     side = torch.linspace(-0.2, 0.2, 9)
     means = torch.tensor(center) + torch.cartesian_prod(side, side, torch.zeros(1))
     return gaussians(means, color, math.log(0.03))
@@ -77,8 +77,12 @@ def photographs_of(scene: Scene) -> list[Photograph]:
     ]
 
 
-def test_the_image_of_a_lamp_is_found_and_the_lamp_gets_its_radiance() -> None:
+@pytest.mark.parametrize("ignored", [0, 2])
+def test_the_image_of_a_lamp_is_found_and_the_lamp_gets_its_radiance(ignored: int) -> None:
     photographs = photographs_of(scene_of(wall(4.0), shining(panel(LAMP))))
+    for number in range(5 - ignored, 5):
+        black = torch.zeros_like(photographs[number].pixels)
+        photographs[number] = photographs[number]._replace(pixels=black, valid=torch.zeros_like(black[..., 0]).bool())
     first = scene_of(wall(4.0), panel(LAMP), panel(IMAGE))
     with CountedElements():
         lamps = mirrored_lamps(first, first.planes, photographs)
@@ -98,6 +102,7 @@ def test_the_image_of_a_lamp_is_found_and_the_lamp_gets_its_radiance() -> None:
             [panel(LAMP), panel((0.5, 0.4, 3.0))], [panel(LAMP), panel((0.5, 0.4, 3.0))], id="as bright as white"
         ),
         pytest.param([shining(panel(LAMP))], [shining(panel(LAMP)), panel((0.2, 0.3, 3.0))], id="an image elsewhere"),
+        pytest.param([panel(LAMP, RED), panel(IMAGE)], [panel(LAMP, RED), panel(IMAGE)], id="red where it is seen"),
     ],
 )
 def test_no_lamp_is_found_without_need(photographed: list[Gaussians], first: list[Gaussians]) -> None:
@@ -105,11 +110,36 @@ def test_no_lamp_is_found_without_need(photographed: list[Gaussians], first: lis
     assert mirrored_lamps(scene, scene.planes, photographs_of(scene_of(wall(4.0), *photographed))) is None
 
 
-def test_ignored_pixels_make_no_lamp() -> None:
-    photographs = photographs_of(scene_of(wall(4.0), shining(panel(LAMP))))
-    hidden = [one._replace(valid=torch.zeros_like(one.valid)) for one in photographs]
+@pytest.mark.parametrize(
+    ("early", "count"),
+    [([panel(LAMP, 200), shining(panel(IMAGE))], 4), ([panel(LAMP)], 3)],
+    ids=["grey where it is seen", "dark in the glass"],
+)
+def test_a_lamp_is_one_in_most_photographs(early: list[Gaussians], count: int) -> None:
     first = scene_of(wall(4.0), panel(LAMP), panel(IMAGE))
+    late = photographs_of(scene_of(wall(4.0), shining(panel(LAMP))))
+    photographs = photographs_of(scene_of(wall(4.0), *early))[:count] + late[count:]
+    assert mirrored_lamps(first, first.planes, photographs) is None
+
+
+@pytest.mark.parametrize("ignored", [(True, True), (True, False), (False, True)], ids=["all", "past", "in the glass"])
+def test_ignored_pixels_make_no_lamp(ignored: tuple[bool, bool]) -> None:
+    lit, first = scene_of(wall(4.0), shining(panel(LAMP))), scene_of(wall(4.0), panel(LAMP), panel(IMAGE))
+    in_glass = [Planar()(lit, view).layers["strength"] > 0 for view in CAMERAS]
+    hidden = [
+        one._replace(valid=~torch.where(glass, ignored[1], ignored[0]))
+        for one, glass in zip(photographs_of(lit), in_glass, strict=True)
+    ]
     assert mirrored_lamps(first, first.planes, hidden) is None
+
+
+def test_what_stands_before_the_glass_is_not_the_image_of_a_lamp() -> None:
+    photographs = photographs_of(scene_of(wall(4.0), shining(panel(LAMP))))
+    haze = panel((0.57, 0.0, 1.9))
+    haze = haze.with_tensors({"logit_opacities": torch.full((len(haze),), -4.0)})
+    first = scene_of(wall(4.0), panel(LAMP), panel(IMAGE), haze)
+    lamps = mirrored_lamps(first, first.planes, photographs)
+    assert lamps is not None and not bool(lamps.images[-len(haze) :].any())
 
 
 def test_places_are_found_where_a_pane_mirrors_nothing_and_nowhere_else() -> None:

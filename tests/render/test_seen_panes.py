@@ -44,6 +44,14 @@ def vitrine(*labels: int, front: Planes = FRONT) -> Scene:
     )
 
 
+def panes_in_a_row(count: int) -> Scene:
+    """The objects of `vitrine` with so many large panes, one behind another."""
+    depths = [1.5 + 0.5 * k for k in range(count)]
+    planes = joined(*(pane(depth, label=k + 1) for k, depth in enumerate(depths)))
+    glass = concatenated(*(glass_at(depth, 20 + k) for k, depth in enumerate(depths)))
+    return replace(vitrine(1, 2), planes=planes, glass=glass)
+
+
 def light(image: Tensor) -> Tensor:
     return linear_from_srgb(image)
 
@@ -86,10 +94,28 @@ def test_layers_skip_an_invisible_nearest_pane() -> None:
         torch.testing.assert_close(both.layers[name][where], back.layers[name][where], rtol=1e-6, atol=1e-7)
 
 
-@pytest.mark.parametrize("tint", [None, ((0.5, 0.9, 0.6), (0.7, 0.6, 0.9))], ids=["clear", "tinted"])
+@pytest.mark.parametrize("faint", [(1,), (0, 1), (0,)], ids=["the second", "the first two", "the first"])
+def test_the_layers_of_three_panes_are_those_of_the_visible_ones(faint: tuple[int, ...]) -> None:
+    scene = panes_in_a_row(3)
+    hidden = torch.isin(nearest_panes(scene.glass.means, scene.planes), torch.tensor(faint))
+    marks = torch.where(hidden, -80.0, scene.glass.channels["logit_mark"])
+    rows = [k for k in range(3) if k not in faint]
+    visible = replace(scene, planes=scene.planes.select(rows), glass=scene.glass.select(~hidden))
+    scene = replace(scene, glass=scene.glass.with_tensors({"logit_mark": marks}))
+    three, fewer = (Planar()(of, CAMERA).layers for of in (scene, visible))
+    where = fewer["strength"] > 0
+    assert bool(where.any())
+    for name in ("transmission", "strength", "reflection"):
+        torch.testing.assert_close(three[name][where], fewer[name][where], rtol=1e-6, atol=1e-7)
+
+
+TINT = ((0.5, 0.9, 0.6), (0.7, 0.6, 0.9), (0.8, 0.5, 0.7))
+
+
+@pytest.mark.parametrize("tint", [None, TINT], ids=["clear", "tinted"])
 @pytest.mark.parametrize("blend", ["linear", "srgb"])
 def test_the_layers_recombine_to_the_image(blend: Blend, tint: tuple[tuple[float, ...], ...] | None) -> None:
-    scene, logarithms = vitrine(1, 2), None if tint is None else torch.tensor(tint, dtype=torch.float64).log()
+    scene, logarithms = panes_in_a_row(3), None if tint is None else torch.tensor(tint, dtype=torch.float64).log()
     frame = Planar(blend=blend)(replace(scene, planes=replace(scene.planes, log_transmittances=logarithms)), CAMERA)
     decode, _ = blend_conversions(blend)
     share = frame.layers["strength"][..., None]
@@ -138,15 +164,12 @@ def test_a_mirror_behind_glass_shows_the_room(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.parametrize("count", [3, 5])
 def test_any_number_of_panes_may_stand_one_behind_another(count: int) -> None:
-    depths = [1.5 + 0.5 * k for k in range(count)]
-    planes = joined(*(pane(depth, label=k + 1) for k, depth in enumerate(depths)))
-    glass = concatenated(*(glass_at(depth, 20 + k) for k, depth in enumerate(depths)))
-    scene = replace(vitrine(1, 2), planes=planes, glass=glass)
+    scene = panes_in_a_row(count)
     share = Planar()(scene, CAMERA).layers["share"]
     passed = torch.ones_like(share)
     for k in range(count):
-        own = glass.select(nearest_panes(glass.means, planes) == k)
-        alone = replace(scene, planes=planes.select([k]), glass=own)
+        own = scene.glass.select(nearest_panes(scene.glass.means, scene.planes) == k)
+        alone = replace(scene, planes=scene.planes.select([k]), glass=own)
         passed = passed * (1 - Planar()(alone, CAMERA).layers["strength"])
     torch.testing.assert_close(1 - share, passed)
 

@@ -248,6 +248,14 @@ def test_views_that_ignore_a_position_are_no_evidence_against_missing_objects() 
     assert len(missing_in(ground, views, Splat())) > 0.9 * len(found) > 5
 
 
+def test_photographs_from_one_side_do_not_locate_missing_objects() -> None:
+    whole = Scene(balls([(0.3, -0.2, 0.1), (0.0, 0.4, 0.0)], [250, 30], -1.8), 2.0)
+    ground = Scene(whole.primary.select(torch.tensor([False, True])), 2.0)
+    around = views_of(whole).train[2:7]
+    assert len(missing_in(ground, around, Splat())) > 5
+    assert len(missing_in(ground, around[:1] * 5, Splat())) == 0
+
+
 def test_missing_objects_are_searched_with_window_sums() -> None:
     """On photographs of two megapixels, summing every window separately took half a minute for each."""
     whole = Scene(balls([(0.3, -0.2, 0.1), (0.0, 0.4, 0.0)], [250, 30], -1.8), 2.0)
