@@ -151,7 +151,10 @@ def test_a_broken_scene_file_is_reported(tmp_path: Path, capsys: pytest.CaptureF
     fails_with(["eval", str(run)], capsys, "cannot be read", "point_cloud.ply")
 
 
-def test_the_demo_compares_both_methods_and_can_be_repeated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_demo_compares_both_methods_and_can_be_repeated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("glassplat.cli.train.DEMO_DOWNSCALE", 12.0)
     for _ in range(2):
         assert main(["demo", "--output", str(tmp_path), "--iterations", "10"]) == 0
         shown = "".join(capsys.readouterr().out.split())

@@ -1,6 +1,7 @@
 """Planes from masks and points, on panes whose geometry is known."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from glassplat.panes.fit import fit_planes
 from glassplat.panes.masks import FramedPlanes, PlaneEquations, mask_agreement, pane_views
 from glassplat.panes.objective import Objective, sample_nearby
 from glassplat.scene.camera import Camera, rotation_from_quat
+from glassplat.scene.panes import Planes
 from tests.panes.pane_scene import (
     EYES,
     FRONT,
@@ -31,8 +33,14 @@ SURFACE = ((1.52 - 1) / (1.52 + 1)) ** 2
 """Reflectance of one surface of clear glass at normal incidence."""
 
 
+@cache
+def fitted_front() -> Planes:
+    """The plane that three masks of a pane and the points of its frame give."""
+    return fit_planes(frame_and_clutter([FRONT]), scene_of([FRONT]), extent=EXTENT, options=QUICK)
+
+
 def test_three_masks_and_a_sparse_frame_give_the_pane() -> None:
-    planes = fit_planes(frame_and_clutter([FRONT]), scene_of([FRONT]), extent=EXTENT, options=QUICK)
+    planes = fitted_front()
     assert planes.labels == (1,)
     assert normal_error(planes, 0, FRONT) < 0.5
     assert offset_error(planes, 0, FRONT) < 0.005 * EXTENT
@@ -64,8 +72,7 @@ def test_a_pane_photographed_from_all_sides_is_found() -> None:
 
 
 def test_scale_and_rotation_of_the_world_change_nothing() -> None:
-    points, annotations = frame_and_clutter([FRONT]), scene_of([FRONT])
-    first = fit_planes(points, annotations, extent=EXTENT, options=QUICK)
+    points, annotations, first = frame_and_clutter([FRONT]), scene_of([FRONT]), fitted_front()
     scale, shift = 1000.0, torch.tensor([3.0, -200.0, 40.0], dtype=torch.float64)
     rotation = rotation_from_quat(torch.tensor([0.3, -0.5, 0.7, 0.2], dtype=torch.float64))
 
@@ -98,8 +105,7 @@ def test_an_occluder_before_the_pane_does_not_move_the_plane() -> None:
 
 
 def test_same_seed_same_planes_and_bad_points_are_passed_over() -> None:
-    points, annotations = frame_and_clutter([FRONT]), scene_of([FRONT])
-    first = fit_planes(points, annotations, extent=EXTENT, options=QUICK)
+    points, annotations, first = frame_and_clutter([FRONT]), scene_of([FRONT]), fitted_front()
     poisoned = torch.cat([points, torch.full((3, 3), torch.nan)])
     second = fit_planes(poisoned, annotations, extent=EXTENT, options=QUICK)
     for name, tensor in first.tensors().items():
