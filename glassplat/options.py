@@ -201,10 +201,6 @@ def _expected_structure(hint: Any) -> str:
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Literal:
         return f"one of {', '.join(map(str, inner))}"
-    if origin in UNION_TYPES:
-        return " or ".join(
-            "None" if option is type(None) else expectation(*unwrap_annotation(option)) for option in inner
-        )
     if origin is tuple:
         if inner[-1] is ...:
             return f"any number of values, each {expectation(*unwrap_annotation(inner[0]))}"
@@ -222,7 +218,7 @@ def _convert_value(hint: Any, value: Any, name: str, requirements: tuple[Require
         return _to_dataclass(typing.cast(type, hint), value, name)
     origin = typing.get_origin(hint)
     if origin in UNION_TYPES:
-        return _to_union(hint, value, name)
+        return _to_optional(hint, value, name)
     if origin in CONVERTERS:
         return CONVERTERS[origin](hint, value, name)
     if not _has_type(hint, value):
@@ -280,23 +276,16 @@ def nested_name(outer: str, field: str, hint: Any) -> str:
     return outer if nameless else f"{outer}.{field}".removeprefix(".")
 
 
-def _to_union(hint: Any, value: Any, name: str) -> Any:
-    """The value converted to the first type of a union that accepts it."""
-    if value is None and type(None) in typing.get_args(hint):
+def _to_optional(hint: Any, value: Any, name: str) -> Any:
+    """None, or the value converted to the other type of the union."""
+    if value is None:
         return None
-    options = [option for option in typing.get_args(hint) if option is not type(None)]
-    if len(options) == 1:
-        try:
-            return check_value(options[0], value, name)
-        except OptionError as error:
-            # An error in a nested field is more specific.
-            raise OptionError(error.name, error.value, f"{error.expected}, or None") from error
-    for option in options:
-        try:
-            return check_value(option, value, name)
-        except InputError:
-            continue
-    raise OptionError(name, value, expectation(hint))
+    (kind,) = (option for option in typing.get_args(hint) if option is not type(None))
+    try:
+        return check_value(kind, value, name)
+    except OptionError as error:
+        # An error in a nested field is more specific.
+        raise OptionError(error.name, error.value, f"{error.expected}, or None") from error
 
 
 def _to_literal(hint: Any, value: Any, name: str) -> Any:

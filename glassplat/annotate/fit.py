@@ -386,7 +386,7 @@ def _edge_line(pixels: Mapping[int, Array], cameras: Sequence[NumpyCamera]) -> t
     normals = np.stack([np.cross(*ends) for ends in rays.values()])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     _, sizes, axes = np.linalg.svd(normals)
-    if len(normals) < 2 or sizes[1] < LEAST_PARALLAX * sizes[0]:
+    if sizes[1] < LEAST_PARALLAX * sizes[0]:
         return None
     offsets = np.array([normal @ cameras[view].center for normal, view in zip(normals, pixels, strict=True)])
     point, direction = np.linalg.lstsq(normals, offsets, rcond=1e-9)[0], axes[2]

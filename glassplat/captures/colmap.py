@@ -64,9 +64,7 @@ def model_suffix(folder: Path) -> str | None:
 
 def read_model(folder: Path) -> SparseModel:
     """Read cameras, images and points; points may be in the other format (binary or text), or missing."""
-    suffix = model_suffix(folder)
-    if suffix is None:
-        raise InputError(f"no COLMAP model in {folder}; expected cameras and images as .bin or .txt")
+    suffix = model_suffix(folder) or ".txt"
     lenses = _by_id(_read_records(folder / f"cameras{suffix}"), folder / f"cameras{suffix}")
     images = tuple(_read_records(folder / f"images{suffix}"))
     if not images:

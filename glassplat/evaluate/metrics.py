@@ -467,8 +467,6 @@ def _build_mismatch() -> str | None:
             f"torchvision {importlib.metadata.version('torchvision')} is of another build than PyTorch "
             f"{torch.__version__}: pip uninstall torchvision, then pip install torchvision torch=={version}{index}"
         )
-    except ImportError:
-        return None
     return None
 
 

@@ -229,8 +229,6 @@ def check_database(path: Path) -> Iterator[None]:
     """Turns COLMAP's errors about its database into InputError, or OSError if the disk is full."""
     try:
         yield
-    except InputError:
-        raise
     except (RuntimeError, LookupError, ValueError) as error:
         reason = str(error)
         if isinstance(error, RuntimeError) and not any(word in reason for word in DATABASE_ERROR_WORDS):

@@ -256,27 +256,6 @@ def nearest_panes(points: Tensor, planes: Planes) -> Tensor:
     return rectangle_offsets(points, planes).square().sum(-1).argmin(dim=1)
 
 
-@torch.no_grad()
-def behind_panes(points: Tensor, planes: Planes, cameras: Sequence[Camera]) -> Tensor:
-    """[N] bool: points that some camera sees through some pane.
-
-    A point counts if a camera, on either side of a pane, has the point in its image and the segment from the camera's
-    centre to the point crosses the pane's rectangle.
-
-    Args:
-        points: [N, 3] world positions.
-        planes: the panes.
-        cameras: the training views.
-    """
-    found = torch.zeros(points.shape[0], dtype=torch.bool, device=points.device)
-    if len(planes) == 0:
-        return found
-    # One view at a time, to avoid views x panes x points values.
-    for camera in (camera.to(points.device) for camera in cameras):
-        found |= crosses_pane(points, planes, camera.center) & in_image(points, camera)
-    return found
-
-
 def crosses_pane(points: Tensor, planes: Planes, camera_center: Tensor) -> Tensor:
     """[N] bool: true if the segment from `camera_center` to the point crosses a pane."""
     normals = planes.normals

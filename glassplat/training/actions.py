@@ -16,7 +16,7 @@ from glassplat.render.frame import Renderer
 from glassplat.render.layers import contributions, window_means
 from glassplat.scene.camera import Camera, to_device
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.panes import behind_panes, crosses_pane, in_image, nearest_pixels
+from glassplat.scene.panes import crosses_pane, in_image, nearest_pixels
 from glassplat.scene.scene import Scene
 from glassplat.training import densify, losses
 from glassplat.training.messages import Working
@@ -301,7 +301,8 @@ class PerturbOpacity:
         selected = torch.zeros(len(means), dtype=torch.bool, device=means.device)
         for done, view in enumerate(dataset.train):
             yield Working("finding what is visible through panes", done, len(dataset.train))
-            selected |= behind_panes(means, planes, [view.camera])
+            camera = view.camera.to(means.device)
+            selected |= crosses_pane(means, planes, camera.center) & in_image(means, camera)
         perturbed = densify.perturb_opacities(
             state.scene.primary,
             selected,

@@ -270,14 +270,8 @@ def apply_edit(
 
 @torch.no_grad()
 def append(gaussians: Gaussians, moments: Moments, new: Gaussians) -> tuple[Gaussians, Moments]:
-    """The primary Gaussians followed by `new` ones, whose moments are zero.
-
-    Raises:
-        ValueError: the two sets do not hold the same tensors.
-    """
+    """The primary Gaussians followed by `new` ones with the same tensors, whose moments are zero."""
     old_tensors, new_tensors = gaussians.tensors(), new.tensors()
-    if set(old_tensors) != set(new_tensors):
-        raise ValueError(f"cannot append Gaussians with {sorted(new_tensors)} to Gaussians with {sorted(old_tensors)}")
     joined = gaussians.with_tensors({name: torch.cat([old_tensors[name], new_tensors[name]]) for name in old_tensors})
 
     def extended(name: str, moment: Tensor) -> Tensor:
@@ -419,11 +413,6 @@ def densify(
         part: the scene part that `gaussians` is.
         prune_large: also remove oversized Gaussians, as 3DGS does after the first opacity reset.
     """
-    if statistics.view_count.shape[1] != len(gaussians):
-        raise ValueError(
-            f"statistics hold {statistics.view_count.shape[1]} columns for {len(gaussians)} Gaussians; "
-            "start new statistics whenever the set has changed"
-        )
     grown = _growth_edit(options, gaussians, statistics, extent=extent, generator=generator)
     pruned = _select_to_prune(options, gaussians, grown, extent=extent, prune_large=prune_large)
     return apply_edit(gaussians, moments, grown.then(keep(~pruned)), part=part)
@@ -647,7 +636,7 @@ def perturb_opacities(
 
     Args:
         gaussians: the primary Gaussians.
-        selected: [N] bool, those visible through a pane (`behind_panes`).
+        selected: [N] bool, those visible through a pane (`crosses_pane`).
         generator: source of the noise, on the device of `gaussians`.
         amplitude: the noise is uniform in [-amplitude, amplitude] and acts on the activated opacity.
         bounds: range the new opacities are clamped to. The paper does not give it; the lower bound

@@ -1,15 +1,22 @@
 """Opacity perturbation of Gaussians seen through a pane."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from glassplat.scene.camera import Camera, rotation_from_quat
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.panes import Planes, behind_panes
+from glassplat.scene.panes import Planes, crosses_pane, in_image
+from glassplat.scene.scene import Scene
+from glassplat.training.actions import PerturbOpacity
 from glassplat.training.densify import perturb_opacities
+from glassplat.training.stage import Clock, Every, TrainState
+from tests.training.progress_of import finished
 
 PANE = Planes(
     centers=torch.zeros(1, 3),
@@ -28,6 +35,12 @@ def camera_at(z: float, *, backwards: bool = False, focal: float = 50.0) -> Came
     matrix[:3, :3] = rotation
     matrix[:3, 3] = -rotation @ torch.tensor([0.0, 0.0, z])
     return Camera(matrix, focal, focal, 50.0, 50.0, 100, 100)
+
+
+def behind_panes(points: Tensor, planes: Planes, cameras: Sequence[Camera]) -> Tensor:
+    """[N] bool: points that some camera sees through some pane."""
+    seen = [crosses_pane(points, planes, camera.center) & in_image(points, camera) for camera in cameras]
+    return torch.stack(seen).any(dim=0)
 
 
 FRONT = camera_at(-2.0)
@@ -110,6 +123,18 @@ def test_noise_is_uniform_on_the_activated_opacity_of_the_selected() -> None:
     assert noise.mean().item() == pytest.approx(0, abs=0.01)
     assert noise.var().item() == pytest.approx(0.8**2 / 12, rel=0.05)
     assert torch.equal(after.logit_opacities[~selected], gaussians.logit_opacities[~selected])
+
+
+def test_what_views_show_through_panes_is_perturbed_and_forgets_its_moments() -> None:
+    state = TrainState(Scene(make_gaussians(100), 1.0, planes=PANE), seed=0)
+    state.optimizer.moments = {"primary.logit_opacities": (torch.ones(100), torch.ones(100))}
+    dataset: Any = SimpleNamespace(train=[SimpleNamespace(camera=camera) for camera in (FRONT, camera_at(-3.0))])
+    action = PerturbOpacity(Every(0.1), **PUBLISHED)
+    assert action.due(Clock(10, 100, 2)) and not action.due(Clock(11, 100, 2))
+    assert finished(action.apply(state, dataset, Clock(10, 100, 2)))
+    behind = torch.arange(100) % 2 == 0
+    assert torch.equal(state.scene.primary.logit_opacities != 0, behind)
+    assert torch.equal(state.optimizer.moments["primary.logit_opacities"][0] == 0, behind)
 
 
 def test_opacities_stay_within_bounds_and_finite() -> None:
