@@ -57,6 +57,13 @@ def test_an_outline_that_leaves_the_photograph_is_cut_there() -> None:
     assert (found[:, 91:] != disc[:, 91:]).sum() < 0.05 * disc.sum()
 
 
+def test_an_outline_without_surroundings_stays() -> None:
+    photo, _ = hedge_before_a_wall()
+    around = np.array([[-5.0, -5], [WIDTH + 5, -5], [WIDTH + 5, HEIGHT + 5], [-5, HEIGHT + 5]])
+    (outline,) = grab_outlines(photo, around)
+    np.testing.assert_array_equal(outline, around)
+
+
 def test_an_outline_outside_the_photograph_is_refused() -> None:
     photo, _ = hedge_before_a_wall()
     with pytest.raises(InputError, match="lies outside the photograph"):

@@ -211,6 +211,13 @@ def test_too_few_marks_are_refused_with_what_is_missing(kept: dict[int, int], ex
         fit_pane(some, cameras, "rectangle")
 
 
+def test_a_corner_that_no_photograph_shows_is_named() -> None:
+    cameras = cameras_on(FRONT)
+    marks = Marks([*corner_marks(FRONT, cameras).corners, {}])
+    with pytest.raises(TooFewMarksError, match="mark corner 5 too, in at least one photograph"):
+        fit_pane(marks, cameras, "polygon")
+
+
 def test_views_from_one_place_are_not_enough() -> None:
     cameras = cameras_on(FRONT, [EYES[0], EYES[0]])
     with pytest.raises(TooFewMarksError, match="taken farther apart"):

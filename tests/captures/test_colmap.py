@@ -173,9 +173,25 @@ def test_cut_off_binary_file_is_named(capture, name: str, share: float) -> None:
 
 
 @pytest.mark.parametrize(
+    ("name", "start", "data", "message"),
+    [
+        ("cameras", 12, b"\x63\0\0\0", r"a camera model of number 99; expected 0 to \d+"),
+        ("images", 8 + 4 + 7 * 8 + 4, None, "it ends within a name"),
+    ],
+)
+def test_damaged_binary_file_is_named(capture, name: str, start: int, data: bytes | None, message: str) -> None:
+    path = capture.write_colmap() / f"{name}.bin"
+    whole = path.read_bytes()
+    path.write_bytes(whole[: start + 2] if data is None else whole[:start] + data + whole[start + len(data) :])
+    with pytest.raises(InputError, match=rf"{name}\.bin is cut off or damaged \(it .*{message}|{message}"):
+        load_dataset(capture.root)
+
+
+@pytest.mark.parametrize(
     ("name", "line", "message"),
     [
         ("cameras", "1 BANANA 32 24 1 2 3", "unknown camera model 'BANANA'"),
+        ("cameras", "1 EQUIRECTANGULAR 32 24 16 12", "EQUIRECTANGULAR .* cannot be undistorted"),
         ("cameras", "1 PINHOLE 32 24 30 30 16", "takes 4 parameters, got 3"),
         ("cameras", "1 PINHOLE 32 24 0 30 16 12", r"expected a finite number from 0.032 to 3.2e\+06 instead of 0"),
         ("cameras", "1 PINHOLE 32 24 nan 30 16 12", "finite"),

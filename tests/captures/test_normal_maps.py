@@ -83,6 +83,11 @@ def test_invalid_normal_maps_are_refused(tmp_path: Path) -> None:
         write(tmp_path, "a.npy", vectors)
         with pytest.raises(InputError, match=message):
             estimated_normals(view_in(tmp_path))
+    (tmp_path / "normals" / "a.npy").unlink()
+    Image.new("L", (SIZE, SIZE)).save(tmp_path / "normals" / "a.png")
+    with pytest.raises(InputError, match=r"a\.png is grey; expected normals as colours"):
+        estimated_normals(view_in(tmp_path))
+    (tmp_path / "normals" / "a.png").unlink()
     # The second was found by damaging files at random: NumPy evaluates the header as Python source.
     head = b"\x93NUMPY\x01\x00v\x00\xd8'descr': '<f4', 'fortran_order': False, 'shape': (2, 3, 3), }" + b" " * 60
     for damaged in (b"no", head):

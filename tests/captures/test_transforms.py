@@ -74,6 +74,9 @@ def test_opening_angle_and_middle_are_the_fallback(capture) -> None:
     assert found is not None
     focal = 16 / math.tan(0.6)
     assert parameters_of(found) == pytest.approx([focal, focal, 16, 12])
+    capture.write_transforms({"frames": capture.frames()})
+    with pytest.raises(InputError, match=r"the lens of 0000\.png has no focal length; expected fl_x"):
+        load_transforms(capture.root)
 
 
 def test_second_opening_angle_is_used(capture) -> None:
@@ -188,6 +191,15 @@ def test_points_may_have_colours_as_shares(names: Sequence[str], capture) -> Non
     np.testing.assert_array_equal(points.colors, [[255, 102, 0], [0, 51, 255]])
 
 
+def test_points_without_colours_are_grey(capture) -> None:
+    capture.root.mkdir()
+    header = ["ply", "format ascii 1.0", "element vertex 1", *(f"property float {n}" for n in "xyz"), "end_header"]
+    (capture.root / "points3d.ply").write_text("\n".join([*header, "0 1 2", ""]))
+    points = load(capture).points
+    assert points is not None and points.positions.tolist() == [[0, 1, 2]]
+    np.testing.assert_array_equal(points.colors, [[128, 128, 128]])
+
+
 def test_random_points_are_where_the_cameras_look(capture) -> None:
     load(capture)
     first, second = load_dataset(capture.root).points, load_dataset(capture.root).points
@@ -241,6 +253,7 @@ def test_missing_photographs_are_named(capture) -> None:
         ({"frames": []}, "lists no frames"),
         ({"frames": [{"transform_matrix": []}]}, "has no file_path"),
         ({"ply_file_path": "lost.ply"}, "ply_file_path names .*lost.ply, which does not exist"),
+        ({"frames": [{"file_path": "images/0000.png", "transform_matrix": np.eye(4).tolist()}] * 2}, "has two frames"),
     ],
 )
 def test_settings_that_cannot_be_used(capture, change: dict[str, Any], message: str) -> None:
@@ -302,10 +315,15 @@ def test_points_of_the_model_next_to_frames_of_nerfstudio_are_mentioned(capture)
     assert len(load_dataset(folder).points) == len(capture.points), "the folder can be read as it is said"
 
 
-def test_a_ply_that_is_not_a_point_cloud_is_refused(capture) -> None:
+@pytest.mark.parametrize(
+    ("axes", "message"), [(None, r"points3d\.ply is not a PLY file"), ("xz", "has no vertex property y; expected a p")]
+)
+def test_a_ply_that_is_not_a_point_cloud_is_refused(axes: str | None, message: str, capture) -> None:
     capture.root.mkdir()
-    (capture.root / "points3d.ply").write_text("not a ply\n")
-    with pytest.raises(InputError, match=r"points3d\.ply"):
+    header = ["ply", "format ascii 1.0", "element vertex 1", *(f"property float {n}" for n in axes or "")]
+    content = "not a ply\n" if axes is None else "\n".join([*header, "end_header", "0 1", ""])
+    (capture.root / "points3d.ply").write_text(content)
+    with pytest.raises(InputError, match=message):
         load(capture)
 
 
@@ -327,6 +345,10 @@ def test_points_that_are_a_link_to_nowhere_are_not_replaced_by_random_ones(captu
     with pytest.raises(InputError, match=r"points3d\.ply is not a readable file"):
         load_dataset(capture.root)
     points = capture.write_colmap(binary=binary) / f"points3D.{'bin' if binary else 'txt'}"
+    points.unlink()
+    points.symlink_to("/nowhere")
+    with pytest.raises(InputError, match=r"points3D\.\w+ does not exist"):
+        load_dataset(capture.root)
     points.unlink()
     points.mkdir()
     with pytest.raises(InputError, match=r"points3D\.\w+ cannot be read \(it is a folder"):

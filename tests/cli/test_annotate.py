@@ -12,8 +12,10 @@ from urllib.request import url2pathname
 import pytest
 
 from glassplat.annotate.server import AnnotationServer
+from glassplat.cli import serving
 from glassplat.cli.main import main
-from tests.annotate.conftest import serving, write_room
+from tests.annotate.conftest import serving as serving_room
+from tests.annotate.conftest import write_room
 from tests.browser_needed import needs_browser
 from tools.browser import Browser, wait_until
 
@@ -58,6 +60,22 @@ def test_the_url_of_the_started_browser_grants_no_access(room: Path, monkeypatch
     assert {path.name for path in room.iterdir()} <= before | {"annotations.json"}
 
 
+@pytest.mark.parametrize(
+    ("variables", "expected"),
+    [({}, False), ({"DISPLAY": ":0"}, True), ({"DISPLAY": "localhost:10.0", "SSH_CONNECTION": "1 2 3 4"}, False)],
+    ids=str,
+)
+def test_a_browser_is_opened_only_where_somebody_sees_it(
+    variables: dict[str, str], expected: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SSH_CONNECTION"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert serving.has_screen() is expected
+
+
 def text_of(browser: Browser) -> str:
     """Text of a page that may be navigating to another one."""
     with suppress(RuntimeError):
@@ -68,7 +86,7 @@ def text_of(browser: Browser) -> str:
 @needs_browser
 def test_the_link_may_stand_on_another_page(room: Path, tmp_path: Path) -> None:
     page = tmp_path / "page.html"
-    with serving(room) as server:
+    with serving_room(room) as server:
         page.write_text(f'<meta http-equiv="refresh" content="0; url={server.address}">')
         with Browser(page, query="") as browser:
             wait_until(lambda: "corners" in text_of(browser), "the page")

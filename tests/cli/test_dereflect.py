@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -84,16 +85,26 @@ def test_photographs_are_never_overwritten(tmp_path: Path, capsys: pytest.Captur
     assert {path.name: path.read_bytes() for path in images.iterdir()} == before
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes with a name")
+def test_a_pipe_is_not_written_to(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, output = write_run(tmp_path / "run"), tmp_path / "clean"
+    claim_folder(output, "dereflect", run)
+    os.mkfifo(output / "0.png")
+    assert main(["dereflect", str(run), "--output", str(output)]) == 2
+    assert "0.png is a pipe, a device or a broken link; nothing was written" in message(capsys)
+
+
+@pytest.mark.parametrize(("name", "other"), [("dereflect", "render"), ("render", "dereflect")])
 def test_an_output_folder_of_the_same_command_is_reused_with_a_message(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str, other: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, output = write_run(tmp_path / "run"), tmp_path / "clean"
-    command = ["dereflect", str(run), "--output", str(output), "--split", "test"]
+    command = [name, str(run), "--output", str(output), "--split", "test"]
     assert main(command) == 0
-    assert "replacing" not in capsys.readouterr().out
+    assert "replac" not in capsys.readouterr().out
     assert main(command) == 0
-    assert "replacing" in capsys.readouterr().out
-    assert main(["render", str(run), "--output", str(output)]) == 2
+    assert "replac" in capsys.readouterr().out
+    assert main([other, str(run), "--output", str(output)]) == 2
 
 
 def test_a_folder_belongs_to_the_command_that_wrote_it(tmp_path: Path) -> None:

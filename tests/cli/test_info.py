@@ -251,6 +251,17 @@ def test_info_lists_the_panes_of_an_exported_folder(tmp_path: Path, capsys: pyte
     assert main(["info", str(output)]) == 2
 
 
+def test_what_a_damaged_run_lacks_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = write_run(tmp_path / "a run")
+    (run / "results.json").write_text("[")
+    assert f"{run / 'results.json'} is damaged; evaluate it again" in told(run, capsys)["problems"]
+    (splats,) = run.glob("point_cloud/*/point_cloud.ply")
+    assert "scene.json" in told(splats, capsys)["facts"]["next to it"]
+    (run / "recipe.json").unlink()
+    assert main(["info", str(run)]) == 2
+    assert "holds a scene, but no recipe.json" in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_folder_of_runs_is_not_taken_for_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     demo = tmp_path / "a demo"
     write_run(demo / "planar")
@@ -280,6 +291,8 @@ def test_splat_files_are_counted_and_judged(suffix: str, tmp_path: Path, capsys:
     faint = gaussians.with_tensors({"logit_opacities": torch.full((len(gaussians),), -8.0)})
     (write_gaussians if suffix == ".ply" else write_spz)(path, faint)
     assert told(path, capsys)["problems"] == ["100% of the Gaussians are nearly invisible"]
+    (write_gaussians if suffix == ".ply" else write_spz)(path, gaussians.select(torch.zeros(len(gaussians)).bool()))
+    assert told(path, capsys)["problems"] == ["it holds no Gaussian"]
 
 
 def test_gaussians_without_a_finite_position_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

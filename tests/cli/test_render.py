@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 
 from glassplat.cli import progress
 from glassplat.cli.main import main
@@ -14,6 +16,7 @@ from glassplat.cli.places import SceneEdits
 from glassplat.errors import InputError
 from glassplat.files.images import read_image
 from glassplat.model.model import load
+from glassplat.prepare.photographs import Note
 from glassplat.scene.scene import (
     Scene,
     as_mirrors,
@@ -23,6 +26,7 @@ from glassplat.scene.scene import (
     with_reflectance,
     without_glass,
 )
+from glassplat.training.messages import Working
 from tests.cli.tiny_run import rendered, write_run
 from tests.scene.test_plane_edits import two_panes
 from tests.training.tiny_capture import true_scene
@@ -116,6 +120,19 @@ def test_progress_is_printed_to_a_log(
     assert main([name, str(run), "--output", str(tmp_path / "out"), *options]) == 0
     said = capsys.readouterr().out
     assert f"{work} (1)\n{work}: 1 of 1, 0 s left\n{end}" in said
+
+
+def test_a_terminal_shows_one_bar_and_the_notes_above_it() -> None:
+    said = io.StringIO()
+    with progress.WorkProgress(Console(file=said, force_terminal=True, width=80)) as shown:
+        for message in (
+            Working("rendering", 0, 3),
+            Working("rendering", 1, 3),
+            Note("one is dark"),
+            Working("saving", 0, 2),
+        ):
+            shown.show(message)
+    assert all(words in said.getvalue() for words in ("one is dark", "saving", "0/2"))
 
 
 def test_panes_that_pass_each_other_keep_their_glass() -> None:

@@ -237,7 +237,7 @@ def test_help_shows_the_defaults_of_the_preset(
     assert ["the paper has no such term. (default: 0.0)" in text for text in shown] == [False, True]
 
 
-def test_the_recipe_of_a_preset_is_recorded(tmp_path: Path) -> None:
+def test_the_recipe_of_a_preset_is_recorded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = tmp_path / "run"
     arguments = ["--data", str(SCENE), "--output", str(run), "--downscale", "12", "--iterations", "3"]
     assert main(["train", "splat", "--preset", "paper", *arguments]) == 0
@@ -245,6 +245,9 @@ def test_the_recipe_of_a_preset_is_recorded(tmp_path: Path) -> None:
     assert '"split_by": "gradient"' in recorded and '"short_run_power": 0.0' in recorded
     assert main(["train", "splat", *arguments, "--resume"]) == 2
     assert main(["train", "splat", "--preset", "paper", *arguments, "--resume"]) == 0
+    capsys.readouterr()
+    assert main(["train", "planar", *arguments, f"--config={run / 'recipe.json'}"]) == 2
+    assert "recipe.json is a recipe of splat; expected one of planar" in " ".join(capsys.readouterr().err.split())
 
 
 def test_every_method_is_offered(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,6 +23,14 @@ def test_an_environment_round_trips_bit_for_bit(
         assert read.raw.dtype == raw.dtype and torch.equal(read.raw, raw)
 
 
+def test_texels_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "environment.safetensors"
+    for raw in (torch.full((6, 2, 2, 3), torch.nan), torch.zeros(6, 2, 2, 3, dtype=torch.int32)):
+        save_file({"raw": raw}, file, metadata={"glassplat": '{"format": "glassplat-environment-1", "region": null}'})
+        with pytest.raises(ValueError, match="holds no tensor `raw` of finite numbers"):
+            read_environment(file)
+
+
 def test_a_file_that_is_cut_off_or_foreign_is_named(tmp_path: Path) -> None:
     file = tmp_path / "environment.safetensors"
     with pytest.raises(FileNotFoundError, match="no environment at"):

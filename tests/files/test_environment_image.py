@@ -59,6 +59,9 @@ def test_files_that_are_not_a_panorama_are_named(tmp_path: Path) -> None:
     write_channels(tmp_path / "square.exr", {"RGB": np.zeros((2, 3, 3), np.float32)})
     with pytest.raises(ValueError, match="3 x 2 pixels; expected an equirectangular image, twice as wide as high"):
         read_equirect(tmp_path / "square.exr")
+    Image.new("L", (4, 2)).save(tmp_path / "grey.png")
+    with pytest.raises(ValueError, match=r"grey\.png is grey; expected a panorama in colour"):
+        read_equirect(tmp_path / "grey.png")
     whole = bytearray((tmp_path / "square.exr").read_bytes() + bytes(2**16))  # Space for a table of all lines.
     window = whole.index(b"dataWindow") + len("dataWindow.box2i.") + 4
     whole[window : window + 16] = np.array([0, 0, 2**16 - 1, 2**15 - 1], "<i4").tobytes()

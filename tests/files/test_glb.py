@@ -18,7 +18,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from glassplat.files.glb import CHUNK, EXTENSION, HEADER, read_glb, write_glb
+from glassplat.files.glb import CHUNK, EXTENSION, HEADER, MAGIC, VERSION, read_glb, write_glb
 from glassplat.kernels.project.reference import rotations, sh_basis
 from glassplat.scene import SH_ZERO
 from glassplat.scene.camera import rotation_from_quat
@@ -304,6 +304,26 @@ def test_an_inconsistent_document_is_refused(
         read_glb(path)
 
 
+@pytest.mark.parametrize(
+    ("text", "rest", "message"),
+    [
+        (b"[]  ", b"", r"holds \[\]; expected a glTF document"),
+        (None, b"", "cut off or damaged"),
+        (None, CHUNK.pack(4, 7) + bytes(4), "buffer of .* has 4 bytes, which are not all there"),
+    ],
+    ids=["a list", "no buffer", "an unknown buffer"],
+)
+def test_a_file_of_other_chunks_is_refused(text: bytes | None, rest: bytes, message: str, tmp_path: Path) -> None:
+    path = written(tmp_path)
+    data = path.read_bytes()
+    size, kind = CHUNK.unpack_from(data, HEADER.size)
+    text = data[HEADER.size + CHUNK.size :][:size] if text is None else text
+    body = CHUNK.pack(len(text), kind) + text + rest
+    path.write_bytes(HEADER.pack(MAGIC, VERSION, HEADER.size + len(body)) + body)
+    with pytest.raises(ValueError, match=message):
+        read_glb(path)
+
+
 def test_one_mesh_shown_over_and_over_is_refused(tmp_path: Path) -> None:
     def repeat(document: dict[str, Any]) -> None:
         document["nodes"] = [{"mesh": 0}] * 1100
@@ -333,12 +353,15 @@ def test_a_file_that_is_cut_off_is_refused(cut: int, tmp_path: Path) -> None:
         read_glb(path)
 
 
-def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
+def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     broken = typical()
     broken.means[3, 1] = torch.nan
     for gaussians, message in ((Gaussians.empty(1), "no Gaussians"), (broken, "means are not all finite")):
         with pytest.raises(ValueError, match=message):
             write_glb(tmp_path / "a.glb", gaussians)
+    monkeypatch.setattr("glassplat.files.glb.MOST_BYTES", 1000)
+    with pytest.raises(ValueError, match="expected at most 1000: use PLY or SPZ"):
+        write_glb(tmp_path / "a.glb", typical())
     assert not list(tmp_path.iterdir())
 
 

@@ -194,6 +194,11 @@ def test_a_mesh_is_refused_as_a_mesh(tmp_path: Path) -> None:
         (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty uchar x\nend_header\nnan\n", "'x' of .* is nan somewhere"),
         (b"ply\nformat ascii 1.0\nend_header\n", "has no element 'vertex'"),
         (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\nabc\n", "not a number"),
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement face 1\nproperty list uchar int i\nelement vertex 1\n"
+            b"property float x\nend_header\n" + bytes(9),
+            "stores lists before element 'vertex'",
+        ),
     ],
 )
 def test_a_damaged_file_ends_in_one_message(tmp_path: Path, content: bytes, message: str) -> None:

@@ -188,6 +188,7 @@ def streamed(count: int, table: list[tuple[int, int]], body: bytes = b"", offset
         (packed(3, bytes(5)), "cut off"),
         (b"\x1f\x8b" + bytes(40), "unpacked"),
         (struct.pack("<II", MAGIC, 4), "within its header"),
+        (streamed(1, [])[: STREAMED_HEADER.size - 1], "begins as SPZ of version 4 does, but is cut off"),
         (streamed(1, []), "sections"),
         (streamed(1, [(1, 9)] * 5, offset=2**31), "sections"),
         (streamed(1, [(2**60, 9), (1, 1), (1, 3), (1, 3), (1, 4)]), "section 0"),

@@ -163,6 +163,20 @@ def test_a_missing_gaussforge_is_reported_with_the_remedy(
         write_splats(suffix[1:], tmp_path / f"b{suffix}", typical())
 
 
+def test_files_that_lack_what_a_scene_needs_are_named(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    assert main(["export", str(run), "--output", str(tmp_path / "out"), "--formats", "ply"]) == 0
+    write_gaussians(tmp_path / "out" / "glass.ply", typical())
+    with pytest.raises(InputError, match=r"glass\.ply has no property logit_mark; expected glass as"):
+        load(tmp_path / "out", device="cpu")
+    write_gaussians(tmp_path / "none.ply", typical().select(torch.zeros(len(typical())).bool()))
+    with pytest.raises(InputError, match=r"none\.ply holds no Gaussians"):
+        load(tmp_path / "none.ply", device="cpu")
+    (run / "cameras.json").write_text("[]")
+    with pytest.raises(InputError, match=r"cameras\.json lists no camera"):
+        load(run, device="cpu")
+
+
 def test_a_direction_that_is_not_up_is_refused(tmp_path: Path) -> None:
     write_gaussians(tmp_path / "scene.ply", true_scene().primary)
     with pytest.raises(InputError, match="up is 'w'; expected one of"):

@@ -169,6 +169,8 @@ def test_a_label_beyond_the_range_of_files_is_refused(label: int) -> None:
     with pytest.raises(ValueError, match=rf"the labels \[{label}\]; expected 1 to 255"):
         bare().with_pane((0.0, 0.0, 1.5), (0.0, 0.0, -1.0), (2.0, 2.0), label=label)
     assert bare().with_pane((0.0, 0.0, 1.5), (0.0, 0.0, -1.0), (2.0, 2.0), label=255).panes == (255,)
+    with pytest.raises(ValueError, match=r"the scene has a pane 1 already; its panes are \[1\]"):
+        model().with_pane((0.0, 0.0, 1.5), (0.0, 0.0, -1.0), (2.0, 2.0), label=1)
 
 
 @pytest.mark.parametrize(("name", "tolerance"), [("a.ply", 1e-6), ("a.spz", 0.1), ("folder", 0.0)])

@@ -8,6 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -147,6 +148,17 @@ def test_resuming_work_without_recorded_photographs_is_refused(photographs: Path
     settings.write_text(json.dumps(task.record()))
     with pytest.raises(InputError, match=r"capture\.partial does not record the photographs .* --force"):
         prepare(task, heard, resume=True)
+
+
+def test_what_was_interrupted_is_neither_begun_again_nor_gone_on_with_by_other_options(
+    photographs: Path, tmp_path: Path, heard: Heard
+) -> None:
+    task = begun(photographs, tmp_path / "capture")
+    with pytest.raises(InputError, match=r"holds an interrupted preparation of .*capture; continue it with --resume"):
+        prepare(task, heard)
+    with pytest.raises(InputError, match=r"capture\.partial was started with another max-size; give the same"):
+        prepare(replace(task, max_size=800), heard, resume=True)
+    assert not heard
 
 
 def test_resuming_with_another_video_of_the_same_name_is_refused(tmp_path: Path, heard: Heard) -> None:

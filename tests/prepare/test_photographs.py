@@ -127,6 +127,9 @@ def test_photographs_are_reduced_and_the_focal_length_with_them(tmp_path: Path, 
     assert (photograph.width, photograph.height) == (400, 300)
     assert photograph.focal == pytest.approx(26 / 43.2666 * 500, rel=1e-3)
     assert read_photograph(photograph).shape == (300, 400, 3)
+    photograph.path.unlink()
+    with pytest.raises(InputError, match=r"large\.jpg does not exist"):
+        read_photograph(photograph)
     assert found(folder, heard)["0.png"].focal is None
 
 

@@ -82,6 +82,12 @@ def test_invalid_videos_are_refused(tmp_path: Path) -> None:
         encode_video(tmp_path / "none" / "film.mp4", iter(PICTURES), count=6, fps=10)
 
 
+def test_a_film_that_was_not_written_completely_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("glassplat.publish.film._count_frames", lambda path: 5)
+    with pytest.raises(OSError, match=r"could not be written completely to .*film\.mp4; is the disk full"):
+        encode_video(tmp_path / "film.mp4", iter(PICTURES), count=len(PICTURES), fps=10)
+
+
 def test_a_wipe_shows_both() -> None:
     left, right = PICTURES[0], PICTURES[5]
     picture = wipe_images(left, right, 0.25)

@@ -59,6 +59,7 @@ def with_client(viewer: Viewer, work: Callable[[ViewerClient], Awaitable[None]])
         {"host": "evil.example:80", "origin": "http://evil.example:80"},
         {"key": ""},
         {"key": "guessed"},
+        {"origin": "http://[localhost"},
     ],
     ids=str,
 )

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from glassplat.errors import InputError
+from glassplat.viewer import render_loop
 from glassplat.viewer.render_loop import (
     LEAST_WIDTH,
     MOST_SHARE,
@@ -137,11 +138,21 @@ def test_disconnected_clients_are_removed_and_errors_stop_nothing() -> None:
     assert {client for client, *_ in recorder.shown} == {3}
 
 
+def test_without_a_free_port_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(host: str, port: int) -> int:
+        raise InputError(f"port {port} is in use")
+
+    monkeypatch.setattr(render_loop, "check_port", refuse)
+    with pytest.raises(InputError, match="none of the 100 ports from 8080 can be used"):
+        render_loop.vacant_port("127.0.0.1")
+
+
 def test_requests_run_in_the_drawing_thread() -> None:
     recorder = Recorder(held=True)
     threads: list[str] = []
     recorder.loop.submit(1, 1, SIZE)
     wait_until(lambda: len(recorder.drawn) == 1)
+    recorder.loop.schedule(lambda: threads.remove("nobody"))  # An error ends nothing.
     for _ in range(2):
         recorder.loop.schedule(lambda: threads.append(threading.current_thread().name))
     recorder.let.set()

@@ -6,6 +6,7 @@ import socket
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from urllib.parse import urlsplit
@@ -59,6 +60,12 @@ def test_handles_are_drawn_in_any_unit(extent: float) -> None:
     viewer = SimpleNamespace(state=SimpleNamespace(scene=SimpleNamespace(extent=extent)), focus=np.zeros(3))
     Client.move_camera(SimpleNamespace(_handle=handle, _viewer=viewer), VIEWS[0].camera)
     assert handle.camera.near < 0.1 * extent < 10 * extent < handle.camera.far
+
+
+def test_a_photograph_that_is_not_there_is_named() -> None:
+    viewer = SimpleNamespace(state=replace(STATE, photographs={}))
+    with pytest.raises(ValueError, match=r"there is no photograph 0\.png to compare with"):
+        Viewer._read_photograph(viewer, 0)
 
 
 @needs_browser
