@@ -118,11 +118,6 @@ def test_append_extends_moments_with_zeros() -> None:
     assert not moments["primary.log_intensity"][1][3:].any()
 
 
-def test_append_names_the_tensors_that_differ() -> None:
-    with pytest.raises(ValueError, match="log_intensity"):
-        append(make_gaussians(3), {}, Gaussians.empty(4))
-
-
 def test_forget_zeroes_only_what_was_replaced() -> None:
     gaussians = make_gaussians(3)
     original = make_moments(gaussians)
