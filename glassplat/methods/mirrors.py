@@ -505,10 +505,8 @@ class RefineEnvironment(AtShares):
 
     @torch.no_grad()
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Edits `state` until the final resolution is reached; moments of the environment are zeroed."""
+        """Edits `state`; moments of the environment are zeroed."""
         environment = state.scene.environment
-        if environment.size >= self.largest:
-            return False
         doublings = sum(round(share * clock.iterations) == clock.step for share in self.shares)
         finer = resize_environment(environment, min(2**doublings * environment.size, self.largest))
         state.scene = replace(state.scene, environment=finer)

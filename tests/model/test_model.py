@@ -86,7 +86,8 @@ def test_every_layer_is_an_image(tmp_path: Path) -> None:
 def test_every_public_object_has_a_repr_of_one_line() -> None:
     whole = model()
     data = tiny_capture()
-    for thing in (whole, whole.scene, whole.cameras["2.png"], whole.render("2.png"), data, data.train[0]):
+    scene = whole.scene
+    for thing in (whole, scene, scene.environment, whole.cameras["2.png"], whole.render("2.png"), data, data.train[0]):
         assert type(thing).__name__ in repr(thing) and "\n" not in repr(thing) and len(repr(thing)) < 300
     assert repr(whole.scene.planes) == f"Planes(labels=({LABEL},), mirrors=(), R0=[0.3])"
 

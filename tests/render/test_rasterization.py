@@ -196,6 +196,7 @@ def test_radii_are_of_what_is_drawn(eps2d: float) -> None:
     [
         ({"camera_model": "fisheye"}, "expected pinhole"),
         ({"render_mode": "depth"}, r"expected one of RGB, D, ED"),
+        ({"rasterize_mode": "sharp"}, "'sharp'; expected classic or antialiased"),
         ({"covars": torch.eye(3)}, "no covars here"),
         ({"with_ut": True}, "no with_ut here"),
         ({"colors": torch.rand(7, 3)}, r"\[7, 3\]; expected \[N, D\]"),

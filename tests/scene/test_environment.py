@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.scene.scene import Environment
+from glassplat.scene.scene import Environment, scale_scene
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.stage import TrainState
 from tests.render.tiny_scene import in_single_precision, showcase
@@ -54,6 +54,11 @@ def test_a_scene_trains_its_environment_only_where_there_is_one() -> None:
     assert lit.to("meta").environment.raw.device.type == "meta"
     with pytest.raises(ValueError, match=r"'environment', 'exposures', .*'poses', 'primary'"):
         lit.with_parameters({"sky.raw": torch.zeros(1)})
+
+
+def test_the_region_of_an_environment_has_the_units_of_the_scene() -> None:
+    scene = replace(in_single_precision(showcase()), environment=replace(noise(), region=(1.0, -2.0, 0.5, 3.0)))
+    assert scale_scene(scene, 2.0).environment.region == (2.0, -4.0, 1.0, 6.0)
 
 
 def test_a_checkpoint_keeps_the_environment(tmp_path: Path) -> None:
