@@ -149,8 +149,9 @@ def test_a_pane_is_found_that_is_mostly_seen_through_another(turn: float) -> Non
         assert covers(planes, index, pane.larger(0.95))
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1e3])
-def test_the_scale_of_the_capture_changes_nothing(scale: float) -> None:
+def test_a_capture_in_kilometres_gives_the_same_pane() -> None:
+    scale = 1e-3
+
     def scaled(camera: Camera) -> Camera:
         matrix = camera.cam_from_world.clone()
         matrix[:3, 3] *= scale
