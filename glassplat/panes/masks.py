@@ -349,8 +349,6 @@ def _without_slivers(mask: Mask) -> Mask:
 
     box, kept = _bounding_box(mask, 1), np.zeros_like(mask)
     parts, count = ndimage.label(mask[box])
-    if count == 0:
-        return mask
     half_widths = ndimage.maximum(_signed_distance(mask[box]), parts, index=np.arange(count + 1))
     wide = half_widths > LEAST_HALF_WIDTH * np.hypot(*mask.shape)
     wide[0] = False

@@ -25,6 +25,7 @@ from glassplat.files.spz import write_spz
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import RunDirectory, RunSettings
 from glassplat.model.training import Run
+from glassplat.panes import PlaneFitError
 from glassplat.scene.gaussians import Gaussians
 from glassplat.training.messages import Message, StepDone
 from tests.cli.tiny_run import write_run
@@ -57,6 +58,22 @@ def test_info_suggests_annotating_a_capture_without_masks(tmp_path: Path, capsys
     found = told(tmp_path / "my capture", capsys)
     assert found["facts"]["panes"] == "none marked"
     assert any("glassplat annotate" in line for line in found["next"])
+
+
+def test_masks_that_give_no_plane_are_to_be_marked_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*given: object) -> None:
+        raise PlaneFitError("pane 1 is annotated in 2 views")
+
+    monkeypatch.setattr("glassplat.cli.details.capture_planes", refuse)
+    shutil.copytree(SCENE, tmp_path / "my capture", ignore=shutil.ignore_patterns("gt"))
+    for mask in sorted((tmp_path / "my capture" / "panes").iterdir())[2:]:
+        mask.unlink()
+    found = told(tmp_path / "my capture", capsys)
+    assert "2 masks only; three to ten, from positions far apart, work better" in found["problems"]
+    assert "pane 1 is annotated in 2 views" in found["problems"]
+    assert any("marks panes by their corners instead" in line for line in found["next"])
 
 
 def test_estimated_normals_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -247,12 +264,16 @@ def test_info_lists_the_panes_of_an_exported_folder(tmp_path: Path, capsys: pyte
     capsys.readouterr()
     found = told(output, capsys)
     assert found["kind"] == "an exported scene" and found["facts"]["panes"] == "1 (mirror)"
+    (output / "index.html").touch()
+    assert f"open {output / 'index.html'} in a browser, or share it: it needs no server" in told(output, capsys)["next"]
     (output / "planes.json").write_text("{}")
     assert main(["info", str(output)]) == 2
 
 
 def test_what_a_damaged_run_lacks_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = write_run(tmp_path / "a run")
+    (run / "results.json").write_text('{"psnr": 31.25}')
+    assert told(run, capsys)["facts"]["measured"] == "PSNR 31.250"
     (run / "results.json").write_text("[")
     assert f"{run / 'results.json'} is damaged; evaluate it again" in told(run, capsys)["problems"]
     (splats,) = run.glob("point_cloud/*/point_cloud.ply")
