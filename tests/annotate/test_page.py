@@ -168,15 +168,31 @@ def test_only_a_plane_certain_to_half_a_degree_is_green(page: Page) -> None:
         assert page.window.run("return document.querySelectorAll('#panes .good').length") == count, page.said()
 
 
-def test_a_corner_keeps_its_distance_from_the_pointer(page: Page) -> None:
+def test_a_marked_corner_keeps_its_distance_from_the_pointer(page: Page) -> None:
     page.mark_true(0)
-    page.mark_true(1)
-    for view in (0, 2):  # Marked there, or known from the fit.
-        page.show(view)
-        ((x, y),) = page.on_screen(true_corners(view)[1:2])
-        page.window.drag([(x + 5, y + 4), (x + 7, y + 4), (x + 5, y + 4)])
-        page.saved()
-        assert np.allclose(page.document()["corners"][1][f"{view}.png"], true_corners(view)[1], atol=0.5)
+    ((x, y),) = page.on_screen(true_corners(0)[1:2])
+    page.window.drag([(x + 5, y + 4), (x + 7, y + 4), (x + 5, y + 4)])
+    page.saved()
+    assert np.allclose(page.document()["corners"][1]["0.png"], true_corners(0)[1], atol=0.5)
+
+
+def test_a_fitted_corner_is_marked_where_it_is_pressed(page: Page) -> None:
+    """Marked where the fit expects it, it would confirm the fit, whatever the photograph shows."""
+    for view in (0, 1):
+        page.mark_true(view)
+    page.show(2)
+    expected = true_corners(2)[1]
+    places = expected + np.array([(2.0, 1.0), (9.0, 0.0), (0.0, 0.0)])
+    pressed, dragged, again = page.on_screen(places)
+    page.window.click(*pressed)
+    page.saved()
+    np.testing.assert_allclose(page.document()["corners"][1]["2.png"], places[0], atol=0.5)
+    page.window.drag([pressed, dragged])
+    page.saved()
+    page.window.click(*again)  # The second corner is elsewhere by now, so this marks the first.
+    page.saved()
+    first, second, *_ = page.document()["corners"]
+    np.testing.assert_allclose([first["2.png"], second["2.png"]], [expected, places[1]], atol=0.5)
 
 
 def test_there_are_at_most_64_panes_and_each_has_its_colour_and_is_shown(page: Page) -> None:

@@ -200,7 +200,7 @@ export class Drawing {
     const marked = pane.corners.findIndex((places) => name in places && near(places[name]));
     if (marked >= 0) return marked;
     if (!answer || !answer.solved) return -1;
-    return answer.corners[number].findIndex((spot, corner) => near(spot) && corner < pane.corners.length);
+    return answer.corners[number].findIndex((spot, corner) => near(spot) && pane.corners[corner] && !(name in pane.corners[corner]));
   }
 
   // Whether a stroke covers a place of the view.

@@ -225,17 +225,15 @@ function pressed(event) {
 }
 
 function pressCorner(place) {
-  const reach = REACH / drawing.scale;
-  const name = view().name, answer = answers[marking.active], pressed = drawing.cornerAt(marking.pane, answer, place, reach);
-  const number = pressed < 0 ? marking.nextCorner(name, skipped.corner) : pressed;
+  const reach = REACH / drawing.scale, name = view().name;
+  let number = drawing.cornerAt(marking.pane, answers[marking.active], place, reach);
+  if (number < 0) number = marking.nextCorner(name, skipped.corner);
   if (number === null) return;
   gestures += 1;
-  const marked = marking.pane.corners[number]?.[name];
-  const at = pressed < 0 ? place : marked || answer.corners[current][number];
-  // A corner keeps its distance from the pointer.
+  // A marked corner keeps its distance from the pointer. One that only the fit knows is marked where it is pressed.
+  const at = marking.pane.corners[number]?.[name] || place;
   drag = { kind: "corner", number, gesture: `drag ${gestures}`, by: [at[0] - place[0], at[1] - place[1]] };
-  // Pressing a corner that only the fit knows here says that it is in the right place.
-  if (!marked) marking.setCorner(name, number, at, drag.gesture);
+  if (at === place) marking.setCorner(name, number, place, drag.gesture);
 }
 
 function pressPolygon(place) {
