@@ -37,7 +37,7 @@ def test_the_object_is_found_within_a_rough_outline() -> None:
     np.testing.assert_array_equal(pieces[0], grab_outlines(photo, ROUGH)[0])
 
 
-def test_large_photographs_are_shown_reduced() -> None:
+def test_large_photographs_give_the_same_outline() -> None:
     photo, disc = hedge_before_a_wall()
     large = np.kron(photo, np.ones((6, 6, 1), dtype=np.uint8))
     pieces = [piece / 6 for piece in grab_outlines(large, 6 * ROUGH)]

@@ -336,7 +336,7 @@ def test_the_command_needs_a_capture(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "is not a readable capture" in " ".join(capsys.readouterr().err.split())
 
 
-def test_info_suggests_prepare_for_photographs_without_poses(
+def test_annotate_suggests_prepare_for_photographs_without_poses(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "photographs"

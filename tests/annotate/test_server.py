@@ -138,7 +138,7 @@ def test_requests_of_other_sites_are_refused(origin: str, server: AnnotationServ
 @pytest.mark.parametrize(
     "path", ["/photo/99", "/photo/-1", "/photo/..%2f..%2fetc%2fpasswd", "/photo/../annotations.json", "/etc/passwd"]
 )
-def test_the_server_serves_no_files_from_disk(path: str, server: AnnotationServer) -> None:
+def test_unknown_photographs_and_paths_of_files_are_not_found(path: str, server: AnnotationServer) -> None:
     assert [ask(server, path, body)[0] for body in (None, {})] == [404, 404]
 
 

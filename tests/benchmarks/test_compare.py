@@ -128,7 +128,9 @@ def test_an_unwritable_run_folder_does_not_stop_other_runs(tmp_path: Path, monke
     assert runs[0].claimed() is not None and runs[1].results() == {"psnr": 1.0}
 
 
-def test_a_failure_on_another_rank_is_reported_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_failed_elsewhere_is_reported_and_not_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "room").mkdir()
     (run,) = planned_runs(parsed([str(tmp_path / "room"), "--methods", "splat", "--output", str(tmp_path / "runs")]))
     run.directory.mkdir(parents=True)

@@ -110,7 +110,7 @@ def test_masks_of_every_pixel_format_exclude_the_same_pixels(tmp_path: Path) -> 
     assert all(torch.equal(ignored, DROPPED) for ignored in found.values())
 
 
-def test_masks_that_exclude_most_pixels_warn_and_all_pixels_are_refused(tmp_path: Path) -> None:
+def test_masks_of_most_pixels_get_a_warning_and_of_all_pixels_are_refused(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path / "capture")
     names = [path.name for path in (root / "images").iterdir()]
     write_shades(root / "masks/1.png", KEPT)

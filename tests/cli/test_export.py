@@ -97,7 +97,7 @@ def test_invalid_options_are_refused(
     assert not output.exists()
 
 
-def test_foreign_folders_and_missing_runs_are_ignored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_foreign_folders_and_missing_runs_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run, output = write_run(tmp_path / "run"), tmp_path / "out"
     output.mkdir()
     (output / "scene.ply").write_text("mine")

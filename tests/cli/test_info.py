@@ -239,7 +239,7 @@ def test_info_describes_a_run_with_a_missing_capture(tmp_path: Path, capsys: pyt
     assert told(run / "point_cloud" / "iteration_1", capsys)["kind"] == "an exported scene"
 
 
-def test_a_run_without_a_scene_is_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_suggests_resuming_a_run_without_a_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = write_run(tmp_path / "run")
     shutil.rmtree(run / "point_cloud")
     (run / "checkpoint.safetensors").write_bytes(b"")

@@ -173,7 +173,7 @@ def test_a_command_can_run_in_another_thread(monkeypatch: pytest.MonkeyPatch) ->
     assert codes == [0]
 
 
-def test_each_command_describes_its_output(tmp_path: Path) -> None:
+def test_interrupt_messages_name_the_output_and_how_to_continue(tmp_path: Path) -> None:
     run, output = tmp_path / "run", tmp_path / "output"
     train = Train(SplatRecipe(), tmp_path, run)
     commands = [

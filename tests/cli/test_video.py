@@ -23,7 +23,7 @@ SHORT = ["--seconds", "0.4", "--fps", "10", "--width", "64"]
         ("--as-mirror 1", (64, 44)),
     ],
 )
-def test_every_frame_of_a_video_shows_all_layers(options: str, size: tuple[int, int], tmp_path: Path) -> None:
+def test_the_size_of_a_video_follows_its_layers(options: str, size: tuple[int, int], tmp_path: Path) -> None:
     run, film = write_run(tmp_path / "run"), tmp_path / "film.webp"
     assert main(["video", str(run), "--output", str(film), *SHORT, *options.split()]) == 0
     with Image.open(film) as pictures:

@@ -43,7 +43,7 @@ def test_only_covered_pixels_count_and_reflective_ones_apart() -> None:
 
 
 @pytest.mark.parametrize("value", [0.0, math.nan, math.inf])
-def test_a_zero_normal_counts_as_unknown(value: float) -> None:
+def test_a_normal_without_direction_counts_as_90_degrees_off(value: float) -> None:
     normal = turned(0.0).clone()
     normal[2:10] = value
     assert surface_metrics(frame(normal=normal), PHOTO, TRUTH)["normal_error_deg"] == pytest.approx(45.0, abs=1e-4)

@@ -53,7 +53,7 @@ def test_the_background_is_seen_through_what_is_before_it(background: tuple[floa
     torch.testing.assert_close(over_background(image[..., :3], alpha, background), image[..., :3] + through)
 
 
-def test_clipped_coverage_has_no_gradient() -> None:
+def test_coverage_has_no_gradient_over_black() -> None:
     """On black, colours do not depend on coverage: the pass that blended them is spared a gradient."""
     image, alpha = (tensor.requires_grad_() for tensor in blended())
     colors = over_background(image[..., :3], alpha, (0.0, 0.0, 0.0))

@@ -95,7 +95,7 @@ def test_bad_input_is_refused(change: dict[str, Tensor], error: type[Exception],
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_gradients_are_sampled_at_centres_behind_the_surface(dtype: torch.dtype) -> None:
+def test_derivatives_are_sampled_at_centres_behind_the_surface(dtype: torch.dtype) -> None:
     derivatives = torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]], dtype=dtype)
     near = torch.tensor([[2.0, 2.0, torch.inf], [2.0, 2.0, 2.0]], dtype=dtype)
     nan, inf = torch.nan, torch.inf

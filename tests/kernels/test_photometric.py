@@ -84,7 +84,7 @@ def test_a_pixel_that_is_not_a_number_is_not_hidden() -> None:
     assert all(mean.isnan() for mean in photometric(image, target))
 
 
-def test_nan_spreads_only_within_the_window() -> None:
+def test_an_infinite_pixel_spreads_only_within_the_window() -> None:
     image, target = pictures(40, 40, torch.float32)
     image[20, 20] = torch.inf
     _, _, gradient = with_gradients(photometric, image, target)

@@ -107,7 +107,7 @@ def test_view_independent_errors_do_not_look_like_a_mirror() -> None:
     assert not bool(mirror_lookalikes(SEARCH, slope(), views(0.2, 0.2, 0.2), Splat())[1].any())
 
 
-def test_mirrors_are_searched_in_the_region_and_among_visible_gaussians() -> None:
+def test_mirrors_are_found_in_the_region_and_among_visible_gaussians() -> None:
     scene = slope()
     elsewhere = replace(scene, environment=replace(scene.environment, region=(9.0, 0.0, 0.0, 1.0)))
     assert not bool(mirror_lookalikes(SEARCH, elsewhere, views(0.2, -0.2), Splat())[1].any())

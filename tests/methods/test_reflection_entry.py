@@ -79,7 +79,7 @@ def test_the_papers_start_from_hardly_any_reflection() -> None:
     assert len(state.scene.surroundings) < len(state.scene.primary)
 
 
-def test_mirrors_are_not_searched_without_near_surroundings() -> None:
+def test_mirrors_are_not_searched_for_if_nothing_needs_them() -> None:
     state, told = begun(every_3rd, MirrorSearch(begin_found=False), near=False)
     assert told == [] and not state.scene.environment.is_empty and not len(state.scene.surroundings)
 

@@ -70,7 +70,7 @@ def test_a_third_of_the_cameras_may_look_elsewhere() -> None:
     assert region[3] == pytest.approx(reflective_region(around)[3], rel=1e-3)  # type: ignore[index]
 
 
-def test_no_more_than_the_minority_may_disagree() -> None:
+def test_cameras_that_mostly_look_outwards_have_no_reflective_region() -> None:
     around = ring(torch.zeros(3), 2.0)
     away = ring(torch.zeros(3), 2.0, turned=True)
     assert reflective_region([*around[:8], *away]) is None

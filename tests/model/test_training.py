@@ -193,7 +193,7 @@ def brightness(frame: Frame, view: View, scene: Scene) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("given", [lambda rgb: 0.5, lambda rgb: rgb, lambda rgb: rgb.mean()[None]])
-def test_a_nan_loss_term_is_named(given: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_invalid_loss_term_is_named(given: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(globals(), "brightness", lambda frame, view, scene: given(frame.rgb))
     with pytest.raises(
         ValueError, match=r"the loss term 'brightness' gave .*; expected a tensor of one number, or None"

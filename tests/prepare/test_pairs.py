@@ -34,7 +34,7 @@ def test_loops_are_closed_by_similar_photographs() -> None:
     assert all(one > other for one, other in pairs)
 
 
-def test_the_most_similar_photographs_share_features() -> None:
+def test_similar_pairs_include_all_neighbours_on_a_loop() -> None:
     found = {frozenset(pair) for pair in similar_pairs(walk_round(60))}
     assert all(frozenset((k, (k + 1) % 60)) in found for k in range(60))
 

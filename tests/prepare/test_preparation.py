@@ -98,7 +98,7 @@ def test_a_capture_is_replaced_only_by_force(prepared: Path, capsys: pytest.Capt
     assert (prepared / "sparse" / "0" / "images.bin").read_bytes() == before
 
 
-def test_info_suggests_resuming_an_interrupted_preparation(photographs: Path, tmp_path: Path, heard: Heard) -> None:
+def test_a_preparation_interrupted_in_any_phase_is_resumed(photographs: Path, tmp_path: Path, heard: Heard) -> None:
     """Interrupted in each phase in turn: each resumed preparation has to reach the next phase."""
     task = Preparation(photographs, tmp_path / "capture")
     phases = ("extracting features", "matching photographs", "registering the photographs", "undistorting")

@@ -84,6 +84,6 @@ def test_a_camera_needs_a_pose_and_whole_pixels() -> None:
 
 
 @pytest.mark.parametrize("name", ["cx", "cy"])
-def test_a_camera_may_have_any_principal_point(name: str) -> None:
+def test_a_principal_point_that_is_not_finite_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match="expected finite numbers"):
         replace(tiny_capture().train[1].camera, **{name: math.nan})

@@ -99,7 +99,7 @@ def test_the_photographer_is_visible_only_in_panes() -> None:
     assert frame.direct is not None and nobody.direct is not None and torch.equal(frame.direct, nobody.direct)
 
 
-def test_objects_behind_the_pane_are_not_mirrored() -> None:
+def test_a_photographer_behind_the_pane_is_not_mirrored() -> None:
     scene = photographed()
     beyond = replace(scene.photographer, means=scene.photographer.means + torch.tensor([0.0, 0.0, 8.0]))
     frame = PRESENT(replace(scene, photographer=beyond), CAMERA)

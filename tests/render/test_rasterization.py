@@ -172,7 +172,7 @@ def test_opaque_and_flat_gaussians_are_drawn() -> None:
     assert float(alpha.max()) > 0.98
 
 
-def test_gaussians_within_the_clip_distance_are_skipped() -> None:
+def test_gaussians_within_the_radius_clip_are_skipped() -> None:
     assert not bool(plain(radius_clip=1e4)[1].any())
 
 

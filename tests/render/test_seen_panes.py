@@ -174,7 +174,7 @@ def test_any_number_of_panes_may_stand_one_behind_another(count: int) -> None:
     torch.testing.assert_close(1 - share, passed)
 
 
-def test_adjacent_panes_are_rendered_independently() -> None:
+def test_panes_next_to_each_other_share_a_layer() -> None:
     left, right = (pane(2.0, half=0.4, label=label) for label in (1, 2))
     right = right.with_tensors({"centers": right.centers + torch.tensor([1.2, 0.0, 0.0])})
     seen = seen_panes(planes := joined(left, right), CAMERA, nearest_hits(panes_in_camera(planes, CAMERA), CAMERA))

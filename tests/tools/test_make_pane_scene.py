@@ -88,7 +88,7 @@ def test_double_glazing_mirrors_twice_as_much() -> None:
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_the_second_pane_reflects_at_twice_the_gap(side: float) -> None:
+def test_the_second_pane_reflects_from_twice_the_gap_farther(side: float) -> None:
     gap, room = 0.1, Place((ROOM,), ())
     pane = replace(WINDOW, second=SecondPane(gap, 0.0))
     direction = np.array([[0.3, side, 0.2]]) / np.linalg.norm([0.3, side, 0.2])

@@ -256,7 +256,7 @@ def test_photographs_from_one_side_do_not_locate_missing_objects() -> None:
     assert len(missing_in(ground, around[:1] * 5, Splat())) == 0
 
 
-def test_missing_objects_are_searched_with_window_sums() -> None:
+def test_missing_objects_are_found_with_window_sums() -> None:
     """On photographs of two megapixels, summing every window separately took half a minute for each."""
     whole = Scene(balls([(0.3, -0.2, 0.1), (0.0, 0.4, 0.0)], [250, 30], -1.8), 2.0)
     ground = Scene(whole.primary.select(torch.tensor([False, True])), 2.0)

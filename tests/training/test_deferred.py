@@ -489,7 +489,7 @@ def test_estimated_normals_count_from_when_things_reflect(recipe: DeferredRecipe
     assert weights(replace(recipe, monocular_weight=0.0)) == [[], [], []]
 
 
-def test_mirrors_are_searched_after_a_minimum_of_steps_in_short_runs() -> None:
+def test_mirrors_are_searched_for_after_a_minimum_of_steps() -> None:
     def steps(recipe: DeferredRecipe | TracedRecipe, iterations: int) -> int:
         stages = recipe.stages(0, iterations)
         assert sum(stage.share for stage in stages) == pytest.approx(1)

@@ -309,7 +309,7 @@ def test_positions_can_stop_to_slow_down_before_the_end() -> None:
     assert rate.at(0.5, 1.0) == rate.at(0.9, 1.0) == pytest.approx(1e-4)
 
 
-def test_the_region_is_searched_only_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_region_is_not_searched_for_if_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("glassplat.methods.surroundings.reflective_region", lambda cameras: (0.0, 0.0, 0.0, 1.0))
 
     def region(**options: Any) -> Any:

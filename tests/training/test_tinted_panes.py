@@ -85,7 +85,7 @@ def test_glass_adds_no_light() -> None:
     assert kept is not None and kept.tolist() == [[0.0, pytest.approx(-0.3), 0.0]]
 
 
-def test_only_recipes_with_tint_have_the_option() -> None:
+def test_only_recipes_with_tint_learn_it() -> None:
     for recipe in (PlanarRecipe(), PlanarRecipe(tint=True)):
         stages = recipe.stages(0)
         entries = [stage.setup for stage in stages if isinstance(stage.setup, PaneSetup)]

@@ -169,7 +169,7 @@ def test_surroundings_are_copied_spread_or_both() -> None:
 
 
 @pytest.mark.parametrize("source", ["box", "both"])
-def test_mirrors_are_searched_only_if_needed(source: Literal["box", "both"]) -> None:
+def test_mirrors_are_searched_for_only_if_needed(source: Literal["box", "both"]) -> None:
     start = replace(RECIPE.surroundings.start, source=source)
     recipe = replace(RECIPE, surroundings=replace(RECIPE.surroundings, start=start))
     state, setup = fresh_state(), recipe.stages(seed=0)[1].setup

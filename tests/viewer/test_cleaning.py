@@ -40,7 +40,7 @@ def test_a_request_renders_without_removed_gaussians() -> None:
     )
 
 
-def test_points_lie_on_the_wall() -> None:
+def test_surface_points_lie_only_on_the_wall() -> None:
     splat = viewer_state(replace(model(), scene=wall_scene()), {}).renderer
     request = ViewRequest(POSE, 1.0, 1.0)
     for aside in (0.0, 0.2, -0.25):
