@@ -306,7 +306,7 @@ def resumed_state(
     written = directory.settings()
     has_moved = written.data != settings.data and directory.has_cameras_of(dataset)
     data = settings.data if has_moved else written.data
-    recorded = replace(written, device=settings.device, data=data, photographs="")
+    recorded = replace(written, device=settings.device, data=data, photographs=settings.photographs)
     # Compared as written: `recipe()` gives what an earlier version did not have its present default.
     if recorded != settings or directory.recipe_as_written() != json.loads(recipe_to_json(recipe)):
         changes = option_changes(vars(recorded), vars(settings)) + recipe_changes(directory, recipe)

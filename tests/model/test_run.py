@@ -482,6 +482,7 @@ def test_changed_photographs_are_warned_about_on_resuming(tmp_path: Path, caplog
             Run(RECIPE, settings, directory, load_dataset(capture), resume=False).run_to_end(lambda message: None)
         Run(RECIPE, settings, directory, load_dataset(capture), resume=True).run_to_end(lambda message: None)
         assert ("have changed since this run began" in caplog.text) == change
+        settings = directory.settings()  # Has the checksum.
 
 
 def test_resuming_names_an_option_that_the_earlier_version_lacked(tmp_path: Path) -> None:
