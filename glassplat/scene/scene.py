@@ -166,6 +166,8 @@ class Scene:
 
     def with_gaussians(self, part: str, gaussians: Gaussians) -> Scene:
         """The scene with one set of Gaussians replaced."""
+        if part not in GAUSSIAN_SETS:
+            raise ValueError(f"unknown set of Gaussians {part!r}; expected one of {sorted(GAUSSIAN_SETS)}")
         changed: dict[str, Any] = {part: gaussians}
         return replace(self, **changed)
 

@@ -230,3 +230,9 @@ def test_a_number_is_read_from_a_tensor_once() -> None:
     camera = replace(CAMERA, fx=focal, fy=focal)
     focal += 30
     assert camera.intrinsics[0] == 50 and replace(CAMERA, fx=focal).intrinsics[0] == 80
+
+
+@pytest.mark.parametrize("name", ["planes", "reflection"])
+def test_only_sets_of_gaussians_are_replaced_by_gaussians(name: str) -> None:
+    with pytest.raises(ValueError, match=f"unknown set of Gaussians '{name}'; expected one of .*'primary'"):
+        showcase().with_gaussians(name, showcase().glass)
