@@ -395,9 +395,9 @@ def check_arguments(arguments: Sequence[str]) -> None:
             raise InputError(f"the value of {name} is empty (an unset shell variable?); expected a value")
 
 
-def closest_words(word: str, known: Iterable[str]) -> list[str]:
+def closest_words(word: str, known: Iterable[str], cutoff: float = 0.6) -> list[str]:
     """The known word closest to a mistyped one, if any is close."""
-    return difflib.get_close_matches(word, list(known), n=1)
+    return difflib.get_close_matches(word, list(known), n=1, cutoff=cutoff)
 
 
 def unknown_name_message(what: str, word: str, known: Iterable[str], command: str) -> str:

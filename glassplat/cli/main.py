@@ -237,7 +237,7 @@ def unknown_option_message(name: str, options: list[str], unknown: list[str]) ->
         chosen = [method for method in [named_method(options)] if method]
         methods = [method for method in RECIPES if [method] != chosen and option in options_in_help(name, [method])]
     known = options_in_help(name, chosen)
-    meant = closest_words(option, known) or [other for other in known if option.strip("-") in other][:3]
+    meant = closest_words(option, known, 0.7) or [other for other in known if option.strip("-") in other][:3]
     guess = f"; did you mean {' or '.join(meant)}?" if meant else ";"
     elsewhere = f"; it is an option of {' and '.join(methods)};" if methods else ""
     return f"{' '.join([command, *chosen])} has no option {option}{elsewhere or guess} {help_pointer(name, options)}"

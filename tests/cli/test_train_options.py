@@ -179,6 +179,7 @@ def test_help_mentions_options_and_no_internal_names(
         ("train traced --data x --output y --iteratons 5", ["--iterations? all options", "train traced --help-adv"]),
         ("train planar --data x --output y --iteration 5", ["did you mean --iterations?", "train planar --help-adv"]),
         ("train planar --data x --output y --means 5", ["did you mean --rates.means?"]),
+        ("train planar --data x --output y --noise 5", ["did you mean --mcmc.noise-rate?"]),
         ("train splat --data x --output y --tint", ["--tint; it is an option of planar; all options"]),
         ("train planer --data x --output y", ["no method 'planer'; did you mean planar?", "glassplat train --help"]),
         ("train planar more --data x --output y", ["glassplat train takes no further argument 'more'"]),
