@@ -413,6 +413,11 @@ def densify(
         part: the scene part that `gaussians` is.
         prune_large: also remove oversized Gaussians, as 3DGS does after the first opacity reset.
     """
+    if statistics.view_count.shape[1] != len(gaussians):
+        raise ValueError(
+            f"statistics hold {statistics.view_count.shape[1]} columns for {len(gaussians)} Gaussians; "
+            "start new statistics whenever the set has changed"
+        )
     grown = _growth_edit(options, gaussians, statistics, extent=extent, generator=generator)
     pruned = _select_to_prune(options, gaussians, grown, extent=extent, prune_large=prune_large)
     return apply_edit(gaussians, moments, grown.then(keep(~pruned)), part=part)

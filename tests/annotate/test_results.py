@@ -347,7 +347,7 @@ def test_annotate_suggests_prepare_for_photographs_without_poses(
     (folder / "recipe.json").touch()
     assert main(["annotate", str(folder)]) == 2
     told = " ".join(capsys.readouterr().err.split())
-    assert "This is a run" in told and "prepare" not in told
+    assert "This is a run" in told and "glassplat prepare" not in told
 
 
 def test_a_damaged_document_is_named(room: Path) -> None:
