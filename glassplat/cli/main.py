@@ -84,17 +84,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run_guarded(arguments: list[str], *, is_program: bool) -> int:
-    """Runs a command so that any failure ends in one readable message and an exit code; ranks exit at once."""
-    from glassplat.training.ranks import exit_rank
+    """Runs a command so that any failure ends in one readable message and an exit code; interrupted ones and ranks exit at once."""
+    from glassplat.training.ranks import exit_at_once
 
     try:
         code = run_to_exit_code(arguments, is_program=is_program)
     except SystemExit as end:
         if is_program and end.code:
-            exit_rank(USAGE_CODE)
+            exit_at_once(USAGE_CODE)
         raise
     if is_program:
-        exit_rank(code)
+        exit_at_once(code)
     return code
 
 

@@ -25,7 +25,7 @@ log = logging.getLogger("glassplat.panes")
 LEAST_MATCHING, LEAST_OF_MEDIAN = 0.3, 0.5
 """Minimum share of a mask's outline that must meet the others, absolute and relative to the median over the masks."""
 EDGES_PER_VIEW = 100
-FARTHEST_ORIGIN = 1e5
+IMPRECISE_DISTANCE = 1e5
 """Distance of the cameras from the origin, in the distances between them, beyond which no mask is called wrong: there,
 single precision moves cameras by a percent of these distances."""
 
@@ -42,7 +42,7 @@ def report_masks(label: int, plane: masks.FramedPlanes, views: Sequence[masks.Pa
     )
     outliers = outlier_masks(matching).nonzero()[0]
     centers = np.stack([view.center for view in views])
-    is_far = np.linalg.norm(centers.mean(axis=0)) > FARTHEST_ORIGIN * np.ptp(centers, axis=0).max()
+    is_far = np.linalg.norm(centers.mean(axis=0)) > IMPRECISE_DISTANCE * np.ptp(centers, axis=0).max()
     if len(outliers) and not is_far:
         log.warning(
             "pane %d: %d of its %d masks do not fit the others, their outlines hardly meet on any plane: %s; "

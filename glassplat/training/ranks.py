@@ -249,7 +249,7 @@ def await_leader() -> None:
             ranks._gather(RankReport())
 
 
-def exit_rank(code: int) -> None:
+def exit_at_once(code: int) -> None:
     """Ends the process immediately if it is one of several or was interrupted; else does nothing.
 
     Python's cleanup is skipped: COLMAP aborts in it after a second Ctrl-C, if one of its threads is still at work, and

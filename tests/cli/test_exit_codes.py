@@ -222,7 +222,7 @@ def test_a_rank_ends_at_once_in_every_case(
 
     monkeypatch.setattr("glassplat.cli.main.prepare_command", lambda arguments: None)
     monkeypatch.setattr("glassplat.cli.main.run", run)
-    monkeypatch.setattr("glassplat.training.ranks.exit_rank", leave)
+    monkeypatch.setattr("glassplat.training.ranks.exit_at_once", leave)
     monkeypatch.setattr("glassplat.cli.main.report_interrupt", lambda stop, command: 130)
     monkeypatch.setattr("sys.argv", ["glassplat", "info"])
     with pytest.raises(LeftError) as left:
