@@ -84,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run_guarded(arguments: list[str], *, is_program: bool) -> int:
-    """Runs a command so that any failure ends in one readable message and an exit code; interrupted ones and ranks exit at once."""
+    """Runs a command so that a failure ends in one readable message and an exit code; ranks exit at once."""
     from glassplat.training.ranks import exit_at_once
 
     try:
