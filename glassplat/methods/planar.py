@@ -385,7 +385,7 @@ def planar_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
         raise PlaneFitError(f"plane_fit.mirror_labels names pane {unknown[0]}; expected some of {name_labels(known)}")
     if dataset.measured_points:
         capture_planes(dataset, None, recipe.plane_fit)
-    scene = Scene(strategy_of(recipe).initial_gaussians(dataset.points, recipe.sh_degree), dataset.extent)
+    scene = Scene(_first_strategy(recipe).initial_gaussians(dataset.points, recipe.sh_degree), dataset.extent)
     return with_neutral_corrections(recipe, scene, dataset)
 
 
@@ -412,7 +412,7 @@ def planar_renderer(recipe: PlanarRecipe) -> Planar:
 def planar_stages(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
     """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
     first, second, third = recipe.stage_shares
-    strategy = strategy_of(recipe)
+    strategy = _first_strategy(recipe)
     setup = PaneSetup(
         recipe.plane_fit,
         recipe.glass_count,
@@ -456,7 +456,7 @@ def plane_rates(factor: float = 1.0) -> dict[str, Rate]:
 
 def _adjustment_stage(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> Stage:
     """Stage 2: the reflection's gradient reaches the planes, not the Gaussians."""
-    strategy = strategy_of(recipe)
+    strategy = _first_strategy(recipe)
     return Stage(
         name="2 plane adjustment",
         share=share,
@@ -504,6 +504,18 @@ def _joint_stage(recipe: PlanarRecipe, share: float) -> Stage:
         post_steps=(*_glass_post_steps(recipe), *strategy.post_steps),
         densify_until=recipe.densify.stop,
     )
+
+
+def _first_strategy(recipe: PlanarRecipe) -> actions.DensificationStrategy:
+    """Strategy of the first two stages.
+
+    `mcmc` represents reflections behind glass by many faint Gaussians at noisy positions, which are hard to recognise.
+    If they are to be moved to the front, it begins after these stages (lab/gaussians.md#mcmc).
+    """
+    if recipe.strategy != "mcmc" or not recipe.turn_reflections:
+        return strategy_of(recipe)
+    densify = actions.Densify(recipe.densify, limit=recipe.mcmc)
+    return replace(strategy_of(replace(recipe, strategy="default")), edits=(densify,), cap=recipe.mcmc.cap)
 
 
 def _gaussian_rates(recipe: PlanarRecipe) -> dict[str, Rate]:

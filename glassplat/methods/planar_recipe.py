@@ -97,8 +97,9 @@ class PlanarRecipe(MethodRecipe):
         moving_mean: propagate the gradient of the depth deviation through the mean depth, too, as Eq. 14 is written;
             otherwise the mean is constant.
         plane_fit: fitting of planes to masks.
-        strategy: strategy for adding and removing primary Gaussians: densification, or MCMC (Eq. 20), which resets
-            opacities once, after reflections behind panes were moved to their front.
+        strategy: strategy for adding and removing primary Gaussians: densification, or MCMC (Eq. 20). Unless as
+            published, MCMC begins with joint optimisation, and resets opacities once, after reflections behind panes
+            were moved to their front.
         early_resets: also reset opacities in the first two stages, as in the paper.
         densify_by: views for the densification of primary Gaussians: `direct` ones, or mirror images (weighted by their
             strength) if these need more detail; or `all` direct and mirrored views alike (paper).

@@ -78,10 +78,17 @@ def densify_cap(densifier: DefaultDensify, dataset: Dataset) -> int | None:
 
 @dataclass(frozen=True)
 class Densify:
-    """Clones, splits and prunes one set of Gaussians by its screen gradients."""
+    """Clones, splits and prunes one set of Gaussians by its screen gradients.
+
+    Attributes:
+        densifier: options.
+        part: the set.
+        limit: options of `mcmc`, if it follows and its cap already holds.
+    """
 
     densifier: DefaultDensify
     part: str = "primary"
+    limit: McmcDensify | None = None
 
     @property
     def name(self) -> str:
@@ -104,7 +111,7 @@ class Densify:
         factor = threshold_factor(dataset) if self.densifier.adapt_to_size else 1.0
         densifier = replace(
             self.densifier,
-            cap=densify_cap(self.densifier, dataset),
+            cap=mcmc_cap(self.limit, dataset) if self.limit else densify_cap(self.densifier, dataset),
             gradient_threshold=self.densifier.gradient_threshold * factor,
             absgrad_threshold=self.densifier.absgrad_threshold * factor,
         )

@@ -30,7 +30,7 @@ from glassplat.training.densify import (
     gaussians_around_cameras,
     gaussians_from_points,
 )
-from glassplat.training.options import DefaultDensify
+from glassplat.training.options import DefaultDensify, McmcDensify
 from glassplat.training.stage import Clock, TrainState
 from tests.panes.test_material import CountedElements
 from tests.render.tiny_scene import concatenated
@@ -163,13 +163,16 @@ def test_photographs_limit_the_number_of_gaussians(densifier: DefaultDensify, li
     assert densify_cap(densifier, capture) == (densifier.cap if limit is None else round(limit * pixels))
 
 
-def test_a_set_grows_up_to_its_cap() -> None:
+@pytest.mark.parametrize("by", ["its own cap", "the cap of mcmc"])
+def test_a_set_grows_up_to_its_cap(by: str) -> None:
     state, capture = TrainState(SplatRecipe(sh_degree=1).initialise(tiny_capture()), seed=0), tiny_capture()
     count = len(state.scene.primary)
     ones = torch.ones(2, count)
     state.statistics["primary"] = ScreenStatistics(ones, ones, ones)
     share = (count + 2) / sum(view.camera.width * view.camera.height for view in capture.train)
-    Densify(DefaultDensify(per_pixel=share)).apply(state, capture, Clock(10, 100, 5))
+    own = by == "its own cap"
+    densify = Densify(DefaultDensify(per_pixel=share if own else 0.0), limit=None if own else McmcDensify(cap=count + 2))
+    densify.apply(state, capture, Clock(10, 100, 5))
     assert len(state.scene.primary) == count + 2
 
 
