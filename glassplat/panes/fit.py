@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -103,12 +104,15 @@ MOST_EXCESS = 0.04
 two well measured panes at an angle of 2 degrees, 0.05 at 3 degrees, and 0.03 where chance preferred a plane to the true
 one."""
 
+MOST_SURFACE_ANGLE, MOST_SURFACE_OFFSET = float(np.radians(8)), 0.05
+"""Maximum angle between the planes of two panes, and distance of the one's middle from the other's plane in scene
+extents, for which a joint plane is tried."""
+
 MOST_CAMERAS = 100
 """Maximum number of cameras that decide which points are seen through a pane."""
 
 
-@dataclass(frozen=True)
-class _FittedRectangle:
+class _FittedRectangle(NamedTuple):
     """One fitted pane, as NumPy arrays."""
 
     center: Array
@@ -279,14 +283,20 @@ def _fit_plane(
 
 def _find_fault(plane: masks.FramedPlanes, objective: Objective, options: PlaneFit) -> ValueError | None:
     """The reason not to trust the plane of a pane; None if there is none."""
-    try:
-        _check_agreement(plane.planes, objective.views, options.least_agreement)
-        _check_contradiction(plane, objective)
-        if (degrees := _tilt_degrees(plane, objective)) > TOO_UNCERTAIN_DEG:
-            raise _UndeterminedError(_tilt_message(degrees, objective))
-    except ValueError as error:
-        return error
-    return None
+    agreement = float(masks.mask_agreement(plane.planes, objective.views)[0])
+    if agreement < options.least_agreement:
+        return ValueError(
+            f"no plane brings its masks together; on the best one they overlap by {agreement:.2f}, "
+            f"expected at least {options.least_agreement:.2f}"
+        )
+    contradiction = float(search.contradiction(plane, objective)[0])
+    if contradiction > MOST_CONTRADICTION:
+        return ValueError(
+            f"the outlines of its masks meet on no plane; on the best one {contradiction:.2f} of the evidence "
+            f"contradicts it, expected at most {MOST_CONTRADICTION}"
+        )
+    degrees = _tilt_degrees(plane, objective)
+    return _UndeterminedError(_tilt_message(degrees, objective)) if degrees > TOO_UNCERTAIN_DEG else None
 
 
 def _share_planes(found: Sequence[_PanePlane], seed: int) -> list[_PanePlane]:
@@ -354,7 +364,12 @@ def _groups_in_one_surface(found: Sequence[_PanePlane]) -> list[list[int]]:
 
     def may_share(one: int, other: int) -> bool:
         first, second = panes[one], panes[other]
-        return search.may_share_surface(first.plane, second.plane, (first.evidence, second.evidence))
+        if search.angle(first.plane, second.plane) > MOST_SURFACE_ANGLE:
+            return False
+        # One of the planes may be tilted about its own middle, and so miss the other's middle by far.
+        pairs = (first, second), (second, first)
+        rises = [abs(a.plane.planes.distances(b.evidence.anchors(b.plane.planes))) for a, b in pairs]
+        return float(np.min(rises)) <= MOST_SURFACE_OFFSET * first.evidence.extent
 
     return [group for group in connected_components(list(panes), may_share) if len(group) > 1]
 
@@ -450,11 +465,6 @@ def _check_views(label: int, views: Sequence[masks.PaneView], extent: float) -> 
             f"pane {label} is annotated in {len(views)} view(s), but a plane can only be found from several "
             "views: annotate at least two more, from positions far apart"
         )
-    _check_camera_spread(label, views, extent)
-    _check_outline_in_views(label, views)
-
-
-def _check_camera_spread(label: int, views: Sequence[masks.PaneView], extent: float) -> None:
     centers = np.stack([view.center for view in views])
     apart = float(np.linalg.norm(centers - centers[0], axis=1).max())
     if apart < LEAST_CAMERA_SPREAD * extent:
@@ -462,23 +472,11 @@ def _check_camera_spread(label: int, views: Sequence[masks.PaneView], extent: fl
             f"pane {label}: its {len(views)} annotated views were taken at most {apart:.3g} apart in a capture "
             f"of radius {extent:.3g}: annotate views from farther apart"
         )
-
-
-def _check_outline_in_views(label: int, views: Sequence[masks.PaneView]) -> None:
     showing = sum(len(view.edge) > 0 for view in views)
     if showing < 2:
         raise PlaneFitError(
             f"pane {label}: its outline lies inside the image in {showing} of {len(views)} annotated views, "
             "expected at least two: annotate views that show its border, from positions far apart"
-        )
-
-
-def _check_contradiction(found: masks.FramedPlanes, objective: Objective) -> None:
-    contradiction = float(search.contradiction(found, objective)[0])
-    if contradiction > MOST_CONTRADICTION:
-        raise ValueError(
-            f"the outlines of its masks meet on no plane; on the best one {contradiction:.2f} of the evidence "
-            f"contradicts it, expected at most {MOST_CONTRADICTION}"
         )
 
 
@@ -493,15 +491,6 @@ def _tilt_message(degrees: float, objective: Objective) -> str:
         f"the masks determine the plane only to {min(degrees, 90):.0f} degrees: they show too little of its "
         f"outline or were taken too close together, and {len(objective.points)} points lie along it"
     )
-
-
-def _check_agreement(plane: masks.PlaneEquations, views: Sequence[masks.PaneView], least: float) -> None:
-    agreement = float(masks.mask_agreement(plane, views)[0])
-    if agreement < least:
-        raise ValueError(
-            f"no plane brings its masks together; on the best one they overlap by {agreement:.2f}, "
-            f"expected at least {least:.2f}"
-        )
 
 
 def _fit_rectangle(plane: masks.PlaneEquations, views: Sequence[masks.PaneView], margin: float) -> _FittedRectangle:
@@ -521,18 +510,10 @@ def _fit_rectangle(plane: masks.PlaneEquations, views: Sequence[masks.PaneView],
 
 
 def _to_planes(panes: Sequence[_FittedRectangle], labels: Sequence[int], options: PlaneFit) -> Planes:
-    def stacked(rows: list[Array]) -> Tensor:
-        return torch.tensor(np.stack(rows), dtype=torch.float32)
-
-    glass = options.glass_reflectance
-    planes = Planes(
-        centers=stacked([pane.center for pane in panes]),
-        raw_normals=stacked([pane.normal for pane in panes]),
-        logit_reflectances=torch.full((len(labels),), logit(glass), dtype=torch.float32),
-        tangents=stacked([pane.tangent for pane in panes]),
-        half_sizes=stacked([pane.half_sizes for pane in panes]),
-        labels=tuple(labels),
-    )
+    stacked = (torch.tensor(np.stack(rows), dtype=torch.float32) for rows in zip(*panes, strict=True))
+    centers, normals, tangents, half_sizes = stacked
+    logits = torch.full((len(labels),), logit(options.glass_reflectance), dtype=torch.float32)
+    planes = Planes(centers, normals, logits, tangents, half_sizes, tuple(labels))
     return with_mirrors(planes, options.mirror_labels, options.mirror_reflectance)
 
 

@@ -71,7 +71,9 @@ def _minimise(planes: FramedPlanes, objective: Evidence, tolerance: float) -> Fr
         steps = -np.linalg.solve(damped + SMALLEST_CURVATURE * np.eye(4), gradient[..., None])[..., 0]
         moved = _step_planes(moving, anchors[active], steps * scales[active])
         better = objective.terms(moved, tolerance).cost < cost
-        planes = _replace_planes(planes, active[better], moved.select(np.flatnonzero(better)))
+        chosen = np.arange(count)
+        chosen[active[better]] = count + np.flatnonzero(better)
+        planes = join_planes([planes, moved]).select(chosen)
         damping[active] *= np.where(better, DAMPING_DECREASE, DAMPING_INCREASE)
         active = active[np.abs(steps).max(axis=1) > CONVERGED_CHANGE]
         if not len(active):
@@ -125,13 +127,6 @@ def _step_planes(planes: FramedPlanes, anchors: Array, steps: Array) -> FramedPl
     return FramedPlanes(move_planes(planes.planes, anchors, steps[:, :3]), np.maximum(planes.frames + steps[:, 3], 0))
 
 
-def _replace_planes(planes: FramedPlanes, index: NDArray[np.int64], others: FramedPlanes) -> FramedPlanes:
-    """The planes, with those at `index` replaced by others."""
-    order = np.arange(len(planes))
-    order[index] = len(planes) + np.arange(len(index))
-    return join_planes([planes, others]).select(order)
-
-
 def tilt_uncertainty(planes: FramedPlanes, objective: Evidence, tolerance: float) -> Array:
     """[H] angle in radians by which each plane can tilt before its cost changes by `NOTICEABLE_CHANGE`.
 
@@ -165,9 +160,6 @@ FRAME_SPREAD = 0.5
 """Standard deviation of the logarithm of the height of frames in each round."""
 COARSE_EDGES = 200
 """Number of edge points over all views together, while there are many hypotheses."""
-MOST_SURFACE_ANGLE, MOST_SURFACE_OFFSET = float(np.radians(8)), 0.05
-"""Maximum angle between the planes of two panes, and distance of the one's middle from the other's plane in scene
-extents, for which a joint plane is tried."""
 HIGHEST_FRAME = 0.1
 """Height of a frame above its glass, in scene extents, above which a plane is treated as wrong."""
 
@@ -214,22 +206,6 @@ def best_joint_plane(objective: JointObjective, starts: FramedPlanes, rng: np.ra
         beam = join_planes([beam, _follow_beam(beam, objective, (tilt, shift), tolerance, rng)])
     finished = _possible_frames(refine_planes(beam, objective, TOLERANCES), objective)
     return finished.select(np.array([np.argmin(contradiction(finished, objective))]))
-
-
-def may_share_surface(one: FramedPlanes, other: FramedPlanes, objectives: tuple[Objective, Objective]) -> bool:
-    """Return whether two panes, whose planes were fitted separately, may lie in one surface.
-
-    Args:
-        one: plane of the first pane.
-        other: plane of the second pane.
-        objectives: evidence for each.
-    """
-    if angle(one, other) > MOST_SURFACE_ANGLE:
-        return False
-    middles = [objective.anchors(plane.planes) for objective, plane in zip(objectives, (one, other), strict=True)]
-    # One of the planes may be tilted about its own middle, and so miss the other's middle by far.
-    rises = abs(one.planes.distances(middles[1])), abs(other.planes.distances(middles[0]))
-    return float(np.min(rises)) <= MOST_SURFACE_OFFSET * objectives[0].extent
 
 
 def contradiction(
