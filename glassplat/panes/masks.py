@@ -142,12 +142,6 @@ def random_planes(points: Array, count: int, rng: np.random.Generator) -> PlaneE
     return PlaneEquations(normals, np.einsum("hd,hd->h", normals, a[usable]))
 
 
-def inlier_share(planes: PlaneEquations, points: Array, *, distance: float) -> Array:
-    """[H] share of the points within `distance` of each plane."""
-    near: Array = (np.abs(planes.distances(points)) <= distance).mean(axis=1)
-    return near
-
-
 Mask = NDArray[np.bool_]
 
 LEAST_HALF_WIDTH = 0.005  # Half width below which a part of a mask is treated as an artefact, in image diagonals.

@@ -26,7 +26,6 @@ from glassplat.panes.masks import (
     Rectangle,
     cameras_of,
     in_plane_axes,
-    inlier_share,
     intersect_rays,
     mask_agreement,
     min_area_rectangle,
@@ -139,20 +138,6 @@ def planes_through_masks(views: Sequence[PaneView], count: int, rng: np.random.G
     return PlaneEquations(normals[usable], np.einsum("hd,hd->h", normals, points)[usable])
 
 
-def pane_centers(planes: PlaneEquations, views: Sequence[PaneView]) -> Array:
-    """[H, 3] a point near the middle of the pane on each plane, from the middles of the masks."""
-    centers, weight_sums = np.zeros((len(planes), 3)), np.zeros(len(planes))
-    for view in views:
-        points, hit = intersect_rays(planes, view.center, view.directions(view.middle))
-        # A view at a grazing angle places the middle far away.
-        rays = points[:, 0] - view.center
-        squared = np.maximum(np.einsum("hd,hd->h", rays, rays), np.finfo(np.float64).tiny)
-        weights = np.where(hit[:, 0], 1 / squared, 0)
-        centers += weights[:, None] * points[:, 0]
-        weight_sums += weights
-    return centers / np.maximum(weight_sums, np.finfo(np.float64).tiny)[:, None]
-
-
 def sample_nearby(
     planes: PlaneEquations, anchors: Array, count: int, *, tilt: float, shift: Array | float, rng: np.random.Generator
 ) -> PlaneEquations:
@@ -240,15 +225,24 @@ class Objective:
         """[H] share of the points near each plane; 0 if there are no points."""
         if not len(self.points):
             return np.zeros(len(planes))
-        return inlier_share(planes, self.points, distance=self.distance)
+        return np.asarray((np.abs(planes.distances(self.points)) <= self.distance).mean(axis=1))
 
     def agreement(self, planes: PlaneEquations) -> Array:
         """[H] agreement of the masks on each plane (`mask_agreement`)."""
         return mask_agreement(planes, self.views, pixels_per_view=max(OVERLAP_PIXELS // len(self.views), 1))
 
     def anchors(self, planes: PlaneEquations) -> Array:
-        """[H, 3] a point near the middle of the pane on each plane."""
-        return pane_centers(planes, self.views)
+        """[H, 3] a point near the middle of the pane on each plane, from the middles of the masks."""
+        centers, weight_sums = np.zeros((len(planes), 3)), np.zeros(len(planes))
+        for view in self.views:
+            points, hit = intersect_rays(planes, view.center, view.directions(view.middle))
+            # A view at a grazing angle places the middle far away.
+            rays = points[:, 0] - view.center
+            squared = np.maximum(np.einsum("hd,hd->h", rays, rays), np.finfo(np.float64).tiny)
+            weights = np.where(hit[:, 0], 1 / squared, 0)
+            centers += weights[:, None] * points[:, 0]
+            weight_sums += weights
+        return centers / np.maximum(weight_sums, np.finfo(np.float64).tiny)[:, None]
 
     def camera_distance(self, planes: PlaneEquations) -> Array:
         """[H] median distance of the cameras from the middle of the pane."""
@@ -302,15 +296,15 @@ class JointObjective:
 
     def agreement(self, planes: PlaneEquations) -> Array:
         """[H] agreement of the masks on each plane, averaged over the panes."""
-        return self._mean([part.agreement(planes) for part in self.parts])
+        return np.asarray(np.mean([part.agreement(planes) for part in self.parts], axis=0))
 
     def anchors(self, planes: PlaneEquations) -> Array:
         """[H, 3] a point near the middle of all panes on each plane."""
-        return self._mean([part.anchors(planes) for part in self.parts])
+        return np.asarray(np.mean([part.anchors(planes) for part in self.parts], axis=0))
 
     def camera_distance(self, planes: PlaneEquations) -> Array:
         """[H] median distance of the cameras from the middle of a pane, averaged over the panes."""
-        return self._mean([part.camera_distance(planes) for part in self.parts])
+        return np.asarray(np.mean([part.camera_distance(planes) for part in self.parts], axis=0))
 
     def terms(self, planes: FramedPlanes, tolerance: float, *, edges: int = EDGE_POINTS) -> Terms:
         """The residuals of H planes, as `Objective.terms`; with `edges` points for each pane, or fewer for many."""
@@ -319,12 +313,8 @@ class JointObjective:
         return Terms(
             np.concatenate([term.residuals for term in terms], axis=1),
             np.concatenate([term.weights for term in terms], axis=1) / len(terms),
-            self._mean([term.rest for term in terms]),
+            np.asarray(np.mean([term.rest for term in terms], axis=0)),
         )
-
-    def _mean(self, values: Sequence[Array]) -> Array:
-        mean: Array = np.mean(values, axis=0)
-        return mean
 
 
 OUTLINE_PIXELS = 4000  # Number of pixels of each view; those of the mask are projected onto the plane.

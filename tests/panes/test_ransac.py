@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from glassplat.panes.masks import PlaneEquations, inlier_share, random_planes
+from glassplat.panes.masks import PlaneEquations, random_planes
+from glassplat.panes.objective import Objective
 
 
 def test_every_plane_passes_through_three_of_the_points() -> None:
@@ -23,4 +24,4 @@ def test_points_on_a_line_or_all_the_same_give_no_plane() -> None:
 def test_support_is_the_share_of_the_inliers() -> None:
     plane = PlaneEquations(np.array([[0.0, 0.0, 1.0]]), np.array([2.0]))
     points = np.array([[0.0, 0.0, 2.0], [5.0, 1.0, 2.09], [0.0, 0.0, 1.8], [0.0, 0.0, -2.0]])
-    assert inlier_share(plane, points, distance=0.1) == pytest.approx([0.5])
+    assert Objective([], points, 1.0, 0.1).inlier_share(plane) == pytest.approx([0.5])
