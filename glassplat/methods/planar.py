@@ -233,8 +233,9 @@ def is_reflection_uncovered(scene: Scene, panes: Planes, cameras: Sequence[Camer
     covered, whole = 0.0, 0
     for done, camera in enumerate(cameras):
         yield Working(f"searching for what {name_panes(panes, 'pane')} can reflect", done, len(cameras))
-        of_view, pixels = material.mirrored_coverage(scene, panes, camera)
-        covered, whole = covered + of_view, whole + pixels
+        with torch.no_grad():
+            mirrored = material.mirrored_image(replace(scene, planes=panes), camera)
+        covered, whole = covered + float(mirrored.coverage.sum()), whole + int(mirrored.seen.sum())
     return covered < LEAST_COVERAGE * whole
 
 

@@ -162,7 +162,7 @@ def mirror_candidate(scene: Scene, label: int, photographs: Sequence[Photograph]
     pane = scene.planes.select([scene.planes.labels.index(label)])
     pane = replace(pane, centers=pane.centers.detach(), raw_normals=pane.normals.detach())
     fitted = replace(scene, planes=replace(pane, half_sizes=INNER_SHARE * pane.half_sizes))
-    regions = [compared_region(fitted, photograph) for photograph in photographs]
+    regions = [compared_region(fitted, photograph)[-1] for photograph in photographs]
     parts = [
         ComparedPart(photograph.camera, region, subtract_local_mean(photograph.pixels, region)[region])
         for photograph, region in zip(photographs, regions, strict=True)
@@ -190,17 +190,14 @@ def degrees_between(normal: Tensor, other: Tensor) -> float:
 
 
 @torch.no_grad()
-def pane_pixels(scene: Scene, photograph: Photograph, mirrored: MirroredImage) -> Tensor:
-    """[H, W] bool: the valid pixels that show the inner part of the scene's only pane."""
-    shown = mirrored.seen & photograph.valid
-    return shown if photograph.labels is None else shown & (photograph.labels == scene.planes.labels[0])
-
-
-@torch.no_grad()
-def compared_region(scene: Scene, photograph: Photograph) -> Tensor:
-    """[H, W] bool: the pixels of `pane_pixels` at which Gaussians cover the mirrored image."""
+def compared_region(scene: Scene, photograph: Photograph) -> tuple[Tensor, Tensor, Tensor]:
+    """[H, W, 3] the mirrored image of the scene's only pane, and [H, W] bool each: the valid pixels that show the inner
+    part of the pane, and those of them at which Gaussians cover the mirrored image.
+    """
     mirrored = mirrored_image(scene, photograph.camera)
-    return pane_pixels(scene, photograph, mirrored) & (mirrored.coverage > LEAST_COVERAGE)
+    shown = mirrored.seen & photograph.valid
+    shown = shown if photograph.labels is None else shown & (photograph.labels == scene.planes.labels[0])
+    return mirrored.color, shown, shown & (mirrored.coverage > LEAST_COVERAGE)
 
 
 @torch.no_grad()
@@ -209,10 +206,8 @@ def compared_pixels(scene: Scene, photograph: Photograph) -> tuple[Tensor, Tenso
 
     Pixels whose mirrored image is not covered by Gaussians are counted, but not compared.
     """
-    mirrored = mirrored_image(scene, photograph.camera)
-    shown = pane_pixels(scene, photograph, mirrored)
-    region = shown & (mirrored.coverage > LEAST_COVERAGE)
-    images = (mirrored.color, photograph.pixels)
+    mirrored, shown, region = compared_region(scene, photograph)
+    images = (mirrored, photograph.pixels)
     first, second = (subtract_local_mean(linear_from_srgb(image), region)[region] for image in images)
     return first, second, int(shown.sum())
 
@@ -224,7 +219,11 @@ def align_pane(scene: Scene, parts: Sequence[ComparedPart]) -> Scene:
         scene: with one pane.
         parts: parts of photographs to compare it with.
     """
-    offsets = best_tilt(scene, parts[:: max(1, len(parts) // TILT_PHOTOGRAPHS)])
+    tilts, means = [math.radians(degrees) for degrees in TILTS_DEG], scene.primary.means
+    candidates = [means.new_tensor([first, second, 0.0]) for first in tilts for second in tilts]
+    some = parts[:: max(1, len(parts) // TILT_PHOTOGRAPHS)]
+    found = mean_correlations([move_pane(scene, offsets) for offsets in candidates], some)
+    offsets = candidates[found.index(max(found))]
     moments, steps = (torch.zeros_like(offsets), torch.zeros_like(offsets)), 0
     for step in range(ALIGN_STEPS):
         moving = offsets.clone().requires_grad_()
@@ -237,7 +236,9 @@ def align_pane(scene: Scene, parts: Sequence[ComparedPart]) -> Scene:
         # Not `torch.optim`: its first optimiser imports PyTorch's compiler, which takes longer than the alignment.
         adam([Update(offsets, gradient, *moments, ALIGN_RATE * (1 - step / ALIGN_STEPS), steps)], eps=1e-8)
     aligned = move_pane(scene, offsets)
-    return aligned if agrees_better(aligned, scene, parts) else scene
+    # On Fisher's scale, the step from 0.9 to 0.97 is about as large as that from 0.3 to 0.7.
+    other, own = (math.atanh(max(-PERFECT, min(r, PERFECT))) for r in mean_correlations([aligned, scene], parts))
+    return aligned if other > LEAST_GAIN_OF_ALIGNING * own else scene
 
 
 @torch.no_grad()
@@ -263,25 +264,6 @@ def polish_pane(scene: Scene, parts: Sequence[ComparedPart]) -> Scene:
             if most == before:
                 break
     return move_pane(scene, best)
-
-
-@torch.no_grad()
-def agrees_better(aligned: Scene, fitted: Scene, parts: Sequence[ComparedPart]) -> bool:
-    """Return whether photographs agree so much better with the aligned pane that the fitted plane must be wrong."""
-    found = mean_correlations([aligned, fitted], parts)
-    # On Fisher's scale, the step from 0.9 to 0.97 is about as large as that from 0.3 to 0.7.
-    other, own = (math.atanh(max(-PERFECT, min(value, PERFECT))) for value in found)
-    return other > LEAST_GAIN_OF_ALIGNING * own
-
-
-@torch.no_grad()
-def best_tilt(scene: Scene, parts: Sequence[ComparedPart]) -> Tensor:
-    """[3] offsets for `move_pane`: the combination of `TILTS_DEG` that agrees best with photographs."""
-    means = scene.primary.means
-    tilts = [math.radians(degrees) for degrees in TILTS_DEG]
-    candidates = [means.new_tensor([first, second, 0.0]) for first in tilts for second in tilts]
-    found = mean_correlations([move_pane(scene, offsets) for offsets in candidates], parts)
-    return candidates[found.index(max(found))]
 
 
 def move_pane(scene: Scene, offsets: Tensor) -> Scene:
@@ -346,13 +328,6 @@ def mirrored_image(scene: Scene, camera: Camera) -> MirroredImage:
     over_black, over_white = Planar(intensity=False).reflections(scene, camera, (BLACK, WHITE))
     seen = over_white.amax(dim=-1) > 0
     return MirroredImage(over_black, torch.where(seen, 1 - (over_white - over_black).mean(dim=-1), 0), seen)
-
-
-@torch.no_grad()
-def mirrored_coverage(scene: Scene, pane: Planes, camera: Camera) -> tuple[float, int]:
-    """Number of a pane's pixels in a view whose mirrored image Gaussians cover, and number of all its pixels."""
-    mirrored = mirrored_image(replace(scene, planes=pane), camera)
-    return float(mirrored.coverage.sum()), int(mirrored.seen.sum())
 
 
 def subtract_local_mean(image: Tensor, region: Tensor) -> Tensor:

@@ -83,7 +83,8 @@ def test_little_is_reflected_where_less_than_half_of_all_views_together_is_cover
     second: float, expected: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     covered = iter([10.0, second])
-    monkeypatch.setattr(material, "mirrored_coverage", lambda *_: (next(covered), 100))
+    image = material.MirroredImage(torch.zeros(0), torch.zeros(0), torch.tensor(100))
+    monkeypatch.setattr(material, "mirrored_image", lambda *_: image._replace(coverage=torch.tensor(next(covered))))
     assert (
         finished(is_reflection_uncovered(true_scene(), PANE, [view.camera for view in tiny_capture().train[:2]]))
         == expected
