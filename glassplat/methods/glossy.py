@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -15,7 +16,7 @@ from glassplat.captures.dataset import Dataset
 from glassplat.methods import mirrors
 from glassplat.methods.splat import image_term, strategy_of
 from glassplat.methods.splat_recipe import Primitive, SplatRecipe
-from glassplat.methods.surroundings import AddEnvironment, AddSurroundings, BeginReflections, SkipReflections
+from glassplat.methods.surroundings import AddEnvironment, AddSurroundings, BeginReflections
 from glassplat.options import BLACK
 from glassplat.render.deferred import INVISIBLE, Deferred
 from glassplat.render.splat import Splat
@@ -27,10 +28,12 @@ from glassplat.training.actions import DensificationStrategy, Densify, GrowSh, P
 from glassplat.training.corrections import with_learned_corrections, with_neutral_corrections
 from glassplat.training.densify import as_discs
 from glassplat.training.options import PUBLISHED_ITERATIONS, GaussianRates, Intervals, Rate
-from glassplat.training.stage import Action, Every, Stage
+from glassplat.training.stage import Action, Every, Stage, TrainState
 
 if TYPE_CHECKING:
     from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
+
+log = logging.getLogger("glassplat.training")
 
 
 def deferred_scene(recipe: DeferredRecipe, dataset: Dataset) -> Scene:
@@ -48,8 +51,7 @@ def deferred_renderer(recipe: DeferredRecipe) -> Deferred:
 
 def deferred_stages(recipe: DeferredRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
     """Bootstrap, then joint training, which `Propagate` controls. A short run has no reflections."""
-    short = iterations < recipe.least_iterations
-    if short:
+    if iterations < recipe.least_iterations:
         return with_learned_corrections(recipe, _matte_stages(recipe, "ellipsoid", seed, iterations))
     return with_learned_corrections(recipe, _reflection_stages(_with_sufficient_bootstrap(recipe, iterations)))
 
@@ -145,7 +147,16 @@ def _matte_stages(recipe: DeferredRecipe, primitive: Primitive, seed: int, itera
         mcmc=recipe.mcmc,
     )
     first, *later = (replace(stage, name=f"as {stage.name}") for stage in plain.stages(seed, iterations))
-    setup = SkipReflections(iterations, recipe.least_iterations, _environment_setup(recipe))
+
+    def setup(state: TrainState, dataset: Dataset) -> None:
+        """Adds an environment that nothing reflects."""
+        log.warning(
+            "%d iterations are too few for normal propagation: the run trains like splat, without reflections, which "
+            "gives better images. Reflections need %d --iterations; --least-iterations 1 forces them",
+            iterations, recipe.least_iterations,
+        )  # fmt: skip
+        _environment_setup(recipe)(state, dataset)
+
     return replace(first, setup=setup), *later
 
 

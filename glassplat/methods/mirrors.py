@@ -217,17 +217,13 @@ def normals_from_views(scene: Scene, views: Sequence[View], estimated: bool = Fa
 
 
 def depth_map_normals(scene: Scene, camera: Camera) -> Tensor:
-    """[H, W, 3] normals of a camera's depth map, world axes; zero where unreliable."""
+    """[H, W, 3] normals of a camera's depth map, interpolated between its cells, world axes; zero where unreliable."""
     surface = blend_surface(scene, camera, background=(0.0, 0.0, 0.0))
     cells, trusted = depth_normals(surface.depth, surface.alpha, camera)
-    return _upsample_cells(cells * trusted[..., None], cell_side(camera), surface.depth.shape)
-
-
-def _upsample_cells(cells: Tensor, side: int, size: Sequence[int]) -> Tensor:
-    """[H, W, 3] unit vectors interpolated between cells [h, w, 3] of several pixels; zero where these are."""
-    height, width = (side * count for count in cells.shape[:2])
-    large = interpolate(cells.permute(2, 0, 1)[None], (height, width), mode="bilinear")[0].permute(1, 2, 0)
-    image = cells.new_zeros(*size, 3)
+    height, width = (cell_side(camera) * count for count in trusted.shape)
+    reliable = (cells * trusted[..., None]).permute(2, 0, 1)[None]
+    large = interpolate(reliable, (height, width), mode="bilinear")[0].permute(1, 2, 0)
+    image = cells.new_zeros(*surface.depth.shape, 3)
     image[:height, :width] = normalize(large, dim=-1)
     return image
 
@@ -252,38 +248,30 @@ def rotate_to_normals(gaussians: Gaussians, normals: Tensor, log_flatness: float
 
 
 @torch.no_grad()
-def propagate_normals(
-    options: NormalPropagation, gaussians: Gaussians, moments: Moments
-) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
+def propagate_normals(options: NormalPropagation, gaussians: Gaussians, moments: Moments) -> tuple[Gaussians, Moments]:
     """Raises opacities and strengths, and grows reflective Gaussians; moments of changed values are zeroed."""
     opacities = gaussians.logit_opacities.clamp(min=logit(options.least_opacity))
     strengths = gaussians.channels["logit_strength"].clamp(min=logit(options.least_strength))
-    grows = strengths >= logit(options.reflective)
-    log_scales = gaussians.log_scales + math.log(options.growth) * (grows[:, None] & _surface_axes(gaussians))
+    grows = (strengths >= logit(options.reflective))[:, None]
+    if not gaussians.are_discs:  # The shortest axis is the normal.
+        grows = grows & ~torch.nn.functional.one_hot(gaussians.log_scales.argmin(dim=1), 3).bool()
+    log_scales = gaussians.log_scales + math.log(options.growth) * grows
     changed = {"logit_opacities": opacities, "logit_strength": strengths, "log_scales": log_scales}
-    everything = torch.ones_like(grows)
-    return gaussians.with_tensors(changed), zero_moments(moments, [f"primary.{name}" for name in changed], everything)
+    return gaussians.with_tensors(changed), zero_moments(moments, [f"primary.{name}" for name in changed])
 
 
 @torch.no_grad()
 def sabotage_colors(
     options: NormalPropagation, gaussians: Gaussians, moments: Moments, generator: torch.Generator
-) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
+) -> tuple[Gaussians, Moments]:
     """Adds noise to the constant colours of non-reflective Gaussians, so that these cannot explain reflections."""
     if options.sabotage == 0:
-        return gaussians, dict(moments)
+        return gaussians, moments
     unit = torch.rand(gaussians.sh[:, 0].shape, generator=generator, device=gaussians.sh.device, dtype=torch.float32)
     matte = gaussians.channels["logit_strength"] <= logit(options.sabotaged)
     sh = gaussians.sh.clone()
     sh[:, 0] += torch.where(matte[:, None], options.sabotage * (2 * unit - 1) / SH_ZERO, 0)
     return gaussians.with_tensors({"sh": sh}), zero_moments(moments, ["primary.sh"], matte)
-
-
-def _surface_axes(gaussians: Gaussians) -> Tensor:
-    """[N, 3] bool, or [N, 2] for discs: axes within the surface; all but the shortest, or both of a disc."""
-    if gaussians.are_discs:
-        return torch.ones_like(gaussians.log_scales, dtype=torch.bool)
-    return ~torch.nn.functional.one_hot(gaussians.log_scales.argmin(dim=1), 3).bool()
 
 
 log = logging.getLogger("glassplat.training")

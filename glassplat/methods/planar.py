@@ -376,10 +376,13 @@ def planar_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
             iteration and not at the second stage.
     """
     if not dataset.pane_labels and dataset.planes is None:
+        count = sum(view.is_annotated for view in (*dataset.train, *dataset.test))
+        found = f"none of the {count} masks of {dataset.root} names a pane"
+        found = found if count else f"{dataset.root} has no masks of panes"
         raise PlaneFitError(
-            f"{_missing_masks_message(dataset)}, and planar needs to know the panes: expected masks of 3 to "
-            f"10 photographs in {dataset.root / 'panes'}, named <photograph's name>.png, each pixel the label 1, "
-            "2, ... of a pane, or 0 (`glassplat annotate` writes them). `glassplat train splat` needs none"
+            f"{found}, and planar needs to know the panes: expected masks of 3 to 10 photographs in "
+            f"{dataset.root / 'panes'}, named <photograph's name>.png, each pixel the label 1, 2, ... of a pane, or 0 "
+            "(`glassplat annotate` writes them). `glassplat train splat` needs none"
         )
     known = (*dataset.pane_labels, *(() if dataset.planes is None else dataset.planes.labels))
     if unknown := [label for label in recipe.plane_fit.mirror_labels if label not in known]:
@@ -388,15 +391,6 @@ def planar_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
         capture_planes(dataset, None, recipe.plane_fit)
     scene = Scene(_first_strategy(recipe).initial_gaussians(dataset.points, recipe.sh_degree), dataset.extent)
     return with_neutral_corrections(recipe, scene, dataset)
-
-
-def _missing_masks_message(dataset: Dataset) -> str:
-    count = sum(view.is_annotated for view in (*dataset.train, *dataset.test))
-    return (
-        f"none of the {count} masks of {dataset.root} names a pane"
-        if count
-        else f"{dataset.root} has no masks of panes"
-    )
 
 
 def planar_renderer(recipe: PlanarRecipe) -> Planar:
@@ -492,7 +486,7 @@ def _joint_stage(recipe: PlanarRecipe, share: float) -> Stage:
         | plane_rates(JOINT_RATE_FACTOR)
         | ({"primary.log_intensity": Rate(recipe.rates.intensity)} if recipe.intensity else {}),
         actions=(
-            *_reflection_actions(recipe),
+            *((TurnReflections((_joint_start(recipe) + TURN_AFTER,)), LightLamps()) if recipe.turn_reflections else ()),
             *_seed_actions(recipe, _joint_start(recipe) + SEED_AFTER_JOINT),
             *strategy.edits,
             actions.GrowSh(Every(recipe.intervals.sh)),
@@ -530,20 +524,24 @@ def _glass_post_steps(recipe: PlanarRecipe) -> tuple[PostStep, ...]:
 
 
 def _shared_terms(recipe: PlanarRecipe, strategy: actions.DensificationStrategy) -> tuple[losses.LossTerm, ...]:
-    glass = losses.weighted_terms(
-        losses.LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, losses.tint_prior)
+    """The terms of both stages with reflections whose weight is not zero."""
+    weights = recipe.weights
+    conflict = losses.cell_gradient_conflict if recipe.conflict == "cells" else losses.gradient_conflict
+    reflectance = losses.ReflectancePrior(recipe.plane_fit.glass_reflectance)
+    of_reflection = losses.weighted_terms(
+        losses.LossTerm("depth", weights.depth, losses.depth_deviation_loss),
+        losses.LossTerm("conflict", weights.conflict, conflict),
+        losses.LossTerm("mask", weights.mask, losses.mask_loss),
+        losses.LossTerm("intensity", weights.intensity, losses.intensity_prior),
+        losses.LossTerm("reflectance", weights.reflectance, reflectance),
+        losses.LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, losses.tint_prior),
     )
-    return (image_term(recipe.ssim_weight), *reflection_terms(recipe), *glass, *strategy.terms)
+    return (image_term(recipe.ssim_weight), *of_reflection, *strategy.terms)
 
 
 def _early_resets(recipe: PlanarRecipe, strategy: actions.DensificationStrategy) -> tuple[actions.ResetOpacity, ...]:
     """The opacity resets of the first two stages, if enabled."""
     return strategy.resets if recipe.early_resets else ()
-
-
-def _reflection_actions(recipe: PlanarRecipe) -> tuple[TurnReflections | LightLamps, ...]:
-    """The actions on reflections and lamps behind glass, if enabled."""
-    return (TurnReflections((_joint_start(recipe) + TURN_AFTER,)), LightLamps()) if recipe.turn_reflections else ()
 
 
 SEED_AFTER_ADJUSTMENT, SEED_AFTER_JOINT = 0.005, 0.003
@@ -583,18 +581,4 @@ def _training_renderer(recipe: PlanarRecipe, gradient: str) -> Planar:
         deviation=recipe.weights.depth != 0,
         deviation_depth_gradient=recipe.moving_mean,
         tells_mirrored=recipe.densify_by == "direct",
-    )
-
-
-def reflection_terms(recipe: PlanarRecipe) -> tuple[losses.LossTerm, ...]:
-    """The terms whose weight is not zero."""
-    weights = recipe.weights
-    conflict = losses.cell_gradient_conflict if recipe.conflict == "cells" else losses.gradient_conflict
-    reflectance = losses.ReflectancePrior(recipe.plane_fit.glass_reflectance)
-    return losses.weighted_terms(
-        losses.LossTerm("depth", weights.depth, losses.depth_deviation_loss),
-        losses.LossTerm("conflict", weights.conflict, conflict),
-        losses.LossTerm("mask", weights.mask, losses.mask_loss),
-        losses.LossTerm("intensity", weights.intensity, losses.intensity_prior),
-        losses.LossTerm("reflectance", weights.reflectance, reflectance),
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
@@ -159,14 +158,6 @@ def copied_surroundings(primary: Gaussians, chosen: Tensor, *, sh_degree: int) -
     )
 
 
-log = logging.getLogger("glassplat.training")
-
-TOO_SHORT = (
-    "%d iterations are too few for normal propagation: the run trains like splat, without reflections, which "
-    "gives better images. Reflections need %d --iterations; --least-iterations 1 forces them"
-)
-
-
 @dataclass(frozen=True)
 class AddEnvironment:
     """Adds an environment of random noise.
@@ -193,26 +184,6 @@ class AddEnvironment:
 
 
 @dataclass(frozen=True)
-class SkipReflections:
-    """Warns that a run is too short for reflections; adds an environment that nothing reflects.
-
-    Attributes:
-        iterations: length of the run.
-        least: length of the shortest run with reflections.
-        environment: adds the environment.
-    """
-
-    iterations: int
-    least: int
-    environment: AddEnvironment
-
-    def __call__(self, state: TrainState, dataset: Dataset) -> None:
-        """Edits `state`."""
-        log.warning(TOO_SHORT, self.iterations, self.least)
-        self.environment(state, dataset)
-
-
-@dataclass(frozen=True)
 class AddSurroundings:
     """Adds Gaussians as surroundings for reflections.
 
@@ -226,20 +197,17 @@ class AddSurroundings:
 
     def __call__(self, state: TrainState, dataset: Dataset, matte: Tensor) -> None:
         """Edits `state`; `matte` [N] bool are the primary Gaussians that may be copied."""
-        parts = [part for part in self._initial_sets(state, dataset, matte) if len(part)]
-        # Nothing to copy if everything reflects.
-        found = reduce(Gaussians.concat, parts or [self._gaussians_in_box(state, dataset)])
-        ordered, _ = apply_edit(found, {}, morton_order(found.means), part="surroundings")
-        state.scene = replace(state.scene, surroundings=ordered)
-
-    def _initial_sets(self, state: TrainState, dataset: Dataset, matte: Tensor) -> list[Gaussians]:
-        """The set with the highest active SH degree, which the result has, comes first."""
         parts = []
         if self.start.source != "box":
-            parts.append(copied_surroundings(state.scene.primary, matte, sh_degree=self.sh_degree))
-        if self.start.source != "scene":
+            copies = copied_surroundings(state.scene.primary, matte, sh_degree=self.sh_degree)
+            parts = [copies] if len(copies) else []
+        # There is nothing to copy if everything reflects.
+        if self.start.source != "scene" or not parts:
             parts.append(self._gaussians_in_box(state, dataset))
-        return parts
+        # The set with the highest active SH degree, which the result has, comes first.
+        found = reduce(Gaussians.concat, parts)
+        ordered, _ = apply_edit(found, {}, morton_order(found.means), part="surroundings")
+        state.scene = replace(state.scene, surroundings=ordered)
 
     def _gaussians_in_box(self, state: TrainState, dataset: Dataset) -> Gaussians:
         cells = self.start.cells or suitable_cells(dataset.photograph_pixels, self.start.per_cell)
