@@ -377,7 +377,9 @@ def mcmc_strategy(densifier: McmcDensify, means_rate: Rate) -> DensificationStra
     """
 
     def regulariser(term: losses.LossFunction) -> losses.LossFunction:
-        return losses.over_all_gaussians(term) if densifier.reach == "all" else term
+        if densifier.reach == "shown":
+            return term
+        return lambda frame, view, scene: term(replace(frame, direct=None), view, scene)
 
     terms = losses.weighted_terms(
         losses.LossTerm("opacity", densifier.opacity_weight, regulariser(losses.mean_opacity)),
@@ -507,7 +509,10 @@ def unexplained_positions(
             visible = visible & (strength <= 0)
         visible = visible[pixels]
         visible &= ~crosses_pane(in_view, scene.planes, camera.center)
-        missing = _missing_pixels(losses.residual(frame, view, scene))[pixels] & visible
+        error = losses.residual(frame, view, scene)
+        reach = max(round(RESIDUAL_WINDOW / 2 * camera.width), 1)
+        mean_error = window_means(error, torch.ones_like(error[..., 0]), reach)
+        missing = (mean_error.abs().mean(dim=-1) > LEAST_UNEXPLAINED)[pixels] & visible
         photographed = scene.exposures.apply_inverse(to_device(view.photo, device)[pixels].float() / 255, view.name)
         color = photographed.clamp(0, 1) * missing[:, None]
         seeing_views[rows] += visible
@@ -538,10 +543,3 @@ def grid_around_cameras(cameras: Sequence[Camera], extent: float) -> tuple[Tenso
         for start, number in zip(low, numbers, strict=True)
     ]
     return torch.stack(torch.meshgrid(*along, indexing="ij"), dim=-1).reshape(-1, 3) @ axes, cell
-
-
-def _missing_pixels(error: Tensor) -> Tensor:
-    """[H, W] bool: pixels of a residual [H, W, 3] in which more than detail is missing."""
-    reach = max(round(RESIDUAL_WINDOW / 2 * error.shape[1]), 1)
-    mean = window_means(error, torch.ones_like(error[..., 0]), reach)
-    return mean.abs().mean(dim=-1) > LEAST_UNEXPLAINED

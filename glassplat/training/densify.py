@@ -418,19 +418,6 @@ def densify(
             f"statistics hold {statistics.view_count.shape[1]} columns for {len(gaussians)} Gaussians; "
             "start new statistics whenever the set has changed"
         )
-    grown = _growth_edit(options, gaussians, statistics, extent=extent, generator=generator)
-    pruned = _select_to_prune(options, gaussians, grown, extent=extent, prune_large=prune_large)
-    return apply_edit(gaussians, moments, grown.then(keep(~pruned)), part=part)
-
-
-def _growth_edit(
-    options: DefaultDensify,
-    gaussians: Gaussians,
-    statistics: ScreenStatistics,
-    *,
-    extent: float,
-    generator: torch.Generator,
-) -> Edit:
     large = gaussians.log_scales.amax(dim=1) > math.log(options.dense_fraction * extent)
     scores = statistics.mean_gradient / options.gradient_threshold
     if options.split_by == "absgrad":
@@ -439,7 +426,12 @@ def _growth_edit(
     after_split = split(gaussians, (chosen & large).nonzero().squeeze(1), generator=generator)
     # Unsplit rows moved forward by the number of split rows before them.
     row_after_split = (~(chosen & large)).cumsum(dim=0) - 1
-    return after_split.then(clone(len(after_split), row_after_split[chosen & ~large]))
+    grown = after_split.then(clone(len(after_split), row_after_split[chosen & ~large]))
+    pruned = torch.sigmoid(grown.edited_tensor(gaussians, "logit_opacities")) < options.prune_opacity
+    if prune_large:
+        longest = grown.edited_tensor(gaussians, "log_scales").amax(dim=1)
+        pruned |= longest > math.log(options.prune_scale_fraction * extent)
+    return apply_edit(gaussians, moments, grown.then(keep(~pruned)), part=part)
 
 
 def _select_to_grow(options: DefaultDensify, scores: Tensor) -> Tensor:
@@ -452,17 +444,6 @@ def _select_to_grow(options: DefaultDensify, scores: Tensor) -> Tensor:
     selected = torch.zeros_like(chosen)
     selected[order[:room]] = True
     return chosen & selected
-
-
-def _select_to_prune(
-    options: DefaultDensify, gaussians: Gaussians, edit: Edit, *, extent: float, prune_large: bool
-) -> Tensor:
-    """[M] bool: which Gaussians of the edited set to remove."""
-    pruned = torch.sigmoid(edit.edited_tensor(gaussians, "logit_opacities")) < options.prune_opacity
-    if prune_large:
-        longest = edit.edited_tensor(gaussians, "log_scales").amax(dim=1)
-        pruned |= longest > math.log(options.prune_scale_fraction * extent)
-    return pruned
 
 
 @torch.no_grad()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 
 import torch
@@ -73,11 +73,6 @@ def mean_scale(frame: Frame, view: View, scene: Scene) -> Tensor:
     the capture's units. Differentiable in the raw scales; for Gaussians in view, as `mean_opacity`.
     """
     return _direct_mean(scene.primary.log_scales, torch.exp, frame) / scene.extent
-
-
-def over_all_gaussians(term: LossFunction) -> LossFunction:
-    """The same term over all Gaussians instead of those in view."""
-    return lambda frame, view, scene: term(replace(frame, direct=None), view, scene)
 
 
 def _direct_mean(values: Tensor, activation: Callable[[Tensor], Tensor], frame: Frame) -> Tensor:
@@ -214,9 +209,7 @@ def residual(frame: Frame, view: View, scene: Scene) -> Tensor:
     """[H, W, 3] photograph minus render, sRGB, 0 at ignored pixels."""
     image = scene.exposures.apply(frame.rgb.detach(), view.name)
     difference = view.photo.to(image) / 255 - image
-    if view.ignored is not None:
-        difference = difference.masked_fill(view.ignored.to(image.device)[..., None], 0)
-    return difference
+    return difference.masked_fill(~valid_pixels(view, image.device)[..., None], 0)
 
 
 def mask_loss(frame: Frame, view: View, scene: Scene) -> Tensor | None:
