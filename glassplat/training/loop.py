@@ -108,7 +108,7 @@ def train(
                 state.is_whole = True
                 ranks.synchronise(state)
             yield StageEntered(state.step, stage.name, counts_of(state.scene))
-        while state.step < end and not stage.is_over(state):
+        while state.step < end and not (stage.until is not None and stage.until(state)):
             upcoming = scheduled_views(dataset, state, (1 + dataset.memory.ahead) * ranks.batch)
             for view in upcoming[ranks.rank :: ranks.count]:
                 view.read_ahead()
@@ -198,8 +198,8 @@ def sum_over_ranks(
     shown = torch.zeros_like(scene.primary.logit_opacities)
     for result in results:
         shown = shown if result.visible is None else torch.maximum(shown, result.visible.to(shown.dtype))
-    sums = ranks.sum_tensors([*gradients, *(total for one in known for total in one.sums)])
-    (shown,) = ranks.max_tensors([shown])
+    sums = ranks.reduce("SUM", [*gradients, *(total for one in known for total in one.sums)])
+    (shown,) = ranks.reduce("MAX", [shown])
     of_parts = iter(sums[len(names) :])
     found = {part: ScreenStatistics(next(of_parts), next(of_parts), next(of_parts)) for part in statistics}
     return StepGradients([], dict(zip(names, sums[: len(names)], strict=True)), found, shown > 0)
@@ -292,7 +292,8 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, with_absgrad: bool)
         if name in stage.rates and tensor.numel() > 0
     }
     learning = scene.with_parameters(leaves)
-    view = with_corrected_pose(view, learning)
+    camera = learning.poses.correct(view.camera, view.name, learning.extent)
+    view = view if camera is view.camera else view.with_camera(camera)
     frame = stage.renderer(learning, view.camera, with_absgrad=with_absgrad)
     terms, weights = loss_terms(stage, frame, view, learning)
     tracked = [record for record in frame.screen if record.means2d.requires_grad and record.means2d.numel() > 0]
@@ -309,12 +310,6 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, with_absgrad: bool)
     space = [(record, v) for record, v in zip(frame.space, v_contributions, strict=True) if v is not None]
     losses = dict(zip(terms, values.tolist(), strict=True))
     return ViewGradients(losses, gradients, screen, space, frame.visible)
-
-
-def with_corrected_pose(view: View, scene: Scene) -> View:
-    """The view with its camera pose corrected by the scene; differentiable."""
-    camera = scene.poses.correct(view.camera, view.name, scene.extent)
-    return view if camera is view.camera else view.with_camera(camera)
 
 
 def loss_terms(stage: Stage, frame: Frame, view: View, scene: Scene) -> tuple[dict[str, Tensor], Tensor]:

@@ -20,7 +20,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from glassplat.errors import InputError, RankLostError
 
@@ -126,15 +126,8 @@ class Ranks:
                 raise RuntimeError("no answer since this process was asked to stop")
         future.result()
 
-    def sum_tensors(self, tensors: Sequence[Tensor]) -> list[Tensor]:
-        """Sums over all ranks of tensors of one type and device; to be called after an exchange."""
-        return self._reduce(tensors, "SUM")
-
-    def max_tensors(self, tensors: Sequence[Tensor]) -> list[Tensor]:
-        """Maxima over all ranks of tensors of one type and device; to be called after an exchange."""
-        return self._reduce(tensors, "MAX")
-
-    def _reduce(self, tensors: Sequence[Tensor], operation: str) -> list[Tensor]:
+    def reduce(self, operation: Literal["SUM", "MAX"], tensors: Sequence[Tensor]) -> list[Tensor]:
+        """Sums or maxima over all ranks of tensors of one type and device; to be called after an exchange."""
         if self.count == 1 or not tensors:
             return list(tensors)
         import torch
@@ -216,13 +209,16 @@ def join_ranks() -> Ranks:
     """
     if not is_launched():
         return Ranks()
+    import torch
     import torch.distributed as dist
 
     if not dist.is_initialized():
         _select_gpu()
         _set_numba_threads()
         with _rank_lost_errors():
-            dist.init_process_group(_backend(), timeout=COLLECTIVE_TIMEOUT)
+            has_nccl = torch.cuda.is_available() and dist.is_nccl_available()
+            backend = "cpu:gloo,cuda:nccl" if has_nccl else "gloo"
+            dist.init_process_group(backend, timeout=COLLECTIVE_TIMEOUT)
     return Ranks(dist.get_rank(), dist.get_world_size())
 
 
@@ -279,13 +275,6 @@ def _block_termination() -> None:
     """Lets the process save and report before it ends: `torchrun` waits 30 seconds after SIGTERM."""
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
-
-
-def _backend() -> str:
-    import torch
-    import torch.distributed as dist
-
-    return "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and dist.is_nccl_available() else "gloo"
 
 
 def _set_numba_threads() -> None:

@@ -60,23 +60,18 @@ class Optimizer:
         average over as many views as before (Malladi et al. 2022, "On the SDEs and Scaling Rules for Adaptive Gradient
         Algorithms").
         """
-        learning = [name for name in gradients if parameters[name].numel() > 0 and not self._is_paused(name, views)]
-        known = decays or {}
-        updates = [
-            self._update(name, parameters[name], gradients[name], rates[name], known.get(name), views)
-            for name in learning
-        ]
+        updates = []
+        for name, gradient in gradients.items():
+            parameter = parameters[name]
+            if not parameter.numel() or self._is_paused(name, views):
+                continue
+            moments = self.moments_of(name, parameter)
+            self.updates[name] = self.updates.get(name, 0) + views
+            factor = math.sqrt(views) * self.raised_rates.get(name, 1.0)
+            lr = rates[name] if factor == 1 else rates[name] * factor
+            step, decay = self.updates[name] / views, (decays or {}).get(name)
+            updates.append(Update(parameter, gradient, *moments, lr, step, decay))
         adam(updates, betas=(BETAS[0] ** views, BETAS[1] ** views))
-
-    def _update(
-        self, name: str, parameter: Tensor, gradient: Tensor, rate: float | Tensor, decay: Tensor | None, views: int
-    ) -> Update:
-        """The update of a parameter for a number of views, which are counted."""
-        moments = self.moments_of(name, parameter)
-        self.updates[name] = self.updates.get(name, 0) + views
-        factor = math.sqrt(views) * self.raised_rates.get(name, 1.0)
-        lr = rate if factor == 1 else rate * factor
-        return Update(parameter, gradient, *moments, lr=lr, step=self.updates[name] / views, decay=decay)
 
     def _is_paused(self, name: str, views: int) -> bool:
         """Return whether a parameter is paused; counts the views of the step."""
@@ -332,10 +327,6 @@ class Stage:
         names = [term.name for term in self.losses]
         if len(set(names)) < len(names):
             raise ValueError(f"the stage {self.name!r} has the loss terms {names}; expected another name for each")
-
-    def is_over(self, state: TrainState) -> bool:
-        """Return whether the stage ends early."""
-        return self.until is not None and self.until(state)
 
 
 def stage_starts(stages: tuple[Stage, ...], iterations: int) -> list[int]:
