@@ -108,7 +108,13 @@ def load_checkpoint(
     """
     with open_checkpoint(path) as file:
         state = restored_state(file.header, file.tensors())
-    check_same_run(state, path, method=method, seed=seed, iterations=iterations)
+    remedy = "put the run's own checkpoint there, or train again"
+    if method and state.method and state.method != method:
+        raise InputError(f"{path} is a checkpoint of {state.method}; expected one of {method}: {remedy}")
+    if seed is not None and state.seed != seed:
+        raise InputError(f"{path} is of a run with the seed {state.seed}; expected {seed}: {remedy}")
+    if iterations is not None and state.step > iterations:
+        raise InputError(f"{path} is of step {state.step}; expected one of at most {iterations}: {remedy}")
     return state
 
 
@@ -128,23 +134,6 @@ def read_progress(path: Path) -> CheckpointProgress:
     """
     with open_checkpoint(path) as file:
         return CheckpointProgress(int(file.header["step"]), float(file.header["seconds"]))
-
-
-def check_same_run(
-    state: TrainState, path: Path, *, method: str | None, seed: int | None, iterations: int | None
-) -> None:
-    """Refuses the checkpoint of another run.
-
-    Raises:
-        InputError: method or seed differ, or the step is beyond the end of the run.
-    """
-    remedy = "put the run's own checkpoint there, or train again"
-    if method and state.method and state.method != method:
-        raise InputError(f"{path} is a checkpoint of {state.method}; expected one of {method}: {remedy}")
-    if seed is not None and state.seed != seed:
-        raise InputError(f"{path} is of a run with the seed {state.seed}; expected {seed}: {remedy}")
-    if iterations is not None and state.step > iterations:
-        raise InputError(f"{path} is of step {state.step}; expected one of at most {iterations}: {remedy}")
 
 
 @contextmanager
@@ -167,7 +156,12 @@ def restored_state(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     Raises:
         InputError: the tensors do not match the header or each other.
     """
-    check_types(tensors)
+    for name, tensor in tensors.items():
+        if not tensor.is_floating_point():
+            raise InputError(f"{name} holds {tensor.dtype}; expected floating-point numbers")
+        common = next(iter(tensors.values())).dtype
+        if tensor.dtype != common:
+            raise InputError(f"{name} holds {tensor.dtype}, other tensors {common}; expected one precision")
     with convert_to_input_error():
         scene = restored_scene(header, tensors)
     first, second = tensors_with_prefix(tensors, "first/"), tensors_with_prefix(tensors, "second/")
@@ -256,16 +250,6 @@ def restored_statistics(tensors: Mapping[str, Tensor], scene: Scene) -> dict[str
             raise InputError(f"the statistics of {part} are {sorted(known)}; expected {sorted(expected)}")
         found[part] = ScreenStatistics(**known)
     return found
-
-
-def check_types(tensors: Mapping[str, Tensor]) -> None:
-    """Raises InputError unless all tensors have the same floating-point type."""
-    for name, tensor in tensors.items():
-        if not tensor.is_floating_point():
-            raise InputError(f"{name} holds {tensor.dtype}; expected floating-point numbers")
-        first = next(iter(tensors.values()))
-        if tensor.dtype != first.dtype:
-            raise InputError(f"{name} holds {tensor.dtype}, other tensors {first.dtype}; expected one precision")
 
 
 def check_shapes(tensors: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...] | None], owner: str) -> None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from glassplat.captures.dataset import Dataset
-from glassplat.render.planar import Planar
+from glassplat.render.planar import Planar, with_photographer
 from glassplat.scene import logit
 from glassplat.scene.camera import Camera
 from glassplat.scene.corrections import Exposures, PerPhotograph, PoseCorrections, estimate_up
@@ -157,15 +157,13 @@ def with_learned_photographer(
         return stages
     first = next(number for number, stage in enumerate(stages) if isinstance(stage.renderer, Planar))
     setup = AddPhotographer(options, seed, after=stages[first].setup)
-    learning = [_with_photographer(options, stage, densify) for stage in stages[first:]]
+    learning = [
+        replace(
+            stage,
+            renderer=with_photographer(stage.renderer, "present"),
+            rates={**stage.rates, **options.rates.of(PART)},
+            actions=(*stage.actions, Densify(densify, part=PART)),
+        )
+        for stage in stages[first:]
+    ]
     return (*stages[:first], replace(learning[0], setup=setup), *learning[1:])
-
-
-def _with_photographer(options: Photographer, stage: Stage, densify: DefaultDensify) -> Stage:
-    assert isinstance(stage.renderer, Planar)
-    return replace(
-        stage,
-        renderer=replace(stage.renderer, photographer="present"),
-        rates={**stage.rates, **options.rates.of(PART)},
-        actions=(*stage.actions, Densify(densify, part=PART)),
-    )
