@@ -312,7 +312,13 @@ class Model:
         tangent = self._horizontal_direction(normal) if tangent is None else tangent
         pane = Planes.rectangle(center, normal, half_sizes, tangent=tangent, label=free if label is None else label)
         added = with_pane(self.scene, pane)
-        recipe = planar_recipe_for(self.recipe)
+        recipe = self.recipe
+        if isinstance(recipe, SplatRecipe) and recipe.primitive == "ellipsoid":
+            recipe = PlanarRecipe(background=recipe.background)
+        elif not isinstance(recipe, PlanarRecipe):
+            raise ValueError(
+                f"panes cannot be put into a scene of {recipe.method}; expected one of planar, or splat's ellipsoids"
+            )
         recipe.renderer().check(added)
         model = replace(self, scene=added, recipe=recipe).with_reflectance(pane.labels[0], base_reflectance)
         return model.with_mirrors(*pane.labels) if base_reflectance == 1 else model
@@ -344,7 +350,34 @@ class Model:
             FileExistsError: a file exists already; nothing was written.
             InputError: the format is not known, or cannot hold this model.
         """
-        return save_model(self, Path(path), overwrite=overwrite)
+        path = Path(path)
+        kind = path.suffix.lower().removeprefix(".")
+        if not kind:
+            return save_folder(self, path, overwrite=overwrite)
+        if kind not in writing.OUTPUT_FORMATS:
+            endings = ", ".join(f".{known}" for known in writing.OUTPUT_FORMATS)
+            raise InputError(f"{path}: expected a name that ends in {endings}, or a folder's")
+        names = (PLANES, GLASS, CAMERAS, *(() if self.scene.environment.is_empty else (ENVIRONMENT, PANORAMA)))
+        sidecars = [path.with_name(name) for name in names] if kind in writing.SPLAT_WRITERS else []
+        targets = [] if overwrite else [path, *_differing_files(self, sidecars)]
+        found = [str(target) for target in targets if target.exists()]
+        if found:
+            raise FileExistsError(
+                f"{join_names(found)} already exists; nothing was written. Choose another folder, or overwrite=True"
+            )
+        writing.make_folder(path.parent)
+        if kind not in writing.SPLAT_WRITERS:
+            save_page(self, path, self.name or path.stem)
+            return path
+        with convert_to_input_error():
+            writing.write_splats(kind, path, self.scene.primary)
+        if lost := unsaved_parts(self, kind):
+            log.warning("%s leaves out %s; a folder, saved without a suffix, holds everything", path, ", ".join(lost))
+        write_sidecars(path.parent, self.scene)
+        if not len(self.scene.planes) and (path.parent / PLANES).exists():
+            write_planes(path.parent / PLANES, self.scene.planes)  # Panes of a previous file must not be used.
+        write_cameras(path.parent / CAMERAS, self.cameras.items())
+        return path
 
 
 def viewer_state(
@@ -365,21 +398,6 @@ def viewer_state(
     )
 
 
-def planar_recipe_for(recipe: Any) -> PlanarRecipe:
-    """The `planar` recipe that renders a scene of another method with a pane.
-
-    Raises:
-        ValueError: the method does not support panes.
-    """
-    if isinstance(recipe, PlanarRecipe):
-        return recipe
-    if isinstance(recipe, SplatRecipe) and recipe.primitive == "ellipsoid":
-        return PlanarRecipe(background=recipe.background)
-    raise ValueError(
-        f"panes cannot be put into a scene of {recipe.method}; expected one of planar, or splat's ellipsoids"
-    )
-
-
 def name_cameras(cameras: Iterable[tuple[str, Camera]]) -> dict[str, Camera]:
     """Cameras by name; duplicates get a number."""
     named: dict[str, Camera] = {}
@@ -397,42 +415,6 @@ EXPORT_STEM = "scene"
 """File name, without suffix, of exported splats."""
 SETTINGS_FILE = "settings.json"
 PANORAMA, ENVIRONMENT = "environment.png", "environment.json"
-
-
-def save_model(model: Model, path: Path, *, overwrite: bool) -> Path:
-    """Writes a model in the format that the path's suffix names, see `Model.save`; returns the path.
-
-    Raises:
-        FileExistsError: a file exists already; nothing was written.
-        InputError: the format is not known, or cannot hold this model.
-    """
-    kind = path.suffix.lower().removeprefix(".")
-    if not kind:
-        return save_folder(model, path, overwrite=overwrite)
-    if kind not in writing.OUTPUT_FORMATS:
-        endings = ", ".join(f".{known}" for known in writing.OUTPUT_FORMATS)
-        raise InputError(f"{path}: expected a name that ends in {endings}, or a folder's")
-    names = (PLANES, GLASS, CAMERAS, *(() if model.scene.environment.is_empty else (ENVIRONMENT, PANORAMA)))
-    sidecars = [path.with_name(name) for name in names] if kind in writing.SPLAT_WRITERS else []
-    targets = [] if overwrite else [path, *_differing_files(model, sidecars)]
-    found = [str(target) for target in targets if target.exists()]
-    if found:
-        raise FileExistsError(
-            f"{join_names(found)} already exists; nothing was written. Choose another folder, or overwrite=True"
-        )
-    writing.make_folder(path.parent)
-    if kind not in writing.SPLAT_WRITERS:
-        save_page(model, path, model.name or path.stem)
-        return path
-    with convert_to_input_error():
-        writing.write_splats(kind, path, model.scene.primary)
-    if lost := unsaved_parts(model, kind):
-        log.warning("%s leaves out %s; a folder, saved without a suffix, holds everything", path, ", ".join(lost))
-    write_sidecars(path.parent, model.scene)
-    if not len(model.scene.planes) and (path.parent / PLANES).exists():
-        write_planes(path.parent / PLANES, model.scene.planes)  # Panes of a previous file must not be used.
-    write_cameras(path.parent / CAMERAS, model.cameras.items())
-    return path
 
 
 def _differing_files(model: Model, sidecars: Sequence[Path]) -> list[Path]:
@@ -477,31 +459,26 @@ def save_page(model: Model, path: Path, title: str, *, sharing: web_page.Sharing
 
 
 def write_sidecars(folder: Path, scene: Scene) -> list[Path]:
-    """Writes planes, glass and environment, if present; returns the written files."""
+    """Writes planes and glass, and the environment as a panorama with a description, if present; returns the files."""
     written = []
     if len(scene.planes):
         write_planes(folder / PLANES, scene.planes)
         write_gaussians(folder / GLASS, scene.glass)
         written += [folder / PLANES, folder / GLASS]
     if not scene.environment.is_empty:
-        write_environment_files(folder, scene)
+        environment = scene.environment
+        write_equirect(folder / PANORAMA, equirect_from_environment(environment, 2 * environment.size))
+        description = {
+            "image": PANORAMA,
+            "projection": "equirectangular",
+            "color": "sRGB",
+            "up": "+z in the top row",
+            "forward": "+x in the middle column, +y left of it",
+            "region": environment.region,
+        }
+        writing.write_text(folder / ENVIRONMENT, json.dumps(description, indent=2) + "\n")
         written += [folder / ENVIRONMENT, folder / PANORAMA]
     return written
-
-
-def write_environment_files(folder: Path, scene: Scene) -> None:
-    """Writes the environment as a panorama, with a description of its format."""
-    environment = scene.environment
-    write_equirect(folder / PANORAMA, equirect_from_environment(environment, 2 * environment.size))
-    description = {
-        "image": PANORAMA,
-        "projection": "equirectangular",
-        "color": "sRGB",
-        "up": "+z in the top row",
-        "forward": "+x in the middle column, +y left of it",
-        "region": environment.region,
-    }
-    writing.write_text(folder / ENVIRONMENT, json.dumps(description, indent=2) + "\n")
 
 
 def write_as_run(folder: Path, model: Model, source: Path | None) -> None:
@@ -559,13 +536,6 @@ AXES: dict[str, tuple[int, int, int]] = {
     "x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1),
 }  # fmt: skip
 log = logging.getLogger(__name__)
-
-
-def scene_extent(gaussians: Gaussians, cameras: NamedCameras) -> float:
-    """Extent of the scene as defined for training; with a single camera, that stored in the scene."""
-    centers = torch.stack([camera.center for _, camera in cameras])
-    radius = float((centers - centers.mean(0)).norm(dim=1).max())
-    return EXTENT_MARGIN * (radius or web_page.bounding_ball(gaussians)[1])
 
 
 def _read_panes(file: Path, planes_file: Path | None) -> Planes:
@@ -657,7 +627,11 @@ def _from_file(path: Path, device: DeviceName, planes_file: Path | None, up: Up)
         own = planes_file is None or writing.real_path(planes_file) == writing.real_path(path.with_name("planes.json"))
         glass = _read_glass(path, planes, own=own)
         cameras = _read_or_place_cameras(path, gaussians, up)
-        scene = Scene(with_intensity(gaussians), scene_extent(gaussians, cameras), glass=glass, planes=planes)
+        centers = torch.stack([camera.center for _, camera in cameras])
+        radius = float((centers - centers.mean(0)).norm(dim=1).max())
+        # As for training; with a single camera, from the Gaussians.
+        extent = EXTENT_MARGIN * (radius or web_page.bounding_ball(gaussians)[1])
+        scene = Scene(with_intensity(gaussians), extent, glass=glass, planes=planes)
     if lost:
         log.warning("%d Gaussians of %s are left out: they contain NaN or values too large to draw", lost, path)
     recipe = recipe_of_splats(scene.primary)

@@ -593,11 +593,12 @@ class Training:
         Args:
             listen: receives every message; its exceptions end the run after saving.
         """
+        listen = listen or (lambda message: None)
         if self._run is not None:
-            self._run.run_to_end(listen or _ignore_message)
+            self._run.run_to_end(listen)
         else:
             for message in self:
-                (listen or _ignore_message)(message)
+                listen(message)
         return self.model
 
     @property
@@ -676,7 +677,3 @@ def chosen_recipe(recipe: str | Recipe) -> Any:
     if isinstance(given, type) or not dataclasses.is_dataclass(given) or not hasattr(given, "stages"):
         raise InputError(f"recipe is {short_repr(given)}; expected a method's name, or a recipe such as SplatRecipe()")
     return given
-
-
-def _ignore_message(message: Message) -> None:
-    """Ignores messages."""
