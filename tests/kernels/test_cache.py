@@ -118,12 +118,12 @@ def test_the_process_that_compiles_runs_the_same_kernels_as_the_next_one(tmp_pat
 def test_a_disk_error_disables_only_the_cache(tmp_path: Path) -> None:
     script = tmp_path / "small_kernel.py"
     refuse = """
-from numba.core.caching import FunctionCache
+from numba.core.caching import IndexDataCacheFile
 
 def refuse(*_):
     raise OSError("no space left")
 
-FunctionCache.save_overload = refuse
+IndexDataCacheFile.save = refuse
 """
     script.write_text(refuse + SMALL_KERNEL)
     (tmp_path / "formula.py").write_text(FORMULA)

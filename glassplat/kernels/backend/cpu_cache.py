@@ -114,9 +114,22 @@ class KernelFiles(caching.CompileResultCacheImpl):
                 self.locator.get_cache_path(),
             )
 
-    def warn_not_stored(self, reason: Exception) -> None:
-        """Logs once that kernels will be compiled again in the next process."""
-        _warn_once("cannot cache compiled kernels: %s; %s", str(reason), REMEDY)
+    def store(self, file: caching.IndexDataCacheFile, key: Any, data: Any) -> None:
+        """Stores data under a key, or logs once that kernels will be compiled again in the next process.
+
+        A damaged index, which cannot be extended, is replaced by a new one.
+        """
+        try:
+            self.locator.ensure_cache_path()
+            try:
+                file.save(key, data)
+            except DAMAGE_ERRORS:
+                file.flush()
+                file.save(key, data)
+        except OSError as error:
+            _warn_once("cannot cache compiled kernels: %s; %s", str(error), REMEDY)
+        else:
+            self.warn_if_elsewhere()
 
 
 @cache
@@ -229,19 +242,6 @@ def load_data(files: Iterable[caching.IndexDataCacheFile], key: Any) -> Any:
     return None
 
 
-def store_data(file: caching.IndexDataCacheFile, key: Any, data: Any) -> None:
-    """Stores data under a key; a damaged index, which cannot be extended, is replaced by a new one.
-
-    Raises:
-        OSError: the folder is not writable.
-    """
-    try:
-        file.save(key, data)
-    except DAMAGE_ERRORS:
-        file.flush()
-        file.save(key, data)
-
-
 @cache
 def loading_context() -> CPUContext:
     """Context for loading kernels that this process compiled, separate from the compiler's."""
@@ -282,30 +282,12 @@ class KernelCache(caching.FunctionCache):
         """The kernel for a signature; compiles it first, with an announcement, if it is not on disk."""
         found = super().load_overload(sig, target_context)
         if found is None:
-            made = self._compile(sig)
+            with announce_compilation(self._name_shown, "this machine"):
+                dispatcher = self._compiled(self._function)
+                dispatcher.compile(sig)
+            (made,) = dispatcher.overloads.values()
+            self.compilations += 1
+            self._impl.store(self._cache_file, self._index_key(sig, made.codegen), self._impl.reduce(made))
             # If it could not be stored, the compiler's own result is used, without its timing metadata.
             found = super().load_overload(sig, loading_context()) or made._replace(metadata=None)
         return found
-
-    def _compile(self, sig: Any) -> Any:
-        """Compiles and stores the kernel; continues if it cannot be stored."""
-        with announce_compilation(self._name_shown, "this machine"):
-            dispatcher = self._compiled(self._function)
-            dispatcher.compile(sig)
-        (made,) = dispatcher.overloads.values()
-        self.compilations += 1
-        self._store(sig, made)
-        return made
-
-    def _store(self, sig: Any, made: Any) -> None:
-        """Stores a compiled kernel on disk; a damaged index, which cannot be extended, is replaced by a new one."""
-        try:
-            try:
-                self.save_overload(sig, made)
-            except DAMAGE_ERRORS:
-                self.flush()
-                self.save_overload(sig, made)
-        except OSError as error:
-            self._impl.warn_not_stored(error)
-        else:
-            self._impl.warn_if_elsewhere()

@@ -26,7 +26,7 @@ from cuda.core import Linker, LinkerOptions, ObjectCode
 from numba import config, cuda, types
 from torch import Tensor
 
-from glassplat.kernels.backend.cpu_cache import KernelFiles, fingerprint, load_data, store_data
+from glassplat.kernels.backend.cpu_cache import KernelFiles, fingerprint, load_data
 from glassplat.kernels.backend.devices import SIMULATED, announce_compilation
 
 ENTRY = re.compile(r"\.entry\s+([\w$]+)\s*\(")
@@ -48,23 +48,6 @@ class MachineCode(NamedTuple):
 
     entry: str
     cubin: bytes
-
-
-def compile_kernel(
-    function: Callable[..., None], signature: tuple[Any, ...], capability: tuple[int, int]
-) -> MachineCode:
-    """Compiles a kernel.
-
-    Args:
-        function: the kernel in Python.
-        signature: the Numba types of its arguments.
-        capability: compute capability (major, minor) of the GPU.
-    """
-    text, _ = cuda.compile(function, signature, device=False, abi="numba", cc=capability, debug=False, opt=True)
-    (entry,) = ENTRY.findall(text)
-    options = LinkerOptions(arch=f"sm_{capability[0]}{capability[1]}")
-    linked = Linker(ObjectCode.from_ptx(text.encode()), options=options).link("cubin")
-    return MachineCode(entry, bytes(linked.code))
 
 
 @cache
@@ -116,14 +99,14 @@ class ImageCache:
         if found is not None and found[:2] == (key, hashlib.sha256(found[3]).digest()):
             return MachineCode(*found[2:])
         with announce_compilation(self.name, "this GPU"):
-            made = compile_kernel(self._function, self._signature, capability)
-        try:
-            folders.locator.ensure_cache_path()
-            store_data(files[0], key, (key, hashlib.sha256(made.cubin).digest(), *made))
-        except OSError as error:
-            folders.warn_not_stored(error)
-        else:
-            folders.warn_if_elsewhere()
+            text, _ = cuda.compile(
+                self._function, self._signature, device=False, abi="numba", cc=capability, debug=False, opt=True
+            )
+            (entry,) = ENTRY.findall(text)
+            options = LinkerOptions(arch=f"sm_{capability[0]}{capability[1]}")
+            linked = Linker(ObjectCode.from_ptx(text.encode()), options=options).link("cubin")
+            made = MachineCode(entry, bytes(linked.code))
+        folders.store(files[0], key, (key, hashlib.sha256(made.cubin).digest(), *made))
         return made
 
     def key(self, capability: tuple[int, int]) -> str:
