@@ -34,16 +34,6 @@ def check_bins(channels: Tensor, bins: TileBins, cameras: int, count: int, these
         )
 
 
-def primary_count(num_primary: int | None, splats: Splats) -> int:
-    """The number of primary splats, by default all."""
-    count = splats.opacities.shape[1]
-    if num_primary is None:
-        return count
-    if not 0 <= num_primary <= count:
-        raise ValueError(f"num_primary is {num_primary}, expected between 0 and the {count} splats there are")
-    return num_primary
-
-
 ABSGRAD = 7
 """Index of `absgrad` among the operation's arguments."""
 
@@ -95,7 +85,9 @@ def composite(
     """
     cameras, count = splats.opacities.shape
     check_bins(channels, bins, cameras, count, "these very splats")
-    num_primary = primary_count(num_primary, splats)
+    num_primary = count if num_primary is None else num_primary
+    if not 0 <= num_primary <= count:
+        raise ValueError(f"num_primary is {num_primary}, expected between 0 and the {count} splats there are")
     if marks is None:
         if num_primary < count:
             raise ValueError(
@@ -144,13 +136,17 @@ class _Composite(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *v_outputs: Tensor) -> tuple[Tensor | None, ...]:
         *fields, channels, marks = ctx.saved_tensors
-        kernels = kernels_for("composite", channels.device)
-        v_means, v_conics, v_opacities, v_channels, v_marks, v_absgrad = kernels.composite_gradients(
+        kernels, with_absgrad = kernels_for("composite", channels.device), ctx.needs_input_grad[ABSGRAD]
+        v_means, v_conics, v_opacities, v_values, v_absgrad = kernels.composite_gradients(
             Splats(*fields), channels, ctx.bins, ctx.saved, v_outputs,
-            marks=marks, num_primary=ctx.num_primary, deviation=ctx.deviation,
-            with_absgrad=ctx.needs_input_grad[ABSGRAD],
+            marks=marks, num_primary=ctx.num_primary, deviation=ctx.deviation, with_absgrad=with_absgrad,
         )  # fmt: skip
-        return v_means, v_conics, v_opacities, None, None, v_channels, v_marks, v_absgrad, None, None, None, None
+        v_marks = torch.zeros_like(marks)
+        if marks.numel():
+            v_marks.copy_(v_values[:, ctx.num_primary :, 0])
+            v_values[:, ctx.num_primary :] = 0
+        v_absgrad = v_absgrad if with_absgrad else None
+        return v_means, v_conics, v_opacities, None, None, v_values, v_marks, v_absgrad, None, None, None, None
 
 
 class BlendedDiscs(NamedTuple):
@@ -197,16 +193,6 @@ def composite_discs(
         absgrad: [C, G, 2], values are ignored; as in `composite`, its gradient is the absolute gradient of `means2d`,
             summed over pixels.
     """
-    _check(discs, channels, bins, absgrad)
-    if not near >= 0 or not low_pass >= 0:
-        raise ValueError(f"near is {near} and low_pass {low_pass}; expected numbers of at least 0")
-    needs = needs_gradients(*discs[:4], channels, absgrad)
-    return BlendedDiscs(
-        *_CompositeDiscs.apply(*discs[:4], channels, absgrad, discs.outlines, bins, near, low_pass, needs)
-    )
-
-
-def _check(discs: Discs, channels: Tensor, bins: TileBins, absgrad: Tensor | None) -> None:
     cameras, count = discs.opacities.shape
     check_bins(channels, bins, cameras, count, "the outlines of these very discs")
     expected = {
@@ -221,6 +207,12 @@ def _check(discs: Discs, channels: Tensor, bins: TileBins, absgrad: Tensor | Non
     if absgrad is not None:
         expected["absgrad"] = (absgrad, (cameras, count, 2))
     check_tensors(expected)
+    if not near >= 0 or not low_pass >= 0:
+        raise ValueError(f"near is {near} and low_pass {low_pass}; expected numbers of at least 0")
+    needs = needs_gradients(*discs[:4], channels, absgrad)
+    return BlendedDiscs(
+        *_CompositeDiscs.apply(*discs[:4], channels, absgrad, discs.outlines, bins, near, low_pass, needs)
+    )
 
 
 class _CompositeDiscs(torch.autograd.Function):

@@ -444,7 +444,7 @@ def composite(
     image, alpha, mask = (torch.from_numpy(np.zeros(size, REAL_OF[dtype])) for size in sizes)
     deviated = torch.zeros(shape if deviation else (0, 0, 0), dtype=dtype)
     # Arrays of PyTorch, because they are aligned to cache lines, and a packed splat fills one.
-    lengths = cameras * count * tile.packed_width(num_channels), tiles * tile.STATE
+    lengths = cameras * count * tile.row_width(tile.VALUES, num_channels), tiles * tile.STATE
     packed, state = (torch.empty(length, dtype=dtype).numpy() for length in lengths)
     spread = torch.zeros(tiles * 2 * tile.PIXELS if deviation else 0, dtype=dtype).numpy()
     saved = Saved(packed, np.empty(len(bins.pair_splats), np.int32), state, spread)
@@ -462,10 +462,10 @@ def composite(
 def composite_gradients(
     splats: Splats, channels: Tensor, bins: TileBins, saved: Saved, v_outputs: Sequence[Tensor],
     *, marks: Tensor, num_primary: int, deviation: Deviation | None, with_absgrad: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]:  # fmt: skip
-    """Gradients of means2d, conics, opacities, channels and marks, given those of image, alpha, mask and deviation.
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """Gradients of means2d, conics, opacities, channels and `absgrad`, given those of image, alpha, mask and deviation.
 
-    The last is that of `absgrad`, None without `with_absgrad`.
+    That of a mark is in the place of its splat's first channel; that of `absgrad` is empty without `with_absgrad`.
     """
     real = REAL_OF[channels.dtype]
     cameras, count, num_channels = channels.shape
@@ -480,9 +480,4 @@ def composite_gradients(
         bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.active.numpy(), *saved,
         *(tile.flat(v) for v in (*v_images, v_deviation)), rows,
     )  # fmt: skip
-    v_means, v_conics, v_opacities, v_values, v_absgrad = sum_pair_rows(rows, bins, splats, num_channels, with_absgrad)
-    v_marks = torch.zeros_like(marks)
-    if num_primary < count:
-        v_marks.copy_(v_values[:, num_primary:, 0])
-        v_values[:, num_primary:] = 0
-    return v_means, v_conics, v_opacities, v_values, v_marks, v_absgrad if with_absgrad else None
+    return sum_pair_rows(rows, bins, splats, num_channels, with_absgrad)

@@ -48,11 +48,6 @@ T, LAST, MEDIAN, FIRST, TOTAL, SQUARES = (plane * tile.PIXELS for plane in range
 STATE = 6 * tile.PIXELS
 
 
-def packed_width(num_values: int) -> int:
-    """Columns of a packed disc with `num_values` channels, rounded up to whole groups and vectors."""
-    return tile.LANES * ((VALUES + tile.GROUP * tile.groups_of(num_values) + tile.LANES - 1) // tile.LANES)
-
-
 def _pack(real: type) -> Scalar:
     pack_outline = tile.pack_of(real)
     zero, one, nothing, endless = real(0.0), real(1.0), real(-np.inf), real(np.inf)
@@ -506,7 +501,7 @@ def composite_discs(
     shape, real = (bins.num_cameras, bins.height, bins.width), REAL_OF[channels.dtype]
     images = [channels.new_zeros(s) for s in ((*shape, num_channels), shape, shape, shape, shape)]
     # Arrays of PyTorch, because they are aligned to cache lines, and a packed disc fills whole ones.
-    sizes = cameras * count * packed_width(num_channels), len(bins.active) * STATE
+    sizes = cameras * count * tile.row_width(VALUES, num_channels), len(bins.active) * STATE
     packed, state = (torch.empty(size, dtype=channels.dtype).numpy() for size in sizes)
     saved = Saved(packed, np.zeros(len(bins.pair_splats), np.int32), state)
     composite_discs_forward(real)(
@@ -525,8 +520,8 @@ def composite_discs_gradients(
     """Gradients of means2d, maps, opacities, depths, channels and absgrad; the last is None without `with_absgrad`."""
     (cameras, count, num_channels), real = channels.shape, REAL_OF[channels.dtype]
     # Zeros, because the rows of inactive tiles are never written.
-    width = tile.LANES * ((PAIR_VALUES + 4 * tile.groups_of(num_channels) + tile.LANES - 1) // tile.LANES)
-    rows = torch.zeros(len(bins.pair_splats) * width, dtype=channels.dtype).numpy()
+    size = len(bins.pair_splats) * tile.row_width(PAIR_VALUES, num_channels)
+    rows = torch.zeros(size, dtype=channels.dtype).numpy()
     composite_discs_backward(real)(
         cameras * count, num_channels, bins.width, bins.height, *_real_options(real, near, low_pass),
         bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.active.numpy(), *saved,

@@ -78,14 +78,9 @@ GLASS = BLOCKS
 """Bit of a pair's flags that marks glass; the lower bits mark the blocks that it reaches."""
 
 
-def groups_of(num_values: int) -> int:
-    """Number of groups of channels for `num_values`."""
-    return (num_values + GROUP - 1) // GROUP
-
-
-def packed_width(num_values: int) -> int:
-    """Columns of a packed splat with `num_values` channels, rounded up to whole groups and vectors."""
-    return LANES * ((VALUES + GROUP * groups_of(num_values) + LANES - 1) // LANES)
+def row_width(first: int, num_values: int) -> int:
+    """Columns of a row with `num_values` values from column `first` on, rounded up to whole groups and vectors."""
+    return LANES * -(-(first + GROUP * -(-num_values // GROUP)) // LANES)
 
 
 def joined_cameras(tensors: Iterable[Tensor]) -> tuple[Tensor, ...]:
@@ -303,18 +298,14 @@ def new_pair_rows(bins: TileBins, num_values: int, real: type) -> NDArray[Any]:
 
     A kernel fills the rows of active tiles. The buffer is zeroed only if other tiles have pairs.
     """
-    width = LANES * ((PAIR_VALUES + GROUP * groups_of(num_values) + LANES - 1) // LANES)
-    size = len(bins.pair_splats) * width
-    filled = len(bins.active) == len(bins.tile_offsets) - 1 or _pairs_of_active_tiles(bins) == len(bins.pair_splats)
+    size, active = len(bins.pair_splats) * row_width(PAIR_VALUES, num_values), bins.active.long()
+    filled = len(active) == len(bins.tile_offsets) - 1 or len(bins.pair_splats) == int(
+        (bins.tile_offsets[active + 1] - bins.tile_offsets[active]).sum()
+    )
     dtype = torch.float64 if real is np.float64 else torch.float32
     # An array of PyTorch, because it is aligned to cache lines, and a row fills one.
     rows: NDArray[Any] = (torch.empty if filled else torch.zeros)(size, dtype=dtype).numpy()
     return rows
-
-
-def _pairs_of_active_tiles(bins: TileBins) -> int:
-    active = bins.active.long()
-    return int((bins.tile_offsets[active + 1] - bins.tile_offsets[active]).sum())
 
 
 def sum_pair_rows(

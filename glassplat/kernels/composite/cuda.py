@@ -105,7 +105,7 @@ def composite(
 def composite_gradients(
     splats: Splats, channels: Tensor, bins: TileBins, saved: Saved, v_outputs: Sequence[Tensor],
     *, marks: Tensor, num_primary: int, deviation: Deviation | None, with_absgrad: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]:  # fmt: skip
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """As `glassplat.kernels.composite.cpu.composite_gradients`."""
     real, (_, count, num_channels), tiles = REAL_OF[channels.dtype], channels.shape, len(bins.active)
     v_image, v_alpha, v_mask, v_deviation = v_outputs
@@ -127,12 +127,7 @@ def composite_gradients(
         saved.last.view(-1), saved.looked_at, saved.bucket_tiles, saved.kept.view(-1), saved.kept_spread.view(-1),
         v_pixels.view(-1), rows,
     )  # fmt: skip
-    v_means, v_conics, v_opacities, v_values, v_absgrad = sum_pair_rows(rows, bins, splats, num_channels)
-    v_marks = torch.zeros_like(marks)
-    if num_primary < count:
-        v_marks.copy_(v_values[:, num_primary:, 0])
-        v_values[:, num_primary:] = 0
-    return v_means, v_conics, v_opacities, v_values, v_marks, v_absgrad if with_absgrad else None
+    return sum_pair_rows(rows, bins, splats, num_channels)
 
 
 def through_mean(

@@ -34,7 +34,15 @@ def photometric(image: Tensor, target: Tensor) -> Photometric:
         image: [H, W, 3] in [0, 1], float32 or float64.
         target: [H, W, 3] uint8, the photograph as stored; 255 represents 1.
     """
-    _check_images(image, target)
+    if image.ndim != 3 or image.shape[2] != 3 or image.shape != target.shape or image.numel() == 0:
+        raise ValueError(f"got images {list(image.shape)} and {list(target.shape)}, expected the same [H, W, 3] twice")
+    if image.dtype not in REAL_OF or target.dtype != torch.uint8:
+        raise TypeError(
+            f"got an image of {image.dtype} and a target of {target.dtype}; the image is float32 or float64, "
+            "the target uint8"
+        )
+    check_device("image", image, "image", image)
+    check_device("target", target, "image", image)
     return Photometric(*_Photometric.apply(image, target))
 
 
@@ -52,15 +60,3 @@ class _Photometric(torch.autograd.Function):
     def backward(ctx: Any, v_l1: Tensor, v_ssim: Tensor) -> tuple[Tensor, None]:
         kernels = kernels_for("photometric", v_l1.device)
         return kernels.photometric_gradient(*ctx.saved_tensors, v_l1, v_ssim), None
-
-
-def _check_images(image: Tensor, target: Tensor) -> None:
-    if image.ndim != 3 or image.shape[2] != 3 or image.shape != target.shape or image.numel() == 0:
-        raise ValueError(f"got images {list(image.shape)} and {list(target.shape)}, expected the same [H, W, 3] twice")
-    if image.dtype not in REAL_OF or target.dtype != torch.uint8:
-        raise TypeError(
-            f"got an image of {image.dtype} and a target of {target.dtype}; the image is float32 or float64, "
-            "the target uint8"
-        )
-    check_device("image", image, "image", image)
-    check_device("target", target, "image", image)

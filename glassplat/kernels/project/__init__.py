@@ -28,8 +28,23 @@ def projection_inputs(
         sh_degree: highest degree of the spherical harmonics to evaluate.
         near: smallest depth.
     """
-    _check(gaussians, cameras, scales)
-    check_sh_degree(sh_degree, gaussians.sh.shape[1])
+    count, num_cameras = gaussians.means.shape[0], cameras.cam_from_world.shape[0]
+    coefficients = gaussians.sh.shape[1] if gaussians.sh.dim() == 3 else 0
+    expected = {
+        "means": (gaussians.means, (count, 3)),
+        "quats": (gaussians.quats, (count, 4)),
+        "log_scales": (gaussians.log_scales, (count, scales)),
+        "logit_opacities": (gaussians.logit_opacities, (count,)),
+        "sh": (gaussians.sh, (count, coefficients, 3)),
+        "cam_from_world": (cameras.cam_from_world, (num_cameras, 4, 4)),
+        "intrinsics": (cameras.intrinsics, (num_cameras, 4)),
+    }
+    if cameras.clip_planes is not None:
+        expected["clip_planes"] = (cameras.clip_planes, (num_cameras, 4))
+    if cameras.windows is not None:
+        expected["windows"] = (cameras.windows, (num_cameras, 4))
+    check_tensors(expected)
+    check_sh_degree(sh_degree, coefficients)
     if not near >= 0:
         raise ValueError(f"near is {near}; expected a depth of at least 0")
     clip_planes = cameras.clip_planes
@@ -55,25 +70,6 @@ def _whole_images(count: int, width: int, height: int, dtype: torch.dtype, devic
     windows[:, 2].fill_(width)
     windows[:, 3].fill_(height)
     return windows
-
-
-def _check(gaussians: RawGaussians, cameras: CameraBatch, scales: int) -> None:
-    count, num_cameras = gaussians.means.shape[0], cameras.cam_from_world.shape[0]
-    coefficients = gaussians.sh.shape[1] if gaussians.sh.dim() == 3 else 0
-    expected = {
-        "means": (gaussians.means, (count, 3)),
-        "quats": (gaussians.quats, (count, 4)),
-        "log_scales": (gaussians.log_scales, (count, scales)),
-        "logit_opacities": (gaussians.logit_opacities, (count,)),
-        "sh": (gaussians.sh, (count, coefficients, 3)),
-        "cam_from_world": (cameras.cam_from_world, (num_cameras, 4, 4)),
-        "intrinsics": (cameras.intrinsics, (num_cameras, 4)),
-    }
-    if cameras.clip_planes is not None:
-        expected["clip_planes"] = (cameras.clip_planes, (num_cameras, 4))
-    if cameras.windows is not None:
-        expected["windows"] = (cameras.windows, (num_cameras, 4))
-    check_tensors(expected)
 
 
 @dataclass
