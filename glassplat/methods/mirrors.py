@@ -134,14 +134,8 @@ def mirror_lookalikes(
 ) -> tuple[Tensor, Tensor]:
     """[N] bool each: visible primary Gaussians, and those that look like mirrors.
 
-    The latter are Gaussians of the region whose residual varies with the view. Neighbours are averaged, because a
-    single Gaussian may be on an unresolved pattern.
-
-    Args:
-        options: thresholds.
-        scene: scene with an environment, which defines the region.
-        views: training views.
-        renderer: draws the primary Gaussians.
+    The latter are Gaussians of the region of the scene's environment whose residual varies with the view. Neighbours
+    are averaged, because a single Gaussian may be on an unresolved pattern.
     """
     plain = replace(scene, primary=replace(scene.primary, active_sh_degree=0))
     shown, spreads = residual_spreads(plain, sample_evenly(views, options.views), renderer)

@@ -482,14 +482,8 @@ def write_sidecars(folder: Path, scene: Scene) -> list[Path]:
 
 
 def write_as_run(folder: Path, model: Model, source: Path | None) -> None:
-    """Writes a scene in the layout of a run; the record comes last, to mark the folder as complete.
-
-    A scene from a run refers to the run's capture.
-
-    Args:
-        folder: new or empty.
-        model: the model to write.
-        source: origin of the scene, for the record.
+    """Writes a model to a new or empty folder in the layout of a run; the record of its source comes last, to mark the
+    folder as complete. A scene from a run refers to the run's capture.
     """
     writing.make_folder(folder)
     directory = RunDirectory(folder)

@@ -213,12 +213,7 @@ def compared_pixels(scene: Scene, photograph: Photograph) -> tuple[Tensor, Tenso
 
 
 def align_pane(scene: Scene, parts: Sequence[ComparedPart]) -> Scene:
-    """The scene with its only pane moved to where it is most like a mirror; unchanged if the gain is small.
-
-    Args:
-        scene: with one pane.
-        parts: parts of photographs to compare it with.
-    """
+    """The scene with its only pane moved to where it is most like a mirror; unchanged if the gain is small."""
     tilts, means = [math.radians(degrees) for degrees in TILTS_DEG], scene.primary.means
     candidates = [means.new_tensor([first, second, 0.0]) for first in tilts for second in tilts]
     some = parts[:: max(1, len(parts) // TILT_PHOTOGRAPHS)]
@@ -393,7 +388,7 @@ those in view are confirmed: with the rest, a room with 0.59 lost 3 dB of its tr
 
 @torch.no_grad()
 def reflections_behind(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Tensor:
-    """[N] bool: primary Gaussians behind glass that represent its reflections.
+    """[N] bool: primary Gaussians behind panes of glass, all in one plane, that represent their reflections.
 
     Before a pane reflects, training builds its reflections at their virtual positions, where they stay as long as they
     explain the photographs equally well. Most of them are farther away than the real surfaces, and show through these.
@@ -402,11 +397,6 @@ def reflections_behind(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -
     if many more Gaussians are hidden in some views only, and views past the panes find surfaces at too few of the
     mirrored positions, or see hardly any of them: then they are real objects. If only somewhat more are, and surfaces
     are found, those with mirrored positions in view are selected.
-
-    Args:
-        scene: with panes or without.
-        panes: of glass, all in one plane.
-        cameras: the training views.
     """
     means = scene.primary.means
     (mirror,) = mirror_matrices(panes.centers[:1], panes.normals[:1])
@@ -493,11 +483,6 @@ def mirrored_lamps(scene: Scene, panes: Planes, photographs: Sequence[Photograph
     the photographs. So lamps are Gaussians that are clipped wherever they are seen directly, and too bright for a
     reflection of white wherever a pane mirrors them. Gaussians behind the pane that are seen only where it mirrors a
     lamp are its mirror image.
-
-    Args:
-        scene: with the panes.
-        panes: of glass.
-        photographs: downscaled training views.
     """
     alone = replace(scene, planes=panes)
     lamps = _detect_lamps(alone, photographs)

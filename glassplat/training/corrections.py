@@ -84,15 +84,7 @@ def initial_photographer(
 ) -> Gaussians:
     """A faint grey cloud behind the camera, with constant density in the logarithm of the distance.
 
-    Args:
-        planes: the panes, at least one.
-        cameras: cameras of the training views.
-        count: number of Gaussians.
-        sh_degree: maximum SH degree of their colours.
-        seed: random seed of the positions.
-
-    Returns:
-        In the photographer's frame, with x to the right, y down and z ahead.
+    It is in the photographer's frame, with x to the right, y down and z ahead; there has to be a pane.
     """
     generator = torch.Generator().manual_seed(seed)
     distance = distance_to_panes(planes, cameras)

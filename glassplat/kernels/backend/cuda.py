@@ -126,14 +126,7 @@ class LoadedKernel:
     """
 
     def __init__(self, code: MachineCode, name: str, index: int, expected: Sequence[Expected]) -> None:
-        """Loads machine code.
-
-        Args:
-            code: for the GPU.
-            name: of the kernel.
-            index: of the GPU, in torch's numbering.
-            expected: the arguments.
-        """
+        """Loads machine code into the memory of the GPU with this index in torch's numbering."""
         self.name = name
         with current_gpu(index):
             self._context = int(check_driver("cuCtxGetCurrent", driver.cuCtxGetCurrent()))
