@@ -479,8 +479,6 @@ def _as_batch(image: Tensor) -> Tensor:
 
 NO_ENVIRONMENT = "the method learns no environment"
 NO_TRUE_ENVIRONMENT = "the data set has no true environment"
-
-
 PANORAMA_HEIGHT = 64
 """Height in rows at which environments are compared."""
 
@@ -509,79 +507,30 @@ def true_environment(capture: Path) -> Tensor | None:
 def environment_metrics(learned: Tensor | None, truth: Tensor | None, lpips: Lpips | str) -> dict[str, Outcome]:
     """`environment_psnr`, `environment_gain` and `environment_lpips` of a scene.
 
+    The learned map is scaled by the gain, 1 if it is black. PSNR weights directions by solid angle, and is infinite for
+    equal maps; LPIPS compares the panoramas as plain images (the paper's measure).
+
     Args:
-        learned: [H, 2H, 3] as in `environment_psnr`; None if the method learns none.
-        truth: [h, 2h, 3], or None if unknown.
+        learned: [H, 2H, 3] panorama, sRGB, floating point; None if the method learns none.
+        truth: [h, 2h, 3] panorama, downsampled by area averaging if larger; None if unknown.
         lpips: the distance, or why there is none.
     """
     if learned is None or truth is None:
         reason = NO_ENVIRONMENT if learned is None else NO_TRUE_ENVIRONMENT
         return {"environment_psnr": reason, "environment_gain": reason, "environment_lpips": reason}
-    value, gain = environment_psnr(learned, truth)
+    source, wanted = (panorama.detach().cpu().to(torch.float64) for panorama in (learned, truth))
+    if wanted.shape != source.shape:
+        channels_first, size = wanted.permute(2, 0, 1)[None], source.shape[:2]
+        wanted = torch.nn.functional.interpolate(channels_first, size, mode="area")[0].permute(1, 2, 0)
+    energy = _mean_over_sphere(source)
+    gain = _mean_over_sphere(wanted) / energy if energy > 0 else 1.0
+    image, target = quantize(gain * source), quantize(wanted)
+    mean_square = _mean_over_sphere((image.to(torch.float64) - target.to(torch.float64)).square())
     return {
-        "environment_psnr": value,
+        "environment_psnr": math.inf if mean_square == 0 else 10 * math.log10(255**2 / mean_square),
         "environment_gain": gain,
-        "environment_lpips": environment_lpips(learned, truth, lpips),
+        "environment_lpips": NO_LPIPS if isinstance(lpips, str) else lpips(image, target),
     }
-
-
-def environment_psnr(learned: Tensor, truth: Tensor) -> tuple[float, float]:
-    """Peak signal-to-noise ratio over the whole sphere in decibels, and the gain applied to the learned map.
-
-    Directions are weighted by solid angle. The ratio is infinite for equal maps.
-
-    Args:
-        learned: [H, 2H, 3] panorama, sRGB, floating point.
-        truth: [h, 2h, 3] panorama, floating point or uint8; downsampled by area averaging if larger.
-
-    Raises:
-        ValueError: a panorama is not twice as wide as high, or contains non-finite values.
-    """
-    image, target, gain = _match_energy(learned, truth)
-    difference = quantize(image).to(torch.float64) - quantize(target).to(torch.float64)
-    mean_square = _mean_over_sphere(difference.square())
-    return math.inf if mean_square == 0 else 10 * math.log10(255**2 / mean_square), gain
-
-
-def environment_lpips(learned: Tensor, truth: Tensor, lpips: Lpips | str) -> Outcome:
-    """LPIPS of the panoramas as plain images, not weighted by solid angle (the paper's measure).
-
-    Args:
-        learned: as in `environment_psnr`.
-        truth: as in `environment_psnr`.
-        lpips: the distance, or why there is none.
-    """
-    if isinstance(lpips, str):
-        return NO_LPIPS
-    image, target, _ = _match_energy(learned, truth)
-    return lpips(quantize(image), quantize(target))
-
-
-def _match_energy(learned: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, float]:
-    """The learned map scaled to the energy of the true one, the true one at its size, and the factor (1 if black)."""
-    image, target = _panorama(learned, "learned"), _panorama(truth, "true")
-    target = _resize_panorama(target, image.shape[0])
-    energy = _mean_over_sphere(image)
-    gain = _mean_over_sphere(target) / energy if energy > 0 else 1.0
-    return gain * image, target, gain
-
-
-def _panorama(pixels: Tensor, which: str) -> Tensor:
-    """The pixels as float64 in [0, 1], not clamped."""
-    if pixels.ndim != 3 or pixels.shape[2] != 3 or not 0 < 2 * pixels.shape[0] == pixels.shape[1]:
-        raise ValueError(f"expected the {which} environment as a panorama [H, 2H, 3], got {list(pixels.shape)}")
-    values = pixels.detach().cpu().to(torch.float64) / (255 if pixels.dtype == torch.uint8 else 1)
-    if not bool(torch.isfinite(values).all()):
-        raise ValueError(f"the {which} environment contains non-finite values; expected sRGB in [0, 1]")
-    return values
-
-
-def _resize_panorama(panorama: Tensor, height: int) -> Tensor:
-    """A panorama resized to another height."""
-    if panorama.shape[0] == height:
-        return panorama
-    channels_first = panorama.permute(2, 0, 1)[None]
-    return torch.nn.functional.interpolate(channels_first, (height, 2 * height), mode="area")[0].permute(1, 2, 0)
 
 
 def _mean_over_sphere(values: Tensor) -> float:

