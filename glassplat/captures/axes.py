@@ -74,7 +74,7 @@ def axes_evidence(views: Sequence[View], measured: Tensor | None) -> AxesEvidenc
 
 def evidence_of_points(cameras: Sequence[Camera], points: Tensor) -> AxesEvidence:
     """Evaluates the axes by measured points [P, 3], each of which was visible to some camera."""
-    some_cameras = [_to_float64(camera) for camera in sample_evenly(cameras, MOST_CAMERAS)]
+    some_cameras = [camera.to(torch.float64) for camera in sample_evenly(cameras, MOST_CAMERAS)]
     some_points = points[sample_evenly(range(len(points)), MOST_POINTS)].double()
     return AxesEvidence(
         _share_of_points(some_cameras, some_points),
@@ -91,9 +91,9 @@ def evidence_of_masks(views: Sequence[View]) -> AxesEvidence | None:
     """
     annotated = sample_evenly([view for view in views if view.is_annotated], MOST_MASKS)
     shares = [
-        (len(sightings), _share_of_masks(sightings), _share_of_masks([_flip_sighting(s) for s in sightings]))
-        for sightings in _sightings(annotated).values()
-        if len(sightings) >= LEAST_SIGHTINGS
+        (len(seen), _share_of_masks(seen), _share_of_masks([s._replace(camera=flip_axes(s.camera)) for s in seen]))
+        for seen in _sightings(annotated).values()
+        if len(seen) >= LEAST_SIGHTINGS
     ]
     known = [(count, mine, other) for count, mine, other in shares if mine is not None and other is not None]
     if not known:
@@ -110,10 +110,6 @@ def flip_axes(camera: Camera) -> Camera:
     """The same camera with y and z negated: converts between OpenGL and OpenCV axes."""
     turn = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=camera.cam_from_world.dtype))
     return replace(camera, cam_from_world=turn @ camera.cam_from_world)
-
-
-def _to_float64(camera: Camera) -> Camera:
-    return replace(camera, cam_from_world=camera.cam_from_world.double())
 
 
 def _share_of_points(cameras: Sequence[Camera], points: Tensor) -> float:
@@ -134,12 +130,8 @@ def _sightings(views: Sequence[View]) -> dict[int, list[_Sighting]]:
         for label in torch.unique(labels[labels > 0]).tolist():
             pixels = torch.nonzero(labels == label).flip(1).double() + 0.5
             box = torch.stack([pixels.amin(dim=0), pixels.amax(dim=0)])
-            found.setdefault(label, []).append(_Sighting(_to_float64(view.camera), pixels.mean(dim=0), box))
+            found.setdefault(label, []).append(_Sighting(view.camera.to(torch.float64), pixels.mean(dim=0), box))
     return found
-
-
-def _flip_sighting(sighting: _Sighting) -> _Sighting:
-    return sighting._replace(camera=flip_axes(sighting.camera))
 
 
 def _share_of_masks(sightings: Sequence[_Sighting]) -> float | None:

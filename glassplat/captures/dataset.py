@@ -24,9 +24,7 @@ from glassplat.captures.view import (
     GIGABYTE,
     PixelCache,
     PointCloud,
-    PreparedView,
     View,
-    ViewOptions,
     normals_paths,
     prepare_view,
     sample_evenly,
@@ -37,7 +35,7 @@ from glassplat.files.records import LARGEST_COORDINATE
 from glassplat.files.sidecars import read_planes
 from glassplat.options import WHITE, Rgb
 from glassplat.scene.camera import Camera
-from glassplat.scene.panes import Planes
+from glassplat.scene.panes import Planes, in_image
 from glassplat.scene.scene import Scene
 
 SAMPLES = 9
@@ -58,7 +56,7 @@ def read_capture_planes(root: Path, cameras: Sequence[Camera]) -> Planes | None:
         planes = read_planes(path)
     for row, label in enumerate(planes.labels):
         points = rectangle_points(planes.select([row]))
-        if not any(_shows_any(camera, points) for camera in cameras):
+        if not any(in_image(points, camera).any() for camera in cameras):
             raise InputError(
                 f"no photograph shows pane {label} of {path}; expected a rectangle in the capture's own frame: mark it "
                 "again, or remove it from the file"
@@ -73,12 +71,6 @@ def rectangle_points(plane: Planes) -> torch.Tensor:
     u, v = torch.meshgrid(steps, steps, indexing="ij")
     half_u, half_v = plane.half_sizes[0]
     return plane.centers[0] + u.reshape(-1, 1) * half_u * tangent + v.reshape(-1, 1) * half_v * bitangent
-
-
-def _shows_any(camera: Camera, points: torch.Tensor) -> bool:
-    pixels, depth = camera.project(points)
-    size = pixels.new_tensor([camera.width, camera.height])
-    return bool(((pixels >= 0).all(dim=1) & (pixels < size).all(dim=1) & (depth > 0)).any())
 
 
 __all__ = ["Dataset", "PointCloud", "View", "load_dataset"]
@@ -207,19 +199,19 @@ def make_dataset(
         transparent = any(is_transparent(shot.image_path) for shot in shots)
     ignores_transparent = transparent and capture.ignores_transparent
     shown = background if transparent and not ignores_transparent else None
-    options = ViewOptions(downscale, None if ignores_transparent else background)
     normals = normals_paths({shot.name: shot.image_path for shot in shots})
     prepared = [
         prepare_view(
             shot,
             masks.masks.get(shot.name),
-            options,
+            downscale=downscale,
+            background=None if ignores_transparent else background,
             ignored=(*files.ignored.get(shot.name, ()), *([AlphaMask(shot.image_path)] if ignores_transparent else ())),
             normals=normals.get(shot.name),
         )
         for shot in shots
     ]
-    train, test, split = _split_views(_share_cache([p.view for p in prepared], memory), capture)
+    train, test, split = _split_views(_share_cache([view for view, _ in prepared], memory), capture)
     points, point_warnings = _points_and_warnings(root, capture, train)
     extent = _extent(train)
     measured = capture.points is not None
@@ -227,7 +219,7 @@ def make_dataset(
     warnings = (
         *capture.warnings,
         *masks.warnings,
-        *_view_warnings(prepared, shown),
+        *_view_warnings([view.name for view, is_rescaled in prepared if is_rescaled], shown),
         *_blank_warnings(shots),
         *_mask_warnings(files),
         *(["Transparent pixels of the photographs are ignored."] if ignores_transparent else ()),
@@ -350,10 +342,9 @@ def _unread_points_advice(path: Path) -> str:
     )
 
 
-def _view_warnings(prepared: list[PreparedView], background: Rgb | None) -> list[str]:
+def _view_warnings(rescaled: list[str], background: Rgb | None) -> list[str]:
     """Warnings of assumptions about photographs, one for all of them."""
     warnings = []
-    rescaled = [p.view.name for p in prepared if p.rescaled]
     if rescaled:
         warnings.append(
             f"{len(rescaled)} photographs are scaled copies of the calibrated ones; their intrinsics were scaled "

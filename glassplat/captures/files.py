@@ -80,8 +80,10 @@ def with_masks(files: CaptureFiles, mask_polarity: Polarity = "auto") -> Capture
     """Add the masks to a capture whose poses were read."""
     photographs = {shot.name: shot.image_path for shot in files.shots}
     capture = files.capture
-    found = find_masks(files.root, photographs, mask_polarity, panes=capture.masks, keep_masks=capture.keep_masks)
-    return replace(files, masks=found.panes, ignored=found.ignored, mask_polarity=mask_polarity)
+    masks, ignored = find_masks(
+        files.root, photographs, mask_polarity, panes=capture.masks, keep_masks=capture.keep_masks
+    )
+    return replace(files, masks=masks, ignored=ignored, mask_polarity=mask_polarity)
 
 
 def _load_capture(root: Path) -> Capture:

@@ -223,19 +223,6 @@ def ignored_share(masks: Sequence[IgnoredMask]) -> float:
     return max(float((mask.labels() > 0).mean()) for mask in masks)
 
 
-@dataclass(frozen=True)
-class CaptureMasks:
-    """Masks of panes and of ignored pixels of a capture.
-
-    Attributes:
-        panes: masks of panes.
-        ignored: masks of pixels to ignore, by name of the photograph; a photograph may have two.
-    """
-
-    panes: MaskSet
-    ignored: Mapping[str, tuple[IgnoredMask, ...]]
-
-
 def find_masks(
     root: Path,
     photographs: Mapping[str, Path],
@@ -243,8 +230,8 @@ def find_masks(
     *,
     panes: Mapping[str, Path] | None = None,
     keep_masks: Mapping[str, Path] | None = None,
-) -> CaptureMasks:
-    """Find and interpret the masks of a capture.
+) -> tuple[MaskSet, Mapping[str, tuple[IgnoredMask, ...]]]:
+    """The masks of panes of a capture, and those of pixels to ignore, by name of the photograph, which may have two.
 
     Panes are in `panes/`; pixels that are black in `masks/`, or above black in `ignore/`, are ignored. For a photograph
     `a/x.jpg`, each folder is searched for `a/x.png`, `a/x.jpg.png`, `a/x.jpg` and `a/x_mask.png`, with any image
@@ -263,7 +250,7 @@ def find_masks(
     if panes is not None:
         # The format assigns files to photographs, and thresholds greys at one half.
         known = _interpret_masks(root, panes, "bright" if polarity == "auto" else polarity, read_mask_at_threshold)
-        return CaptureMasks(known, _join_masks(keep_masks, ignored))
+        return known, _join_masks(keep_masks, ignored)
     paths = _match_masks(root / PANE_FOLDER, photographs)
     if not paths and (root / PANE_FOLDER).is_dir():
         raise InputError(f"{root / PANE_FOLDER} holds no mask images; add masks, or remove the folder")
@@ -273,10 +260,9 @@ def find_masks(
         found = _interpret_masks(root, masks, polarity, read_mask_values)
         renaming = f"{earlier} {next(iter(masks.values())).parent} is read as panes; rename it to {PANE_FOLDER}/."
         warnings = (renaming, *warnings)
-        return CaptureMasks(replace(found, warnings=(*warnings, *found.warnings)), _join_masks(keep_masks, ignored))
+        return replace(found, warnings=(*warnings, *found.warnings)), _join_masks(keep_masks, ignored)
     found = _interpret_masks(root, paths, polarity, read_mask_values) if paths else MaskSet({})
-    joined = _join_masks({**masks, **keep_masks}, ignored)
-    return CaptureMasks(replace(found, warnings=(*found.warnings, *warnings)), joined)
+    return replace(found, warnings=(*found.warnings, *warnings)), _join_masks({**masks, **keep_masks}, ignored)
 
 
 def _find_keep_masks(

@@ -168,10 +168,10 @@ def _axes_evidence(shots: tuple[Shot, ...], masks: Mapping[str, Path], points: R
 
 
 def _view(shot: Shot, mask: Path | None) -> View:
-    from glassplat.captures.view import ViewOptions, prepare_view
+    from glassplat.captures.view import prepare_view
 
     pane_mask = None if mask is None else PaneMask(mask, inverted=False, read=read_mask_at_threshold)
-    return prepare_view(shot, pane_mask, ViewOptions()).view
+    return prepare_view(shot, pane_mask)[0]
 
 
 def _correct_axes(capture: Capture, evidence: AxesEvidence | None) -> Capture:

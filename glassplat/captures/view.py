@@ -438,43 +438,27 @@ class IgnoredFiles:
         return torch.stack([*blank, *(mask.ignored() for mask in self.masks)]).amax(dim=0)
 
 
-@dataclass(frozen=True)
-class ViewOptions:
-    """Options for making views from photographs.
-
-    Attributes:
-        downscale: width and height are divided by it and rounded.
-        background: sRGB in [0, 1] behind transparent pixels; None keeps their own colours.
-    """
-
-    downscale: float = 1.0
-    background: Rgb | None = WHITE
-
-
-@dataclass(frozen=True)
-class PreparedView:
-    """A view, and whether its intrinsics were rescaled to the size of the image file."""
-
-    view: View
-    rescaled: bool
-
-
 def prepare_view(
     shot: Shot,
     mask: PaneMask | None,
-    options: ViewOptions,
     *,
+    downscale: float = 1.0,
+    background: Rgb | None = WHITE,
     ignored: Sequence[IgnoredMask] = (),
     normals: Path | None = None,
-) -> PreparedView:
+) -> tuple[View, bool]:
     """Checks one photograph against its camera and sets up its readers; decodes no pixels.
 
     Args:
         shot: the photograph.
         mask: of its panes.
-        options: of reading it.
+        downscale: width and height are divided by it and rounded.
+        background: sRGB in [0, 1] behind transparent pixels; None keeps their own colours.
         ignored: masks of pixels to ignore.
         normals: file of its estimated normals.
+
+    Returns:
+        The view, and true if its intrinsics were rescaled to the size of the image file.
 
     Raises:
         InputError: unreadable file, inconsistent sizes, non-rigid pose, or lens that cannot be undistorted.
@@ -483,7 +467,7 @@ def prepare_view(
         width, height = image_size(shot.image_path)
     lens = cameras.lens_for_image(shot.lens, (width, height), shot.name)
     pinhole, distorted = cameras.pinhole_of(lens)
-    small = _reduced_size(pinhole, options.downscale, shot.name)
+    small = _reduced_size(pinhole, downscale, shot.name)
     pixel_map = cameras.PixelMap(lens if distorted else None, *small)
     blank = pixel_map if cameras.blank_share(lens) else None
     pose = torch.from_numpy(cameras.rigid_pose(shot.cam_from_world, shot.name)).float()
@@ -492,14 +476,14 @@ def prepare_view(
         name=shot.name,
         camera=camera,
         image_path=shot.image_path,
-        read_photo=PhotoFile(shot.image_path, pixel_map, options.background),
+        read_photo=PhotoFile(shot.image_path, pixel_map, background),
         read_pane_labels=None if mask is None else _mask_file(mask, (width, height), pixel_map),
         read_ignored=IgnoredFiles(tuple(_mask_file(one, (width, height), pixel_map) for one in ignored), blank)
         if ignored or blank
         else None,
         read_normals=normals_reader(normals, camera),
     )
-    return PreparedView(view, lens is not shot.lens)
+    return view, lens is not shot.lens
 
 
 def _reduced_size(pinhole: cameras.Pinhole, downscale: float, name: str) -> tuple[int, int]:

@@ -11,7 +11,7 @@ import torch
 from PIL import Image, ImageOps
 
 from glassplat.captures.dataset import Dataset, load_dataset
-from glassplat.captures.masks import CaptureMasks, MaskSet, find_masks, mask_paths, read_mask_values
+from glassplat.captures.masks import MaskSet, find_masks, mask_paths, read_mask_values
 from glassplat.captures.view import View
 from glassplat.errors import InputError
 
@@ -77,8 +77,8 @@ def masks_of(root: Path, masks: list[str], photographs: list[str]) -> dict[str, 
         path = root / "panes" / mask
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(INSIDE).save(path)
-    found = find_masks(root, {name: root / name for name in photographs}).panes.masks
-    return {name: mask.path.relative_to(root / "panes").as_posix() for name, mask in found.items()}
+    found, _ = find_masks(root, {name: root / name for name in photographs})
+    return {name: mask.path.relative_to(root / "panes").as_posix() for name, mask in found.masks.items()}
 
 
 @pytest.mark.parametrize(
@@ -468,4 +468,4 @@ def test_no_masks_at_all(capture, tmp_path: Path) -> None:
     data = load_dataset(capture.root)
     assert not annotated(data)
     assert data.pane_labels == ()
-    assert find_masks(tmp_path / "nowhere", {}) == CaptureMasks(MaskSet({}), {})
+    assert find_masks(tmp_path / "nowhere", {}) == (MaskSet({}), {})
