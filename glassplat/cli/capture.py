@@ -18,7 +18,6 @@ from glassplat.files.writing import check_capture_folder, real_path
 from glassplat.options import Range, Share
 from glassplat.prepare.colmap import LensName, Mapper
 from glassplat.prepare.preparation import PAGE, Preparation, WorkFolder, check_paths, prepare
-from glassplat.prepare.reconstruction import Settings
 
 
 @dataclass(frozen=True)
@@ -53,9 +52,8 @@ class Prepare:
         quiet_pycolmap()
 
     def _task(self) -> Preparation:
-        settings = Settings(lens=self.lens, mapper=self.mapper)
         return Preparation(
-            self.input, self._output, self.max_size, self.frames, self.least_registered, settings=settings
+            self.input, self._output, self.max_size, self.frames, self.least_registered, self.lens, self.mapper
         )
 
     @cached_property

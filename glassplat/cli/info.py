@@ -12,7 +12,7 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from glassplat.captures.files import CaptureFiles, read_capture
+from glassplat.captures.files import read_capture
 from glassplat.cli.console import count_noun, import_uninterrupted, print_line, print_warning, shell_word
 from glassplat.errors import InputError, UnknownFormatError, convert_to_input_error, join_names
 from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES, files_below, is_hidden
@@ -62,16 +62,6 @@ class Finding:
         self.problems += part.problems
         self.next += part.next
 
-    def as_json(self) -> dict[str, Any]:
-        """JSON representation."""
-        return {
-            "kind": self.kind,
-            "healthy": not self.problems,
-            "facts": self.facts,
-            "problems": self.problems,
-            "next": self.next,
-        }
-
 
 Finder = Callable[[Path], Iterator[Finding]]
 """Examines a path, and yields findings part by part."""
@@ -85,16 +75,12 @@ def capture_finding(path: Path) -> Iterator[Finding]:
         InputError: it cannot be read.
     """
     files = read_capture(path)
-    yield _first_part(files)
-    yield from import_uninterrupted(DETAILS_MODULE).remaining_parts(files)
-
-
-def _first_part(files: CaptureFiles) -> Finding:
-    capture = files.capture
+    capture, points = files.capture, files.capture.points
     finding = Finding("a capture", {"format": capture.format_name})
-    finding.facts["points"] = "none (random ones are used)" if capture.points is None else len(capture.points)
+    finding.facts["points"] = "none (random ones are used)" if points is None else len(points)
     _describe_preparation(files.root, finding)
-    return finding
+    yield finding
+    yield from import_uninterrupted(DETAILS_MODULE).remaining_parts(files)
 
 
 def _describe_preparation(path: Path, finding: Finding) -> None:
@@ -155,7 +141,7 @@ def video_finding(path: Path) -> Iterator[Finding]:
         problem = "OpenCV cannot read a frame of it; convert it to an MP4, or give a folder of photographs"
         yield Finding("a file with a video's suffix", {"bytes": size}, [problem])
         return
-    finding = Finding("a video", {"bytes": size, "frames": facts.frames, "pictures": f"{facts.width}x{facts.height}"})
+    finding = Finding("a video", {"bytes": size, **facts})
     finding.next.append(
         f"glassplat prepare {shell_word(path)} --output CAPTURE    extracts frames and estimates their camera poses"
     )
@@ -261,7 +247,9 @@ class Info:
         if self.page is not None:
             import_uninterrupted(DETAILS_MODULE).write_capture_page(self.path, self.page)
         if self.json:
-            console.file.write(json.dumps({"path": str(self.path), **whole.as_json()}, indent=1) + "\n")
+            healthy = not whole.problems
+            found = {"path": str(self.path), "kind": whole.kind, "healthy": healthy, **vars(whole)}
+            console.file.write(json.dumps(found, indent=1) + "\n")
             return
         for problem in whole.problems:
             print_warning(console, problem)

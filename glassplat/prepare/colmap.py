@@ -393,7 +393,7 @@ def register_photographs(
     output.mkdir(exist_ok=True)
     listen(Working(REGISTERING, 0, count))
     if mapper == "incremental":
-        work = _incremental_mapping(database, output, _incremental_options(options), count, listen)
+        work = _incremental_mapping(database, output, options, count, listen)
     else:
         work = _global_mapping(database, output)
     with check_database(database):
@@ -402,8 +402,11 @@ def register_photographs(
 
 
 def _incremental_mapping(
-    database: Path, output: Path, options: Any, count: int, listen: Listener
+    database: Path, output: Path, options: MappingOptions, count: int, listen: Listener
 ) -> Callable[[Any], dict]:
+    chosen = library.pycolmap.IncrementalPipelineOptions(random_seed=SEED, min_model_size=3, extract_colors=False)
+    chosen.mapper.init_min_tri_angle = options.first_angle
+    chosen.mapper.abs_pose_min_num_inliers = options.least_matches
     group = registered_now = 0
 
     def report() -> None:
@@ -426,7 +429,7 @@ def _incremental_mapping(
             database,
             output,
             output,
-            options=options,
+            options=chosen,
             initial_image_pair_callback=begin_group,
             next_image_callback=count_image,
             cancellation_token=token,
@@ -437,15 +440,4 @@ def _incremental_mapping(
 
 def _global_mapping(database: Path, output: Path) -> Callable[[Any], dict]:
     options = library.pycolmap.GlobalPipelineOptions(random_seed=SEED)
-
-    def work(token: Any) -> dict:
-        return library.pycolmap.global_mapping(database, output, output, options=options)
-
-    return work
-
-
-def _incremental_options(options: MappingOptions) -> Any:
-    chosen = library.pycolmap.IncrementalPipelineOptions(random_seed=SEED, min_model_size=3, extract_colors=False)
-    chosen.mapper.init_min_tri_angle = options.first_angle
-    chosen.mapper.abs_pose_min_num_inliers = options.least_matches
-    return chosen
+    return lambda token: library.pycolmap.global_mapping(database, output, output, options=options)

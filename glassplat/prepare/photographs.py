@@ -371,24 +371,17 @@ class NoOpenCVError(InputError):
     """Raised when a video is to be read and OpenCV is not installed; the message says what to do."""
 
 
-@dataclass(frozen=True)
-class VideoFacts:
-    """Number of frames of a video, and their width and height in pixels."""
-
-    frames: int
-    width: int
-    height: int
-
-
-def video_facts(video: Path) -> VideoFacts | None:
-    """Size and length of a video; None if OpenCV cannot read a frame.
+def video_facts(video: Path) -> dict[str, Any] | None:
+    """Number of frames of a video, and their size as text; None if OpenCV cannot read a frame.
 
     Raises:
         NoOpenCVError: OpenCV is not installed.
     """
     cv2 = _import_opencv()
     frame = next(_read_frames(cv2, video), None)
-    return None if frame is None else VideoFacts(_frame_count(cv2, video), frame.shape[1], frame.shape[0])
+    if frame is None:
+        return None
+    return {"frames": _frame_count(cv2, video), "pictures": f"{frame.shape[1]}x{frame.shape[0]}"}
 
 
 def _import_opencv() -> Any:

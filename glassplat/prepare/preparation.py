@@ -10,7 +10,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from glassplat.captures.masks import IGNORE_FOLDER
 from glassplat.errors import InputError, join_names
 from glassplat.files import writing
 from glassplat.files.records import read_json, readable_name
+from glassplat.prepare.colmap import LensName, Mapper
 from glassplat.prepare.photographs import (
     FEWEST_PHOTOGRAPHS,
     PHOTOGRAPH_SUFFIX,
@@ -34,14 +35,7 @@ from glassplat.prepare.photographs import (
     masks_among,
     photographs_in,
 )
-from glassplat.prepare.reconstruction import (
-    CannotRegisterError,
-    Settings,
-    Solution,
-    best_solution,
-    image_numbers,
-    write_capture,
-)
+from glassplat.prepare.reconstruction import CannotRegisterError, Solution, best_solution, image_numbers, write_capture
 
 log = logging.getLogger(__name__)
 
@@ -115,17 +109,17 @@ class WorkFolder:
         if known is not None and force and not resume:
             shutil.rmtree(self.folder)
             known = None
-        if known is not None and not resume:
+        if known is None:
+            writing.make_folder(self.folder)
+            writing.write_text(self.folder / "settings.json", json.dumps(settings, indent=1))
+            return True
+        if not resume:
             raise InputError(
                 f"{self.folder} holds an interrupted preparation of {self.output}; continue it with --resume, or "
                 "start again with --force"
             )
-        if known is not None:
-            self._check_unchanged(known, json.loads(json.dumps(settings)))
-        if known is None:
-            writing.make_folder(self.folder)
-            writing.write_text(self.folder / "settings.json", json.dumps(settings, indent=1))
-        return known is None
+        self._check_unchanged(known, json.loads(json.dumps(settings)))
+        return False
 
     def finish(self, record: Mapping[str, Any]) -> None:
         """Writes the record into the finished capture and moves it to the output."""
@@ -286,7 +280,7 @@ def make_report(solution: Solution) -> Report:
         attempts=solution.attempts_made,
         advice=(),
     )
-    return Report(**{**report.__dict__, "advice": tuple(_advice(report, missing, solution))})
+    return replace(report, advice=tuple(_advice(report, missing, solution)))
 
 
 def _group_sizes(solution: Solution) -> tuple[int, ...]:
@@ -352,7 +346,8 @@ class Preparation:
         max_size: maximum longer side in pixels; larger photographs are reduced.
         frames: maximum number of frames extracted from a video.
         least_registered: minimum share of registered photographs.
-        settings: options for registering photographs.
+        lens: COLMAP's camera model.
+        mapper: incremental or global structure from motion.
     """
 
     source: Path
@@ -360,12 +355,12 @@ class Preparation:
     max_size: int = 1600
     frames: int = 150
     least_registered: float = 0.8
-    settings: Settings = field(default_factory=Settings)
+    lens: LensName = "simple_radial"
+    mapper: Mapper = "incremental"
 
     def record(self) -> dict[str, Any]:
         """Inputs of the work; an interrupted preparation continues only with equal ones."""
-        options = {"lens": self.settings.lens, "mapper": self.settings.mapper}
-        source = readable_name(writing.real_path(self.source))
+        source, options = readable_name(writing.real_path(self.source)), {"lens": self.lens, "mapper": self.mapper}
         return {"input": source, "max-size": self.max_size, "frames": self.frames, **options}
 
 
@@ -392,7 +387,9 @@ def _prepare(task: Preparation, work_folder: WorkFolder, listen: Listener, *, re
     try:
         photographs = _read_photographs(task, work_folder, listen)
         begun = False
-        solution = best_solution(photographs, work_folder.folder, task.settings, task.least_registered, listen)
+        solution = best_solution(
+            photographs, work_folder.folder, listen, lens=task.lens, mapper=task.mapper, least=task.least_registered
+        )
         report = make_report(solution)
         _check_enough(report, task)
     except InputError as error:

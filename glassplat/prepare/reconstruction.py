@@ -71,26 +71,19 @@ class Solution:
         return [one for index, one in enumerate(self.database.photographs) if index not in known]
 
 
-@dataclass(frozen=True)
-class Settings:
-    """Options for registering photographs.
-
-    Attributes:
-        lens: COLMAP's camera model.
-        mapper: incremental or global structure from motion.
-    """
-
-    lens: colmap.LensName = "simple_radial"
-    mapper: colmap.Mapper = "incremental"
-
-
 def image_numbers(model: Any) -> dict[int, Any]:
     """The registered images of a model by the index of their photograph."""
     return {int(Path(image.name).stem): image for image in model.images.values() if image.has_pose}
 
 
 def best_solution(
-    photographs: Sequence[Photograph], work: Path, settings: Settings, least: float, listen: Listener
+    photographs: Sequence[Photograph],
+    work: Path,
+    listen: Listener,
+    *,
+    lens: colmap.LensName,
+    mapper: colmap.Mapper,
+    least: float,
 ) -> Solution:
     """Registers photographs in several attempts until enough are registered; earlier results in `work` are reused.
 
@@ -105,9 +98,9 @@ def best_solution(
                 break
             share = f"{best.registered} of {len(photographs)} photographs"
             listen(Note(f"{share} are registered; trying again with {attempt.name}"))
-        database = _match_features(photographs, work, attempt.features, settings, listen)
+        database = _match_features(photographs, work, attempt.features, lens, listen)
         models = colmap.register_photographs(
-            database.path, settings.mapper, attempt.mapping, count=len(photographs), listen=listen
+            database.path, mapper, attempt.mapping, count=len(photographs), listen=listen
         )
         tried += 1
         found = Solution(database, models, attempt.name, tried)
@@ -118,12 +111,16 @@ def best_solution(
 
 
 def _match_features(
-    photographs: Sequence[Photograph], work: Path, features: colmap.FeatureOptions, settings: Settings, listen: Listener
+    photographs: Sequence[Photograph],
+    work: Path,
+    features: colmap.FeatureOptions,
+    lens: colmap.LensName,
+    listen: Listener,
 ) -> colmap.FeatureDatabase:
     """The database of these features, with the pairs selected by `pairs_to_match` matched."""
     database = colmap.FeatureDatabase(work / f"features-{features.most}.db", work / "grey", photographs)
     database.write_images(listen)
-    database.create(settings.lens)
+    database.create(lens)
     database.extract(features, listen)
     _check_texture(database)
     database.match(colmap.pairs_to_match(database.descriptors()), features, listen)

@@ -6,8 +6,7 @@ import base64
 import html
 import io
 import itertools
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from unicodedata import normalize
@@ -167,21 +166,6 @@ REPORT: dict[str, Field] = {
 """Fields of a preparation's report that the page shows."""
 
 
-@dataclass(frozen=True)
-class PhotographStatistics:
-    """Statistics of one photograph in the model.
-
-    Attributes:
-        view: the photograph.
-        points: number of its triangulated points.
-        error: mean reprojection error of these points, in pixels.
-    """
-
-    view: View
-    points: int
-    error: float
-
-
 def write_page(capture: Path, target: Path, planes: Planes | None = None) -> None:
     """Writes the page of a capture made by `glassplat prepare`; the page is self-contained.
 
@@ -223,9 +207,10 @@ def _page(report: Mapping[str, Any], dataset: Dataset, model: Any, planes: Plane
         f"<section>{_histogram('Points by number of photographs', tracks, TRACK_BINS)}"
         f"{_histogram('Points by reprojection error, in pixels', errors, ERROR_BINS)}</section>",
         "<h2>Photographs</h2>",
-        f'<div class="photographs">{"".join(_figures(_photograph_statistics(views, model)))}</div>',
-        *_missing_section(report["missing"]),
+        f'<div class="photographs">{"".join(_figures(views, model))}</div>',
     ]
+    if report["missing"]:
+        body += ["<h2>Not registered</h2>", f'<p class="advice">{html.escape(", ".join(report["missing"]))}</p>']
     head = f'<meta charset="utf-8"><title>{html.escape(title)}</title><style>{STYLE}{PAGE_STYLE}</style>'
     return f"<!doctype html>\n<html><head>{head}</head><body>\n" + "\n".join(body) + "\n</body></html>\n"
 
@@ -273,29 +258,18 @@ def _bin_label(low: float, high: float) -> str:
     return f"{low:g}" if last == low else f"{low:g} to {last:g}"
 
 
-def _photograph_statistics(views: Sequence[View], model: Any) -> list[PhotographStatistics]:
+def _figures(views: Sequence[View], model: Any) -> Iterator[str]:
+    """Thumbnails of photographs, each with the number of its points and the mean of their reprojection errors."""
     # Accents may be encoded in another way in file names than in the model.
     images = {normalize("NFC", image.name): image for image in model.images.values()}
-    found = []
-    for view in views:
+    for view in views[:: -(-len(views) // MOST_THUMBNAILS)]:
         keys = [point.point3D_id for point in images[normalize("NFC", view.name)].points2D if point.has_point3D()]
         error = float(np.mean([model.points3D[key].error for key in keys])) if keys else 0.0
-        found.append(PhotographStatistics(view, len(keys), error))
-    return found
-
-
-def _figures(statistics: Sequence[PhotographStatistics]) -> list[str]:
-    every = -(-len(statistics) // MOST_THUMBNAILS)
-    return [_figure(one) for one in statistics[::every]]
-
-
-def _figure(statistics: PhotographStatistics) -> str:
-    weak = ' class="weak"' if statistics.points < FEW_POINTS else ""
-    name = html.escape(statistics.view.name)
-    return (
-        f'<figure{weak}><img src="{_thumbnail(statistics.view)}" alt="{name}">{name}<br>{statistics.points} points, '
-        f"error {statistics.error:.2f} pixels</figure>"
-    )
+        weak, name = ' class="weak"' if len(keys) < FEW_POINTS else "", html.escape(view.name)
+        yield (
+            f'<figure{weak}><img src="{_thumbnail(view)}" alt="{name}">{name}<br>{len(keys)} points, '
+            f"error {error:.2f} pixels</figure>"
+        )
 
 
 def _thumbnail(view: View) -> str:
@@ -305,9 +279,3 @@ def _thumbnail(view: View) -> str:
     buffer = io.BytesIO()
     small.save(buffer, "JPEG", quality=70)
     return f"data:image/jpeg;base64,{base64.b64encode(buffer.getvalue()).decode()}"
-
-
-def _missing_section(names: Sequence[str]) -> list[str]:
-    if not names:
-        return []
-    return ["<h2>Not registered</h2>", f'<p class="advice">{html.escape(", ".join(map(str, names)))}</p>']

@@ -12,7 +12,7 @@ from glassplat.captures import colmap_library as library
 from glassplat.prepare import colmap, reconstruction
 from glassplat.prepare.colmap import FeatureOptions, MappingOptions
 from glassplat.prepare.photographs import Note
-from glassplat.prepare.reconstruction import DEFAULT_FEATURES, MANY_FEATURES, Settings, best_solution
+from glassplat.prepare.reconstruction import DEFAULT_FEATURES, MANY_FEATURES, best_solution
 from glassplat.training.messages import Working
 
 
@@ -64,7 +64,9 @@ def test_more_features_only_where_too_few_are_placed(
         return [Group(size)] if (size := next(left)) else []
 
     monkeypatch.setattr(colmap, "register_photographs", placed)
-    solution = best_solution(photographs, Path("work"), Settings(), least, notes.append)
+    solution = best_solution(
+        photographs, Path("work"), notes.append, lens="simple_radial", mapper="incremental", least=least
+    )
     assert tried == features
     assert (solution.registered, solution.attempts_made) == (best, len(sizes))
     assert len(notes) == len(sizes) - 1 and all(isinstance(note, Note) for note in notes)

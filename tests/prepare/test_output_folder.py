@@ -128,7 +128,7 @@ def test_a_mount_point_is_refused_as_output(
 
 def finish(monkeypatch: pytest.MonkeyPatch) -> None:
     """Makes preparations write an empty capture at once."""
-    monkeypatch.setattr(preparation, "best_solution", lambda *_: None)
+    monkeypatch.setattr(preparation, "best_solution", lambda *_, **__: None)
     monkeypatch.setattr(preparation, "make_report", lambda _: Report(3, 3, (), (3,), 9, 0.1, 3.0, 9, (), "", 1, ()))
     monkeypatch.setattr(preparation, "write_capture", lambda _, folder, *__: (folder / "images").mkdir(parents=True))
 

@@ -17,7 +17,6 @@ from glassplat.errors import InputError
 from glassplat.prepare import colmap
 from glassplat.prepare.photographs import Note
 from glassplat.prepare.preparation import Preparation, prepare
-from glassplat.prepare.reconstruction import Settings
 from glassplat.training.messages import Working
 from tests.prepare.conftest import CONNECTED, Heard, copy_photographs
 
@@ -141,7 +140,7 @@ def test_only_one_sqlite_has_the_database_open_and_progress_is_read_from_it(
 
 
 def test_the_global_mapper_registers_the_photographs_too(photographs: Path, tmp_path: Path, heard: Heard) -> None:
-    task = Preparation(photographs, tmp_path / "capture", settings=Settings(mapper="global"))
+    task = Preparation(photographs, tmp_path / "capture", mapper="global")
     assert prepare(task, heard).registered >= 8
 
 
