@@ -464,8 +464,8 @@ class Command:
     """Base of the commands whose work is a function `(command, console)` of a module that imports PyTorch.
 
     Attributes:
-        work: the module in `glassplat.cli`, and the function.
-        left: what an interrupt leaves behind, and how to go on; fields of the command stand in braces.
+        entry_point: the module in `glassplat.cli`, and the function.
+        interrupt_hint: what an interrupt leaves behind, and how to go on; fields of the command stand in braces.
     """
 
     entry_point: ClassVar[str]

@@ -158,8 +158,8 @@ def results_table(*results: dict) -> Table:
     """The main metrics of one or several runs, side by side, by their names in `results.json`."""
     table = Table("metric", *(r["method"] for r in results))
     metrics = {name: metric for r in results for name, metric in shown_metrics(r).items()}
-    for name in dict.fromkeys(name for r in results for name in shown_metrics(r)):
-        table.add_row(name, *(format_value(r.get(name), metrics[name].pattern) for r in results))
+    for name, metric in metrics.items():
+        table.add_row(name, *(format_value(r.get(name), metric.pattern) for r in results))
     for result in results:
         for plane in result.get("planes") or []:
             cells = (plane_text(plane) if r is result else "" for r in results)

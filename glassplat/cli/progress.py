@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 from rich import progress
 from rich.console import Console
@@ -170,9 +171,9 @@ class TrainingProgress:
             state.stage = message.stage
             self._speed.enter_stage()
             counts = ", ".join(f"{number} {name}" for name, number in message.counts.items())
-            self._print_line(f"step {message.step}: stage {message.stage}, {counts}")
+            print_line(self._console, f"step {message.step}: stage {message.stage}, {counts}")
         elif isinstance(message, messages.ActionDone) and not message.action.startswith(SILENT_ACTIONS):
-            self._print_line(f"step {message.step}: {message.action}")
+            print_line(self._console, f"step {message.step}: {message.action}")
         elif isinstance(message, messages.Working):
             self._speed.work()
             self._display.work(state, message)
@@ -186,7 +187,7 @@ class TrainingProgress:
             seconds = self._speed.seconds_left(message.step)
             state.time_left = "estimating the remaining time" if seconds is None else f"{format_duration(seconds)} left"
             if forecast := self._speed.forecast(message.step):
-                self._print_line(forecast)
+                print_line(self._console, forecast)
             self._display.step(state)
 
     def _begin(self, message: messages.RunBegun) -> None:
@@ -194,10 +195,7 @@ class TrainingProgress:
             print_warning(self._console, "replacing an earlier run in this folder, which was never saved")
         if message.step:
             self._state.step = message.step
-            self._print_line(f"continuing from step {message.step} of {message.iterations}")
-
-    def _print_line(self, text: str) -> None:
-        print_line(self._console, text)
+            print_line(self._console, f"continuing from step {message.step} of {message.iterations}")
 
 
 class StepBar:
@@ -219,32 +217,27 @@ class StepBar:
         if console.width >= WIDE_TERMINAL:
             columns.append(progress.TextColumn("{task.fields[saved]}"))
         self._bar = progress.Progress(*columns, console=console, refresh_per_second=4)
-        self._begun = False
 
     def step(self, state: ProgressState) -> None:
         """Shows a step."""
-        if not self._begun:
-            # The speed is that of this session, not of the steps before it.
-            fields = {"loss": state.loss, "count": state.count, "left": state.time_left, "saved": ""}
-            self._bar.add_task(state.stage, total=state.iterations, completed=state.step - 1, **fields)  # type: ignore[arg-type]
-            self._bar.start()
-            self._begun = True
         saved = "" if state.saved_step is None else f"saved at {state.saved_step}"
-        fields = {"loss": state.loss, "count": state.count, "left": state.time_left, "saved": saved}
-        task = self._bar.task_ids[0]
-        self._bar.update(task, description=state.stage, completed=state.step, **fields)  # type: ignore[arg-type]
+        fields: dict[str, Any] = {"loss": state.loss, "count": state.count, "left": state.time_left, "saved": saved}
+        if not self._bar.task_ids:
+            # The speed is that of this session, not of the steps before it.
+            self._bar.add_task(state.stage, total=state.iterations, completed=state.step - 1, **fields)
+            self._bar.start()
+        self._bar.update(self._bar.task_ids[0], description=state.stage, completed=state.step, **fields)
 
     def work(self, state: ProgressState, work: messages.Working) -> None:
         """Shows the work instead of the stage; before the first step as a line, without a bar."""
-        if self._begun:
+        if self._bar.task_ids:
             self._bar.update(self._bar.task_ids[0], description=f"{work.what} {work.done}/{work.total}")
         elif work.done == 0:
             print_line(self._bar.console, work.what)
 
     def stop(self) -> None:
         """Ends the display."""
-        if self._begun:
-            self._bar.stop()
+        self._bar.stop()
 
 
 class StepLines:

@@ -8,7 +8,7 @@ import itertools
 import operator
 import typing
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar
@@ -106,10 +106,6 @@ class Train(Generic[RecipeKind]):
         device = str(chosen_device(self.device))
         data = str(self.data.resolve())  # Later commands may be started in another folder.
         return RunSettings(data, self.iterations, self.downscale, self.seed, device, self.mask_polarity)
-
-    def with_resume(self, begun: bool) -> Train:
-        """The same run, resumed from its checkpoint if it has one."""
-        return replace(self, resume=begun)
 
 
 PATH_OPTIONS = ("--data", "--output", "--config")
@@ -242,8 +238,8 @@ class Demo:
         """Trains and evaluates both methods, and prints where the images are."""
         recipes: tuple[Recipe, ...] = (PlanarRecipe(), SplatRecipe())
         for recipe, folder in zip(recipes, self.folders, strict=True):
-            run = Train(recipe, SCENE, folder, self.iterations, DEMO_DOWNSCALE, seed=self.seed, device=self.device)
-            run = run.with_resume(RunDirectory(folder).checkpoint.is_file())
+            begun = RunDirectory(folder).checkpoint.is_file()
+            run = Train(recipe, SCENE, folder, self.iterations, DEMO_DOWNSCALE, self.seed, self.device, resume=begun)
             print_line(console, f"training {recipe.method}")
             run.set_up()
             run.run(console)

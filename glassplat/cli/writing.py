@@ -85,8 +85,9 @@ def write_dereflected(command: Dereflect, console: Console) -> None:
     check_targets(command.output, targets, photograph_paths(stored.dataset))
     if claim_folder(command.output, "dereflect", command.run_directory):
         print_line(console, f"replacing the images of an earlier run of this command in {command.output}")
-    for warning in mirror_warnings(stored):
-        print_warning(console, warning)
+    for label in stored.scene.planes.mirrors:
+        shown = "whatever the scene has behind it, which no photograph shows"
+        print_warning(console, f"pane {label} is a mirror; without its reflection, it shows {shown}")
     with WorkProgress(console) as progress:
         for view in track_progress("taking reflections off", views, len(views), progress):
             write_image(command.output / paths[view.name], dereflect_view(command, stored, renderer, view))
@@ -113,15 +114,6 @@ def planar_renderer(stored: StoredRun) -> Planar:
         f"{stored.directory.path} is a {stored.recipe.method} run without panes; reflections are removed from "
         f"panes only: glassplat train planar --data {data} --output RUN"
     )
-
-
-def mirror_warnings(stored: StoredRun) -> list[str]:
-    """Warnings about panes that transmit nothing."""
-    return [
-        f"pane {label} is a mirror; without its reflection, it shows whatever the scene has behind it, which no "
-        "photograph shows"
-        for label in stored.scene.planes.mirrors
-    ]
 
 
 WIPE_SPAN = 0.9
