@@ -207,11 +207,6 @@ class Session:
             self._document: Any = read_document(self.root)
         self._remember(self._document)
 
-    @property
-    def document(self) -> Any:
-        """Marks as JSON."""
-        return self._document
-
     def describe(self) -> dict[str, Any]:
         """Description of the capture for the page."""
         return {

@@ -8,11 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.publish.web_page import least_aligned_axis, survey_capture
-from glassplat.scene.camera import Camera, look_at
+from glassplat.scene.camera import Camera, look_at, rigid_transform
 
 MOST_KEYFRAMES = 12
 """Maximum number of photographs on a path; more would reproduce the shake of a hand-held camera."""
@@ -82,7 +81,7 @@ def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     lens = np.stack([np.interp(times, knots, column) for column in lenses.T], axis=1)
     path = []
     for rotation, position, (fx, fy, cx, cy) in zip(path_rotations, positions, lens.tolist(), strict=True):
-        path.append(Camera(_pose(rotation, position), fx, fy, cx, cy, first.width, first.height))
+        path.append(Camera(rigid_transform(rotation, position), fx, fy, cx, cy, first.width, first.height))
     return path
 
 
@@ -107,9 +106,3 @@ def _intrinsics_for_size(camera: Camera, width: int, height: int) -> tuple[float
 
 def _loop_radius(spread: Tensor, distance: float) -> float:
     return max(SHARE_OF_SPREAD * float(spread.std(correction=0)), LEAST_LOOP * distance)
-
-
-def _pose(rotation: NDArray[np.float64], position: NDArray[np.float64]) -> Tensor:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
-    return torch.from_numpy(pose).float()

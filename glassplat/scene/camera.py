@@ -231,6 +231,13 @@ class Camera:
 Array = NDArray[np.float64]
 
 
+def rigid_transform(rotation: Array, center: Array) -> Tensor:
+    """`cam_from_world` [4, 4], float32, of a camera at `center` [3] whose axes are the rows of `rotation` [3, 3]."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ center
+    return torch.from_numpy(pose).float()
+
+
 @dataclass(frozen=True)
 class NumpyCamera:
     """A pinhole camera.

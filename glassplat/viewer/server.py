@@ -17,7 +17,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -25,7 +24,7 @@ from glassplat.access import Access, is_local
 from glassplat.errors import InputError
 from glassplat.publish.web_page import best_view, survey_capture
 from glassplat.render.frame import Renderer
-from glassplat.scene.camera import Camera
+from glassplat.scene.camera import Camera, rigid_transform
 from glassplat.scene.scene import Scene
 from glassplat.viewer import controls, drawing
 from glassplat.viewer.render_loop import RenderLoop, RenderThread, check_port
@@ -80,10 +79,6 @@ class Client:
         if self._status_line is not None:
             self._status_line.content = escape_markdown(status)
 
-    def stop_playback(self) -> None:
-        """Stops playback, because the browser has disconnected."""
-        self.keyframes.stop()
-
     def request_render(self) -> None:
         """Requests the view given by the controls and the camera."""
         request = self.request()
@@ -101,9 +96,10 @@ class Client:
             fov_rad, aspect = float(camera.fov), float(camera.aspect)
         except AssertionError:  # The browser has not sent its camera yet.
             return None
-        self._nearest = self._viewer.viewpoints.nearest(position, drawing.matrix_of(wxyz)[:, 2])
+        world_from_cam = drawing.matrix_of(wxyz)  # With the axes of OpenCV.
+        self._nearest = self._viewer.viewpoints.nearest(position, world_from_cam[:, 2])
         compared_photograph = self._nearest if self._layer.value == drawing.ERROR_LAYER else None
-        pose = cam_from_world(wxyz, position)
+        pose = rigid_transform(world_from_cam.T, position)
         request = drawing.ViewRequest(pose, fov_rad, aspect, self._layer.value, compared_photograph=compared_photograph)
         request = request if self._clean is None else self._clean.apply(request)
         return request if self._panes is None else self._panes.apply(request)
@@ -223,14 +219,6 @@ def escape_markdown(text: str) -> str:
     return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", text)
 
 
-def cam_from_world(wxyz: NDArray[np.float64], position: NDArray[np.float64]) -> Tensor:
-    """[4, 4] float32 from viser's camera, which has the axes of OpenCV."""
-    rotation = drawing.matrix_of(wxyz).T
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
-    return torch.from_numpy(pose).float()
-
-
 class Viewer:
     """Serves a scene to any number of browsers until it is stopped; the caller renders, or `start` does."""
 
@@ -330,7 +318,7 @@ class Viewer:
         self.loop.forget(handle.client_id)
         gone = self._clients.pop(handle.client_id, None)
         if gone is not None:
-            gone.stop_playback()
+            gone.keyframes.stop()
 
     def _draw(self, request: drawing.ViewRequest, height: int) -> NDArray[np.uint8]:
         scene, renderer = self.state.scene, self.state.renderer

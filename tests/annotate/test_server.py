@@ -194,7 +194,7 @@ def test_invalid_messages_change_nothing(body: Any, status: int, server: Annotat
     else:
         found, message = save(server, body)
     assert found == status and message["error"]
-    assert server.session.document == marked_document()
+    assert server.session.describe()["document"] == marked_document()
 
 
 def test_more_points_than_fit_are_counted_in_the_refusal(server: AnnotationServer) -> None:

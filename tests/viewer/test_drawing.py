@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from glassplat.render.deferred import Deferred
 from glassplat.render.planar import Planar
+from glassplat.scene.camera import rigid_transform
 from glassplat.scene.corrections import Exposures
 from glassplat.scene.scene import Environment, PaneMove, Scene, as_mirrors, move_panes, with_reflectance, without_glass
-from glassplat.viewer.drawing import Viewpoints, ViewRequest, draw_error_map, draw_image, edit_scene
-from glassplat.viewer.server import cam_from_world
+from glassplat.viewer.drawing import Viewpoints, ViewRequest, draw_error_map, draw_image, edit_scene, matrix_of
 from tests.training.tiny_capture import tiny_capture, true_scene
 
 POSE = tiny_capture().train[1].camera.cam_from_world
@@ -107,4 +107,4 @@ def test_gain_brightens_what_is_mirrored() -> None:
 def test_the_camera_of_the_browser_converts_exactly() -> None:
     rotation, center = POSE[:3, :3].double().numpy(), tiny_capture().train[1].camera.center.double().numpy()
     x, y, z, w = Rotation.from_matrix(rotation.T).as_quat()
-    torch.testing.assert_close(cam_from_world(np.array([w, x, y, z]), center), POSE, atol=1e-6, rtol=0)
+    torch.testing.assert_close(rigid_transform(matrix_of(np.array([w, x, y, z])).T, center), POSE, atol=1e-6, rtol=0)
