@@ -168,11 +168,11 @@ def read_gaussians(path: Path | str) -> Gaussians:
     path = Path(path)
     table = read_table(path)
     _check_is_splat(table, path)
-    columns = {name: torch.from_numpy(_as_float32(values)) for name, values in table.columns.items()}
+    columns = {name: as_tensor(values) for name, values in table.columns.items()}
     plain = point_colors(table.columns)
     sh = _read_sh(columns, path)
     if plain is not None and sh.shape[1] == 0:
-        sh = (torch.from_numpy(_as_float32(plain))[:, None] / 255 - 0.5) / SH_ZERO
+        sh = (as_tensor(plain)[:, None] / 255 - 0.5) / SH_ZERO
     return Gaussians(
         means=_stack_columns(columns, POSITION),
         quats=_stack_columns(columns, ROTATION),
@@ -229,11 +229,6 @@ def _check_is_splat(table: PlyTable, path: Path) -> None:
     raise ValueError(f"{path} looks like {kind} and lacks {' '.join(missing)}; {expected}. Give a trained splat")
 
 
-def _as_float32(values: NDArray) -> NDArray[np.float32]:
-    with np.errstate(over="ignore"):  # Doubles that exceed float32 become infinite.
-        return np.ascontiguousarray(values, dtype=np.float32)
-
-
 def _stack_columns(columns: Mapping[str, Tensor], names: tuple[str, ...]) -> Tensor:
     return torch.stack([columns[name] for name in names], dim=1)
 
@@ -245,4 +240,5 @@ def as_numpy(tensor: Tensor) -> NDArray[np.float32]:
 
 def as_tensor(values: NDArray) -> Tensor:
     """An array as a float32 tensor."""
-    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+    with np.errstate(over="ignore"):  # Doubles that exceed float32 become infinite.
+        return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
