@@ -48,9 +48,9 @@ def drawn(base: Picture, draw: Callable[[ImageDraw.ImageDraw], object], blur: fl
     return np.clip(base + over[..., 3:] * (over[..., :3] * (0.5 + 0.5 * relative) - base), 0, 1)
 
 
-def font(size: int, name: str = SERIF) -> ImageFont.FreeTypeFont:
+def font(size: int) -> ImageFont.FreeTypeFont:
     """A free font that is installed on most systems."""
-    return ImageFont.truetype(name, size)
+    return ImageFont.truetype(SERIF, size)
 
 
 def wood(color: Color, seed: int, size: tuple[int, int] = (512, 512)) -> Picture:
@@ -128,12 +128,11 @@ def house(color: Color, seed: int, *, shutters: Color, ground: str) -> Picture:
 
     def window(d: ImageDraw.ImageDraw, x: int, y: int) -> None:
         lit = generator.random() < 0.3
+        glass, curtain = ((252, 214, 140), (250, 236, 204)) if lit else ((62, 78, 98), (176, 182, 190))
         d.rectangle((x - 14, y - 14, x + 114, y + 184), (232, 226, 214, 255))
-        d.rectangle((x, y, x + 100, y + 170), (*((252, 214, 140) if lit else (62, 78, 98)), 255))
-        d.polygon([(x, y), (x + 46, y), (x, y + 130)], (*((250, 236, 204) if lit else (176, 182, 190)), 255))
-        d.polygon(
-            [(x + 100, y), (x + 54, y), (x + 100, y + 130)], (*((250, 236, 204) if lit else (176, 182, 190)), 255)
-        )
+        d.rectangle((x, y, x + 100, y + 170), (*glass, 255))
+        d.polygon([(x, y), (x + 46, y), (x, y + 130)], (*curtain, 255))
+        d.polygon([(x + 100, y), (x + 54, y), (x + 100, y + 130)], (*curtain, 255))
         for bar in ((x + 46, y, x + 54, y + 170), (x, y + 76, x + 100, y + 84)):
             d.rectangle(bar, (240, 236, 226, 255))
         for side in (x - 76, x + 116):
@@ -145,19 +144,15 @@ def house(color: Color, seed: int, *, shutters: Color, ground: str) -> Picture:
         for y in (150, 560):
             for x in (130, 420, 710):
                 window(d, x, y)
-        d.rectangle((0, 930, 1000, 960), (*tuple(min(int(1.25 * c), 255) for c in color), 255))
-        d.rectangle((0, 40, 1000, 80), (*tuple(min(int(1.25 * c), 255) for c in color), 255))
+        for ledge in ((0, 930, 1000, 960), (0, 40, 1000, 80)):
+            d.rectangle(ledge, (*(min(int(1.25 * c), 255) for c in color), 255))
         if ground == "door":
             for x in (130, 710):
                 window(d, x, 1100)
             d.rectangle((400, 1080, 580, 1560), (*shutters, 255))
-            for panel in (
-                (425, 1110, 480, 1300),
-                (500, 1110, 555, 1300),
-                (425, 1330, 480, 1520),
-                (500, 1330, 555, 1520),
-            ):
-                d.rectangle(panel, tuple(int(0.7 * c) for c in shutters))
+            for x in (425, 500):
+                for y in (1110, 1330):
+                    d.rectangle((x, y, x + 55, y + 190), tuple(int(0.7 * c) for c in shutters))
             d.ellipse((548, 1305, 566, 1323), GOLD)
         else:
             d.rectangle((60, 1140, 940, 1560), (44, 40, 44, 255))
@@ -301,29 +296,16 @@ def spines(seed: int) -> Picture:
     """The spines of twelve books."""
     generator = np.random.default_rng(seed)
     colors = [(120, 32, 36), (28, 66, 92), (60, 84, 50), (150, 110, 50), (70, 46, 84), (190, 170, 130), (30, 30, 36)]
-    titles = [
-        "OPTICS",
-        "FRESNEL",
-        "LIGHT",
-        "PARIS",
-        "ATLAS",
-        "ALICE",
-        "FAUST",
-        "MIRRORS",
-        "GLASS",
-        "SEA",
-        "EMMA",
-        "MOON",
-    ]
+    titles = ("OPTICS", "FRESNEL", "LIGHT", "PARIS", "ATLAS", "ALICE")
+    titles += ("FAUST", "MIRRORS", "GLASS", "SEA", "EMMA", "MOON")
 
     def books(d: ImageDraw.ImageDraw) -> None:
-        for number in range(12):
-            x = number * 64
+        for x, word in zip(range(0, 768, 64), titles, strict=True):
             d.rectangle((x, 0, x + 61, 384), (*colors[generator.integers(7)], 255))
             for y in (30, 44, 330, 344):
                 d.rectangle((x + 4, y, x + 58, y + 5), (*GOLD, 255))
             title = Image.new("RGBA", (260, 50), (0, 0, 0, 0))
-            ImageDraw.Draw(title).text((130, 25), titles[number], (*GOLD, 255), font(40), anchor="mm")
+            ImageDraw.Draw(title).text((130, 25), word, (*GOLD, 255), font(40), anchor="mm")
             d._image.paste(title.rotate(90, expand=True), (x + 6, 60), title.rotate(90, expand=True))
 
     return drawn(grained((60, 50, 44), (768, 384), seed, 0.08), books)

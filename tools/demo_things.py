@@ -403,18 +403,11 @@ def shop_front() -> list[Shape]:
         (RIGHT + 0.45, -0.04, 0.0), (RIGHT + 1.45, 0.0, TOP + 0.1), "door", sides="flr", spacing=s, picture=(0, 0)
     )
     made.append(lathe([(0.03, 0), (0.035, 0.02), (0.001, 0.04)], "brass", turns=16).moved((RIGHT + 0.56, -0.08, 1.05)))
-    made.append(quad((RIGHT + 1.45, 0, 0), (5.0, 0, 0), (0, 0, 6.5), "bricks", spacing=0.15, picture=(1.8, 1.2)))
-    made.append(quad((LEFT - 5.4, 0, 0), (5.0, 0, 0), (0, 0, 6.5), "bricks", spacing=0.15, picture=(1.8, 1.2)))
-    made.append(
-        quad(
-            (LEFT - 0.4, 0, TOP + 0.65),
-            (RIGHT - LEFT + 2.25, 0, 0),
-            (0, 0, 4.0),
-            "bricks",
-            spacing=0.15,
-            picture=(1.8, 1.2),
-        )
-    )
+    for corner, width, height in (
+        ((RIGHT + 1.45, 0, 0), 5.0, 6.5), ((LEFT - 5.4, 0, 0), 5.0, 6.5),
+        ((LEFT - 0.4, 0, TOP + 0.65), RIGHT - LEFT + 2.25, 4.0),
+    ):  # fmt: skip
+        made.append(quad(corner, (width, 0, 0), (0, 0, height), "bricks", spacing=0.15, picture=(1.8, 1.2)))
     for x in (-0.75, 1.2):
         made += box((x, -0.06, 3.4), (x + 1.0, 0, 3.5), "cream", sides="flrtb", spacing=0.1)
         made.append(quad((x + 0.08, -0.02, 3.5), (0.84, 0, 0), (0, 0, 1.4), "window", spacing=0.1))
@@ -441,7 +434,7 @@ def car(place: Triple) -> list[Shape]:
     glass = [(-0.95, 0.95), (0.8, 0.95), (0.45, 1.34), (-0.7, 1.34)]
     made = [*slab(body, 1.5, "carpaint", spacing=0.15), *slab(cabin, 1.3, "carpaint", spacing=0.15)]
     made += slab(glass, 1.32, "carglass", spacing=0.15)
-    made += placed(box((-0.04, -0.67, 0.93), (0.04, 0.67, 1.4), "carpaint", sides="fk"), (0, 0, 0))
+    made += box((-0.04, -0.67, 0.93), (0.04, 0.67, 1.4), "carpaint", sides="fk")
     for x in (-1.1, 1.1):
         a = np.linspace(0, 2 * math.pi, 33)[:-1]
         for radius, depth, paint in ((0.34, 1.54, "rubber"), (0.2, 1.56, "chrome")):
@@ -462,20 +455,13 @@ def houses() -> list[Shape]:
         made += placed(
             box((-width, -0.25, height), (0, 0.12, height + 0.2), "cream", sides="kflrtb", spacing=0.2), (right, FAR, 0)
         )
-        roof = quad(
-            (right, FAR, height + 0.2), (-width, 0, 0), (0, -1.2, 1.3), "tiles", spacing=0.2, picture=(1.2, 1.2)
-        )
-        made += [roof]
+        eaves = (right, FAR, height + 0.2)
+        made.append(quad(eaves, (-width, 0, 0), (0, -1.2, 1.3), "tiles", spacing=0.2, picture=(1.2, 1.2)))
         for column in (0.13, 0.42, 0.71):
             x = right - width * column - 0.05 * width
-            for level in (0.54, 0.795):
-                made += box(
-                    (x - 0.55, FAR, height * level - 0.08),
-                    (x + 0.1, FAR + 0.16, height * level),
-                    "cream",
-                    sides="kflrtb",
-                    spacing=0.12,
-                )
+            for top in (height * 0.54, height * 0.795):
+                low, high = (x - 0.55, FAR, top - 0.08), (x + 0.1, FAR + 0.16, top)
+                made += box(low, high, "cream", sides="kflrtb", spacing=0.12)
         right -= width
     return made
 
@@ -487,18 +473,9 @@ def cafe() -> list[Shape]:
         awning, normals=-awning.normals, faces=awning.faces[:, ::-1], vertices=awning.vertices - [0, 0, 0.01]
     )
     made = [awning, under]
-    for x in (5.0, 6.4, 7.8):  # tables in front of the café
-        made += placed(
-            [
-                lathe(
-                    [(0.2, 0), (0.03, 0.04), (0.03, 0.68), (0.36, 0.7), (0.36, 0.73), (0.001, 0.73)],
-                    "white",
-                    turns=24,
-                    smooth=1,
-                )
-            ],
-            (x, FAR + 0.95, 0),
-        )
+    table = [(0.2, 0), (0.03, 0.04), (0.03, 0.68), (0.36, 0.7), (0.36, 0.73), (0.001, 0.73)]
+    for x in (5.0, 6.4, 7.8):
+        made.append(lathe(table, "white", turns=24, smooth=1).moved((x, FAR + 0.95, 0)))
         for side, paint in ((-0.55, "red"), (0.55, "blue")):
             made += placed(
                 box((-0.18, -0.18, 0.38), (0.18, 0.18, 0.43), paint, sides="fklrtb"), (x + side, FAR + 0.95, 0)

@@ -33,6 +33,8 @@ from tools.make_pane_scene import (
     write_colmap,
 )
 from tools.make_scenes import as_bytes, srgb_from_linear
+from tools.pane_draws import world_from_cam
+from tools.pane_things import camera_rays
 from tools.pane_tracer import Array, Seen, reflectance
 
 MOST_BYTES = 8_000_000
@@ -100,24 +102,14 @@ def camera_poses(views: int) -> list[Array]:
         else:
             place = np.array([1.9 * side, -generator.uniform(1.25, 2.9), generator.uniform(1.05, 1.75)])
             target = np.array([generator.uniform(-0.5, 0.5) + 0.25 * side, 0.35, generator.uniform(1.1, 1.35)])
-        forward = (target - place) / np.linalg.norm(target - place)
-        right = np.cross(forward, [0, 0, 1])
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-        pose[:3, 3] = place
-        made.append(pose)
+        made.append(world_from_cam(place, target))
     return made
 
 
 def view(lit: Lit, pose: Array, width: int, rays: int) -> dict[str, Array]:
     """Layers of a view, [H, W, ...] each, averaged over the rays of each pixel."""
-    height, focal = width * 3 // 4, FOCAL_PER_WIDTH * width
-    fine = (np.arange(rays) + 0.5) / rays
-    x, y, dx, dy = np.meshgrid(np.arange(width), np.arange(height), fine, fine, indexing="xy")
-    axes = [(x + dx - width / 2) / focal, (y + dy - height / 2) / focal, np.ones_like(dx)]
-    directions = np.stack(axes, axis=-1).reshape(-1, 3)
-    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True) @ pose[:3, :3].T
+    height = width * 3 // 4
+    directions = camera_rays(width, height, rays, FOCAL_PER_WIDTH) @ pose[:3, :3].T
     seen = lit.seen(np.broadcast_to(pose[:3, 3], directions.shape), directions)
     labels = seen.label.reshape(height, width, rays**2)
     layers = {

@@ -290,11 +290,6 @@ def srgb_from_linear(linear: Array) -> Array:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def linear_from_srgb(srgb: Array) -> Array:
-    """Linear radiance in [0, 1] of sRGB values in [0, 1]."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-
-
 def as_bytes(unit: Array) -> NDArray[np.uint8]:
     """Values in [0, 1] as uint8."""
     return np.round(np.clip(unit, 0, 1) * 255).astype(np.uint8)

@@ -57,11 +57,11 @@ class Paint:
 
 
 @lru_cache(maxsize=4)
-def _camera_rays(width: int, height: int) -> Array:
-    """Unit directions [H W S, 3] of the rays of an image in camera axes, evenly spaced over each pixel."""
-    fine = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS
+def camera_rays(width: int, height: int, subpixels: int, focal_per_width: float) -> Array:
+    """Unit directions [H W S, 3] of the rays of an image in camera axes, `subpixels` squared for each pixel."""
+    fine = (np.arange(subpixels) + 0.5) / subpixels
     x, y, dx, dy = np.meshgrid(np.arange(width), np.arange(height), fine, fine, indexing="xy")
-    focal = FOCAL_PER_WIDTH * width
+    focal = focal_per_width * width
     rays = np.stack([(x + dx - width / 2) / focal, (y + dy - height / 2) / focal, np.ones_like(dx)], axis=-1)
     return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).reshape(-1, 3)
 
@@ -279,7 +279,7 @@ class Place:
             width: width of the image, pixels.
             height: height of the image, pixels.
         """
-        directions = _camera_rays(width, height) @ pose[:3, :3].T
+        directions = camera_rays(width, height, SUBPIXELS, FOCAL_PER_WIDTH) @ pose[:3, :3].T
         seen = self.seen(np.broadcast_to(pose[:3, 3], directions.shape), directions)
         return Seen(*(layer.reshape(height, width, SUBPIXELS**2, *layer.shape[1:]) for layer in seen))
 

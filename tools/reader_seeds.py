@@ -211,10 +211,6 @@ def _database(path: Path) -> None:
     features.descriptors()
 
 
-def _environment(path: Path) -> None:
-    read_environment(path)
-
-
 def _transforms(path: Path) -> None:
     capture = load_transforms(path.parent)
     with suppress(FileNotFoundError):
@@ -257,10 +253,6 @@ def _annotations_seeds(folder: Path) -> None:
     stroke = {"kind": "brush", "effect": "cut", "radius": 3.0, "points": [[1.0, 2.0], [3.0, 4.0]]}
     pane = {"label": 1, "material": "glass", "shape": "rectangle", "corners": corners, "edges": []}
     (folder / "a.json").write_text(json.dumps({"version": 1, "panes": [{**pane, "strokes": {"0.png": [stroke]}}]}))
-
-
-def _annotations(path: Path) -> None:
-    read_document(path.parent)
 
 
 def _picture_seeds(folder: Path) -> None:
@@ -306,7 +298,7 @@ READERS: dict[str, Reader] = {
     ),
     "environment": Reader(
         "environment.safetensors",
-        _environment,
+        read_environment,
         lambda folder: write_environment(folder / "a.safetensors", Environment(torch.zeros(6, 2, 2, 3))),
     ),
     "scene": Reader("scene.json", lambda path: read_scene(path.parent), _scene_seeds),
@@ -318,7 +310,7 @@ READERS: dict[str, Reader] = {
     "recipe": Reader("recipe.json", lambda path: RunDirectory(path.parent).recipe(), _recipe_seeds, longest=16_384),
     "settings": Reader("settings.json", lambda path: RunDirectory(path.parent).settings(), _settings_seeds),
     "log": Reader("log.jsonl", lambda path: lines_until(path, 10), _log_seeds),
-    "annotations": Reader(ANNOTATIONS, _annotations, _annotations_seeds),
+    "annotations": Reader(ANNOTATIONS, lambda path: read_document(path.parent), _annotations_seeds),
     "photograph": Reader("a.png", read_colors, _picture_seeds, most_mib=LARGEST_PICTURE_MIB),
     "mask": Reader("a.png", read_mask_values, _mask_seeds, most_mib=LARGEST_PICTURE_MIB),
     "panorama": Reader(

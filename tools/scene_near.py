@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -36,13 +35,7 @@ COLORS: tuple[Color, ...] = (
 
 def near_scene(name: NearScene) -> DrawnScene:
     """The scene of a name; reflective bodies come first."""
-    makers: dict[str, Callable[[], tuple[tuple[Body, ...], Stand]]] = {
-        "table": _table,
-        "gold": _gold,
-        "sheet": _sheet,
-        "car": _car,
-    }
-    bodies, stand = makers[name]()
+    bodies, stand = {"table": _table, "gold": _gold, "sheet": _sheet, "car": _car}[name]()
     return DrawnScene(bodies, stand, NAMED)
 
 

@@ -106,14 +106,14 @@ def star_shaped(radius_along: Callable[[Array], Array], rings: int = 320, segmen
     )
 
 
-def _star_normals(positions: Array, radius_along: Callable[[Array], Array], step: float = 1e-4) -> Array:
+def _star_normals(positions: Array, radius_along: Callable[[Array], Array]) -> Array:
     """Unit normals [V, 3]: the gradient of |p| - radius(p / |p|), by central differences."""
 
     def excess(points: Array) -> Array:
         distances = np.linalg.norm(points, axis=-1)
         return distances - radius_along(points / distances[..., None])
 
-    slopes = np.stack([excess(positions + offset) - excess(positions - offset) for offset in step * np.eye(3)], -1)
+    slopes = np.stack([excess(positions + offset) - excess(positions - offset) for offset in 1e-4 * np.eye(3)], -1)
     return np.asarray(slopes / np.linalg.norm(slopes, axis=-1, keepdims=True))
 
 

@@ -12,12 +12,10 @@ import io
 import json
 import random
 import socket
-import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, redirect_stderr, suppress
 from pathlib import Path
-from threading import Thread
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -27,14 +25,13 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
 from glassplat.access import cookie_name
 from glassplat.annotate.server import AnnotationServer
-from glassplat.annotate.session import open_session
 from glassplat.files.images import write_image
 from glassplat.prepare.preparation import PAGE
 from glassplat.render.planar import Planar
 from glassplat.viewer.drawing import ViewerState
 from glassplat.viewer.gate import LARGEST_MESSAGE, MESSAGES
 from glassplat.viewer.server import Viewer
-from tests.annotate.conftest import write_room
+from tests.annotate.conftest import serving, write_room
 from tests.prepare.conftest import copy_photographs
 from tests.training.tiny_capture import tiny_capture, true_scene, write_tiny_capture
 from tests.viewer.free_port import free_port
@@ -65,7 +62,7 @@ def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
     yield Case("names that are HTML", names_fault(place / "names"))
     draw = random.Random(seed)
     root = write_room(place / "room")
-    with viewed() as viewer, annotated(root) as annotation:
+    with viewed() as viewer, serving(root) as annotation:
         for name, port in (("view", viewer.port), ("annotate", int(annotation.server_address[1]))):
             yield Case(f"{name} from elsewhere", elsewhere_fault(port))
         for number in range(3, cases):
@@ -135,32 +132,16 @@ def viewed() -> Iterator[Viewer]:
         viewer.stop()
 
 
-@contextmanager
-def annotated(root: Path) -> Iterator[AnnotationServer]:
-    """Runs the annotation server of a capture."""
-    with AnnotationServer(open_session(root), 0) as server:
-        thread = Thread(target=server.serve_forever, args=(0.02,))
-        thread.start()
-        try:
-            yield server
-        finally:
-            server.shutdown()
-            thread.join()
-
-
 def at_view(viewer: Viewer, draw: random.Random, number: int) -> tuple[str, str]:
     """Tests one case at the viewer; returns its name and fault."""
     kind = draw.choice(("stranger", "messages", "messages", "long", "slow", "garbage"))
     if number in (3, 5):
         kind = "many" if number == 3 else "silent"
-    errors, there = sys.stderr, io.StringIO()
-    sys.stderr = there
-    try:
-        fault = asyncio.run(asyncio.wait_for(VIEWED[kind](viewer, draw), 120)) or asyncio.run(served(viewer))
-    except Exception as error:  # noqa: BLE001 - Any error means that a client was not served.
-        fault = f"{type(error).__name__}: {error}"
-    finally:
-        sys.stderr = errors
+    with redirect_stderr(io.StringIO()) as there:
+        try:
+            fault = asyncio.run(asyncio.wait_for(VIEWED[kind](viewer, draw), 120)) or asyncio.run(served(viewer))
+        except Exception as error:  # noqa: BLE001 - Any error means that a client was not served.
+            fault = f"{type(error).__name__}: {error}"
     printed = there.getvalue()
     return f"view {kind}", fault or (printed if "Traceback" in printed else "")
 
@@ -279,16 +260,12 @@ def at_annotate(server: AnnotationServer, draw: random.Random, number: int) -> t
     port = int(server.server_address[1])
     has_key = draw.random() < 0.5
     cookie = f"{cookie_name(f'127.0.0.1:{port}')}={server.access.key}" if has_key else ""
-    errors, there = sys.stderr, io.StringIO()
-    sys.stderr = there
-    try:
-        sent = request(draw, port, cookie)
-        fault = answered_well(port, sent, let_in=has_key)
-        fault = fault or capture_fault(server)
-    except Exception as error:  # noqa: BLE001 - Any error means that the next client was not served.
-        fault = f"{type(error).__name__}: {error}"
-    finally:
-        sys.stderr = errors
+    sent = request(draw, port, cookie)
+    with redirect_stderr(io.StringIO()) as there:
+        try:
+            fault = answered_well(port, sent, let_in=has_key) or capture_fault(server)
+        except Exception as error:  # noqa: BLE001 - Any error means that the next client was not served.
+            fault = f"{type(error).__name__}: {error}"
     if (file.read_bytes() if file.is_file() else b"") != before:
         fault = fault or "the marks were changed"
     printed = there.getvalue()

@@ -8,14 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from glassplat.captures.dataset import load_dataset
+from glassplat.kernels.maths.images import linear_from_srgb
 from tools.make_scenes import (
     BALL_RADIUS,
     Arguments,
     camera_positions,
-    linear_from_srgb,
     main,
     srgb_from_linear,
     world_from_opengl,
@@ -32,7 +33,7 @@ TRAIN, TEST, SIZE = 24, 6, 96
 
 def test_srgb_and_linear_are_inverses() -> None:
     values = np.linspace(0, 1, 101)
-    np.testing.assert_allclose(linear_from_srgb(srgb_from_linear(values)), values, atol=1e-7)
+    np.testing.assert_allclose(linear_from_srgb(torch.from_numpy(srgb_from_linear(values))), values, atol=1e-7)
 
 
 def unit_pixels(path: Path) -> np.ndarray:
@@ -40,9 +41,13 @@ def unit_pixels(path: Path) -> np.ndarray:
         return np.array(image) / 255.0
 
 
+def linear_pixels(path: Path) -> np.ndarray:
+    return linear_from_srgb(torch.from_numpy(unit_pixels(path)[..., :3])).numpy()
+
+
 def environment_along(direction: np.ndarray) -> np.ndarray:
     """Nearest pixel of the ball's surroundings, linear radiance [..., 3], by the documented convention."""
-    panorama = linear_from_srgb(unit_pixels(BALL / "environment.png"))
+    panorama = linear_pixels(BALL / "environment.png")
     height, width = panorama.shape[:2]
     column = (0.5 - np.arctan2(direction[..., 1], direction[..., 0]) / (2 * np.pi)) * width
     row = np.arccos(np.clip(direction[..., 2], -1, 1)) / np.pi * height
@@ -204,7 +209,7 @@ def test_the_small_ball_mirrors_its_surroundings(frame: dict) -> None:
     mirrored = rays - 2 * (rays * normals).sum(axis=-1, keepdims=True) * normals
     # Below the horizon the ball reflects the ground, which is near.
     sky = hit & (mirrored[..., 2] > 0.05)
-    shown = linear_from_srgb(unit_pixels(BALL / f"{frame['file_path']}.png")[..., :3])
+    shown = linear_pixels(BALL / f"{frame['file_path']}.png")
     difference = np.abs(shown - environment_along(mirrored))[sky]
     assert sky.sum() > 100
     assert np.median(difference) < 0.01
