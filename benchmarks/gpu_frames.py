@@ -69,16 +69,13 @@ def measured(count: int) -> Table:
     )
     for name, work in works.items():
         partner = partners.get(name) if theirs else None
-        table.add(name, milliseconds(seconds, name), *beside(seconds, name, partner), peak(work),
-                  peak(theirs[partner]) if partner else "")  # fmt: skip
+        own, memory = milliseconds(seconds, name), peak(work)
+        if partner is None:
+            table.add(name, own, "", "", memory, "")
+            continue
+        ratio = paired_ratio(seconds, partner, name)
+        table.add(name, own, milliseconds(seconds, partner), ratio, memory, peak(theirs[partner]))
     return table
-
-
-def beside(seconds: Mapping[str, list[float]], name: str, partner: str | None) -> tuple[object, object]:
-    """Milliseconds of gsplat and their ratio to ours; empty without a counterpart."""
-    if partner is None:
-        return "", ""
-    return milliseconds(seconds, partner), paired_ratio(seconds, partner, name)
 
 
 def milliseconds(seconds: Mapping[str, list[float]], name: str) -> float:

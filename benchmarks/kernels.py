@@ -68,38 +68,37 @@ def evaluated_pixels(splats: Splats, channels: Tensor, bins: TileBins) -> int:
     return LANES * int(np.unpackbits(blocks.view(np.uint8)).sum())
 
 
-def kernel_times() -> Table:
-    """Milliseconds of every kernel at 100k Gaussians."""
-    camera = bench_camera(WIDTH, HEIGHT)
-    gaussians = room(COUNT)
+def kernel_works(gaussians: Gaussians, camera: Camera) -> tuple[dict[str, Work], Splats, Tensor, TileBins]:
+    """Both passes of the kernels, on the device of the Gaussians; and splats, colours and tile bins to composite."""
     raw, batch = raw_of(gaussians, trainable=True), batch_of(camera)
     projected = project(raw, batch, sh_degree=3, near=0.03)
     flat = Projected(*(t.detach() for t in projected))
     splats = concat_splats(flat)
-    bins = bin_tiles(splats, WIDTH, HEIGHT)
-    leaves = splats._replace(
-        means2d=splats.means2d.clone().requires_grad_(),
-        conics=splats.conics.clone().requires_grad_(),
-        opacities=splats.opacities.clone().requires_grad_(),
-    )
-    colors = flat.colors.clone().requires_grad_()
-    blended = composite(leaves, colors, bins)
-    picture = torch.rand(HEIGHT, WIDTH, 3)
-    photo = (torch.rand(HEIGHT, WIDTH, 3) * 255).to(torch.uint8)
+    bins = bin_tiles(splats, camera.width, camera.height)
+    leaves: list[Any] = [t.clone().requires_grad_() for t in (*splats[:3], flat.colors)]
+    blended = composite(splats._replace(means2d=leaves[0], conics=leaves[1], opacities=leaves[2]), leaves[3], bins)
+    picture = torch.rand(camera.height, camera.width, 3, device=gaussians.means.device)
+    photo = (torch.rand_like(picture) * 255).to(torch.uint8)
     image = picture.clone().requires_grad_()
     means = list(photometric(image, photo))
     weights = [torch.rand_like(t) for t in projected[:5]]
     works: dict[str, Work] = {
         "project forward": lambda: project(raw_of(gaussians), batch, sh_degree=3, near=0.03),
         "project backward": backward(list(projected[:5]), weights, list(raw)),
-        "bin_tiles": lambda: bin_tiles(splats, WIDTH, HEIGHT),
+        "bin_tiles": lambda: bin_tiles(splats, camera.width, camera.height),
         "composite forward": lambda: composite(splats, flat.colors, bins),
-        "composite backward": backward([blended.image], [picture[None]], [*leaves[:3], colors]),
+        "composite backward": backward([blended.image], [picture[None]], leaves),
         "photometric forward": lambda: photometric(picture, photo),
         "photometric forward, for a gradient": lambda: photometric(image, photo),
-        "photometric backward": backward(means, [torch.tensor(1.0)] * 2, [image]),
+        "photometric backward": backward(means, [torch.ones_like(means[0])] * 2, [image]),
     }
-    evaluations = evaluated_pixels(splats, flat.colors, bins)
+    return works, splats, flat.colors, bins
+
+
+def kernel_times() -> Table:
+    """Milliseconds of every kernel at 100k Gaussians."""
+    works, splats, colors, bins = kernel_works(room(COUNT), bench_camera(WIDTH, HEIGHT))
+    evaluations = evaluated_pixels(splats, colors, bins)
     peak = peak_multiply_adds(2)
     table = Table(
         f"Kernels, {COUNT // 1000}k Gaussians (half of them in front of the camera), SH 3, {WIDTH}x{HEIGHT}",

@@ -101,23 +101,19 @@ def against_splat(method: str, scene: Scene, renderer: Renderer, stage: Stage, v
     return cells
 
 
+def cost_columns(method: str) -> tuple[str, ...]:
+    """Titles of the values of `against_splat`."""
+    parts = ("frame", "step")
+    return tuple(title for part in parts for title in (f"splat {part}, ms", f"{method} {part}, ms", f"{part} ratio"))
+
+
 def method_costs() -> Table:
     """Frames and steps of both methods with the same primary Gaussians."""
     camera = bench_camera(WIDTH, HEIGHT)
     view = view_of(camera)
     table = Table(
         f"planar against splat, {COUNT // 1000}k primary Gaussians, SH 3, {WIDTH}x{HEIGHT}",
-        (
-            "panes",
-            "share of the image",
-            "splat frame, ms",
-            "planar frame, ms",
-            "frame ratio",
-            "splat step, ms",
-            "planar step, ms",
-            "step ratio",
-            "minimum frame ratio",
-        ),
+        ("panes", "share of the image", *cost_columns("planar"), "minimum frame ratio"),
         "Ratios are medians of ratios taken round by round. The planar step is one of stage 3 on an annotated view. "
         "The minimum frame ratio is that of a splat frame plus the bare mirrored images: no glass, no blending.",
     )
@@ -136,16 +132,7 @@ def deferred_costs() -> Table:
     """Frames and steps of `deferred` and `splat` with the same Gaussians."""
     table = Table(
         "deferred against splat, SH 3, every Gaussian glossy",
-        (
-            "Gaussians",
-            "pixels",
-            "splat frame, ms",
-            "deferred frame, ms",
-            "frame ratio",
-            "splat step, ms",
-            "deferred step, ms",
-            "step ratio",
-        ),
+        ("Gaussians", "pixels", *cost_columns("deferred")),
         "Ratios are medians of ratios taken round by round. Environment: 6 x 128 x 128 texels.",
     )
     deferred_stage = DeferredRecipe().stages(0)[1]
