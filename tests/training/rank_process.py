@@ -1,7 +1,7 @@
 """One of several processes that train the tiny capture together and save their results; helpers that start them.
 
 `torchrun` starts them as users do. Where a test does not depend on that, they are forked from a process that has
-imported everything, as importing takes longer than most of their work.
+imported everything, as importing takes longer than most of their work. So is `torchrun` itself.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import multiprocessing
 import os
 import runpy
 import socket
-import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,6 @@ LONGEST = 240
 """Limit in seconds for work that takes a few on an idle machine."""
 FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(["tests.training.rank_process", "glassplat.cli.train", "torch.distributed"])
-ONE_THREAD = os.environ | {"NUMBA_NUM_THREADS": "1"}
 
 
 def stages_of(name: str) -> tuple[Stage, ...]:
@@ -76,7 +75,7 @@ class ForkedRank:
     ) -> None:
         self.args, self._said = arguments, said
         self._process = forked(_become, arguments, environment, said, shorter or {})
-        self.kill = self._process.kill
+        self.pid, self.kill, self.terminate = self._process.pid, self._process.kill, self._process.terminate
 
     @property
     def returncode(self) -> int | None:
@@ -86,7 +85,7 @@ class ForkedRank:
         return self._process.exitcode
 
     def send_signal(self, number: int) -> None:
-        os.kill(self._process.pid, number)
+        os.kill(self.pid, number)
 
     def communicate(self, timeout: float) -> tuple[str, str]:
         """Its standard output and standard error, once it has ended."""
@@ -97,6 +96,7 @@ class ForkedRank:
 
 def _become(arguments: list[str], environment: dict[str, str], said: Path, shorter: dict[str, Any]) -> None:
     os.environ.update(environment)
+    os.chdir(ROOT)
     vars(ranks).update(shorter)
     for number, suffix in ((1, ".out"), (2, ".err")):
         with said.with_suffix(suffix).open("wb") as file:
@@ -137,12 +137,22 @@ def start_apart(
     ]
 
 
-def torchrun(count: int, *arguments: str, timeout: float = LONGEST) -> subprocess.CompletedProcess[str]:
-    """Runs `python -m ARGUMENTS` in `count` processes."""
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}", "-m"]
-    return subprocess.run(
-        [*command, *arguments], cwd=ROOT, env=ONE_THREAD, capture_output=True, text=True, timeout=timeout, check=False
-    )
+@contextmanager
+def torchrun(count: int, arguments: list[str], folder: Path) -> Iterator[ForkedRank]:
+    """`torchrun` with `python -m ARGUMENTS` in `count` processes, terminated on leaving the context.
+
+    Args:
+        count: number of ranks.
+        arguments: a module and its arguments.
+        folder: receives their output.
+    """
+    options = ["--standalone", f"--nproc-per-node={count}", "-m"]
+    process = ForkedRank(["torch.distributed.run", *options, *arguments], {}, folder / "said_by_torchrun")
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.communicate(timeout=LONGEST)
 
 
 def main() -> None:

@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -27,8 +26,6 @@ from glassplat.training.ranks import COLLECTIVE_TIMEOUT, Ranks
 from glassplat.training.stage import Clock, Optimizer, TrainState
 from tests.training.rank_process import (
     LONGEST,
-    ONE_THREAD,
-    ROOT,
     ForkedRank,
     losses_of,
     stages_of,
@@ -51,19 +48,7 @@ def train_arguments(capture: Path, output: Path, *more: str, iterations: int = I
     return ["glassplat", "train", "splat", *common, *more]
 
 
-@contextmanager
-def running(count: int, *arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """A running `torchrun`, terminated on leaving the context."""
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}", "-m"]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    with subprocess.Popen([*command, *arguments], cwd=ROOT, env=ONE_THREAD, **pipes) as process:
-        try:
-            yield process
-        finally:
-            process.terminate()
-
-
-def ranks_of(process: subprocess.Popen[str]) -> list[int]:
+def ranks_of(process: ForkedRank) -> list[int]:
     """The processes started by `torchrun`, in the order of their ranks."""
     found = {}
     for number in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split():
@@ -73,7 +58,7 @@ def ranks_of(process: subprocess.Popen[str]) -> list[int]:
     return [found[rank] for rank in sorted(found)]
 
 
-def wait_for(path: Path, process: subprocess.Popen[str] | ForkedRank) -> None:
+def wait_for(path: Path, process: ForkedRank) -> None:
     """Waits until a file exists."""
     end = time.monotonic() + LONGEST
     while not path.is_file():
@@ -82,9 +67,9 @@ def wait_for(path: Path, process: subprocess.Popen[str] | ForkedRank) -> None:
         time.sleep(0.05)
 
 
-def ended(process: subprocess.Popen[str] | ForkedRank) -> str:
+def ended(process: ForkedRank) -> str:
     """The output of a process until it ends."""
-    return "".join(text or "" for text in process.communicate(timeout=LONGEST))
+    return "".join(process.communicate(timeout=LONGEST))
 
 
 def started_apart(arguments: list[str], folder: Path, of_rank_1: list[str]) -> list[subprocess.CompletedProcess[str]]:
@@ -232,8 +217,9 @@ def test_noise_grows_as_the_rate_that_it_follows() -> None:
 
 
 def test_one_process_of_torchrun_learns_the_same_bits_as_without(capture: Path, tmp_path: Path) -> None:
-    done = torchrun(1, *train_arguments(capture, tmp_path / "torchrun"))
-    assert done.returncode == 0, done.stderr
+    with torchrun(1, train_arguments(capture, tmp_path / "torchrun"), tmp_path) as process:
+        text = ended(process)
+    assert process.returncode == 0, text
     assert main(train_arguments(capture, tmp_path / "plain")[1:]) == 0
     files = [tmp_path / run / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply" for run in ("torchrun", "plain")]
     assert files[0].read_bytes() == files[1].read_bytes()
@@ -242,7 +228,7 @@ def test_one_process_of_torchrun_learns_the_same_bits_as_without(capture: Path, 
 def test_an_interrupted_run_resumes_with_another_number_of_ranks(capture: Path, tmp_path: Path) -> None:
     arguments = train_arguments(capture, tmp_path / "run", "--checkpoint-every", "0.01", iterations=100_000)
     checkpoint = tmp_path / "run" / "checkpoint.safetensors"
-    with running(2, *arguments) as process:
+    with torchrun(2, arguments, tmp_path) as process:
         wait_for(checkpoint, process)
         os.kill(ranks_of(process)[1], signal.SIGTERM)
         assert "repeat the command with --resume" in ended(process)
@@ -261,10 +247,19 @@ def test_an_interrupted_run_resumes_with_another_number_of_ranks(capture: Path, 
     assert (load_checkpoint(checkpoint).step - begun) % 3 == 0
 
 
+@pytest.fixture(scope="module")
+def waiting(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[ForkedRank, Path]]:
+    """The leader that waits 15 seconds for a silent rank, and its output; other tests run in the meantime."""
+    output = tmp_path_factory.mktemp("waiting") / "run"
+    with silent_rank(capture, output, COLLECTIVE_TIMEOUT=timedelta(seconds=15)) as first:
+        yield first, output
+
+
+@pytest.mark.usefixtures("waiting")
 @pytest.mark.parametrize("rank", [0, 1])
 def test_the_death_of_a_rank_ends_the_others_with_one_message(rank: int, capture: Path, tmp_path: Path) -> None:
     arguments = train_arguments(capture, tmp_path / "run", "--checkpoint-every", "0.01", iterations=100_000)
-    with running(2, *arguments) as process:
+    with torchrun(2, arguments, tmp_path) as process:
         wait_for(tmp_path / "run" / "checkpoint.safetensors", process)
         os.kill(ranks_of(process)[rank], signal.SIGKILL)
         text = ended(process)  # `torchrun` waits less long for it than a rank waits for a silent one.
@@ -274,20 +269,23 @@ def test_the_death_of_a_rank_ends_the_others_with_one_message(rank: int, capture
     assert load_checkpoint(tmp_path / "run" / "checkpoint.safetensors").step > 0
 
 
-def last_word_before_a_silent_rank(capture: Path, output: Path, *, asked: bool, **shorter: object) -> str:
-    """The leader's message about a stopped rank, with or without a request to end; it saves and exits with 1."""
+@contextmanager
+def silent_rank(capture: Path, output: Path, **shorter: object) -> Iterator[ForkedRank]:
+    """The leader of two ranks that have saved a checkpoint, the other one of which has been stopped."""
     arguments = train_arguments(capture, output, "--checkpoint-every", "0.01", iterations=100_000)
     first, silent = start_apart(arguments, output.parent, shorter=shorter)
     try:
         wait_for(output / "checkpoint.safetensors", first)
         silent.send_signal(signal.SIGSTOP)
-        if asked:
-            time.sleep(1.0)
-            first.send_signal(signal.SIGTERM)
-        _, text = first.communicate(timeout=LONGEST)
+        yield first
     finally:
         first.kill()
         silent.kill()
+
+
+def last_word(first: ForkedRank, output: Path) -> str:
+    """The leader's message about a stopped rank; it saves and exits with 1."""
+    _, text = first.communicate(timeout=LONGEST)
     assert first.returncode == 1
     ours = [line for line in text.splitlines() if line.startswith(("stopped:", "error:"))]
     assert len(ours) == 1, text
@@ -296,15 +294,14 @@ def last_word_before_a_silent_rank(capture: Path, output: Path, *, asked: bool, 
 
 
 def test_a_terminated_rank_waits_briefly_for_the_others(capture: Path, tmp_path: Path) -> None:
-    said = last_word_before_a_silent_rank(capture, tmp_path / "run", asked=True, TERMINATION_TIMEOUT=3.0)
-    assert "asked to stop" in said
+    with silent_rank(capture, tmp_path / "run", TERMINATION_TIMEOUT=3.0) as first:
+        time.sleep(1.0)
+        first.send_signal(signal.SIGTERM)
+        assert "asked to stop" in last_word(first, tmp_path / "run")
 
 
-def test_training_is_saved_when_a_rank_stops_responding(capture: Path, tmp_path: Path) -> None:
-    said = last_word_before_a_silent_rank(
-        capture, tmp_path / "run", asked=False, COLLECTIVE_TIMEOUT=timedelta(seconds=15)
-    )
-    assert "does not respond" in said
+def test_training_is_saved_when_a_rank_stops_responding(waiting: tuple[ForkedRank, Path]) -> None:
+    assert "does not respond" in last_word(*waiting)
 
 
 @pytest.mark.parametrize(
