@@ -13,8 +13,9 @@ from tests.publish.test_web_page import CAMERAS
 from tests.training.tiny_capture import true_scene
 from tools.browser import Browser
 
+pytestmark = [needs_browser, pytest.mark.usefixtures("one_chromium")]
 
-@needs_browser
+
 def test_every_control_can_be_reached_on_a_narrow_screen_until_all_are_hidden(tmp_path: Path) -> None:
     write_page(tmp_path / "index.html", true_scene(), Planar(), CAMERAS, "Narrow")
     with Browser(tmp_path / "index.html", 320, 240) as browser:
@@ -32,7 +33,6 @@ def test_every_control_can_be_reached_on_a_narrow_screen_until_all_are_hidden(tm
         browser.wait(f"{shown} === 'hidden'", "controls that no key reaches")
 
 
-@needs_browser
 def test_a_window_wider_than_textures_shows_a_coarser_picture(tmp_path: Path) -> None:
     write_page(tmp_path / "index.html", true_scene(), Planar(), CAMERAS, "Wide")
     with Browser(tmp_path / "index.html", 8400, 100) as browser:
@@ -46,7 +46,6 @@ LOSE = "document.getElementById('view').getContext('webgl2').getExtension('WEBGL
 BEGIN = "await display.begin();"
 
 
-@needs_browser
 @pytest.mark.parametrize(
     ("broken", "by", "message"),
     [
@@ -65,7 +64,6 @@ def test_an_image_that_the_browser_cannot_show_is_reported(broken: str, by: str,
         assert message in browser.evaluate("document.getElementById('message').textContent")
 
 
-@needs_browser
 def test_preferences_of_the_reader_count(tmp_path: Path) -> None:
     write_page(tmp_path / "index.html", true_scene(), Planar(), CAMERAS, "Preferences")
     with Browser(tmp_path / "index.html", 320, 240) as browser:
@@ -77,7 +75,6 @@ def test_preferences_of_the_reader_count(tmp_path: Path) -> None:
         assert browser.evaluate(f"glassplat.then(({{ navigation, scene }}) => {{ {flown} }})") == [True, False]
 
 
-@needs_browser
 def test_the_page_works_in_a_srcdoc_frame(tmp_path: Path) -> None:
     page = script_json(page_text(true_scene(), Planar(), CAMERAS, "Framed"))
     frame = "<iframe allow=\"fullscreen 'none'\"></iframe>"

@@ -24,6 +24,7 @@ from tests.training.tiny_capture import tiny_capture, true_scene
 from tests.viewer.free_port import free_port
 from tools.browser import Browser
 
+pytestmark = pytest.mark.usefixtures("one_chromium")
 VIEWS = tiny_capture().train
 STATE = ViewerState(
     "tiny",
