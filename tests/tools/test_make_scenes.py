@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -128,17 +129,18 @@ def test_a_seed_is_a_scene() -> None:
 
 
 SEEDS = range(40)
+drawn = cache(draw_scene)
 
 
 def test_all_shapes_and_coatings_are_drawn() -> None:
-    bodies = [body for seed in SEEDS for body in draw_scene(seed).bodies]
+    bodies = [body for seed in SEEDS for body in drawn(seed).bodies]
     assert {body.shape for body in bodies} == set(SHAPES)
     assert {body.coating for body in bodies} == set(COATINGS)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_drawn_objects_stand_side_by_side(seed: int) -> None:
-    scene = draw_scene(seed)
+    scene = drawn(seed)
     points = [body.triangles.positions for body in scene.bodies]
     assert all(np.abs(positions).max() < 1.3 for positions in points) and scene.stand.radius < 1.3
     assert all(positions[:, 2].min() == pytest.approx(scene.stand.z) for positions in points)
@@ -150,7 +152,7 @@ def test_drawn_objects_stand_side_by_side(seed: int) -> None:
 
 
 def test_drawn_surroundings_can_be_rendered() -> None:
-    pictures = [make_environment(32, draw_scene(seed).surroundings) for seed in (1, 2)]
+    pictures = [make_environment(32, drawn(seed).surroundings) for seed in (1, 2)]
     assert all(picture.min() >= 0 and picture.max() <= 1.2 + 1e-6 for picture in pictures)
     assert np.abs(pictures[0] - pictures[1]).mean() > 0.05
     assert all(picture.std() > 0.05 for picture in pictures)
