@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
+from contextlib import suppress
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 pytest.importorskip("numba_cuda", reason="numba-cuda is not installed; `make setup` installs it")
 
+from glassplat.kernels.backend.cpu_cache import KernelFiles, load_data, store_data
 from glassplat.kernels.backend.devices import SIMULATED
-from tools.compile_kernels import CAPABILITIES, all_kernels, linked, ptx_of, read_report
+from tools import compile_kernels
+from tools.compile_kernels import CAPABILITIES, Resources, all_kernels, linked, ptx_of, read_report
 
 if SIMULATED:
     pytest.skip("the simulator has no compiler", allow_module_level=True)
@@ -20,20 +25,34 @@ MOST_REGISTERS = 255
 MOST_SHARED_BYTES = 48 * 1024
 KERNELS = all_kernels()
 NAMED = {kernel.name: kernel for kernel in KERNELS}
+TOOL = hashlib.sha256(Path(compile_kernels.__file__).read_bytes()).hexdigest()
 
 
 @cache
-def compiled(name: str) -> dict[tuple[int, int], str]:
-    """PTX of a kernel for each generation, cached because compiling takes seconds."""
-    return dict(zip(CAPABILITIES, ptx_of(NAMED[name]), strict=True))
+def compiled(name: str) -> dict[tuple[int, int], tuple[str, Resources]]:
+    """PTX and resources of a kernel for each generation.
+
+    Compiling takes seconds, so they are stored like machine code until the kernel, a function that it uses, a compiler
+    or the tool changes.
+    """
+    kernel = NAMED[name]
+    folders, key = KernelFiles(kernel.function), f"{kernel._images.key(CAPABILITIES)} {TOOL}"
+    files = folders.files(kernel.function)
+    found = load_data(files, key)
+    if found is None or found[0] != key:  # Another process may have written its own under the same name.
+        texts = zip(CAPABILITIES, ptx_of(kernel), strict=True)
+        found = key, {capability: (text, linked(text, capability)) for capability, text in texts}
+        with suppress(OSError):
+            folders.locator.ensure_cache_path()
+            store_data(files[0], key, found)
+    return found[1]
 
 
 @pytest.mark.filterwarnings("ignore::numba.core.errors.NumbaPerformanceWarning")
 @pytest.mark.parametrize("kernel", KERNELS, ids=lambda kernel: kernel.name)
 def test_the_kernel_compiles_and_fits(kernel) -> None:
-    for capability, text in compiled(kernel.name).items():
+    for capability, (text, found) in compiled(kernel.name).items():
         assert f".target sm_{capability[0]}{capability[1]}" in text
-        found = linked(text, capability)
         print(f"{kernel.name} sm_{capability[0]}{capability[1]}: {found}")
         assert 0 < found.registers <= MOST_REGISTERS
         assert found.spilled == 0
@@ -58,7 +77,7 @@ def test_the_linkers_report_is_read() -> None:
 
 @pytest.mark.filterwarnings("ignore::numba.core.errors.NumbaPerformanceWarning")
 def test_a_pair_is_emitted_without_float64() -> None:
-    emitted, counted = (compiled(name)[9, 0] for name in ("emit_tiles_int16", "count_tiles_float32"))
+    emitted, counted = (compiled(name)[9, 0][0] for name in ("emit_tiles_int16", "count_tiles_float32"))
     assert ".f64" not in emitted
     assert ".f64" in counted, "what is counted for each splat is, which shows that it would be seen"
 
@@ -104,7 +123,7 @@ def agree(pattern: Tree, other: Tree, known: dict[str, Tree]) -> bool:
 @pytest.mark.filterwarnings("ignore::numba.core.errors.NumbaPerformanceWarning")
 @pytest.mark.parametrize("other", ["composite_deviation_float32", "composite_backward_4_absgrad_float32"])
 def test_every_pass_computes_the_same_coverage(other: str) -> None:
-    first, second = (exponent_of(compiled(name)[9, 0]) for name in ("composite_forward_4_float32", other))
+    first, second = (exponent_of(compiled(name)[9, 0][0]) for name in ("composite_forward_4_float32", other))
     assert agree(first, second, {}), (first, second)
     # No contraction is left to the linker, which could fuse a product and a sum.
     assert str(first).count("fma.rn.f32") == 2
