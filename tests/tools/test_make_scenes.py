@@ -118,7 +118,7 @@ def test_a_star_shaped_surface_has_the_normals_of_its_equation() -> None:
 
 
 def drawn_values(scene: DrawnScene) -> list:
-    meshes = [body.triangles.positions.tolist() for body in scene.bodies]
+    meshes = [body.triangles.positions.tobytes() for body in scene.bodies]
     looks = [(body.shape, body.coating, body.tint, body.refraction) for body in scene.bodies]
     return [meshes, looks, scene.stand, scene.surroundings]
 
