@@ -18,6 +18,7 @@ import torch
 import glassplat
 from glassplat.captures.view import estimated_normals
 from glassplat.cli import main
+from tests.training.tiny_capture import write_tiny_capture
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 DEMO = Path(glassplat.__file__).parent / "demo_scene"
@@ -29,6 +30,7 @@ def said_by(example: str, *options: str, folder: Path) -> str:
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said):
         patch.chdir(folder)
         patch.setattr(sys, "argv", [str(path), *options])
+        patch.setattr("glassplat.training.actions.GRID_CELLS", 24)  # Most of the time of a short training.
         runpy.run_path(str(path), run_name="__main__")
     return said.getvalue()
 
@@ -128,7 +130,11 @@ def test_an_unavailable_network_ends_with_one_message(tmp_path: Path, monkeypatc
 
 
 def test_estimated_normals_are_written_where_they_are_read(tmp_path: Path) -> None:
-    capture, hub = shutil.copytree(DEMO, tmp_path / "capture"), tmp_path / "hub"
+    capture, hub = write_tiny_capture(tmp_path / "capture"), tmp_path / "hub"
+    for photograph in sorted((capture / "images").iterdir()):
+        photograph.rename(photograph.with_suffix(".jpg"))
+    cameras = capture / "transforms.json"
+    cameras.write_text(cameras.read_text().replace(".png", ".jpg"))
     hub.mkdir()
     (hub / "hubconf.py").write_text(HUB)
     options = ["--repository", str(hub), "--model", "slope", "--height", "64", "--width", "128", "--device", "cpu"]

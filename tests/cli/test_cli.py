@@ -23,6 +23,12 @@ PLANE_KEYS = {
 }  # fmt: skip
 
 
+@pytest.fixture(autouse=True)
+def coarse_grid(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the usual grid, the search for missing objects takes most of a training of a few steps."""
+    monkeypatch.setattr("glassplat.training.actions.GRID_CELLS", 24)
+
+
 def train(method: str, output: Path, *options: str) -> int:
     return main(["train", method, "--data", str(SCENE), "--output", str(output), "--downscale", "12", *options])
 
