@@ -86,8 +86,12 @@ class Ascending:
         return "in ascending order"
 
 
-Finite = Annotated[float, Range()]
-"""Any finite number."""
+LARGEST_COORDINATE = 1e12
+"""World units; squares of larger values, and sums of these, may exceed float32."""
+Coordinate = Annotated[float, Range(-LARGEST_COORDINATE, LARGEST_COORDINATE)]
+Length = Annotated[float, Range(above=0, high=LARGEST_COORDINATE)]
+Angle = Annotated[float, Range(-360, 360)]
+"""Degrees."""
 Positive = Annotated[float, Range(above=0)]
 NonNegative = Annotated[float, Range(0)]
 Share = Annotated[float, Range(0, 1)]
@@ -349,6 +353,6 @@ class Cleaning:
             removed; 0 keeps all.
     """
 
-    box: tuple[Finite, Finite, Finite, Finite, Finite, Finite] | None = None
+    box: tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate] | None = None
     isolated: NonNegative = 8.0
     oversized: NonNegative = 1.0

@@ -15,7 +15,7 @@ from glassplat.files.records import read_json, readable_name, wrap_read_errors
 from glassplat.files.writing import LOADABLE, check_folder, make_folder, real_path, scene_source, write_text
 from glassplat.kernels.backend.devices import DeviceName
 from glassplat.model.run_directory import RunDirectory
-from glassplat.options import Finite, PaneLabel, Share, Up
+from glassplat.options import Angle, Coordinate, PaneLabel, Share, Up
 
 if TYPE_CHECKING:
     from glassplat.captures.dataset import Dataset
@@ -154,8 +154,8 @@ class SceneEdits:
     remove_glass: bool = False
     as_mirror: tuple[PaneLabel, ...] = ()
     reflectance: dict[PaneLabel, Share] = field(default_factory=dict)
-    tilt: dict[PaneLabel, tuple[Finite, Finite]] = field(default_factory=dict)
-    shift: dict[PaneLabel, Finite] = field(default_factory=dict)
+    tilt: dict[PaneLabel, tuple[Angle, Angle]] = field(default_factory=dict)
+    shift: dict[PaneLabel, Coordinate] = field(default_factory=dict)
     surroundings: Path | None = None
 
     def apply(self, scene: Scene) -> Scene:

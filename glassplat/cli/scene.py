@@ -16,7 +16,7 @@ from glassplat.errors import InputError, convert_to_input_error
 from glassplat.files.writing import GAUSSFORGE_SUFFIXES, OUTPUT_FORMATS, check_folder
 from glassplat.kernels.backend.devices import DeviceName
 from glassplat.model.run_directory import RunDirectory
-from glassplat.options import Cleaning, Downscale, Finite, Positive, Range
+from glassplat.options import Cleaning, Coordinate, Downscale, Positive, Range
 from glassplat.publish.film import check_encoder
 from glassplat.viewer.render_loop import LOCALHOST, check_port
 
@@ -214,7 +214,7 @@ class Clean(Command):
     scene: tyro.conf.Positional[Path]
     output: Path
     rules: Annotated[Cleaning, tyro.conf.arg(name="")] = field(default_factory=Cleaning)
-    scale: tuple[Finite, Finite, Finite, Finite, Finite, Finite, Positive] | None = None
+    scale: tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Positive] | None = None
     file: Annotated[SplatFile, tyro.conf.arg(name="")] = field(default_factory=SplatFile)
     device: DeviceName = "auto"
 

@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from glassplat.options import is_finite, short_repr
+from glassplat.options import LARGEST_COORDINATE, is_finite, short_repr
 
 LARGEST_TEXT = 2**28
 """Maximum bytes of a text file; a list of a hundred thousand photographs with poses takes a quarter of it."""
@@ -124,8 +124,6 @@ def _too_deep(where: str) -> str:
 
 
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
-LARGEST_COORDINATE = 1e12
-"""World units; squares of larger values, and sums of these, may exceed float32."""
 
 
 class Field:

@@ -9,11 +9,11 @@ from typing import Annotated, Any, Literal
 from glassplat.methods.splat_recipe import Primitive
 from glassplat.options import (
     ESSENTIAL,
-    Finite,
+    Coordinate,
     Internal,
+    Length,
     NonNegative,
     OpenShare,
-    Positive,
     PositiveCount,
     Share,
 )
@@ -75,7 +75,7 @@ class GlossyOptions(MethodRecipe):
     first_texels: Texels = 16
     first_strength: Internal[OpenShare] = 1e-3
     search: Internal[MirrorSearch] = field(default_factory=MirrorSearch)
-    region: Annotated[tuple[Finite, Finite, Finite, Positive] | None, ESSENTIAL] = None
+    region: Annotated[tuple[Coordinate, Coordinate, Coordinate, Length] | None, ESSENTIAL] = None
     find_region: Internal[bool] = True
     outside_weight: NonNegative = 0.4
     strength_weight: NonNegative = 0.005

@@ -52,6 +52,7 @@ WRONG = [
     ["deferred", "--texels", "0"],
     ["deferred", "--texels", LARGE],
     ["deferred", "--region", "0", "0", "0", "-1"],
+    ["deferred", "--region", "0", "0", "0", "1e13"],
     ["deferred", "--schedule.stop", "0.01"],
 ]
 
@@ -107,6 +108,8 @@ def test_fields_set_only_in_python_are_checked(recipe: Any, named: str) -> None:
         ["demo", "--seed", "-1"],
         ["render", "run", "--output", "y", "--shift", "1", "nan"],
         ["render", "run", "--output", "y", "--tilt", "1", "inf", "0"],
+        ["export", "run", "--output", "y", "--shift", "1", "1e13"],
+        ["export", "run", "--output", "y", "--tilt", "1", "1e300", "0"],
         ["render", "run", "--output", "y", "--reflectance", "1", "2"],
     ],
     ids=" ".join,
