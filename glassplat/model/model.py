@@ -487,7 +487,7 @@ def write_as_run(folder: Path, model: Model, source: Path | None) -> None:
     """
     writing.make_folder(folder)
     directory = RunDirectory(folder)
-    directory.export(model.scene, step=0)
+    directory.export(model.scene, max({} if source is None else RunDirectory(source).scene_folders(), default=0))
     write_cameras(folder / CAMERAS, model.cameras.items())
     if source is not None and (source / SETTINGS_FILE).is_file():
         writing.write_text(folder / SETTINGS_FILE, read_text(source / SETTINGS_FILE))

@@ -279,6 +279,11 @@ class RunDirectory:
 
     def settings(self) -> RunSettings:
         """The recorded settings."""
+        if self.import_record.is_file():
+            raise InputError(
+                f"{self.path} is a scene without a capture, as `clean --scale` writes it; expected a run with its "
+                "photographs: give the one that the scene was made from"
+            )
         path = self.path / "settings.json"
         with convert_to_input_error():
             written = parse_json(self._read_file(path.name), str(path))
@@ -360,12 +365,16 @@ class RunDirectory:
             write_equirect(folder / "environment.png", panorama)
         return folder
 
+    def scene_folders(self) -> dict[int, Path]:
+        """The folders of saved scenes, by iteration."""
+        named = {ITERATION_FOLDER.fullmatch(folder.name): folder for folder in self.path.glob("point_cloud/*")}
+        return {int(match[1]): folder for match, folder in named.items() if match and folder.is_dir()}
+
     def latest_scene(self) -> tuple[Scene, int]:
         """The scene of the last saved iteration, and that iteration."""
         from glassplat.files.scene_folder import read_scene
 
-        named = {ITERATION_FOLDER.fullmatch(folder.name): folder for folder in self.path.glob("point_cloud/*")}
-        folders = {int(match[1]): folder for match, folder in named.items() if match and folder.is_dir()}
+        folders = self.scene_folders()
         if not folders:
             raise InputError(
                 f"{self.path} holds no point_cloud/iteration_N; expected a finished run. Train first, or --resume it"

@@ -13,6 +13,7 @@ from glassplat.cli.main import main
 from glassplat.errors import InputError
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.model.model import Model
+from glassplat.model.run_directory import RunDirectory
 from glassplat.options import Cleaning
 from glassplat.publish.cleaning import Floaters, clean_scene
 from glassplat.scene.gaussians import Gaussians
@@ -106,6 +107,7 @@ def test_a_box_that_takes_out_most_of_the_scene_is_warned_of(
     count = int((along > along.quantile(kept)).sum())
     said = f"warning: --box removes {count} Gaussians, more than half"
     assert (said in " ".join(capsys.readouterr().out.split())) == warns
+    assert RunDirectory(tmp_path / "clean").latest_scene()[1] == RunDirectory(run).latest_scene()[1] == 1
 
 
 def test_the_command_writes_another_scene_in_metres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -121,6 +123,8 @@ def test_the_command_writes_another_scene_in_metres(tmp_path: Path, capsys: pyte
     torch.testing.assert_close(new.scene.planes.centers, old.scene.planes.centers / 2)
     torch.testing.assert_close(new.image("2.png"), old.image("2.png"), atol=2e-4, rtol=0)
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+    assert main(["eval", str(output), "--data", str(tmp_path / "capture")]) == 2
+    assert "is a scene without a capture" in " ".join(capsys.readouterr().err.split())
     assert main(["clean", str(run), "--output", str(run)]) == 2
     assert main(["clean", str(run), "--output", str(tmp_path / "no"), "--scale", *"1231234"]) == 2
     assert "expected two different points" in " ".join(capsys.readouterr().err.split())
