@@ -202,7 +202,10 @@ def spz_bytes(gaussians: Gaussians, version: int = 3) -> bytes:
         raise ValueError("Gaussians without colours cannot be written as SPZ; expected f_dc_0 to f_dc_2")
     broken = [name for name, tensor in gaussians.tensors().items() if not bool(tensor.isfinite().all())]
     if broken:
-        raise ValueError(f"Gaussians whose {', '.join(broken)} are not all finite cannot be written as SPZ")
+        raise ValueError(
+            f"Gaussians whose {', '.join(broken)} are not all finite cannot be written as SPZ; remove them with "
+            "`glassplat clean`"
+        )
     farthest = float(gaussians.means.abs().max()) if len(gaussians) else 0.0
     if farthest > LARGEST_POSITION:
         raise ValueError(

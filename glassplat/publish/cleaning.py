@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -34,12 +35,18 @@ class Floaters:
         from scipy.spatial import cKDTree  # Slow to import, and rarely needed.
 
         self._gaussians = gaussians
-        means = gaussians.means.detach().double().cpu().numpy()
+        rows = [tensor.detach()[:, None].flatten(1) for tensor in gaussians.tensors().values()]
+        finite = torch.stack([row.isfinite().all(dim=1) for row in rows]).all(dim=0).cpu()
+        means = gaussians.means.detach().double().cpu()[finite].numpy()
         count = min(NEIGHBOURS, len(means) - 1)
-        apart = cKDTree(means).query(means, k=count + 1, workers=-1)[0].reshape(len(means), -1)[:, -1]
-        near = cKDTree(cameras.detach().double().cpu().numpy()).query(means)[0]
-        self._neighbour_distances, self._camera_distances = torch.from_numpy(apart), torch.from_numpy(near)
-        self._largest_scales = gaussians.log_scales.detach().double().cpu().amax(dim=1).exp()
+        # Gaussians that are not finite count as isolated.
+        distances = torch.full((2, len(gaussians)), torch.inf, dtype=torch.float64)
+        if len(means):
+            apart = cKDTree(means).query(means, k=count + 1, workers=-1)[0].reshape(len(means), -1)[:, -1]
+            near = cKDTree(cameras.detach().double().cpu().numpy()).query(means)[0]
+            distances[:, finite] = torch.from_numpy(np.stack([apart, near]))
+        self._neighbour_distances, self._camera_distances = distances
+        self._largest_scales = gaussians.log_scales.detach().double().cpu().amax(dim=1).exp().where(finite, 0)
 
     def masks(self, cleaning: Cleaning) -> dict[str, Tensor]:
         """[N] bool for each rule: the Gaussians it removes."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 
 import pytest
@@ -49,6 +50,9 @@ def with_one(gaussians: Gaussians, mean: tuple[float, float, float], deviation: 
     [
         ((0.0, 0.0, 1.0), 0.1, "isolated"),
         ((0.0, 0.0, 0.5), 0.8, "oversized"),
+        ((0.0, math.nan, 1.0), 0.1, "isolated"),
+        ((0.0, 0.0, 3.0), math.nan, "isolated"),
+        ((0.0, 0.0, 3.0), math.inf, "isolated"),
     ],
 )
 def test_the_rules_find_the_floater_and_not_the_wall(mean, deviation: float, rule: str) -> None:
