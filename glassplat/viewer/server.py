@@ -157,6 +157,7 @@ class Client:
         self.keyframes.lay_out(self.move_camera, None if state.writer is None else self.save_keyframes)
         if state.writer is not None:
             self._add_save_controls(f"{state.title}-edited")
+        self._photographs.show_nearest(self._nearest)
 
     def measure(self, direction: NDArray[np.float64]) -> None:
         """Adds the surface point visible in a direction [3] (world axes) to the measurement.
