@@ -338,6 +338,13 @@ class View:
         return None if self.read_pane_labels is None else self.memory.get(PixelSource(self.read_pane_labels))
 
     @property
+    def mask_paths(self) -> list[Path]:
+        """Files of its masks, of panes and of ignored pixels, apart from the photograph."""
+        readers = (self.read_pane_labels, *getattr(self.read_ignored, "masks", ()))
+        paths = [reader.mask.path for reader in readers if isinstance(reader, MaskFile)]
+        return [path for path in paths if path != self.image_path]
+
+    @property
     def ignored(self) -> Tensor | None:
         """[H, W] bool, the pixels excluded from training and evaluation; None if there are none."""
         return None if self.read_ignored is None else self.memory.get(PixelSource(self.read_ignored, is_mask=True))

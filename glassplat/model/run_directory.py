@@ -99,6 +99,7 @@ class RunSettings:
         device: training device.
         mask_polarity: value of black-and-white masks that marks panes.
         photographs: the checksum of the photographs with which the run began; empty if unknown.
+        masks: the same of the masks.
     """
 
     data: str
@@ -108,6 +109,7 @@ class RunSettings:
     device: str = "cpu"
     mask_polarity: Polarity = "auto"
     photographs: str = ""
+    masks: str = ""
 
 
 def photographs_checksum(dataset: Dataset) -> str:
@@ -115,6 +117,12 @@ def photographs_checksum(dataset: Dataset) -> str:
     paths = {view.name: view.image_path for view in (*dataset.train, *dataset.test)}
     sizes = [(name, path.stat().st_size) for name, path in sorted(paths.items()) if path.is_file()]
     return f"{zlib.crc32(repr(sizes).encode()):08x}" if sizes else ""
+
+
+def masks_checksum(dataset: Dataset) -> str:
+    """A checksum of the masks' files; that of no masks is not empty."""
+    paths = sorted({(view.name, path) for view in (*dataset.train, *dataset.test) for path in view.mask_paths})
+    return f"{zlib.crc32(repr([(name, zlib.crc32(path.read_bytes())) for name, path in paths]).encode()):08x}"
 
 
 EVALUATION_FILES = ("per_view.json", "sheets", "uses.png", "index.html")
@@ -233,7 +241,8 @@ class RunDirectory:
 
         make_folder(self.path)
         write_text(self.path / "recipe.json", recipe_to_json(recipe) + "\n")
-        self.write_settings(dataclasses.replace(settings, photographs=photographs_checksum(dataset)))
+        photographs, masks = photographs_checksum(dataset), masks_checksum(dataset)
+        self.write_settings(dataclasses.replace(settings, photographs=photographs, masks=masks))
         write_cameras(self.path / "cameras.json", [(v.name, v.camera) for v in (*dataset.train, *dataset.test)])
 
     def write_settings(self, settings: RunSettings) -> None:

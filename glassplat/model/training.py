@@ -306,7 +306,8 @@ def resumed_state(
     written = directory.settings()
     has_moved = written.data != settings.data and directory.has_cameras_of(dataset)
     data = settings.data if has_moved else written.data
-    recorded = replace(written, device=settings.device, data=data, photographs=settings.photographs)
+    photographs, masks = settings.photographs, settings.masks
+    recorded = replace(written, device=settings.device, data=data, photographs=photographs, masks=masks)
     # Compared as written: `recipe()` gives what an earlier version did not have its present default.
     if recorded != settings or directory.recipe_as_written() != json.loads(recipe_to_json(recipe)):
         changes = option_changes(vars(recorded), vars(settings)) + recipe_changes(directory, recipe)
@@ -315,12 +316,17 @@ def resumed_state(
             "Repeat the original options, with the version of glassplat that began it, or choose another --output"
         )
     directory.check_photographs(dataset)
-    if written.photographs not in ("", run_directory.photographs_checksum(dataset)):
-        log.warning(
-            "photographs of %s have changed since this run began (their files have other sizes); if they look "
-            "different, train again",
-            dataset.root,
-        )
+    for what, begun, now, differs in (
+        ("photographs", written.photographs, run_directory.photographs_checksum(dataset), "have other sizes"),
+        ("masks", written.masks, run_directory.masks_checksum(dataset), "differ"),
+    ):
+        if begun not in ("", now):
+            log.warning(
+                "%s of %s have changed since this run began (their files %s); if they look different, train again",
+                what,
+                dataset.root,
+                differs,
+            )
     state = load_checkpoint(
         directory.checkpoint, method=recipe.method, seed=settings.seed, iterations=settings.iterations
     )

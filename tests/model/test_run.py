@@ -471,18 +471,21 @@ def test_a_run_resumes_with_its_moved_capture_only(tmp_path: Path) -> None:
     assert directory.settings() == moved
 
 
-def test_changed_photographs_are_warned_about_on_resuming(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize("what", ["photographs", "masks"])
+def test_changed_files_are_warned_about_on_resuming(
+    what: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     capture, directory = write_tiny_capture(tmp_path / "capture"), RunDirectory(tmp_path / "run")
     settings = replace(SETTINGS, data=str(capture))
     for change in (False, True):
         if change:
-            first = capture / "images" / "0.png"
-            first.write_bytes((capture / "images" / "1.png").read_bytes() + b"0")
+            folder = capture / ("images" if what == "photographs" else "panes")
+            (folder / "0.png").write_bytes((folder / "1.png").read_bytes() + b"0")
         else:
             Run(RECIPE, settings, directory, load_dataset(capture), resume=False).run_to_end(lambda message: None)
         Run(RECIPE, settings, directory, load_dataset(capture), resume=True).run_to_end(lambda message: None)
-        assert ("have changed since this run began" in caplog.text) == change
-        settings = directory.settings()  # Has the checksum.
+        assert [record.args[0] for record in caplog.records if "have changed since" in record.msg] == [what] * change
+        settings = directory.settings()  # Has the checksums.
 
 
 def test_resuming_names_an_option_that_the_earlier_version_lacked(tmp_path: Path) -> None:
