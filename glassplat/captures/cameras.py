@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -212,6 +213,19 @@ def area_resize(pixels: NDArray[np.uint8], width: int, height: int) -> NDArray[n
     if pixels.shape[:2] == (height, width):
         return pixels
     return np.clip(np.round(resize_by_area(pixels, width, height)), 0, 255).astype(np.uint8)
+
+
+def check_proportions(path: Path, size: tuple[int, int], photograph: tuple[int, int]) -> None:
+    """Check that a file is of the size of an undistorted photograph (width, height), or of a multiple of it.
+
+    Raises:
+        InputError: its proportions are others, beyond rounding.
+    """
+    if abs(size[0] * photograph[1] - size[1] * photograph[0]) > max(*size, *photograph):
+        raise InputError(
+            f"{path} is {size[0]}x{size[1]} pixels, its photograph {photograph[0]}x{photograph[1]} here, without "
+            "the distortion of its lens; expected the same proportions, so make it again at the photograph's size"
+        )
 
 
 def nearest_resize(labels: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:

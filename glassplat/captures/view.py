@@ -583,11 +583,7 @@ def read_normals_file(path: Path, camera: Camera) -> Tensor:
     with convert_to_input_error():
         vectors = _read_vectors(path)
     height, width = vectors.shape[:2]
-    if abs(width * camera.height - height * camera.width) > max(width, height, camera.width, camera.height):
-        raise InputError(
-            f"{path} is {width}x{height} pixels, its photograph {camera.width}x{camera.height} here, without "
-            "the distortion of its lens; expected the same proportions"
-        )
+    cameras.check_proportions(path, (width, height), (camera.width, camera.height))
     batch = torch.from_numpy(vectors).permute(2, 0, 1)[None]
     small = torch.nn.functional.interpolate(batch, (camera.height, camera.width), mode="area")[0].permute(1, 2, 0)
     known = small.norm(dim=-1, keepdim=True) > LEAST_LENGTH

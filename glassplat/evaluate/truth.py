@@ -24,7 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.captures.cameras import LEAST_SHARE, area_resize
+from glassplat.captures.cameras import LEAST_SHARE, area_resize, check_proportions
 from glassplat.captures.view import View
 from glassplat.errors import InputError, convert_to_input_error
 from glassplat.files.images import image_size, read_colors, read_image, read_image_float, resize_by_area
@@ -91,7 +91,7 @@ class GroundTruth:
             None if the folder has no files for this view.
 
         Raises:
-            InputError: only some of the view's files exist, or a file is broken.
+            InputError: only some of the view's files exist, or a file is broken or has other proportions.
         """
         in_folder = self._paths(Path(image_name).with_suffix(""))
         without_folder = self._paths(Path(Path(image_name).stem))
@@ -105,6 +105,8 @@ class GroundTruth:
             )
         size = (width, height)
         with convert_to_input_error():
+            for path in paths.values():
+                check_proportions(path, image_size(path), size)
             return TrueView(
                 transmission=torch.from_numpy(_resized_color(read_colors(paths["transmission"]), size)),
                 reflection=torch.from_numpy(_resized_color(read_colors(paths["reflection"]), size)),

@@ -83,6 +83,14 @@ def test_a_broken_layer_is_named(tmp_path: Path) -> None:
         truth.view("0008.jpg", 6, 2)
 
 
+def test_a_layer_of_other_proportions_is_refused(tmp_path: Path) -> None:
+    write_view(tmp_path, "0008", np.ones((30, 40), np.uint8))
+    truth = load_truth(tmp_path)
+    assert truth is not None and truth.view("0008.jpg", 21, 16) is not None
+    with pytest.raises(InputError, match=r"0008\.png is 40x30 pixels, its photograph 40x20 here.*expected the same"):
+        truth.view("0008.jpg", 40, 20)
+
+
 def test_a_layer_may_be_grey(tmp_path: Path) -> None:
     write_view(tmp_path, "0008", LABELS)
     Image.fromarray(np.full((2, 6), 30, np.uint8)).save(tmp_path / "refl" / "0008.png")
