@@ -70,10 +70,12 @@ def test_invalid_edits_write_nothing(
 def test_every_layer_that_is_listed_can_be_rendered(method: str, tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", planar=method == "planar")
     layers = load(run, device="cpu").layers
+    assert main(["render", str(run), "--output", str(tmp_path / "out")]) == 0
+    (tmp_path / "out" / "rgb" / "0.npy").symlink_to(tmp_path / "elsewhere")  # No layer is written there.
     assert len(layers) == (9 if method == "planar" else 4)
     assert main(["render", str(run), "--output", str(tmp_path / "out"), "--layers", *layers]) == 0
     assert sorted(path.name for path in (tmp_path / "out").iterdir() if path.is_dir()) == sorted(layers)
-    arrays = {path.parent.name: np.load(path) for path in (tmp_path / "out").glob("*/0.npy")}
+    arrays = {path.parent.name: np.load(path) for path in (tmp_path / "out").glob("*/0.npy") if path.is_file()}
     frame = load(run, device="cpu").render("0.png", layers=["depth", "normal"])
     assert sorted(arrays) == ["depth", "normal"] and arrays["depth"].max() > 1
     assert all(np.array_equal(array, frame.layers[layer].numpy()) for layer, array in arrays.items())
