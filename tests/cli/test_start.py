@@ -110,6 +110,7 @@ REFUSED = {
     "prepare none --output new": "no folder or video none",
     "annotate none": "no folder none",
     "train splat --data none --output new": "no folder none",
+    "train splat --data splats.ply --output new": "splats.ply is a file; expected the folder of a capture",
     "train splat --data=capture --data=none --output new": "no folder none",
     "train planar --data capture --output trained": "trained already holds a run",
     "train planar --data capture --output new --resume": "nothing was saved yet in new",
