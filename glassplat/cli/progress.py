@@ -12,7 +12,7 @@ from typing import Any
 from rich import progress
 from rich.console import Console
 
-from glassplat.cli.console import print_line, print_warning
+from glassplat.cli.console import count_noun, print_line, print_warning
 from glassplat.prepare.photographs import Note
 from glassplat.training import messages
 
@@ -170,8 +170,12 @@ class TrainingProgress:
         elif isinstance(message, messages.StageEntered):
             state.stage = message.stage
             self._speed.enter_stage()
-            counts = ", ".join(f"{number} {name}" for name, number in message.counts.items())
-            print_line(self._console, f"step {message.step}: stage {message.stage}, {counts}")
+            counts = [
+                count_noun(number, "pane" if part == "planes" else f"{part} Gaussian")
+                for part, number in message.counts.items()
+                if number
+            ]
+            print_line(self._console, f"step {message.step}: stage {', '.join([message.stage, *counts])}")
         elif isinstance(message, messages.ActionDone) and not message.action.startswith(SILENT_ACTIONS):
             print_line(self._console, f"step {message.step}: {message.action}")
         elif isinstance(message, messages.Working):

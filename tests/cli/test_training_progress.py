@@ -181,7 +181,7 @@ def test_events_are_lines_but_for_frequent_ones_and_those_with_a_log_line() -> N
     lines = lines_of([RunBegun(0, 1000, anew=True), StageEntered(0, "1 [stage]", COUNTS), *actions], 0.0)
     assert lines == [
         "warning: replacing an earlier run in this folder, which was never saved",
-        "step 0: stage 1 [stage], 1000 primary, 20 glass, 1 planes",
+        "step 0: stage 1 [stage], 1000 primary Gaussians, 20 glass Gaussians, 1 pane",
         "step 5: reset opacity",
     ]
 
