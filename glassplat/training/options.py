@@ -196,7 +196,8 @@ class DefaultDensify:
         cap: maximum number of Gaussians, including the initial ones; by default `--densify.per-pixel` decides. 0 adds
             none.
         per_pixel: maximum number of Gaussians per pixel of all training photographs, a limit for captures whose
-            photographs contradict each other (moving cars, leaves); 0 sets no limit.
+            photographs contradict each other (moving cars, leaves); 0 sets no limit. Unlike `cap`, it limits
+            densification only: searches for missing objects and unseen reflections add up to 5 % each.
         least_contribution: contribution in pixels to every training view, directly and mirrored, below which Gaussians
             are removed; 0 keeps them.
         contribution_moments: shares of the run at which they are: when the set has stopped growing, when `planar`
@@ -238,7 +239,8 @@ class McmcDensify:
     """Options for relocating, adding and moving Gaussians (Kheradmand et al. 2024).
 
     Attributes:
-        cap: maximum number of Gaussians, including the initial ones; by default half the pixels of a photograph.
+        cap: maximum number of Gaussians, including the initial ones; by default half the pixels of a photograph,
+            beyond which searches for missing objects and unseen reflections add up to 5 % each.
         interval: steps between relocations.
         start: share of the run after which relocation begins.
         stop: share of the run after which relocation and growth end; the noise goes on.
