@@ -124,6 +124,10 @@ class Scene:
     exposures: Exposures = field(default_factory=Exposures.neutral)
     poses: PoseCorrections = field(default_factory=PoseCorrections.neutral)
 
+    def __post_init__(self) -> None:
+        if not 0 < self.extent < math.inf:
+            raise ValueError(f"the extent is {self.extent}; expected the radius of the capture, a length above 0")
+
     def __repr__(self) -> str:
         sets = (f"{name}={gaussians}" for name, gaussians in self.gaussian_sets().items())
         return f"Scene({', '.join(sets)}, planes={self.planes}, extent={self.extent:.4g})"

@@ -13,11 +13,12 @@ from torch import Tensor
 
 from glassplat.captures.dataset import Dataset, with_corrected_cameras
 from glassplat.captures.view import View
+from glassplat.errors import join_names
 from glassplat.kernels.screen_statistics import Views
 from glassplat.render.frame import Frame, ScreenPass, SpacePass
 from glassplat.scene.camera import constant, to_device
-from glassplat.scene.panes import nearest_pixels
-from glassplat.scene.scene import Scene
+from glassplat.scene.panes import PANE_TENSORS, nearest_pixels
+from glassplat.scene.scene import PARTS, Scene
 from glassplat.training.densify import ScreenStatistics
 from glassplat.training.messages import ActionDone, Message, StageEntered, StepDone
 from glassplat.training.ranks import Ranks
@@ -107,6 +108,7 @@ def train(
                 state.records[ENTERED_STAGE] = start
                 state.is_whole = True
                 ranks.synchronise(state)
+            check_rates(stage, state.scene)
             yield StageEntered(state.step, stage.name, counts_of(state.scene))
         while state.step < end and not (stage.until is not None and stage.until(state)):
             upcoming = scheduled_views(dataset, state, (1 + dataset.memory.ahead) * ranks.batch)
@@ -365,6 +367,19 @@ def statistics_of(
     if part not in statistics:
         statistics[part] = ScreenStatistics.zeros(count, device=device)
     return statistics[part]
+
+
+def check_rates(stage: Stage, scene: Scene) -> None:
+    """Check that a stage has learning rates of parameters of the scene only; a part that it lacks may appear later.
+
+    Raises:
+        ValueError: a name is unknown, and what it is meant for would not be learned.
+    """
+    known = [*scene.parameters(), *(f"planes.{name}" for name in PANE_TENSORS)]
+    absent = set(PARTS) - {name.partition(".")[0] for name in known}
+    wrong = [name for name in stage.rates if name not in known and name.partition(".")[0] not in absent]
+    if wrong:
+        raise ValueError(f"stage {stage.name} has rates of {join_names(wrong)}; expected some of {', '.join(known)}")
 
 
 def counts_of(scene: Scene) -> dict[str, int]:

@@ -236,3 +236,9 @@ def test_a_number_is_read_from_a_tensor_once() -> None:
 def test_only_sets_of_gaussians_are_replaced_by_gaussians(name: str) -> None:
     with pytest.raises(ValueError, match=f"unknown set of Gaussians '{name}'; expected one of .*'primary'"):
         showcase().with_gaussians(name, showcase().glass)
+
+
+@pytest.mark.parametrize("extent", [0.0, -1.0, float("nan"), float("inf")])
+def test_an_extent_is_a_length(extent: float) -> None:
+    with pytest.raises(ValueError, match=f"the extent is {extent}; expected the radius of the capture"):
+        replace(two_panes(), extent=extent)

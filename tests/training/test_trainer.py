@@ -21,6 +21,7 @@ from glassplat.training.densify import ScreenStatistics, gaussians_from_points
 from glassplat.training.loop import TrainingDivergedError, collect_statistics, differentiate, train
 from glassplat.training.losses import LossTerm, PhotometricLoss
 from glassplat.training.messages import ActionDone, StageEntered, StepDone
+from glassplat.training.options import Rate
 from glassplat.training.stage import Stage, TrainState
 from tests.training.progress_of import finished
 from tests.training.tiny_capture import place_true_planes, tiny_capture, true_scene
@@ -237,3 +238,10 @@ def test_plane_entry_needs_annotated_views() -> None:
     setup = PaneSetup(PlanarRecipe().plane_fit, 10, 0)
     with pytest.raises(ValueError, match=r"pane 1 is marked only in 0\.png, which are test photographs"):
         finished(setup(TrainState(Scene(gaussians_from_points(dataset.points), dataset.extent), 0), bare))
+
+
+@pytest.mark.parametrize("name", ["primary.mean", "primry.means"])
+def test_a_rate_of_no_parameter_is_refused(name: str) -> None:
+    stages = tuple(replace(s, rates={**s.rates, name: Rate(1.0)}) for s in SplatRecipe().stages(seed=0))
+    with pytest.raises(ValueError, match=f"has rates of {name}; expected some of primary.means, "):
+        run(fresh_state(), stages, 5)
