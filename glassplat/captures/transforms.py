@@ -174,13 +174,21 @@ FILE: dict[str, records.Field] = {
 """Fields read in addition to the lens (`LENS`); other fields of the file are ignored."""
 
 
+def _without_nulls(value: Any) -> Any:
+    """An object without its optional fields that are null, as some programs write what is absent."""
+    if not isinstance(value, dict):
+        return value
+    return {key: one for key, one in value.items() if one is not None or key in ("file_path", "transform_matrix")}
+
+
 def read_settings(path: Path) -> dict[str, Any]:
     """Contents of one file; checks that there are frames, each with a photograph and a matrix."""
     with convert_to_input_error():
-        settings = records.read_json(path)
+        settings = _without_nulls(records.read_json(path))
         frames = settings.get("frames") if isinstance(settings, dict) else None
         if not isinstance(frames, list) or not frames:
             raise ValueError(f"{path} lists no frames; expected a list `frames` of at least one photograph")
+        frames = settings["frames"] = [_without_nulls(frame) for frame in frames]
         for index, frame in enumerate(frames, start=1):
             records.check_fields(frame, FRAME, f"frame {index} of {path}")
         records.check_fields(settings, FILE, str(path))

@@ -146,6 +146,14 @@ def test_split_that_names_no_frame(capture) -> None:
         load(capture, train_filenames=["nothing.png"], test_filenames=["images/0001.png"])
 
 
+def test_null_is_an_absent_field(capture) -> None:
+    frames = [frame | {"mask_path": None, "fl_x": None, "camera_angle_x": None} for frame in capture.frames()]
+    nulls = dict.fromkeys(("applied_transform", "ply_file_path", "train_filenames", "k1", "distortion_params"))
+    found, expected = load(capture, frames=frames, **nulls), load(capture)
+    assert found is not None and expected is not None
+    assert [shot.lens for shot in found.shots] == [shot.lens for shot in expected.shots]
+
+
 @pytest.mark.parametrize("prior", ["depth_file_path", "normal_file_path"])
 def test_priors_that_are_not_used_are_named(capture, prior: str) -> None:
     frames = capture.frames()
