@@ -74,6 +74,7 @@ class Ranks:
         self.batch = count if batch is None else batch
         self.is_stop_requested: Callable[[], bool] = lambda: False
         self._is_ending = False
+        self._parent = os.getppid()
         self._thread = ThreadPoolExecutor(1)
 
     @property
@@ -86,6 +87,10 @@ class Ranks:
         """Return whether any process was asked to end; the same on all ranks after an exchange."""
         return self.is_stop_requested() if self.count == 1 else self._is_ending
 
+    def _is_asked_to_end(self) -> bool:
+        """Return whether this process was asked to end, or `torchrun`, its parent, has ended without asking it."""
+        return self.is_stop_requested() or os.getppid() != self._parent
+
     def exchange(self, value: Any = None) -> list[Any]:
         """The values of all ranks, in their order.
 
@@ -94,7 +99,7 @@ class Ranks:
         """
         if self.count == 1:
             return [value]
-        reports = self._gather(RankReport(value, self.is_stop_requested()))
+        reports = self._gather(RankReport(value, self._is_asked_to_end()))
         failed = next((rank for rank, one in enumerate(reports) if one.failure is not None), None)
         if failed is not None:
             _block_termination()
@@ -120,7 +125,7 @@ class Ranks:
         requested_at = None
         future = self._thread.submit(call)
         while not wait([future], TERMINATION_TIMEOUT / 10).done:
-            if requested_at is None and self.is_stop_requested():
+            if requested_at is None and self._is_asked_to_end():
                 requested_at = time.monotonic()
             if requested_at is not None and time.monotonic() - requested_at > TERMINATION_TIMEOUT:
                 raise RuntimeError("no answer since this process was asked to stop")

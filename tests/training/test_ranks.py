@@ -22,7 +22,7 @@ from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.training.actions import PruneIdle
 from glassplat.training.checkpoint import load_checkpoint
 from glassplat.training.messages import ActionDone, Message, StepDone, Working
-from glassplat.training.ranks import COLLECTIVE_TIMEOUT, Ranks
+from glassplat.training.ranks import COLLECTIVE_TIMEOUT, RankReport, Ranks
 from glassplat.training.stage import Clock, Optimizer, TrainState
 from tests.training.rank_process import (
     LONGEST,
@@ -175,6 +175,16 @@ def actions_taken(messages: Sequence[Message]) -> Iterator[str]:
             yield message.what
         elif isinstance(message, ActionDone) and message.action == "grow SH":
             yield message.action
+
+
+def test_ranks_end_once_torchrun_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    ranks = Ranks(0, 2)
+    monkeypatch.setattr(ranks, "_gather", lambda report: [report, RankReport()])
+    ranks.exchange()
+    assert not ranks.is_ending
+    monkeypatch.setattr(os, "getppid", lambda: 1)  # As of an orphan.
+    ranks.exchange()
+    assert ranks.is_ending
 
 
 def test_learning_rates_grow_by_the_root_of_the_views_and_pauses_count_views() -> None:
