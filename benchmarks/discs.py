@@ -5,6 +5,7 @@ CPU time, the minimum over several rounds in which both alternate, so that other
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -102,5 +103,6 @@ def disc_costs() -> Table:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     torch.set_num_threads(1)
     print(disc_costs().markdown())

@@ -142,6 +142,15 @@ def test_tools_and_benchmarks_take_every_option_shown(module: str, option: str) 
     assert option in source or option.removeprefix("--").replace("-", "_") in source
 
 
+def test_every_command_of_the_repository_explains_itself() -> None:
+    sources = {
+        path: path.read_text(encoding="utf-8") for name in ("tools", "benchmarks") for path in ROOT.glob(f"{name}/*.py")
+    }
+    commands = [path.name for path, source in sources.items() if '__name__ == "__main__"' in source]
+    silent = [path.name for path, source in sources.items() if not re.search(r"\.parse_args\(|tyro\.cli\(", source)]
+    assert len(commands) > 20 and not set(commands) & set(silent)
+
+
 LAB_BOOK = ROOT / "lab"
 MOST_LAB_BOOK_LINES = 800
 

@@ -9,6 +9,7 @@ word such as "Whether ..." or "What ...".
 
 from __future__ import annotations
 
+import argparse
 import ast
 import re
 import sys
@@ -135,6 +136,7 @@ def riddles(path: Path) -> Iterator[str]:
 
 def main() -> None:
     """Print the measurements and all complaints; exit with 1 if there are any."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     paths = sorted((ROOT / "docs").glob("**/*.md"))
     pages = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in paths}

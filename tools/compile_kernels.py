@@ -6,6 +6,7 @@ reports registers, spills and shared memory. Neither needs a driver.
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import inspect
 import pkgutil
@@ -139,6 +140,7 @@ def table(kernels: Sequence[Any]) -> list[str]:
 
 def main() -> int:
     """Prints the table of all kernels."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     for line in table(all_kernels()):
         print(line)
     return 0

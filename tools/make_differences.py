@@ -8,6 +8,7 @@ the pages are up to date and that every difference has a reason.
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -168,6 +169,7 @@ def with_table(page: str, method: str) -> str:
 
 def main() -> None:
     """Write the tables of all methods."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     for method in RECIPES:
         page = DOCS / f"{method}.md"
         page.write_text(with_table(page.read_text(encoding="utf-8"), method), encoding="utf-8")

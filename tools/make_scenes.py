@@ -363,7 +363,10 @@ def main(arguments: Arguments) -> None:
     if existing:
         raise FileExistsError(f"{', '.join(existing)} exist; expected new folders, so remove them first")
     # Imported here, because the backend has to be chosen before the rest of Mitsuba can be used.
-    import mitsuba
+    try:
+        import mitsuba
+    except ImportError as error:
+        raise SystemExit(f"Mitsuba 3 cannot be imported ({error}); pip install -e '.[scenes]'") from error
 
     mitsuba.set_variant(arguments.variant)
     for key, folder in folders.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from functools import cache
 from pathlib import Path
 
@@ -215,3 +216,9 @@ def test_the_small_ball_mirrors_its_surroundings(frame: dict) -> None:
     difference = np.abs(shown - environment_along(mirrored))[sky]
     assert sky.sum() > 100
     assert np.median(difference) < 0.01
+
+
+def test_a_missing_mitsuba_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
+    with pytest.raises(SystemExit, match=r"Mitsuba 3 cannot be imported .*pip install -e '\.\[scenes\]'"):
+        main(Arguments(tmp_path))
