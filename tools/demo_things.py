@@ -94,8 +94,8 @@ def quad(
 
 
 def box(
-    low: Triple, high: Triple, paint: str, *, spacing: float = 0.04, picture: tuple[float, float] = (0.5, 0.5),
-    sides: str = "frlrtb", glow: Triple | None = None,
+    low: Triple, high: Triple, paint: str, *, sides: str, spacing: float = 0.04,
+    picture: tuple[float, float] = (0.5, 0.5), glow: Triple | None = None,
 ) -> list[Shape]:  # fmt: skip
     """Sides of a box: front (-y), back, left, right, top, bottom (f, k, l, r, t, b)."""
     (x0, y0, z0), (x1, y1, z1) = low, high
@@ -108,7 +108,7 @@ def box(
         "t": ((x0, y0, z1), (w, 0, 0), (0, d, 0)),
         "b": ((x0, y1, z0), (w, 0, 0), (0, -d, 0)),
     }
-    return [quad(*made[side], paint, spacing=spacing, picture=picture, glow=glow) for side in dict.fromkeys(sides)]
+    return [quad(*made[side], paint, spacing=spacing, picture=picture, glow=glow) for side in sides]
 
 
 def lathe(profile: Sequence[tuple[float, float]], paint: str, *, turns: int = 48, smooth: int = 8, repeat: float = 1.0,
