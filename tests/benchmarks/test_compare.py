@@ -29,7 +29,6 @@ from benchmarks.compare import (
     values_of,
 )
 from glassplat.cli import main as command_line
-from tests.training.rank_process import ForkedRank
 from tests.training.tiny_capture import write_tiny_capture
 
 
@@ -64,15 +63,6 @@ def test_runs_are_trained_and_evaluated_once_and_failures_stop_no_other(
 ) -> None:
     arguments = [str(write_tiny_capture(tmp_path / "tiny")), "--methods", "splat", "--iterations", "8"]
     arguments += ["--variant", "splat:broken=--no-such-option", "--output", str(tmp_path / "runs")]
-    begin = compare.Run._glassplat
-
-    def begun(run: compare.Run, command: str, *more: str) -> subprocess.Popen[bytes] | ForkedRank:
-        """The command that fails runs as usual; the others are forked, as importing takes longer than their work."""
-        if run.name == "splat:broken":
-            return begin(run, command, *more)
-        return ForkedRank(["glassplat", command, *more], {}, tmp_path / "said")
-
-    monkeypatch.setattr(compare.Run, "_glassplat", begun)
     assert main(arguments) == 1
     said = capsys.readouterr()
     assert "tiny, splat:broken, seed 0: train ended with 2: " in said.err and "no-such-option" in said.err
