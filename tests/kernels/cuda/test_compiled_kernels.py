@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import pytest
 
 pytest.importorskip("numba_cuda", reason="numba-cuda is not installed; `make setup` installs it")
 
-from glassplat.kernels.backend.cpu_cache import KernelFiles, load_data, store_data
+from glassplat.kernels.backend.cpu_cache import KernelFiles, load_data
 from glassplat.kernels.backend.devices import SIMULATED
 from tools import compile_kernels
 from tools.compile_kernels import CAPABILITIES, Resources, all_kernels, linked, ptx_of, read_report
@@ -42,9 +41,7 @@ def compiled(name: str) -> dict[tuple[int, int], tuple[str, Resources]]:
     if found is None or found[0] != key:  # Another process may have written its own under the same name.
         texts = zip(CAPABILITIES, ptx_of(kernel), strict=True)
         found = key, {capability: (text, linked(text, capability)) for capability, text in texts}
-        with suppress(OSError):
-            folders.locator.ensure_cache_path()
-            store_data(files[0], key, found)
+        folders.store(files[0], key, found)
     return found[1]
 
 
