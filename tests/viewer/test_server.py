@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import socket
 import time
 from collections.abc import Callable
@@ -17,8 +16,6 @@ import pytest
 
 from glassplat.cli.main import main, parse_arguments
 from glassplat.render.planar import Planar
-from glassplat.render.splat import Splat
-from glassplat.scene.panes import Planes
 from glassplat.viewer.drawing import ViewerState
 from glassplat.viewer.server import WAITING_NOTIFICATION, Client, Viewer
 from tests.browser_needed import needs_browser
@@ -26,7 +23,6 @@ from tests.cli.tiny_run import write_run
 from tests.training.tiny_capture import tiny_capture, true_scene
 from tests.viewer.free_port import free_port
 from tools.browser import Browser
-from tools.viewer_client import ViewerClient
 
 pytestmark = pytest.mark.usefixtures("one_chromium")
 VIEWS = tiny_capture().train
@@ -141,23 +137,5 @@ def test_port_0_is_one_that_is_free_and_the_link_has_it() -> None:
         assert viewer.port > 0 and f"http://localhost:{viewer.port}/" in viewer.address
         with socket.create_connection(("127.0.0.1", viewer.port)):
             pass
-    finally:
-        viewer.stop()
-
-
-def test_the_nearest_photograph_is_shown_again_when_panes_change() -> None:
-    viewer = Viewer(STATE, "127.0.0.1", free_port())  # Without a thread, nothing is drawn afterwards.
-
-    async def look() -> None:
-        async with ViewerClient(viewer.address) as browser:
-            await browser.look()
-            while not viewer._clients:
-                await asyncio.sleep(0.02)
-            viewer.replace_scene(replace(STATE.scene, planes=Planes.empty()), Splat())
-            (client,) = viewer._clients.values()
-            assert client._photographs._photo.label == f"Nearest photograph: {VIEWS[viewer.first].name}"
-
-    try:
-        asyncio.run(look())
     finally:
         viewer.stop()

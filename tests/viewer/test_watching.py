@@ -26,6 +26,7 @@ from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model import watching
 from glassplat.model.watching import WatchedTraining, current_renderer
 from glassplat.render.splat import Splat
+from glassplat.scene.panes import Planes
 from glassplat.training.messages import Message
 from glassplat.viewer import gate
 from glassplat.viewer.render_loop import vacant_port
@@ -34,7 +35,7 @@ from tests.browser_needed import needs_browser
 from tests.model.test_model import model
 from tests.training.tiny_capture import tiny_capture, write_tiny_capture
 from tests.viewer.free_port import free_port
-from tests.viewer.test_server import eventually
+from tests.viewer.test_server import STATE, VIEWS, eventually
 from tools.browser import Browser
 from tools.viewer_client import ViewerClient
 
@@ -197,3 +198,21 @@ def test_a_scene_that_lacks_what_its_method_mirrors_is_drawn_plainly() -> None:
     early = replace(model(), recipe=DeferredRecipe(background=(0.0, 0.0, 0.0)))
     assert isinstance(current_renderer(early.recipe, early.scene), Splat)
     assert current_renderer(model().recipe, model().scene) == model().renderer
+
+
+def test_the_nearest_photograph_is_shown_again_when_panes_change() -> None:
+    viewer = Viewer(STATE, "127.0.0.1", free_port())  # Without a thread, nothing is drawn afterwards.
+
+    async def look() -> None:
+        async with ViewerClient(viewer.address) as browser:
+            await browser.look()
+            while not viewer._clients:
+                await asyncio.sleep(0.02)
+            viewer.replace_scene(replace(STATE.scene, planes=Planes.empty()), Splat())
+            (client,) = viewer._clients.values()
+            assert client._photographs._photo.label == f"Nearest photograph: {VIEWS[viewer.first].name}"
+
+    try:
+        asyncio.run(look())
+    finally:
+        viewer.stop()
