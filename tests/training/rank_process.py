@@ -57,8 +57,8 @@ def losses_of(messages: list[Message]) -> list[float]:
 
 
 def forked(target: Callable[..., None], *arguments: Any) -> BaseProcess:
-    """A function in a separate process that has imported everything and computes on one thread."""
-    process = FORKS.Process(target=target, args=arguments)
+    """A function in a process that has imported everything, computes on one thread, and ends with the tests."""
+    process = FORKS.Process(target=target, args=arguments, daemon=True)
     with pytest.MonkeyPatch.context() as patch:
         # The parent of all forked processes reads them once.
         patch.setenv("NUMBA_NUM_THREADS", "1")
