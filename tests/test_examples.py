@@ -30,7 +30,7 @@ def said_by(example: str, *options: str, folder: Path) -> str:
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said):
         patch.chdir(folder)
         patch.setattr(sys, "argv", [str(path), *options])
-        patch.setattr("glassplat.training.actions.GRID_CELLS", 24)  # Most of the time of a short training.
+        patch.setattr("glassplat.training.actions.GRID_CELLS", 24)  # Takes up to half of a training.
         runpy.run_path(str(path), run_name="__main__")
     return said.getvalue()
 

@@ -366,7 +366,7 @@ def main(arguments: Arguments) -> None:
     try:
         import mitsuba
     except ImportError as error:
-        raise SystemExit(f"Mitsuba 3 cannot be imported ({error}); pip install -e '.[scenes]'") from error
+        raise SystemExit(f"Mitsuba 3 cannot be imported ({error}); install it: pip install -e '.[scenes]'") from error
 
     mitsuba.set_variant(arguments.variant)
     for key, folder in folders.items():

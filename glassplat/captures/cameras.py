@@ -216,10 +216,10 @@ def area_resize(pixels: NDArray[np.uint8], width: int, height: int) -> NDArray[n
 
 
 def check_proportions(path: Path, size: tuple[int, int], photograph: tuple[int, int]) -> None:
-    """Check that a file is of the size of an undistorted photograph (width, height), or of a multiple of it.
+    """Check that a file has the proportions of an undistorted photograph (width, height).
 
     Raises:
-        InputError: its proportions are others, beyond rounding.
+        InputError: they differ by more than rounding.
     """
     if abs(size[0] * photograph[1] - size[1] * photograph[0]) > max(*size, *photograph):
         raise InputError(

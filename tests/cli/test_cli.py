@@ -25,7 +25,7 @@ PLANE_KEYS = {
 
 @pytest.fixture(autouse=True)
 def coarse_grid(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On the usual grid, the search for missing objects takes most of a training of a few steps."""
+    """On the usual grid, the search for missing objects takes up to half of a training of a few steps."""
     monkeypatch.setattr("glassplat.training.actions.GRID_CELLS", 24)
 
 
