@@ -12,8 +12,8 @@ import pytest
 from glassplat.errors import InputError
 from glassplat.options import (
     Ascending,
+    Coordinate,
     Count,
-    Finite,
     OpenShare,
     PaneLabel,
     Positive,
@@ -42,7 +42,7 @@ class Outer:
     color: tuple[Share, Share, Share] | None = None
     moments: Annotated[tuple[Share, ...], Ascending()] = ()
     kind: Literal["a", "b"] = "a"
-    by_label: dict[PaneLabel, Finite] = field(default_factory=dict)
+    by_label: dict[PaneLabel, Coordinate] = field(default_factory=dict)
     folder: Path = Path("x")
     end_value: OpenShare = 0.5
 
