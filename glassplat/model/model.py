@@ -482,8 +482,8 @@ def write_sidecars(folder: Path, scene: Scene) -> list[Path]:
 
 
 def write_as_run(folder: Path, model: Model, source: Path | None) -> None:
-    """Writes a model to a new or empty folder in the layout of a run; the record of its source comes last, to mark the
-    folder as complete. A scene from a run refers to the run's capture.
+    """Writes a model to a new or empty folder in the layout of a run; the recipe comes last, to mark the folder as
+    complete. A scene from a run refers to the run's capture, any other records `source`, where it comes from.
     """
     writing.make_folder(folder)
     directory = RunDirectory(folder)

@@ -397,6 +397,8 @@ def reflections_behind(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -
     if many more Gaussians are hidden in some views only, and views past the panes find surfaces at too few of the
     mirrored positions, or see hardly any of them: then they are real objects. If only somewhat more are, and surfaces
     are found, those with mirrored positions in view are selected.
+
+    The cameras are those of the training views; the scene's own panes, if it has any, have no influence.
     """
     means = scene.primary.means
     (mirror,) = mirror_matrices(panes.centers[:1], panes.normals[:1])
@@ -483,6 +485,8 @@ def mirrored_lamps(scene: Scene, panes: Planes, photographs: Sequence[Photograph
     the photographs. So lamps are Gaussians that are clipped wherever they are seen directly, and too bright for a
     reflection of white wherever a pane mirrors them. Gaussians behind the pane that are seen only where it mirrors a
     lamp are its mirror image.
+
+    The photographs are downscaled training views.
     """
     alone = replace(scene, planes=panes)
     lamps = _detect_lamps(alone, photographs)

@@ -153,7 +153,7 @@ class Intervals:
     Attributes:
         opacity: between changes of the opacities, as a share of the run.
         least: fewest iterations between them; the scene needs as many to recover.
-        reset_stop: share of the run after which no reset happens; the `mcmc` strategy has none.
+        reset_stop: share of the run after which no reset happens. The `mcmc` strategy has none of these.
         sh: distance between rises of the SH degree, as a share of the run.
         averaged_passes: final passes over the views over which the parameters are averaged; 0 keeps the last step.
     """
@@ -254,7 +254,8 @@ class McmcDensify:
         reach: what noise and regularisers act on at a step: what its view shows (`shown`; the regularisers on what it
             shows directly), or as published on `all` Gaussians.
         initial_spread: standard deviation of the first Gaussians, as a share of the distance to their neighbours. The
-            published 0.1 takes a thousand steps or more to grow over the gaps (lab/gaussians.md).
+            published 0.1 takes a thousand steps or more to grow over the gaps (lab/gaussians.md). Unused in `planar`,
+            except as published, because its first stages precede MCMC.
     """
 
     cap: Annotated[Count | None, ESSENTIAL, tyro.conf.arg(aliases=("--cap",))] = None
