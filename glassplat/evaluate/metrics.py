@@ -507,12 +507,12 @@ def true_environment(capture: Path) -> Tensor | None:
 def environment_metrics(learned: Tensor | None, truth: Tensor | None, lpips: Lpips | str) -> dict[str, Outcome]:
     """`environment_psnr`, `environment_gain` and `environment_lpips` of a scene.
 
-    The learned map is scaled by the gain, 1 if it is black. PSNR weights directions by solid angle, and is infinite for
-    equal maps; LPIPS compares the panoramas as plain images (the paper's measure).
+    The learned map is scaled by the gain, 1 if it is black. PSNR, in decibels, weights directions by solid angle, and
+    is infinite for equal maps; LPIPS compares the panoramas as plain images (the paper's measure).
 
     Args:
         learned: [H, 2H, 3] panorama, sRGB, floating point; None if the method learns none.
-        truth: [h, 2h, 3] panorama, downsampled by area averaging if larger; None if unknown.
+        truth: [h, 2h, 3] of the same kind, downsampled by area averaging if larger; None if unknown.
         lpips: the distance, or why there is none.
     """
     if learned is None or truth is None:
