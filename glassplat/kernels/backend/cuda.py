@@ -96,7 +96,7 @@ class ImageCache:
         files = folders.files(self._function)
         found = load_data(files, key)
         # Another process may have written its own kernel under the same name at the same time.
-        if found is not None and found[:2] == (key, hashlib.sha256(found[3]).digest()):
+        if found is not None and found[0] == key and found[1] == hashlib.sha256(found[3]).digest():
             return MachineCode(*found[2:])
         with announce_compilation(self.name, "this GPU"):
             text, _ = cuda.compile(

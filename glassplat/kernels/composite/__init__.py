@@ -144,7 +144,7 @@ class _Composite(torch.autograd.Function):
         v_marks = torch.zeros_like(marks)
         if marks.numel():
             v_marks.copy_(v_values[:, ctx.num_primary :, 0])
-            v_values[:, ctx.num_primary :] = 0
+            v_values[:, ctx.num_primary :].zero_()
         v_absgrad = v_absgrad if with_absgrad else None
         return v_means, v_conics, v_opacities, None, None, v_values, v_marks, v_absgrad, None, None, None, None
 
