@@ -54,9 +54,9 @@ def write_layers(command: Render, console: Console) -> None:
     renderer = stored.renderer.with_layers(command.layers)
     views = chosen_views(stored.dataset, command.split)
     paths = image_names(stored.dataset)
-    targets = [command.output / layer / paths[view.name] for layer in command.layers for view in views]
-    arrays = [path.with_suffix(".npy") for path in targets if path.relative_to(command.output).parts[0] in MEASURED]
-    check_targets(command.output, [*targets, *arrays], photograph_paths(stored.dataset))
+    images = [(layer, command.output / layer / paths[view.name]) for layer in command.layers for view in views]
+    arrays = [path.with_suffix(".npy") for layer, path in images if layer in MEASURED]
+    check_targets(command.output, [*(path for _, path in images), *arrays], photograph_paths(stored.dataset))
     if claim_folder(command.output, "render", command.run_directory):
         print_line(
             console,
