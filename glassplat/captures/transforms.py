@@ -178,7 +178,8 @@ def _without_nulls(value: Any) -> Any:
     """An object without its optional fields that are null, as some programs write what is absent."""
     if not isinstance(value, dict):
         return value
-    return {key: one for key, one in value.items() if one is not None or key in ("file_path", "transform_matrix")}
+    required = {name for name, field in FRAME.items() if not isinstance(field, records.Optional)}
+    return {key: one for key, one in value.items() if one is not None or key in required}
 
 
 def read_settings(path: Path) -> dict[str, Any]:
@@ -188,8 +189,8 @@ def read_settings(path: Path) -> dict[str, Any]:
         frames = settings.get("frames") if isinstance(settings, dict) else None
         if not isinstance(frames, list) or not frames:
             raise ValueError(f"{path} lists no frames; expected a list `frames` of at least one photograph")
-        frames = settings["frames"] = [_without_nulls(frame) for frame in frames]
-        for index, frame in enumerate(frames, start=1):
+        settings["frames"] = [_without_nulls(frame) for frame in frames]
+        for index, frame in enumerate(settings["frames"], start=1):
             records.check_fields(frame, FRAME, f"frame {index} of {path}")
         records.check_fields(settings, FILE, str(path))
     return settings
