@@ -279,6 +279,11 @@ class Objective:
         return Terms(np.concatenate(residuals, axis=1), np.concatenate(weight_blocks, axis=1), unknown * edge_weight)
 
 
+def _mean(values: Sequence[Array]) -> Array:
+    """The mean of arrays, element by element."""
+    return np.asarray(np.mean(values, axis=0))
+
+
 @dataclass(frozen=True)
 class JointObjective:
     """Evidence for the common plane of several panes, whose frames are equally high; each pane has the same weight.
@@ -296,15 +301,15 @@ class JointObjective:
 
     def agreement(self, planes: PlaneEquations) -> Array:
         """[H] agreement of the masks on each plane, averaged over the panes."""
-        return np.asarray(np.mean([part.agreement(planes) for part in self.parts], axis=0))
+        return _mean([part.agreement(planes) for part in self.parts])
 
     def anchors(self, planes: PlaneEquations) -> Array:
         """[H, 3] a point near the middle of all panes on each plane."""
-        return np.asarray(np.mean([part.anchors(planes) for part in self.parts], axis=0))
+        return _mean([part.anchors(planes) for part in self.parts])
 
     def camera_distance(self, planes: PlaneEquations) -> Array:
         """[H] median distance of the cameras from the middle of a pane, averaged over the panes."""
-        return np.asarray(np.mean([part.camera_distance(planes) for part in self.parts], axis=0))
+        return _mean([part.camera_distance(planes) for part in self.parts])
 
     def terms(self, planes: FramedPlanes, tolerance: float, *, edges: int = EDGE_POINTS) -> Terms:
         """The residuals of H planes, as `Objective.terms`; with `edges` points for each pane, or fewer for many."""
@@ -313,7 +318,7 @@ class JointObjective:
         return Terms(
             np.concatenate([term.residuals for term in terms], axis=1),
             np.concatenate([term.weights for term in terms], axis=1) / len(terms),
-            np.asarray(np.mean([term.rest for term in terms], axis=0)),
+            _mean([term.rest for term in terms]),
         )
 
 
