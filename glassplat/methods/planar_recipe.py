@@ -101,8 +101,8 @@ class PlanarRecipe(MethodRecipe):
             published, MCMC begins with joint optimisation, and resets opacities once, after reflections behind panes
             were moved to their front.
         early_resets: also reset opacities in the first two stages, as in the paper.
-        densify_by: views for the densification of primary Gaussians: `direct` ones, or mirror images (weighted by their
-            strength) if these need more detail; or `all` direct and mirrored views alike (paper).
+        densify_by: views for the densification of primary Gaussians: `direct` ones, or mirror images (weighted by the
+            root of their strength) if these need more detail; or `all` direct and mirrored views alike (paper).
         photographer: reflection of the photographer in the panes.
     """
 

@@ -32,8 +32,8 @@ class ScreenPass:
         means2d: [C, N, 2] projected centres, pixels; part of the autograd graph.
         absgrad: [C, N, 2] given to `composite`; its gradient is the absolute gradient of the centres (AbsGS).
         radii: [C, N, 2] half extents in pixels; 0 where not visible.
-        weight: share of the drawn light that is left in the image, of the whole pass or [C, N] of each Gaussian: 1,
-            except in and behind panes.
+        weight: of the whole pass or [C, N] of each Gaussian: the share of the drawn light that is left in the image,
+            or for mirror images its root; 1, except in and behind panes.
         direct: true for the Gaussians themselves, false for their mirror images.
     """
 

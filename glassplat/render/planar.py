@@ -359,8 +359,9 @@ def weighted_screen(
 ) -> tuple[ScreenPass, ...]:
     """The records of both passes, weighted by the share of each layer in the image (see `layer_derivatives`).
 
-    Gaussians behind a pane are weighted by the transmission at their centres, mirror images by the mean over pixels of
-    panes.
+    Gaussians behind a pane are weighted by the transmission at their centres, mirror images by the root of the mean
+    over pixels of panes. With the mean itself, errors of the transmission would count as much in reflections as
+    errors of direct views count in these.
     """
     hit = hits.pane >= 0
     layers = result.strength, result.transmission, result.reflection
@@ -368,7 +369,7 @@ def weighted_screen(
     primary, glass = first.screen
     depths = first.splats.depths[:, : primary.means2d.shape[1]]
     primary = replace(primary, weight=sample_derivatives(through, hits.depth, primary.means2d, depths))
-    weight = mirrored.sum() / hit.sum().clamp(min=1)
+    weight = (mirrored.sum() / hit.sum().clamp(min=1)).sqrt()
     return (primary, glass, *(replace(record, weight=weight) for record in second.screen))
 
 

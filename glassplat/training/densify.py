@@ -314,8 +314,8 @@ class ScreenStatistics:
     Attributes:
         gradient_sum: [2, N] sum over views of the norm of the loss gradient with respect to the centre on screen.
         absgrad_sum: [2, N] the same for the sum of absolute per-pixel contributions.
-        view_count: [2, N] number of views that saw the Gaussian, weighted by the share of its light that a pane leaves
-            in the image. Gradients are smaller by the same factor; with a weight of 1, weak reflections would never be
+        view_count: [2, N] number of views that saw the Gaussian, with the weights of `ScreenPass`. A pane reduces
+            gradients by the share of the light that it leaves; with a weight of 1, weak reflections would never be
             densified.
     """
 

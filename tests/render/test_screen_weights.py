@@ -38,11 +38,12 @@ def test_only_what_is_behind_the_pane_counts_by_what_comes_through() -> None:
 
 
 @pytest.mark.parametrize("half", [50.0, 0.6])
-def test_a_mirror_counts_for_what_it_shows(half: float) -> None:
+def test_a_mirror_image_counts_by_the_root_of_its_share_of_the_panes(half: float) -> None:
     scene = replace(showcase(), planes=pane(2.0, half, base_reflectance=1 - 1e-9))
     layers = Planar(blend="srgb")(scene, CAMERA).layers
     direct, mirrored = primary_and_mirrored(scene, CAMERA)
-    assert float(mirrored.weight) == pytest.approx(float(layers["mask"][layers["pane"] >= 0].mean()), rel=1e-6)
+    share = float(layers["mask"][layers["pane"] >= 0].mean())
+    assert float(mirrored.weight) == pytest.approx(share**0.5, rel=1e-6)
     columns, rows = direct.means2d[0].floor().long().unbind(-1)
     inside = (columns >= 0) & (columns < CAMERA.width) & (rows >= 0) & (rows < CAMERA.height)
     hidden = inside & (direct.radii[0] > 0).all(dim=-1)
