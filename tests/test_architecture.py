@@ -171,6 +171,18 @@ def test_every_file_keeps_the_architecture(rows: dict[str, int]) -> None:
     assert not found, "\n" + "\n".join(found)
 
 
+def test_docstrings_name_only_attributes_that_exist() -> None:
+    stale = []
+    for path in source_files():
+        for node in ast.walk(ast.parse((ROOT / path).read_text())):
+            if not isinstance(node, ast.ClassDef) or node.bases or not (docstring := ast.get_docstring(node)):
+                continue
+            described = re.findall(r"^    (\w+): ", docstring.partition("Attributes:\n")[2], re.MULTILINE)
+            body = "\n".join(map(ast.unparse, node.body[1:]))
+            stale += [f"{path}: {node.name}.{name}" for name in described if not re.search(rf"\b{name}\b", body)]
+    assert not stale, stale
+
+
 def test_the_diagram_names_only_what_exists(rows: dict[str, int]) -> None:
     package = ROOT / PACKAGE
     missing = [name for name in rows if not (package / name).is_dir() and not (package / f"{name}.py").is_file()]

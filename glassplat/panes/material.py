@@ -80,8 +80,8 @@ class MirrorRegression(NamedTuple):
 class MirrorCandidate(NamedTuple):
     """A pane that may be a mirror.
 
-    pane: a single plane, aligned to the photographs as if it were a mirror; like: its likeness to one there;
-    compared: number of pixels compared; shown: number of pixels that show the pane.
+    pane: a single plane, aligned to the photographs as if it were a mirror; regression: of the photographs, with that
+    plane; compared: number of pixels compared; shown: number of pixels that show the pane.
     """
 
     pane: Planes

@@ -105,7 +105,7 @@ class FeatureDatabase:
 
     Attributes:
         path: of the file.
-        pictures: folder of the greyscale images from which features are extracted.
+        image_folder: folder of the greyscale images from which features are extracted.
         photographs: in the order of their indices.
     """
 

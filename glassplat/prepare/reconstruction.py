@@ -52,7 +52,7 @@ class Solution:
         database: of the attempt.
         models: `pycolmap.Reconstruction`, the largest first; they are not connected with each other.
         attempt: its name.
-        tried: number of attempts made.
+        attempts_made: number of attempts.
     """
 
     database: colmap.FeatureDatabase

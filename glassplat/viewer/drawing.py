@@ -111,7 +111,7 @@ class ViewRequest:
         reflectances: R0 by label of the panes for which it differs from the scene.
         gain: factor on the light reflected by panes.
         moves: movements of panes, relative to the scene.
-        against: index of the photograph that the layer `error` compares with; None for the other layers.
+        compared_photograph: index of the photograph that the layer `error` compares with; None for the other layers.
         kept: [N] bool, the primary Gaussians to keep; None keeps all.
     """
 
