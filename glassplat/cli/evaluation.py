@@ -114,7 +114,7 @@ def evaluate_run(
 
     show(Working(RENDERING_LABEL, 0, len(stored.dataset.test)))
     evaluation: scoring.Evaluation = scoring.evaluate(
-        stored.scene, with_photographer(stored.renderer, "beside"), stored.dataset, regions=regions, listen=add
+        stored.scene, with_photographer(stored.renderer, "separate"), stored.dataset, regions=regions, listen=add
     )
     results = {
         "method": stored.recipe.method,

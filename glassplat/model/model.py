@@ -193,7 +193,7 @@ class Model:
         from glassplat.evaluate.evaluate import evaluate  # Imported here, because training rarely needs it.
 
         resolve_background(with_background(self.recipe, BLACK), dataset)
-        scene, renderer = self.scene, with_photographer(self.renderer, "beside")
+        scene, renderer = self.scene, with_photographer(self.renderer, "separate")
         if dataset.test:
             scene = scene.to(dataset.test[0].camera.cam_from_world.dtype)
         return evaluate(scene, renderer, with_corrected_cameras(dataset, scene)).results

@@ -57,7 +57,7 @@ DEPTH_CHANNEL = 3
 """Channel of the depth in the first pass, after the colours."""
 PHOTOGRAPHED = "photographed"
 """Layer with the photographer in the panes, in addition to an image without."""
-PhotographerMode = Literal["absent", "present", "beside"]
+PhotographerMode = Literal["absent", "present", "separate"]
 """Modes of rendering the photographer in panes."""
 
 
@@ -161,7 +161,7 @@ class Planar(WithBackground):
         second = self._second_pass(scene, camera, seen, with_absgrad, first.total)
         masks = self._visibilities(scene, camera, seen, first)
         result = self._composite_panes(first, seen, masks, second, camera)
-        if self.photographer == "beside" and len(scene.photographer):
+        if self.photographer == "separate" and len(scene.photographer):
             with_body = replace(self, photographer="present")._second_pass(scene, camera, seen, False, first.total)
             layers["photographed"] = self._composite_panes(first, seen, masks, with_body, camera).rgb
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
@@ -207,7 +207,7 @@ class Planar(WithBackground):
 
     def with_layers(self, layers: Sequence[str]) -> Renderer:
         """The renderer of frames that also have `photographed` and `normal` where they are among the layers."""
-        renderer = replace(self, photographer="beside") if PHOTOGRAPHED in layers else self
+        renderer = replace(self, photographer="separate") if PHOTOGRAPHED in layers else self
         return WithNormals(renderer) if "normal" in layers else renderer
 
     def page_settings(self) -> Mapping[str, Any]:

@@ -108,10 +108,10 @@ def test_a_photographer_behind_the_pane_is_not_mirrored() -> None:
 
 def test_new_views_omit_the_photographer_by_default() -> None:
     scene = photographed()
-    absent, beside, present = (Planar(photographer=mode)(scene, CAMERA) for mode in ("absent", "beside", "present"))  # type: ignore[arg-type]
+    absent, separate, present = (Planar(photographer=mode)(scene, CAMERA) for mode in ("absent", "separate", "present"))  # type: ignore[arg-type]
     empty = Planar()(replace(scene, photographer=Gaussians.empty()), CAMERA)
-    assert torch.equal(absent.rgb, empty.rgb) and torch.equal(beside.rgb, empty.rgb)
-    assert torch.equal(beside.photographed, present.rgb) and torch.equal(absent.photographed, absent.rgb)
+    assert torch.equal(absent.rgb, empty.rgb) and torch.equal(separate.rgb, empty.rgb)
+    assert torch.equal(separate.photographed, present.rgb) and torch.equal(absent.photographed, absent.rgb)
     assert not torch.equal(present.rgb, absent.rgb)
 
 
