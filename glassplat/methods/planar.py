@@ -17,7 +17,7 @@ from glassplat.options import BLACK, CLEAR_GLASS
 from glassplat.panes import PlaneFit, PlaneFitError, material
 from glassplat.panes.fit import fit_planes, with_mirrors
 from glassplat.render.panes import nearest_hits, panes_in_camera
-from glassplat.render.planar import Planar
+from glassplat.render.planar import Planar, ReflectionGradient
 from glassplat.render.splat import Splat
 from glassplat.scene import logit
 from glassplat.scene.camera import Camera
@@ -574,10 +574,10 @@ def _joint_start(recipe: PlanarRecipe) -> float:
     return (first + second) / (first + second + third)
 
 
-def _training_renderer(recipe: PlanarRecipe, gradient: str) -> Planar:
+def _training_renderer(recipe: PlanarRecipe, gradient: ReflectionGradient) -> Planar:
     return replace(
         planar_renderer(recipe),
-        reflection_gradient="all" if gradient == "all" else "planes",
+        reflection_gradient=gradient,
         deviation=recipe.weights.depth != 0,
         deviation_depth_gradient=recipe.moving_mean,
         tells_mirrored=recipe.densify_by == "direct",

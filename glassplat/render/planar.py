@@ -59,6 +59,9 @@ PHOTOGRAPHED = "photographed"
 """Layer with the photographer in the panes, in addition to an image without."""
 PhotographerMode = Literal["absent", "present", "separate"]
 """Modes of rendering the photographer in panes."""
+ReflectionGradient = Literal["all", "planes"]
+"""Parameters that receive the gradient of the reflection."""
+MODES = {"fresnel": Fresnel, "blend": Blend, "reflection_gradient": ReflectionGradient, "photographer": PhotographerMode}
 
 
 class FirstPass(NamedTuple):
@@ -127,7 +130,7 @@ class Planar(WithBackground):
 
     fresnel: Fresnel = "pane"
     intensity: bool = True
-    reflection_gradient: Literal["all", "planes"] = "all"
+    reflection_gradient: ReflectionGradient = "all"
     deviation: bool = False
     deviation_depth_gradient: bool = False
     blend: Blend = "linear"
@@ -137,8 +140,9 @@ class Planar(WithBackground):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.blend not in get_args(Blend):
-            raise ValueError(f"blend is {self.blend!r}; expected one of {get_args(Blend)}")
+        for name, modes in MODES.items():
+            if (value := getattr(self, name)) not in get_args(modes):
+                raise ValueError(f"{name} is {value!r}; expected one of {get_args(modes)}")
 
     def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
         """Renders `scene` from `camera`, on the scene's device.

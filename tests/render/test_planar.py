@@ -296,6 +296,7 @@ def test_detached_cuts_every_tensor_off() -> None:
     assert not detach_gaussians(trainable).means.requires_grad
 
 
-def test_an_unknown_blend_space_is_refused() -> None:
-    with pytest.raises(ValueError, match="blend is 'Linear'; expected one of"):
-        Planar(blend="Linear")  # type: ignore[arg-type]
+@pytest.mark.parametrize("mode", ["fresnel", "blend", "reflection_gradient", "photographer"])
+def test_an_unknown_mode_is_refused(mode: str) -> None:
+    with pytest.raises(ValueError, match=f"{mode} is 'Linear'; expected one of"):
+        replace(Planar(), **{mode: "Linear"})  # type: ignore[arg-type]
