@@ -580,5 +580,5 @@ def _training_renderer(recipe: PlanarRecipe, gradient: ReflectionGradient) -> Pl
         reflection_gradient=gradient,
         deviation=recipe.weights.depth != 0,
         deviation_depth_gradient=recipe.moving_mean,
-        tells_mirrored=recipe.densify_by == "direct",
+        separate_mirrored=recipe.densify_by == "direct",
     )

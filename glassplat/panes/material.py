@@ -14,8 +14,9 @@ from torch import Tensor
 from glassplat.captures.view import View, sample_evenly
 from glassplat.kernels.adam import Update, adam
 from glassplat.kernels.maths.images import linear_from_srgb
+from glassplat.options import BLACK, WHITE
 from glassplat.render.layers import gather_mirrored_pixels, gather_pixels, window_means, window_sums
-from glassplat.render.planar import FirstPass, Planar
+from glassplat.render.planar import DirectPass, Planar
 from glassplat.render.splat import Splat
 from glassplat.scene import SH_ZERO, logit
 from glassplat.scene.camera import Camera, mirror_matrices
@@ -24,7 +25,6 @@ from glassplat.scene.scene import Scene
 
 log = logging.getLogger("glassplat.panes")
 
-BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 MIRROR_SLOPE, MIRROR_CORRELATION = 0.35, 0.3
 """An aligned pane above both is classified as a mirror. In linear radiance, the slope was at most 0.20 for 15 panes of
 glass in ten captures, including a dark television, and at most 0.30 for 29 in sixteen more. It was at least 0.52 for
@@ -285,12 +285,12 @@ MIRROR_RENDERER = Planar(BLACK, intensity=False, reflection_gradient="planes")
 """Renders the image mirrored by a pane."""
 
 
-def mirror_correlation(scene: Scene, part: ComparedPart, first: FirstPass | None = None) -> Tensor:
+def mirror_correlation(scene: Scene, part: ComparedPart, direct: DirectPass | None = None) -> Tensor:
     """Correlation of the image mirrored by the scene's only pane with a part of a photograph.
 
-    `first` is the direct view, if it has been rendered already.
+    `direct` is the direct pass, if it has been rendered already.
     """
-    (mirrored,) = MIRROR_RENDERER.reflections(scene, part.camera, (BLACK,), first)
+    (mirrored,) = MIRROR_RENDERER.reflections(scene, part.camera, (BLACK,), direct)
     one, other = subtract_local_mean(mirrored, part.region)[part.region], part.pixels
     tiny = torch.finfo(one.dtype).tiny
     return (one * other).sum() / torch.sqrt(((one * one).sum() * (other * other).sum()).clamp(min=tiny))
@@ -301,9 +301,9 @@ def mean_correlations(scenes: Sequence[Scene], parts: Sequence[ComparedPart]) ->
     """Means of `mirror_correlation` over one or more parts, for scenes that differ only in their pane."""
     sums = [0.0] * len(scenes)
     for part in parts:
-        first = MIRROR_RENDERER.first_pass(scenes[0], part.camera)
+        direct = MIRROR_RENDERER.direct_pass(scenes[0], part.camera)
         for number, scene in enumerate(scenes):
-            sums[number] += float(mirror_correlation(scene, part, first))
+            sums[number] += float(mirror_correlation(scene, part, direct))
     return [total / len(parts) for total in sums]
 
 

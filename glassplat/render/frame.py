@@ -173,7 +173,7 @@ def project_gaussians(
     poses: Tensor | None = None,
     clip_planes: Tensor | None = None,
     windows: Tensor | None = None,
-    total: GradientSum | None = None,
+    gradient_sum: GradientSum | None = None,
 ) -> Projected:
     """Projects a set of Gaussians into one camera, or into several that share its intrinsics.
 
@@ -184,10 +184,12 @@ def project_gaussians(
         poses: [C, 4, 4] `cam_from_world` of the cameras; may be left-handed.
         clip_planes: [C, 4] world planes (n, d); a Gaussian whose centre has n . x + d <= 0 is culled.
         windows: [C, 4] left, top, right and bottom edge of the required part of each image, pixels.
-        total: shared by all projections of one set whose gradients are summed; see `project`.
+        gradient_sum: shared by all projections of one set whose gradients are summed; see `project`.
     """
     cameras = camera_batch(camera, poses)._replace(clip_planes=clip_planes, windows=windows)
-    return project(raw_gaussians(gaussians), cameras, sh_degree=gaussians.active_sh_degree, near=near, total=total)
+    return project(
+        raw_gaussians(gaussians), cameras, sh_degree=gaussians.active_sh_degree, near=near, gradient_sum=gradient_sum
+    )
 
 
 def raw_gaussians(gaussians: Gaussians) -> RawGaussians:

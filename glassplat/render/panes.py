@@ -124,7 +124,7 @@ def _union_windows(hits: list[PaneHits]) -> Tensor:
 
 
 def project_mirrored(
-    gaussians: Gaussians, camera: Camera, seen: SeenPanes, *, near: float, total: GradientSum | None = None
+    gaussians: Gaussians, camera: Camera, seen: SeenPanes, *, near: float, gradient_sum: GradientSum | None = None
 ) -> Projected:
     """Projects the Gaussians of the camera's side into the camera mirrored about each plane (Eqs. 8-12).
 
@@ -133,7 +133,7 @@ def project_mirrored(
         camera: the camera to mirror.
         seen: visible planes; Gaussians outside a plane's window are culled.
         near: depth below which a Gaussian is culled, world units.
-        total: see `project_gaussians`.
+        gradient_sum: see `project_gaussians`.
     """
     return project_gaussians(
         gaussians,
@@ -142,7 +142,7 @@ def project_mirrored(
         poses=seen.views.poses,
         clip_planes=seen.views.half_spaces,
         windows=seen.windows,
-        total=total,
+        gradient_sum=gradient_sum,
     )
 
 

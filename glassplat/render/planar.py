@@ -54,18 +54,23 @@ from glassplat.scene.panes import nearest_panes
 from glassplat.scene.scene import Scene
 
 DEPTH_CHANNEL = 3
-"""Channel of the depth in the first pass, after the colours."""
+"""Channel of the depth in the direct pass, after the colours."""
 PHOTOGRAPHED = "photographed"
 """Layer with the photographer in the panes, in addition to an image without."""
 PhotographerMode = Literal["absent", "present", "separate"]
 """Modes of rendering the photographer in panes."""
 ReflectionGradient = Literal["all", "planes"]
 """Parameters that receive the gradient of the reflection."""
-MODES = {"fresnel": Fresnel, "blend": Blend, "reflection_gradient": ReflectionGradient, "photographer": PhotographerMode}
+MODES = {
+    "fresnel": Fresnel,
+    "blend": Blend,
+    "reflection_gradient": ReflectionGradient,
+    "photographer": PhotographerMode,
+}
 
 
-class FirstPass(NamedTuple):
-    """Result of the first pass, without reflections."""
+class DirectPass(NamedTuple):
+    """The scene as the camera sees it directly, without reflections; see `Planar`."""
 
     image: Tensor
     alpha: Tensor
@@ -74,17 +79,17 @@ class FirstPass(NamedTuple):
     deviation: Tensor | None
     splats: Splats
     marks: Tensor
-    direct: Tensor
+    visible: Tensor
     screen: tuple[ScreenPass, ...]
-    total: GradientSum
+    gradient_sum: GradientSum
 
 
-class SecondPass(NamedTuple):
+class MirroredPass(NamedTuple):
     """Mirrored images: colours and intensity minus 1 [K, H, W, 4] of each, and their coverage [K, H, W]."""
 
     reflections: Tensor
     alpha: Tensor
-    mirrored: Tensor
+    visible: Tensor
     screen: tuple[ScreenPass, ...]
 
 
@@ -96,9 +101,9 @@ class Planar(WithBackground):
         R = M sum_k H_k R_k                          (Eqs. 5, 19)
         C_r = C_raw A                                (Eq. 13)
 
-    The first pass blends the primary Gaussians into C_t and, with the glass Gaussians among them, the mask M (Eq. 7).
-    The second pass renders the primary Gaussians of the camera's side through cameras mirrored about each plane, which
-    is the same as mirroring the Gaussians (Eqs. 8-12), and only in tiles where that pane is visible.
+    The direct pass blends the primary Gaussians into C_t and, with the glass Gaussians among them, the mask M (Eq. 7).
+    The mirrored pass renders the primary Gaussians of the camera's side through cameras mirrored about each plane. This
+    is the same as mirroring the Gaussians (Eqs. 8-12), and is done only in tiles where that pane is visible.
 
     If there are several panes on a ray, Eq. 1 is applied from the farthest to the nearest: the C_t of a pane is the C
     of the pane behind it (the paper renders only the nearest). The layers R, C_r and C_t are those of the nearest pane
@@ -124,7 +129,7 @@ class Planar(WithBackground):
         nearest_only: render only the nearest of several panes on a ray, as in the paper.
         photographer: rendering of the photographer in panes: none; in the image and its reflection, for training; or in
             a separate layer `photographed` [H, W, 3].
-        tells_mirrored: let the records in `Frame.screen` distinguish mirror images from direct views, with their
+        separate_mirrored: let the records in `Frame.screen` distinguish mirror images from direct views, with their
             weights; otherwise all count alike.
     """
 
@@ -136,7 +141,7 @@ class Planar(WithBackground):
     blend: Blend = "linear"
     nearest_only: bool = False
     photographer: PhotographerMode = "absent"
-    tells_mirrored: bool = True
+    separate_mirrored: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -152,50 +157,52 @@ class Planar(WithBackground):
         """
         check_panes(scene)
         camera = camera.to(scene.primary.means.device)
-        first, hits, seen = self._direct(scene, camera, with_absgrad=with_absgrad)
-        layers = {"without_panes": first.image, "depth": first.depth, "alpha": first.alpha, "mask": first.mask}
+        direct, hits, seen = self._find_panes(scene, camera, with_absgrad=with_absgrad)
+        layers = {"without_panes": direct.image, "depth": direct.depth, "alpha": direct.alpha, "mask": direct.mask}
         layers["pane"] = hits.pane
-        if first.deviation is not None:
-            layers["deviation"] = first.deviation
+        if direct.deviation is not None:
+            layers["deviation"] = direct.deviation
         if seen is None:
-            nothing = torch.zeros_like(first.mask)
-            layers |= {"transmission": first.image, "reflection": torch.zeros_like(first.image)}
+            nothing = torch.zeros_like(direct.mask)
+            layers |= {"transmission": direct.image, "reflection": torch.zeros_like(direct.image)}
             layers |= {"strength": nothing, "share": nothing}
-            return Frame(first.image, layers, first.direct, None, first.screen)
-        second = self._second_pass(scene, camera, seen, with_absgrad, first.total)
-        masks = self._visibilities(scene, camera, seen, first)
-        result = self._composite_panes(first, seen, masks, second, camera)
+            return Frame(direct.image, layers, direct.visible, None, direct.screen)
+        mirrored = self._mirrored_pass(scene, camera, seen, with_absgrad, direct.gradient_sum)
+        masks = self._visibilities(scene, camera, seen, direct)
+        result = self._composite_panes(direct, seen, masks, mirrored, camera)
         if self.photographer == "separate" and len(scene.photographer):
-            with_body = replace(self, photographer="present")._second_pass(scene, camera, seen, False, first.total)
-            layers["photographed"] = self._composite_panes(first, seen, masks, with_body, camera).rgb
+            with_body = replace(self, photographer="present")._mirrored_pass(
+                scene, camera, seen, False, direct.gradient_sum
+            )
+            layers["photographed"] = self._composite_panes(direct, seen, masks, with_body, camera).rgb
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
         if seen.planes.transmittances is not None:
             layers["tint"] = tint_of_panes(seen, masks, seen.planes.transmittances)
-        screen = self._screen(first, second, hits, result) if with_absgrad else ()
-        return Frame(result.rgb, layers, first.direct, second.mirrored, screen)
+        screen = self._screen(direct, mirrored, hits, result) if with_absgrad else ()
+        return Frame(result.rgb, layers, direct.visible, mirrored.visible, screen)
 
     def reflections(
-        self, scene: Scene, camera: Camera, backgrounds: Sequence[Rgb], first: FirstPass | None = None
+        self, scene: Scene, camera: Camera, backgrounds: Sequence[Rgb], direct: DirectPass | None = None
     ) -> list[Tensor]:
         """The layer `reflection` [H, W, 3] over each of several backgrounds.
 
-        `first` is the result of the first pass, if available.
+        `direct` is the result of `direct_pass`, if available.
         """
         check_panes(scene)
         camera = camera.to(scene.primary.means.device)
-        first, _, seen = self._direct(scene, camera, first=first)
+        direct, _, seen = self._find_panes(scene, camera, direct=direct)
         if seen is None:
-            return [torch.zeros_like(first.image) for _ in backgrounds]
-        second = replace(self, background=BLACK)._second_pass(scene, camera, seen, False, first.total)
-        masks = self._visibilities(scene, camera, seen, first)
-        images = (over_background(second.reflections, second.alpha, (*color, 0.0)) for color in backgrounds)
-        passes = (second._replace(reflections=image) for image in images)
-        return [self._composite_panes(first, seen, masks, one, camera).reflection for one in passes]
+            return [torch.zeros_like(direct.image) for _ in backgrounds]
+        mirrored = replace(self, background=BLACK)._mirrored_pass(scene, camera, seen, False, direct.gradient_sum)
+        masks = self._visibilities(scene, camera, seen, direct)
+        images = (over_background(mirrored.reflections, mirrored.alpha, (*color, 0.0)) for color in backgrounds)
+        passes = (mirrored._replace(reflections=image) for image in images)
+        return [self._composite_panes(direct, seen, masks, one, camera).reflection for one in passes]
 
-    def first_pass(self, scene: Scene, camera: Camera) -> FirstPass:
-        """The first pass: the direct view, independent of the poses of panes."""
+    def direct_pass(self, scene: Scene, camera: Camera) -> DirectPass:
+        """The direct pass, which does not depend on the poses of panes."""
         camera = camera.to(scene.primary.means.device)
-        return self._first_pass(scene, camera, panes_in_camera(scene.planes, camera), False)
+        return self._direct_pass(scene, camera, panes_in_camera(scene.planes, camera), False)
 
     def check(self, scene: Scene) -> None:
         """Raises ValueError if a scene lacks colours, or tensors of its panes, if it has any."""
@@ -224,18 +231,18 @@ class Planar(WithBackground):
             "nearest": self.nearest_only,
         }
 
-    def _direct(
-        self, scene: Scene, camera: Camera, *, with_absgrad: bool = False, first: FirstPass | None = None
-    ) -> tuple[FirstPass, PaneHits, SeenPanes | None]:
-        """The first pass, the nearest panes, and all visible panes (None if there are none)."""
+    def _find_panes(
+        self, scene: Scene, camera: Camera, *, with_absgrad: bool = False, direct: DirectPass | None = None
+    ) -> tuple[DirectPass, PaneHits, SeenPanes | None]:
+        """The direct pass, the nearest panes, and all visible panes (None if there are none)."""
         rectangles = panes_in_camera(scene.planes, camera)
-        first = self._first_pass(scene, camera, rectangles, with_absgrad) if first is None else first
-        hits = nearest_hits(rectangles, camera, first.mask)
-        return first, hits, seen_panes(scene.planes, camera, hits, first.mask, most=1 if self.nearest_only else None)
+        direct = self._direct_pass(scene, camera, rectangles, with_absgrad) if direct is None else direct
+        hits = nearest_hits(rectangles, camera, direct.mask)
+        return direct, hits, seen_panes(scene.planes, camera, hits, direct.mask, most=1 if self.nearest_only else None)
 
-    def _first_pass(self, scene: Scene, camera: Camera, rectangles: Panes, with_absgrad: bool) -> FirstPass:
-        near, total = NEAR_PER_EXTENT * scene.extent, GradientSum()
-        primary = project_gaussians(scene.primary, camera, near=near, total=total)
+    def _direct_pass(self, scene: Scene, camera: Camera, rectangles: Panes, with_absgrad: bool) -> DirectPass:
+        near, gradient_sum = NEAR_PER_EXTENT * scene.extent, GradientSum()
+        primary = project_gaussians(scene.primary, camera, near=near, gradient_sum=gradient_sum)
         glass = project_gaussians(scene.glass, camera, near=near)
         splats = concat_splats(primary, glass)
         bins = bin_tiles(splats, camera.width, camera.height)
@@ -259,7 +266,7 @@ class Planar(WithBackground):
         alpha = result.alpha.squeeze(0)
         # Squeezed and split, because indexing an image allocates a gradient of zeros.
         color, depth = result.image.squeeze(0).split((3, 1), dim=-1)
-        return FirstPass(
+        return DirectPass(
             image=over_background(color.contiguous(), alpha, self.background),
             alpha=alpha,
             depth=mean_depth(depth.squeeze(-1), alpha),
@@ -269,24 +276,24 @@ class Planar(WithBackground):
             marks=marks,
             direct=visible_gaussians(primary),
             screen=screen,
-            total=total,
+            gradient_sum=gradient_sum,
         )
 
-    def _second_pass(
-        self, scene: Scene, camera: Camera, seen: SeenPanes, with_absgrad: bool, total: GradientSum
-    ) -> SecondPass:
-        primary = scene.primary
+    def _mirrored_pass(
+        self, scene: Scene, camera: Camera, seen: SeenPanes, with_absgrad: bool, gradient_sum: GradientSum
+    ) -> MirroredPass:
+        primary, near = scene.primary, NEAR_PER_EXTENT * scene.extent
         if self.reflection_gradient == "planes":
-            primary, total = detach_gaussians(scene.primary), GradientSum()
-        projected = project_mirrored(primary, camera, seen, near=NEAR_PER_EXTENT * scene.extent, total=total)
+            primary, gradient_sum = detach_gaussians(scene.primary), GradientSum()
+        projected = project_mirrored(primary, camera, seen, near=near, gradient_sum=gradient_sum)
         # As the difference from 1, so that the background has 0 and needs no blending.
         gain = torch.expm1(primary.channels["log_intensity"])[None].expand(len(seen.planes), -1)
         channels = torch.cat([projected.colors, gain[..., None]], dim=-1)
         mirrored = [projected]
         screen: tuple[ScreenPass, ...] = (screen_pass("primary", projected, direct=False),) if with_absgrad else ()
         if self.photographer == "present" and len(scene.photographer):
-            body = project_photographer(scene, camera, seen, near=NEAR_PER_EXTENT * scene.extent)
-            # The photographer has no intensity, which would be a second factor on the colours.
+            body = project_photographer(scene, camera, seen, near=near)
+            # The photographer has no intensity, which would be another factor on the colours.
             plain = torch.nn.functional.pad(body.colors, (0, channels.shape[-1] - 3))
             channels = torch.cat([channels, plain], dim=1)
             mirrored.append(body)
@@ -296,17 +303,17 @@ class Planar(WithBackground):
         bins = bin_tiles(splats, camera.width, camera.height, seen.tiles)
         result = composite(splats, channels, bins, absgrad=concat_absgrad(screen))
         reflections = over_background(result.image, result.alpha, (*self.background, 0.0))
-        return SecondPass(reflections, result.alpha, visible_gaussians(projected), screen)
+        return MirroredPass(reflections, result.alpha, visible_gaussians(projected), screen)
 
     def _composite_panes(
-        self, first: FirstPass, seen: SeenPanes, masks: Sequence[Tensor], second: SecondPass, camera: Camera
+        self, direct: DirectPass, seen: SeenPanes, masks: Sequence[Tensor], mirrored: MirroredPass, camera: Camera
     ) -> CompositedPanes:
         """Composites the panes and their reflections over the image."""
         return composite_panes(
-            first.image,
+            direct.image,
             seen,
             masks,
-            second.reflections,
+            mirrored.reflections,
             camera,
             fresnel=self.fresnel,
             intensity=self.intensity,
@@ -314,20 +321,20 @@ class Planar(WithBackground):
         )
 
     def _screen(
-        self, first: FirstPass, second: SecondPass, hits: PaneHits, result: CompositedPanes
+        self, direct: DirectPass, mirrored: MirroredPass, hits: PaneHits, result: CompositedPanes
     ) -> tuple[ScreenPass, ...]:
         """The records of both passes."""
-        if self.tells_mirrored:
-            return weighted_screen(first, second, hits, result, self.blend)
-        return (*first.screen, *(replace(record, direct=True) for record in second.screen))
+        if self.separate_mirrored:
+            return weighted_screen(direct, mirrored, hits, result, self.blend)
+        return (*direct.screen, *(replace(record, direct=True) for record in mirrored.screen))
 
-    def _visibilities(self, scene: Scene, camera: Camera, seen: SeenPanes, first: FirstPass) -> list[Tensor]:
+    def _visibilities(self, scene: Scene, camera: Camera, seen: SeenPanes, direct: DirectPass) -> list[Tensor]:
         """[H, W] for each of `seen.order`: how much of that pane is visible."""
         if len(seen.order) == 1:
-            return [first.mask]
+            return [direct.mask]
         owners = nearest_panes(scene.glass.means, scene.planes)
-        own = own_masks(seen, first.splats, first.marks, owners, (camera.height, camera.width))
-        return visibilities(seen, first.mask, own)
+        own = own_masks(seen, direct.splats, direct.marks, owners, (camera.height, camera.width))
+        return visibilities(seen, direct.mask, own)
 
 
 LARGEST_LOG = 80.0
@@ -359,7 +366,7 @@ def check_panes(scene: Scene) -> None:
 
 @torch.no_grad()
 def weighted_screen(
-    first: FirstPass, second: SecondPass, hits: PaneHits, result: CompositedPanes, blend: Blend
+    direct: DirectPass, mirrored: MirroredPass, hits: PaneHits, result: CompositedPanes, blend: Blend
 ) -> tuple[ScreenPass, ...]:
     """The records of both passes, weighted by the share of each layer in the image (see `layer_derivatives`).
 
@@ -369,12 +376,12 @@ def weighted_screen(
     """
     hit = hits.pane >= 0
     layers = result.strength, result.transmission, result.reflection
-    through, mirrored = layer_derivatives(*layers, hit, linear=blend == "linear")
-    primary, glass = first.screen
-    depths = first.splats.depths[:, : primary.means2d.shape[1]]
+    through, reflected = layer_derivatives(*layers, hit, linear=blend == "linear")
+    primary, glass = direct.screen
+    depths = direct.splats.depths[:, : primary.means2d.shape[1]]
     primary = replace(primary, weight=sample_derivatives(through, hits.depth, primary.means2d, depths))
-    weight = (mirrored.sum() / hit.sum().clamp(min=1)).sqrt()
-    return (primary, glass, *(replace(record, weight=weight) for record in second.screen))
+    weight = (reflected.sum() / hit.sum().clamp(min=1)).sqrt()
+    return (primary, glass, *(replace(record, weight=weight) for record in mirrored.screen))
 
 
 def detach_gaussians(gaussians: Gaussians) -> Gaussians:

@@ -265,8 +265,8 @@ def test_bad_cameras_and_options_are_refused() -> None:
 def test_gradients_of_several_projections_add_up_where_they_are_made(asked: tuple[int, ...]) -> None:
     gaussians, batches = random_gaussians(700), [random_cameras(n, clip=n > 1) for n in (1, 2, 1)]
 
-    def slopes(total: GradientSum | None) -> tuple[Tensor, ...]:
-        found = [project(gaussians, batch, sh_degree=3, near=NEAR, total=total) for batch in batches]
+    def slopes(gradient_sum: GradientSum | None) -> tuple[Tensor, ...]:
+        found = [project(gaussians, batch, sh_degree=3, near=NEAR, gradient_sum=gradient_sum) for batch in batches]
         loss = sum((1 + i) * field.sin().sum() for i in asked for field in found[i][:5])
         inputs = [*gaussians, *(batch.cam_from_world for batch in batches)]
         once = torch.autograd.grad(loss, inputs, retain_graph=True, allow_unused=True, materialize_grads=True)
@@ -283,15 +283,15 @@ def test_gradients_of_several_projections_add_up_where_they_are_made(asked: tupl
 
 
 def test_a_sum_of_gradients_frees_its_graph() -> None:
-    gaussians, total = random_gaussians(5), GradientSum()
-    first = project(gaussians, random_cameras(1), sh_degree=3, near=NEAR, total=total)
-    second = project(gaussians, random_cameras(1), sh_degree=3, near=NEAR, total=total)
+    gaussians, gradient_sum = random_gaussians(5), GradientSum()
+    first = project(gaussians, random_cameras(1), sh_degree=3, near=NEAR, gradient_sum=gradient_sum)
+    second = project(gaussians, random_cameras(1), sh_degree=3, near=NEAR, gradient_sum=gradient_sum)
     torch.autograd.grad(first.means2d.sum() + second.means2d.sum(), gaussians.means)
-    assert total.found == []
+    assert gradient_sum.found == []
     node = weakref.ref(first.means2d.grad_fn)
     gc.disable()
     try:
-        del first, second, total
+        del first, second, gradient_sum
         assert node() is None
     finally:
         gc.enable()

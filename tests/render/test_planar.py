@@ -275,7 +275,7 @@ def test_switches_change_what_they_name() -> None:
 def test_reflections_are_the_layers_before_each_background_wherever_panes_have_moved_to(count: int) -> None:
     panes = [pane(2.0, half=0.5, label=1), pane(4.0, label=2)]
     scene = showcase(joined(*panes[:count])) if count else replace(showcase(), planes=Planes.empty())
-    first = Planar().first_pass(scene, CAMERA)
+    first = Planar().direct_pass(scene, CAMERA)
     turned = scene.planes.raw_normals + torch.tensor([0.02, 0.01, 0.0])
     there = replace(scene, planes=replace(scene.planes, raw_normals=turned))
     backgrounds = ((0.0, 0.0, 0.0), (1.0, 0.5, 0.25))

@@ -91,7 +91,12 @@ class GradientSum:
 
 
 def project(
-    gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, near: float, total: GradientSum | None = None
+    gaussians: RawGaussians,
+    cameras: CameraBatch,
+    *,
+    sh_degree: int,
+    near: float,
+    gradient_sum: GradientSum | None = None,
 ) -> Projected:
     """Projects Gaussians into cameras: activation, EWA splatting, bounds, culling and view-dependent colour.
 
@@ -112,12 +117,13 @@ def project(
         sh_degree: highest degree of the spherical harmonics to evaluate; `gaussians.sh` may hold more, or
             none at all, which makes all colours zero.
         near: smallest depth (camera z, world units), at least 0.
-        total: shared by all projections of these same tensors whose gradients are to be summed.
+        gradient_sum: shared by all projections of these same tensors whose gradients are to be summed.
     """
     inputs = projection_inputs(gaussians, cameras, scales=SOLID, sh_degree=sh_degree, near=near)
-    total = GradientSum() if total is None else total
-    *fields, total.token = _Project.apply(
-        *inputs, total.token, total.found, cameras.width, cameras.height, _degree(gaussians, sh_degree), near
+    gradient_sum = gradient_sum or GradientSum()
+    *fields, gradient_sum.token = _Project.apply(
+        *inputs, gradient_sum.token, gradient_sum.found,
+        cameras.width, cameras.height, _degree(gaussians, sh_degree), near,
     )  # fmt: skip
     return Projected(*fields)
 
