@@ -117,12 +117,12 @@ def _reflection_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         setup=reflection_setup(recipe),
         densify_until=strategy.densify_until,
         # Without propagation, the consistency of normals is not needed (lab/glossy.md).
-        until=mirrors.found_nothing,
+        is_finished=mirrors.found_nothing,
     )
     refinement = replace(
         reflection,
         setup=None,
-        until=None,
+        is_finished=None,
         name="3 refinement",
         share=1 - recipe.schedule.stop,
         renderer=Deferred(recipe.background or BLACK, depth=False),

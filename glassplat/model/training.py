@@ -435,7 +435,7 @@ class TrainingSession:
                 check()
                 yield message
         except (RankLostError, InputError, OSError) as error:
-            if not self._state.is_whole or self._state.step == begun:
+            if not self._state.is_consistent or self._state.step == begun:
                 raise
             self.save()
             if not isinstance(error, InputError):

@@ -102,15 +102,15 @@ def train(
         is_new = state.records.get(ENTERED_STAGE) != start
         if state.step == start or (is_early and is_new):
             if is_new and (is_early or stage.setup is not None):
-                state.is_whole = False
+                state.is_consistent = False
                 if stage.setup is not None:
                     yield from run_edit(stage.setup(state, with_corrected_cameras(dataset, state.scene)))
                 state.records[ENTERED_STAGE] = start
-                state.is_whole = True
+                state.is_consistent = True
                 ranks.synchronise(state)
             check_rates(stage, state.scene)
             yield StageEntered(state.step, stage.name, counts_of(state.scene))
-        while state.step < end and not (stage.until is not None and stage.until(state)):
+        while state.step < end and not (stage.is_finished is not None and stage.is_finished(state)):
             upcoming = scheduled_views(dataset, state, (1 + dataset.memory.ahead) * ranks.batch)
             for view in upcoming[ranks.rank :: ranks.count]:
                 view.read_ahead()
@@ -131,8 +131,8 @@ def run_step(
     """One optimisation step of a batch of views, and the actions due after it."""
     found = differentiate_step(stage, state, views, ranks, with_absgrad=state.step < stage.densify_until * iterations)
     visibility.record(found.visible, state.step, len(views))
-    state.is_whole = False
-    update_parameters(stage, state, found.gradients, iterations, views=len(views))
+    state.is_consistent = False
+    update_parameters(stage, state, found.gradients, iterations, batch=len(views))
     for part, added in found.statistics.items():
         statistics_of(state.statistics, part, added.view_count.shape[1], added.view_count.device).merge(added)
     clocks = [
@@ -148,7 +148,7 @@ def run_step(
         if (yield from run_edit(action.apply(state, with_corrected_cameras(dataset, state.scene), clock))):
             done.append(action)
     check_has_gaussians(state)
-    state.is_whole = True
+    state.is_consistent = True
     losses = mean_losses(found.losses)
     names = ", ".join(view.name for view in views)
     yield StepDone(state.step, names, sum(losses.values()), losses, counts_of(state.scene))
@@ -327,7 +327,7 @@ def loss_terms(stage: Stage, frame: Frame, view: View, scene: Scene) -> tuple[di
 
 
 def update_parameters(
-    stage: Stage, state: TrainState, gradients: Mapping[str, Tensor], iterations: int, *, views: int = 1
+    stage: Stage, state: TrainState, gradients: Mapping[str, Tensor], iterations: int, *, batch: int = 1
 ) -> None:
     """Steps the optimiser at the stage's learning rates, with gradients averaged over the batch."""
     parameters = state.scene.parameters()
@@ -335,7 +335,7 @@ def update_parameters(
     extent = state.scene.extent
     rates = {n: rate_tensor(stage.rates[n], parameters[n], progress, extent, iterations) for n in gradients}
     decays = {n: decay for n in gradients if (decay := decay_tensor(stage.rates[n], parameters[n])) is not None}
-    state.optimizer.step(parameters, gradients, rates, decays=decays, views=views)
+    state.optimizer.step(parameters, gradients, rates, decays=decays, batch=batch)
 
 
 def collect_statistics(statistics: dict[str, ScreenStatistics], result: ViewGradients, view: View) -> None:

@@ -50,9 +50,9 @@ class Optimizer:
         rates: Mapping[str, float | Tensor],
         *,
         decays: Mapping[str, Tensor] | None = None,
-        views: int = 1,
+        batch: int = 1,
     ) -> None:
-        """Updates `parameters` in place for every name in `gradients`, which are means over the views of the step.
+        """Updates `parameters` in place for every name in `gradients`, which are means over a batch of views.
 
         `decays` are those of `glassplat.kernels.adam.Update`, for parameters that have one.
 
@@ -63,21 +63,21 @@ class Optimizer:
         updates = []
         for name, gradient in gradients.items():
             parameter = parameters[name]
-            if not parameter.numel() or self._is_paused(name, views):
+            if not parameter.numel() or self._is_paused(name, batch):
                 continue
             moments = self.moments_of(name, parameter)
-            self.updates[name] = self.updates.get(name, 0) + views
-            factor = math.sqrt(views) * self.raised_rates.get(name, 1.0)
+            self.updates[name] = self.updates.get(name, 0) + batch
+            factor = math.sqrt(batch) * self.raised_rates.get(name, 1.0)
             lr = rates[name] if factor == 1 else rates[name] * factor
-            step, decay = self.updates[name] / views, (decays or {}).get(name)
+            step, decay = self.updates[name] / batch, (decays or {}).get(name)
             updates.append(Update(parameter, gradient, *moments, lr, step, decay))
-        adam(updates, betas=(BETAS[0] ** views, BETAS[1] ** views))
+        adam(updates, betas=(BETAS[0] ** batch, BETAS[1] ** batch))
 
-    def _is_paused(self, name: str, views: int) -> bool:
+    def _is_paused(self, name: str, batch: int) -> bool:
         """Return whether a parameter is paused; counts the views of the step."""
         left = self.paused.get(name, 0)
         if left:
-            self.paused[name] = max(left - views, 0)
+            self.paused[name] = max(left - batch, 0)
         return left > 0
 
     def moments_of(self, name: str, parameter: Tensor) -> tuple[Tensor, Tensor]:
@@ -133,7 +133,7 @@ class TrainState:
         records: numbers that actions keep between calls, and the last setup, by name.
         means: running means of the parameters over the last steps of the run, see `AverageLast`.
         method: name of the method, for checkpoints; None if unknown.
-        is_whole: true if it can be saved; false during a step or an edit.
+        is_consistent: true if it can be saved; false during a step or an edit.
     """
 
     scene: Scene
@@ -145,7 +145,7 @@ class TrainState:
     records: dict[str, float] = field(default_factory=dict)
     means: dict[str, Tensor] = field(default_factory=dict)
     method: str | None = None
-    is_whole: bool = True
+    is_consistent: bool = True
 
     def generator(self, purpose: str) -> torch.Generator:
         """A random generator for one purpose at this step.
@@ -309,7 +309,7 @@ class Stage:
         post_steps: operations after the optimiser in every step, before the actions.
         setup: preparation at the start of the stage.
         densify_until: share of the run until which screen gradients are collected for densification.
-        until: condition that ends the stage early, checked before every step; the next stage then starts at once.
+        is_finished: ends the stage early where it returns true, before a step; the next stage then starts at once.
     """
 
     name: str
@@ -321,7 +321,7 @@ class Stage:
     post_steps: tuple[PostStep, ...] = ()
     setup: Setup | None = None
     densify_until: float = 0.0
-    until: Callable[[TrainState], bool] | None = None
+    is_finished: Callable[[TrainState], bool] | None = None
 
     def __post_init__(self) -> None:
         names = [term.name for term in self.losses]

@@ -270,7 +270,7 @@ def test_scenes_without_reflections_raise_the_rates_with_a_log_message(
     warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert state.optimizer.raised_rates == ({} if said is None else {"primary.sh": 3.0})
     _, reflection, refinement = DeferredRecipe().stages(seed=0)
-    assert reflection.until is not None and reflection.until(state) == (said is not None)
+    assert reflection.is_finished is not None and reflection.is_finished(state) == (said is not None)
     assert {term.name for term in reflection.losses} - {term.name for term in refinement.losses} == {"consistency"}
     assert len(warnings) == (said is not None)
     if said is not None:

@@ -191,9 +191,9 @@ def test_learning_rates_grow_by_the_root_of_the_views_and_pauses_count_views() -
     moved = []
     for views in (1, 4):
         parameters, optimizer = {"a": torch.zeros(3)}, Optimizer(paused={"b": 5})
-        optimizer.step(parameters, {"a": torch.ones(3)}, {"a": 0.1}, views=views)
+        optimizer.step(parameters, {"a": torch.ones(3)}, {"a": 0.1}, batch=views)
         moved.append(parameters["a"])
-        optimizer.step({"b": torch.zeros(1)}, {"b": torch.ones(1)}, {"b": 0.1}, views=views)
+        optimizer.step({"b": torch.zeros(1)}, {"b": torch.ones(1)}, {"b": 0.1}, batch=views)
         assert optimizer.paused["b"] == 5 - views
     assert torch.allclose(moved[1], 2 * moved[0])
 
@@ -206,7 +206,7 @@ def test_moments_remember_as_many_views_whatever_the_batch() -> None:
         views = 0
         for count in batches:
             gradient = torch.full((3,), float(views < 4), dtype=torch.float64)
-            optimizer.step(parameters, {"a": gradient}, {"a": 0.1}, views=count)
+            optimizer.step(parameters, {"a": gradient}, {"a": 0.1}, batch=count)
             views += count
         assert optimizer.updates == {"a": 6}
         moments.append(optimizer.moments["a"])

@@ -190,7 +190,7 @@ def test_a_stage_that_ends_early_leaves_its_steps_to_the_next(pause: int, tmp_pa
 
     (stage,) = SplatRecipe(sh_degree=1).stages(seed=0)
     stages = (
-        replace(stage, name="first", share=0.5, until=lambda state: state.step >= 3),
+        replace(stage, name="first", share=0.5, is_finished=lambda state: state.step >= 3),
         replace(stage, name="second", share=0.5, setup=grow),
     )
     whole, left = fresh_state(), fresh_state()
