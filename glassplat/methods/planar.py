@@ -529,9 +529,9 @@ def _shared_terms(recipe: PlanarRecipe, strategy: actions.DensificationStrategy)
     conflict = losses.cell_gradient_conflict if recipe.conflict == "cells" else losses.gradient_conflict
     reflectance = losses.ReflectancePrior(recipe.plane_fit.glass_reflectance)
     of_reflection = losses.weighted_terms(
-        losses.LossTerm("depth", weights.depth, losses.depth_deviation_loss),
+        losses.LossTerm("depth", weights.depth, losses.depth_deviation),
         losses.LossTerm("conflict", weights.conflict, conflict),
-        losses.LossTerm("mask", weights.mask, losses.mask_loss),
+        losses.LossTerm("mask", weights.mask, losses.mask_difference),
         losses.LossTerm("intensity", weights.intensity, losses.intensity_prior),
         losses.LossTerm("reflectance", weights.reflectance, reflectance),
         losses.LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, losses.tint_prior),

@@ -12,7 +12,7 @@ from glassplat.scene.scene import Scene
 from glassplat.training.actions import DensificationStrategy, GrowSh, SeedUnexplained, default_strategy, mcmc_strategy
 from glassplat.training.corrections import with_learned_corrections, with_neutral_corrections
 from glassplat.training.densify import as_discs
-from glassplat.training.losses import LossTerm, PhotometricLoss, disc_normals, distortion
+from glassplat.training.losses import LossTerm, PhotometricLoss, disc_normal_consistency, distortion
 from glassplat.training.options import PUBLISHED_ITERATIONS, MethodRecipe
 from glassplat.training.stage import AverageLast, Every, Stage
 
@@ -50,7 +50,7 @@ def splat_stages(recipe: SplatRecipe, seed: int, iterations: int = PUBLISHED_ITE
         last = stages.pop()
         stages += [replace(last, share=start - began)] if start > began else []
         losses = (*last.losses, term)
-        with_normals = any(known.function is disc_normals for known in losses)
+        with_normals = any(known.function is disc_normal_consistency for known in losses)
         name = f"{last.name}, {term.name}"
         stages.append(replace(last, name=name, renderer=_training_renderer(recipe, normal=with_normals), losses=losses))
         began = start
@@ -97,7 +97,7 @@ def terms_by_start(options: DiscTerms, iterations: int) -> tuple[tuple[float, Lo
     distortion_start = max(options.distortion_start, LEAST_DISTORTION_START / iterations)
     terms = (
         (distortion_start, LossTerm("distortion", options.distortion_weight, distortion)),
-        (options.normal_start, LossTerm("normals", options.normal_weight, disc_normals)),
+        (options.normal_start, LossTerm("normals", options.normal_weight, disc_normal_consistency)),
     )
     wanted = [(start, term) for start, term in terms if term.weight > 0 and start < 1]
     return tuple(sorted(wanted, key=lambda pair: pair[0]))

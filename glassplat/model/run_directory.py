@@ -208,7 +208,7 @@ class RunDirectory:
         """
         if self.checkpoint.exists():
             raise InputError(
-                f"{self.path} already holds a run; pass --resume to continue it, or choose another --output"
+                f"{self.path} already holds a run; resume it (--resume, resume=True), or choose another output"
             )
         if self.is_saved:
             raise InputError(f"{self.path} already holds a trained scene; choose another --output, or move it away")

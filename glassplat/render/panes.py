@@ -84,12 +84,12 @@ def seen_panes(
         mask: [H, W] as given to `nearest_hits`.
         most: maximum number per ray, nearest first; all if None.
     """
-    hits, seen = [first], _visible_panes(first)
+    hits, seen = [first], _are_visible(first)
     if not any(seen):
         return None
     while len(hits) < (len(planes) if most is None else most):
         further = nearest_hits(panes_in_camera(planes, camera), camera, mask, beyond=hits[-1])
-        shown = _visible_panes(further)
+        shown = _are_visible(further)
         if not any(shown):
             break
         hits.append(further)
@@ -108,8 +108,8 @@ def seen_panes(
     return SeenPanes(planes, rows, order, tiles[rows], windows[rows], mirrored_views(planes, camera))
 
 
-def _visible_panes(hits: PaneHits) -> list[bool]:
-    """Visible panes. The only synchronisation with a GPU here."""
+def _are_visible(hits: PaneHits) -> list[bool]:
+    """Visibility of each pane. Reading it is the only synchronisation with a GPU here."""
     found: list[bool] = hits.tiles.flatten(1).any(dim=1).tolist()
     return found
 

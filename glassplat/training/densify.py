@@ -483,11 +483,11 @@ def relocate_and_grow(
         cap: maximum number of Gaussians; a larger set does not shrink.
         generator: source of randomness, on the device of `gaussians`.
     """
-    relocated, moments = apply_edit(gaussians, moments, relocate(options, gaussians, generator))
+    relocated, moments = apply_edit(gaussians, moments, relocate(gaussians, generator))
     return apply_edit(relocated, moments, grow(options, relocated, cap, generator))
 
 
-def relocate(options: McmcDensify, gaussians: Gaussians, generator: torch.Generator) -> Edit:
+def relocate(gaussians: Gaussians, generator: torch.Generator) -> Edit:
     """Moves every dead Gaussian onto a live one, drawn with a probability proportional to its opacity.
 
     Without live ones, nothing moves; if more than `MOST_COPIES` would share a position, the surplus stays dead.

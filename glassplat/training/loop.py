@@ -34,7 +34,7 @@ class NoGaussiansError(TrainingDivergedError):
 
 
 ENTERED_STAGE = "set up"
-"""Key of `TrainState.records`: the stage last set up, or entered early, by its scheduled first step."""
+"""Key of `TrainState.records`: the scheduled first step of the last stage that was set up or began early."""
 CAMERA_ADVICE = (
     "Expected cameras that look at the points: check their poses and focal lengths, and whether the points are those "
     "of this capture; photographs of a few pixels (--downscale) or high learning rates end like this too"

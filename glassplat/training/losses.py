@@ -12,14 +12,15 @@ import torch
 from torch import Tensor
 
 from glassplat.captures.view import NORMALS_FOLDER, View, copy_ignored_pixels, rotate_to_world
-from glassplat.kernels.panes import gradient_conflict as shared_edges
-from glassplat.kernels.panes import inside_panes
+from glassplat.kernels import panes as pane_kernels
 from glassplat.kernels.photometric import photometric
 from glassplat.render.deferred import cell_means, cell_side, depth_normals
 from glassplat.render.frame import Frame
 from glassplat.scene import camera, logit
 from glassplat.scene.camera import Camera, to_device
 from glassplat.scene.scene import Scene
+
+log = logging.getLogger("glassplat.training")
 
 LossFunction = Callable[[Frame, View, Scene], Tensor | None]
 
@@ -86,7 +87,7 @@ def _direct_mean(values: Tensor, activation: Callable[[Tensor], Tensor], frame: 
     return total / (frame.direct.sum() * math.prod(values.shape[1:])).clamp(min=1)
 
 
-def depth_deviation_loss(frame: Frame, view: View, scene: Scene) -> Tensor:
+def depth_deviation(frame: Frame, view: View, scene: Scene) -> Tensor:
     """Depth variance loss L_d over the hit mask (TR-Gaussians, Eq. 14).
 
     The image mean of H(u) sum_i |z_i - D_t(u)| w_i, the `deviation` layer, divided by the scene extent so that its
@@ -113,7 +114,7 @@ def distortion(frame: Frame, view: View, scene: Scene) -> Tensor:
     return frame.layers["distortion"].mean()
 
 
-def disc_normals(frame: Frame, view: View, scene: Scene) -> Tensor:
+def disc_normal_consistency(frame: Frame, view: View, scene: Scene) -> Tensor:
     """Normal consistency L_n (2DGS, Eq. 14): the image mean of sum_i w_i (1 - n_i . N).
 
     N is the normal of the surface that the expected depths describe, from the pixels left and right, above and below.
@@ -148,10 +149,7 @@ PAPER_PIXELS = 960 * 720
 """Size of photographs for which the paper chose the weight of L_c."""
 SIZE_POWER = 0.8
 """Exponent by which L_c shrinks with the number of pixels: between 0.5, if all edges are steps, and 1, if all are
-ramps. Measured on one scene from 100x75 to 800x600: 0.0525, 0.0193, 0.0062,
-0.0018."""
-
-
+ramps. Measured on one scene from 100x75 to 800x600: 0.0525, 0.0193, 0.0062, 0.0018."""
 CELLS_ACROSS = 36
 """Cells along the longer side of a photograph, in which shared edges are summed."""
 
@@ -168,8 +166,8 @@ def gradient_conflict(frame: Frame, view: View, scene: Scene) -> Tensor:
     one weight suits all sizes.
     """
     layers = frame.layers
-    inside = inside_panes(layers["pane"], layers["strength"])
-    return _size_factor(inside) * shared_edges(layers["without_panes"], layers["reflection"], inside)
+    inside = pane_kernels.inside_panes(layers["pane"], layers["strength"])
+    return _size_factor(inside) * pane_kernels.gradient_conflict(layers["without_panes"], layers["reflection"], inside)
 
 
 def cell_gradient_conflict(frame: Frame, view: View, scene: Scene) -> Tensor:
@@ -181,10 +179,10 @@ def cell_gradient_conflict(frame: Frame, view: View, scene: Scene) -> Tensor:
     left do not count (see `gradient_conflict` of `kernels.panes`), and values are clipped at white.
     """
     layers = frame.layers
-    inside = inside_panes(layers["pane"], layers["strength"])
+    inside = pane_kernels.inside_panes(layers["pane"], layers["strength"])
     reflection = layers["reflection"].detach().clamp(0, 1)
     cell = max(1, round(max(inside.shape) / CELLS_ACROSS))
-    edges = shared_edges(layers["without_panes"], reflection, inside, layers["strength"], cell=cell)
+    edges = pane_kernels.gradient_conflict(layers["without_panes"], reflection, inside, layers["strength"], cell=cell)
     return _size_factor(inside) * edges
 
 
@@ -212,7 +210,7 @@ def residual(frame: Frame, view: View, scene: Scene) -> Tensor:
     return difference.masked_fill(~valid_pixels(view, image.device)[..., None], 0)
 
 
-def mask_loss(frame: Frame, view: View, scene: Scene) -> Tensor | None:
+def mask_difference(frame: Frame, view: View, scene: Scene) -> Tensor | None:
     """Reflection mask loss L_m (TR-Gaussians, Eq. 16), on annotated views only. Ignored pixels have no error."""
     if view.pane_labels is None:
         return None
@@ -282,9 +280,6 @@ def strength_outside(frame: Frame, view: View, scene: Scene) -> Tensor | None:
 def mean_strength(frame: Frame, view: View, scene: Scene) -> Tensor:
     """Mean reflection strength of all Gaussians: a penalty that prefers plain colours where these suffice."""
     return torch.sigmoid(scene.primary.channels["logit_strength"]).mean()
-
-
-log = logging.getLogger("glassplat.training")
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from glassplat.render.frame import Frame
 from glassplat.render.splat import Splat
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
-from glassplat.training.losses import disc_normals, distortion, normals_of_depths
+from glassplat.training.losses import disc_normal_consistency, distortion, normals_of_depths
 from tests.render.tiny_scene import camera_at
 from tests.training.tiny_capture import tiny_capture
 
@@ -63,17 +63,17 @@ def test_normals_of_a_true_depth_map_are_exact(normal: tuple[float, float, float
 
 
 def test_discs_that_lie_in_their_surface_agree_with_it() -> None:
-    agreeing = disc_normals(frame_of(wall(0.5)), VIEW, wall(0.5)).detach()
-    apart = disc_normals(frame_of(wall(0.5, turned=0.4)), VIEW, wall(0.5)).detach()
+    agreeing = disc_normal_consistency(frame_of(wall(0.5)), VIEW, wall(0.5)).detach()
+    apart = disc_normal_consistency(frame_of(wall(0.5, turned=0.4)), VIEW, wall(0.5)).detach()
     assert abs(float(agreeing)) < 0.02 < float(apart)
 
 
 def test_normals_turn_discs_into_their_surface() -> None:
     scene = wall(0.3, turned=0.3)
-    (gradient,) = torch.autograd.grad(disc_normals(frame_of(scene), VIEW, scene), scene.primary.quats)
+    (gradient,) = torch.autograd.grad(disc_normal_consistency(frame_of(scene), VIEW, scene), scene.primary.quats)
     turned: Tensor = scene.primary.quats.detach() - 20 * gradient
     after = Scene(scene.primary.with_tensors({"quats": turned}), 2.0)
-    before, better = (disc_normals(frame_of(s), VIEW, s).detach() for s in (scene, after))
+    before, better = (disc_normal_consistency(frame_of(s), VIEW, s).detach() for s in (scene, after))
     assert float(better) < float(before)
 
 

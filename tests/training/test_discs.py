@@ -17,7 +17,7 @@ from glassplat.model.run_directory import RunDirectory
 from glassplat.render.splat import Splat
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import train
-from glassplat.training.losses import disc_normals
+from glassplat.training.losses import disc_normal_consistency
 from glassplat.training.messages import StepDone
 from glassplat.training.stage import TrainState
 from tests.cli.tiny_run import write_capture
@@ -43,7 +43,7 @@ def test_terms_count_from_their_share_of_the_run_on() -> None:
     assert [isinstance(renderer, Splat) and renderer.normal for renderer in renderers] == [False, False, True]
     first = replace(DISCS, discs=DiscTerms(normal_start=0.0, distortion_weight=0.0)).stages(0)
     assert [stage.share for stage in first] == [1.0]
-    assert first[0].losses[-1].function is disc_normals
+    assert first[0].losses[-1].function is disc_normal_consistency
     assert len(replace(DISCS, discs=DiscTerms(0.0, 0.1, 0.0, 0.2)).stages(0)) == 1
     assert len(replace(DISCS, primitive="ellipsoid").stages(0)) == 1
 

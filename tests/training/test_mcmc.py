@@ -99,7 +99,7 @@ def test_dead_gaussians_are_relocated_to_live_ones_and_share_their_opacity() -> 
 
 def test_live_ones_are_drawn_in_proportion_to_their_opacity() -> None:
     opacities = [0.8, 0.2] * 100 + [0.001] * 1000
-    edit = relocate(OPTIONS, make_gaussians(opacities), rng())
+    edit = relocate(make_gaussians(opacities), rng())
     moved = edit.source[200:]
     assert (moved < 200).all()
     assert (moved % 2 == 0).float().mean().item() == pytest.approx(0.8, abs=0.04)

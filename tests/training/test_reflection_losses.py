@@ -21,10 +21,10 @@ from glassplat.training.losses import (
     LossFunction,
     ReflectancePrior,
     cell_gradient_conflict,
-    depth_deviation_loss,
+    depth_deviation,
     gradient_conflict,
     intensity_prior,
-    mask_loss,
+    mask_difference,
     tint_prior,
 )
 
@@ -144,8 +144,8 @@ def test_mask_loss_applies_to_annotated_views_only() -> None:
     frame = frame_with(mask=torch.full((8, 9), 0.25))
     labels = torch.zeros(8, 9, dtype=torch.uint8)
     labels[:4] = 2
-    assert mask_loss(frame, SimpleNamespace(pane_labels=None), SimpleNamespace()) is None
-    annotated = mask_loss(frame, SimpleNamespace(pane_labels=labels, ignored=None), SimpleNamespace())
+    assert mask_difference(frame, SimpleNamespace(pane_labels=None), SimpleNamespace()) is None
+    annotated = mask_difference(frame, SimpleNamespace(pane_labels=labels, ignored=None), SimpleNamespace())
     torch.testing.assert_close(annotated, torch.tensor(0.5 * 0.75 + 0.5 * 0.25))
 
 
@@ -155,7 +155,7 @@ def test_people_in_front_of_a_pane_leave_no_hole_in_it() -> None:
     ignored = torch.zeros(8, 9, dtype=torch.bool)
     ignored[2:5, 3:7] = True
     view = SimpleNamespace(pane_labels=labels, ignored=ignored)
-    (gradient,) = torch.autograd.grad(mask_loss(frame_with(mask=mask), view, SimpleNamespace()), mask)
+    (gradient,) = torch.autograd.grad(mask_difference(frame_with(mask=mask), view, SimpleNamespace()), mask)
     assert not bool(gradient[ignored].any()) and bool((gradient[~ignored] < 0).all())
 
 
@@ -171,10 +171,8 @@ def test_reflections_depart_from_what_they_mirror_as_much_darker_as_brighter() -
 
 def test_depth_deviation_loss_does_not_depend_on_the_unit_of_length() -> None:
     deviation, hit = torch.rand(8, 9), torch.ones(8, 9)
-    metres = depth_deviation_loss(
-        frame_with(deviation=deviation, hit=hit), SimpleNamespace(), SimpleNamespace(extent=2.0)
-    )
-    millimetres = depth_deviation_loss(
+    metres = depth_deviation(frame_with(deviation=deviation, hit=hit), SimpleNamespace(), SimpleNamespace(extent=2.0))
+    millimetres = depth_deviation(
         frame_with(deviation=1000 * deviation, hit=hit), SimpleNamespace(), SimpleNamespace(extent=2000.0)
     )
     torch.testing.assert_close(metres, millimetres)

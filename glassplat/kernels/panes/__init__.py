@@ -265,12 +265,12 @@ def layer_derivatives(
 
 
 @torch.no_grad()
-def sample_derivatives(derivatives: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
+def sample_derivatives(derivatives: Tensor, surface: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
     """Values of an image of derivatives at the centres of splats, 1 in front of a surface. Not differentiable.
 
     Args:
         derivatives: [H, W] derivatives by the transmission.
-        near: [H, W] depth of the surface, infinite where there is none.
+        surface: [H, W] its depth, infinite where there is none.
         means2d: [C, N, 2] centres in pixels; those outside the image, and NaN, are clamped to its border.
         depths: [C, N] of the centres.
 
@@ -278,9 +278,9 @@ def sample_derivatives(derivatives: Tensor, near: Tensor, means2d: Tensor, depth
         [C, N].
     """
     size, leading = tuple(derivatives.shape), tuple(depths.shape)
-    expected = {"derivatives": (derivatives, size), "near": (near, size), "means2d": (means2d, (*leading, 2))}
+    expected = {"derivatives": (derivatives, size), "surface": (surface, size), "means2d": (means2d, (*leading, 2))}
     check_tensors({**expected, "depths": (depths, leading)})
-    images = (tensor.detach().contiguous() for tensor in (derivatives, near, means2d, depths))
+    images = (tensor.detach().contiguous() for tensor in (derivatives, surface, means2d, depths))
     found: Tensor = kernels_for("panes", derivatives.device).sample_derivatives(*images)
     return found
 
