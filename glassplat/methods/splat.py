@@ -9,12 +9,19 @@ from glassplat.captures.dataset import Dataset
 from glassplat.options import BLACK
 from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
-from glassplat.training.actions import DensificationStrategy, GrowSh, SeedUnexplained, default_strategy, mcmc_strategy
+from glassplat.training.actions import (
+    AverageLast,
+    DensificationStrategy,
+    GrowSh,
+    SeedUnexplained,
+    default_strategy,
+    mcmc_strategy,
+)
 from glassplat.training.corrections import with_learned_corrections, with_neutral_corrections
 from glassplat.training.densify import as_discs
 from glassplat.training.losses import LossTerm, PhotometricLoss, disc_normal_consistency, distortion
 from glassplat.training.options import PUBLISHED_ITERATIONS, MethodRecipe
-from glassplat.training.stage import AverageLast, Every, Stage
+from glassplat.training.stage import Every, Stage
 
 if TYPE_CHECKING:
     from glassplat.methods.splat_recipe import DiscTerms, SplatRecipe

@@ -46,7 +46,7 @@ class ScreenPass:
 
 
 @dataclass(frozen=True)
-class SpacePass:
+class TracedPass:
     """The record of a ray-traced scene part, which has no screen positions, for densification.
 
     Attributes:
@@ -68,7 +68,7 @@ class Frame:
         direct: [N] bool, primary Gaussians that are visible directly; None if unknown.
         mirrored: [N] bool, those visible as mirror images; None without reflections.
         screen: one record per rasterised part and pass, if requested by `with_absgrad`.
-        space: one record per traced part, if requested by `with_absgrad`.
+        traced: one record per traced part, if requested by `with_absgrad`.
     """
 
     rgb: Tensor
@@ -76,7 +76,7 @@ class Frame:
     direct: Tensor | None = None
     mirrored: Tensor | None = None
     screen: tuple[ScreenPass, ...] = ()
-    space: tuple[SpacePass, ...] = ()
+    traced: tuple[TracedPass, ...] = ()
 
     def __repr__(self) -> str:
         height, width = self.rgb.shape[:2]
@@ -102,7 +102,7 @@ class Renderer(Protocol):
         Args:
             scene: the scene.
             camera: the camera.
-            with_absgrad: also prepare the records of densification, `Frame.screen` and `Frame.space`; slows down the
+            with_absgrad: also prepare the records of densification, `Frame.screen` and `Frame.traced`; slows down the
                 backward pass.
         """
         ...

@@ -27,7 +27,7 @@ from glassplat.render.frame import (
     MEDIAN_DEPTH,
     NEAR_PER_EXTENT,
     Frame,
-    SpacePass,
+    TracedPass,
     WithBackground,
     check_colored,
     over_background,
@@ -96,7 +96,7 @@ class Traced(WithBackground):
             layers=layers,
             direct=surface.direct,
             screen=surface.screen,
-            space=() if contributions is None else (SpacePass("surroundings", contributions),),
+            traced=() if contributions is None else (TracedPass("surroundings", contributions),),
         )
 
     def _shade(

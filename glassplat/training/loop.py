@@ -15,7 +15,7 @@ from glassplat.captures.dataset import Dataset, with_corrected_cameras
 from glassplat.captures.view import View
 from glassplat.errors import join_names
 from glassplat.kernels.screen_statistics import Views
-from glassplat.render.frame import Frame, ScreenPass, SpacePass
+from glassplat.render.frame import Frame, ScreenPass, TracedPass
 from glassplat.scene.camera import constant, to_device
 from glassplat.scene.panes import PANE_TENSORS, nearest_pixels
 from glassplat.scene.scene import PARTS, Scene
@@ -49,7 +49,7 @@ class ViewGradients(NamedTuple):
     losses: dict[str, float]
     gradients: dict[str, Tensor]
     screen: list[tuple[ScreenPass, Tensor, Tensor]]
-    space: list[tuple[SpacePass, Tensor]]
+    traced: list[tuple[TracedPass, Tensor]]
     visible: Tensor | None
 
 
@@ -303,15 +303,15 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, with_absgrad: bool)
     values = torch.stack([*terms.values()]) * weights
     # Of their sum, not of the terms with weights as `grad_outputs`, for which PyTorch imports SymPy.
     sums = [values.sum()] if values.requires_grad else []
-    inputs = ([*leaves.values()], centers, absgrads, [record.contributions for record in frame.space])
+    inputs = ([*leaves.values()], centers, absgrads, [record.contributions for record in frame.traced])
     gradient = iter(torch.autograd.grad(sums, [*itertools.chain(*inputs)], allow_unused=True))
     v_leaves, v_centers, v_absgrads, v_contributions = ([*itertools.islice(gradient, len(some))] for some in inputs)
     gradients = {name: g for name, g in zip(leaves, v_leaves, strict=True) if g is not None}
     passes = zip(tracked, v_centers, v_absgrads, strict=True)
     screen = [(record, v_means, v) for record, v_means, v in passes if v_means is not None and v is not None]
-    space = [(record, v) for record, v in zip(frame.space, v_contributions, strict=True) if v is not None]
+    traced = [(record, v) for record, v in zip(frame.traced, v_contributions, strict=True) if v is not None]
     losses = dict(zip(terms, values.tolist(), strict=True))
-    return ViewGradients(losses, gradients, screen, space, frame.visible)
+    return ViewGradients(losses, gradients, screen, traced, frame.visible)
 
 
 def loss_terms(stage: Stage, frame: Frame, view: View, scene: Scene) -> tuple[dict[str, Tensor], Tensor]:
@@ -344,10 +344,10 @@ def collect_statistics(statistics: dict[str, ScreenStatistics], result: ViewGrad
     for record, v_means, v_absgrad in result.screen:
         known = statistics_of(statistics, record.part, v_means.shape[1], v_means.device)
         known.add(Views(v_means, v_absgrad, valid_radii(record, view), *size, record.weight, record.direct))
-    for traced, v_contributions in result.space:
-        gradient = result.gradients.get(f"{traced.part}.means")
+    for record, v_contributions in result.traced:
+        gradient = result.gradients.get(f"{record.part}.means")
         if gradient is not None:
-            known = statistics_of(statistics, traced.part, gradient.shape[0], gradient.device)
+            known = statistics_of(statistics, record.part, gradient.shape[0], gradient.device)
             known.add_traced(gradient, v_contributions)
 
 

@@ -131,7 +131,7 @@ class TrainState:
         statistics: screen gradients collected for densification, by scene part.
         seconds: training time so far, over all sessions, without compilation of kernels.
         records: numbers that actions keep between calls, and the last setup, by name.
-        means: running means of the parameters over the last steps of the run, see `AverageLast`.
+        means: running means of the parameters over the last steps of the run, see `AverageLast` of `training.actions`.
         method: name of the method, for checkpoints; None if unknown.
         is_consistent: true if it can be saved; false during a step or an edit.
     """
@@ -361,39 +361,3 @@ def stages_without_step(stages: tuple[Stage, ...], iterations: int) -> list[Stag
     starts = stage_starts(stages, iterations)
     spans = zip(stages, starts[:-1], starts[1:], strict=True)
     return [stage for stage, start, end in spans if start >= end and (stage.share > 0 or stage.setup is not None)]
-
-
-MOST_AVERAGED_SHARE = 0.1
-"""Maximum share of the run to average over, because short runs still change much during their last pass."""
-AVERAGED_STEPS = "averaged steps"
-
-
-@dataclass(frozen=True)
-class AverageLast:
-    """Replaces the parameters at the end of the run by their mean over the last passes over the views.
-
-    Each step pulls the scene towards one view, and learning rates are high to the end; the mean over a pass favours
-    none (Polyak and Juditsky 1992; not in the papers).
-
-    Attributes:
-        passes: number of passes over the training views; 0 keeps the parameters of the last step.
-    """
-
-    passes: float
-
-    def __call__(self, state: TrainState, clock: Clock, visible: Tensor | None) -> None:
-        """Edits `state`; the mean restarts if the set of Gaussians changes."""
-        length = min(round(self.passes * clock.views), int(MOST_AVERAGED_SHARE * clock.iterations))
-        if clock.step <= clock.iterations - length:
-            return
-        parameters = state.scene.parameters()
-        shapes, known = ({name: t.shape for name, t in tensors.items()} for tensors in (parameters, state.means))
-        if shapes != known or AVERAGED_STEPS not in state.records:
-            state.means = {name: tensor.detach().clone() for name, tensor in parameters.items()}
-            state.records[AVERAGED_STEPS] = 0
-        state.records[AVERAGED_STEPS] += 1
-        for name, tensor in parameters.items():
-            state.means[name].lerp_(tensor.detach(), 1 / state.records[AVERAGED_STEPS])
-        if clock.step == clock.iterations:
-            state.scene, state.means = state.scene.with_parameters(state.means), {}
-            del state.records[AVERAGED_STEPS]

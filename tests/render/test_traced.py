@@ -257,9 +257,9 @@ def test_pixels_without_a_traced_ray_reflect_the_environment() -> None:
 
 def test_a_frame_with_absgrad_records_distances_of_the_surroundings() -> None:
     scene, camera = glossy(), camera_at(0.0, 0.0, 0.0)
-    assert Traced()(scene, camera).space == ()
+    assert Traced()(scene, camera).traced == ()
     frame = Traced()(scene, camera, with_absgrad=True)
-    (record,) = frame.space
+    (record,) = frame.traced
     weights, products = torch.autograd.grad(frame.rgb.sum(), record.contributions)[0].unbind(dim=1)
     # Objects are three units in front of the camera, and the surroundings one and a half behind it.
     expected = (scene.surroundings.means - torch.tensor([0.0, 0.0, 3.0])).norm(dim=1)
@@ -287,5 +287,5 @@ def test_an_empty_view_has_no_reflection() -> None:
             each, replace(away, cam_from_world=away.cam_from_world), with_absgrad=True
         )
         assert bool(frame.rgb.isfinite().all()) and int(frame.layers["reflection"].count_nonzero()) == 0
-        (met,) = torch.autograd.grad(frame.rgb.sum(), frame.space[0].contributions)
+        (met,) = torch.autograd.grad(frame.rgb.sum(), frame.traced[0].contributions)
         assert int(met.count_nonzero()) == 0

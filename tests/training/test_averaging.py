@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from glassplat.methods.splat_recipe import SplatRecipe
-from glassplat.training.actions import replace_sorted
+from glassplat.training.actions import AverageLast, replace_sorted
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import train
 from glassplat.training.messages import StepDone
 from glassplat.training.options import Intervals
-from glassplat.training.stage import AverageLast, Clock, Stage, TrainState
+from glassplat.training.stage import Clock, Stage, TrainState
 from tests.training.tiny_capture import tiny_capture
 
 ITERATIONS, LAST = 40, 4

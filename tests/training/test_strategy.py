@@ -18,6 +18,7 @@ from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import (
     AddNoise,
+    AverageLast,
     Densify,
     Relocate,
     ResetOpacity,
@@ -30,7 +31,7 @@ from glassplat.training.loop import differentiate, train
 from glassplat.training.losses import PhotometricLoss
 from glassplat.training.messages import ActionDone, Message, StepDone
 from glassplat.training.options import DefaultDensify, Intervals, McmcDensify
-from glassplat.training.stage import AverageLast, Clock, Stage, TrainState
+from glassplat.training.stage import Clock, Stage, TrainState
 from tests.training.tiny_capture import tiny_capture, true_scene
 
 OFTEN = McmcDensify(interval=2, start=0.1, cap=45)

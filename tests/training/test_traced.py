@@ -209,11 +209,11 @@ def test_a_step_accumulates_gradients_of_hit_gaussians() -> None:
     state.scene = replace(state.scene, primary=replace(state.scene.primary, channels=strong))
     stage = RECIPE.stages(0)[2]
     result = differentiate(stage, state.scene, tiny_capture().train[0], with_absgrad=True)
-    ((record, met),) = result.space
+    ((record, met),) = result.traced
     assert record.part == "surroundings"
     reached = result.gradients["surroundings.means"].any(dim=1)
     assert bool(reached.any()) and bool((met[reached] > 0).all())
-    assert not differentiate(stage, state.scene, tiny_capture().train[0], with_absgrad=False).space
+    assert not differentiate(stage, state.scene, tiny_capture().train[0], with_absgrad=False).traced
 
 
 def test_surroundings_never_reflected_are_pruned() -> None:
