@@ -30,8 +30,8 @@ def main(run: tyro.conf.Positional[Path], output: Path = Path("edited")) -> None
     # Add a mirror by its centre, its normal and its half sizes; this also works in scenes of other programs.
     planes = model.scene.planes
     size = 0.2 * model.scene.extent
-    beside = planes.centers[0] + 0.1 * model.scene.extent * planes.normals[0]
-    mirrored = model.with_pane(beside.tolist(), planes.normals[0].tolist(), (size, size), base_reflectance=1)
+    position = planes.centers[0] + 0.1 * model.scene.extent * planes.normals[0]
+    mirrored = model.with_pane(position.tolist(), planes.normals[0].tolist(), (size, size), base_reflectance=1)
     print(mirrored)
 
     # Save for other programs, with the panes in a separate file; as a page for any browser; and as a run to reload.

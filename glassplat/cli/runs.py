@@ -22,7 +22,7 @@ from glassplat.files.images import image_paths
 from glassplat.files.sidecars import read_cameras
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
 from glassplat.methods.recipe import photo_background, resolve_background
-from glassplat.model.run_directory import RunDirectory, check_output
+from glassplat.model.run_directory import RunDirectory
 from glassplat.model.training import Listener, Training
 from glassplat.render.frame import Renderer
 from glassplat.scene.scene import Scene
@@ -133,7 +133,6 @@ def photograph_paths(dataset: Dataset) -> list[Path]:
 
 def train(command: Train[Any], console: Console) -> None:
     """Trains, with a progress bar or lines."""
-    check_output(RunDirectory(command.output), resume=command.resume)
     dataset = make_dataset(
         command.files, downscale=command.downscale, background=photo_background(command.recipe), memory=command.memory
     )

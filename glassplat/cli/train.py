@@ -130,14 +130,14 @@ def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:
     if first not in RECIPES and not first.startswith("-"):
         raise InputError(unknown_name_message("method", first, RECIPES, "glassplat train --help"))
     full = FULL_HELP in arguments
-    # One that is none, parsing will refuse.
+    # An unknown preset is refused by the parser.
     preset: Preset = "paper" if last_option_value(arguments, "--preset") == "paper" else "glassplat"
     recipes = [recipe_of(method, preset) for method in RECIPES]
     if (config := last_option_value(arguments, "--config")) is not None:
         given = read_recipe(Path(config), arguments)
         recipes = [given if recipe.method == given.method else recipe for recipe in recipes]
     if not full and any(help_option in arguments for help_option in HELP):
-        note = HELP_POINTER if named_method(arguments) else ""  # Once, not for each method of the list.
+        note = HELP_POINTER if named_method(arguments) else ""  # Not for each method of the list.
         recipes = [hide_advanced_options(recipe, note) for recipe in recipes]
     choices = [Annotated[type(r), tyro.conf.subcommand(r.method, default=r)] for r in recipes]
     any_recipe: Any = functools.reduce(operator.or_, choices)

@@ -34,8 +34,8 @@ def check_bins(channels: Tensor, bins: TileBins, cameras: int, count: int, these
         )
 
 
-ABSGRAD = 7
-"""Index of `absgrad` among the operation's arguments."""
+ABSGRAD, ABSGRAD_OF_DISCS = 7, 5
+"""Positions of `absgrad` among the arguments of the two autograd functions."""
 
 
 class Composite(NamedTuple):
@@ -237,7 +237,7 @@ class _CompositeDiscs(torch.autograd.Function):
         found = kernels_for("composite", channels.device).composite_discs_gradients(
             Discs(means2d, maps, opacities, depths, outlines), channels, bins, saved,
             [v.contiguous() for v in v_outputs],
-            near=near, low_pass=low_pass, with_absgrad=ctx.needs_input_grad[5],
+            near=near, low_pass=low_pass, with_absgrad=ctx.needs_input_grad[ABSGRAD_OF_DISCS],
         )  # fmt: skip
         return (*found, None, None, None, None, None)
 
