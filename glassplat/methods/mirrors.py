@@ -75,17 +75,8 @@ class ReflectionMeasure:
 
 def mean_in_region(scene: Scene, shown: Tensor, values: Tensor) -> float:
     """Mean of values [N] over the Gaussians in the region, weighted by visibility [N]; 0 if there are none."""
-    shown = torch.where(in_region(scene), shown, 0)
+    shown = torch.where(scene.environment.surrounds(scene.primary.means), shown, 0)
     return float((shown * values).sum() / shown.sum().clamp(min=1e-6))
-
-
-def in_region(scene: Scene) -> Tensor:
-    """[N] bool: primary Gaussians inside the region; all if there is none."""
-    means = scene.primary.means
-    if scene.environment.region is None:
-        return torch.ones(len(means), dtype=torch.bool, device=means.device)
-    *center, radius = scene.environment.region
-    return (means - means.new_tensor(center)).norm(dim=1) <= radius
 
 
 def residual_spreads(scene: Scene, views: Sequence[View], renderer: Renderer) -> tuple[Tensor, Tensor]:
@@ -145,7 +136,7 @@ def mirror_lookalikes(
     neighbours = nearest_neighbours(scene.primary.means[rows], COLOR_NEIGHBOURS)
     weights, values = shown[rows][neighbours], spreads[rows].square()[neighbours]
     variances[rows] = (weights * values).sum(1) / weights.sum(1)
-    return seen, seen & (variances > options.spread**2) & in_region(scene)
+    return seen, seen & (variances > options.spread**2) & scene.environment.surrounds(scene.primary.means)
 
 
 @torch.no_grad()
@@ -399,7 +390,7 @@ class Propagate:
             )
             return
         region = state.scene.environment.region
-        if region is not None and not bool(in_region(state.scene).any()):
+        if region is not None and not bool(state.scene.environment.surrounds(state.scene.primary.means).any()):
             *center, radius = region
             advice = EMPTY_ADVICE % (radius, *center)
         else:

@@ -58,6 +58,13 @@ class Environment:
         """Return whether there is no environment."""
         return self.size == 0
 
+    def surrounds(self, means: Tensor) -> Tensor:
+        """[N] bool: centres [N, 3] inside the region; all if there is none."""
+        if self.region is None:
+            return torch.ones(len(means), dtype=torch.bool, device=means.device)
+        *center, radius = self.region
+        return (means - means.new_tensor(center)).norm(dim=1) <= radius
+
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name."""
         return {name: getattr(self, name) for name in ENVIRONMENT_TENSORS}

@@ -270,9 +270,7 @@ def strength_outside(frame: Frame, view: View, scene: Scene) -> Tensor | None:
     """
     if scene.environment.region is None:
         return None
-    means = scene.primary.means.detach()
-    *center, radius = scene.environment.region
-    outside = (means - means.new_tensor(center)).norm(dim=1) > radius
+    outside = ~scene.environment.surrounds(scene.primary.means.detach())
     strengths = torch.sigmoid(scene.primary.channels["logit_strength"])
     return (strengths * outside).sum() / outside.sum().clamp(min=1)
 

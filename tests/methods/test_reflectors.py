@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from glassplat.captures.view import View, sample_evenly
-from glassplat.methods.mirrors import ReflectionMeasure, in_region, residual_spreads
+from glassplat.methods.mirrors import ReflectionMeasure, residual_spreads
 from glassplat.render.deferred import Deferred
 from glassplat.render.layers import contributions
 from glassplat.scene import SH_ZERO, logit
@@ -55,7 +55,7 @@ def test_reflectors_are_weighted_by_strength_and_visibility(strength: float) -> 
 def test_gaussians_outside_the_region_do_not_count() -> None:
     scene = two_discs(strength=0.9)
     scene = replace(scene, environment=replace(scene.environment, region=(-0.5, 0.0, 2.0, 0.3)))
-    assert in_region(scene).tolist() == [True, False]
+    assert scene.environment.surrounds(scene.primary.means).tolist() == [True, False]
     assert ReflectionMeasure().reflective_share(scene, views(0)) == pytest.approx(0.9, abs=1e-3)
     everywhere = replace(scene, environment=replace(scene.environment, region=None))
     assert ReflectionMeasure().reflective_share(everywhere, views(0)) == pytest.approx(0.45, abs=1e-3)
