@@ -274,7 +274,7 @@ class Planar(WithBackground):
             deviation=result.deviation.squeeze(0) if deviation else None,
             splats=splats,
             marks=marks,
-            direct=visible_gaussians(primary),
+            visible=visible_gaussians(primary),
             screen=screen,
             gradient_sum=gradient_sum,
         )

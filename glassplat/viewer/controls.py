@@ -21,7 +21,7 @@ from glassplat.scene.panes import Planes
 from glassplat.scene.scene import PaneMove
 from glassplat.viewer.drawing import LEAST_GAIN, MOST_GAIN, ViewerState, ViewRequest, matrix_of, wxyz_of
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 
 def log_errors(callback: Callable[..., Any]) -> Callable[..., None]:
@@ -32,7 +32,7 @@ def log_errors(callback: Callable[..., Any]) -> Callable[..., None]:
         try:
             callback(*arguments)
         except Exception as error:  # noqa: BLE001 - A client must not stop the server or the other clients.
-            logger.warning("a request of a browser failed: %s: %s", type(error).__name__, error)
+            log.warning("a request of a browser failed: %s: %s", type(error).__name__, error)
 
     return call
 

@@ -44,7 +44,7 @@ HEADERS = {"X-Frame-Options": "DENY", "X-Content-Type-Options": "nosniff", "Refe
 HANDLER_DELAY_ITERATIONS = 4
 """Iterations of asyncio's loop from accepting a connection until its handler runs."""
 _SERVE = threading.Lock()
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 
 class ShortText(Field):
@@ -223,4 +223,4 @@ def guarded_server(access: Access, *, host: str, port: int, title: str) -> viser
 
 def _log_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     """Logs the error of a message instead of printing its traceback."""
-    logger.debug("a message of a browser was rejected: %s", context.get("exception") or context.get("message"))
+    log.debug("a message of a browser was rejected: %s", context.get("exception") or context.get("message"))

@@ -71,7 +71,7 @@ MOST_SAVED = 2.0
 COARSE_SECONDS = 0.08
 """Target time of the first image after a move; its size follows from the time of previous images."""
 SMOOTHING = 0.3
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,7 @@ class RenderLoop(Generic[ViewT]):
         """The error as text; it is logged unless it repeats the previous one."""
         text = str(error) or type(error).__name__
         if text != self._last_error:
-            logger.warning("a view could not be rendered: %s", text)
+            log.warning("a view could not be rendered: %s", text)
         self._last_error = text
         return text
 
