@@ -23,7 +23,7 @@ from PIL import Image
 from glassplat.errors import InputError, convert_to_input_error, join_names
 from glassplat.files import images
 
-HIGHEST_LABEL = 64
+HIGHEST_MASK_LABEL = 64
 """Grey values up to this one are labels if none is brighter; masks painted for viewing are never that dark."""
 THRESHOLD = 128
 WHITE = 255
@@ -54,7 +54,7 @@ def read_mask_values(path: Path) -> MaskValues:
     shades = _read_shades(path)
     counts = np.bincount(shades.ravel(), minlength=WHITE + 1)
     lossy = path.suffix.lower() in LOSSY_SUFFIXES
-    if not lossy and not counts[HIGHEST_LABEL + 1 :].any():
+    if not lossy and not counts[HIGHEST_MASK_LABEL + 1 :].any():
         return MaskValues("labels" if counts[1:].any() else "empty", shades)
     _check_black_and_white(counts, path, lossy)
     pixels = (shades >= THRESHOLD).astype(np.uint8)
@@ -64,7 +64,7 @@ def read_mask_values(path: Path) -> MaskValues:
 def read_mask_at_threshold(path: Path) -> MaskValues:
     """Read one mask file of a format that thresholds greys at one half; label images are unchanged."""
     shades = _read_shades(path)
-    if path.suffix.lower() not in LOSSY_SUFFIXES and not (shades > HIGHEST_LABEL).any():
+    if path.suffix.lower() not in LOSSY_SUFFIXES and not (shades > HIGHEST_MASK_LABEL).any():
         return MaskValues("labels" if shades.any() else "empty", shades)
     pixels = (shades >= THRESHOLD).astype(np.uint8)
     return MaskValues("binary" if pixels.any() else "empty", pixels)
@@ -95,10 +95,10 @@ def _to_eight_bits(values: NDArray[np.integer], path: Path) -> NDArray[np.uint8]
     most = int(values.max())
     if most <= WHITE:
         return values.astype(np.uint8)
-    if most // SIXTEEN_TO_EIGHT <= HIGHEST_LABEL and (values % SIXTEEN_TO_EIGHT).any():
+    if most // SIXTEEN_TO_EIGHT <= HIGHEST_MASK_LABEL and (values % SIXTEEN_TO_EIGHT).any():
         raise InputError(
-            f"{path} holds the value {most}, which is neither a pane label (0..{HIGHEST_LABEL}) nor white of 16 bits "
-            "(65535); write 0 for no pane and 1..K for the panes"
+            f"{path} holds the value {most}, which is neither a pane label (0..{HIGHEST_MASK_LABEL}) nor white of "
+            "16 bits (65535); write 0 for no pane and 1..K for the panes"
         )
     return (values // SIXTEEN_TO_EIGHT).astype(np.uint8)
 
@@ -138,8 +138,8 @@ def _check_black_and_white(counts: NDArray[np.int64], path: Path, lossy: bool) -
     if few or grey.sum() > SOFT_SHARE * counts.sum():
         present = join_names([str(value) for value in np.flatnonzero(counts)])
         raise InputError(
-            f"{path} holds the grey values {present}, which are neither pane labels (0..{HIGHEST_LABEL}) nor black and "
-            "white (0 and 255); write 0 for no pane and 1..K for the panes"
+            f"{path} holds the grey values {present}, which are neither pane labels (0..{HIGHEST_MASK_LABEL}) nor "
+            "black and white (0 and 255); write 0 for no pane and 1..K for the panes"
         )
 
 
@@ -194,7 +194,7 @@ class KeepMask:
     def labels(self) -> NDArray[np.uint8]:
         """[H, W] 1 where a pixel is ignored."""
         shades = _brightness(self.path)
-        return (shades < (THRESHOLD if shades.max() > HIGHEST_LABEL else 1)).astype(np.uint8)
+        return (shades < (THRESHOLD if shades.max() > HIGHEST_MASK_LABEL else 1)).astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -284,7 +284,7 @@ def _find_keep_masks(
 def _pane_masks_reason(root: Path, masks: Mapping[str, Path], *, marked: bool) -> str | None:
     """Sentence on why masks in `masks/` are treated as pane masks; None if they are not."""
     highest = next((value for value in map(_highest_value, masks.values()) if value), 0)
-    labels = 0 < highest <= HIGHEST_LABEL
+    labels = 0 < highest <= HIGHEST_MASK_LABEL
     if marked:
         if labels:
             raise InputError(

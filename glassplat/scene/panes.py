@@ -46,7 +46,7 @@ class Planes:
         logit_reflectances: [K] base reflectance R0 before the sigmoid.
         tangents: [K, 3] direction of the rectangle's first side; made orthogonal to the normal in use.
         half_sizes: [K, 2] half the side lengths along tangent and bitangent; world units.
-        labels: pane label of each plane, as found in the masks, 1 to 255.
+        labels: pane label of each plane, 1 to 255; masks have labels up to 64.
         mirrors: labels of mirrors, which transmit nothing; their base reflectance gets no gradient.
         log_transmittances: [K, 3] logarithm of the transmitted share of the unreflected red, green and blue light. None
             if all panes are clear.
@@ -65,7 +65,7 @@ class Planes:
         rows = dict.fromkeys(self.tensors(), ((3,),)) | {"logit_reflectances": ((),), "half_sizes": ((2,),)}
         check_rows(self.tensors(), len(self.labels), rows)
         if wrong := [label for label in self.labels if not 1 <= label <= HIGHEST_LABEL]:
-            raise ValueError(f"there are planes with the labels {wrong}; expected 1 to {HIGHEST_LABEL}, as in masks")
+            raise ValueError(f"there are planes with the labels {wrong}; expected 1 to {HIGHEST_LABEL}")
         if len(set(self.labels)) < len(self.labels):
             raise ValueError(f"there are planes with the labels {self.labels}; expected another one for each plane")
         if not set(self.mirrors) <= set(self.labels):

@@ -344,10 +344,10 @@ def collect_statistics(statistics: dict[str, ScreenStatistics], result: ViewGrad
     for record, v_means, v_absgrad in result.screen:
         known = statistics_of(statistics, record.part, v_means.shape[1], v_means.device)
         known.add(Views(v_means, v_absgrad, valid_radii(record, view), *size, record.weight, record.direct))
-    for record, v_contributions in result.traced:
-        gradient = result.gradients.get(f"{record.part}.means")
+    for traced, v_contributions in result.traced:
+        gradient = result.gradients.get(f"{traced.part}.means")
         if gradient is not None:
-            known = statistics_of(statistics, record.part, gradient.shape[0], gradient.device)
+            known = statistics_of(statistics, traced.part, gradient.shape[0], gradient.device)
             known.add_traced(gradient, v_contributions)
 
 
