@@ -73,7 +73,7 @@ REASONS: dict[str, dict[str, str]] = {
         "turn_reflections": "What the first stage built behind glass would stay there, and R0 would be too low.",
         "weights.reflectance": "Where no photograph shows what is mirrored, its brightness and R0 are ambiguous.",
         "plane_fit.glass_reflectance": "That of clear glass: from 0.2, reflections begin too bright.",
-        "weights.intensity": "R0 and the brightness factor a are nearly interchangeable.",
+        "weights.intensity": "R0 and the reflection intensity a are nearly interchangeable.",
         "conflict": "Per pixel, most matches are edges that coincide by chance.",
         "moving_mean": "Gaussians move towards the mean depth, and outliers do not pull the mean.",
         "perturbation.stop": "Perturbed opacities need time to settle.",
