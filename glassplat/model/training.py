@@ -508,7 +508,7 @@ class Training:
                     print(step, loss)
 
     Under `torchrun`, several processes train together, each with one view per step. Between two messages, after the
-    first `StepDone`, `model` is the current scene. With an `output`, the run is written as by `glassplat train`; after
+    first `StageEntered`, `model` is the current scene. With an `output`, the run is written as by `glassplat train`; after
     `break` or Ctrl-C, `resume=True` continues it. Without `output`, everything stays in memory, and a `break` at a
     `Working` message loses the edit in progress.
 
@@ -616,7 +616,7 @@ class Training:
         """
         state = self._state if self._run is None else self._run.state
         if state is None:
-            raise RuntimeError("the run has not started; ask after the first message of a step")
+            raise RuntimeError("the run has not started; iterate over it first, at least to `StageEntered`")
         return state
 
     @property

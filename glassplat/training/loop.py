@@ -270,15 +270,16 @@ class VisibilityCheck:
 
 
 def scheduled_views(dataset: Dataset, state: TrainState, count: int) -> list[View]:
-    """The views of this step: every view once per pass, in a new random order for each pass."""
-    positions = (divmod(step, len(dataset.train)) for step in range(state.step, state.step + count))
-    return [dataset.train[view_order(len(dataset.train), state.seed, n)[position]] for n, position in positions]
+    """The next views: every view once per pass, in a new random order for each pass."""
+    views = dataset.train
+    positions = (divmod(step, len(views)) for step in range(state.step, state.step + count))
+    return [views[view_order(len(views), state.seed, passes)[position]] for passes, position in positions]
 
 
 @lru_cache(maxsize=8)
-def view_order(count: int, seed: int, number: int) -> list[int]:
-    """Random order of the views in a pass."""
-    generator = torch.Generator().manual_seed(seed * 1_000_003 + number)
+def view_order(count: int, seed: int, passes: int) -> list[int]:
+    """Random order of the views in the pass after `passes` others."""
+    generator = torch.Generator().manual_seed(seed * 1_000_003 + passes)
     order: list[int] = torch.randperm(count, generator=generator).tolist()
     return order
 
