@@ -9,14 +9,7 @@ from glassplat.captures.dataset import Dataset
 from glassplat.options import BLACK
 from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
-from glassplat.training.actions import (
-    AverageLast,
-    DensificationStrategy,
-    GrowSh,
-    SeedUnexplained,
-    default_strategy,
-    mcmc_strategy,
-)
+from glassplat.training import actions
 from glassplat.training.corrections import with_learned_corrections, with_neutral_corrections
 from glassplat.training.densify import as_discs
 from glassplat.training.losses import LossTerm, PhotometricLoss, disc_normal_consistency, distortion
@@ -48,7 +41,7 @@ def splat_stages(recipe: SplatRecipe, seed: int, iterations: int = PUBLISHED_ITE
         renderer=_training_renderer(recipe),
         losses=(image_term(recipe.ssim_weight), *strategy.terms),
         rates=recipe.rates.of("primary", recipe.view_dependence_weight),
-        actions=(*_seed_actions(recipe), *strategy.edits, GrowSh(Every(recipe.intervals.sh)), *strategy.resets),
+        actions=(*_seed_actions(recipe), *strategy.edits, actions.GrowSh(Every(recipe.intervals.sh)), *strategy.resets),
         post_steps=strategy.post_steps,
         densify_until=strategy.densify_until,
     )
@@ -74,22 +67,22 @@ SEED_AT = (0.105, 0.203)
 """Shares of a run at which missing objects are searched for, as in `planar`."""
 
 
-def _seed_actions(recipe: SplatRecipe) -> tuple[SeedUnexplained, ...]:
+def _seed_actions(recipe: SplatRecipe) -> tuple[actions.SeedUnexplained, ...]:
     """The search for missing objects, if enabled."""
     wanted = recipe.seed_unexplained and recipe.primitive == "ellipsoid" and recipe.strategy == "default"
     cap = recipe.densify.cap
-    return tuple(SeedUnexplained((share,), _training_renderer(recipe), cap) for share in SEED_AT if wanted)
+    return tuple(actions.SeedUnexplained((share,), _training_renderer(recipe), cap) for share in SEED_AT if wanted)
 
 
-def strategy_of(recipe: MethodRecipe) -> DensificationStrategy:
+def strategy_of(recipe: MethodRecipe) -> actions.DensificationStrategy:
     """Contribution of the recipe's strategy."""
     if recipe.strategy == "mcmc":
-        strategy = mcmc_strategy(recipe.mcmc, recipe.rates.of("primary")["primary.means"])
+        strategy = actions.mcmc_strategy(recipe.mcmc, recipe.rates.of("primary")["primary.means"])
     else:
-        strategy = default_strategy(recipe.densify, recipe.intervals)
+        strategy = actions.default_strategy(recipe.densify, recipe.intervals)
     if recipe.intervals.averaged_passes == 0:
         return strategy
-    return replace(strategy, post_steps=(*strategy.post_steps, AverageLast(recipe.intervals.averaged_passes)))
+    return replace(strategy, post_steps=(*strategy.post_steps, actions.AverageLast(recipe.intervals.averaged_passes)))
 
 
 LEAST_DISTORTION_START = 400

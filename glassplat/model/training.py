@@ -508,9 +508,9 @@ class Training:
                     print(step, loss)
 
     Under `torchrun`, several processes train together, each with one view per step. Between two messages, after the
-    first `StageEntered`, `model` is the current scene. With an `output`, the run is written as by `glassplat train`; after
-    `break` or Ctrl-C, `resume=True` continues it. Without `output`, everything stays in memory, and a `break` at a
-    `Working` message loses the edit in progress.
+    first `StageEntered`, `model` is the current scene. With an `output`, the run is written as by `glassplat train`;
+    after `break` or Ctrl-C, `resume=True` continues it. Without `output`, everything stays in memory, and a `break`
+    at a `Working` message loses the edit in progress.
 
     Attributes:
         recipe: method and options, with the background of the photographs.

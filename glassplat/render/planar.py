@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_origin, get_type_hints
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from glassplat.kernels.panes import layer_derivatives, sample_derivatives
 from glassplat.kernels.project import GradientSum
 from glassplat.kernels.records import Deviation, PaneHits, Panes, Splats
 from glassplat.kernels.tiles import bin_tiles
-from glassplat.options import BLACK, Blend, Rgb
+from glassplat.options import BLACK, Blend, Rgb, check_value
 from glassplat.render.frame import (
     NEAR_PER_EXTENT,
     Frame,
@@ -61,12 +61,6 @@ PhotographerMode = Literal["absent", "present", "separate"]
 """Modes of rendering the photographer in panes."""
 ReflectionGradient = Literal["all", "planes"]
 """Parameters that receive the gradient of the reflection."""
-MODES = {
-    "fresnel": Fresnel,
-    "blend": Blend,
-    "reflection_gradient": ReflectionGradient,
-    "photographer": PhotographerMode,
-}
 
 
 class DirectPass(NamedTuple):
@@ -145,9 +139,9 @@ class Planar(WithBackground):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, modes in MODES.items():
-            if (value := getattr(self, name)) not in get_args(modes):
-                raise ValueError(f"{name} is {value!r}; expected one of {get_args(modes)}")
+        for name, hint in get_type_hints(type(self)).items():
+            if get_origin(hint) is Literal:
+                check_value(hint, getattr(self, name), name)
 
     def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
         """Renders `scene` from `camera`, on the scene's device.
