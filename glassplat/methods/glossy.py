@@ -116,7 +116,6 @@ def _reflection_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         post_steps=strategy.post_steps,
         setup=reflection_setup(recipe),
         densify_until=strategy.densify_until,
-        # Without propagation, the consistency of normals is not needed (lab/glossy.md).
         is_finished=mirrors.found_nothing,
     )
     refinement = replace(
@@ -126,6 +125,7 @@ def _reflection_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         name="3 refinement",
         share=1 - recipe.schedule.stop,
         renderer=Deferred(recipe.background or BLACK, depth=False),
+        # Without propagation, the consistency of normals is not needed (lab/glossy.md).
         losses=tuple(term for term in reflection.losses if term.name != "consistency"),
     )
     return bootstrap, reflection, refinement
