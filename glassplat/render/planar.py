@@ -163,12 +163,13 @@ class Planar(WithBackground):
             return Frame(direct.image, layers, direct.visible, None, direct.screen)
         mirrored = self._mirrored_pass(scene, camera, seen, with_absgrad, direct.gradient_sum)
         masks = self._visibilities(scene, camera, seen, direct)
-        result = self._composite_panes(direct, seen, masks, mirrored, camera)
+        result = composite_panes(direct.image, seen, masks, mirrored.reflections, camera, **self._blending)
         if self.photographer == "separate" and len(scene.photographer):
             with_body = replace(self, photographer="present")._mirrored_pass(
                 scene, camera, seen, False, direct.gradient_sum
             )
-            layers["photographed"] = self._composite_panes(direct, seen, masks, with_body, camera).rgb
+            photographed = composite_panes(direct.image, seen, masks, with_body.reflections, camera, **self._blending)
+            layers["photographed"] = photographed.rgb
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
         if seen.planes.transmittances is not None:
             layers["tint"] = tint_of_panes(seen, masks, seen.planes.transmittances)
@@ -190,8 +191,8 @@ class Planar(WithBackground):
         mirrored = replace(self, background=BLACK)._mirrored_pass(scene, camera, seen, False, direct.gradient_sum)
         masks = self._visibilities(scene, camera, seen, direct)
         images = (over_background(mirrored.reflections, mirrored.alpha, (*color, 0.0)) for color in backgrounds)
-        passes = (mirrored._replace(reflections=image) for image in images)
-        return [self._composite_panes(direct, seen, masks, one, camera).reflection for one in passes]
+        results = (composite_panes(direct.image, seen, masks, image, camera, **self._blending) for image in images)
+        return [result.reflection for result in results]
 
     def direct_pass(self, scene: Scene, camera: Camera) -> DirectPass:
         """The direct pass, which does not depend on the poses of panes."""
@@ -299,20 +300,10 @@ class Planar(WithBackground):
         reflections = over_background(result.image, result.alpha, (*self.background, 0.0))
         return MirroredPass(reflections, result.alpha, visible_gaussians(projected), screen)
 
-    def _composite_panes(
-        self, direct: DirectPass, seen: SeenPanes, masks: Sequence[Tensor], mirrored: MirroredPass, camera: Camera
-    ) -> CompositedPanes:
-        """Composites the panes and their reflections over the image."""
-        return composite_panes(
-            direct.image,
-            seen,
-            masks,
-            mirrored.reflections,
-            camera,
-            fresnel=self.fresnel,
-            intensity=self.intensity,
-            blend=self.blend,
-        )
+    @property
+    def _blending(self) -> dict[str, Any]:
+        """Settings of `composite_panes`."""
+        return {"fresnel": self.fresnel, "intensity": self.intensity, "blend": self.blend}
 
     def _screen(
         self, direct: DirectPass, mirrored: MirroredPass, hits: PaneHits, result: CompositedPanes

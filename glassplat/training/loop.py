@@ -95,13 +95,13 @@ def train(
     ranks = ranks or Ranks()
     check_has_gaussians(state)
     visibility = VisibilityCheck(len(dataset.train))
-    starts, is_early = stage_starts(stages, iterations), False
+    starts, ended_early = stage_starts(stages, iterations), False
     for stage, start, end in zip(stages, starts, starts[1:], strict=False):
         if state.step >= end:
             continue
         is_new = state.records.get(ENTERED_STAGE) != start
-        if state.step == start or (is_early and is_new):
-            if is_new and (is_early or stage.setup is not None):
+        if state.step == start or (ended_early and is_new):
+            if is_new and (ended_early or stage.setup is not None):
                 state.is_consistent = False
                 if stage.setup is not None:
                     yield from run_edit(stage.setup(state, with_corrected_cameras(dataset, state.scene)))
@@ -116,7 +116,7 @@ def train(
                 view.read_ahead()
             views = scheduled_views(dataset, state, min(ranks.batch, end - state.step))
             yield from run_step(stage, dataset, state, iterations, views, ranks, visibility)
-        is_early = state.step < end
+        ended_early = state.step < end
 
 
 def run_step(
@@ -129,11 +129,11 @@ def run_step(
     visibility: VisibilityCheck,
 ) -> Iterator[Message]:
     """One optimisation step of a batch of views, and the actions due after it."""
-    found = differentiate_step(stage, state, views, ranks, with_absgrad=state.step < stage.densify_until * iterations)
-    visibility.record(found.visible, state.step, len(views))
+    result = differentiate_step(stage, state, views, ranks, with_absgrad=state.step < stage.densify_until * iterations)
+    visibility.record(result.visible, state.step, len(views))
     state.is_consistent = False
-    update_parameters(stage, state, found.gradients, iterations, batch=len(views))
-    for part, added in found.statistics.items():
+    update_parameters(stage, state, result.gradients, iterations, batch=len(views))
+    for part, added in result.statistics.items():
         statistics_of(state.statistics, part, added.view_count.shape[1], added.view_count.device).merge(added)
     clocks = [
         Clock(step + 1, iterations, len(dataset.train), batch=len(views))
@@ -141,7 +141,7 @@ def run_step(
     ]
     state.step += len(views)
     for post_step in stage.post_steps:
-        post_step(state, clocks[-1], found.visible)
+        post_step(state, clocks[-1], result.visible)
     due = [(clock, action) for clock, action in itertools.product(clocks, stage.actions) if action.due(clock)]
     done = []
     for clock, action in due:
@@ -149,7 +149,7 @@ def run_step(
             done.append(action)
     check_has_gaussians(state)
     state.is_consistent = True
-    losses = mean_losses(found.losses)
+    losses = mean_losses(result.losses)
     names = ", ".join(view.name for view in views)
     yield StepDone(state.step, names, sum(losses.values()), losses, counts_of(state.scene))
     for action in done:
