@@ -320,11 +320,7 @@ def _merge_layers(layers: Layers, farther: Layers, where: Tensor, blend: Blend) 
 
 def blend_conversions(blend: Blend) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
     """Conversions to the space of blending and back to sRGB."""
-    return (linear_from_srgb, srgb_from_linear) if blend == "linear" else (_identity, _identity)
-
-
-def _identity(color: Tensor) -> Tensor:
-    return color
+    return (linear_from_srgb, srgb_from_linear) if blend == "linear" else (torch.positive, torch.positive)
 
 
 def visibilities(seen: SeenPanes, joint: Tensor, own: Tensor) -> list[Tensor]:
