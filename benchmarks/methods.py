@@ -70,7 +70,7 @@ def step_work(scene: Scene, stage: Stage, view: View) -> Work:
     state = TrainState(scene, seed=0)
 
     def work() -> None:
-        result = differentiate(stage, state.scene, view, with_absgrad=True)
+        result = differentiate(stage, state.scene, view, with_records=True)
         update_parameters(stage, state, result.gradients, iterations=1000)
 
     return work

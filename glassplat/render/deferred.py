@@ -193,7 +193,7 @@ class Surface:
         alpha: [H, W] coverage.
         background: background colour, sRGB.
         direct: [N] bool, visible Gaussians.
-        screen: record of the pass, if requested by `with_absgrad`.
+        screen: record of the pass, if requested by `with_records`.
         extra: further layers; for discs, those of the surface's thickness.
     """
 
@@ -231,7 +231,7 @@ def blend_surface(
     *,
     background: tuple[float, float, float],
     depth: bool = True,
-    with_absgrad: bool = False,
+    with_records: bool = False,
 ) -> Surface:
     """Blends the surfaces of the primary Gaussians, which have a `logit_strength`. Depths of ellipsoids are those of
     their centres, and are omitted without `depth`, which saves a channel; those of discs are at ray intersections.
@@ -240,7 +240,7 @@ def blend_surface(
     extra: dict[str, Tensor] = {}
     if scene.primary.are_discs:
         discs = projected_discs(scene.primary, camera, near=near)
-        screen = (screen_pass("primary", discs),) if with_absgrad else ()
+        screen = (screen_pass("primary", discs),) if with_records else ()
         strengths = torch.sigmoid(scene.primary.channels["logit_strength"])[None, :, None]
         channels = torch.cat([discs.colors, discs.normals, strengths], dim=-1)
         blended = blend_discs(discs, channels, camera, near=near, screen=screen)
@@ -250,7 +250,7 @@ def blend_surface(
         direct = visible_gaussians(discs)
     else:
         projected = project_gaussians(scene.primary, camera, near=near)
-        screen = (screen_pass("primary", projected),) if with_absgrad else ()
+        screen = (screen_pass("primary", projected),) if with_records else ()
         depths = projected.depths[0, :, None] if depth else None
         channels = ellipsoid_channels(scene.primary, projected, camera, depths)
         result = blend_ellipsoids(projected, channels[None], camera, screen=screen)
@@ -348,7 +348,7 @@ class Deferred(WithBackground):
     environment: bool = False
     least_strength: float = 0.0
 
-    def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
+    def __call__(self, scene: Scene, camera: Camera, *, with_records: bool = False) -> Frame:
         """Renders `scene` from `camera`, on the scene's device.
 
         Raises:
@@ -356,7 +356,7 @@ class Deferred(WithBackground):
         """
         check_reflective(scene)
         camera = camera.to(scene.primary.means.device)
-        surface = blend_surface(scene, camera, background=self.background, depth=self.depth, with_absgrad=with_absgrad)
+        surface = blend_surface(scene, camera, background=self.background, depth=self.depth, with_records=with_records)
         shaded = shaded_pixels(scene, camera, surface.image, surface.alpha, self.background, self.least_strength)
         layers = surface.layers(shaded.base) | {"reflection": shaded.reflection}
         if self.environment:

@@ -67,8 +67,8 @@ class Frame:
         layers: further images by name, [H, W] or [H, W, 3]; a renderer's docstring lists its own.
         direct: [N] bool, primary Gaussians that are visible directly; None if unknown.
         mirrored: [N] bool, those visible as mirror images; None without reflections.
-        screen: one record per rasterised part and pass, if requested by `with_absgrad`.
-        traced: one record per traced part, if requested by `with_absgrad`.
+        screen: one record per rasterised part and pass, if requested by `with_records`.
+        traced: one record per traced part, if requested by `with_records`.
     """
 
     rgb: Tensor
@@ -96,13 +96,13 @@ class Frame:
 class Renderer(Protocol):
     """A function from a scene and a camera to a frame."""
 
-    def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
+    def __call__(self, scene: Scene, camera: Camera, *, with_records: bool = False) -> Frame:
         """Renders `scene` from `camera`; differentiable in every tensor of the scene.
 
         Args:
             scene: the scene.
             camera: the camera.
-            with_absgrad: also prepare the records of densification, `Frame.screen` and `Frame.traced`; slows down the
+            with_records: also make the records for densification, `Frame.screen` and `Frame.traced`; slows down the
                 backward pass.
         """
         ...

@@ -143,7 +143,7 @@ class Planar(WithBackground):
             if get_origin(hint) is Literal:
                 check_value(hint, getattr(self, name), name)
 
-    def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
+    def __call__(self, scene: Scene, camera: Camera, *, with_records: bool = False) -> Frame:
         """Renders `scene` from `camera`, on the scene's device.
 
         Raises:
@@ -151,7 +151,7 @@ class Planar(WithBackground):
         """
         check_panes(scene)
         camera = camera.to(scene.primary.means.device)
-        direct, hits, seen = self._find_panes(scene, camera, with_absgrad=with_absgrad)
+        direct, hits, seen = self._find_panes(scene, camera, with_records=with_records)
         layers = {"without_panes": direct.image, "depth": direct.depth, "alpha": direct.alpha, "mask": direct.mask}
         layers["pane"] = hits.pane
         if direct.deviation is not None:
@@ -161,7 +161,7 @@ class Planar(WithBackground):
             layers |= {"transmission": direct.image, "reflection": torch.zeros_like(direct.image)}
             layers |= {"strength": nothing, "share": nothing}
             return Frame(direct.image, layers, direct.visible, None, direct.screen)
-        mirrored = self._mirrored_pass(scene, camera, seen, with_absgrad, direct.gradient_sum)
+        mirrored = self._mirrored_pass(scene, camera, seen, with_records, direct.gradient_sum)
         masks = self._visibilities(scene, camera, seen, direct)
         result = composite_panes(direct.image, seen, masks, mirrored.reflections, camera, **self._blending)
         if self.photographer == "separate" and len(scene.photographer):
@@ -173,7 +173,7 @@ class Planar(WithBackground):
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
         if seen.planes.transmittances is not None:
             layers["tint"] = tint_of_panes(seen, masks, seen.planes.transmittances)
-        screen = self._screen(direct, mirrored, hits, result) if with_absgrad else ()
+        screen = self._screen(direct, mirrored, hits, result) if with_records else ()
         return Frame(result.rgb, layers, direct.visible, mirrored.visible, screen)
 
     def reflections(
@@ -227,15 +227,15 @@ class Planar(WithBackground):
         }
 
     def _find_panes(
-        self, scene: Scene, camera: Camera, *, with_absgrad: bool = False, direct: DirectPass | None = None
+        self, scene: Scene, camera: Camera, *, with_records: bool = False, direct: DirectPass | None = None
     ) -> tuple[DirectPass, PaneHits, SeenPanes | None]:
         """The direct pass, the nearest panes, and all visible panes (None if there are none)."""
         rectangles = panes_in_camera(scene.planes, camera)
-        direct = self._direct_pass(scene, camera, rectangles, with_absgrad) if direct is None else direct
+        direct = self._direct_pass(scene, camera, rectangles, with_records) if direct is None else direct
         hits = nearest_hits(rectangles, camera, direct.mask)
         return direct, hits, seen_panes(scene.planes, camera, hits, direct.mask, most=1 if self.nearest_only else None)
 
-    def _direct_pass(self, scene: Scene, camera: Camera, rectangles: Panes, with_absgrad: bool) -> DirectPass:
+    def _direct_pass(self, scene: Scene, camera: Camera, rectangles: Panes, with_records: bool) -> DirectPass:
         near, gradient_sum = NEAR_PER_EXTENT * scene.extent, GradientSum()
         primary = project_gaussians(scene.primary, camera, near=near, gradient_sum=gradient_sum)
         glass = project_gaussians(scene.glass, camera, near=near)
@@ -248,7 +248,7 @@ class Planar(WithBackground):
         if self.deviation:
             hit = nearest_hits(rectangles, camera).pane >= 0
             deviation = Deviation(DEPTH_CHANNEL, hit.to(channels.dtype)[None], self.deviation_depth_gradient)
-        screen = (screen_pass("primary", primary), screen_pass("glass", glass)) if with_absgrad else ()
+        screen = (screen_pass("primary", primary), screen_pass("glass", glass)) if with_records else ()
         result = composite(
             splats,
             channels,
@@ -275,7 +275,7 @@ class Planar(WithBackground):
         )
 
     def _mirrored_pass(
-        self, scene: Scene, camera: Camera, seen: SeenPanes, with_absgrad: bool, gradient_sum: GradientSum
+        self, scene: Scene, camera: Camera, seen: SeenPanes, with_records: bool, gradient_sum: GradientSum
     ) -> MirroredPass:
         primary, near = scene.primary, NEAR_PER_EXTENT * scene.extent
         if self.reflection_gradient == "planes":
@@ -285,7 +285,7 @@ class Planar(WithBackground):
         gain = torch.expm1(primary.channels["log_intensity"])[None].expand(len(seen.planes), -1)
         channels = torch.cat([projected.colors, gain[..., None]], dim=-1)
         mirrored = [projected]
-        screen: tuple[ScreenPass, ...] = (screen_pass("primary", projected, direct=False),) if with_absgrad else ()
+        screen: tuple[ScreenPass, ...] = (screen_pass("primary", projected, direct=False),) if with_records else ()
         if self.photographer == "present" and len(scene.photographer):
             body = project_photographer(scene, camera, seen, near=near)
             # The photographer has no intensity, which would be another factor on the colours.
@@ -293,7 +293,7 @@ class Planar(WithBackground):
             channels = torch.cat([channels, plain], dim=1)
             mirrored.append(body)
             # Densified by mirror images, as no view shows it directly.
-            screen += (screen_pass("photographer", body),) if with_absgrad else ()
+            screen += (screen_pass("photographer", body),) if with_records else ()
         splats = concat_splats(*mirrored)
         bins = bin_tiles(splats, camera.width, camera.height, seen.tiles)
         result = composite(splats, channels, bins, absgrad=concat_absgrad(screen))

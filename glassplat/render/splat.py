@@ -133,9 +133,9 @@ class WithNormals:
 
     renderer: Renderer
 
-    def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
+    def __call__(self, scene: Scene, camera: Camera, *, with_records: bool = False) -> Frame:
         """Renders `scene` from `camera`, on the scene's device."""
-        frame = self.renderer(scene, camera, with_absgrad=with_absgrad)
+        frame = self.renderer(scene, camera, with_records=with_records)
         if "normal" in frame.layers:
             return frame
         normals = ellipsoid_normals(scene, camera.to(scene.primary.means.device))
@@ -188,16 +188,16 @@ class Splat(WithBackground):
     depth: bool = True
     normal: bool = True
 
-    def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
+    def __call__(self, scene: Scene, camera: Camera, *, with_records: bool = False) -> Frame:
         """Renders `scene` from `camera`, on the scene's device."""
         camera = camera.to(scene.primary.means.device)
         if scene.primary.are_discs:
-            return self._discs(scene, camera, with_absgrad)
+            return self._discs(scene, camera, with_records)
         projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
         channels = projected.colors
         if self.depth:
             channels = torch.cat([channels, projected.depths[..., None]], dim=-1)
-        screen = (screen_pass("primary", projected),) if with_absgrad else ()
+        screen = (screen_pass("primary", projected),) if with_records else ()
         result = blend_ellipsoids(projected, channels, camera, screen=screen)
         # As a batch of one, then split, because indexing an image allocates a gradient of zeros.
         color, *depth = result.image.squeeze(0).split((3, 1) if self.depth else 3, dim=-1)
@@ -208,13 +208,13 @@ class Splat(WithBackground):
         rgb = over_background(color, alpha, self.background)
         return Frame(rgb, layers, direct=visible_gaussians(projected), screen=screen)
 
-    def _discs(self, scene: Scene, camera: Camera, with_absgrad: bool) -> Frame:
+    def _discs(self, scene: Scene, camera: Camera, with_records: bool) -> Frame:
         near = NEAR_PER_EXTENT * scene.extent
         projected = projected_discs(scene.primary, camera, near=near)
         channels = projected.colors
         if self.normal:
             channels = torch.cat([channels, projected.normals], dim=-1)
-        screen = (screen_pass("primary", projected),) if with_absgrad else ()
+        screen = (screen_pass("primary", projected),) if with_records else ()
         blended = blend_discs(projected, channels, camera, near=near, screen=screen)
         layers = disc_layers(blended, scene.extent)
         if self.normal:

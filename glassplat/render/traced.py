@@ -75,7 +75,7 @@ class Traced(WithBackground):
     joint: bool = True
     surroundings: bool = False
 
-    def __call__(self, scene: Scene, camera: Camera, *, with_absgrad: bool = False) -> Frame:
+    def __call__(self, scene: Scene, camera: Camera, *, with_records: bool = False) -> Frame:
         """Renders `scene` from `camera`, on the scene's device.
 
         Raises:
@@ -84,9 +84,9 @@ class Traced(WithBackground):
         """
         check_mirrored(scene)
         camera = camera.to(scene.primary.means.device)
-        surface = blend_surface(scene, camera, background=self.background, with_absgrad=with_absgrad)
+        surface = blend_surface(scene, camera, background=self.background, with_records=with_records)
         part = scene.surroundings
-        contributions = part.means.new_zeros(len(part), 2).requires_grad_() if with_absgrad and len(part) else None
+        contributions = part.means.new_zeros(len(part), 2).requires_grad_() if with_records and len(part) else None
         rgb, reflection = self._shade(scene, camera, surface, contributions)
         layers = surface.layers(surface.base) | {"reflection": reflection}
         if self.surroundings:

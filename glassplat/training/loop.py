@@ -129,7 +129,7 @@ def run_step(
     visibility: VisibilityCheck,
 ) -> Iterator[Message]:
     """One optimisation step of a batch of views, and the actions due after it."""
-    result = differentiate_step(stage, state, views, ranks, with_absgrad=state.step < stage.densify_until * iterations)
+    result = differentiate_step(stage, state, views, ranks, with_records=state.step < stage.densify_until * iterations)
     visibility.record(result.visible, state.step, len(views))
     state.is_consistent = False
     update_parameters(stage, state, result.gradients, iterations, batch=len(views))
@@ -160,11 +160,11 @@ def run_step(
 
 
 def differentiate_step(
-    stage: Stage, state: TrainState, views: Sequence[View], ranks: Ranks, *, with_absgrad: bool
+    stage: Stage, state: TrainState, views: Sequence[View], ranks: Ranks, *, with_records: bool
 ) -> StepGradients:
     """Differentiate the views of a step, each rank its own; the scene is not changed yet."""
     own = views[ranks.rank :: ranks.count]
-    results = [differentiate(stage, state.scene, view, with_absgrad=with_absgrad) for view in own]
+    results = [differentiate(stage, state.scene, view, with_records=with_records) for view in own]
     if len(views) == ranks.count == 1:
         check_losses(results[0].losses, state.step + 1, views[0])
         collect_statistics(state.statistics, results[0], views[0])
@@ -284,10 +284,10 @@ def view_order(count: int, seed: int, passes: int) -> list[int]:
     return order
 
 
-def differentiate(stage: Stage, scene: Scene, view: View, *, with_absgrad: bool) -> ViewGradients:
+def differentiate(stage: Stage, scene: Scene, view: View, *, with_records: bool) -> ViewGradients:
     """Renders a view; returns the weighted losses and the gradients of all learned parameters.
 
-    Gradients of passes are included only `with_absgrad`.
+    Gradients of passes are included only `with_records`.
     """
     leaves = {
         name: tensor.detach().requires_grad_()
@@ -297,7 +297,7 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, with_absgrad: bool)
     learning = scene.with_parameters(leaves)
     camera = learning.poses.correct(view.camera, view.name, learning.extent)
     view = view if camera is view.camera else view.with_camera(camera)
-    frame = stage.renderer(learning, view.camera, with_absgrad=with_absgrad)
+    frame = stage.renderer(learning, view.camera, with_records=with_records)
     terms, weights = loss_terms(stage, frame, view, learning)
     tracked = [record for record in frame.screen if record.means2d.requires_grad and record.means2d.numel() > 0]
     centers, absgrads = [record.means2d for record in tracked], [record.absgrad for record in tracked]

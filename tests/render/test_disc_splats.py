@@ -41,10 +41,10 @@ def test_the_background_lies_behind() -> None:
     torch.testing.assert_close(white.rgb - black.rgb, (1 - black.layers["alpha"])[..., None].expand_as(black.rgb))
 
 
-def test_a_frame_with_absgrad_has_the_gradient_of_each_pass() -> None:
+def test_a_frame_with_records_has_the_gradient_of_each_pass() -> None:
     scene = disc_scene()
     leaves = {name: t.detach().requires_grad_() for name, t in scene.parameters().items() if t.numel()}
-    frame = Splat()(scene.with_parameters(leaves), camera_at(0, 0, 0), with_absgrad=True)
+    frame = Splat()(scene.with_parameters(leaves), camera_at(0, 0, 0), with_records=True)
     (record,) = frame.screen
     v_means, v_absgrad = torch.autograd.grad(frame.rgb.sum(), [record.means2d, record.absgrad])
     assert bool((v_absgrad >= v_means.abs() - 1e-9).all()) and bool(v_absgrad.any())

@@ -164,7 +164,7 @@ def test_only_the_photographer_is_trained_during_plane_adjustment() -> None:
 
 
 def test_mirror_images_of_the_photographer_are_recorded_for_densification() -> None:
-    frame = PRESENT(photographed(), CAMERA, with_absgrad=True)
+    frame = PRESENT(photographed(), CAMERA, with_records=True)
     records = [record for record in frame.screen if record.part == "photographer"]
     assert len(records) == 1 and records[0].direct and float(records[0].radii.max()) > 0
     assert 0 < float(torch.as_tensor(records[0].weight)) < 1

@@ -17,7 +17,7 @@ CAMERA = camera_at(0.0, 0.0, -0.2)
 
 
 def primary_and_mirrored(scene: Scene, camera: Camera) -> tuple[ScreenPass, ScreenPass]:
-    screen = Planar(blend="srgb")(scene, camera, with_absgrad=True).screen
+    screen = Planar(blend="srgb")(scene, camera, with_records=True).screen
     assert [(record.part, record.direct) for record in screen] == [
         ("primary", True),
         ("glass", True),

@@ -255,10 +255,10 @@ def test_pixels_without_a_traced_ray_reflect_the_environment() -> None:
     torch.testing.assert_close(some.rgb[seen], distant.rgb[seen], atol=1e-6, rtol=0)
 
 
-def test_a_frame_with_absgrad_records_distances_of_the_surroundings() -> None:
+def test_a_frame_with_records_has_distances_of_the_surroundings() -> None:
     scene, camera = glossy(), camera_at(0.0, 0.0, 0.0)
     assert Traced()(scene, camera).traced == ()
-    frame = Traced()(scene, camera, with_absgrad=True)
+    frame = Traced()(scene, camera, with_records=True)
     (record,) = frame.traced
     weights, products = torch.autograd.grad(frame.rgb.sum(), record.contributions)[0].unbind(dim=1)
     # Objects are three units in front of the camera, and the surroundings one and a half behind it.
@@ -284,7 +284,7 @@ def test_an_empty_view_has_no_reflection() -> None:
     away = replace(camera_at(0.0, 0.0, 0.0), cam_from_world=torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double())
     for each in (scene, lit(scene)):
         frame = Traced(background=(0.2, 0.3, 0.4))(
-            each, replace(away, cam_from_world=away.cam_from_world), with_absgrad=True
+            each, replace(away, cam_from_world=away.cam_from_world), with_records=True
         )
         assert bool(frame.rgb.isfinite().all()) and int(frame.layers["reflection"].count_nonzero()) == 0
         (met,) = torch.autograd.grad(frame.rgb.sum(), frame.traced[0].contributions)

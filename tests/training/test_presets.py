@@ -291,14 +291,14 @@ def test_the_mean_depth_can_learn_from_the_deviation() -> None:
         recipe = PlanarRecipe(moving_mean=moving, ssim_weight=0.0, weights=weights)
         stage = recipe.stages(0)[-1]
         stage = replace(stage, losses=tuple(term for term in stage.losses if term.name == "depth"))
-        gradients.append(differentiate(stage, scene, view, with_absgrad=False).gradients["primary.means"])
+        gradients.append(differentiate(stage, scene, view, with_records=False).gradients["primary.means"])
     assert bool(gradients[0].any()) and not torch.allclose(*gradients)
 
 
 def test_all_views_and_mirror_images_can_count_alike() -> None:
     view, scene = tiny_capture().train[0], true_scene()
     direct, alike = (
-        PlanarRecipe(densify_by=by).stages(0)[-1].renderer(scene, view.camera, with_absgrad=True).screen
+        PlanarRecipe(densify_by=by).stages(0)[-1].renderer(scene, view.camera, with_records=True).screen
         for by in ("direct", "all")
     )
     assert [record.direct for record in direct] == [True, True, False]

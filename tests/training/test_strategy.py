@@ -145,7 +145,7 @@ def test_the_regularisers_reach_the_gaussians() -> None:
     (stage,) = RECIPES[0].stages(seed=0)
     scene, view = fresh_state(RECIPES[0]).scene, tiny_capture().train[0]
     plain = replace(stage, losses=tuple(term for term in stage.losses if term.name not in ("opacity", "scale")))
-    gradients = [differentiate(s, scene, view, with_absgrad=False).gradients for s in (stage, plain)]
+    gradients = [differentiate(s, scene, view, with_records=False).gradients for s in (stage, plain)]
     opacities, scales = torch.sigmoid(scene.primary.logit_opacities), scene.primary.log_scales.exp()
     shown = in_front(scene, view)
     expected = {
@@ -173,7 +173,7 @@ def test_the_noise_moves_what_the_view_shows(visible: list[bool] | None) -> None
 def test_a_step_passes_on_the_visible_gaussians() -> None:
     (stage,) = RECIPES[0].stages(seed=0)
     scene, view = fresh_state(RECIPES[0]).scene, tiny_capture().train[0]
-    visible = differentiate(stage, scene, view, with_absgrad=False).visible
+    visible = differentiate(stage, scene, view, with_records=False).visible
     assert visible is not None and torch.equal(visible, in_front(scene, view))
     assert visible.any() and not visible.all()
 

@@ -208,12 +208,12 @@ def test_a_step_accumulates_gradients_of_hit_gaussians() -> None:
     strong = {"logit_strength": torch.full((len(state.scene.primary),), 1.0)}
     state.scene = replace(state.scene, primary=replace(state.scene.primary, channels=strong))
     stage = RECIPE.stages(0)[2]
-    result = differentiate(stage, state.scene, tiny_capture().train[0], with_absgrad=True)
+    result = differentiate(stage, state.scene, tiny_capture().train[0], with_records=True)
     ((record, met),) = result.traced
     assert record.part == "surroundings"
     reached = result.gradients["surroundings.means"].any(dim=1)
     assert bool(reached.any()) and bool((met[reached] > 0).all())
-    assert not differentiate(stage, state.scene, tiny_capture().train[0], with_absgrad=False).traced
+    assert not differentiate(stage, state.scene, tiny_capture().train[0], with_records=False).traced
 
 
 def test_surroundings_never_reflected_are_pruned() -> None:
@@ -292,7 +292,7 @@ def test_normals_of_discs_can_learn_from_the_first_step_on() -> None:
     scene = fresh_state(recipe).scene
     # Depths count only where most of a pixel is covered.
     scene = scene.with_parameters({"primary.logit_opacities": torch.full((len(scene.primary),), 3.0)})
-    found = differentiate(recipe.stages(0)[0], scene, tiny_capture().train[0], with_absgrad=False)
+    found = differentiate(recipe.stages(0)[0], scene, tiny_capture().train[0], with_records=False)
     assert found.losses["consistency"] > 0 and bool(found.gradients["primary.quats"].any())
 
 
@@ -331,7 +331,7 @@ def test_faint_surfaces_learn_to_reflect_an_environment() -> None:
 def learns_to_reflect(stage: Stage, scene: Scene) -> bool:
     """Returns True if the photometric loss alone, without penalties on strength, gives strengths a gradient."""
     photometric = replace(stage, losses=stage.losses[:1])
-    found = differentiate(photometric, scene, tiny_capture().train[0], with_absgrad=False)
+    found = differentiate(photometric, scene, tiny_capture().train[0], with_records=False)
     return "primary.logit_strength" in found.gradients and bool(found.gradients["primary.logit_strength"].any())
 
 

@@ -109,7 +109,7 @@ def test_collecting_screen_gradients_changes_no_other_gradient() -> None:
     state = fresh_state()
     run(state, planar_stages(), 20, until=12)
     results = [
-        differentiate(planar_stages()[-1], state.scene, tiny_capture().train[0], with_absgrad=p) for p in (True, False)
+        differentiate(planar_stages()[-1], state.scene, tiny_capture().train[0], with_records=p) for p in (True, False)
     ]
     assert len(results[0].screen) == 3
     assert not results[1].screen
@@ -123,7 +123,7 @@ def statistics_of_views(views: Sequence[View]) -> dict[str, ScreenStatistics]:
     place_true_planes(state, None)
     found: dict[str, ScreenStatistics] = {}
     for view in views:
-        collect_statistics(found, differentiate(planar_stages()[-1], state.scene, view, with_absgrad=True), view)
+        collect_statistics(found, differentiate(planar_stages()[-1], state.scene, view, with_records=True), view)
     return found
 
 

@@ -40,7 +40,7 @@ def step(recipe: PlanarRecipe | SplatRecipe, stage: int, scene: Scene, view: Vie
     for _ in range(2):
         waits.places.clear()
         with waits:
-            result = differentiate(chosen, state.scene, view, with_absgrad=True)
+            result = differentiate(chosen, state.scene, view, with_records=True)
             update_parameters(chosen, state, result.gradients, iterations=100)
             collect_statistics(state.statistics, result, view)
     return waits.places
@@ -117,7 +117,7 @@ def test_the_cuda_kernels_synchronize_as_counted_by_the_stand_in() -> None:
 def test_terms_skipped_on_a_gpu_do_not_change_statistics(monkeypatch: pytest.MonkeyPatch) -> None:
     def differentiated() -> tuple[dict[str, float], dict[str, Tensor], list[Tensor]]:
         found = differentiate(
-            PlanarRecipe().stages(seed=0)[2], true_scene(), tiny_capture().train[0], with_absgrad=True
+            PlanarRecipe().stages(seed=0)[2], true_scene(), tiny_capture().train[0], with_records=True
         )
         return found.losses, found.gradients, [torch.as_tensor(record.weight) for record, *_ in found.screen]
 
