@@ -26,7 +26,7 @@ from glassplat.evaluate.metrics import quantize
 from glassplat.files.images import write_image
 from glassplat.files.records import readable_name
 from glassplat.files.sidecars import read_cameras, write_cameras
-from glassplat.files.writing import SPLAT_WRITERS, atomic_write, real_path, scene_source, write_splats
+from glassplat.files.writing import OUTPUT_FORMATS, SPLAT_WRITERS, atomic_write, real_path, scene_source, write_splats
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model import model as models
 from glassplat.publish.camera_paths import fit_to_width, interpolate_cameras, select_keyframes
@@ -219,19 +219,29 @@ def write_files(command: Export, console: Console) -> None:
         print_line(console, f"replacing the files of an earlier run of this command in {command.output}")
     written = [*_write_sidecars(command, model.scene, console), command.output / models.CAMERAS]
     write_cameras(command.output / models.CAMERAS, model.cameras.items())
-    for kind in (kind for kind in splats if kind in command.formats):
-        options = {"version": command.spz_version} if kind == "spz" else {}
-        with convert_to_input_error():
-            write_splats(kind, splats[kind], model.scene.primary, **options)
-        written.append(splats[kind])
-        print_line(console, f"{splats[kind].stat().st_size / 1e6:.2f} MB -> {splats[kind]}")
-        if lost := models.unsaved_parts(model, kind):
-            hint = f"; {command.scene} holds everything" if command.edits == SceneEdits() else ""
-            print_warning(console, f"{splats[kind].name} leaves out {', '.join(lost)}{hint}")
-    if "html" in command.formats:
-        written += _write_page(command, model, console)
+    failures = []
+    for kind in (kind for kind in OUTPUT_FORMATS if kind in command.formats):
+        try:
+            written += _write_format(command, model, kind, console)
+        except ValueError as error:
+            failures.append(f"{kind}: {error}")
     if is_again:
         _remove_earlier(command, [*sidecars, *splats.values()], written, console)
+    if failures:
+        raise InputError("not written: " + "; ".join(failures))
+
+
+def _write_format(command: Export, model: models.Model, kind: str, console: Console) -> list[Path]:
+    """Writes the scene in one format, and reports what the file leaves out; returns the written files."""
+    if kind == "html":
+        return _write_page(command, model, console)
+    path = command.output / f"{models.EXPORT_STEM}.{kind}"
+    write_splats(kind, path, model.scene.primary, **({"version": command.spz_version} if kind == "spz" else {}))
+    print_line(console, f"{path.stat().st_size / 1e6:.2f} MB -> {path}")
+    if lost := models.unsaved_parts(model, kind):
+        hint = f"; {command.scene} holds everything" if command.edits == SceneEdits() else ""
+        print_warning(console, f"{path.name} leaves out {', '.join(lost)}{hint}")
+    return [path]
 
 
 SIDECARS = ("index.html", PREVIEW, models.GLASS, models.PLANES, models.ENVIRONMENT, models.PANORAMA, models.CAMERAS)

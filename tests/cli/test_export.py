@@ -156,3 +156,15 @@ def test_too_many_panes_for_a_page_are_refused_before_writing(
     assert not output.exists()
     for way_out in (("--layer", "transmission"), ("--formats", "ply", "spz")):
         assert main(["export", many, "--output", str(output), *way_out]) == 0
+
+
+def test_a_format_that_cannot_hold_the_scene_does_not_stop_the_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, output = load(write_run(tmp_path / "run"), device="cpu"), exported(tmp_path, "--formats", "spz")
+    model.scene.primary.means[0, 0] = 1e8
+    far = model.save(tmp_path / "far")
+    assert main(["export", str(far), "--output", str(output), "--formats", "html", "spz", "glb", "ply"]) == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert all(f"{kind}: a Gaussian lies 1e+08 units" in told for kind in ("not written: spz", "html"))
+    assert {path.suffix for path in output.glob("scene.*")} == {".ply", ".glb"}
