@@ -153,8 +153,10 @@ def missing_reasons(results: Mapping[str, Any]) -> dict[str, list[str]]:
     return reasons
 
 
-def quantize(image: Tensor) -> Tensor:
+def quantize(image: Tensor, what: str = "image") -> Tensor:
     """The image as it would be stored: clamped to [0, 1] and rounded to uint8; uint8 passes through.
+
+    `what` names it in the error.
 
     Raises:
         TypeError: the image is neither uint8 nor floating point.
@@ -165,7 +167,7 @@ def quantize(image: Tensor) -> Tensor:
     if not image.is_floating_point():
         raise TypeError(f"expected a uint8 or floating-point image, got {image.dtype}; convert it first")
     if not bool(torch.isfinite(image).all()):
-        raise ValueError("the image contains non-finite values; expected sRGB in [0, 1]")
+        raise ValueError(f"the {what} contains non-finite values; expected sRGB in [0, 1]")
     return torch.round(image.detach().clamp(0, 1) * 255).to(torch.uint8)
 
 
@@ -524,7 +526,9 @@ def environment_metrics(learned: Tensor | None, truth: Tensor | None, lpips: Lpi
         wanted = torch.nn.functional.interpolate(channels_first, size, mode="area")[0].permute(1, 2, 0)
     energy = _mean_over_sphere(source)
     gain = _mean_over_sphere(wanted) / energy if energy > 0 else 1.0
-    image, target = quantize(gain * source), quantize(wanted)
+    # The truth first: its values are part of the gain.
+    target = quantize(wanted, "true environment")
+    image = quantize(gain * source, "learned environment")
     mean_square = _mean_over_sphere((image.to(torch.float64) - target.to(torch.float64)).square())
     return {
         "environment_psnr": math.inf if mean_square == 0 else 10 * math.log10(255**2 / mean_square),

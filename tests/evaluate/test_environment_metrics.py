@@ -78,8 +78,10 @@ def test_black_maps() -> None:
 
 
 def test_values_that_are_not_finite_are_refused() -> None:
-    with pytest.raises(ValueError, match="non-finite values"):
-        environment_psnr(TRUTH / 0, TRUTH)
+    broken = TRUTH / 0
+    for learned, truth, name in ((broken, TRUTH, "learned"), (TRUTH, broken, "true")):
+        with pytest.raises(ValueError, match=f"the {name} environment contains non-finite values"):
+            environment_psnr(learned, truth)
 
 
 def test_lpips_sees_equalised_maps() -> None:
