@@ -117,7 +117,7 @@ def aligned_camera(scene: Scene, renderer: Renderer, view: View) -> Camera:
     best, lowest = torch.zeros_like(twist), torch.inf
     for _ in range(ALIGNMENT_STEPS):
         optimizer.zero_grad()
-        image = exposures.apply(renderer(detached, moved_camera(camera, twist, scene.extent)).rgb, view.name)
+        image = renderer(detached, moved_camera(camera, twist, scene.extent)).exposed(exposures, view.name)
         found = photometric(copy_ignored_pixels(image, view), photo)
         loss = found.l1.lerp(1 - found.ssim, SSIM_SHARE)
         if (value := float(loss.detach())) < lowest:
@@ -189,8 +189,7 @@ def in_photograph_colors(frame: Frame, exposures: Exposures, name: str) -> Frame
     """The frame with a layer `photographed` in the colours of that photograph; unchanged without an exposure for it."""
     if name not in exposures.names:
         return frame
-    image = exposures.apply(frame.photographed, name)
-    return replace(frame, layers={**frame.layers, "photographed": image})
+    return replace(frame, layers={**frame.layers, "photographed": frame.exposed(exposures, name)})
 
 
 @dataclass(frozen=True)

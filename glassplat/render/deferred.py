@@ -361,7 +361,7 @@ class Deferred(WithBackground):
         layers = surface.layers(shaded.base) | {"reflection": shaded.reflection}
         if self.environment:
             layers["environment"] = torch.sigmoid(cube_lookup(scene.environment.raw, view_directions(camera)))
-        return Frame(shaded.rgb, layers, direct=surface.direct, screen=surface.screen)
+        return Frame(shaded.rgb, layers, surface.direct, screen=surface.screen, background=self.background)
 
     def check(self, scene: Scene) -> None:
         """Raises ValueError if a scene lacks colours, or tensors for reflection."""

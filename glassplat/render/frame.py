@@ -15,7 +15,9 @@ from torch.utils.weak import WeakIdKeyDictionary
 from glassplat.errors import InputError
 from glassplat.kernels.project import GradientSum, project
 from glassplat.kernels.records import CameraBatch, Projected, ProjectedDiscs, RawGaussians, Splats
+from glassplat.options import BLACK, Rgb
 from glassplat.scene.camera import Camera, constant
+from glassplat.scene.corrections import Exposures
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 
@@ -69,6 +71,7 @@ class Frame:
         mirrored: [N] bool, those visible as mirror images; None without reflections.
         screen: one record per rasterised part and pass, if requested by `with_records`.
         traced: one record per traced part, if requested by `with_records`.
+        background: the background colour in `rgb`, sRGB.
     """
 
     rgb: Tensor
@@ -77,6 +80,7 @@ class Frame:
     mirrored: Tensor | None = None
     screen: tuple[ScreenPass, ...] = ()
     traced: tuple[TracedPass, ...] = ()
+    background: Rgb = BLACK
 
     def __repr__(self) -> str:
         height, width = self.rgb.shape[:2]
@@ -86,6 +90,18 @@ class Frame:
     def photographed(self) -> Tensor:
         """[H, W, 3] the image as photographed: with the photographer in panes, if rendered."""
         return self.layers.get("photographed", self.rgb)
+
+    def exposed(self, exposures: Exposures, name: str) -> Tensor:
+        """[H, W, 3] the image as photographed, in the colours of a photograph; the background keeps its own.
+
+        Differentiable in image, coverage and exposures.
+        """
+        own = exposures.values_of(name)
+        if own is None:
+            return self.photographed
+        changed = own[:, :3] @ constant(self.background, own.dtype, own.device) + own[:, 3]
+        uncovered = (1 - self.layers["alpha"])[..., None]
+        return torch.addcmul(exposures.apply(self.photographed, name), uncovered, changed, value=-1)
 
     @property
     def visible(self) -> Tensor | None:

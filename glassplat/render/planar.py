@@ -160,7 +160,7 @@ class Planar(WithBackground):
             nothing = torch.zeros_like(direct.mask)
             layers |= {"transmission": direct.image, "reflection": torch.zeros_like(direct.image)}
             layers |= {"strength": nothing, "share": nothing}
-            return Frame(direct.image, layers, direct.visible, None, direct.screen)
+            return Frame(direct.image, layers, direct.visible, None, direct.screen, background=self.background)
         mirrored = self._mirrored_pass(scene, camera, seen, with_records, direct.gradient_sum)
         masks = self._visibilities(scene, camera, seen, direct)
         result = composite_panes(direct.image, seen, masks, mirrored.reflections, camera, **self._blending)
@@ -174,7 +174,7 @@ class Planar(WithBackground):
         if seen.planes.transmittances is not None:
             layers["tint"] = tint_of_panes(seen, masks, seen.planes.transmittances)
         screen = self._screen(direct, mirrored, hits, result) if with_records else ()
-        return Frame(result.rgb, layers, direct.visible, mirrored.visible, screen)
+        return Frame(result.rgb, layers, direct.visible, mirrored.visible, screen, background=self.background)
 
     def reflections(
         self, scene: Scene, camera: Camera, backgrounds: Sequence[Rgb], direct: DirectPass | None = None

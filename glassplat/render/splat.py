@@ -206,7 +206,7 @@ class Splat(WithBackground):
         if self.depth:
             layers["depth"] = mean_depth(depth[0].squeeze(-1), alpha)
         rgb = over_background(color, alpha, self.background)
-        return Frame(rgb, layers, direct=visible_gaussians(projected), screen=screen)
+        return Frame(rgb, layers, visible_gaussians(projected), screen=screen, background=self.background)
 
     def _discs(self, scene: Scene, camera: Camera, with_records: bool) -> Frame:
         near = NEAR_PER_EXTENT * scene.extent
@@ -220,7 +220,7 @@ class Splat(WithBackground):
         if self.normal:
             layers["normal"] = blended.image[0, ..., 3:]
         rgb = over_background(blended.image[0, ..., :3], layers["alpha"], self.background)
-        return Frame(rgb, layers, direct=visible_gaussians(projected), screen=screen)
+        return Frame(rgb, layers, visible_gaussians(projected), screen=screen, background=self.background)
 
     def check(self, scene: Scene) -> None:
         """Raises ValueError if the Gaussians have no colours."""

@@ -97,6 +97,7 @@ class Traced(WithBackground):
             direct=surface.direct,
             screen=surface.screen,
             traced=() if contributions is None else (TracedPass("surroundings", contributions),),
+            background=self.background,
         )
 
     def _shade(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +11,6 @@ import torch
 from torch import Tensor
 
 from glassplat.captures.dataset import Dataset
-from glassplat.options import BLACK
 from glassplat.render.planar import Planar, with_photographer
 from glassplat.scene import logit
 from glassplat.scene.camera import Camera
@@ -24,7 +22,6 @@ from glassplat.training.actions import Densify
 from glassplat.training.options import DefaultDensify, MethodRecipe, Photographer, Rate
 from glassplat.training.stage import Clock, Setup, Stage, TrainState, Work, run_edit
 
-log = logging.getLogger("glassplat.training")
 FINAL_RATE_SHARE = 0.1
 """Learning rate at the end of the run, as a share of that at the start."""
 CORRECTIONS: dict[str, type[PerPhotograph]] = {"exposures": Exposures, "poses": PoseCorrections}
@@ -40,11 +37,6 @@ def _correction_rates(recipe: MethodRecipe) -> dict[str, float]:
 def with_neutral_corrections(recipe: MethodRecipe, scene: Scene, dataset: Dataset) -> Scene:
     """The initial scene, with neutral corrections."""
     names = tuple(view.name for view in dataset.train)
-    if recipe.exposure.rate and dataset.background not in (None, BLACK):
-        log.warning(
-            "Exposures are learned poorly from cut-out photographs over a bright background, because they change it, "
-            "too; --background 0 0 0 is better"
-        )
     neutral: dict[str, Any] = {part: CORRECTIONS[part].neutral(names) for part in _correction_rates(recipe)}
     return replace(scene, **neutral)
 

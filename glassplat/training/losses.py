@@ -51,7 +51,7 @@ class PhotometricLoss:
 
     def __call__(self, frame: Frame, view: View, scene: Scene) -> Tensor:
         """Loss of a view, in the colours of its photograph; scalar. Ignored pixels have no error."""
-        image = copy_ignored_pixels(scene.exposures.apply(frame.rgb, view.name), view)
+        image = copy_ignored_pixels(frame.exposed(scene.exposures, view.name), view)
         found = photometric(image, to_device(view.photo, image.device))
         return found.l1.lerp(1 - found.ssim, self.ssim_weight)
 
@@ -205,7 +205,7 @@ def valid_pixels(view: View, device: torch.device) -> Tensor:
 
 def residual(frame: Frame, view: View, scene: Scene) -> Tensor:
     """[H, W, 3] photograph minus render, sRGB, 0 at ignored pixels."""
-    image = scene.exposures.apply(frame.rgb.detach(), view.name)
+    image = frame.exposed(scene.exposures, view.name).detach()
     difference = view.photo.to(image) / 255 - image
     return difference.masked_fill(~valid_pixels(view, image.device)[..., None], 0)
 

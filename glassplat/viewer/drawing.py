@@ -182,8 +182,7 @@ def draw_error_map(
     small = torch.nn.functional.interpolate(
         photo.to(frame.rgb).movedim(-1, 0)[None], (rows, columns), mode="bilinear", antialias=True
     )[0].movedim(0, -1)
-    image = scene.exposures.interpolate(name).apply(frame.photographed, name)
-    colors = error_colors(image, small)
+    colors = error_colors(frame.exposed(scene.exposures.interpolate(name), name), small)
     missing = max(1, round(request.aspect * rows)) - columns
     left = missing // 2
     return _to_uint8(torch.nn.functional.pad(colors, (0, 0, left, missing - left)))

@@ -8,7 +8,10 @@ import pytest
 import torch
 
 from glassplat.render.frame import Frame
+from glassplat.render.planar import Planar
+from glassplat.render.splat import Splat
 from glassplat.scene.corrections import Exposures
+from glassplat.scene.scene import Scene
 from glassplat.training.losses import PhotometricLoss
 from tests.training.tiny_capture import tiny_capture, true_scene
 
@@ -34,11 +37,6 @@ def test_a_transform_is_applied_to_its_photograph_only() -> None:
     torch.testing.assert_close(exposures.apply(image, "b"), expected)
 
 
-def test_gradients_reach_image_and_transform() -> None:
-    image, affine = drawn(3, 2, 3).requires_grad_(), (0.1 * drawn(2, 3, 4, seed=1)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda i, a: Exposures(a, ("a", "b")).apply(i, "b"), (image, affine))
-
-
 def test_as_many_transforms_as_names_are_expected() -> None:
     with pytest.raises(ValueError, match=r"expected \[1, 3, 4\]"):
         Exposures(torch.zeros(2, 3, 4), ("a",))
@@ -50,8 +48,30 @@ def test_the_loss_compares_in_the_colours_of_the_photograph() -> None:
     affine = torch.zeros(1, 3, 4)
     affine[0, :, :3] = -0.5 * torch.eye(3)
     exposed = replace(scene, exposures=Exposures(affine, (view.name,)))
-    assert float(PhotometricLoss(0.2)(Frame(2 * photo), view, exposed)) < 1e-5
-    assert float(PhotometricLoss(0.2)(Frame(2 * photo), view, scene)) > 0.05
+    frame = Frame(2 * photo, {"alpha": torch.ones_like(photo[..., 0])})
+    assert float(PhotometricLoss(0.2)(frame, view, exposed)) < 1e-5
+    assert float(PhotometricLoss(0.2)(frame, view, scene)) > 0.05
+
+
+@pytest.mark.parametrize("renderer", [Splat(), Planar()])
+def test_the_background_is_not_exposed(renderer: Splat | Planar) -> None:
+    view, affine, background = tiny_capture().train[0], 0.2 * drawn(1, 3, 4).float(), (1.0, 0.6, 0.2)
+    scene = Scene(true_scene().primary, true_scene().extent)
+    frame = replace(renderer, background=background)(scene, view.camera)
+    uncovered = 1 - frame.layers["alpha"][..., None]
+    own = renderer(scene, view.camera).rgb @ (torch.eye(3) + affine[0, :, :3].T) + (1 - uncovered) * affine[0, :, 3]
+    assert float(uncovered.max()) > 0.5
+    torch.testing.assert_close(
+        frame.exposed(Exposures(affine, (view.name,)), view.name), own + uncovered * torch.tensor(background)
+    )
+
+
+def test_gradients_reach_image_coverage_and_transform() -> None:
+    def exposed(image: torch.Tensor, alpha: torch.Tensor, affine: torch.Tensor) -> torch.Tensor:
+        return Frame(image, {"alpha": alpha}, background=(1.0, 0.6, 0.2)).exposed(Exposures(affine, ("a", "b")), "b")
+
+    inputs = drawn(3, 2, 3), drawn(3, 2, seed=1), 0.1 * drawn(2, 3, 4, seed=2)
+    assert torch.autograd.gradcheck(exposed, tuple(tensor.requires_grad_() for tensor in inputs))
 
 
 def test_a_view_without_a_transform_gets_the_mean_of_its_neighbours() -> None:

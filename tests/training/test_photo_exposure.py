@@ -90,14 +90,3 @@ def test_they_are_stored_with_the_scene_and_in_checkpoints(tmp_path: Path) -> No
     restored = load_checkpoint(tmp_path / "checkpoint.safetensors").scene.exposures
     assert restored.names == state.scene.exposures.names
     assert torch.equal(restored.values, state.scene.exposures.values)
-
-
-@pytest.mark.parametrize(
-    ("rate", "background"), [(1e-3, (1.0, 1.0, 1.0)), (0.0, (1.0, 1.0, 1.0)), (1e-3, (0.0, 0.0, 0.0))]
-)
-def test_exposures_of_cut_out_photographs_need_a_black_background(
-    rate: float, background: tuple[float, float, float], caplog: pytest.LogCaptureFixture
-) -> None:
-    recipe = SplatRecipe(exposure=PhotoExposure(rate))
-    with_neutral_corrections(recipe, true_scene(), replace(tiny_capture(), background=background))
-    assert ("--background 0 0 0 is better" in caplog.text) == (rate > 0 and background[0] > 0)
