@@ -39,6 +39,11 @@ def convert_to_input_error(where: object = None) -> Iterator[None]:
         raise InputError(str(error) if where is None else f"{where}: {error}") from error
 
 
+def count_noun(number: int, noun: str) -> str:
+    """A count with its noun, as in "1 pane" and "2 panes"."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
 def join_names(names: list[str], limit: int = 5) -> str:
     """A list of names for a message, cut short after `limit`."""
     shown = ", ".join(names[:limit])

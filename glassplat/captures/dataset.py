@@ -29,7 +29,7 @@ from glassplat.captures.view import (
     prepare_view,
     sample_evenly,
 )
-from glassplat.errors import InputError, convert_to_input_error, join_names
+from glassplat.errors import InputError, convert_to_input_error, count_noun, join_names
 from glassplat.files.images import is_transparent
 from glassplat.files.records import LARGEST_COORDINATE
 from glassplat.files.sidecars import read_planes
@@ -146,7 +146,7 @@ class Dataset:
 
     def __repr__(self) -> str:
         return (
-            f"Dataset({str(self.root)!r}: {len(self.train)} training and {len(self.test)} test views, "
+            f"Dataset({str(self.root)!r}: {len(self.train)} training and {count_noun(len(self.test), 'test view')}, "
             f"{len(self.points.positions)} points, panes {self.pane_labels})"
         )
 
@@ -347,8 +347,8 @@ def _view_warnings(rescaled: list[str], background: Rgb | None) -> list[str]:
     warnings = []
     if rescaled:
         warnings.append(
-            f"{len(rescaled)} photographs are scaled copies of the calibrated ones; their intrinsics were scaled "
-            f"accordingly ({join_names(rescaled)})."
+            f"Intrinsics were scaled for {join_names(rescaled)}, because these are scaled copies of the calibrated "
+            "photographs."
         )
     if background is not None:
         warnings.append(f"The photographs have transparent pixels; they are laid over sRGB {background}.")

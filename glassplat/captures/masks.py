@@ -350,12 +350,10 @@ def _interpret_masks(
     found = {name: _present_labels(_labels(mask_values, inverted)) for name, mask_values in values.items()}
     labels = sorted(set().union(*found.values()))
     if not labels:
-        raise InputError(
-            f"none of the {len(masks)} masks of {root} marks a pane; expected values 1..K, or 255, on the panes"
-        )
+        raise InputError(f"no mask of {root} marks a pane; expected values 1..K, or 255, on the panes")
     empty = sorted(name for name, present in found.items() if not present)
     if empty:
-        warnings.append(f"{len(empty)} masks mark no pane ({join_names(empty)}); these views count as seeing none.")
+        warnings.append(f"No pane is marked in {join_names(empty)}; these views count as seeing none.")
     return MaskSet(masks, tuple(labels), tuple(warnings))
 
 
@@ -413,7 +411,7 @@ def _match_masks(
 def _unmatched_message(folder: Path, unmatched: list[str], photographs: Mapping[str, Path]) -> str:
     """Message about masks that belong to no photograph."""
     return (
-        f"{len(unmatched)} masks in {folder} match no photograph: {join_names(sorted(unmatched))}; name a mask "
+        f"masks in {folder} match no photograph: {join_names(sorted(unmatched))}; name a mask "
         f"like its photograph, such as {mask_paths(photographs)[min(photographs)]}"
     )
 

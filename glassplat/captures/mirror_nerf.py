@@ -27,7 +27,7 @@ import numpy as np
 from glassplat.captures import transforms
 from glassplat.captures.capture import Capture, RawPoints, Shot
 from glassplat.captures.masks import MASK_FOLDER, PANE_FOLDER, PaneMask, read_mask_at_threshold
-from glassplat.errors import InputError, convert_to_input_error, join_names
+from glassplat.errors import InputError, convert_to_input_error, count_noun, join_names
 from glassplat.files.images import IMAGE_SUFFIXES, image_size
 
 if TYPE_CHECKING:
@@ -58,9 +58,7 @@ def load_mirror_nerf(root: Path) -> Capture | None:
     kept = tuple(shot for shot in train if shot.name not in tested)
     warnings = []
     if len(kept) < len(train):
-        warnings.append(
-            f"{len(train) - len(kept)} training photographs are test photographs too; they are not used for training."
-        )
+        warnings.append(f"Not trained on: {count_noun(len(train) - len(kept), 'photograph')} of the test split, too.")
     masks = _masks(root, (*kept, *(test or ())))
     points = transforms.read_points(root, settings)
     capture = Capture(kept, test, points, "Mirror-NeRF", tuple(warnings), masks=masks)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from glassplat.captures.cameras import LARGEST_SIDE, Lens, make_lens, rigid_pose
 from glassplat.captures.capture import Capture, RawPoints, Shot
-from glassplat.errors import InputError, convert_to_input_error, join_names
+from glassplat.errors import InputError, convert_to_input_error, count_noun, join_names
 from glassplat.files import records
 from glassplat.files.images import IMAGE_SUFFIXES, image_size
 from glassplat.files.ply_table import point_colors, read_table
@@ -351,7 +351,7 @@ def _mask_paths(root: Path, file: str, settings: Settings, shots: Mapping[str, S
     missing = [str(path) for path in paths.values() if not isfile(path)]
     if missing:
         raise InputError(
-            f"mask_path of {file} names {len(missing)} masks that are missing: {join_names(missing)}; copy them "
+            f"mask_path of {file} names masks that are missing: {join_names(missing)}; copy them "
             "there, or delete the entries"
         )
     return paths
@@ -367,7 +367,9 @@ PRIORS = {
 def _unused_priors(settings: Settings) -> list[str]:
     """Warnings about files that frames name and that are not read."""
     counts = {key: sum(bool(frame.get(key)) for frame in settings["frames"]) for key in PRIORS}
-    return [f"{count} frames have a {key}, which is left out: {PRIORS[key]}." for key, count in counts.items() if count]
+    return [
+        f"{key} of {count_noun(count, 'frame')} is left out: {PRIORS[key]}." for key, count in counts.items() if count
+    ]
 
 
 def _is_blender(settings: Settings) -> bool:
@@ -399,7 +401,8 @@ def _listed_split(
     test = tuple(by_path[name] for name in test_names)
     train = tuple(by_path[name] for name in train_names or by_path if name not in set(test_names))
     left_out = len(shots) - len(train) - len(test)
-    return train, test, [f"{left_out} photographs are in neither part of the split and ignored."] if left_out else []
+    warning = f"Ignored: {count_noun(left_out, 'photograph')} in neither part of the split."
+    return train, test, [warning] if left_out else []
 
 
 def _normalise_path(name: str) -> str:

@@ -36,7 +36,7 @@ from rich.control import Control, ControlType
 from rich.text import Text
 
 from glassplat import __version__
-from glassplat.errors import InputError, RankLostError
+from glassplat.errors import InputError, RankLostError, count_noun
 
 UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 """Control characters other than tabs and line breaks, and undecodable bytes of file names."""
@@ -61,11 +61,6 @@ def shell_word(path: object) -> str:
     """A path quoted for the shell; a leading dash is escaped, so that it is not read as an option."""
     word = str(path)
     return quote(f"./{word}" if word.startswith("-") else word)
-
-
-def count_noun(number: int, noun: str) -> str:
-    """A count with its noun, as in "1 pane" and "2 panes"."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def print_line(console: Console, text: object, *, label: str = "", style: str = "") -> None:

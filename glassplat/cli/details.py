@@ -11,9 +11,9 @@ from glassplat.captures.cameras import LEAST_SIDE
 from glassplat.captures.dataset import Dataset, load_dataset, make_dataset
 from glassplat.captures.files import CaptureFiles
 from glassplat.captures.view import sample_evenly
-from glassplat.cli.console import count_noun, shell_word
+from glassplat.cli.console import shell_word
 from glassplat.cli.info import FEW_VIEWS, Finding, describe_broken
-from glassplat.errors import InputError, convert_to_input_error
+from glassplat.errors import InputError, convert_to_input_error, count_noun
 from glassplat.files.records import read_json
 from glassplat.files.scene_folder import read_scene, read_splats
 from glassplat.files.sidecars import read_planes
@@ -47,7 +47,9 @@ def remaining_parts(files: CaptureFiles) -> Iterator[Finding]:
             f"only {count_noun(len(dataset.train) + len(dataset.test), 'photograph')}; 30 or more work better"
         )
     if dataset.measured_points and len(dataset.points) < FEW_POINTS:
-        finding.problems.append(f"{len(dataset.points)} points only; more photographs with more overlap give more")
+        finding.problems.append(
+            f"{count_noun(len(dataset.points), 'point')} only; more photographs with more overlap give more"
+        )
     yield finding
     yield _panes_part(files.root, dataset)
     yield _planes_part(files.root, dataset)
@@ -74,7 +76,9 @@ def _panes_part(path: Path, dataset: Dataset) -> Finding:
             "transparency, or the lens"
         )
     if estimated := sum(view.read_normals is not None for view in dataset.train):
-        finding.facts["normals"] = f"estimated for {estimated} training photographs; deferred and traced use them"
+        finding.facts["normals"] = (
+            f"estimated for {count_noun(estimated, 'training photograph')}; deferred and traced use them"
+        )
     annotated = sum(view.is_annotated for view in dataset.train)
     if not dataset.pane_labels and dataset.planes is None:
         finding.facts["panes"] = "none marked"
@@ -83,11 +87,13 @@ def _panes_part(path: Path, dataset: Dataset) -> Finding:
         return finding
     given = () if dataset.planes is None else dataset.planes.labels
     labels = name_labels((*dataset.pane_labels, *given))
-    finding.facts["panes"] = f"{labels}; masks of {annotated} training photographs" + (
+    finding.facts["panes"] = f"{labels}; masks of {count_noun(annotated, 'training photograph')}" + (
         f", planes.json gives {name_labels(given)}" if given else ""
     )
     if annotated < FEW_MASKS and not given:
-        finding.problems.append(f"{annotated} masks only; three to ten, from positions far apart, work better")
+        finding.problems.append(
+            f"{count_noun(annotated, 'mask')} only; three to ten, from positions far apart, work better"
+        )
     return finding
 
 

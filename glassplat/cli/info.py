@@ -13,8 +13,8 @@ import tyro
 from rich.console import Console
 
 from glassplat.captures.files import read_capture
-from glassplat.cli.console import count_noun, import_uninterrupted, print_line, print_warning, shell_word
-from glassplat.errors import InputError, UnknownFormatError, convert_to_input_error, join_names
+from glassplat.cli.console import import_uninterrupted, print_line, print_warning, shell_word
+from glassplat.errors import InputError, UnknownFormatError, convert_to_input_error, count_noun, join_names
 from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES, files_below, is_hidden
 from glassplat.files.records import Text, check_fields, read_json
 from glassplat.files.writing import SCENE_FILE, SPLAT_SUFFIXES, check_folder, scene_source

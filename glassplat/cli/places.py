@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from glassplat.cli.console import message_console, print_line
-from glassplat.errors import InputError, convert_to_input_error, join_names
+from glassplat.errors import InputError, convert_to_input_error, count_noun, join_names
 from glassplat.files.records import read_json, readable_name, wrap_read_errors
 from glassplat.files.writing import LOADABLE, check_folder, make_folder, real_path, scene_source, write_text
 from glassplat.kernels.backend.devices import DeviceName
@@ -102,7 +102,7 @@ def _describe_scene(path: Path) -> str:
     if directory.import_record.is_file():
         return "a scene without a capture"
     recipe, settings = directory.recipe(), directory.settings()
-    return f"a {recipe.method} run of {settings.iterations} iterations on {settings.data}"
+    return f"a {recipe.method} run of {count_noun(settings.iterations, 'iteration')} on {settings.data}"
 
 
 def check_file(path: Path) -> None:

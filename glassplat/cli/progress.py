@@ -12,7 +12,8 @@ from typing import Any
 from rich import progress
 from rich.console import Console
 
-from glassplat.cli.console import count_noun, print_line, print_warning
+from glassplat.cli.console import print_line, print_warning
+from glassplat.errors import count_noun
 from glassplat.prepare.photographs import Note
 from glassplat.training import messages
 

@@ -14,10 +14,10 @@ from torch import Tensor
 from glassplat.access import is_local
 from glassplat.captures.dataset import TEST_EVERY, Dataset, load_dataset, make_dataset, with_corrected_cameras
 from glassplat.captures.view import GIGABYTE, PointCloud, View
-from glassplat.cli.console import count_noun, print_line, print_warning, shell_word
+from glassplat.cli.console import print_line, print_warning, shell_word
 from glassplat.cli.places import chosen_views
 from glassplat.cli.progress import Plan, TrainingProgress
-from glassplat.errors import InputError, convert_to_input_error
+from glassplat.errors import InputError, convert_to_input_error, count_noun
 from glassplat.files.images import image_paths
 from glassplat.files.sidecars import read_cameras
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
@@ -157,7 +157,7 @@ def train(command: Train[Any], console: Console) -> None:
         scene = training.run(listen).scene
     print_line(
         console,
-        f"trained {command.recipe.method} for {training.step} iterations in {training.seconds:.0f} s: "
+        f"trained {command.recipe.method} for {count_noun(training.step, 'iteration')} in {training.seconds:.0f} s: "
         f"{scene.num_gaussians} Gaussians, {count_noun(len(scene.planes), 'pane')} -> {command.output}",
     )
     print_line(console, f"next: glassplat eval {shell_word(command.output)}")
@@ -213,7 +213,7 @@ def print_summary(dataset: Dataset, console: Console) -> None:
     given = f", {len(dataset.planes)} in planes.json" if dataset.planes is not None else ""
     print_line(
         console,
-        f"{dataset.root}: {len(dataset.train)} training and {len(dataset.test)} test views, "
+        f"{dataset.root}: {len(dataset.train)} training and {count_noun(len(dataset.test), 'test view')}, "
         f"{len(dataset.points.positions)} points, {count_noun(annotated, 'annotated view')} with "
         f"{count_noun(len(dataset.pane_labels), 'pane')}{given}",
     )

@@ -16,11 +16,11 @@ from rich.console import Console
 from torch import Tensor
 
 from glassplat.captures.view import View
-from glassplat.cli.console import count_noun, print_line, print_warning, shell_word
+from glassplat.cli.console import print_line, print_warning, shell_word
 from glassplat.cli.places import SceneEdits, check_targets, chosen_views, claim_folder
 from glassplat.cli.progress import WorkProgress
 from glassplat.cli.runs import StoredRun, image_names, open_run, photograph_paths
-from glassplat.errors import InputError, convert_to_input_error, join_names
+from glassplat.errors import InputError, convert_to_input_error, count_noun, join_names
 from glassplat.evaluate.evaluate import time_render
 from glassplat.evaluate.metrics import quantize
 from glassplat.files.images import write_image

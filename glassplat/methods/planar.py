@@ -376,9 +376,8 @@ def planar_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
             iteration and not at the second stage.
     """
     if not dataset.pane_labels and dataset.planes is None:
-        count = sum(view.is_annotated for view in (*dataset.train, *dataset.test))
-        found = f"none of the {count} masks of {dataset.root} names a pane"
-        found = found if count else f"{dataset.root} has no masks of panes"
+        is_annotated = any(view.is_annotated for view in (*dataset.train, *dataset.test))
+        found = f"no mask of {dataset.root} names a pane" if is_annotated else f"{dataset.root} has no masks of panes"
         raise PlaneFitError(
             f"{found}, and planar needs to know the panes: expected masks of 3 to 10 photographs in "
             f"{dataset.root / 'panes'}, named <photograph's name>.png, each pixel the label 1, 2, ... of a pane, or 0 "

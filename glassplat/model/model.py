@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from glassplat.captures.dataset import EXTENT_MARGIN, Dataset, check_dataset, with_corrected_cameras
-from glassplat.errors import InputError, convert_to_input_error, join_names
+from glassplat.errors import InputError, convert_to_input_error, count_noun, join_names
 from glassplat.files import writing
 from glassplat.files.ply import read_gaussians, write_gaussians
 from glassplat.files.records import read_text
@@ -72,10 +72,9 @@ class Model:
     path: Path | None = None
 
     def __repr__(self) -> str:
-        panes = len(self.scene.planes)
         return (
             f"Model({self.name!r}: {self.recipe.method}, {len(self.scene.primary)} Gaussians, "
-            f"{panes} {'pane' if panes == 1 else 'panes'}, {len(self.cameras)} cameras)"
+            f"{count_noun(len(self.scene.planes), 'pane')}, {count_noun(len(self.cameras), 'camera')})"
         )
 
     def _repr_html_(self) -> str:

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from glassplat.errors import count_noun
 from glassplat.panes import PlaneFit, PlaneFitError, masks, search
 from glassplat.panes.material import virtual_points
 from glassplat.panes.objective import MIDDLE_TOLERANCE, JointObjective, Objective, edge_matches, pane_rectangle
@@ -166,9 +167,7 @@ def fit_planes(
     named = sorted({int(label) for _, image in annotations for label in image.unique()} - {0})
     labels = named if labels is None else labels
     if not named:
-        raise PlaneFitError(
-            f"none of the {len(annotations)} masks names a pane; expected pixels with labels 1, 2, ... in at least two"
-        )
+        raise PlaneFitError("no mask names a pane; expected pixels with labels 1, 2, ... in at least two")
     clouds = {"the points" if measured is None else "the Gaussians": _finite_points(centers)}
     if measured is not None:
         clouds = {"the measured points": _finite_points(measured)} | clouds
@@ -462,8 +461,8 @@ def _parallax_angle(middle: Array, center: Array, other: Array) -> float:
 def _check_views(label: int, views: Sequence[masks.PaneView], extent: float) -> None:
     if len(views) < 2:
         raise PlaneFitError(
-            f"pane {label} is annotated in {len(views)} view(s), but a plane can only be found from several "
-            "views: annotate at least two more, from positions far apart"
+            f"pane {label} is annotated in {count_noun(len(views), 'view')}, but a plane can only be found from "
+            "several views: annotate at least two more, from positions far apart"
         )
     centers = np.stack([view.center for view in views])
     apart = float(np.linalg.norm(centers - centers[0], axis=1).max())

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from glassplat.errors import count_noun
 from glassplat.kernels.plane_search import Edges, follow_edges
 from glassplat.panes.masks import (
     UNKNOWN_WEIGHT,
@@ -348,7 +349,9 @@ def pane_rectangle(plane: PlaneEquations, views: Sequence[PaneView], axes: Array
     points = np.concatenate([_pixels_on_plane(plane, view) for view in views])
     points = points[_shows_pane(points, views, plane.normals[0])]
     if len(points) < 3:
-        raise ValueError(f"{len(points)} mask pixels agree on where the pane is; expected at least three")
+        raise ValueError(
+            f"the masks agree on where the pane is in {count_noun(len(points), 'pixel')}; expected at least three"
+        )
     corners = (points - foot) @ axes.T
     low, high = corners.min(axis=0), corners.max(axis=0)
     cell = (high - low).max() / MAP_CELLS

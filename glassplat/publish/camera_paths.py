@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from glassplat.errors import count_noun
 from glassplat.publish.web_page import least_aligned_axis, survey_capture
 from glassplat.scene.camera import Camera, look_at, rigid_transform
 
@@ -69,7 +70,7 @@ def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     from scipy.spatial.transform import Rotation, RotationSpline
 
     if len(cameras) < 2:
-        raise ValueError(f"{len(cameras)} cameras do not make a path; expected at least two")
+        raise ValueError(f"no path leads through {count_noun(len(cameras), 'camera')}; expected at least two")
     knots = np.arange(len(cameras), dtype=np.float64)
     times = np.linspace(0, knots[-1], frames)
     poses = [camera.cam_from_world.double().cpu().numpy() for camera in cameras]

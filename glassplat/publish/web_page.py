@@ -25,7 +25,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from glassplat.errors import InputError
+from glassplat.errors import InputError, count_noun
 from glassplat.files.spz import HALF_TURN_X, spz_bytes
 from glassplat.files.writing import write_bytes, write_text
 from glassplat.kernels.environment import cube_lookup
@@ -290,7 +290,7 @@ def page_text(
     description = describe_scene(scene, settings, cameras, poster_view)
     count = len(scene.planes)
     kept = f"{len(scene.primary):,}" + (f" of {drawable:,}" if len(scene.primary) < drawable else "")
-    subtitle = f"{kept} Gaussians" + (f" · {count} pane{'s' if count > 1 else ''}" if count else "")
+    subtitle = f"{kept} Gaussians" + (f" · {count_noun(count, 'pane')}" if count else "")
     # Glass has no colour, but the SPZ format needs one, so a constant is used.
     sh = torch.zeros(len(scene.glass), 1, 3, dtype=torch.float32)
     glass = replace(scene.glass, sh=sh, channels={}, active_sh_degree=0)

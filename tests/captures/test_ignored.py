@@ -145,7 +145,7 @@ def test_frames_name_their_masks(tmp_path: Path) -> None:
     found = ignored_of(root)
     assert list(found) == ["1.png"] and torch.equal(found["1.png"], DROPPED)
     (root / "kept/first.png").unlink()
-    with pytest.raises(InputError, match=r"mask_path .* 1 masks that are missing: .*first\.png"):
+    with pytest.raises(InputError, match=r"mask_path .* names masks that are missing: .*first\.png"):
         load_dataset(root)
 
 

@@ -157,7 +157,7 @@ def test_the_validation_split_replaces_a_missing_test_split(capture) -> None:
     write_real(capture, parts={"train": slice(0, 8), "val": slice(6, 10)})
     data = load_dataset(capture.root)
     assert len(data.train) == 6 and len(data.test) == 4
-    assert any("2 training photographs are test photographs too" in warning for warning in data.warnings)
+    assert any("Not trained on: 2 photographs of the test split" in warning for warning in data.warnings)
 
 
 def test_photographs_without_their_folder_are_found_in_images(capture) -> None:

@@ -125,7 +125,7 @@ def test_split_named_in_the_file(capture) -> None:
     assert [shot.name for shot in found.shots] == capture.names[:6]
     assert found.test_shots is not None
     assert [shot.name for shot in found.test_shots] == capture.names[6:9]
-    assert "1 photographs are in neither" in found.warnings[0]
+    assert "Ignored: 1 photograph in neither" in found.warnings[0]
 
 
 @pytest.mark.parametrize("prefix", ["images/", "./images/", ".\\images\\", "images/../images/"])
@@ -136,7 +136,7 @@ def test_a_split_with_one_side_alone(capture, prefix: str) -> None:
     assert [shot.name for shot in found.shots] == capture.names[3:] and not found.warnings
     found = load(capture, train_filenames=names[:6], test_filenames=[])
     assert [shot.name for shot in found.shots] == capture.names[:6] and found.test_shots == ()
-    assert "4 photographs are in neither" in found.warnings[0]
+    assert "Ignored: 4 photographs in neither" in found.warnings[0]
     data = load_dataset(capture.root)
     assert (len(data.train), len(data.test)) == (6, 0)
 
@@ -158,8 +158,8 @@ def test_null_is_an_absent_field(capture) -> None:
 def test_priors_that_are_not_used_are_named(capture, prior: str) -> None:
     frames = capture.frames()
     frames[0][prior] = "elsewhere/0000.png"
-    assert any(f"1 frames have a {prior}" in warning for warning in load(capture, frames=frames).warnings)
-    assert not any("frames have a" in warning for warning in load(capture).warnings)
+    assert any(f"{prior} of 1 frame is left out" in warning for warning in load(capture, frames=frames).warnings)
+    assert not any("left out" in warning for warning in load(capture).warnings)
 
 
 @pytest.mark.parametrize("name", ["points3d.ply", "sparse_pc.ply", "cloud.ply"])

@@ -154,7 +154,7 @@ def test_small_photographs_of_a_capture_are_valid(tmp_path: Path, capsys: pytest
         with Image.open(path) as image:
             image.resize((80, 60)).save(path)
     (scaled,) = told(capture, capsys)["problems"]
-    assert "are scaled copies of the calibrated ones" in scaled
+    assert "are scaled copies of the calibrated photographs" in scaled
 
 
 def test_a_folder_of_few_photographs_gets_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
