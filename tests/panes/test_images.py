@@ -10,7 +10,7 @@ import torch
 
 from glassplat.panes.fit import fit_planes
 from glassplat.panes.masks import PlaneEquations
-from glassplat.panes.search import MirrorImages, plane_of_mirror_images
+from glassplat.panes.search import MirrorImages, _proximity_field, plane_of_mirror_images
 from glassplat.scene.camera import rotation_from_quat
 from tests.panes.pane_scene import EYES, FRONT, Pane, normal_error, offset_error, scene_of
 from tests.panes.test_hard_panes import EXTENT, QUICK, roughened
@@ -140,3 +140,14 @@ def test_mirror_images_do_not_overrule_contradicting_masks() -> None:
     points = torch.tensor(np.concatenate([room, images_of(room, 0)]))
     planes = fit_planes(points, scene_of([pane], (*EYES, (-1.2, 0.5, -0.4))), extent=EXTENT, options=QUICK)
     assert normal_error(planes, 0, pane) < 1
+
+
+def test_proximity_falls_with_the_distance_to_the_nearest_point() -> None:
+    points, tolerance = before_the_pane(0)[:60], 0.3
+    field = _proximity_field(points, tolerance)
+    low, high = np.percentile(points, (1, 99), axis=0)
+    inner = points[((points >= low) & (points <= high)).all(axis=1)]
+    occupied = np.unique(((inner - field.corner) / field.cell).astype(int), axis=0)
+    cells = np.stack(np.meshgrid(*map(np.arange, field.values.shape), indexing="ij"), axis=-1)[::5, ::4, ::3]
+    away = np.linalg.norm(cells[..., None, :] - occupied, axis=-1).min(axis=-1) * field.cell / tolerance
+    np.testing.assert_allclose(field.values[::5, ::4, ::3], np.exp(-0.5 * away**2), rtol=1e-6)
