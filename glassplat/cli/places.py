@@ -189,7 +189,7 @@ class SceneEdits:
 
     def _check(self, scene: Scene) -> None:
         if not len(scene.planes):
-            raise InputError("the run has no panes to edit; train it with `glassplat train planar` and pane masks")
+            raise InputError("the scene has no panes to edit; train it with `glassplat train planar` and pane masks")
         if self.remove_glass and replace(self, surroundings=None) != SceneEdits(remove_glass=True):
             raise InputError("--remove-glass leaves no pane to edit; give it without the other edits")
         twice = sorted(set(self.as_mirror) & set(self.reflectance))
@@ -204,7 +204,7 @@ def replace_environment(scene: Scene, panorama: Path) -> Scene:
     from glassplat.scene.gaussians import Gaussians
 
     if scene.environment.is_empty and not len(scene.surroundings):
-        raise InputError("nothing in the run reflects an environment; train it with `glassplat train deferred`")
+        raise InputError("nothing in the scene reflects an environment; train it with `glassplat train deferred`")
     try:
         image = read_equirect(panorama)
         size = scene.environment.size or min(LARGEST_FACE, max(1, image.shape[0] // 2))

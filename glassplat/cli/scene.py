@@ -201,7 +201,8 @@ class Clean(Command):
 
     Attributes:
         scene: directory of a run, exported folder, or splat file (.ply, .spz, .glb, .splat, .sog, .ksplat).
-        output: new folder for the cleaned scene, which `glassplat view` and `export` read like a run.
+        output: new folder for the cleaned scene, which `glassplat view` and `export` read like a run; or a new splat
+            file.
         rules: what is removed.
         scale: two points, x y z each in world units, and their distance in metres; `view` measures points.
         file: what a splat file does not record.
@@ -224,6 +225,8 @@ class Clean(Command):
         self.file.check()
         if self.scale is not None and self.scale[:3] == self.scale[3:6]:
             raise InputError(f"--scale has the point {self.scale[:3]} twice; expected two different points")
+        if os.path.isfile(self.output):
+            raise InputError(f"{self.output} already exists; nothing was written. Choose another --output")
         check_folder(self.output)
         if os.path.lexists(self.output) and any(self.output.iterdir()):
             raise InputError(f"{self.output} is not empty; nothing was written. Choose a new folder for --output")
@@ -271,6 +274,10 @@ class Export(Command):
             raise InputError(f"nothing to write without --formats; expected some of {', '.join(OUTPUT_FORMATS)}")
         if {f".{kind}" for kind in self.formats} & {*GAUSSFORGE_SUFFIXES} and find_spec("gaussforge") is None:
             raise InputError("--formats sog and ksplat need gaussforge; pip install 'glassplat[formats]'")
+        if "html" not in self.formats and (self.title or self.credit or self.url):
+            raise InputError("--title, --credit and --url are for the page; add html to --formats")
+        if "spz" not in self.formats and self.spz_version != 3:
+            raise InputError("--spz-version is for SPZ; add spz to --formats")
         if self.url is not None and not self.url.startswith(("https://", "http://")):
             raise InputError(f"--url is {self.url}; expected an address that begins with https://")
         check_scene(self.scene)

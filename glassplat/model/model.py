@@ -362,7 +362,8 @@ class Model:
         found = [str(target) for target in targets if target.exists()]
         if found:
             raise FileExistsError(
-                f"{join_names(found)} already exists; nothing was written. Choose another folder, or overwrite=True"
+                f"{join_names(found)} already exists; nothing was written. Choose another folder; in Python, "
+                "overwrite=True replaces files"
             )
         writing.make_folder(path.parent)
         if kind not in writing.SPLAT_WRITERS:

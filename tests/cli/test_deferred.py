@@ -92,7 +92,7 @@ def test_surroundings_can_be_exchanged(run: Path, capsys: pytest.CaptureFixture[
 
 def test_exchanging_surroundings_needs_a_reflective_scene(run: Path) -> None:
     scene = replace(open_run(run, "cpu").scene, environment=Environment.empty())
-    with pytest.raises(InputError, match="nothing in the run reflects an environment"):
+    with pytest.raises(InputError, match="nothing in the scene reflects an environment"):
         SceneEdits(surroundings=run.parent / "red.png").apply(scene)
 
 

@@ -86,6 +86,8 @@ def test_another_program_reads_the_ply(tmp_path: Path) -> None:
     ("options", "words"),
     [
         ("--as-mirror 4", "no pane 4"),
+        ("--formats ply --credit me", "add html to --formats"),
+        ("--formats ply --spz-version 4", "add spz to --formats"),
     ],
 )
 def test_invalid_options_are_refused(

@@ -130,6 +130,9 @@ def test_the_command_writes_another_scene_in_metres(tmp_path: Path, capsys: pyte
     assert main(["eval", str(output), "--data", str(tmp_path / "capture")]) == 2
     assert "is a scene without a capture" in " ".join(capsys.readouterr().err.split())
     assert main(["clean", str(run), "--output", str(run)]) == 2
+    (tmp_path / "mine.ply").write_text("mine")
+    assert main(["clean", str(run), "--output", str(tmp_path / "mine.ply")]) == 2
+    assert "mine.ply already exists; nothing was written" in " ".join(capsys.readouterr().err.split())
     assert main(["clean", str(run), "--output", str(tmp_path / "no"), "--scale", *"1231234"]) == 2
     assert "expected two different points" in " ".join(capsys.readouterr().err.split())
     for metres in ("1e-12", "1e30"):
