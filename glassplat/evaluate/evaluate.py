@@ -290,7 +290,8 @@ def time_render(renderer: Renderer, scene: Scene, view: View) -> tuple[Frame, fl
         # Reading a pixel synchronises with an asynchronous device.
         frame.rgb[0, 0, 0].item()
         seconds = time.perf_counter() - start
-    frame = Frame(frame.rgb.cpu(), {name: layer.cpu() for name, layer in frame.layers.items()})
+    layers = {name: layer.cpu() for name, layer in frame.layers.items()}
+    frame = Frame(frame.rgb.cpu(), layers, background=frame.background)
     if not bool(torch.isfinite(frame.rgb).all()):
         raise InputError(f"the render of {view.name} contains non-finite values; the scene is broken, train it again")
     return frame, seconds

@@ -94,13 +94,14 @@ class Frame:
     def exposed(self, exposures: Exposures, name: str) -> Tensor:
         """[H, W, 3] the image as photographed, in the colours of a photograph; the background keeps its own.
 
-        Differentiable in image, coverage and exposures.
+        Differentiable in image, coverage and exposures. Needs the layer `alpha`; reflections are part of the scene.
         """
         own = exposures.values_of(name)
         if own is None:
             return self.photographed
         changed = own[:, :3] @ constant(self.background, own.dtype, own.device) + own[:, 3]
-        uncovered = (1 - self.layers["alpha"])[..., None]
+        reflected = self.layers.get("share", self.layers.get("strength", 0))
+        uncovered = ((1 - self.layers["alpha"]) * (1 - reflected))[..., None]
         return torch.addcmul(exposures.apply(self.photographed, name), uncovered, changed, value=-1)
 
     @property

@@ -7,12 +7,14 @@ from dataclasses import replace
 import pytest
 import torch
 
+from glassplat.evaluate.evaluate import time_render
+from glassplat.render.deferred import Deferred
 from glassplat.render.frame import Frame
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.corrections import Exposures
-from glassplat.scene.scene import Scene
 from glassplat.training.losses import PhotometricLoss
+from tests.render.test_deferred import glossy
 from tests.training.tiny_capture import tiny_capture, true_scene
 
 
@@ -53,17 +55,22 @@ def test_the_loss_compares_in_the_colours_of_the_photograph() -> None:
     assert float(PhotometricLoss(0.2)(frame, view, scene)) > 0.05
 
 
-@pytest.mark.parametrize("renderer", [Splat(), Planar()])
-def test_the_background_is_not_exposed(renderer: Splat | Planar) -> None:
-    view, affine, background = tiny_capture().train[0], 0.2 * drawn(1, 3, 4).float(), (1.0, 0.6, 0.2)
-    scene = Scene(true_scene().primary, true_scene().extent)
-    frame = replace(renderer, background=background)(scene, view.camera)
-    uncovered = 1 - frame.layers["alpha"][..., None]
-    own = renderer(scene, view.camera).rgb @ (torch.eye(3) + affine[0, :, :3].T) + (1 - uncovered) * affine[0, :, 3]
+@pytest.mark.parametrize("renderer", [Splat(), Planar(), Deferred()])
+def test_the_background_is_not_exposed(renderer: Splat | Planar | Deferred) -> None:
+    scene, view, color = glossy(0.8).to(torch.float32), tiny_capture().train[2], (1.0, 0.6, 0.2)
+    exposures, black = Exposures(0.2 * drawn(1, 3, 4).float(), ("a",)), renderer(scene, view.camera)
+    frame, _ = time_render(replace(renderer, background=color), scene, view)
+    behind = frame.rgb - black.rgb
+    uncovered = behind / torch.tensor(color)
     assert float(uncovered.max()) > 0.5
-    torch.testing.assert_close(
-        frame.exposed(Exposures(affine, (view.name,)), view.name), own + uncovered * torch.tensor(background)
-    )
+    own = exposures.apply(black.rgb, "a") - uncovered * exposures.values[0, :, 3]
+    torch.testing.assert_close(frame.exposed(exposures, "a"), own + behind)
+
+
+def test_a_mirror_in_front_of_nothing_is_exposed() -> None:
+    exposures, image, empty = Exposures(drawn(1, 3, 4), ("a",)), drawn(4, 5, 3, seed=1), drawn(4, 5) * 0
+    frame = Frame(image, {"alpha": empty, "strength": empty, "share": empty + 1}, background=(1.0, 0.6, 0.2))
+    torch.testing.assert_close(frame.exposed(exposures, "a"), exposures.apply(image, "a"))
 
 
 def test_gradients_reach_image_coverage_and_transform() -> None:
