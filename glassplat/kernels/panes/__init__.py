@@ -270,7 +270,7 @@ def sample_derivatives(derivatives: Tensor, surface: Tensor, means2d: Tensor, de
 
     Args:
         derivatives: [H, W] derivatives by the transmission.
-        surface: [H, W] its depth, infinite where there is none.
+        surface: [H, W] depth of the surface, infinite where there is none.
         means2d: [C, N, 2] centres in pixels; those outside the image, and NaN, are clamped to its border.
         depths: [C, N] of the centres.
 
