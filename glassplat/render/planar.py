@@ -139,7 +139,7 @@ class Planar(WithBackground):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, hint in get_type_hints(type(self)).items():
+        for name, hint in get_type_hints(Planar).items():
             if get_origin(hint) is Literal:
                 check_value(hint, getattr(self, name), name)
 

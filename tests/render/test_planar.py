@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -300,3 +300,13 @@ def test_detached_cuts_every_tensor_off() -> None:
 def test_an_unknown_mode_is_refused(mode: str) -> None:
     with pytest.raises(ValueError, match=f"{mode} is 'Linear'; expected one of"):
         replace(Planar(), **{mode: "Linear"})  # type: ignore[arg-type]
+
+
+def test_a_renderer_may_extend_planar_by_fields_of_types_of_its_own() -> None:
+    @dataclass(frozen=True)
+    class Extended(Planar):
+        own: Own | None = None  # type: ignore[name-defined] # noqa: F821 - As if imported for type checkers only.
+
+    assert Extended().own is None
+    with pytest.raises(ValueError, match="blend is 'Linear'; expected one of"):
+        Extended(blend="Linear")  # type: ignore[arg-type]
