@@ -130,15 +130,15 @@ class Densify:
 
 
 LEAST_MIDAIR_SHARE = 1e-4
-"""Minimum contribution, as a share of a view's pixels, of a Gaussian in mid-air in front of a camera."""
+"""Minimum contribution, as a share of a view's pixels, of a Gaussian in mid-air or large for a camera."""
 
 
 @dataclass(frozen=True)
 class PruneIdle:
     """Removes the Gaussians of one set that contribute almost nothing to any training view, or surround a camera. The
     former include Gaussians behind a pane whose reflection is now explained by the mirrored image. For those around a
-    camera see `gaussians_around_cameras`; Gaussians in mid-air in front of a camera must contribute to other views, see
-    `floaters_near_cameras`.
+    camera see `gaussians_around_cameras`; those in mid-air in front of a camera, or large for its distance, must
+    contribute more to some view, see `floaters_near_cameras` and `large_for_cameras`.
 
     Attributes:
         densifier: holds the threshold and the times.
@@ -175,9 +175,10 @@ class PruneIdle:
         if self.part == "primary":
             positions = torch.stack([view.camera.center for view in dataset.train])
             contributing &= ~densify.gaussians_around_cameras(gaussians, positions)
+            suspect = densify.large_for_cameras(gaussians, positions)
             if dataset.measured_points:
-                floating = densify.floaters_near_cameras(gaussians.means, positions, dataset.points.positions)
-                contributing &= ~floating | (largest_share >= LEAST_MIDAIR_SHARE)
+                suspect |= densify.floaters_near_cameras(gaussians.means, positions, dataset.points.positions)
+            contributing &= ~suspect | (largest_share >= LEAST_MIDAIR_SHARE)
         # A scene without Gaussians is an error; surroundings that nothing reflects yet may still be needed.
         if bool(contributing.all()) or (self.part != "primary" and not bool(contributing.any())):
             return False

@@ -210,6 +210,23 @@ def floaters_near_cameras(means: Tensor, positions: Tensor, points: Tensor) -> T
     return floating
 
 
+LARGE_SHARE = 0.4
+"""Gaussians longer than this share of the distance to the nearest camera are large for it."""
+
+
+@torch.no_grad()
+def large_for_cameras(gaussians: Gaussians, positions: Tensor) -> Tensor:
+    """[N] bool: Gaussians whose longest standard deviation is large for the distance to the nearest of [P, 3] cameras.
+
+    Their projection is linearised at the centre. If a camera sees the centre at a right angle to its axis, the image of
+    such a Gaussian may cover a whole view that it does not reach in space.
+    """
+    nearest = torch.full_like(gaussians.logit_opacities, math.inf)
+    for position in positions.to(gaussians.means):
+        nearest = torch.minimum(nearest, (gaussians.means - position).norm(dim=1))
+    return gaussians.log_scales.amax(dim=1).exp() > LARGE_SHARE * nearest
+
+
 CHILDREN = 2
 """Gaussians that replace one that is split."""
 SHRINK = 1.6

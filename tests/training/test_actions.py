@@ -29,6 +29,7 @@ from glassplat.training.densify import (
     floaters_near_cameras,
     gaussians_around_cameras,
     gaussians_from_points,
+    large_for_cameras,
 )
 from glassplat.training.options import DefaultDensify, McmcDensify
 from glassplat.training.stage import Clock, TrainState
@@ -118,14 +119,31 @@ def test_gaussians_nearer_to_a_camera_than_any_surface_are_in_mid_air() -> None:
     assert not floaters_near_cameras(means, places, points[:2]).any()
 
 
+def test_the_nearest_camera_decides_how_large_a_gaussian_may_be() -> None:
+    places = torch.tensor([[1.0, 0.0, 2.0], [0.0, 0.0, -9.0]])
+    for longest, expected in ((0.79, False), (0.81, True)):
+        assert large_for_cameras(one_gaussian((0.01, longest, 0.1), 0.5), places).tolist() == [expected]
+
+
 @pytest.mark.parametrize(
-    ("needed", "measured", "stays"), [(0.0005, True, True), (0.00005, True, False), (0.00005, False, True)]
+    ("needed", "measured", "large", "stays"),
+    [
+        (0.0005, True, False, True),
+        (0.00005, True, False, False),
+        (0.00005, False, False, True),
+        (0.00005, False, True, False),
+        (0.0005, False, True, True),
+    ],
 )
-def test_gaussians_in_front_of_a_camera_stay_only_if_needed(needed: float, measured: bool, stays: bool) -> None:
+def test_gaussians_in_front_of_a_camera_stay_only_if_needed(
+    needed: float, measured: bool, large: bool, stays: bool
+) -> None:
     state, capture = state_with_one_out_of_sight(), tiny_capture()
     means = state.scene.primary.means.clone()
     means[5] = capture.train[5].camera.center - torch.tensor([0.0, 0.0, 0.01])
-    primary = state.scene.primary.with_tensors({"means": means})
+    log_scales = state.scene.primary.log_scales.clone()
+    log_scales[5] = torch.tensor([0.005 if large else 0.003, 1e-4, 1e-4]).log()
+    primary = state.scene.primary.with_tensors({"means": means, "log_scales": log_scales})
     state.scene = replace(state.scene, primary=primary)
     state.optimizer.moments["primary.means"] = (torch.arange(len(means)).float()[:, None].repeat(1, 3),) * 2
 
