@@ -211,9 +211,9 @@ def write_files(command: Export, console: Console) -> None:
     if "html" in command.formats:
         with convert_to_input_error():
             check_panes(model.scene)
-    splats = {kind: command.output / f"{models.EXPORT_STEM}.{kind}" for kind in SPLAT_WRITERS}
+    splats = [_splat_file(command, kind) for kind in SPLAT_WRITERS]
     sidecars = [command.output / name for name in SIDECARS]
-    check_targets(command.output, [*sidecars, *splats.values()], [])
+    check_targets(command.output, [*sidecars, *splats], [])
     is_again = claim_folder(command.output, "export", command.scene)
     if is_again:
         print_line(console, f"replacing the files of an earlier run of this command in {command.output}")
@@ -226,16 +226,20 @@ def write_files(command: Export, console: Console) -> None:
         except ValueError as error:
             failures.append(f"{kind}: {error}")
     if is_again:
-        _remove_earlier(command, [*sidecars, *splats.values()], written, console)
+        _remove_earlier(command, [*sidecars, *splats], written, console)
     if failures:
         raise InputError("not written: " + "; ".join(failures))
+
+
+def _splat_file(command: Export, kind: str) -> Path:
+    return command.output / f"{models.EXPORT_STEM}.{kind}"
 
 
 def _write_format(command: Export, model: models.Model, kind: str, console: Console) -> list[Path]:
     """Writes the scene in one format, and reports what the file leaves out; returns the written files."""
     if kind == "html":
         return _write_page(command, model, console)
-    path = command.output / f"{models.EXPORT_STEM}.{kind}"
+    path = _splat_file(command, kind)
     write_splats(kind, path, model.scene.primary, **({"version": command.spz_version} if kind == "spz" else {}))
     print_line(console, f"{path.stat().st_size / 1e6:.2f} MB -> {path}")
     if lost := models.unsaved_parts(model, kind):

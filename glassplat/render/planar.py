@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Literal, NamedTuple, get_origin, get_type_hints
 
 import torch
@@ -139,9 +140,8 @@ class Planar(WithBackground):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, hint in get_type_hints(Planar).items():
-            if get_origin(hint) is Literal:
-                check_value(hint, getattr(self, name), name)
+        for name, hint in _modes().items():
+            check_value(hint, getattr(self, name), name)
 
     def __call__(self, scene: Scene, camera: Camera, *, with_records: bool = False) -> Frame:
         """Renders `scene` from `camera`, on the scene's device.
@@ -320,6 +320,14 @@ class Planar(WithBackground):
         owners = nearest_panes(scene.glass.means, scene.planes)
         own = own_masks(seen, direct.splats, direct.marks, owners, (camera.height, camera.width))
         return visibilities(seen, direct.mask, own)
+
+
+@cache
+def _modes() -> dict[str, Any]:
+    """Annotations of the fields of `Planar` that have a few possible values. Evaluated once, because `reflections`
+    makes a renderer for each view.
+    """
+    return {name: hint for name, hint in get_type_hints(Planar).items() if get_origin(hint) is Literal}
 
 
 LARGEST_LOG = 80.0
