@@ -59,7 +59,7 @@ class StepGradients(NamedTuple):
     Attributes:
         losses: losses of each view.
         gradients: means over the views.
-        statistics: additions to the statistics of the state; empty if already added.
+        statistics: sums over the views, by scene part; empty for a view alone.
         visible: [N] bool, primary Gaussians that any view showed; None if unknown.
     """
 
@@ -129,19 +129,14 @@ def run_step(
     visibility: VisibilityCheck,
 ) -> Iterator[Message]:
     """One optimisation step of a batch of views, and the actions due after it."""
-    result = differentiate_step(stage, state, views, ranks, with_records=state.step < stage.densify_until * iterations)
-    visibility.record(result.visible, state.step, len(views))
-    state.is_consistent = False
-    update_parameters(stage, state, result.gradients, iterations, batch=len(views))
-    for part, added in result.statistics.items():
-        statistics_of(state.statistics, part, added.view_count.shape[1], added.view_count.device).merge(added)
+    losses, visible = take_step(stage, state, iterations, views, ranks, visibility)
     clocks = [
         Clock(step + 1, iterations, len(dataset.train), batch=len(views))
         for step in range(state.step, state.step + len(views))
     ]
     state.step += len(views)
     for post_step in stage.post_steps:
-        post_step(state, clocks[-1], result.visible)
+        post_step(state, clocks[-1], visible)
     due = [(clock, action) for clock, action in itertools.product(clocks, stage.actions) if action.due(clock)]
     done = []
     for clock, action in due:
@@ -149,7 +144,6 @@ def run_step(
             done.append(action)
     check_has_gaussians(state)
     state.is_consistent = True
-    losses = mean_losses(result.losses)
     names = ", ".join(view.name for view in views)
     yield StepDone(state.step, names, sum(losses.values()), losses, counts_of(state.scene))
     for action in done:
@@ -159,27 +153,45 @@ def run_step(
         ranks.synchronise(state)
 
 
-def differentiate_step(
-    stage: Stage, state: TrainState, views: Sequence[View], ranks: Ranks, *, with_records: bool
-) -> StepGradients:
-    """Differentiate the views of a step, each rank its own; the scene is not changed yet."""
+def take_step(
+    stage: Stage, state: TrainState, iterations: int, views: Sequence[View], ranks: Ranks, visibility: VisibilityCheck
+) -> tuple[dict[str, float], Tensor | None]:
+    """Updates parameters and statistics by a batch of views, of which each rank renders its own.
+
+    Returns the mean losses, and [N] bool: primary Gaussians that any view showed, None if unknown. Until all checks are
+    passed, `state` is unchanged; from then on it is inconsistent.
+    """
+    with_records = state.step < stage.densify_until * iterations
     own = views[ranks.rank :: ranks.count]
     results = [differentiate(stage, state.scene, view, with_records=with_records) for view in own]
-    if len(views) == ranks.count == 1:
-        check_losses(results[0].losses, state.step + 1, views[0])
-        collect_statistics(state.statistics, results[0], views[0])
-        return StepGradients([results[0].losses], results[0].gradients, {}, results[0].visible)
+    is_alone = len(views) == ranks.count == 1
+    if is_alone:
+        step = StepGradients([results[0].losses], results[0].gradients, {}, results[0].visible)
+    else:
+        step = sum_views(state.scene, views, results, ranks)
+    for number, (view, losses) in enumerate(zip(views, step.losses, strict=True), 1):
+        check_losses(losses, state.step + number, view)
+    visibility.record(step.visible, state.step, len(views))
+    state.is_consistent = False
+    update_parameters(stage, state, step.gradients, iterations, batch=len(views))
+    if is_alone:  # Added directly, without separate sums.
+        collect_statistics(state.statistics, results[0], own[0])
+    for part, added in step.statistics.items():
+        statistics_of(state.statistics, part, added.view_count.shape[1], added.view_count.device).merge(added)
+    return mean_losses(step.losses), step.visible
+
+
+def sum_views(scene: Scene, views: Sequence[View], results: Sequence[ViewGradients], ranks: Ranks) -> StepGradients:
+    """Losses, gradients and statistics of all views of a step; `results` are those of the views of this rank."""
     statistics: dict[str, ScreenStatistics] = {}
-    for view, result in zip(own, results, strict=True):
+    for view, result in zip(views[ranks.rank :: ranks.count], results, strict=True):
         collect_statistics(statistics, result, view)
     exchanged = ranks.exchange((list(statistics), [(r.losses, set(r.gradients), r.visible is None) for r in results]))
     # Rank r renders the views r, r + count, ...
     of_views = [exchanged[i % ranks.count][1][i // ranks.count] for i in range(len(views))]
-    for number, (view, (losses, _, _)) in enumerate(zip(views, of_views, strict=True), 1):
-        check_losses(losses, state.step + number, view)
     parts = dict.fromkeys(part for known, _ in exchanged for part in known)
-    names = [name for name in state.scene.parameters() if any(name in learning for _, learning, _ in of_views)]
-    step = sum_over_ranks(state.scene, results, {part: statistics.get(part) for part in parts}, names, ranks)
+    names = [name for name in scene.parameters() if any(name in learning for _, learning, _ in of_views)]
+    step = sum_over_ranks(scene, results, {part: statistics.get(part) for part in parts}, names, ranks)
     gradients = {name: gradient / len(views) for name, gradient in step.gradients.items()}
     visible = None if any(unknown for _, _, unknown in of_views) else step.visible
     return StepGradients([losses for losses, _, _ in of_views], gradients, step.statistics, visible)

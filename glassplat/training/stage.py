@@ -63,7 +63,7 @@ class Optimizer:
         updates = []
         for name, gradient in gradients.items():
             parameter = parameters[name]
-            if not parameter.numel() or self._is_paused(name, batch):
+            if not parameter.numel() or self._wait_out_pause(name, batch):
                 continue
             moments = self.moments_of(name, parameter)
             self.updates[name] = self.updates.get(name, 0) + batch
@@ -73,8 +73,8 @@ class Optimizer:
             updates.append(Update(parameter, gradient, *moments, lr, step, decay))
         adam(updates, betas=(BETAS[0] ** batch, BETAS[1] ** batch))
 
-    def _is_paused(self, name: str, batch: int) -> bool:
-        """Return whether a parameter is paused; counts the views of the step."""
+    def _wait_out_pause(self, name: str, batch: int) -> bool:
+        """Return whether a parameter is paused at this step, whose views shorten its pause."""
         left = self.paused.get(name, 0)
         if left:
             self.paused[name] = max(left - batch, 0)

@@ -61,6 +61,13 @@ def test_views_that_all_show_nothing_end_it_after_one_pass() -> None:
         list(train(stages_of(SplatRecipe()), some_views_away(6), state, 600))
 
 
+def test_a_step_that_is_refused_leaves_the_state_as_it_was() -> None:
+    state, dataset = fresh_state(), some_views_away(1)
+    with pytest.raises(NoGaussiansError, match="none of the 1 training views"):
+        list(train(stages_of(SplatRecipe()), replace(dataset, train=dataset.train[:1]), state, 600))
+    assert state.step == 0 and state.is_consistent and not state.statistics and not state.optimizer.moments
+
+
 def test_only_whole_passes_are_judged() -> None:
     nothing, something = torch.zeros(3, dtype=torch.bool), torch.tensor([False, True, False])
     visibility = VisibilityCheck(3)

@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import sys
+import weakref
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
+from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import View
 from glassplat.errors import InputError
 from glassplat.methods.planar import PaneSetup
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.scene.scene import Scene
+from glassplat.training import loop
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.densify import ScreenStatistics, gaussians_from_points
-from glassplat.training.loop import TrainingDivergedError, collect_statistics, differentiate, train
+from glassplat.training.loop import TrainingDivergedError, ViewGradients, collect_statistics, differentiate, train
 from glassplat.training.losses import LossTerm, PhotometricLoss
 from glassplat.training.messages import ActionDone, StageEntered, StepDone
 from glassplat.training.options import Rate
-from glassplat.training.stage import Stage, TrainState
+from glassplat.training.stage import AtShares, Clock, Stage, TrainState
 from tests.training.progress_of import finished
 from tests.training.tiny_capture import place_true_planes, tiny_capture, true_scene
 
@@ -103,6 +107,29 @@ def test_screen_gradients_are_collected_as_long_as_densification_reads_them() ->
     assert seen[0]["glass"].sum() > 0
     for part, views in seen[0].items():
         assert torch.equal(views, seen[1][part]), part
+
+
+def test_gradients_are_freed_before_the_actions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Densification needs the most memory of a run."""
+    found: list[weakref.ref[torch.Tensor]] = []
+    alive: list[bool] = []
+
+    def noted(*arguments: Any, **options: Any) -> ViewGradients:
+        result = differentiate(*arguments, **options)
+        found.append(weakref.ref(result.gradients["primary.means"]))
+        return result
+
+    class Look(AtShares):
+        name = "look"
+
+        def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+            alive.extend(reference() is not None for reference in found)
+            return False
+
+    monkeypatch.setattr(loop, "differentiate", noted)
+    (stage,) = SplatRecipe(sh_degree=1).stages(seed=0)
+    run(fresh_state(), (replace(stage, actions=(Look((0.5, 1.0)),)),), iterations=2)
+    assert alive == [False, False, False]
 
 
 def test_collecting_screen_gradients_changes_no_other_gradient() -> None:
