@@ -183,6 +183,28 @@ def test_docstrings_name_only_attributes_that_exist() -> None:
     assert not stale, stale
 
 
+DESCRIBED = ("methods", "panes", "render", "scene", "training")
+"""Folders in which every constant number says what it is."""
+
+
+def undescribed_numbers(source: str) -> list[str]:
+    """Constants that are numbers and are followed by no string."""
+    body = ast.parse(source).body
+    return [
+        ast.unparse(statement)
+        for statement, following in zip(body, [*body[1:], None], strict=True)
+        if isinstance(statement, ast.Assign) and re.fullmatch(r"[-+*/.,() \de]*", ast.unparse(statement.value))
+        if not (isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant))
+    ]
+
+
+def test_constants_that_decide_results_are_described() -> None:
+    assert undescribed_numbers('ONE = 1\nTWO, THREE = 2.0, 1 / 3\n"""Both."""') == ["ONE = 1"]
+    sources = [(path, source) for path, source in package_sources().items() if path.parts[1] in DESCRIBED]
+    assert len(sources) > 30
+    assert not [f"{path}: {number}" for path, source in sources for number in undescribed_numbers(source)]
+
+
 def test_the_diagram_names_only_what_exists(rows: dict[str, int]) -> None:
     package = ROOT / PACKAGE
     missing = [name for name in rows if not (package / name).is_dir() and not (package / f"{name}.py").is_file()]

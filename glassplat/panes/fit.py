@@ -27,6 +27,7 @@ log = logging.getLogger("glassplat.panes")
 LEAST_MATCHING, LEAST_OF_MEDIAN = 0.3, 0.5
 """Minimum share of a mask's outline that must meet the others, absolute and relative to the median over the masks."""
 EDGES_PER_VIEW = 100
+"""Number of points of a mask's outline that are compared with the other masks."""
 IMPRECISE_DISTANCE = 1e5
 """Distance of the cameras from the origin, in the distances between them, beyond which no mask is called wrong: there,
 single precision moves cameras by a percent of these distances."""

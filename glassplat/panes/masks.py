@@ -144,8 +144,8 @@ def random_planes(points: Array, count: int, rng: np.random.Generator) -> PlaneE
 
 Mask = NDArray[np.bool_]
 
-LEAST_HALF_WIDTH = 0.005  # Half width below which a part of a mask is treated as an artefact, in image diagonals.
-
+LEAST_HALF_WIDTH = 0.005
+"""Half width below which a part of a mask is treated as an artefact, in image diagonals."""
 EDGE_SMOOTHING = 0.005
 """Standard deviation of the Gaussian that smooths a mask to find the direction of its edge, in image diagonals."""
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from glassplat.captures.view import View, sample_evenly
 from glassplat.kernels.adam import Update, adam
 from glassplat.kernels.maths.images import linear_from_srgb
+from glassplat.kernels.records import DAZZLING
 from glassplat.options import BLACK, WHITE
 from glassplat.render.layers import gather_mirrored_pixels, gather_pixels, window_means, window_sums
 from glassplat.render.planar import DirectPass, Planar
@@ -137,13 +138,14 @@ def reduced_photograph(scene: Scene, view: View) -> Photograph:
     size = (max(round(factor * camera.height), 1), max(round(factor * camera.width), 1))
     pixels = scene.exposures.apply_inverse(view.photo.to(device).float() / 255, view.name)
     pixels = torch.nn.functional.interpolate(pixels.movedim(-1, 0)[None], size, mode="area")[0].movedim(0, -1)
-    valid = torch.ones_like(pixels[..., 0]) if view.ignored is None else 1.0 - view.ignored.to(device).float()
+    valid = torch.ones_like(pixels[..., 0], dtype=torch.bool)
     if view.ignored is not None:
-        valid = torch.nn.functional.interpolate(valid[None, None], size, mode="area")[0, 0]
+        ignored = view.ignored.to(device)[None, None].float()
+        valid = torch.nn.functional.interpolate(ignored, size, mode="area")[0, 0] == 0
     labels = None if view.pane_labels is None else view.pane_labels.to(device)
     if labels is not None:
         labels = torch.nn.functional.interpolate(labels[None, None].float(), size, mode="nearest-exact")[0, 0]
-    return Photograph(camera.resize(size[1], size[0]), pixels, valid == 1, labels)
+    return Photograph(camera.resize(size[1], size[0]), pixels, valid, labels)
 
 
 def mirror_candidate(scene: Scene, label: int, photographs: Sequence[Photograph]) -> MirrorCandidate:
@@ -223,10 +225,10 @@ def align_pane(scene: Scene, parts: Sequence[ComparedPart]) -> Scene:
     for step in range(ALIGN_STEPS):
         moving = offsets.clone().requires_grad_()
         # A stride coprime to the number of parts visits all of them, neighbours far apart.
-        regression = mirror_correlation(move_pane(scene, moving), parts[step * 7919 % len(parts)])
-        if not regression.requires_grad:
+        likeness = mirror_correlation(move_pane(scene, moving), parts[step * 7919 % len(parts)])
+        if not likeness.requires_grad:  # The moved pane is out of this view.
             continue
-        (gradient,) = torch.autograd.grad(-regression, moving)
+        (gradient,) = torch.autograd.grad(-likeness, moving)
         steps += 1
         # Not `torch.optim`: its first optimiser imports PyTorch's compiler, which takes longer than the alignment.
         adam([Update(offsets, gradient, *moments, ALIGN_RATE * (1 - step / ALIGN_STEPS), steps)], eps=1e-8)
@@ -245,16 +247,16 @@ def polish_pane(scene: Scene, parts: Sequence[ComparedPart]) -> Scene:
     """
     chosen = parts[:: max(1, len(parts) // POLISH_PHOTOGRAPHS)]
 
-    def correlation(offsets: Tensor) -> float:
+    def likeness(offsets: Tensor) -> float:
         return mean_correlations([move_pane(scene, offsets)], chosen)[0]
 
     best = scene.primary.means.new_zeros(3)
-    most, axes = correlation(best), torch.eye(3, dtype=torch.float32).to(best)
+    most, axes = likeness(best), torch.eye(3, dtype=torch.float32).to(best)
     for step in POLISH_STEPS:
         for _ in range(POLISH_ROUNDS):
             before = most
             for change in step * torch.cat([axes, -axes]):
-                if (found := correlation(best + change)) > most:
+                if (found := likeness(best + change)) > most:
                     best, most = best + change, found
             if most == before:
                 break
@@ -291,9 +293,13 @@ def mirror_correlation(scene: Scene, part: ComparedPart, direct: DirectPass | No
     `direct` is the direct pass, if it has been rendered already.
     """
     (mirrored,) = MIRROR_RENDERER.reflections(scene, part.camera, (BLACK,), direct)
-    one, other = subtract_local_mean(mirrored, part.region)[part.region], part.pixels
-    tiny = torch.finfo(one.dtype).tiny
-    return (one * other).sum() / torch.sqrt(((one * one).sum() * (other * other).sum()).clamp(min=tiny))
+    return correlation(subtract_local_mean(mirrored, part.region)[part.region], part.pixels)
+
+
+def correlation(one: Tensor, other: Tensor) -> Tensor:
+    """Correlation of two sets of values, both minus their means; 0 where one is constant. Differentiable."""
+    spreads = (one * one).sum() * (other * other).sum()
+    return (one * other).sum() / torch.sqrt(spreads.clamp(min=torch.finfo(one.dtype).tiny))
 
 
 @torch.no_grad()
@@ -333,15 +339,13 @@ def subtract_local_mean(image: Tensor, region: Tensor) -> Tensor:
 
 def regress_on_mirrored(mirrored: Tensor, photographed: Tensor) -> MirrorRegression:
     """Regression of photographed on mirrored values [P, 3], both minus their means."""
-    covariance = (mirrored * photographed).sum()
-    spread, target_spread = (mirrored * mirrored).sum(), (photographed * photographed).sum()
-    tiny = torch.finfo(mirrored.dtype).tiny
-    correlation = covariance / torch.sqrt((spread * target_spread).clamp(min=tiny))
-    return MirrorRegression(float(covariance / spread.clamp(min=tiny)), float(correlation))
+    spread = (mirrored * mirrored).sum().clamp(min=torch.finfo(mirrored.dtype).tiny)
+    slope = (mirrored * photographed).sum() / spread
+    return MirrorRegression(float(slope), float(correlation(mirrored, photographed)))
 
 
-MOST_SEEN_DIRECTLY = 0.5
-"""A Gaussian is virtual if less than this share of the views that contain it see it directly, not through mirrors."""
+MAJORITY = 0.5
+"""Share of the views that show a Gaussian, or its mirrored position, above which most of them do."""
 
 
 @torch.no_grad()
@@ -363,7 +367,7 @@ def virtual_points(points: Tensor, mirrors: Planes, cameras: Sequence[Camera]) -
         inside = in_image(points, camera)
         held += inside
         through += inside & crosses_pane(points, mirrors, camera.center)
-    return through > (1 - MOST_SEEN_DIRECTLY) * held
+    return through > MAJORITY * held
 
 
 HIDDEN_DEPTH_RATIO = 1.1
@@ -371,8 +375,8 @@ HIDDEN_DEPTH_RATIO = 1.1
 EMPTY_DEPTH_RATIO = 0.85
 """Ratio of a position's depth to the mean depth of its pixel below which a view shows that the position is empty; above
 the inverse it is occluded."""
-OFTEN_HIDDEN, ALWAYS_HIDDEN = 0.5, 0.9
-"""Minimum shares, of the views that show a Gaussian behind panes, in which it is hidden often, and almost always."""
+ALWAYS_HIDDEN = 0.9
+"""Minimum share of the views that show a Gaussian behind panes in which it is hidden, to count as always hidden."""
 LEAST_ALWAYS_HIDDEN, LEAST_CONFIRMED = 0.9, 0.4
 """Minimum shares of possible reflections, at least one of which must be reached: always hidden ones among those often
 hidden, and ones whose mirrored positions lie on surfaces among those with mirrored positions in view. Each of ten glass
@@ -416,10 +420,10 @@ def reflections_behind(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -
         direct_views += in_view
         empty += in_view & (ratio < EMPTY_DEPTH_RATIO)
         occluded += in_view & (ratio > 1 / EMPTY_DEPTH_RATIO)
-    often = virtual_points(means, panes, cameras) & (hidden > OFTEN_HIDDEN * shown) & (empty <= 0.5 * direct_views)
+    often = virtual_points(means, panes, cameras) & (hidden > MAJORITY * shown) & (empty <= MAJORITY * direct_views)
     always = often & (hidden > ALWAYS_HIDDEN * shown)
     in_some_view = always & (direct_views > 0)
-    confirmed = in_some_view & (empty + occluded <= 0.5 * direct_views)
+    confirmed = in_some_view & (empty + occluded <= MAJORITY * direct_views)
     selected = torch.where(always.sum() >= MANY_ALWAYS_HIDDEN * often.sum(), always, in_some_view)
     return selected & are_mostly_reflections(often.sum(), always.sum(), in_some_view.sum(), confirmed.sum())
 
@@ -453,8 +457,8 @@ CLIPPED = 0.98
 LAMP_SHARE = 0.6
 """Minimum share of a lamp's directly visible pixels that are clipped, and of its mirror image's pixels that lie where a
 pane mirrors it."""
-LEAST_GAIN, MOST_GAIN = 1.5, 30.0
-"""Minimum and maximum radiance of a lamp; white is 1."""
+MOST_GAIN = 30.0
+"""Maximum radiance of a lamp, where white is 1; the minimum is `DAZZLING`."""
 LEAST_BRIGHT = 0.8
 """Minimum share of the pixels in which a pane mirrors a lamp that are bright enough for one."""
 IMAGE_BRIGHTNESS = 0.5
@@ -462,7 +466,7 @@ IMAGE_BRIGHTNESS = 0.5
 LAMP_RIM = 0.012
 """Distance from its expected position within which a mirror image is searched for, as a share of the image width."""
 FEWEST_SEEN = 0.3
-"""Minimum number of pixels over all photographs for a decision."""
+"""Minimum sum of a Gaussian's blending weights over the pixels of all photographs, for a decision."""
 
 
 class Lamps(NamedTuple):
@@ -510,7 +514,7 @@ def _detect_lamps(scene: Scene, photographs: Sequence[Photograph]) -> Tensor:
         past, through = photograph.valid & (strength <= 0), photograph.valid & (strength > 0)
         darkest = photograph.pixels.amin(dim=-1)
         shown = gather_pixels(scene, photograph.camera, torch.stack([past & (darkest > CLIPPED), past], dim=-1).float())
-        enough = linear_from_srgb(darkest.clamp(0, 1)) > LEAST_GAIN * strength
+        enough = linear_from_srgb(darkest.clamp(0, 1)) > DAZZLING * strength
         lit = torch.stack([through & enough, through], dim=-1).float()
         there = gather_mirrored_pixels(scene, photograph.camera, lit)
         clipped, direct = clipped + shown[:, 0], direct + shown[:, 1]

@@ -323,11 +323,16 @@ class JointObjective:
         )
 
 
-OUTLINE_PIXELS = 4000  # Number of pixels of each view; those of the mask are projected onto the plane.
-MAP_CELLS = 128  # Number of grid cells along the longer side of the map of the plane.
-GRAZING_COSINE = 0.06  # Cosine to the normal below which a pixel is too large on the plane to locate the border.
-SMALLEST_PART = 0.05  # Share of the largest connected part below which a part is an error in a mask.
-LEAST_AGREEING_SHARE = 0.34  # Minimum share, of the views of a point, that show the pane there; others may be occluded.
+OUTLINE_PIXELS = 4000
+"""Number of pixels of each view; those of the mask are projected onto the plane."""
+MAP_CELLS = 128
+"""Number of grid cells along the longer side of the map of the plane."""
+GRAZING_COSINE = 0.06
+"""Cosine to the normal below which a pixel is too large on the plane to locate the border."""
+SMALLEST_PART = 0.05
+"""Share of the largest connected part below which a part is an error in a mask."""
+LEAST_AGREEING_SHARE = 0.34
+"""Minimum share, of the views of a point, that show the pane there; others may be occluded."""
 
 
 def pane_rectangle(plane: PlaneEquations, views: Sequence[PaneView], axes: Array) -> Rectangle:

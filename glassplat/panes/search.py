@@ -32,10 +32,13 @@ Array = NDArray[np.float64]
 Evidence = Objective | JointObjective
 
 ITERATIONS = 15
+"""Maximum number of Gauss-Newton steps for each tolerance."""
 STEP = 3e-4
 """Step of the numerical derivative, a fraction of a pixel: in radians, distances of the cameras, scene extents."""
 SMALLEST_CURVATURE = 1e-12
+"""Added to the Gauss-Newton matrix, in the units of `_scales`, so that parameters without influence stay."""
 FIRST_DAMPING, DAMPING_DECREASE, DAMPING_INCREASE = 1e-2, 0.3, 5.0
+"""Damping as a share of the matrix's diagonal, and its factors after steps that lower the cost and that do not."""
 NOTICEABLE_CHANGE = 0.01
 """Change of the cost that counts as noticeable, as a share of its maximum."""
 CONVERGED_CHANGE = 1e-4
@@ -321,8 +324,9 @@ def angle(one: FramedPlanes, other: FramedPlanes) -> float:
 
 
 IMAGE_TILT, IMAGE_TILT_STEP = 15.0, 0.75
+"""Range and step of both tilts in the search around the plane of the masks, in degrees."""
 IMAGE_SHIFT, IMAGE_SHIFT_STEP = 0.06, 0.01
-"""Ranges and steps of the search around the plane of the masks: two tilts in degrees, a shift in scene extents."""
+"""The same for the shift, in scene extents."""
 IMAGE_TOLERANCE = 0.01
 """Standard deviation of the distance between a point and the mirror image of another that match, in scene extents."""
 LEAST_IMAGES, LEAST_PEAK, PEAK_WIDTH = 12.0, 1.4, 3.0
@@ -331,7 +335,9 @@ more than the given degrees. Of 27 panes in synthetic rooms, 10 have such a peak
 MOST_BEFORE = 0.5
 """Share of the pairs that the plane of the masks needs to count as equally good."""
 MOST_IMAGES, MOST_CELLS = 500, 200
+"""Maximum number of points that are mirrored, and of cells of the field of the others along its longest side."""
 HALVINGS = 4
+"""Refinements of the best plane, each with half the steps of the one before."""
 
 
 class MirrorImages(NamedTuple):

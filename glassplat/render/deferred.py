@@ -131,6 +131,7 @@ def _sample_panorama(image: Tensor, directions: Tensor) -> Tensor:
 CELLS_ACROSS = 32
 """Cells along the longer side of an image; depths and normals are averaged over cells before they are compared."""
 LEAST_COVERAGE = 0.5
+"""Coverage of a pixel above which its depth counts."""
 LEAST_CELLS_ACROSS = 3
 """Minimum number of cells along the shorter side, if there are enough pixels: a normal needs a cell and its
 neighbours."""

@@ -18,8 +18,6 @@ from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 
-# Lightness rises evenly from black through violet, red and amber to pale yellow, so that brighter always
-# means more, in grey print too.
 HEAT_STOPS = (
     (0, 0, 4),
     (31, 12, 72),
@@ -31,6 +29,7 @@ HEAT_STOPS = (
     (249, 201, 50),
     (252, 255, 164),
 )
+"""Lightness rises evenly from black through violet, red and amber to pale yellow: brighter means more, in grey, too."""
 LABEL_COLORS = (
     (86, 180, 233),
     (230, 159, 0),
@@ -41,6 +40,7 @@ LABEL_COLORS = (
     (213, 94, 0),
     (160, 160, 160),
 )
+"""Colours of panes, which differ with impaired colour vision, too (Okabe and Ito)."""
 MEASURED = ("normal", "depth", "median_depth")
 """Layers whose values are not colours; `glassplat render` also writes them as arrays."""
 ERROR_SCALE = 0.2

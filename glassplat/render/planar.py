@@ -398,6 +398,7 @@ TRUSTED_PART, DISTRUSTED_PART = 0.3, 0.8
 TRUST_WINDOW = 5
 """Pixels over which trust is averaged, against noise."""
 DARKEST = 1e-3
+"""Added to the photographed light, of 1, before shares of it are taken: noise in black pixels has none."""
 DARKEST_GLASS = 0.1
 """Minimum transmittance of tinted glass, so that details and noise are amplified by at most ten."""
 

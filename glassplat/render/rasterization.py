@@ -19,7 +19,9 @@ from glassplat.kernels.tiles import bin_tiles, tile_grid
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 LEAST_SCALE = 1e-20
+"""Minimum standard deviation, world units: that of a line or a point has no logarithm."""
 LEAST_ALPHA = 1e-10
+"""Minimum divisor of depths, as in gsplat."""
 ANYWHERE = 1e9
 """Edges of a window that culls nothing, in pixels."""
 

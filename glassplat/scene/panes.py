@@ -16,6 +16,7 @@ from glassplat.scene.gaussians import check_rows
 LEAST_SINE = 1e-6
 """Minimum sine of the angle between a pane's normal and its tangent."""
 HIGHEST_LABEL = 255
+"""Labels are stored in a byte."""
 PANE_TENSORS = ("centers", "raw_normals", "logit_reflectances", "log_transmittances")
 LONGEST_LIST = 3
 """Consecutive labels that messages list individually."""
@@ -201,6 +202,7 @@ class Planes:
 
 
 LARGEST_ANGLE = math.radians(1.0)
+"""Maximum angle between the normals of coplanar panes."""
 LARGEST_OFFSET = 0.02
 """Maximum distance of one pane's centre from the other's plane, as a share of the longer half side."""
 

@@ -19,6 +19,7 @@ from glassplat.scene.panes import PANE_TENSORS, Planes, name_labels, nearest_pan
 
 ENVIRONMENT_TENSORS = ("raw",)
 FACES = 6
+"""Faces of a cube map."""
 NOISE = 5.0
 """Amplitude of the initial logits of an environment."""
 

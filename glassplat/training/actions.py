@@ -432,9 +432,8 @@ def mcmc_strategy(densifier: McmcDensify, means_rate: Rate) -> DensificationStra
     )
 
 
-LEAST_UNEXPLAINED = 0.1
-"""Mean residual over a window of `RESIDUAL_WINDOW` of the width, sRGB, above which more than detail is missing."""
-RESIDUAL_WINDOW = 0.03
+LEAST_UNEXPLAINED, RESIDUAL_WINDOW = 0.1, 0.03
+"""Mean residual, sRGB, above which more than detail is missing, and the side of its window as a share of the width."""
 GRID_CELLS = 96
 """Grid cells along the longest side of the searched box."""
 MOST_SEARCHED_PHOTOGRAPHS = 100

@@ -77,6 +77,7 @@ units is unknown, and the feet are ten times as far from the camera as the head.
 SPREAD = 0.2
 """Standard deviation of each Gaussian, as a share of its distance from the camera."""
 OPACITY = 0.05
+"""Initial opacity of each Gaussian."""
 
 
 def initial_photographer(

@@ -27,6 +27,7 @@ from glassplat.scene.gaussians import DISC_SCALES, Gaussians
 from glassplat.training.options import DefaultDensify, McmcDensify
 
 NEIGHBOURS = 3
+"""Number of nearest points whose mean distance is the size of a first Gaussian (3DGS)."""
 SMALLEST_SCALE = 1e-6
 """Minimum standard deviation, as a share of the cloud's size, for coinciding points."""
 DARKEST = 0.25

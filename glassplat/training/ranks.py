@@ -39,6 +39,7 @@ LOST_MESSAGE = (
     "--resume to continue from the last checkpoint"
 )
 LONGEST_QUOTE = 150
+"""Maximum length of an error message that is quoted, in characters."""
 
 
 def is_launched() -> bool:
