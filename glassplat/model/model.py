@@ -28,7 +28,7 @@ from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.recipe import recipe_to_json, resolve_background, with_background
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import RunDirectory
-from glassplat.options import BLACK, CLEAR_GLASS, Cleaning, Up
+from glassplat.options import BLACK, CLEAR_GLASS, Cleaning, Up, short_repr
 from glassplat.publish import web_page
 from glassplat.publish.camera_paths import orbit
 from glassplat.publish.cleaning import Floaters, clean_scene
@@ -153,7 +153,7 @@ class Model:
             raise InputError(f"layers is {layers!r}; expected a sequence of names, such as ({layers!r},)")
         check_layers(self.renderer, self.scene, layers, self.recipe.method)
         if not isinstance(camera, (str, Camera)):
-            raise InputError(f"camera is {camera!r}; expected a Camera, or the name of one of `cameras`")
+            raise InputError(f"camera is {short_repr(camera)}; expected one Camera, or the name of one of `cameras`")
         if isinstance(camera, str):
             if camera not in self.cameras:
                 raise InputError(f"there is no camera {camera!r}; expected one of {join_names(list(self.cameras))}")

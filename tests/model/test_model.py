@@ -75,8 +75,10 @@ def test_every_layer_is_an_image(tmp_path: Path) -> None:
         assert 0 <= float(image.min()) <= float(image.max()) <= 1
     with pytest.raises(InputError, match=r"layers is 'depth'; expected a sequence"):
         whole.render("2.png", layers="depth")
-    with pytest.raises(InputError, match="camera is 3; expected a Camera, or the name"):
+    with pytest.raises(InputError, match="camera is 3; expected one Camera, or the name"):
         whole.render(3)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"^camera is \[Camera.{,100}\.\.\.; expected one Camera"):
+        whole.render([*whole.cameras.values()])  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"planar renders no layer base; expected .*reflection"):
         whole.image("2.png", "base")
     with pytest.raises(InputError, match=r"there is no camera 'nobody\.png'; expected one of .*0\.png"):
