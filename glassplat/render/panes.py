@@ -212,7 +212,8 @@ def composite_panes(
 ) -> CompositedPanes:  # fmt: skip
     """Applies Eq. 1 of TR-Gaussians for each pane on a ray; C_t is the image with all panes behind it.
 
-    Tinted glass, which the paper does not have, scales the channels of C_t.
+    Tinted glass, which the paper does not have, scales the channels of C_t. Differentiable in all images, and in
+    normals, reflectances and transmittances of the panes.
 
     Args:
         image: [H, W, 3] image without panes.
@@ -338,7 +339,7 @@ def visibilities(seen: SeenPanes, joint: Tensor, own: Tensor) -> list[Tensor]:
 def own_masks(seen: SeenPanes, splats: Splats, marks: Tensor, owners: Tensor, size: tuple[int, int]) -> Tensor:
     """[K, H, W] mask of each pane as if it were the only one, in tiles with several.
 
-    As M of TR-Gaussians, Eq. 7, but not occluded by other panes.
+    As M of TR-Gaussians, Eq. 7, but not occluded by other panes. Differentiable in splats and marks.
 
     Args:
         seen: panes behind each other.

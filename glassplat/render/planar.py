@@ -112,6 +112,9 @@ class Planar(WithBackground):
     Photographs also show their photographer in the panes: `Scene.photographer`, Gaussians in a frame that moves with
     the camera. They are only rendered in mirrored images.
 
+    Gradients reach all tensors of the scene and the camera's pose, except R0 of mirrors, and tangents and sizes of
+    rectangles, at whose edges the image is discontinuous. Where the intensity is above `DAZZLING`, R_k has none.
+
     Attributes:
         background: background colour, sRGB.
         fresnel: angular dependence of R_k: a pane with two surfaces, Schlick's approximation for one surface (Eq. 6),
