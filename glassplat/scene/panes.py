@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from glassplat.scene import check_tensor_names
+from glassplat.scene import check_tensor_names, logit
 from glassplat.scene.camera import Camera, constant
 from glassplat.scene.gaussians import check_rows
 
@@ -157,8 +157,9 @@ class Planes:
         *,
         tangent: Sequence[float] | None = None,
         label: int = 1,
+        base_reflectance: float = 0.5,
     ) -> Planes:
-        """A single plane, with a base reflectance of one half.
+        """A single plane.
 
         Args:
             center: [3] centre, world units.
@@ -166,10 +167,11 @@ class Planes:
             half_sizes: half its sides along tangent and bitangent, world units.
             tangent: [3] direction of its first side; any direction in the plane if None.
             label: label of the pane, 1 to 255.
+            base_reflectance: R0, between 0 and 1; 0.08 for clear glass.
 
         Raises:
-            ValueError: a value is not finite, a size is not positive, a direction has length 0, or the label is out of
-                range.
+            ValueError: a value is not finite, a size is not positive, a direction has length 0, or the label or R0 is
+                out of range.
         """
         middle, across, half = (
             torch.tensor(list(values), dtype=torch.float32) for values in (center, normal, half_sizes)
@@ -186,7 +188,10 @@ class Planes:
             raise ValueError(f"a pane of {center}, {normal}, {half_sizes}; expected finite numbers, sizes above 0")
         if float(torch.linalg.cross(across, axis).norm()) <= LEAST_SINE * float(across.norm() * axis.norm()):
             raise ValueError(f"a pane with the normal {normal} and the tangent {tangent}; expected two directions")
-        return Planes(middle[None], across[None], torch.zeros(1, dtype=torch.float32), axis[None], half[None], (label,))
+        if not 0 < base_reflectance < 1:
+            raise ValueError(f"a pane with an R0 of {base_reflectance}; expected a number between 0 and 1")
+        logits = torch.tensor([logit(base_reflectance)], dtype=torch.float32)
+        return Planes(middle[None], across[None], logits, axis[None], half[None], (label,))
 
     @staticmethod
     def empty() -> Planes:

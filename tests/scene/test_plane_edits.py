@@ -225,6 +225,13 @@ def test_a_label_names_one_pane() -> None:
         twice.concat(twice)
 
 
+def test_a_rectangle_has_the_reflectance_that_it_is_given() -> None:
+    given = [Planes.rectangle((0, 0, 2), (0, 0, -1), (1, 1), **r) for r in ({}, {"base_reflectance": 0.08})]
+    assert [float(plane.base_reflectances) for plane in given] == pytest.approx([0.5, 0.08])
+    with pytest.raises(ValueError, match=r"an R0 of 1\.0; expected a number between 0 and 1"):
+        Planes.rectangle((0, 0, 2), (0, 0, -1), (1, 1), base_reflectance=1.0)
+
+
 def test_a_number_is_read_from_a_tensor_once() -> None:
     focal = torch.tensor(50.0)
     camera = replace(CAMERA, fx=focal, fy=focal)
