@@ -478,7 +478,7 @@ def layer_derivatives_kernel(real: type) -> Kernel:
     return derivatives
 
 
-def sample_derivatives(derivatives: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
+def sample_derivatives(derivatives: Tensor, surface: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
     """As `glassplat.kernels.panes.sample_derivatives`, of contiguous tensors."""
     height, width = derivatives.shape
     # Clamped to the image before the conversion, which is undefined for infinities and NaN; fmax maps NaN to 0.
@@ -488,8 +488,8 @@ def sample_derivatives(derivatives: Tensor, near: Tensor, means2d: Tensor, depth
         for axis, size in zip(means2d.unbind(-1), (width, height), strict=True)
     )
     pixels = (rows * width + columns).flatten()
-    surface, derivative = (image.flatten().index_select(0, pixels).view_as(depths) for image in (near, derivatives))
-    return torch.where(depths > surface, derivative, 1.0)
+    depth, derivative = (image.flatten().index_select(0, pixels).view_as(depths) for image in (surface, derivatives))
+    return torch.where(depths > depth, derivative, 1.0)
 
 
 def inside_panes(pane: Tensor, strength: Tensor) -> Tensor:

@@ -424,12 +424,12 @@ def layer_derivatives_kernel(real: type) -> Kernel:
     return derivatives
 
 
-def sample_derivatives(derivatives: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
+def sample_derivatives(derivatives: Tensor, surface: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
     """As `glassplat.kernels.panes.cpu.sample_derivatives`."""
     found = torch.empty_like(depths)
     per_splat = means2d.view(-1, 2), depths.view(-1), found.view(-1)
     sample_derivatives_kernel(REAL_OF[depths.dtype])(
-        blocks_for(depths.numel(), THREADS), THREADS, derivatives, near, *per_splat
+        blocks_for(depths.numel(), THREADS), THREADS, derivatives, surface, *per_splat
     )
     return found
 
@@ -440,7 +440,7 @@ def sample_derivatives_kernel(real: type) -> Kernel:
     zero, one = real(0.0), real(1.0)
 
     @kernel("sample_derivatives", real, "real2 real2 real2 real1 real1")
-    def fill(derivatives, near, means2d, depths, found):
+    def fill(derivatives, surface, means2d, depths, found):
         i = cuda.grid(1)
         if i >= depths.size:
             return
@@ -448,7 +448,7 @@ def sample_derivatives_kernel(real: type) -> Kernel:
         # Neither comparison holds for NaN, which counts as 0.
         column = right if x >= real(np.int32(right)) else (np.int32(x) if x > zero else 0)
         row = bottom if y >= real(np.int32(bottom)) else (np.int32(y) if y > zero else 0)
-        found[i] = derivatives[row, column] if depths[i] > near[row, column] else one
+        found[i] = derivatives[row, column] if depths[i] > surface[row, column] else one
 
     return fill
 
