@@ -28,7 +28,7 @@ from glassplat.training.actions import DensificationStrategy, Densify, GrowSh, P
 from glassplat.training.corrections import with_learned_corrections, with_neutral_corrections
 from glassplat.training.densify import as_discs
 from glassplat.training.options import PUBLISHED_ITERATIONS, GaussianRates, Intervals, Rate
-from glassplat.training.stage import Action, Every, Stage, TrainState
+from glassplat.training.stage import RESET_TURN, Action, Every, Stage, TrainState
 
 if TYPE_CHECKING:
     from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
@@ -88,7 +88,7 @@ def _reflection_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         densify_until=strategy.densify_until,
     )
     propagate_at = Every(
-        recipe.intervals.opacity, 0.0, recipe.schedule.stop, recipe.intervals.least, skip_multiples_of=3
+        recipe.intervals.opacity, 0.0, recipe.schedule.stop, recipe.intervals.least, skip_multiples_of=RESET_TURN
     )
     renderer = Deferred(recipe.background or BLACK, depth=recipe.consistency_weight != 0)
     guidance = losses.weighted_terms(

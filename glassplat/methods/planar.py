@@ -29,7 +29,7 @@ from glassplat.training.corrections import with_learned_corrections, with_learne
 from glassplat.training.densify import NEIGHBOURS
 from glassplat.training.messages import Working
 from glassplat.training.options import PUBLISHED_ITERATIONS, Rate
-from glassplat.training.stage import AtShares, Clock, Every, PostStep, Stage, TrainState, Work
+from glassplat.training.stage import RESET_TURN, AtShares, Clock, Every, PostStep, Stage, TrainState, Work
 
 if TYPE_CHECKING:
     from glassplat.methods.planar_recipe import PlanarRecipe
@@ -474,7 +474,7 @@ def _joint_stage(recipe: PlanarRecipe, share: float) -> Stage:
     """Stage 3: joint optimisation, with perturbed opacities and slowly moving planes."""
     strategy = strategy_of(recipe)
     perturb_at = Every(
-        recipe.intervals.opacity, 0.0, recipe.perturbation.stop, recipe.intervals.least, skip_multiples_of=3
+        recipe.intervals.opacity, 0.0, recipe.perturbation.stop, recipe.intervals.least, skip_multiples_of=RESET_TURN
     )
     return Stage(
         name="3 joint optimisation",
@@ -508,7 +508,7 @@ def _first_strategy(recipe: PlanarRecipe) -> actions.DensificationStrategy:
     """
     if recipe.strategy != "mcmc" or not recipe.turn_reflections:
         return strategy_of(recipe)
-    densify = actions.Densify(recipe.densify, limit=recipe.mcmc)
+    densify = actions.Densify(recipe.densify, mcmc=recipe.mcmc)
     return replace(strategy_of(replace(recipe, strategy="default")), edits=(densify,), cap=recipe.mcmc.cap)
 
 

@@ -21,7 +21,7 @@ from glassplat.scene.scene import Scene
 from glassplat.training import densify, losses
 from glassplat.training.messages import Working
 from glassplat.training.options import DefaultDensify, Intervals, McmcDensify, Rate
-from glassplat.training.stage import Action, AtShares, Clock, Every, PostStep, TrainState, Work
+from glassplat.training.stage import RESET_TURN, Action, AtShares, Clock, Every, PostStep, TrainState, Work
 
 log = logging.getLogger("glassplat.training")
 
@@ -83,12 +83,12 @@ class Densify:
     Attributes:
         densifier: options.
         part: the set.
-        limit: options of `mcmc`, if it follows and its cap already holds.
+        mcmc: options of `mcmc`, if it follows and its cap already holds.
     """
 
     densifier: DefaultDensify
     part: str = "primary"
-    limit: McmcDensify | None = None
+    mcmc: McmcDensify | None = None
 
     @property
     def name(self) -> str:
@@ -111,7 +111,7 @@ class Densify:
         factor = threshold_factor(dataset) if self.densifier.adapt_to_size else 1.0
         densifier = replace(
             self.densifier,
-            cap=mcmc_cap(self.limit, dataset) if self.limit else densify_cap(self.densifier, dataset),
+            cap=mcmc_cap(self.mcmc, dataset) if self.mcmc else densify_cap(self.densifier, dataset),
             gradient_threshold=self.densifier.gradient_threshold * factor,
             absgrad_threshold=self.densifier.absgrad_threshold * factor,
         )
@@ -395,7 +395,9 @@ class DensificationStrategy:
 
 def default_strategy(densifier: DefaultDensify, intervals: Intervals) -> DensificationStrategy:
     """3DGS: clone, split, prune and reset opacities; finally remove Gaussians that contribute to no view."""
-    reset = ResetOpacity(Every(intervals.opacity, 0.0, intervals.reset_stop, intervals.least, only_multiples_of=3))
+    reset = ResetOpacity(
+        Every(intervals.opacity, 0.0, intervals.reset_stop, intervals.least, only_multiples_of=RESET_TURN)
+    )
     edits = (Densify(densifier), PruneIdle(densifier))
     return DensificationStrategy(edits=edits, resets=(reset,), densify_until=densifier.stop, cap=densifier.cap)
 

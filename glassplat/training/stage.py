@@ -229,6 +229,9 @@ class Every:
         return not self.only_multiples_of or count % self.only_multiples_of == 0
 
 
+RESET_TURN = 3
+"""Every third time, opacities are reset; in between, they are perturbed or raised."""
+
 MOST_TRIED_LENGTHS = 1000
 """Lengths to try in the search for one in which every stage has a step."""
 

@@ -189,9 +189,7 @@ def test_a_set_grows_up_to_its_cap(by: str) -> None:
     state.statistics["primary"] = ScreenStatistics(ones, ones, ones)
     share = (count + 2) / sum(view.camera.width * view.camera.height for view in capture.train)
     own = by == "its own cap"
-    densify = Densify(
-        DefaultDensify(per_pixel=share if own else 0.0), limit=None if own else McmcDensify(cap=count + 2)
-    )
+    densify = Densify(DefaultDensify(per_pixel=share if own else 0.0), mcmc=None if own else McmcDensify(cap=count + 2))
     densify.apply(state, capture, Clock(10, 100, 5))
     assert len(state.scene.primary) == count + 2
 

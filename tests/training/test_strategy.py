@@ -111,7 +111,7 @@ def test_the_strategy_decides_what_happens_to_the_primary_gaussians(recipe: Any)
     assert all(action.part == "glass" for action in last.actions if isinstance(action, Densify))
     for stage in first:
         densify = [action for action in stage.actions if isinstance(action, Densify) and action.part == "primary"]
-        assert [action.limit for action in densify] == [recipe.mcmc]
+        assert [action.mcmc for action in densify] == [recipe.mcmc]
         assert not {Relocate, ResetOpacity} & {type(action) for action in stage.actions}
         assert [type(post_step) for post_step in stage.post_steps] == [AverageLast]
     for stage in replace(recipe, strategy="default").stages(seed=0):
