@@ -136,9 +136,8 @@ LEAST_MIDAIR_SHARE = 1e-4
 @dataclass(frozen=True)
 class PruneIdle:
     """Removes the Gaussians of one set that contribute almost nothing to any training view, or surround a camera. The
-    former include Gaussians behind a pane whose reflection is now explained by the mirrored image. For those around a
-    camera see `gaussians_around_cameras`; those in mid-air in front of a camera, or large for its distance, must
-    contribute more to some view, see `floaters_near_cameras` and `large_for_cameras`.
+    former include Gaussians behind a pane whose reflection is now explained by the mirrored image. Those in mid-air in
+    front of a camera, or large for its distance, must contribute more to some view; see `gaussians_near_cameras`.
 
     Attributes:
         densifier: holds the threshold and the times.
@@ -174,11 +173,9 @@ class PruneIdle:
         contributing = largest >= self.densifier.least_contribution
         if self.part == "primary":
             positions = torch.stack([view.camera.center for view in dataset.train])
-            contributing &= ~densify.gaussians_around_cameras(gaussians, positions)
-            suspect = densify.large_for_cameras(gaussians, positions)
-            if dataset.measured_points:
-                suspect |= densify.floaters_near_cameras(gaussians.means, positions, dataset.points.positions)
-            contributing &= ~suspect | (largest_share >= LEAST_MIDAIR_SHARE)
+            points = dataset.points.positions if dataset.measured_points else positions[:0]
+            obstructing, suspect = densify.gaussians_near_cameras(gaussians, positions, points)
+            contributing &= ~obstructing & (~suspect | (largest_share >= LEAST_MIDAIR_SHARE))
         # A scene without Gaussians is an error; surroundings that nothing reflects yet may still be needed.
         if bool(contributing.all()) or (self.part != "primary" and not bool(contributing.any())):
             return False

@@ -162,70 +162,52 @@ def clone(count: int, index: Tensor) -> Edit:
 
 LEAST_OBSTRUCTING_OPACITY = 0.1
 """Opacity of a Gaussian at a camera's position above which it is removed."""
-
-
-@torch.no_grad()
-def gaussians_around_cameras(gaussians: Gaussians, positions: Tensor) -> Tensor:
-    """[N] bool: Gaussians that would obstruct the view from one of the positions [P, 3].
-
-    A Gaussian is drawn if its centre is in front of the camera. One that surrounds the cameras is therefore drawn in
-    some views and not in others: it may be visible to two cameras only in a pane, and cover the whole image of a
-    third. Discs have no volume and are never selected.
-    """
-    obstructing = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
-    if gaussians.are_discs:
-        return obstructing
-    reach = math.sqrt(-2 * math.log(LEAST_OBSTRUCTING_OPACITY)) * gaussians.log_scales.amax(dim=1).exp()
-    for position in positions.to(gaussians.means):
-        near = ((position - gaussians.means).norm(dim=1) < reach).nonzero().squeeze(1)
-        offset = (position - gaussians.means[near])[:, None] @ rotation_from_quat(gaussians.quats[near])
-        squared = (offset.squeeze(1) / gaussians.log_scales[near].exp()).square().sum(dim=1)
-        opacities = torch.sigmoid(gaussians.logit_opacities[near]) * torch.exp(-squared / 2)
-        obstructing[near] |= opacities > LEAST_OBSTRUCTING_OPACITY
-    return obstructing
-
-
 FREE_SHARE, SURFACE_POINTS = 0.15, 3
 """Gaussians closer to a camera than this share of the distance to its third nearest SfM point are in mid-air."""
-
-
-@torch.no_grad()
-def floaters_near_cameras(means: Tensor, positions: Tensor, points: Tensor) -> Tensor:
-    """[N] bool: means [N, 3] so close to one of the cameras at [P, 3] that no surface can be there.
-
-    A small Gaussian on the camera path is a few pixels wide in distant views, where it explains noise, and covers the
-    image of a camera in between.
-
-    Args:
-        means: centres of Gaussians.
-        positions: positions of cameras.
-        points: [M, 3] SfM points; with fewer than three, nothing is selected.
-    """
-    floating = torch.zeros(len(means), dtype=torch.bool, device=means.device)
-    if len(points) < SURFACE_POINTS:
-        return floating
-    points = points.to(means)
-    for position in positions.to(means):
-        nearest = (points - position).norm(dim=1).topk(SURFACE_POINTS, largest=False).values[-1]
-        floating |= (means - position).norm(dim=1) < FREE_SHARE * nearest
-    return floating
-
-
 LARGE_SHARE = 0.4
 """Gaussians longer than this share of the distance to the nearest camera are large for it."""
 
 
 @torch.no_grad()
-def large_for_cameras(gaussians: Gaussians, positions: Tensor) -> Tensor:
-    """[N] bool: Gaussians whose longest standard deviation is large for the distance to the nearest of [P, 3] cameras.
+def gaussians_near_cameras(gaussians: Gaussians, positions: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    """[N] bool each: Gaussians that obstruct the view from one of the positions, and suspicious ones.
 
-    Their projection is linearised at the centre. If a camera sees the centre at a right angle to its axis, the image of
-    such a Gaussian may cover a whole view that it does not reach in space.
+    A Gaussian is drawn if its centre is in front of the camera. One that surrounds the cameras is therefore drawn in
+    some views and not in others: it may be visible to two cameras only in a pane, and cover the whole image of a
+    third. Discs have no volume and obstruct nothing.
+
+    Suspicious are Gaussians so close to a camera that no surface can be there: a small one on the camera path is a few
+    pixels wide in distant views, where it explains noise, and covers the image of a camera in between. So are those
+    whose longest standard deviation is large for the distance to the nearest camera. Their projection is linearised at
+    the centre. If a camera sees the centre at a right angle to its axis, the image of such a Gaussian may cover a
+    whole view that it does not reach in space.
+
+    Args:
+        gaussians: the set.
+        positions: [P, 3] positions of cameras.
+        points: [M, 3] SfM points; with fewer than three, nothing counts as too close.
     """
-    nearest = torch.full_like(gaussians.logit_opacities, math.inf)
-    for position in positions.to(gaussians.means):
-        nearest = torch.minimum(nearest, (gaussians.means - position).norm(dim=1))
-    return gaussians.log_scales.amax(dim=1).exp() > LARGE_SHARE * nearest
+    means, longest = gaussians.means, gaussians.log_scales.amax(dim=1).exp()
+    obstructing, floating = torch.zeros(2, len(gaussians), dtype=torch.bool, device=means.device)
+    nearest, points = torch.full_like(longest, math.inf), points.to(means)
+    reach = math.sqrt(-2 * math.log(LEAST_OBSTRUCTING_OPACITY)) * longest
+    for position in positions.to(means):
+        distance = (means - position).norm(dim=1)
+        nearest = torch.minimum(nearest, distance)
+        if len(points) >= SURFACE_POINTS:
+            surface = (points - position).norm(dim=1).topk(SURFACE_POINTS, largest=False).values[-1]
+            floating |= distance < FREE_SHARE * surface
+        if not gaussians.are_discs:
+            close = (distance < reach).nonzero().squeeze(1)
+            obstructing[close] |= _opacities_at(gaussians.select(close), position) > LEAST_OBSTRUCTING_OPACITY
+    return obstructing, floating | (longest > LARGE_SHARE * nearest)
+
+
+def _opacities_at(ellipsoids: Gaussians, position: Tensor) -> Tensor:
+    """[N] opacity of each Gaussian at a position [3]."""
+    offset = (position - ellipsoids.means)[:, None] @ rotation_from_quat(ellipsoids.quats)
+    squared = (offset.squeeze(1) / ellipsoids.log_scales.exp()).square().sum(dim=1)
+    return torch.sigmoid(ellipsoids.logit_opacities) * torch.exp(-squared / 2)
 
 
 CHILDREN = 2

@@ -26,10 +26,8 @@ from glassplat.scene.scene import Scene, glass_gaussians, without_glass
 from glassplat.training.actions import Densify, PruneIdle, SeedUnexplained, densify_cap, unexplained_positions
 from glassplat.training.densify import (
     ScreenStatistics,
-    floaters_near_cameras,
-    gaussians_around_cameras,
     gaussians_from_points,
-    large_for_cameras,
+    gaussians_near_cameras,
 )
 from glassplat.training.options import DefaultDensify, McmcDensify
 from glassplat.training.stage import Clock, TrainState
@@ -76,6 +74,9 @@ def one_gaussian(
     )
 
 
+NO_POINTS = torch.empty(0, 3)
+
+
 @pytest.mark.parametrize(
     ("gaussian", "expected"),
     [
@@ -91,8 +92,8 @@ def one_gaussian(
 )
 def test_fog_is_what_is_opaque_where_a_camera_stands(gaussian: Gaussians, expected: bool) -> None:
     far, here = torch.tensor([[9.0, 9.0, 9.0]]), torch.zeros(1, 3)
-    assert gaussians_around_cameras(gaussian, torch.cat([far, here])).tolist() == [expected]
-    assert not gaussians_around_cameras(gaussian, far).any()
+    assert gaussians_near_cameras(gaussian, torch.cat([far, here]), NO_POINTS)[0].tolist() == [expected]
+    assert not gaussians_near_cameras(gaussian, far, NO_POINTS)[0].any()
 
 
 def test_gaussians_around_a_camera_are_removed_even_if_others_see_them() -> None:
@@ -112,17 +113,20 @@ def test_gaussians_around_a_camera_are_removed_even_if_others_see_them() -> None
 
 def test_gaussians_nearer_to_a_camera_than_any_surface_are_in_mid_air() -> None:
     means = torch.tensor([[0.0, 0.0, 0.1], [0.0, 0.0, 0.4], [5.0, 0.0, 0.0]])
+    gaussians = one_gaussian((1e-3, 1e-3, 1e-3), 0.5).select(torch.zeros(3, dtype=torch.long))
+    gaussians = gaussians.with_tensors({"means": means})
     places = torch.tensor([[0.0, 0.0, 0.0], [0.0, 9.0, 0.0]])
     # One point in front of the first camera is wrong.
     points = torch.tensor([[0.0, 0.0, 0.01], [0.0, 0.1, 2.0], [0.1, 0.0, 2.0], [0.0, 0.0, 30.0]])
-    assert floaters_near_cameras(means, places, points).tolist() == [True, False, False]
-    assert not floaters_near_cameras(means, places, points[:2]).any()
+    assert gaussians_near_cameras(gaussians, places, points)[1].tolist() == [True, False, False]
+    assert not gaussians_near_cameras(gaussians, places, points[:2])[1].any()
 
 
 def test_the_nearest_camera_decides_how_large_a_gaussian_may_be() -> None:
     places = torch.tensor([[1.0, 0.0, 2.0], [0.0, 0.0, -9.0]])
     for longest, expected in ((0.79, False), (0.81, True)):
-        assert large_for_cameras(one_gaussian((0.01, longest, 0.1), 0.5), places).tolist() == [expected]
+        suspicious = gaussians_near_cameras(one_gaussian((0.01, longest, 0.1), 0.5), places, NO_POINTS)[1]
+        assert suspicious.tolist() == [expected]
 
 
 @pytest.mark.parametrize(
