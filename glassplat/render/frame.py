@@ -94,15 +94,28 @@ class Frame:
     def exposed(self, exposures: Exposures, name: str) -> Tensor:
         """[H, W, 3] the image as photographed, in the colours of a photograph; the background keeps its own.
 
-        Differentiable in image, coverage and exposures. Needs the layer `alpha`; reflections are part of the scene.
+        Differentiable in image, coverage and exposures. Reflections are part of the scene.
+
+        Raises:
+            ValueError: the photograph has an exposure, and the frame no layer `alpha`.
         """
-        own = exposures.values_of(name)
-        if own is None:
+        changed = exposures.change_of(self.background, name)
+        if changed is None:
             return self.photographed
-        changed = own[:, :3] @ constant(self.background, own.dtype, own.device) + own[:, 3]
         reflected = self.layers.get("share", self.layers.get("strength", 0))
-        uncovered = ((1 - self.layers["alpha"]) * (1 - reflected))[..., None]
+        uncovered = (self.uncovered * (1 - reflected))[..., None]
         return torch.addcmul(exposures.apply(self.photographed, name), uncovered, changed, value=-1)
+
+    @property
+    def uncovered(self) -> Tensor:
+        """[H, W] the share of the background, apart from reflections in front of it.
+
+        Raises:
+            ValueError: there is no layer `alpha`.
+        """
+        if "alpha" not in self.layers:
+            raise ValueError(f"the frame has the layers {', '.join(self.layers) or 'none'}; expected alpha among them")
+        return 1 - self.layers["alpha"]
 
     @property
     def visible(self) -> Tensor | None:

@@ -419,7 +419,8 @@ def dereflected_photo(
 
     Args:
         frame: a view rendered by `planar`, with `without_panes`, `share`, and `tint` where glass is tinted; on the CPU.
-            With the layer `photographed`, the photographer's reflection is removed as well.
+            With the layer `photographed`, the photographer's reflection is removed as well. If there are exposures, it
+            also needs `alpha`, because they do not act on the background.
         photo: [H, W, 3] uint8, photograph of that view.
         blend: space of Eq. 1 in the run.
         exposures: exposures of the run's photographs; layers are blended in scene colours. Held-out photographs get the
@@ -437,7 +438,9 @@ def dereflected_photo(
     photographed = photo.to(torch.float32) / 255
     # Clipping is evaluated in the camera's colours, the rest in the scene's.
     clipped = photographed
-    photographed = exposures.apply_inverse(photographed, name).clamp(0, 1)
+    change = exposures.change_of(frame.background, name)
+    unexposed = 0 if change is None else frame.uncovered[..., None] * change
+    photographed = exposures.apply_inverse(photographed + (1 - share) * unexposed, name).clamp(0, 1)
     tint = frame.layers.get("tint", torch.ones((), dtype=torch.float32)).clamp(min=DARKEST_GLASS)
     light, reflected = decode(photographed), decode(frame.photographed) - (1 - share) * tint * decode(without_panes)
     # Trust is almost zero before this division would amplify noise.
@@ -445,7 +448,7 @@ def dereflected_photo(
     rendered = decode(without_panes.clamp(0, 1))
     trust = _trust(clipped, light, reflected, share[..., 0])
     behind = rendered + trust[..., None] * (solved - rendered)
-    colors = exposures.apply(encode(behind.clamp(0, 1)), name)
+    colors = exposures.apply(encode(behind.clamp(0, 1)), name) - unexposed
     pixels = torch.round(colors.clamp(0, 1) * 255).to(torch.uint8)
     return torch.where(share > 0, pixels, photo)
 

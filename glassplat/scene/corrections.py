@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from glassplat.scene import check_tensor_names
-from glassplat.scene.camera import Camera
+from glassplat.scene.camera import Camera, constant
 
 
 def neighbour_rows(name: str, names: Sequence[str]) -> list[int]:
@@ -123,6 +123,11 @@ class Exposures(PerPhotograph):
         if own is None:
             return image
         return image @ (torch.eye(3, dtype=image.dtype, device=image.device) + own[:, :3].T) + own[:, 3]
+
+    def change_of(self, color: tuple[float, float, float], name: str) -> Tensor | None:
+        """[3] c' - c of one colour in a photograph; None if the photograph has no values."""
+        own = self.values_of(name)
+        return None if own is None else own[:, :3] @ constant(color, own.dtype, own.device) + own[:, 3]
 
     def apply_inverse(self, photo: Tensor, name: str) -> Tensor:
         """A photograph [..., 3] in the colours of the scene: the inverse of `apply`."""

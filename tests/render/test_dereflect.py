@@ -125,11 +125,31 @@ def test_the_mirror_made_of_layers_is_the_mirror_rendered(blend: Blend, half: fl
     torch.testing.assert_close(as_mirror_image(renderer(scene, camera), blend), rendered, rtol=1e-3, atol=1e-4)
 
 
+DARK = Exposures(
+    torch.tensor([[[-0.3, 0.0, 0.0, 0.02], [0.0, -0.2, 0.0, 0.0], [0.0, 0.0, -0.25, -0.01]]]), ("dark.png",)
+)
+
+
+@pytest.mark.parametrize("strength", [0.1, 0.95], ids=["photograph", "render"])
+@pytest.mark.parametrize("blend", BLENDS)
+def test_the_background_of_an_object_keeps_its_colour(blend: Blend, strength: float) -> None:
+    """The object half covers its background, white or black, in front of which is a pane."""
+    scenes, half = [], torch.full(SIZE, 0.5)
+    for color in ((1.0, 1.0, 1.0), (0.0, 0.0, 0.0)):
+        backdrop = 0.5 * torch.tensor(color).expand(*SIZE, 3)
+        frame = model(torch.full((*SIZE, 3), 0.2) + backdrop, torch.full((*SIZE, 3), 0.3), half * 2 * strength, blend)
+        frame = replace(frame, layers={**frame.layers, "alpha": half}, background=color)
+        photo = uint8(frame.exposed(DARK, "dark.png"))
+        scenes.append(dereflected_photo(frame, photo, blend, exposures=DARK, name="dark.png") / 255 - backdrop)
+    torch.testing.assert_close(*scenes, rtol=0, atol=2.5 / 255)
+    exposed = DARK.apply(torch.full((*SIZE, 3), 0.2), "dark.png") - 0.5 * DARK.values[0, :, 3]
+    torch.testing.assert_close(scenes[1], exposed, rtol=0, atol=2.5 / 255)
+
+
 def test_dereflected_photographs_keep_their_exposure() -> None:
     frame, photo, truth = case(0.1, "linear")
-    affine = torch.zeros(1, 3, 4)
-    affine[0, :, :3], affine[0, :, 3] = torch.diag(torch.tensor([-0.3, -0.2, -0.25])), torch.tensor([0.02, 0.0, -0.01])
-    exposures = Exposures(affine, ("dark.png",))
+    frame = replace(frame, layers={**frame.layers, "alpha": torch.ones(*SIZE)})
+    exposures, affine = DARK, DARK.values
     dark = uint8(exposures.apply(photo.float() / 255, "dark.png"))
     result = dereflected_photo(frame, dark, "linear", exposures=exposures, name="dark.png")
     expected = exposures.apply(truth, "dark.png")

@@ -71,6 +71,9 @@ def test_a_mirror_in_front_of_nothing_is_exposed() -> None:
     exposures, image, empty = Exposures(drawn(1, 3, 4), ("a",)), drawn(4, 5, 3, seed=1), drawn(4, 5) * 0
     frame = Frame(image, {"alpha": empty, "strength": empty, "share": empty + 1}, background=(1.0, 0.6, 0.2))
     torch.testing.assert_close(frame.exposed(exposures, "a"), exposures.apply(image, "a"))
+    with pytest.raises(ValueError, match="has the layers depth; expected alpha among them"):
+        Frame(image, {"depth": empty}).exposed(exposures, "a")
+    assert Frame(image).exposed(exposures, "of no photograph") is image
 
 
 def test_gradients_reach_image_coverage_and_transform() -> None:
