@@ -122,9 +122,7 @@ def viewed() -> Iterator[Viewer]:
     views = tiny_capture().train
     photographs = {view.name: lambda: torch.zeros(28, 40, 3, dtype=torch.uint8) for view in views}
     cameras = [(view.name, view.camera) for view in views]
-    viewer = Viewer(
-        ViewerState("trial", true_scene(), Planar(), ("rgb", "depth"), cameras, photographs), "127.0.0.1", free_port()
-    )
+    viewer = Viewer(ViewerState("trial", true_scene(), Planar(), cameras, photographs), "127.0.0.1", free_port())
     viewer.start()
     try:
         yield viewer

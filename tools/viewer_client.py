@@ -34,6 +34,7 @@ class ViewerClient:
         pictures: number of received images of the scene.
         controls: messages that created controls, by their uuid.
         gizmos: messages that created gizmos on panes, by their name.
+        removed: uuids of removed controls and folders.
         notes: titles and texts of notifications.
     """
 
@@ -46,6 +47,7 @@ class ViewerClient:
         self.pictures = 0
         self.controls: dict[str, dict[str, Any]] = {}
         self.gizmos: dict[str, dict[str, Any]] = {}
+        self.removed: list[str] = []
         self.notes: list[str] = []
 
     async def __aenter__(self) -> ViewerClient:
@@ -120,6 +122,8 @@ class ViewerClient:
             self.pictures += message["rgb_data"] is not None  # The first message of viser has no image.
         elif kind in CONTROLS:
             self.controls[message["uuid"]] = message
+        elif kind == "GuiRemoveMessage":
+            self.removed.append(message["uuid"])
         elif kind == "TransformControlsMessage":
             self.gizmos[message["name"]] = message
         elif kind == "NotificationShowMessage":

@@ -42,11 +42,10 @@ from glassplat.scene.corrections import DEFAULT_UP, estimate_up
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene, covering_glass, with_intensity, with_pane
-from glassplat.viewer.drawing import ERROR_LAYER, ViewerState, Writer
+from glassplat.viewer.drawing import ViewerState, Writer
 from glassplat.viewer.render_loop import LOCALHOST, vacant_port
 from glassplat.viewer.server import Viewer
 
-HIDDEN_LAYERS = ("alpha",)
 NOTEBOOK_WIDTH = 480
 """Pixels."""
 
@@ -390,12 +389,7 @@ def viewer_state(
         photographs: [H, W, 3] uint8 by name, read when asked for.
         writer: saves edits and keyframes of the browser; None if saving is disabled.
     """
-    layers: list[str] = [layer for layer in model.layers if layer not in HIDDEN_LAYERS]
-    if photographs:
-        layers.append(ERROR_LAYER)
-    return ViewerState(
-        model.name, model.scene, model.renderer, layers, tuple(model.cameras.items()), photographs, writer
-    )
+    return ViewerState(model.name, model.scene, model.renderer, tuple(model.cameras.items()), photographs, writer)
 
 
 def name_cameras(cameras: Iterable[tuple[str, Camera]]) -> dict[str, Camera]:

@@ -108,17 +108,19 @@ class PaneGizmo:
 class PaneControls:
     """A folder of controls for the panes; only for scenes with at least one."""
 
-    def __init__(self, handle: Any, planes: Planes) -> None:
+    def __init__(self, handle: Any, planes: Planes, order: float | None = None) -> None:
         """Lays out the controls; `listen` activates them.
 
         Args:
             handle: of the client.
             planes: of the displayed scene; at least one.
+            order: of the folder among the client's controls; by default, the last.
         """
         gui = handle.gui
         self._initial_reflectances = dict(zip(planes.labels, planes.base_reflectances.tolist(), strict=True))
         self._gizmos = [PaneGizmo(handle.scene, planes, row) for row in range(len(planes))]
-        with gui.add_folder("Glass"):
+        self._folder = gui.add_folder("Glass", order=order)
+        with self._folder:
             self._glass = gui.add_dropdown("Panes", ("as it is", "mirror", "none"))
             with gui.add_folder("Reflectance R0", expand_by_default=len(planes) <= MOST_OPEN):
                 self._reflectances = {
@@ -153,7 +155,8 @@ class PaneControls:
         )
 
     def remove(self) -> None:
-        """Removes the gizmos from the view; the controls are removed with their layout."""
+        """Removes the controls, and the gizmos from the view."""
+        self._folder.remove()
         for gizmo in self._gizmos:
             gizmo.remove()
 

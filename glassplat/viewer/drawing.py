@@ -54,7 +54,6 @@ class ViewerState:
         title: of the page.
         scene: on the renderer's device.
         renderer: of its frames.
-        layers: names of the layers; the first one is shown initially.
         cameras: of the photographs, by name; at least one.
         photographs: [H, W, 3] uint8 by name, read on demand; may be empty.
         writer: writes edits made in the browser; None if writing is not allowed.
@@ -63,10 +62,15 @@ class ViewerState:
     title: str
     scene: Scene
     renderer: Renderer
-    layers: Sequence[str]
     cameras: Sequence[tuple[str, Camera]]
     photographs: Mapping[str, Photograph]
     writer: Writer | None = None
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the layers; the first one is shown initially."""
+        shown = (layer for layer in self.renderer.layers(self.scene) if layer not in HIDDEN_LAYERS)
+        return (*shown, *((ERROR_LAYER,) if self.photographs else ()))
 
 
 class Viewpoints:
@@ -94,6 +98,7 @@ Glass = Literal["as it is", "mirror", "none"]
 LEAST_GAIN, MOST_GAIN = 0.1, 10.0
 ERROR_LAYER = "error"
 """The layer that compares with a photograph."""
+HIDDEN_LAYERS = ("alpha",)
 MEASURED_ROWS, SURFACE_COVERAGE = 480, 0.5
 """Rows of the image in which points are measured, and the alpha below which a pixel shows no surface."""
 

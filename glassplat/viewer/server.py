@@ -46,7 +46,6 @@ class Client:
         """Lays out the controls and moves to the first view; the caller then calls `request_render`."""
         self._handle, self._viewer = handle, viewer
         self._status, self._nearest = "", viewer.first
-        self._layer: Any = None
         self._panes: controls.PaneControls | None = None
         self._clean: controls.CleanControls | None = None
         self._measure = controls.MeasureControls(handle)
@@ -130,27 +129,19 @@ class Client:
             self._handle.camera.fov = 2 * float(np.arctan(camera.height / 2 / camera.fy))
 
     def lay_out(self) -> None:
-        """Lays out the controls, replacing existing ones."""
+        """Lays out the controls."""
         gui, state = self._handle.gui, self._viewer.state
-        layers = tuple(state.layers)
-        chosen = layers[0] if self._layer is None else self._layer.value
-        gui.reset()
         self._status_line = gui.add_markdown(escape_markdown(self._status)) if self._viewer.buttons else None
         for name, act in self._viewer.buttons.items():
             gui.add_button(name).on_click(controls.log_errors(lambda _, act=act: act()))
-        self._layer = gui.add_dropdown("Layer", layers, initial_value=chosen)
-        self._layer.on_update(controls.log_errors(lambda _: self.request_render()))
-        panes = state.scene.planes
-        if self._panes is not None:
-            self._panes.remove()
-        self._panes = controls.PaneControls(self._handle, panes) if len(panes) else None
+        self._layer = gui.add_dropdown("Layer", state.layers)
         # A scene in training changes at every step.
         self._clean = None if self._viewer.buttons else controls.CleanControls(gui, state)
         self._measure.lay_out(self.measure)
         self._photographs = controls.PhotographControls(gui, state, self._nearest)
         # After all are created, because a control may fire as soon as it listens.
-        if self._panes is not None:
-            self._panes.listen(self.request_render)
+        self.lay_out_panes()
+        self._layer.on_update(controls.log_errors(lambda _: self.request_render()))
         if self._clean is not None:
             self._clean.listen(self.request_render)
         self._photographs.listen(self.go_to_photograph)
@@ -158,6 +149,21 @@ class Client:
         if state.writer is not None:
             self._add_save_controls(f"{state.title}-edited")
         self._photographs.show_nearest(self._nearest)
+
+    def lay_out_panes(self) -> None:
+        """Lays out the controls of the scene's panes and the list of layers, replacing existing ones.
+
+        The other controls stay, because a page that is slow gets to updates of a control only after its removal, and
+        reports errors.
+        """
+        state = self._viewer.state
+        self._layer.options = state.layers
+        if self._panes is not None:
+            self._panes.remove()
+        self._panes = None
+        if len(state.scene.planes):
+            self._panes = controls.PaneControls(self._handle, state.scene.planes, self._layer.order + 0.5)
+            self._panes.listen(self.request_render)
 
     def measure(self, direction: NDArray[np.float64]) -> None:
         """Adds the surface point visible in a direction [3] (world axes) to the measurement.
@@ -297,11 +303,11 @@ class Viewer:
 
     def replace_scene(self, scene: Scene, renderer: Renderer) -> None:
         """Replaces the displayed scene; to be called by the rendering thread. `refresh` renders it."""
-        previous_labels = self.state.scene.planes.labels
-        self.state = replace(self.state, scene=scene, renderer=renderer)
-        if scene.planes.labels != previous_labels:
+        previous = self.state
+        self.state = replace(previous, scene=scene, renderer=renderer)
+        if (scene.planes.labels, self.state.layers) != (previous.scene.planes.labels, previous.layers):
             for client in list(self._clients.values()):
-                controls.log_errors(client.lay_out)()
+                controls.log_errors(client.lay_out_panes)()
 
     def refresh(self, status: str = "") -> None:
         """Requests the views of all clients again, and shows them a status line."""

@@ -242,7 +242,7 @@ def test_a_missing_photograph_does_not_stop_the_viewer(capfd: pytest.CaptureFixt
         return torch.zeros(28, 28, 3, dtype=torch.uint8)
 
     photographs = dict.fromkeys(STATE.photographs, photograph)
-    state = replace(STATE, photographs=photographs, layers=("rgb", "error"))
+    state = replace(STATE, photographs=photographs)
     viewer = Viewer(state, "127.0.0.1", free_port())
     viewer.start()
 

@@ -30,7 +30,6 @@ STATE = ViewerState(
     "tiny",
     true_scene(),
     Planar(),
-    ("rgb", "strength"),
     [(view.name, view.camera) for view in VIEWS],
     {view.name: lambda: VIEWS[0].photo for view in VIEWS},
 )

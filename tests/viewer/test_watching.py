@@ -200,7 +200,7 @@ def test_a_scene_that_lacks_what_its_method_mirrors_is_drawn_plainly() -> None:
     assert current_renderer(model().recipe, model().scene) == model().renderer
 
 
-def test_the_nearest_photograph_is_shown_again_when_panes_change() -> None:
+def test_only_the_controls_of_panes_are_replaced_when_panes_change() -> None:
     viewer = Viewer(STATE, "127.0.0.1", free_port())  # Without a thread, nothing is drawn afterwards.
 
     async def look() -> None:
@@ -208,9 +208,17 @@ def test_the_nearest_photograph_is_shown_again_when_panes_change() -> None:
             await browser.look()
             while not viewer._clients:
                 await asyncio.sleep(0.02)
-            viewer.replace_scene(replace(STATE.scene, planes=Planes.empty()), Splat())
             (client,) = viewer._clients.values()
+            client._layer.value = "strength"
+            viewer.replace_scene(replace(STATE.scene, planes=Planes.empty()), Splat())
             assert client._photographs._photo.label == f"Nearest photograph: {VIEWS[viewer.first].name}"
+            assert (client._layer.options, client._layer.value) == (("rgb", "normal", "depth", "error"), "rgb")
+            assert client._panes is None
+            viewer.replace_scene(STATE.scene, STATE.renderer)
+            assert client._layer.order < client._panes._folder.order < client._photographs._name.order
+            while not browser.removed:
+                await asyncio.sleep(0.02)
+            assert not {browser.labels()[label] for label in ("Layer", "Go to")} & {*browser.removed}
 
     try:
         asyncio.run(look())
