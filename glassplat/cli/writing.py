@@ -49,8 +49,8 @@ Item = TypeVar("Item")
 def write_layers(command: Render, console: Console) -> None:
     """Renders every layer of every view into its image, and the values of depth and normals into an array."""
     stored = open_run(command.run_directory, command.device, command.data)
-    check_layers(stored.renderer, stored.scene, command.layers, stored.recipe.method)
     scene = command.edits.apply(stored.scene)
+    check_layers(stored.renderer, scene, command.layers, stored.recipe.method)
     renderer = stored.renderer.with_layers(command.layers)
     views = chosen_views(stored.dataset, command.split)
     paths = image_names(stored.dataset)
@@ -123,8 +123,8 @@ WIPE_SPAN = 0.9
 def write_video(command: Video, console: Console) -> None:
     """Renders the frames and encodes them one by one."""
     model = command.file.open(command.scene, command.device)
-    check_layers(model.renderer, model.scene, command.layers, model.recipe.method)
     model = model.with_scene(command.edits.apply(model.scene))
+    check_layers(model.renderer, model.scene, command.layers, model.recipe.method)
     cameras = _video_cameras(command, model)
     columns = 1 if command.layout == "wipe" else len(command.layers)
     with convert_to_input_error():

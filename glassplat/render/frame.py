@@ -187,8 +187,10 @@ def check_layers(renderer: Renderer, scene: Scene, layers: Sequence[str], method
     foreign = [layer for layer in layers if layer not in known]
     if foreign or not layers:
         problem = f"renders no layer {', '.join(foreign)}" if foreign else "renders nothing without layers"
-        trained = "; only a run trained with --photographer.learn has photographed" if "photographed" in foreign else ""
-        raise InputError(f"{method} {problem}; expected layers out of {', '.join(known)}{trained}")
+        reason = "; the scene has no panes" if method == "planar" and not len(scene.planes) else ""
+        if "photographed" in foreign:
+            reason = "; only a run trained with --photographer.learn has photographed"
+        raise InputError(f"{method} {problem}; expected layers out of {', '.join(known)}{reason}")
 
 
 NEAR_PER_EXTENT = 0.01

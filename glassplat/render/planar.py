@@ -209,9 +209,9 @@ class Planar(WithBackground):
         check_channels(scene)
 
     def layers(self, scene: Scene) -> tuple[str, ...]:
-        """Names of the layers for display; with `photographed` if the scene has a photographer."""
+        """Names of the layers for display; those of panes and `photographed` if the scene has panes, a photographer."""
         known = (PHOTOGRAPHED,) if len(scene.photographer) else ()
-        panes = ("transmission", "without_panes", "reflection", "strength", "mask")
+        panes = ("transmission", "without_panes", "reflection", "strength", "mask") if len(scene.planes) else ()
         return ("rgb", *panes, "normal", "depth", "alpha", *known)
 
     def with_layers(self, layers: Sequence[str]) -> Renderer:

@@ -65,6 +65,7 @@ def test_an_interrupted_film_leaves_nothing(
         ("--output film.webp --layout wipe", "two --layers"),
         ("--output film.webp --path keyframes", "belong together"),
         ("--output film.webp --layers base", "renders no layer base"),
+        ("--output film.webp --layers reflection --remove-glass", "no layer reflection; expected layers out of rgb, "),
         ("--output film.webp --seconds 0", "--seconds"),
         ("--output film.webp --width 8192 --layers rgb rgb --seconds 0.1", "at most 16383 pixels a side, not 16384 x"),
         ("--output film.gif --fps 60", "at most 50 frames per second, not 60"),

@@ -81,6 +81,8 @@ def test_every_layer_is_an_image(tmp_path: Path) -> None:
         whole.render([*whole.cameras.values()])  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"planar renders no layer base; expected .*reflection"):
         whole.image("2.png", "base")
+    with pytest.raises(InputError, match=r"no layer reflection; expected .* rgb, normal, depth, alpha; .* no panes"):
+        whole.without_glass().image("2.png", "reflection")
     with pytest.raises(InputError, match=r"there is no camera 'nobody\.png'; expected one of .*0\.png"):
         whole.render("nobody.png")
 
