@@ -14,7 +14,7 @@ from glassplat.captures.masks import IgnoredMask, MaskSet, Polarity, find_masks
 from glassplat.errors import InputError, UnknownFormatError, join_names
 from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
 from glassplat.files.records import is_encodable, readable_name
-from glassplat.files.writing import check_capture_folder
+from glassplat.files.writing import check_capture_folder, scene_source
 
 LOADERS: tuple[tuple[Loader, str], ...] = (
     (colmap.load_colmap, colmap.FORMAT_DESCRIPTION),
@@ -97,8 +97,11 @@ def _load_capture(root: Path) -> Capture:
     names = sorted(path.name for path in root.iterdir())
     found = join_names(names, limit=8) or "nothing"
     message = f"{root} is not a readable capture. Looked for: {looked_for}. Found: {found}."
-    if "recipe.json" in names:
-        message += " This is a run; expected a capture, such as the one that `glassplat info` shows for it"
+    if "recipe.json" in names or scene_source(root) != root:
+        message += (
+            " This is a scene, which `glassplat.load` reads; expected a capture, such as the one that `glassplat info` "
+            "shows for a run"
+        )
     elif any(Path(name).suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) for name in names):
         message += f" Photographs become a capture by: glassplat prepare {shlex.quote(str(root))} --output CAPTURE"
     raise UnknownFormatError(message)

@@ -138,7 +138,8 @@ def check_folder(path: Path) -> None:
 def check_capture_folder(path: Path) -> None:
     """Check that the folder of a capture exists."""
     if os.path.isfile(path):
-        raise NotADirectoryError(f"{path} is a file; expected the folder of a capture")
+        scene = ". `glassplat.load` reads splat files" if path.suffix.lower() in SPLAT_SUFFIXES else ""
+        raise NotADirectoryError(f"{path} is a file; expected the folder of a capture{scene}")
     if not os.path.isdir(path):
         raise FileNotFoundError(f"no folder {path}; expected the folder of a capture")
 

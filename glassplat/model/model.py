@@ -585,6 +585,8 @@ def load(
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; expected {writing.LOADABLE}")
     source = writing.scene_source(path)
+    if source.is_dir() and not (source / "recipe.json").is_file():
+        raise InputError(f"{path} holds no scene; expected {writing.LOADABLE}. `glassplat.load_dataset` reads captures")
     if not source.is_dir():
         model = _from_file(source, device, None if planes is None else Path(planes), up)
         return model if source == path else replace(model, name=path.resolve().name)

@@ -20,7 +20,7 @@ from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.options import BLACK
 from tests.cli.tiny_run import write_run
 from tests.files.test_spz import typical
-from tests.training.tiny_capture import tiny_capture, true_scene
+from tests.training.tiny_capture import tiny_capture, true_scene, write_tiny_capture
 
 
 def test_exported_scenes_are_read_back(tmp_path: Path) -> None:
@@ -175,6 +175,11 @@ def test_files_that_lack_what_a_scene_needs_are_named(tmp_path: Path) -> None:
     (run / "cameras.json").write_text("[]")
     with pytest.raises(InputError, match=r"cameras\.json lists no camera"):
         load(run, device="cpu")
+
+
+def test_a_folder_without_a_scene_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"holds no scene; expected a run, .*`glassplat\.load_dataset` reads"):
+        load(write_tiny_capture(tmp_path / "capture"))
 
 
 def test_a_direction_that_is_not_up_is_refused(tmp_path: Path) -> None:
