@@ -200,10 +200,14 @@ class Model:
         """The same on another device, or in another precision, as float64 for `torch.autograd.gradcheck`.
 
         Cameras stay where they are: rendering takes them to the scene's device.
+
+        Raises:
+            CudaUnavailableError: a GPU was requested, but cannot be used.
+            ValueError: the device is not one of `auto`, `cpu` and `cuda`.
         """
-        cameras = self.cameras
-        if isinstance(device, torch.dtype):
-            cameras = {name: camera.to(device) for name, camera in cameras.items()}
+        if not isinstance(device, torch.dtype):
+            return replace(self, scene=self.scene.to(chosen_device(device)))
+        cameras = {name: camera.to(device) for name, camera in self.cameras.items()}
         return replace(self, scene=self.scene.to(device), cameras=cameras)
 
     def with_scene(self, scene: Scene) -> Model:

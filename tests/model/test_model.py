@@ -410,6 +410,8 @@ def test_a_model_in_double_precision_is_rendered_from_its_cameras() -> None:
     assert double.render("2.png").rgb.dtype == torch.float64
     torch.testing.assert_close(double.image("2.png").float(), model().image("2.png"))
     assert double.to("cpu").cameras is double.cameras
+    with pytest.raises(ValueError, match="device is 'gpu'; expected auto, cpu or cuda"):
+        double.to("gpu")
 
 
 @pytest.mark.parametrize("shape", [(30, 5, 3), (30, 25, 3), (30, 4), (30, 4, 4)])

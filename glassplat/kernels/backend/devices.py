@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING, Any, Literal, cast, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 if TYPE_CHECKING:
     import torch
@@ -137,7 +137,7 @@ def _module(operation: str, folder: str) -> Any:
     return importlib.import_module(f"glassplat.kernels.{operation}.{folder}")
 
 
-def chosen_device(name: DeviceName | torch.device) -> torch.device:
+def chosen_device(name: str | torch.device) -> torch.device:
     """The device for a name from the command line; `auto` is the GPU if it can be used. Logs the choice.
 
     Raises:
@@ -146,7 +146,7 @@ def chosen_device(name: DeviceName | torch.device) -> torch.device:
     """
     import torch
 
-    name = cast(DeviceName, str(name))
+    name = str(name)
     if torch.cuda.is_available() and name == f"cuda:{torch.cuda.current_device()}":
         name = "cuda"
     if name not in get_args(DeviceName):
