@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -13,7 +12,7 @@ import tyro
 from glassplat.cli.console import Command
 from glassplat.cli.places import SceneEdits, SplatFile, Split, check_claim, check_file, check_scene, print_scene
 from glassplat.errors import InputError, convert_to_input_error
-from glassplat.files.writing import GAUSSFORGE_SUFFIXES, OUTPUT_FORMATS, check_folder
+from glassplat.files.writing import OUTPUT_FORMATS, check_folder, check_scene_name
 from glassplat.kernels.backend.devices import DeviceName
 from glassplat.model.run_directory import RunDirectory
 from glassplat.options import Cleaning, Coordinate, Downscale, Positive, Range
@@ -220,12 +219,13 @@ class Clean(Command):
     device: DeviceName = "auto"
 
     def check(self) -> None:
-        """Checks the scene, the two points and the output folder."""
+        """Checks the scene, the two points and the output."""
+        check_scene_name(self.output)
         check_scene(self.scene)
         self.file.check()
         if self.scale is not None and self.scale[:3] == self.scale[3:6]:
             raise InputError(f"--scale has the point {self.scale[:3]} twice; expected two different points")
-        if os.path.isfile(self.output):
+        if os.path.isfile(self.output) or (self.output.suffix and self.output.exists()):
             raise InputError(f"{self.output} already exists; nothing was written. Choose another --output")
         check_folder(self.output)
         if os.path.lexists(self.output) and any(self.output.iterdir()):
@@ -272,8 +272,8 @@ class Export(Command):
         """Checks the options, the scene and the output folder."""
         if not self.formats:
             raise InputError(f"nothing to write without --formats; expected some of {', '.join(OUTPUT_FORMATS)}")
-        if {f".{kind}" for kind in self.formats} & {*GAUSSFORGE_SUFFIXES} and find_spec("gaussforge") is None:
-            raise InputError("--formats sog and ksplat need gaussforge; pip install 'glassplat[formats]'")
+        for kind in self.formats:
+            check_scene_name(Path(f"scene.{kind}"))
         if "html" not in self.formats and (self.title or self.credit or self.url):
             raise InputError("--title, --credit and --url are for the page; add html to --formats")
         if "spz" not in self.formats and self.spz_version != 3:

@@ -223,9 +223,11 @@ class Demo:
     device: DeviceName = "auto"
 
     def set_up(self) -> None:
-        """Checks the output folder, and that the runs are long enough for the stages of `planar`."""
+        """Checks the folders of both runs, and that the runs are long enough for the stages of `planar`."""
         check_folder(self.output)
         check_targets(self.output, self.folders, [])
+        for run in map(RunDirectory, self.folders):
+            check_output(run, resume=run.checkpoint.is_file())
         if self.iterations < LEAST_ITERATIONS:
             raise InputError(f"--iterations is {self.iterations}; expected at least {LEAST_ITERATIONS}")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import importlib
+import importlib.util
 import itertools
 import os
 import re
@@ -33,6 +33,15 @@ SPLAT_WRITERS = {
 """Output formats of Gaussians by suffix: the function `(path, gaussians)` of each, imported when needed."""
 OUTPUT_FORMATS = (*SPLAT_WRITERS, "html")
 """All formats of `export` and `Model.save`; `html` is the page of a whole model."""
+
+
+def check_scene_name(path: Path) -> None:
+    """Refuse the name of a file to be saved in an unknown format; a name without a suffix is a folder's."""
+    if (suffix := path.suffix.lower()) and suffix[1:] not in OUTPUT_FORMATS:
+        endings = ", ".join(f".{known}" for known in OUTPUT_FORMATS)
+        raise InputError(f"{path}: expected a name that ends in {endings}, or a folder's")
+    if suffix in GAUSSFORGE_SUFFIXES and importlib.util.find_spec("gaussforge") is None:
+        raise InputError(f"{suffix} files need gaussforge; pip install 'glassplat[formats]'")
 
 
 def write_splats(kind: str, path: Path, gaussians: Any, **options: Any) -> None:

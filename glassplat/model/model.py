@@ -354,11 +354,9 @@ class Model:
         """
         path = Path(path)
         kind = path.suffix.lower().removeprefix(".")
+        writing.check_scene_name(path)
         if not kind:
             return save_folder(self, path, overwrite=overwrite)
-        if kind not in writing.OUTPUT_FORMATS:
-            endings = ", ".join(f".{known}" for known in writing.OUTPUT_FORMATS)
-            raise InputError(f"{path}: expected a name that ends in {endings}, or a folder's")
         names = (PLANES, GLASS, CAMERAS, *(() if self.scene.environment.is_empty else (ENVIRONMENT, PANORAMA)))
         sidecars = [path.with_name(name) for name in names] if kind in writing.SPLAT_WRITERS else []
         targets = [] if overwrite else [path, *_differing_files(self, sidecars)]

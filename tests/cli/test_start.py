@@ -135,9 +135,12 @@ REFUSED = {
     "export begun --output capture": "capture is not empty",
     "export none.ply --output new": "none.ply does not exist",
     "view splats.ply --planes none.json": "none.json does not exist",
+    "clean begun --output x.txt": "x.txt: expected a name that ends in .ply, ",
     "info none": "none does not exist",
     "info splats.txt": "splats.txt is not a known kind of file",
+    "clean splats.ply --output folder.ply": "folder.ply already exists; nothing was written",
     "demo --output splats.ply": "splats.ply is a file",
+    "demo --output demo": "demo/splat holds recipe.json, which is not from a run of this version",
 }
 """Command lines and their error messages without PyTorch."""
 
@@ -146,8 +149,9 @@ REFUSED = {
 def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a capture, two runs and files, as far as they are checked before PyTorch is imported."""
     root = tmp_path_factory.mktemp("places")
-    for name in ("capture/images", "begun", "trained", "photographs"):
+    for name in ("capture/images", "begun", "trained", "photographs", "folder.ply", "demo/splat"):
         (root / name).mkdir(parents=True)
+    (root / "demo/splat/recipe.json").write_bytes(b"")
     for name in ("begun/recipe.json", "trained/recipe.json", "trained/checkpoint.safetensors", "splats.ply"):
         (root / name).write_bytes(b"")
     (root / "splats.txt").write_bytes(b"")
