@@ -144,9 +144,14 @@ class WorkFolder:
                 f"{join_names([key for key in changed if key != PHOTOGRAPHS_KEY])}; give the same "
                 "to --resume, or start again with --force"
             )
-        if not changed:
-            return
         before, now = known.get(PHOTOGRAPHS_KEY), settings[PHOTOGRAPHS_KEY]
+        if not changed:
+            if list(before or ()) != list(now):
+                raise InputError(
+                    f"{self.folder} was started by another version of glassplat, which numbered the photographs "
+                    "differently; start again with --force"
+                )
+            return
         if not isinstance(before, dict):
             raise InputError(
                 f"{self.folder} does not record the photographs it was started with; start again with --force"

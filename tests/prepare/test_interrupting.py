@@ -150,6 +150,17 @@ def test_resuming_work_without_recorded_photographs_is_refused(photographs: Path
         prepare(task, heard, resume=True)
 
 
+def test_resuming_work_whose_photographs_are_numbered_differently_is_refused(
+    photographs: Path, tmp_path: Path, heard: Heard
+) -> None:
+    task = begun(photographs, tmp_path / "capture")
+    settings = tmp_path / "capture.partial" / "settings.json"
+    known = json.loads(settings.read_text())
+    settings.write_text(json.dumps({**known, "photographs": dict(reversed(known["photographs"].items()))}))
+    with pytest.raises(InputError, match=r"another version of glassplat, which numbered .* --force"):
+        prepare(task, heard, resume=True)
+
+
 def test_what_was_interrupted_is_neither_begun_again_nor_gone_on_with_by_other_options(
     photographs: Path, tmp_path: Path, heard: Heard
 ) -> None:
