@@ -16,7 +16,7 @@ from glassplat.cli.progress import WorkProgress
 from glassplat.cli.runs import StoredRun, open_run
 from glassplat.errors import InputError
 from glassplat.evaluate import evaluate as scoring
-from glassplat.evaluate.metrics import PLANE_COLUMNS, format_value, missing_reasons, shown_metrics
+from glassplat.evaluate.metrics import PLANE_COLUMNS, format_value, missing_reasons, partial_means, shown_metrics
 from glassplat.evaluate.report import Report
 from glassplat.files.writing import check_links, write_text
 from glassplat.methods.planar import capture_planes
@@ -181,7 +181,7 @@ def plane_text(plane: dict) -> str:
 
 
 def result_notes(*results: dict) -> list[str]:
-    """One line for each change to test views, and for each reason of missing metrics."""
+    """One line for each change to test views, for means over some of them, and for each reason of missing metrics."""
     heads = [f"{result['method']}: " if len(results) > 1 else "" for result in results]
     changed = [
         f"{head}{name} of test views: {result[key]}"
@@ -192,7 +192,12 @@ def result_notes(*results: dict) -> list[str]:
         )
         if result.get(key, default) != default
     ]
-    return changed + [
+    partial = [
+        f"{head}{', '.join(names)}: means over {count} of {result['num_test_views']} test views, see per_view.json"
+        for head, result in zip(heads, results, strict=True)
+        for count, names in partial_means(result).items()
+    ]
+    return [*changed, *partial] + [
         f"{head}no {', '.join(names)}: {reason}"
         for head, result in zip(heads, results, strict=True)
         for reason, names in missing_reasons(result).items()

@@ -148,7 +148,8 @@ class Evaluation:
     """Metrics as plain data, ready to be written as JSON.
 
     Attributes:
-        results: one value per metric; if it is None, `<name>_reason` gives the reason.
+        results: one value per metric; if it is None, `<name>_reason` gives the reason. The mean over some of the test
+            views only has their number as `<name>_views`.
         per_view: the same for every view by name, for metrics of single views.
     """
 
@@ -406,14 +407,18 @@ def _add_reflection(measurements: Iterable[_Measurement]) -> float | None:
 
 
 def _mean_metrics(per_view: list[dict[str, metrics.Outcome]]) -> dict[str, metrics.Outcome]:
-    """Mean of every metric over the views that have it and are not perfect, or all reasons why there is none."""
+    """Mean of every metric over the views that have it and are not perfect, or all reasons why there is none; if these
+    are not all views, also their number as `<name>_views`.
+    """
     means: dict[str, metrics.Outcome] = {}
     for name in per_view[0]:
         outcomes = [of_view[name] for of_view in per_view]
         values = [outcome for outcome in outcomes if not isinstance(outcome, str)]
         reasons = dict.fromkeys(outcome for outcome in outcomes if isinstance(outcome, str))
-        imperfect = [value for value in values if value != math.inf]
-        means[name] = statistics.fmean(imperfect or values) if values else "; ".join(reasons)
+        counted = [value for value in values if value != math.inf] or values
+        means[name] = statistics.fmean(counted) if counted else "; ".join(reasons)
+        if 0 < len(counted) < len(outcomes):
+            means[f"{name}_views"] = len(counted)
     return means
 
 

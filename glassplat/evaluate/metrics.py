@@ -153,6 +153,15 @@ def missing_reasons(results: Mapping[str, Any]) -> dict[str, list[str]]:
     return reasons
 
 
+def partial_means(results: Mapping[str, Any]) -> dict[int, list[str]]:
+    """Names of the shown metrics that are means over some of the test views only, by the number of these views."""
+    counts: dict[int, list[str]] = {}
+    for name in shown_metrics(results):
+        if results[name] is not None and (count := results.get(f"{name}_views")):
+            counts.setdefault(count, []).append(name)
+    return counts
+
+
 def quantize(image: Tensor, what: str = "image") -> Tensor:
     """The image as it would be stored: clamped to [0, 1] and rounded to uint8; uint8 passes through.
 

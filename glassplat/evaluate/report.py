@@ -369,11 +369,16 @@ def _cards(results: Mapping[str, Any]) -> str:
 
 
 def _missing_metrics(results: Mapping[str, Any]) -> str:
-    """Reasons for missing metrics."""
+    """Reasons for missing metrics, and the number of views of means over some of them."""
     known = metrics.shown_metrics(results)
     lines = [
         f"<p>Not measured: <b>{_escape('; '.join(known[name].label for name in names))}</b>: {_escape(reason)}</p>"
         for reason, names in metrics.missing_reasons(results).items()
+    ]
+    lines += [
+        f"<p>Means over {count} of {results['num_test_views']} views: "
+        f"<b>{_escape('; '.join(known[name].label for name in names))}</b></p>"
+        for count, names in metrics.partial_means(results).items()
     ]
     return f'<div class="settings">{"".join(lines)}</div>' if lines else ""
 

@@ -56,6 +56,8 @@ def test_a_table_of_several_runs_names_missing_values(capsys: pytest.CaptureFixt
     assert result_notes(SPLAT) == []
     aligned = SPLAT | {"test_cameras": "aligned with their photographs", "test_exposures": SCENE_COLORS}
     assert result_notes(aligned) == ["cameras of test views: aligned with their photographs"]
+    partial = SPLAT | {"psnr_views": 2, "pane_psnr": None, "pane_psnr_views": 2, "num_test_views": 3}
+    assert result_notes(partial | {"pane_psnr_reason": "equal"})[0].startswith("psnr: means over 2 of 3 test views")
 
 
 def test_errors_of_a_pane_are_printed_with_their_quantities() -> None:

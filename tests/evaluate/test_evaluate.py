@@ -73,6 +73,7 @@ def test_region_metrics_are_means_over_the_views_that_see_a_pane(case) -> None:
     assert evaluation.results["pane_psnr"] == pytest.approx(
         (views["a.jpg"]["pane_psnr"] + views["b.jpg"]["pane_psnr"]) / 2
     )
+    assert evaluation.results["pane_psnr_views"] == 2 and "psnr_views" not in evaluation.results
     assert views["c.jpg"]["pane_psnr"] is None
     assert views["c.jpg"]["pane_psnr_reason"] == "fewer than 100 pixels show a pane"
     assert evaluation.results["pane_region"] == "ground-truth pane labels"

@@ -217,6 +217,8 @@ def test_the_page_explains_missing_numbers_and_metrics() -> None:
     assert "<dt>normal error, reflective</dt>" not in page
     assert "of the extent" not in overview_page(results | {"planes": []}, {}, {})
     assert "Not measured" not in overview_page({"psnr": 30.0}, {}, {})
+    partial = overview_page({"psnr": 30.0, "pane_psnr": 25.0, "pane_psnr_views": 3, "num_test_views": 7}, {}, {})
+    assert "Means over 3 of 7 views: <b>PSNR, pane</b>" in partial
 
 
 def test_every_metric_is_written_with_its_unit_and_explained() -> None:
