@@ -25,12 +25,13 @@ from glassplat.files.records import read_text
 from glassplat.files.writing import check_folder, real_path
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
 from glassplat.methods.planar_recipe import PlanarRecipe
-from glassplat.methods.recipe import RECIPES, Preset, Recipe, recipe_from_json, recipe_of
+from glassplat.methods.recipe import RECIPES, Preset, recipe_from_json, recipe_of
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import CHECKPOINT_SECONDS, RunDirectory, RunSettings, check_output
 from glassplat.options import Downscale, Essential, Positive, PositiveCount, Seed
+from glassplat.training.options import MethodRecipe
 
-RecipeKind = TypeVar("RecipeKind", bound=Recipe)
+RecipeKind = TypeVar("RecipeKind", bound=MethodRecipe)
 
 
 @dataclass(frozen=True)
@@ -73,8 +74,7 @@ class Train(Generic[RecipeKind]):
         """Checks options, capture and output, prints a summary of the capture, and imports the training code."""
         if real_path(self.output) == real_path(self.data):
             raise InputError(f"{self.output} is the capture itself; choose another folder for --output")
-        recipe: Any = self.recipe
-        if recipe.strategy != "mcmc" and recipe.mcmc.cap is not None:
+        if self.recipe.strategy != "mcmc" and self.recipe.mcmc.cap is not None:
             raise InputError("--cap belongs to --strategy mcmc; expected that strategy, or --densify.cap")
         check_output(RunDirectory(self.output), resume=self.resume)
         print_line(message_console(), self.files)
@@ -238,7 +238,7 @@ class Demo:
 
     def run(self, console: Console) -> None:
         """Trains and evaluates both methods, and prints where the images are."""
-        recipes: tuple[Recipe, ...] = (PlanarRecipe(), SplatRecipe())
+        recipes: tuple[MethodRecipe, ...] = (PlanarRecipe(), SplatRecipe())
         for recipe, folder in zip(recipes, self.folders, strict=True):
             begun = RunDirectory(folder).checkpoint.is_file()
             run = Train(recipe, SCENE, folder, self.iterations, DEMO_DOWNSCALE, self.seed, self.device, resume=begun)

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import logging
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
 from glassplat.errors import InputError, convert_to_input_error
 from glassplat.files.records import parse_json
@@ -14,40 +14,9 @@ from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.options import BLACK, WHITE, Rgb, options_from_json, short_repr
-from glassplat.training.options import PUBLISHED_ITERATIONS
 
 if TYPE_CHECKING:
     from glassplat.captures.dataset import Dataset
-    from glassplat.render.frame import Renderer
-    from glassplat.scene.scene import Scene
-    from glassplat.training.stage import Stage
-
-
-class Recipe(Protocol):
-    """Recipe of a method: options, an initialiser and stages."""
-
-    @property
-    def method(self) -> str:
-        """The method's name on the command line."""
-        ...
-
-    @property
-    def background(self) -> Rgb | None:
-        """Background colour, sRGB; None for that of the photographs."""
-        ...
-
-    def initialise(self, dataset: Dataset) -> Scene:
-        """The initial scene."""
-        ...
-
-    def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
-        """The training stages of a run of this length."""
-        ...
-
-    def renderer(self) -> Renderer:
-        """The renderer of the finished scene."""
-        ...
-
 
 log = logging.getLogger("glassplat.training")
 

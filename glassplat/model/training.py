@@ -25,7 +25,7 @@ from glassplat.captures.dataset import Dataset, check_dataset, read_photographs_
 from glassplat.errors import InputError, RankLostError, join_names
 from glassplat.files.writing import make_folder
 from glassplat.kernels.backend.devices import DeviceName, chosen_device, compile_seconds
-from glassplat.methods.recipe import RECIPES, Recipe, recipe_to_json, resolve_background
+from glassplat.methods.recipe import RECIPES, recipe_to_json, resolve_background
 from glassplat.model import run_directory
 from glassplat.model.model import Model
 from glassplat.options import check_value, short_repr
@@ -41,6 +41,7 @@ from glassplat.training.messages import (
     StepDone,
     Working,
 )
+from glassplat.training.options import MethodRecipe
 from glassplat.training.ranks import Ranks, join_ranks
 from glassplat.training.stage import Stage, TrainState, check_length, stage_starts
 
@@ -520,7 +521,7 @@ class Training:
     def __init__(
         self,
         dataset: Dataset,
-        recipe: str | Recipe = "planar",
+        recipe: str | MethodRecipe = "planar",
         *,
         iterations: int = 30_000,
         output: str | os.PathLike[str] | None = None,
@@ -669,7 +670,7 @@ class Training:
         yield from train(self._stages, self._dataset, self._state, self.iterations, ranks=self._ranks)
 
 
-def chosen_recipe(recipe: str | Recipe) -> Any:
+def chosen_recipe(recipe: str | MethodRecipe) -> Any:
     """The recipe itself, or the default one of a method's name.
 
     Raises:
