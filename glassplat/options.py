@@ -13,7 +13,7 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import tyro
 
@@ -21,20 +21,6 @@ from glassplat.errors import InputError
 
 LARGEST_COUNT = 1_000_000_000
 """Maximum of all counts: more than a machine holds, and small enough for every integer type."""
-
-
-@runtime_checkable
-class Requirement(Protocol):
-    """Requirement in the annotation of a field, for values of the annotated type."""
-
-    def allows(self, value: Any) -> bool:
-        """Return whether the value is valid."""
-        ...
-
-    @property
-    def expected(self) -> str:
-        """Expectation, as the end of a message."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -85,6 +71,9 @@ class Ascending:
         """The order in words."""
         return "in ascending order"
 
+
+Requirement = Range | Ascending
+"""Requirement in the annotation of a field, for values of the annotated type."""
 
 LARGEST_COORDINATE = 1e12
 """World units; squares of larger values, and sums of these, may exceed float32."""
