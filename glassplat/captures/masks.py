@@ -51,21 +51,20 @@ class MaskValues:
 
 def read_mask_values(path: Path) -> MaskValues:
     """Read one mask file."""
-    shades = _read_shades(path)
-    counts = np.bincount(shades.ravel(), minlength=WHITE + 1)
-    lossy = path.suffix.lower() in LOSSY_SUFFIXES
-    if not lossy and not counts[HIGHEST_MASK_LABEL + 1 :].any():
-        return MaskValues("labels" if counts[1:].any() else "empty", shades)
-    _check_black_and_white(counts, path, lossy)
-    pixels = (shades >= THRESHOLD).astype(np.uint8)
-    return MaskValues("binary" if pixels.any() else "empty", pixels)
+    return _read_values(path, with_greys=False)
 
 
 def read_mask_at_threshold(path: Path) -> MaskValues:
     """Read one mask file of a format that thresholds greys at one half; label images are unchanged."""
-    shades = _read_shades(path)
-    if path.suffix.lower() not in LOSSY_SUFFIXES and not (shades > HIGHEST_MASK_LABEL).any():
+    return _read_values(path, with_greys=True)
+
+
+def _read_values(path: Path, *, with_greys: bool) -> MaskValues:
+    shades, lossy = _read_shades(path), path.suffix.lower() in LOSSY_SUFFIXES
+    if not lossy and not (shades > HIGHEST_MASK_LABEL).any():
         return MaskValues("labels" if shades.any() else "empty", shades)
+    if not with_greys:
+        _check_black_and_white(np.bincount(shades.ravel(), minlength=WHITE + 1), path, lossy)
     pixels = (shades >= THRESHOLD).astype(np.uint8)
     return MaskValues("binary" if pixels.any() else "empty", pixels)
 
