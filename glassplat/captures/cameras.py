@@ -108,25 +108,15 @@ FARTHEST_CENTER = 1e3
 LARGEST_COEFFICIENT = 1e6
 """Largest distortion coefficient; those of real calibrations are below 100."""
 LEAST_SIDE = 8
-"""Smallest side of a photograph, in pixels; smaller files come from failed downloads or exports."""
+"""Smallest side of a photograph, in pixels; smaller files come from failed downloads or exports, and smaller reductions
+show neither pane edges nor details.
+"""
 LEAST_BLANK = 1e-3
 """Share of an undistorted image outside the photograph, below which it is rounding along the border."""
 BLANK_SIDE = 128
 """Side of the image on which this share is measured, in pixels; full resolution would take seconds."""
 MOST_SKEW = 0.05
 """Largest relative deviation of a photograph's side from that of a scaled copy, even if it is one pixel."""
-
-
-@dataclass(frozen=True)
-class Pinhole:
-    """Intrinsics in pixels and the image size."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    width: int
-    height: int
 
 
 @dataclass(frozen=True)
@@ -303,22 +293,20 @@ def _skew(expected: float, side: int, rounding: float) -> float:
 
 
 @lru_cache(maxsize=1024)
-def pinhole_of(lens: Lens) -> tuple[Pinhole, bool]:
-    """The pinhole camera that replaces a lens, and whether photographs must be undistorted for it."""
+def pinhole_of(lens: Lens) -> tuple[Lens, bool]:
+    """The `PINHOLE` that replaces a lens, and whether photographs must be undistorted for it."""
     if _is_pinhole(lens.model, lens.parameters):
         first = PARAMETER_COUNTS[lens.model].focal
-        cx, cy = lens.parameters[first : first + 2]
-        return Pinhole(*lens.focal_lengths(), cx, cy, lens.width, lens.height), False
+        middle = lens.parameters[first : first + 2]
+        return Lens("PINHOLE", (*lens.focal_lengths(), *middle), lens.width, lens.height), False
+    pycolmap = library.pycolmap
     try:
-        found = library.pycolmap.undistort_camera(library.pycolmap.UndistortCameraOptions(), lens.as_colmap())
-    except InputError:
-        raise
+        found = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens.as_colmap())
     except (ValueError, RuntimeError) as error:
         raise InputError(
             f"camera model {lens.model} with parameters {lens.parameters} cannot be undistorted ({error})"
         ) from error
-    fx, fy, cx, cy = (float(value) for value in found.params)
-    return Pinhole(fx, fy, cx, cy, found.width, found.height), True
+    return Lens("PINHOLE", tuple(map(float, found.params)), found.width, found.height), True
 
 
 @lru_cache(maxsize=1024)

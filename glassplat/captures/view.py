@@ -40,9 +40,6 @@ from glassplat.files.images import image_size, read_colors, read_image_float
 from glassplat.options import WHITE, Rgb
 from glassplat.scene.camera import Camera, to_device
 
-LEAST_SIDE = 8
-"""Smallest side of a reduced photograph, in pixels; smaller ones show neither pane edges nor details."""
-
 GIGABYTE = 1e9
 MEMORY_SHARE = 0.25
 """Default share of the machine's memory for photographs."""
@@ -478,7 +475,8 @@ def prepare_view(
     pixel_map = cameras.PixelMap(lens if distorted else None, *small)
     blank = pixel_map if cameras.blank_share(lens) else None
     pose = torch.from_numpy(cameras.rigid_pose(shot.cam_from_world, shot.name)).float()
-    camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, pinhole.width, pinhole.height).resize(*small)
+    fx, fy, cx, cy = pinhole.parameters
+    camera = Camera(pose, fx, fy, cx, cy, pinhole.width, pinhole.height).resize(*small)
     view = View(
         name=shot.name,
         camera=camera,
@@ -493,18 +491,19 @@ def prepare_view(
     return view, lens is not shot.lens
 
 
-def _reduced_size(pinhole: cameras.Pinhole, downscale: float, name: str) -> tuple[int, int]:
+def _reduced_size(pinhole: cameras.Lens, downscale: float, name: str) -> tuple[int, int]:
     """Width and height of a photograph reduced by a factor.
 
     Raises:
         InputError: it would be too small for training.
     """
     width, height = (max(1, round(side / downscale)) for side in (pinhole.width, pinhole.height))
-    if downscale > 1 and min(width, height) < LEAST_SIDE:
-        most = max(min(pinhole.width, pinhole.height) / LEAST_SIDE, 1)
+    least = cameras.LEAST_SIDE
+    if downscale > 1 and min(width, height) < least:
+        most = max(min(pinhole.width, pinhole.height) / least, 1)
         raise InputError(
             f"{name} is {pinhole.width}x{pinhole.height} pixels, and {width}x{height} reduced by {downscale:g}; "
-            f"expected at least {LEAST_SIDE} pixels along each side: use --downscale {int(10 * most) / 10:g} or less"
+            f"expected at least {least} pixels along each side: use --downscale {int(10 * most) / 10:g} or less"
         )
     return width, height
 
