@@ -6,7 +6,7 @@ import base64
 import html
 import io
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from unicodedata import normalize
@@ -19,10 +19,11 @@ from glassplat.captures.dataset import Dataset, load_dataset
 from glassplat.captures.view import PointCloud, View
 from glassplat.errors import InputError
 from glassplat.evaluate.report import STYLE
-from glassplat.files.records import Field, Integer, ListOf, Number, Text, check_fields, read_json
+from glassplat.files.records import read_json
 from glassplat.files.writing import write_text
+from glassplat.options import options_from_json
 from glassplat.panes.material import virtual_points
-from glassplat.prepare.preparation import RECORD
+from glassplat.prepare.preparation import RECORD, Report
 from glassplat.scene.camera import NumpyCamera
 from glassplat.scene.corrections import natural_sort_key
 from glassplat.scene.panes import Planes
@@ -149,23 +150,6 @@ svg { background: #0c0d0f; border-radius: 8px }
 """
 
 
-COUNT_FIELD, NAMES_FIELD = Integer(0), ListOf(Text())
-REPORT: dict[str, Field] = {
-    "photographs": COUNT_FIELD,
-    "registered": COUNT_FIELD,
-    "missing": NAMES_FIELD,
-    "points": COUNT_FIELD,
-    "reprojection_error": Number(),
-    "track_length": Number(),
-    "features": COUNT_FIELD,
-    "cameras": NAMES_FIELD,
-    "attempt": Text(),
-    "attempts": COUNT_FIELD,
-    "advice": NAMES_FIELD,
-}
-"""Fields of a preparation's report that the page shows."""
-
-
 def write_page(capture: Path, target: Path, planes: Planes | None = None) -> None:
     """Writes the page of a capture made by `glassplat prepare`; the page is self-contained.
 
@@ -182,16 +166,16 @@ def write_page(capture: Path, target: Path, planes: Planes | None = None) -> Non
     write_text(target, _page(report, dataset, model, planes, capture.resolve().name))
 
 
-def _read_report(path: Path) -> dict[str, Any]:
+def _read_report(path: Path) -> Report:
     try:
         record = read_json(path)
-        report = record.get("report") if isinstance(record, dict) else record
-        return check_fields(report, REPORT, f"the report in {path}")
+        found: Report = options_from_json(Report, record.get("report") if isinstance(record, dict) else record)
+        return found
     except ValueError as error:
-        raise InputError(f"{error}; prepare the capture again to get its report") from error
+        raise InputError(f"the report in {path}: {error}; prepare the capture again to get its report") from error
 
 
-def _page(report: Mapping[str, Any], dataset: Dataset, model: Any, planes: Planes | None, title: str) -> str:
+def _page(report: Report, dataset: Dataset, model: Any, planes: Planes | None, title: str) -> str:
     views = sorted((*dataset.train, *dataset.test), key=lambda view: natural_sort_key(view.name))
     behind = _points_behind_panes(dataset, planes)
     points = list(model.points3D.values())
@@ -202,15 +186,15 @@ def _page(report: Mapping[str, Any], dataset: Dataset, model: Any, planes: Plane
     body = [
         f"<h1>{html.escape(title)}</h1>",
         f'<div class="cards">{"".join(_cards(report, behind, planes))}</div>',
-        *(f'<p class="advice">{html.escape(str(line))}</p>' for line in report["advice"]),
+        *(f'<p class="advice">{html.escape(line)}</p>' for line in report.advice),
         f"<section><h2>Plan</h2>{plan_svg(views, dataset.points, behind, planes)}<p>{legend}</p></section>",
         f"<section>{_histogram('Points by number of photographs', tracks, TRACK_BINS)}"
         f"{_histogram('Points by reprojection error, in pixels', errors, ERROR_BINS)}</section>",
         "<h2>Photographs</h2>",
         f'<div class="photographs">{"".join(_figures(views, model))}</div>',
     ]
-    if report["missing"]:
-        body += ["<h2>Not registered</h2>", f'<p class="advice">{html.escape(", ".join(report["missing"]))}</p>']
+    if report.missing:
+        body += ["<h2>Not registered</h2>", f'<p class="advice">{html.escape(", ".join(report.missing))}</p>']
     head = f'<meta charset="utf-8"><title>{html.escape(title)}</title><style>{STYLE}{PAGE_STYLE}</style>'
     return f"<!doctype html>\n<html><head>{head}</head><body>\n" + "\n".join(body) + "\n</body></html>\n"
 
@@ -224,18 +208,18 @@ def _points_behind_panes(dataset: Dataset, planes: Planes | None) -> NDArray[np.
     return found
 
 
-def _cards(report: Mapping[str, Any], behind: NDArray[np.bool_], planes: Planes | None) -> list[str]:
+def _cards(report: Report, behind: NDArray[np.bool_], planes: Planes | None) -> list[str]:
     share = behind.sum() / max(len(behind), 1)
     facts = {
-        "photographs registered": f"{report['registered']} of {report['photographs']}",
-        "points": f"{report['points']:,}",
-        "mean reprojection error, in pixels": f"{report['reprojection_error']:.2f}",
-        "photographs per point": f"{report['track_length']:.1f}",
-        "features per photograph": f"{report['features']:,}",
+        "photographs registered": f"{report.registered} of {report.photographs}",
+        "points": f"{report.points:,}",
+        "mean reprojection error, in pixels": f"{report.reprojection_error:.2f}",
+        "photographs per point": f"{report.track_length:.1f}",
+        "features per photograph": f"{report.features:,}",
         "points behind panes": "no panes yet" if planes is None else f"{behind.sum():,} ({share:.0%})",
-        "settings": f"{report['attempt']} (of {report['attempts']} tried)",
+        "settings": f"{report.attempt} (of {report.attempts} tried)",
     }
-    facts |= {f"camera {number}": camera for number, camera in enumerate(report["cameras"], start=1)}
+    facts |= {f"camera {number}": camera for number, camera in enumerate(report.cameras, start=1)}
     return [f"<div><b>{html.escape(str(value))}</b><span>{name}</span></div>" for name, value in facts.items()]
 
 

@@ -16,7 +16,7 @@ from glassplat.captures.dataset import load_dataset
 from glassplat.cli.main import main
 from glassplat.cli.train import SCENE
 from glassplat.errors import InputError
-from glassplat.prepare.preparation import PAGE
+from glassplat.prepare.preparation import PAGE, Report
 from glassplat.prepare.report_page import _bin_label, _cards, plan_svg, write_page
 from tests.render.tiny_scene import pane
 
@@ -85,7 +85,7 @@ def test_with_panes_the_points_behind_them_are_counted(capture: Path, capsys: py
 
 
 def test_without_points_none_is_behind_panes() -> None:
-    cards = _cards(RECORD["report"], np.zeros(0, dtype=bool), pane(2.0))
+    cards = _cards(Report(**RECORD["report"]), np.zeros(0, dtype=bool), pane(2.0))
     assert "<div><b>0 (0%)</b><span>points behind panes</span></div>" in cards
 
 
