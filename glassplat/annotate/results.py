@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from glassplat.annotate.document import MarkedPane, apply_strokes, fill_polygon, plane_depths, project_outline
@@ -24,9 +23,9 @@ from glassplat.files.images import files_below, image_size, is_hidden, leaves_fo
 from glassplat.files.records import read_json
 from glassplat.files.sidecars import planes_json, write_planes
 from glassplat.files.writing import file_digest, remove_empty, remove_unfinished, write_text
-from glassplat.options import CLEAR_GLASS
+from glassplat.panes import PlaneFit
+from glassplat.panes.fit import FittedRectangle, to_planes
 from glassplat.panes.masks import min_area_rectangle
-from glassplat.scene import logit
 from glassplat.scene.camera import NumpyCamera
 from glassplat.scene.panes import Planes
 
@@ -104,7 +103,6 @@ FittedPanes = Sequence[tuple[MarkedPane, PaneFit]]
 
 RECORD = "annotated.json"
 """Record in the folder of masks of the masks and planes written here, which may be replaced."""
-MIRROR_REFLECTANCE = 0.999
 
 
 def write_results(root: Path, views: Sequence[View], cameras: Sequence[NumpyCamera], panes: FittedPanes) -> list[str]:
@@ -252,28 +250,16 @@ def resample_to_photograph(view: View, labels: Labels) -> Labels:
 
 def planes_from_panes(panes: FittedPanes, cameras: Sequence[NumpyCamera]) -> Planes:
     """The minimum-area rectangle around each outline, with the normal towards most cameras."""
-    rows = [_bounding_rectangle(fit, cameras) for _, fit in panes]
-    centers, normals, tangents, half_sizes = (
-        torch.tensor(np.stack(column), dtype=torch.float32) for column in zip(*rows, strict=True)
-    )
     mirrors = tuple(pane.label for pane, _ in panes if pane.material == "mirror")
-    reflectances = [MIRROR_REFLECTANCE if pane.label in mirrors else CLEAR_GLASS for pane, _ in panes]
-    return Planes(
-        centers=centers,
-        raw_normals=normals,
-        logit_reflectances=torch.tensor([logit(value) for value in reflectances], dtype=torch.float32),
-        tangents=tangents,
-        half_sizes=half_sizes,
-        labels=tuple(pane.label for pane, _ in panes),
-        mirrors=mirrors,
-    )
+    rectangles = [_bounding_rectangle(fit, cameras) for _, fit in panes]
+    return to_planes(rectangles, [pane.label for pane, _ in panes], PlaneFit(mirror_labels=mirrors))
 
 
-def _bounding_rectangle(fit: PaneFit, cameras: Sequence[NumpyCamera]) -> tuple[NDArray[np.float64], ...]:
-    """Centre, normal, tangent and half sizes."""
+def _bounding_rectangle(fit: PaneFit, cameras: Sequence[NumpyCamera]) -> FittedRectangle:
     corners, axes = fit.shape.corners(), fit.shape.axes
     middle = corners.mean(axis=0)
     rectangle = min_area_rectangle((corners - middle) @ axes[:2].T)
     facing = np.sign([(camera.center - middle) @ axes[2] for camera in cameras]).sum()
     normal = axes[2] if facing >= 0 else -axes[2]
-    return middle + rectangle.center @ axes[:2], normal, rectangle.axis @ axes[:2], rectangle.half_sizes
+    center, tangent = middle + rectangle.center @ axes[:2], rectangle.axis @ axes[:2]
+    return FittedRectangle(center, normal, tangent, rectangle.half_sizes)

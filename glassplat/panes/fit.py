@@ -114,7 +114,7 @@ MOST_CAMERAS = 100
 """Maximum number of cameras that decide which points are seen through a pane."""
 
 
-class _FittedRectangle(NamedTuple):
+class FittedRectangle(NamedTuple):
     """One fitted pane, as NumPy arrays."""
 
     center: Array
@@ -183,7 +183,7 @@ def fit_planes(
     for pane in _share_planes(found, options.seed):
         with _with_advice(pane.label, len(labels)):
             panes.append(_finish_pane(_place_by_mirror_images(pane, cloud, cameras, options), options, unmarked))
-    return _to_planes(panes, labels, options).to(centers.device)
+    return to_planes(panes, labels, options).to(centers.device)
 
 
 @contextmanager
@@ -336,7 +336,7 @@ def _place_by_mirror_images(pane: _PanePlane, cloud: Array, cameras: Sequence[Ca
         return pane
     some = cameras[:: -(-len(cameras) // MOST_CAMERAS)]
     some = [replace(camera, cam_from_world=camera.cam_from_world.float()) for camera in some]
-    panes = _to_planes([outlined], [pane.label], options)
+    panes = to_planes([outlined], [pane.label], options)
     seen = virtual_points(torch.from_numpy(cloud).float(), panes, some).numpy()
     behind, others, extent = cloud[seen], cloud[~seen], pane.evidence.extent
     images = search.plane_of_mirror_images(pane.plane.planes, outlined.center, behind, others, extent)
@@ -390,7 +390,7 @@ def _fit_joint_plane(panes: Sequence[_PanePlane], seed: int) -> list[_PanePlane]
     return panes
 
 
-def _finish_pane(pane: _PanePlane, options: PlaneFit, unmarked: Sequence[tuple[str, Camera]]) -> _FittedRectangle:
+def _finish_pane(pane: _PanePlane, options: PlaneFit, unmarked: Sequence[tuple[str, Camera]]) -> FittedRectangle:
     """The pane with its rectangle.
 
     Raises:
@@ -493,7 +493,7 @@ def _tilt_message(degrees: float, objective: Objective) -> str:
     )
 
 
-def _fit_rectangle(plane: masks.PlaneEquations, views: Sequence[masks.PaneView], margin: float) -> _FittedRectangle:
+def _fit_rectangle(plane: masks.PlaneEquations, views: Sequence[masks.PaneView], margin: float) -> FittedRectangle:
     centers = np.stack([view.center for view in views])
     normal = plane.normals[0]
     if (np.sign(plane.distances(centers)[0])).sum() < 0:
@@ -501,7 +501,7 @@ def _fit_rectangle(plane: masks.PlaneEquations, views: Sequence[masks.PaneView],
     axes = np.linalg.svd(normal[None])[2][1:]
     rectangle = pane_rectangle(plane, views, axes)
     foot = plane.normals[0] * plane.offsets[0]
-    return _FittedRectangle(
+    return FittedRectangle(
         center=foot + rectangle.center @ axes,
         normal=normal,
         tangent=rectangle.axis @ axes,
@@ -509,7 +509,8 @@ def _fit_rectangle(plane: masks.PlaneEquations, views: Sequence[masks.PaneView],
     )
 
 
-def _to_planes(panes: Sequence[_FittedRectangle], labels: Sequence[int], options: PlaneFit) -> Planes:
+def to_planes(panes: Sequence[FittedRectangle], labels: Sequence[int], options: PlaneFit) -> Planes:
+    """The planes of rectangles, with the reflectances of glass and mirrors."""
     stacked = (torch.tensor(np.stack(rows), dtype=torch.float32) for rows in zip(*panes, strict=True))
     centers, normals, tangents, half_sizes = stacked
     logits = torch.full((len(labels),), logit(options.glass_reflectance), dtype=torch.float32)
