@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from glassplat.captures.view import View, sample_evenly
-from glassplat.scene.camera import Camera
+from glassplat.scene.camera import Camera, nearest_to_lines
 from glassplat.scene.panes import in_image
 
 LEAST_SEEN = 0.05
@@ -18,8 +18,6 @@ LEAST_SEEN = 0.05
 MOST_SEEN = 0.5
 MOST_CAMERAS, MOST_POINTS, MOST_MASKS = 64, 2000, 24
 LEAST_SIGHTINGS = 3
-LEAST_CROSSING = 1e-3
-"""Smallest eigenvalue of the mean of I - d d^T for which rays towards a pane count as crossing."""
 BOX_MARGIN = 0.5
 """Tolerance around a mask's box for the pane's centre, in sizes of the box; photographs may crop panes."""
 
@@ -149,14 +147,9 @@ def _share_of_masks(sightings: Sequence[_Sighting]) -> float | None:
 
 def _intersect_rays(sightings: Sequence[_Sighting]) -> Tensor | None:
     """[3] the least-squares intersection of the lines through the mask centres; it may lie behind the cameras."""
-    projectors, targets = [], []
+    directions = []
     for camera, middle, _ in sightings:
         intrinsics = camera.intrinsics
         direction = torch.cat([(middle - intrinsics[2:]) / intrinsics[:2], torch.ones(1, dtype=middle.dtype)])
-        direction = torch.nn.functional.normalize(direction @ camera.cam_from_world[:3, :3], dim=0)
-        projectors.append(torch.eye(3, dtype=middle.dtype) - torch.outer(direction, direction))
-        targets.append(projectors[-1] @ camera.center)
-    mean = torch.stack(projectors).mean(dim=0)
-    if float(torch.linalg.eigvalsh(mean)[0]) < LEAST_CROSSING:
-        return None
-    return torch.linalg.solve(mean, torch.stack(targets).mean(dim=0))
+        directions.append(torch.nn.functional.normalize(direction @ camera.cam_from_world[:3, :3], dim=0))
+    return nearest_to_lines(torch.stack([camera.center for camera, _, _ in sightings]), torch.stack(directions))

@@ -15,7 +15,7 @@ from glassplat.captures.view import PointCloud
 from glassplat.methods.mirrors import mirror_lookalikes, turn_into_mirrors
 from glassplat.render.frame import Renderer
 from glassplat.scene import logit
-from glassplat.scene.camera import Camera
+from glassplat.scene.camera import Camera, nearest_to_lines
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Environment
 from glassplat.training.densify import apply_edit, as_discs, morton_order, zero_moments
@@ -40,7 +40,7 @@ def reflective_region(cameras: Sequence[Camera]) -> tuple[float, float, float, f
     """
     centers = torch.stack([camera.center.double().cpu() for camera in cameras])
     forward = torch.stack([camera.cam_from_world[2, :3].double().cpu() for camera in cameras])
-    found = _common_point(centers, forward)
+    found = nearest_to_lines(centers, forward)
     if found is None:
         return None
     ahead, misses = _axis_misses(found, centers, forward)
@@ -48,7 +48,7 @@ def reflective_region(cameras: Sequence[Camera]) -> tuple[float, float, float, f
         for _ in range(SELECTION_ROUNDS):
             away = torch.where(ahead, misses, torch.inf)
             kept = away.argsort()[: math.ceil(MAJORITY_SHARE * len(cameras))]
-            found = _common_point(centers[kept], forward[kept])
+            found = nearest_to_lines(centers[kept], forward[kept])
             if found is None:
                 return None
             ahead, misses = _axis_misses(found, centers, forward)
@@ -66,15 +66,6 @@ def _axis_misses(point: torch.Tensor, centers: torch.Tensor, axes: torch.Tensor)
     towards = point - centers
     along = (towards * axes).sum(1)
     return along > 0, (towards - along[:, None] * axes).norm(dim=1) / towards.norm(dim=1)
-
-
-def _common_point(centers: torch.Tensor, forward: torch.Tensor) -> torch.Tensor | None:
-    """[3] the point nearest to the axes from centers [C, 3] along unit vectors [C, 3]; None if they are parallel."""
-    across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
-    normal_matrix = across.sum(0)
-    if float(torch.linalg.eigvalsh(normal_matrix)[0]) < 1e-3 * len(centers):
-        return None
-    return torch.linalg.solve(normal_matrix, (across @ centers[:, :, None]).sum(0)).squeeze(1)
 
 
 MOST_CELLS = 32
@@ -148,14 +139,7 @@ def copied_surroundings(primary: Gaussians, chosen: Tensor, *, sh_degree: int) -
     sh = kept.sh.new_zeros(len(kept), coefficients, 3)
     shared = min(coefficients, kept.sh.shape[1])
     sh[:, :shared] = kept.sh[:, :shared]
-    return Gaussians(
-        means=kept.means.clone(),
-        quats=kept.quats.clone(),
-        log_scales=kept.log_scales.clone(),
-        logit_opacities=kept.logit_opacities.clone(),
-        sh=sh,
-        active_sh_degree=min(kept.active_sh_degree, sh_degree),
-    )
+    return replace(kept, sh=sh, channels={}, active_sh_degree=min(kept.active_sh_degree, sh_degree))
 
 
 @dataclass(frozen=True)

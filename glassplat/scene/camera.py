@@ -38,6 +38,8 @@ def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) 
 
 LEAST_SINE = 1e-6
 """Minimum sine of the angle between viewing direction and up."""
+LEAST_CROSSING = 1e-3
+"""Smallest eigenvalue of the mean of I - d d^T for which lines along d count as crossing."""
 
 
 def rotation_from_quat(quats: Tensor) -> Tensor:
@@ -92,6 +94,15 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
     return pose.float()
+
+
+def nearest_to_lines(centers: Tensor, directions: Tensor) -> Tensor | None:
+    """[3] the point nearest to lines from centers [L, 3] along unit vectors [L, 3], float64; None if parallel."""
+    across = torch.eye(3, dtype=torch.float64) - directions[:, :, None] * directions[:, None, :]
+    normal_matrix = across.sum(0)
+    if float(torch.linalg.eigvalsh(normal_matrix)[0]) < LEAST_CROSSING * len(centers):
+        return None
+    return torch.linalg.solve(normal_matrix, (across @ centers[:, :, None]).sum(0)).squeeze(1)
 
 
 def mirror_matrices(centers: Tensor, normals: Tensor) -> Tensor:
