@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -27,7 +27,7 @@ from glassplat.training import losses
 from glassplat.training.actions import DensificationStrategy, Densify, GrowSh, PruneIdle, ResetOpacity
 from glassplat.training.corrections import with_learned_corrections, with_neutral_corrections
 from glassplat.training.densify import as_discs
-from glassplat.training.options import PUBLISHED_ITERATIONS, GaussianRates, Intervals, Rate
+from glassplat.training.options import PUBLISHED_ITERATIONS, GaussianRates, Intervals, MethodRecipe, Rate
 from glassplat.training.stage import RESET_TURN, Action, Every, Stage, TrainState
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def deferred_renderer(recipe: DeferredRecipe) -> Deferred:
 def deferred_stages(recipe: DeferredRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
     """Bootstrap, then joint training, which `Propagate` controls. A short run has no reflections."""
     if iterations < recipe.least_iterations:
-        return with_learned_corrections(recipe, _matte_stages(recipe, "ellipsoid", seed, iterations))
+        return _matte_stages(recipe, "ellipsoid", seed, iterations)
     return with_learned_corrections(recipe, _reflection_stages(_with_sufficient_bootstrap(recipe, iterations)))
 
 
@@ -134,18 +134,10 @@ def _reflection_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
 def _matte_stages(recipe: DeferredRecipe, primitive: Primitive, seed: int, iterations: int) -> tuple[Stage, ...]:
     """Stages of a run too short for normal propagation, as in `splat`."""
     usual = Intervals()
-    plain = SplatRecipe(
-        primitive=primitive,
-        sh_degree=recipe.sh_degree,
-        ssim_weight=recipe.ssim_weight,
-        view_dependence_weight=recipe.view_dependence_weight,
-        background=recipe.background,
-        rates=_rates_of_splat(recipe),
-        intervals=replace(recipe.intervals, opacity=usual.opacity, least=usual.least),
-        strategy=recipe.strategy,
-        densify=recipe.densify,
-        mcmc=recipe.mcmc,
-    )
+    shared: dict[str, Any] = {option.name: getattr(recipe, option.name) for option in fields(MethodRecipe)}
+    shared["rates"] = _rates_of_splat(recipe)
+    shared["intervals"] = replace(recipe.intervals, opacity=usual.opacity, least=usual.least)
+    plain = SplatRecipe(**shared, primitive=primitive)
     first, *later = (replace(stage, name=f"as {stage.name}") for stage in plain.stages(seed, iterations))
 
     def setup(state: TrainState, dataset: Dataset) -> None:
@@ -250,7 +242,7 @@ def traced_renderer(recipe: TracedRecipe) -> Traced | Deferred:
 def traced_stages(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
     """Bootstrap, reflections with propagation, and joint training without it; a short run trains like `splat`."""
     if iterations < recipe.least_iterations:
-        return with_learned_corrections(recipe, _matte_stages(recipe.distant(), recipe.primitive, seed, iterations))
+        return _matte_stages(recipe.distant(), recipe.primitive, seed, iterations)
     known = recipe.distant().stages(seed, iterations)
     if recipe.harmonics_from_start:
         grow = GrowSh(Every(recipe.intervals.sh))
