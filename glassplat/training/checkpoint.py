@@ -67,7 +67,7 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
     for name, (first, second) in state.optimizer.moments.items():
         tensors |= {f"first/{name}": first, f"second/{name}": second}
     for part, statistics in state.statistics.items():
-        tensors |= {f"statistics/{part}/{name}": t for name, t in vars(statistics).items()}
+        tensors |= {f"statistics/{part}/{name}": t for name, t in statistics._asdict().items()}
     tensors |= {f"means/{name}": mean for name, mean in state.means.items()}
     header = {
         "format": FORMAT,
@@ -243,7 +243,7 @@ def restored_statistics(tensors: Mapping[str, Tensor], scene: Scene) -> dict[str
         gaussians = scene.gaussian_sets().get(part)
         if gaussians is None:
             raise InputError(f"it holds statistics of {part}; expected those of {', '.join(scene.gaussian_sets())}")
-        expected = vars(ScreenStatistics.zeros(len(gaussians)))
+        expected = ScreenStatistics.zeros(len(gaussians))._asdict()
         known = tensors_with_prefix(tensors, f"{part}/")
         check_like(known, expected, f"the statistics of {part}")
         if known.keys() != expected.keys():

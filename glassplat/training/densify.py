@@ -301,8 +301,7 @@ def zero_moments(moments: Moments, names: Collection[str], rows: Tensor | None =
     return {name: (cleared(m), cleared(v)) if name in names else (m, v) for name, (m, v) in moments.items()}
 
 
-@dataclass(frozen=True)
-class ScreenStatistics:
+class ScreenStatistics(Sums):
     """Statistics of each Gaussian over the views since the last densification.
 
     Gradients are in normalised device coordinates, in which the image spans [-1, 1], so that thresholds do not depend
@@ -319,10 +318,6 @@ class ScreenStatistics:
             densified.
     """
 
-    gradient_sum: Tensor
-    absgrad_sum: Tensor
-    view_count: Tensor
-
     @staticmethod
     def zeros(count: int, *, device: torch.device | str = "cpu") -> ScreenStatistics:
         """Empty statistics of `count` Gaussians."""
@@ -330,15 +325,15 @@ class ScreenStatistics:
 
     def select(self, kept: Tensor) -> ScreenStatistics:
         """The rows where `kept` [N] is true."""
-        return ScreenStatistics(*(sums[:, kept] for sums in self.sums))
+        return ScreenStatistics(*(sums[:, kept] for sums in self))
 
     def with_empty_rows(self, count: int) -> ScreenStatistics:
         """The rows, followed by `count` empty ones."""
-        return ScreenStatistics(*(torch.nn.functional.pad(sums, (0, count)) for sums in self.sums))
+        return ScreenStatistics(*(torch.nn.functional.pad(sums, (0, count)) for sums in self))
 
     def add(self, views: Views) -> None:
         """Adds the views of one training step, in place."""
-        add_views(self.sums, views)
+        add_views(self, views)
 
     @torch.no_grad()
     def add_traced(self, means_gradient: Tensor, ray_weights: Tensor) -> None:
@@ -359,14 +354,9 @@ class ScreenStatistics:
         self.absgrad_sum.add_(equivalents)
         self.view_count.add_(norms > 0)
 
-    @property
-    def sums(self) -> Sums:
-        """All sums, in the form that the kernel takes."""
-        return Sums(self.gradient_sum, self.absgrad_sum, self.view_count)
-
     def merge(self, other: ScreenStatistics) -> None:
         """Adds statistics of the same Gaussians from other views, in place."""
-        for total, added in zip(self.sums, other.sums, strict=True):
+        for total, added in zip(self, other, strict=True):
             total += added
 
     @property

@@ -212,7 +212,7 @@ def sum_over_ranks(
     shown = torch.zeros_like(scene.primary.logit_opacities)
     for result in results:
         shown = shown if result.visible is None else torch.maximum(shown, result.visible.to(shown.dtype))
-    sums = ranks.reduce("SUM", [*gradients, *(total for one in known for total in one.sums)])
+    sums = ranks.reduce("SUM", [*gradients, *(total for one in known for total in one)])
     (shown,) = ranks.reduce("MAX", [shown])
     of_parts = iter(sums[len(names) :])
     found = {part: ScreenStatistics(next(of_parts), next(of_parts), next(of_parts)) for part in statistics}

@@ -162,8 +162,7 @@ class TrainState:
             name: (first.to(device), second.to(device)) for name, (first, second) in self.optimizer.moments.items()
         }
         statistics = {
-            part: ScreenStatistics(**{name: tensor.to(device) for name, tensor in vars(known).items()})
-            for part, known in self.statistics.items()
+            part: ScreenStatistics(*(sums.to(device) for sums in known)) for part, known in self.statistics.items()
         }
         optimizer = replace(self.optimizer, moments=moments)
         means = {name: mean.to(device) for name, mean in self.means.items()}
@@ -335,11 +334,8 @@ class Stage:
 def stage_starts(stages: tuple[Stage, ...], iterations: int) -> list[int]:
     """The first step of each stage, followed by the end of the run."""
     total = sum(stage.share for stage in stages)
-    starts, passed = [], 0.0
-    for stage in stages:
-        starts.append(round(passed / total * iterations))
-        passed += stage.share
-    return [*starts, iterations]
+    passed = itertools.accumulate((stage.share for stage in stages[:-1]), initial=0.0)
+    return [*(round(share / total * iterations) for share in passed), iterations]
 
 
 def check_length(stages: tuple[Stage, ...], iterations: int) -> None:

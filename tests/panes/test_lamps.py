@@ -216,7 +216,7 @@ def test_unseen_reflected_parts_are_filled_once() -> None:
     assert not finished(full.apply(state, capture_of(scene), Clock(50, 100, 5)))
     assert finished(action.apply(state, capture_of(scene), Clock(50, 100, 5)))
     added = len(state.scene.primary) - len(scene.primary)
-    for sums in state.statistics["primary"].sums:
+    for sums in state.statistics["primary"]:
         assert bool((sums[:, :-added] == 1).all()) and not bool(sums[:, -added:].any())
     size = 0.7 * unseen_positions(scene, scene.planes, CAMERAS).cell
     assert bool(torch.isclose(state.scene.primary.log_scales[-added:].exp(), torch.tensor(size)).all())

@@ -56,7 +56,7 @@ def test_unneeded_gaussians_are_removed_with_their_moments() -> None:
     kept = state.optimizer.moments["primary.means"][0][:, 0].long()
     assert 0 < len(kept) < len(before) and 3 not in kept.tolist()
     assert torch.equal(state.scene.primary.means, before[kept])
-    for times, sums in enumerate(state.statistics["primary"].sums, start=1):
+    for times, sums in enumerate(state.statistics["primary"], start=1):
         assert torch.equal(sums, times * gathered[:, kept])
     assert not finished(action.apply(state, tiny_capture(), Clock(80, 100, 5)))
 
