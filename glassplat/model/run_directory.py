@@ -12,7 +12,7 @@ import logging
 import os
 import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from operator import itemgetter
@@ -23,7 +23,7 @@ from filelock import FileLock, Timeout
 
 from glassplat.captures.masks import Polarity
 from glassplat.errors import InputError, convert_to_input_error, join_names
-from glassplat.files.records import parse_json, read_json, read_text
+from glassplat.files.records import parse_json, read_text
 from glassplat.files.writing import check_folder, check_links, make_folder, remove_unfinished, write_text
 from glassplat.options import Downscale, PositiveCount, Seed, options_from_json
 from glassplat.training.messages import Message, StepDone, Working
@@ -301,13 +301,6 @@ class RunDirectory:
         except InputError as error:
             raise InputError(f"{path} cannot be read: {error}; train again") from error
 
-    def photographs(self) -> set[str] | None:
-        """Names of the photographs of the run; None if they cannot be read."""
-        try:
-            return {entry["img_name"] for entry in read_json(self.path / "cameras.json")}
-        except (OSError, ValueError, TypeError, KeyError):
-            return None
-
     def has_cameras_of(self, dataset: Dataset) -> bool:
         """Return whether the recorded cameras match the capture's, up to pose refinement."""
         recorded = self._cameras()
@@ -318,9 +311,8 @@ class RunDirectory:
             for name, camera in cameras.items()
         )
 
-    def _check_poses(self, dataset: Dataset) -> None:
+    def _check_poses(self, recorded: Mapping[str, Camera], dataset: Dataset) -> None:
         """Refuse a capture in which most cameras have moved, since it has another world frame."""
-        recorded = self._cameras()
         known = {v.name: v.camera for v in (*dataset.train, *dataset.test) if v.name in recorded}
         moved = [name for name, camera in known.items() if not _is_unmoved(recorded[name], camera, dataset.extent)]
         if 2 * len(moved) > len(known):
@@ -347,9 +339,10 @@ class RunDirectory:
         Raises:
             InputError: photographs are missing or additional, or cameras have moved.
         """
-        trained, found = self.photographs(), {view.name for view in (*dataset.train, *dataset.test)}
-        if trained is None or trained == found:
-            self._check_poses(dataset)
+        recorded, found = self._cameras(), {view.name for view in (*dataset.train, *dataset.test)}
+        trained = set(recorded)
+        if not recorded or trained == found:
+            self._check_poses(recorded, dataset)
             return
         only = [
             f"{join_names(sorted(names))} only in {where}"
