@@ -47,58 +47,50 @@ class PaneSetup:
     """Fits the planes and places the glass at the start of reflections (Appendix A).
 
     Attributes:
-        fit: options of plane fitting.
-        glass_count: number of glass Gaussians on each pane.
+        recipe: options of panes.
         seed: random seed of the glass Gaussians' positions.
-        detect_mirrors: detect mirrors, unless `fit` names them.
-        fixed_mirrors: freeze the reflectance of mirrors and move Gaussians behind them to the front; otherwise, mirrors
-            only start with that reflectance.
-        seed_reflections: initialise parts that no photograph shows directly from the virtual points behind panes.
-        tint: learn the tint of panes.
     """
 
-    fit: PlaneFit
-    glass_count: int
+    recipe: PlanarRecipe
     seed: int
-    detect_mirrors: bool = True
-    fixed_mirrors: bool = True
-    seed_reflections: bool = True
-    tint: bool = False
 
     def __call__(self, state: TrainState, dataset: Dataset) -> Work:
         """Edits `state`, and yields its progress."""
+        recipe = self.recipe
         yield Working("fitting planes to the masks", 0, 1)
-        scene = self._with_glass(state.scene, capture_planes(dataset, state.scene.primary.means, self.fit))
-        if self.detect_mirrors or self.fit.mirror_labels:
+        scene = self._with_glass(state.scene, capture_planes(dataset, state.scene.primary.means, recipe.plane_fit))
+        if recipe.detect_mirrors or recipe.plane_fit.mirror_labels:
             # The search for mirrors aligns them.
             scene = self._with_glass(scene, (yield from self._find_mirrors(scene, dataset)))
-        planes = scene.planes if self.fixed_mirrors else replace(scene.planes, mirrors=())
-        state.scene = replace(scene, planes=planes.that_may_tint() if self.tint else planes)
+        planes = scene.planes if recipe.fixed_mirrors else replace(scene.planes, mirrors=())
+        state.scene = replace(scene, planes=planes.that_may_tint() if recipe.tint else planes)
         state.statistics.clear()
         for mirrors in coplanar_panes(planes, mirrors=True):
             yield Working(f"moving Gaussians from behind {name_panes(mirrors, 'mirror')} to the front", 0, 1)
             mirror_virtual_gaussians(state, dataset, mirrors)
-        for panes in coplanar_panes(planes, mirrors=False) if self.seed_reflections else ():
+        for panes in coplanar_panes(planes, mirrors=False) if recipe.seed_reflections else ():
             yield from seed_reflection(state, dataset, panes)
         return True
 
     def _with_glass(self, scene: Scene, planes: Planes) -> Scene:
         """The scene with these planes, and glass on them."""
-        return replace(scene, planes=planes, glass=glass_gaussians(planes, count=self.glass_count, seed=self.seed))
+        glass = glass_gaussians(planes, count=self.recipe.glass_count, seed=self.seed)
+        return replace(scene, planes=planes, glass=glass)
 
     def _find_mirrors(self, scene: Scene, dataset: Dataset) -> Generator[Working, None, Planes]:
         """The scene's planes with detected mirrors marked and aligned.
 
-        If `fit` names mirrors, only these are; planes of planes.json are as stated there.
+        If the recipe names mirrors, only these are; planes of planes.json are as stated there.
         """
+        fit = self.recipe.plane_fit
         given = Planes.empty() if dataset.planes is None else dataset.planes
         fitted = [label for label in scene.planes.labels if label not in given.labels]
         candidates = yield from mirror_candidates(scene, dataset, fitted)
         detected = detected_mirrors(scene.planes, candidates)
-        mirrors = tuple(dict.fromkeys((*given.mirrors, *(self.fit.mirror_labels or detected))))
+        mirrors = tuple(dict.fromkeys((*given.mirrors, *(fit.mirror_labels or detected))))
         log.info("mirrors among the panes: %s", name_labels(mirrors) or "none")
         aligned = [candidates[label].pane for label in detected if label in mirrors]
-        return with_mirrors(with_poses_of(scene.planes, aligned), mirrors, self.fit.mirror_reflectance)
+        return with_mirrors(with_poses_of(scene.planes, aligned), mirrors, fit.mirror_reflectance)
 
 
 def with_poses_of(planes: Planes, panes: Sequence[Planes]) -> Planes:
@@ -407,15 +399,6 @@ def planar_stages(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_I
     """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
     first, second, third = recipe.stage_shares
     strategy = _first_strategy(recipe)
-    setup = PaneSetup(
-        recipe.plane_fit,
-        recipe.glass_count,
-        seed,
-        detect_mirrors=recipe.detect_mirrors,
-        fixed_mirrors=recipe.fixed_mirrors,
-        seed_reflections=recipe.seed_reflections,
-        tint=recipe.tint,
-    )
     initialisation = Stage(
         name="1 initialisation",
         share=first,
@@ -426,7 +409,11 @@ def planar_stages(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_I
         post_steps=strategy.post_steps,
         densify_until=strategy.densify_until,
     )
-    stages: tuple[Stage, ...] = (initialisation, _adjustment_stage(recipe, second, setup), _joint_stage(recipe, third))
+    stages: tuple[Stage, ...] = (
+        initialisation,
+        _adjustment_stage(recipe, second, seed),
+        _joint_stage(recipe, third),
+    )
     stages = with_learned_photographer(recipe.photographer, stages, recipe.densify, seed)
     return with_learned_corrections(recipe, stages)
 
@@ -448,7 +435,7 @@ def plane_rates(factor: float = 1.0) -> dict[str, Rate]:
     }
 
 
-def _adjustment_stage(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> Stage:
+def _adjustment_stage(recipe: PlanarRecipe, share: float, seed: int) -> Stage:
     """Stage 2: the reflection's gradient reaches the planes, not the Gaussians."""
     strategy = _first_strategy(recipe)
     return Stage(
@@ -465,7 +452,7 @@ def _adjustment_stage(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> S
             *_early_resets(recipe, strategy),
         ),
         post_steps=(*_glass_post_steps(recipe), *strategy.post_steps),
-        setup=setup,
+        setup=PaneSetup(recipe, seed),
         densify_until=recipe.densify.stop,
     )
 

@@ -20,7 +20,8 @@ from glassplat.methods.planar import (
     mirror_virtual_gaussians,
     seed_reflection,
 )
-from glassplat.panes import PlaneFit, material
+from glassplat.methods.planar_recipe import PlanarRecipe
+from glassplat.panes import material
 from glassplat.panes.fit import with_mirrors
 from glassplat.panes.material import (
     MirrorCandidate,
@@ -123,7 +124,7 @@ def test_glass_lies_on_the_plane_of_an_aligned_mirror(monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(planar, "mirror_candidates", judged)
     monkeypatch.setattr(planar, "capture_planes", lambda *_: PANE)
-    finished(PaneSetup(PlaneFit(), glass_count=50, seed=0)(state, tiny_capture()))
+    finished(PaneSetup(PlanarRecipe(glass_count=50), seed=0)(state, tiny_capture()))
     planes, glass = state.scene.planes, state.scene.glass
     assert planes.mirrors == planes.labels
     heights = (glass.means - planes.centers[0]) @ planes.normals[0]

@@ -80,7 +80,7 @@ def test_mirrors_declared_by_the_capture_are_mirrors(mirror: bool) -> None:
     given = replace(PANE, mirrors=PANE.labels if mirror else ())
     scene = replace(true_scene(), planes=Planes.empty(), glass=true_scene().glass.select(torch.zeros(0).long()))
     state = TrainState(scene, seed=0)
-    entry = PaneSetup(PlaneFit(), glass_count=50, seed=0)
+    entry = PaneSetup(PlanarRecipe(glass_count=50), seed=0)
     finished(entry(state, replace(tiny_capture(), planes=given)))
     assert state.scene.planes.mirrors == given.mirrors
     assert (float(state.scene.planes.base_reflectances) > 0.99) == mirror

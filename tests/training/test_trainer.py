@@ -262,7 +262,7 @@ def test_a_truncated_checkpoint_is_refused(tmp_path: Path) -> None:
 def test_plane_entry_needs_annotated_views() -> None:
     dataset = tiny_capture()
     bare = replace(dataset, train=tuple(replace(view, read_pane_labels=None) for view in dataset.train))
-    setup = PaneSetup(PlanarRecipe().plane_fit, 10, 0)
+    setup = PaneSetup(PlanarRecipe(glass_count=10), 0)
     with pytest.raises(ValueError, match=r"pane 1 is marked only in 0\.png, which are test photographs"):
         finished(setup(TrainState(Scene(gaussians_from_points(dataset.points), dataset.extent), 0), bare))
 
