@@ -315,11 +315,6 @@ def view_directions(camera: Camera) -> Tensor:
     return ray_grid(camera.shared_intrinsics.to(rotation), camera.width, camera.height) @ rotation
 
 
-def page_settings(background: tuple[float, float, float], mirrored: str) -> dict[str, Any]:
-    """Settings of the web page for surfaces; `mirrored` is the kind of surroundings, distant or near."""
-    return {"background": background, "fresnel": "none", "blend": "srgb", "intensity": False, "mirrored": mirrored}
-
-
 INVISIBLE = 1 / 512
 """Weaker reflections change a pixel by at most half a step of 8 bits."""
 
@@ -381,13 +376,12 @@ class Deferred(WithBackground):
 
     def page_settings(self) -> Mapping[str, Any]:
         """Settings of the web page: shading with distant light."""
-        return page_settings(self.background, "distant")
+        return {**super().page_settings(), "mirrored": "distant"}
 
 
 def check_reflective(scene: Scene) -> None:
     """Raises ValueError if a scene lacks tensors for reflection."""
-    if scene.environment.is_empty:
-        raise ValueError("the scene has no environment; expected one trained with `deferred`")
+    _check_not_empty(scene.environment)
     check_strengths(scene, "deferred")
 
 

@@ -172,6 +172,10 @@ class WithBackground:
         if len(self.background) != 3:
             raise ValueError(f"background is {self.background}; expected three numbers, sRGB from 0 to 1")
 
+    def page_settings(self) -> Mapping[str, Any]:
+        """Settings of the web page: no panes."""
+        return {"background": self.background, "fresnel": "none", "blend": "srgb", "intensity": False}
+
 
 MEDIAN_DEPTH = "median_depth"
 """Layer that all renderers have for discs."""
@@ -238,11 +242,8 @@ def camera_batch(camera: Camera, poses: Tensor | None = None) -> CameraBatch:
 
 def concat_splats(*parts: Projected) -> Splats:
     """One list of splats per camera from several projected sets, in the order given."""
-    if len(parts) == 1:
-        only = parts[0]
-        return Splats(only.means2d, only.conics, only.opacities, only.depths, only.radii)
-    names = ("means2d", "conics", "opacities", "depths", "radii")
-    return Splats(*(torch.cat([getattr(part, name) for part in parts], dim=1) for name in names))
+    columns = ([getattr(part, name) for part in parts] for name in Splats._fields)
+    return Splats(*(column[0] if len(column) == 1 else torch.cat(column, dim=1) for column in columns))
 
 
 def visible_gaussians(projected: Projected | ProjectedDiscs) -> Tensor:

@@ -234,7 +234,3 @@ class Splat(WithBackground):
         """The renderer of frames that also have `depth` and `normal` where they are among the layers."""
         renderer = replace(self, depth=self.depth or "depth" in layers, normal=self.normal or "normal" in layers)
         return WithNormals(renderer) if "normal" in layers else renderer
-
-    def page_settings(self) -> Mapping[str, Any]:
-        """Settings of the web page: no panes."""
-        return {"background": self.background, "fresnel": "none", "blend": "srgb", "intensity": False}

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.environment import cube_lookup
-from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT, RawGaussians, Rays
+from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT, Rays
 from glassplat.kernels.records import Traced as Found
 from glassplat.kernels.trace import trace
 from glassplat.render.deferred import (
@@ -18,7 +18,6 @@ from glassplat.render.deferred import (
     Surface,
     blend_surface,
     check_strengths,
-    page_settings,
     reflected_rays,
     shaded_pixels,
     view_directions,
@@ -31,6 +30,7 @@ from glassplat.render.frame import (
     WithBackground,
     check_colored,
     over_background,
+    raw_gaussians,
 )
 from glassplat.scene import SH_ZERO
 from glassplat.scene.camera import Camera
@@ -144,7 +144,7 @@ class Traced(WithBackground):
 
     def page_settings(self) -> Mapping[str, Any]:
         """Settings of the web page, which looks up the surroundings as seen from the centre of the region."""
-        return page_settings(self.background, "near")
+        return {**super().page_settings(), "mirrored": "near"}
 
     def behind(self, scene: Scene, camera: Camera) -> Tensor:
         """[H, W, 3] the surroundings along the ray of each pixel."""
@@ -176,10 +176,8 @@ def traced_surroundings(
     part: Gaussians, origins: Tensor, directions: Tensor, near: float, contributions: Tensor | None = None
 ) -> Found:
     """Trace rays [R, 3] through a set of Gaussians."""
-    raw = RawGaussians(part.means, part.quats, part.log_scales, part.logit_opacities, part.sh)
-    return trace(
-        raw, Rays(origins, directions), sh_degree=part.active_sh_degree, near=near, contributions=contributions
-    )
+    rays = Rays(origins, directions)
+    return trace(raw_gaussians(part), rays, sh_degree=part.active_sh_degree, near=near, contributions=contributions)
 
 
 def mirrored_contributions(scene: Scene, camera: Camera) -> Tensor:
