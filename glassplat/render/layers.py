@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from glassplat.kernels.composite import composite
-from glassplat.kernels.records import Projected
+from glassplat.kernels.records import Projected, ProjectedDiscs
 from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.frame import NEAR_PER_EXTENT, Frame, concat_splats, project_gaussians
-from glassplat.render.panes import nearest_hits, panes_in_camera, project_mirrored, seen_panes
+from glassplat.render.panes import SeenPanes, nearest_hits, panes_in_camera, project_mirrored, seen_panes
 from glassplat.render.planar import detach_gaussians
-from glassplat.render.splat import blend_discs, projected_discs
+from glassplat.render.splat import blend_discs, blend_ellipsoids, projected_discs
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
@@ -134,66 +135,59 @@ def contributions(scene: Scene, camera: Camera) -> Tensor:
         camera: camera of the view.
     """
     camera = camera.to(scene.primary.means.device)
-    # Colours are not needed.
-    primary, near = replace(detach_gaussians(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
-    if primary.are_discs:
-        return _gather_discs(primary, camera, near, primary.means.new_ones(camera.height, camera.width, 1))[:, 0]
-    most = _weight_sums(project_gaussians(primary, camera, near=near), camera)
+    ones = scene.primary.means.new_ones(camera.height, camera.width, 1)
+    most = gather_pixels(scene, camera, ones)[:, 0]
+    if scene.primary.are_discs:
+        return most
     seen = seen_panes(scene.planes, camera, nearest_hits(panes_in_camera(scene.planes, camera), camera))
     if seen is None:
         return most
-    mirrored = project_mirrored(primary, camera, seen, near=near)
-    return torch.maximum(most, _weight_sums(mirrored, camera, seen.tiles))
+    return torch.maximum(most, _gather_mirrored(scene, camera, ones, seen)[..., 0].amax(dim=0))
 
 
 def gather_pixels(scene: Scene, camera: Camera, values: Tensor) -> Tensor:
     """[N, D] an image [H, W, D] summed over the pixels of each primary Gaussian, with its blending weights."""
     camera = camera.to(scene.primary.means.device)
-    primary, near = replace(detach_gaussians(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
+    primary, near = _without_harmonics(scene), NEAR_PER_EXTENT * scene.extent
     if primary.are_discs:
-        return _gather_discs(primary, camera, near, values)
-    return _gather(project_gaussians(primary, camera, near=near), camera, values)[0]
+        discs = projected_discs(primary, camera, near=near)
+        return _gather(discs, values, lambda ones: blend_discs(discs, ones, camera, near=near).image)[0]
+    projected = project_gaussians(primary, camera, near=near)
+    return _gather(projected, values, lambda ones: blend_ellipsoids(projected, ones, camera).image)[0]
 
 
 def gather_mirrored_pixels(scene: Scene, camera: Camera, values: Tensor) -> Tensor:
     """[N, D] the same, with the weights in the reflection of each pixel's nearest pane."""
     camera = camera.to(scene.primary.means.device)
-    primary, near = replace(detach_gaussians(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
     seen = seen_panes(scene.planes, camera, nearest_hits(panes_in_camera(scene.planes, camera), camera), most=1)
     if seen is None:
-        return values.new_zeros(len(primary), values.shape[-1])
+        return values.new_zeros(len(scene.primary), values.shape[-1])
     of_pane = seen.order[0] == torch.arange(len(seen.planes), device=values.device)[:, None, None]
-    projected = project_mirrored(primary, camera, seen, near=near)
-    return _gather(projected, camera, of_pane[..., None] * values, seen.tiles).sum(dim=0)
+    return _gather_mirrored(scene, camera, of_pane[..., None] * values, seen).sum(dim=0)
 
 
-def _weight_sums(projected: Projected, camera: Camera, tiles: Tensor | None = None) -> Tensor:
-    """[N] blending weights summed over the pixels of the images."""
-    ones = projected.depths.new_ones(camera.height, camera.width, 1)
-    return _gather(projected, camera, ones, tiles)[..., 0].amax(dim=0)
+def _without_harmonics(scene: Scene) -> Gaussians:
+    """The primary Gaussians for projection without gradients, where colours are not needed."""
+    return replace(detach_gaussians(scene.primary), active_sh_degree=0)
 
 
-def _gather(projected: Projected, camera: Camera, values: Tensor, tiles: Tensor | None = None) -> Tensor:
+def _gather_mirrored(scene: Scene, camera: Camera, values: Tensor, seen: SeenPanes) -> Tensor:
+    """[K, N, D] as `_gather`, of the primary Gaussians in the images mirrored by K panes."""
+    projected = project_mirrored(_without_harmonics(scene), camera, seen, near=NEAR_PER_EXTENT * scene.extent)
+    splats = concat_splats(projected)
+    bins = bin_tiles(splats, camera.width, camera.height, seen.tiles)
+    return _gather(projected, values, lambda ones: composite(splats, ones, bins).image)
+
+
+def _gather(projected: Projected | ProjectedDiscs, values: Tensor, blend: Callable[[Tensor], Tensor]) -> Tensor:
     """[C, N, D] gradient of a constant channel if `values` are the gradients of the images.
 
     They are [C, H, W, D], or [H, W, D] for all images.
     """
-    splats = concat_splats(projected)
     with torch.enable_grad():
         ones = projected.depths.new_ones(*projected.depths.shape, values.shape[-1]).requires_grad_()
-        image = composite(splats, ones, bin_tiles(splats, camera.width, camera.height, tiles)).image
-        (sums,) = torch.autograd.grad((image * values).sum(), ones)
+        (sums,) = torch.autograd.grad((blend(ones) * values).sum(), ones)
     return sums
-
-
-def _gather_discs(discs: Gaussians, camera: Camera, near: float, values: Tensor) -> Tensor:
-    """[N, D] as `_gather`, for discs and one camera."""
-    projected = projected_discs(discs, camera, near=near)
-    with torch.enable_grad():
-        ones = projected.depths.new_ones(*projected.depths.shape, values.shape[-1]).requires_grad_()
-        image = blend_discs(projected, ones, camera, near=near).image
-        (sums,) = torch.autograd.grad((image * values).sum(), ones)
-    return sums[0]
 
 
 def window_means(image: Tensor, region: Tensor, radius: int) -> Tensor:
