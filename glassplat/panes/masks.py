@@ -221,15 +221,15 @@ class PaneView:
         inside = (depth > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
         return np.stack([x, y], axis=-1).reshape(*points.shape[:-1], 2), inside.reshape(points.shape[:-1])
 
-    def covers(self, pixels: Array, inside: Mask) -> Mask:
+    def covers(self, pixels: Array, inside: Mask | bool = True) -> Mask:
         """[...] bool: pixel positions [..., 2] on the pane; false where `inside` is false."""
         return inside & self._sample(self.mask, pixels, inside)
 
-    def is_unoccluded(self, pixels: Array, inside: Mask) -> Mask:
+    def is_unoccluded(self, pixels: Array, inside: Mask | bool = True) -> Mask:
         """[...] bool: pixel positions [..., 2] that no other pane covers; false where `inside` is false."""
         return inside & ~self._sample(self.hidden, pixels, inside)
 
-    def _sample(self, image: Mask, pixels: Array, inside: Mask) -> Mask:
+    def _sample(self, image: Mask, pixels: Array, inside: Mask | bool) -> Mask:
         """[...] values of an image at pixel positions [..., 2]; arbitrary where `inside` is false."""
         column, row = (np.where(inside, pixels[..., axis], 0).astype(np.int64) for axis in (0, 1))
         return image.ravel()[row * image.shape[1] + column]
@@ -505,16 +505,12 @@ def agreement_per_view(plane: PlaneEquations, views: Sequence[PaneView]) -> Arra
 
 def _overlaps(planes: PlaneEquations, views: Sequence[PaneView], pixels_per_view: int) -> tuple[Array, Array]:
     """Pixel counts of the intersection and the union of the masks of two views; [H, V, V], from and to."""
-    seen = []
-    for view in views:
-        pixels = view.pixel_grid(pixels_per_view)
-        seen.append(pixels[view.is_unoccluded(pixels, np.ones(len(pixels), dtype=bool))])
+    grids = [view.pixel_grid(pixels_per_view) for view in views]
+    seen = [pixels[view.is_unoccluded(pixels)] for view, pixels in zip(views, grids, strict=True)]
     rays = Rays(
         np.repeat(np.arange(len(views)), [len(pixels) for pixels in seen]),
         np.concatenate([view.directions(pixels) for view, pixels in zip(views, seen, strict=True)]),
-        np.concatenate(
-            [view.covers(pixels, np.ones(len(pixels), dtype=bool)) for view, pixels in zip(views, seen, strict=True)]
-        ),
+        np.concatenate([view.covers(pixels) for view, pixels in zip(views, seen, strict=True)]),
     )
     masks, hidden = [view.mask for view in views], [view.hidden for view in views]
     return overlaps(planes.normals, planes.offsets, cameras_of(views), rays, masks, hidden, UNKNOWN_WEIGHT)

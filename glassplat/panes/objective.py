@@ -369,7 +369,7 @@ def pane_rectangle(plane: PlaneEquations, views: Sequence[PaneView], axes: Array
 def _pixels_on_plane(plane: PlaneEquations, view: PaneView) -> Array:
     """[P, 3] points of the plane that are seen through the pixels of a mask."""
     pixels = view.pixel_grid(OUTLINE_PIXELS)
-    directions = view.directions(pixels[view.covers(pixels, np.ones(len(pixels), dtype=bool))])
+    directions = view.directions(pixels[view.covers(pixels)])
     points, hit = intersect_rays(plane, view.center, directions)
     return points[0, hit[0]]
 

@@ -181,12 +181,11 @@ def best_plane(objective: Objective, *, hypotheses: int, refine: int, rng: np.ra
         rng: source of randomness.
     """
     beam = first_hypotheses(objective, hypotheses, rng)
-    for tilt, shift, tolerance in SEARCH_ROUNDS:
-        beam = _follow_beam(beam, objective, (tilt, shift), tolerance, rng)
+    for search_round in SEARCH_ROUNDS:
+        beam = _follow_beam(beam, objective, search_round, rng)
     # If a pane is occluded in every mask, planes far behind impossibly high frames may fit better than its own.
     beam = _possible_frames(_best_planes(refine_planes(beam, objective, TOLERANCES[:2]), objective), objective)
-    tilt, shift, tolerance = PERTURBATION
-    perturbed = _follow_beam(beam, objective, (tilt, shift), tolerance, rng)
+    perturbed = _follow_beam(beam, objective, PERTURBATION, rng)
     best_first = np.argsort(contradiction(beam, objective, TOLERANCES[:2]), kind="stable")
     leading = join_planes([beam.select(best_first[:refine]), perturbed.select(np.arange(min(refine, len(perturbed))))])
     finished = _possible_frames(_best_planes(refine_planes(leading, objective, TOLERANCES[1:]), objective), objective)
@@ -205,8 +204,8 @@ def best_joint_plane(objective: JointObjective, starts: FramedPlanes, rng: np.ra
     if len(starts) > MOST_STARTS:
         costs = contradiction(starts, objective, (COARSE_TOLERANCE,), edges=COARSE_EDGES)
         beam = starts.select(np.argsort(costs, kind="stable")[:MOST_STARTS])
-    for tilt, shift, tolerance in (*SEARCH_ROUNDS[1:], PERTURBATION):
-        beam = join_planes([beam, _follow_beam(beam, objective, (tilt, shift), tolerance, rng)])
+    for search_round in (*SEARCH_ROUNDS[1:], PERTURBATION):
+        beam = join_planes([beam, _follow_beam(beam, objective, search_round, rng)])
     finished = _possible_frames(refine_planes(beam, objective, TOLERANCES), objective)
     return finished.select(np.array([np.argmin(contradiction(finished, objective))]))
 
@@ -242,10 +241,10 @@ def first_hypotheses(objective: Objective, count: int, rng: np.random.Generator)
 
 
 def _follow_beam(
-    beam: FramedPlanes, objective: Evidence, spread: tuple[float, float], tolerance: float, rng: np.random.Generator
+    beam: FramedPlanes, objective: Evidence, search_round: tuple[float, float, float], rng: np.random.Generator
 ) -> FramedPlanes:
     """The best of the planes sampled around each plane of the beam, best first."""
-    tilt, shift = spread
+    tilt, shift, tolerance = search_round
     shifts = shift * objective.camera_distance(beam.planes)
     around = sample_nearby(beam.planes, objective.anchors(beam.planes), SAMPLES_EACH, tilt=tilt, shift=shifts, rng=rng)
     factors = np.exp(FRAME_SPREAD * rng.standard_normal((len(beam), 1 + SAMPLES_EACH)))
