@@ -14,7 +14,7 @@ import json
 import math
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -110,16 +110,12 @@ class GltfWriter:
         """
         data = np.ascontiguousarray(values, dtype="<f4")
         kind = "SCALAR" if data.ndim == 1 else f"VEC{data.shape[1]}"
-        accessor: dict[str, Any] = {"bufferView": len(self._views), "componentType": FLOAT, "count": len(data)}
-        accessor["type"] = kind
-        if bounded:
-            accessor |= {"min": data.min(axis=0).tolist(), "max": data.max(axis=0).tolist()}
-        length = data.nbytes
-        view = {"buffer": 0, "byteOffset": self._size, "byteLength": length, "target": ARRAY_BUFFER}
-        self._views.append(view)
+        accessor = {"bufferView": len(self._views), "componentType": FLOAT, "count": len(data), "type": kind}
+        bounds = {"min": data.min(axis=0).tolist(), "max": data.max(axis=0).tolist()} if bounded else {}
+        self._accessors.append(accessor | bounds)
+        self._views.append({"buffer": 0, "byteOffset": self._size, "byteLength": data.nbytes, "target": ARRAY_BUFFER})
         self._parts.append(data.tobytes())
-        self._size += length
-        self._accessors.append(accessor)
+        self._size += data.nbytes
         return len(self._accessors) - 1
 
     def to_bytes(self, document: Mapping[str, Any]) -> bytes:
@@ -236,77 +232,52 @@ TOLERANCE = 1e-4
 LEAST_NODE_SCALE, MOST_SCALE = 1e-9, 1e9
 
 
-@dataclass(frozen=True)
-class Placement:
-    """A similarity transform: x -> scale * rotation x + shift.
-
-    Attributes:
-        quat: [4] `wxyz`, unit, float64.
-        scale: above 0.
-        shift: [3] float64.
-    """
-
-    quat: Tensor = field(default_factory=lambda: torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64))
-    scale: float = 1.0
-    shift: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
-
-
-def placement_of(node: Mapping[str, Any], outer: Placement, where: str) -> Placement:
-    """Placement of a node, within the placement of its parent."""
+def placement_of(node: Mapping[str, Any], outer: Tensor, where: str) -> Tensor:
+    """[4, 4] float64 the placement of a node within that of its parent: a turn, a shift and one positive scale."""
+    own = torch.eye(4, dtype=torch.float64)
     if node["matrix"] is not None:
-        own = _placement_from_matrix(torch.tensor(node["matrix"], dtype=torch.float64).reshape(4, 4).T, where)
+        own = torch.tensor(node["matrix"], dtype=torch.float64).reshape(4, 4).T
     else:
         x, y, z, w = node["rotation"]
-        own = _checked_placement(
-            torch.tensor([w, x, y, z], dtype=torch.float64),
-            torch.tensor(node["scale"], dtype=torch.float64),
-            torch.tensor(node["translation"], dtype=torch.float64),
-            where,
+        turn, scales, shift = (
+            torch.tensor(part, dtype=torch.float64) for part in ((w, x, y, z), node["scale"], node["translation"])
         )
-    shift = outer.shift + outer.scale * (rotation_from_quat(outer.quat) @ own.shift)
-    return Placement(quat_product(outer.quat, own.quat), outer.scale * own.scale, shift)
+        own[:3, :3], own[:3, 3] = rotation_from_quat(turn) * scales, shift
+    placement = outer @ own
+    rotation, scale = _rotation_and_scale(placement)
+    shear = float((rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max())
+    is_turned = math.hypot(*node["rotation"]) > TOLERANCE and float(torch.linalg.det(rotation)) > 0
+    if (
+        own[3].tolist() != [0, 0, 0, 1]
+        or not LEAST_NODE_SCALE <= scale <= MOST_SCALE
+        or not shear < TOLERANCE
+        or not is_turned
+    ):
+        raise ValueError(
+            f"{where} skews, mirrors or stretches splats; expected a turn, a shift and one scale: apply the transform "
+            "first"
+        )
+    return placement
 
 
-def place_gaussians(gaussians: Gaussians, placement: Placement) -> Gaussians:
+def _rotation_and_scale(placement: Tensor) -> tuple[Tensor, float]:
+    scale = float(placement[:3, :3].norm()) / math.sqrt(3)
+    return placement[:3, :3] / max(scale, LEAST_NODE_SCALE), scale
+
+
+def place_gaussians(gaussians: Gaussians, placement: Tensor) -> Gaussians:
     """The Gaussians transformed by a placement, including their SH; the identity changes no bit."""
-    if placement.scale == 1 and not bool(placement.shift.any()) and not bool(placement.quat[1:].any()):
+    if torch.equal(placement, torch.eye(4, dtype=torch.float64)):
         return gaussians
-    rotation = rotation_from_quat(placement.quat)
-    means = placement.scale * (gaussians.means.double() @ rotation.T) + placement.shift
-    quats = quat_product(placement.quat.expand(len(gaussians), 4), gaussians.quats.double())
+    rotation, scale = _rotation_and_scale(placement)
+    means = gaussians.means.double() @ placement[:3, :3].T + placement[:3, 3]
+    quats = quat_product(quat_from_rotation(rotation).expand(len(gaussians), 4), gaussians.quats.double())
     return replace(
         gaussians,
         means=means.float(),
         quats=quats.float(),
-        log_scales=gaussians.log_scales + math.log(placement.scale),
+        log_scales=gaussians.log_scales + math.log(scale),
         sh=rotate_sh(gaussians.sh, rotation),
-    )
-
-
-def _placement_from_matrix(matrix: Tensor, where: str) -> Placement:
-    linear = matrix[:3, :3]
-    scale = float(linear.norm()) / math.sqrt(3)
-    unit = linear / scale if scale > 0 else linear
-    is_affine = torch.equal(matrix[3], torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64))
-    shear = float((unit @ unit.T - torch.eye(3, dtype=torch.float64)).abs().max())
-    if not is_affine or not shear < TOLERANCE or float(torch.linalg.det(unit)) < 0:
-        raise ValueError(_similarity_message(where))
-    return _checked_placement(
-        quat_from_rotation(unit), torch.full((3,), scale, dtype=torch.float64), matrix[:3, 3], where
-    )
-
-
-def _checked_placement(quat: Tensor, scales: Tensor, shift: Tensor, where: str) -> Placement:
-    scale = float(scales[0])
-    is_uniform = bool(((scales - scale).abs() <= TOLERANCE * abs(scale)).all())
-    if not (LEAST_NODE_SCALE <= scale <= MOST_SCALE) or not is_uniform or not float(quat.norm()) > TOLERANCE:
-        raise ValueError(_similarity_message(where))
-    return Placement(torch.nn.functional.normalize(quat, dim=0), scale, shift)
-
-
-def _similarity_message(where: str) -> str:
-    return (
-        f"{where} skews, mirrors or stretches splats; expected a turn, a shift and one scale: apply the transform first"
     )
 
 
@@ -423,7 +394,7 @@ def _glb_bytes(gaussians: Gaussians) -> bytes:
     )
 
 
-def _placed_meshes(file: GltfReader) -> list[tuple[int, Placement | ValueError]]:
+def _placed_meshes(file: GltfReader) -> list[tuple[int, Tensor | ValueError]]:
     """The meshes that the scene shows, with their placements; a file without scenes shows all its nodes.
 
     Unsupported placements are returned as errors, because they matter only for meshes with splats.
@@ -439,8 +410,8 @@ def _placed_meshes(file: GltfReader) -> list[tuple[int, Placement | ValueError]]
         every = range(len(file.list_of("nodes")))
         below = {child for node in every for child in file.entry("nodes", node, NODE)["children"]}
         roots = [node for node in every if node not in below]
-    pending: list[tuple[int, Placement | ValueError]] = [(node, Placement()) for node in roots]
-    found: list[tuple[int, Placement | ValueError]] = []
+    pending: list[tuple[int, Tensor | ValueError]] = [(node, torch.eye(4, dtype=torch.float64)) for node in roots]
+    found: list[tuple[int, Tensor | ValueError]] = []
     seen: set[int] = set()
     while pending:
         number, placement = pending.pop()
@@ -448,7 +419,7 @@ def _placed_meshes(file: GltfReader) -> list[tuple[int, Placement | ValueError]]
             raise ValueError(f"node {number} of {file.path} hangs below two others; expected a tree: it is damaged")
         seen.add(number)
         node = file.entry("nodes", number, NODE)
-        if isinstance(placement, Placement):
+        if isinstance(placement, Tensor):
             try:
                 placement = placement_of(node, placement, f"node {number} of {file.path}")
             except ValueError as error:
