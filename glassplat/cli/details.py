@@ -183,10 +183,8 @@ def imported_part(directory: RunDirectory) -> Finding:
 
 def scene_part(path: Path) -> Finding:
     """Finding on the scene in a folder."""
-    try:
+    with convert_to_input_error():
         scene = read_scene(path)
-    except (ValueError, FileNotFoundError) as error:
-        raise InputError(str(error)) from error
     finding = Finding()
     _describe_scene(scene, finding)
     return finding

@@ -205,12 +205,10 @@ def replace_environment(scene: Scene, panorama: Path) -> Scene:
 
     if scene.environment.is_empty and not len(scene.surroundings):
         raise InputError("nothing in the scene reflects an environment; train it with `glassplat train deferred`")
-    try:
+    with convert_to_input_error():
         image = read_equirect(panorama)
         size = scene.environment.size or min(LARGEST_FACE, max(1, image.shape[0] // 2))
         environment = environment_from_equirect(image, size)
-    except (FileNotFoundError, ValueError) as error:
-        raise InputError(str(error)) from error
     raw = environment.raw.to(scene.primary.means)
     return replace(scene, environment=replace(scene.environment, raw=raw), surroundings=Gaussians.empty())
 

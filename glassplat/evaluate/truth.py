@@ -221,7 +221,8 @@ def _read_companion(view: View, suffix: str) -> NDArray[np.float32] | None:
     if not path.is_file():
         return None
     photo_size = image_size(view.image_path)
-    pixels = _read_image(path)
+    with convert_to_input_error():
+        pixels = read_image_float(path)
     if pixels.shape[1::-1] != photo_size:
         raise InputError(
             f"{path} is {pixels.shape[1]}x{pixels.shape[0]} pixels, its photograph {photo_size[0]}x"
@@ -230,16 +231,12 @@ def _read_companion(view: View, suffix: str) -> NDArray[np.float32] | None:
     return pixels
 
 
-def _read_image(path: Path) -> NDArray[np.float32]:
-    with convert_to_input_error():
-        return read_image_float(path)
-
-
 def _coverage(view: View, vectors: NDArray[np.float32] | None) -> NDArray[np.float32]:
     """[H, W] share of each pixel of the photograph's file that shows the surface."""
     if vectors is not None and vectors.shape[2] == 4:
         return vectors[..., 3]
-    photo = _read_image(view.image_path)
+    with convert_to_input_error():
+        photo = read_image_float(view.image_path)
     if photo.shape[2] == 4:
         return photo[..., 3]
     if vectors is None:
