@@ -10,6 +10,7 @@ import re
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from os.path import isfile
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -130,7 +131,10 @@ def _unicode_name(path: Path) -> Iterator[Path]:
 
 EDIT_TOLERANCE = 1e-5
 """Difference above which the readable value was edited by hand, and takes precedence over the raw one."""
-REFLECTANCE_MARGIN = 1e-6
+Conversion = Callable[[Tensor], Tensor]
+UNIT: Conversion = partial(torch.nn.functional.normalize, dim=0)
+LOGIT_OF: Conversion = partial(torch.logit, eps=1e-6)
+"""Of a reflectance, which may be 0 or 1."""
 LEAST_LENGTH = 1e-6
 LEAST_ANGLE = 1e-3
 """Smallest angle between tangent and normal, radians; below, the rectangle's sides are undefined."""
@@ -198,8 +202,10 @@ def read_planes(path: Path | str) -> Planes:
         raise ValueError(f"{path} has plane labels {list(labels)}; expected every label once")
     return Planes(
         centers=_column(entries, "center"),
-        raw_normals=torch.stack([_raw_normal(entry) for entry in entries]),
-        logit_reflectances=torch.stack([_logit_reflectance(entry) for entry in entries]),
+        raw_normals=torch.stack([_raw(one["normal"], one["raw_normal"], UNIT, torch.clone) for one in entries]),
+        logit_reflectances=torch.stack(
+            [_raw(one["base_reflectance"], one["logit_reflectance"], torch.sigmoid, LOGIT_OF) for one in entries]
+        ),
         tangents=_column(entries, "tangent"),
         half_sizes=_column(entries, "half_sizes"),
         labels=labels,
@@ -262,38 +268,19 @@ def _column(entries: list[dict[str, Any]], key: str) -> Tensor:
     return torch.tensor([entry[key] for entry in entries], dtype=torch.float32)
 
 
-def _raw_normal(entry: Mapping[str, Any]) -> Tensor:
-    normal = torch.tensor(entry["normal"], dtype=torch.float32)
-    if entry["raw_normal"] is None:
-        return normal
-    raw = torch.tensor(entry["raw_normal"], dtype=torch.float32)
-    unit, raw_unit = (torch.nn.functional.normalize(vector, dim=0) for vector in (normal, raw))
-    return raw if (unit - raw_unit).abs().max() <= EDIT_TOLERANCE else normal
-
-
-def _logit_reflectance(entry: Mapping[str, Any]) -> Tensor:
-    readable = torch.tensor(entry["base_reflectance"], dtype=torch.float32)
-    if entry["logit_reflectance"] is not None:
-        logit = torch.tensor(entry["logit_reflectance"], dtype=torch.float32)
-        if (torch.sigmoid(logit) - readable).abs() <= EDIT_TOLERANCE:
-            return logit
-    return torch.logit(readable, eps=REFLECTANCE_MARGIN)
+def _raw(readable: Any, raw: Any, activate: Conversion, invert: Conversion) -> Tensor:
+    """A raw value, computed from the readable one if that was edited or is alone."""
+    computed = invert(torch.tensor(readable, dtype=torch.float32))
+    given = computed if raw is None else torch.tensor(raw, dtype=torch.float32)
+    return given if (activate(given) - activate(computed)).abs().max() <= EDIT_TOLERANCE else computed
 
 
 def _log_transmittances(entries: list[dict[str, Any]]) -> Tensor | None:
     """[K, 3], zeros for panes without transmittance; None if all lack it."""
-    if all(entry["transmittance"] is None for entry in entries):
+    values = [(entry["transmittance"], entry["log_transmittance"]) for entry in entries]
+    if all(readable is None for readable, _ in values):
         return None
-    return torch.stack([_log_transmittance(entry) for entry in entries])
-
-
-def _log_transmittance(entry: Mapping[str, Any]) -> Tensor:
-    readable = torch.tensor(entry["transmittance"] or (1.0, 1.0, 1.0), dtype=torch.float32)
-    if entry["log_transmittance"] is not None:
-        raw = torch.tensor(entry["log_transmittance"], dtype=torch.float32)
-        if (raw.exp() - readable).abs().max() <= EDIT_TOLERANCE:
-            return raw
-    return readable.log()
+    return torch.stack([_raw(readable or (1.0, 1.0, 1.0), raw, torch.exp, torch.log) for readable, raw in values])
 
 
 LARGEST_SIDE = 2**17
