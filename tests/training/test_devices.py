@@ -84,7 +84,7 @@ def test_a_state_moves_as_a_whole() -> None:
     state = trained(4)
     moved = state.to("meta")
     tensors = [*moved.scene.parameters().values(), *(t for pair in moved.optimizer.moments.values() for t in pair)]
-    tensors += [tensor for known in moved.statistics.values() for tensor in vars(known).values()]
+    tensors += [tensor for known in moved.statistics.values() for tensor in known]
     assert {tensor.device.type for tensor in tensors} == {"meta"}
     assert moved.step == 4
     assert moved.optimizer.updates == state.optimizer.updates

@@ -164,8 +164,8 @@ def test_views_that_are_ignored_do_not_count_for_densification() -> None:
     without = statistics_of_views(views[2:])
     assert bool(whole["primary"].view_count[0].gt(whole["primary"].view_count[1]).any())
     for part, known in whole.items():
-        for name, sums in vars(known).items():
-            assert torch.equal(sums, vars(without[part])[name]), (part, name)
+        for name, sums in known._asdict().items():
+            assert torch.equal(sums, getattr(without[part], name)), (part, name)
 
 
 def test_only_what_stands_on_ignored_pixels_is_not_counted() -> None:
