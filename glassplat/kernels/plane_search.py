@@ -132,7 +132,7 @@ def sum_mirrored(normals: Array, offsets: Array, points: Array, field: Field) ->
 
 
 @inlined
-def along_ray(normal, offset, center, ray):  # type: ignore[no-untyped-def]
+def along_ray(normal, offset, center, ray):
     """Distance along a ray to a plane; not positive behind its origin."""
     slope = normal[0] * ray[0] + normal[1] * ray[1] + normal[2] * ray[2]
     if abs(slope) < PARALLEL:
@@ -141,7 +141,7 @@ def along_ray(normal, offset, center, ray):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def project_to_image(pose, lens, size, x, y, z):  # type: ignore[no-untyped-def]
+def project_to_image(pose, lens, size, x, y, z):
     """Column and row of a point in an image, in pixels, its depth, and whether it is inside the image."""
     depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
     if not depth > 0.0:
@@ -153,7 +153,7 @@ def project_to_image(pose, lens, size, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def interpolated(field, size, column, row):  # type: ignore[no-untyped-def]
+def interpolated(field, size, column, row):
     """Bilinearly interpolated value of an image at a position inside it."""
     x, y = min(max(column - 0.5, 0.0), size[1] - 1.0), min(max(row - 0.5, 0.0), size[0] - 1.0)
     left, top = min(int(x), max(size[1] - 2, 0)), min(int(y), max(size[0] - 2, 0))
@@ -170,7 +170,7 @@ def follow_edges_kernel() -> Kernel:
     at = array_at(np.float64)
 
     @kernel("follow_edges", np.float64)
-    def follow(  # type: ignore[no-untyped-def]
+    def follow(
         normals, offsets, poses, centers, lenses, sizes, sources, rays, limits, addresses, distances, shifts, outward,
         compared,
     ):  # fmt: skip
@@ -233,7 +233,7 @@ def overlaps_kernel() -> Kernel:
     at = array_at(np.bool_)
 
     @kernel("mask_overlaps", np.float64, parallel=False)
-    def add(  # type: ignore[no-untyped-def]
+    def add(
         normals, offsets, poses, centers, lenses, sizes, sources, rays, on_pane, addresses, unknown_weight, both, either
     ):  # fmt: skip
         for h in range(offsets.size):
@@ -268,7 +268,7 @@ def sum_mirrored_kernel() -> Kernel:
     """Fills the results of `sum_mirrored`, plane by plane."""
 
     @kernel("sum_mirrored", np.float64, parallel=False)
-    def add(normals, offsets, points, values, corner, cell, sums):  # type: ignore[no-untyped-def]
+    def add(normals, offsets, points, values, corner, cell, sums):
         columns, rows, layers = values.shape
         scale = 1.0 / cell
         for h in range(offsets.size):

@@ -86,7 +86,7 @@ def add_views_kernel(real: type) -> Kernel:
     half, zero = real(0.5), real(0.0)
 
     @kernel("screen_statistics", real)
-    def add(  # type: ignore[no-untyped-def]
+    def add(
         gradient_sum, absgrad_sum, view_count, v_means2d, v_absgrad, radii, weight, width, height, rows
     ):  # fmt: skip
         cameras, count = radii.shape[0], radii.shape[1]

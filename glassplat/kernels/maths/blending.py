@@ -54,7 +54,7 @@ def _fast_exp2(real: type) -> Scalar:
     lowest = real(-80.0)
 
     @inlined
-    def exp2(t):  # type: ignore[no-untyped-def]
+    def exp2(t):
         # This order of the comparison maps NaN to the lowest value too.
         t = t if t > lowest else lowest
         # Truncation towards zero is one vector instruction; math.floor would widen to 64 bits.
@@ -71,7 +71,7 @@ def _exact_exp2(real: type) -> Scalar:
     lowest, natural = real(-80.0), real(math.log(2.0))
 
     @inlined
-    def exp2(t):  # type: ignore[no-untyped-def]
+    def exp2(t):
         t = t if t > lowest else lowest
         return real(math.exp(t * natural))
 
@@ -83,7 +83,7 @@ def _screen_form(real: type) -> Scalar:
     half_bits = real(-0.5 / math.log(2.0))
 
     @inlined
-    def screen_form(conic_xx, conic_xy, conic_yy):  # type: ignore[no-untyped-def]
+    def screen_form(conic_xx, conic_xy, conic_yy):
         return half_bits * conic_xx, bits * conic_xy, half_bits * conic_yy
 
     return screen_form
@@ -94,7 +94,7 @@ def _vertical_reach(real: type) -> Scalar:
     inverse_alpha_min, slack, endless = real(1.0 / ALPHA_MIN), real(1e-3), real(np.inf)
 
     @inlined
-    def vertical_reach(conic_xx, conic_xy, conic_yy, opacity):  # type: ignore[no-untyped-def]
+    def vertical_reach(conic_xx, conic_xy, conic_yy, opacity):
         # In double precision, because the determinant of a needle's conic is a small difference of large products.
         xx, xy = np.float64(conic_xx), np.float64(conic_xy)
         determinant = xx * np.float64(conic_yy) - xy * xy
@@ -111,7 +111,7 @@ def _row_range(real: type) -> Scalar:
     half, zero = real(0.5), real(0.0)
 
     @inlined
-    def row_range(center, reach, count):  # type: ignore[no-untyped-def]
+    def row_range(center, reach, count):
         # Row r is sampled at r + 0.5. Clamping before the conversion keeps infinite reaches well defined.
         low, high, bottom = center - reach - half, center + reach - half, real(count - 1)
         if not (reach >= zero and high >= zero and low <= bottom):

@@ -47,7 +47,7 @@ def _faces(real: type) -> tuple[Scalar, Scalar]:
     zero, one = real(0.0), real(1.0)
 
     @inlined
-    def on_face(x, y, z):  # type: ignore[no-untyped-def]
+    def on_face(x, y, z):
         size_x, size_y, size_z = abs(x), abs(y), abs(z)
         if size_x >= size_y and size_x >= size_z:
             axis, major, along, down = 0, x, y, z
@@ -59,7 +59,7 @@ def _faces(real: type) -> tuple[Scalar, Scalar]:
         return axis, 2 * axis + (1 if major < zero else 0), along * inverse, down * inverse, inverse
 
     @inlined
-    def from_face(place, g_u, g_v):  # type: ignore[no-untyped-def]
+    def from_face(place, g_u, g_v):
         axis, face, u, v, inverse = place
         along, down = g_u * inverse, g_v * inverse
         outwards = -(along * u + down * v)
@@ -77,7 +77,7 @@ def _cell(real: type) -> Scalar:
     half = real(0.5)
 
     @inlined
-    def cell(u, size):  # type: ignore[no-untyped-def]
+    def cell(u, size):
         extent = real(size)
         position = half * (u * extent + extent) + half
         held = position if position > half else half
@@ -92,13 +92,13 @@ def _filter(real: type) -> tuple[Scalar, Scalar]:
     one = real(1.0)
 
     @inlined
-    def bilinear(left, right, lower_left, lower_right, along, down):  # type: ignore[no-untyped-def]
+    def bilinear(left, right, lower_left, lower_right, along, down):
         above = left * (one - along) + right * along
         below = lower_left * (one - along) + lower_right * along
         return above * (one - down) + below * down
 
     @inlined
-    def bilinear_gradient(left, right, lower_left, lower_right, along, down):  # type: ignore[no-untyped-def]
+    def bilinear_gradient(left, right, lower_left, lower_right, along, down):
         across = right - left
         twist = lower_right - lower_left - across
         return across + down * twist, lower_left - left + along * twist
@@ -111,7 +111,7 @@ def _logistic(real: type) -> Scalar:
     zero, one, bits = real(0.0), real(1.0), real(1.0 / np.log(2.0))
 
     @inlined
-    def logistic(x):  # type: ignore[no-untyped-def]
+    def logistic(x):
         small = exp2(-abs(x) * bits)
         value = (one if x >= zero else small) / (one + small)
         # `exp2` treats NaN as a very small number.
@@ -126,7 +126,7 @@ def lookup_maths(real: type) -> tuple[Scalar, Scalar]:
     zero, half = real(0.0), real(0.5)
 
     @inlined
-    def look_up(i, padded, directions, found):  # type: ignore[no-untyped-def]
+    def look_up(i, padded, directions, found):
         size = padded.shape[1] - 2
         _, face, u, v, _ = on_face(directions[i, 0], directions[i, 1], directions[i, 2])
         column, along = cell(u, size)
@@ -138,7 +138,7 @@ def lookup_maths(real: type) -> tuple[Scalar, Scalar]:
             )
 
     @inlined
-    def look_up_gradient(i, padded, directions, v_found, v_directions, fractions):  # type: ignore[no-untyped-def]
+    def look_up_gradient(i, padded, directions, v_found, v_directions, fractions):
         """Also fills the fractions; returns the row of cells, counted over all faces, and the column."""
         side = padded.shape[1]
         place = on_face(directions[i, 0], directions[i, 1], directions[i, 2])
@@ -167,13 +167,13 @@ TWO = np.float32(2.0)
 
 
 @inlined
-def mirror_ray(ray, normal):  # type: ignore[no-untyped-def]
+def mirror_ray(ray, normal):
     """A ray mirrored by a normal of any length, times the square of that length."""
     return combine(dot(normal, normal), ray, -TWO * dot(ray, normal), normal)
 
 
 @inlined
-def mirrored_gradient(ray, normal, g):  # type: ignore[no-untyped-def]
+def mirrored_gradient(ray, normal, g):
     """Gradient of the normal from that of the mirrored ray."""
     by_square = combine(TWO * dot(ray, g), normal, -TWO * dot(normal, g), ray)
     across = -TWO * dot(ray, normal)
@@ -184,12 +184,12 @@ def mirrored_gradient(ray, normal, g):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def over_column(face, side, row, size):  # type: ignore[no-untyped-def]
+def over_column(face, side, row, size):
     """(face, row, column) of the texel next to `row`: after the last column for side 0, before the first for side 1."""
     return 2 * ((face // 2 + 1) % 3) + side, (1 - face % 2) * (size - 1), row
 
 
 @inlined
-def over_row(face, side, column, size):  # type: ignore[no-untyped-def]
+def over_row(face, side, column, size):
     """The same for the texel next to `column`, after the last or before the first row."""
     return 2 * ((face // 2 + 2) % 3) + side, column, (1 - face % 2) * (size - 1)

@@ -53,7 +53,7 @@ def _disc(real: type) -> RayHitMaths:
     zero, one, two, nowhere, edge_on = real(0.0), real(1.0), real(2.0), real("inf"), real(EDGE_ON)
 
     @inlined
-    def intersect(offset, d, frame):  # type: ignore[no-untyped-def]
+    def intersect(offset, d, frame):
         slope = dot(frame[2], d)
         if not slope * slope > edge_on * edge_on * dot(d, d):
             return nowhere, (zero, zero, zero), nowhere
@@ -63,7 +63,7 @@ def _disc(real: type) -> RayHitMaths:
         return t, (u, v, zero), u * u + v * v
 
     @inlined
-    def intersect_gradient(offset, d, frame, t, q, v_t, v_squared):  # type: ignore[no-untyped-def]
+    def intersect_gradient(offset, d, frame, t, q, v_t, v_squared):
         inverse_slope = one / dot(frame[2], d)
         x = combine(t, d, -one, offset)
         v_u, v_v = two * v_squared * q[0], two * v_squared * q[1]
@@ -85,12 +85,12 @@ def _ellipsoid(real: type) -> RayHitMaths:
     zero, one, two, nowhere = real(0.0), real(1.0), real(2.0), real("inf")
 
     @inlined
-    def outer(a, b, v, w):  # type: ignore[no-untyped-def]
+    def outer(a, b, v, w):
         """One row of a v^T + b w^T, for numbers a and b."""
         return a * v[0] + b * w[0], a * v[1] + b * w[1], a * v[2] + b * w[2]
 
     @inlined
-    def across(q, f, length):  # type: ignore[no-untyped-def]
+    def across(q, f, length):
         """Component of q perpendicular to the ray: all of q, apart from rounding.
 
         Across a thin ellipsoid q is a difference of numbers as large as the inverse of its thickness. Gradients
@@ -99,7 +99,7 @@ def _ellipsoid(real: type) -> RayHitMaths:
         return combine(one, q, -dot(q, f) / length, f)
 
     @inlined
-    def intersect(offset, d, frame):  # type: ignore[no-untyped-def]
+    def intersect(offset, d, frame):
         e, f = dot_products(offset, frame[0], frame[1], frame[2]), dot_products(d, frame[0], frame[1], frame[2])
         length = dot(f, f)
         if not length > zero:
@@ -109,7 +109,7 @@ def _ellipsoid(real: type) -> RayHitMaths:
         return t, q, dot(q, q)
 
     @inlined
-    def intersect_gradient(offset, d, frame, t, q, v_t, v_squared):  # type: ignore[no-untyped-def]
+    def intersect_gradient(offset, d, frame, t, q, v_t, v_squared):
         e, f = dot_products(offset, frame[0], frame[1], frame[2]), dot_products(d, frame[0], frame[1], frame[2])
         length = dot(f, f)
         # Repeated, because the first projection leaves a rounding error of its own.
@@ -160,17 +160,17 @@ def _shape(real: type) -> tuple[Scalar, Scalar, Scalar]:
     edge_on, largest = real(EDGE_ON), real(np.finfo(real).max)
 
     @inlined
-    def cross_products(p, q, m):  # type: ignore[no-untyped-def]
+    def cross_products(p, q, m):
         return cross(q, m), cross(m, p), cross(p, q)
 
     @inlined
-    def is_not_edge_on(n, m):  # type: ignore[no-untyped-def]
+    def is_not_edge_on(n, m):
         slope = dot(n, m)
         # Written so that NaN fails the comparison.
         return edge_on * edge_on * dot(n, n) * dot(m, m) < slope * slope <= largest
 
     @inlined
-    def pixel_map(a, b, n, m, inverse_u, inverse_v, fx, fy):  # type: ignore[no-untyped-def]
+    def pixel_map(a, b, n, m, inverse_u, inverse_v, fx, fy):
         k = m[2] / dot(n, m)
         x, y = k / fx, k / fy
         return (
@@ -189,11 +189,11 @@ def _map_gradient(real: type) -> Scalar:
     zero, one = real(0.0), real(1.0)
 
     @inlined
-    def plus(a, b):  # type: ignore[no-untyped-def]
+    def plus(a, b):
         return combine(one, a, one, b)
 
     @inlined
-    def map_gradient(p, q, m, n, found, inverse_u, inverse_v, fx, fy, g):  # type: ignore[no-untyped-def]
+    def map_gradient(p, q, m, n, found, inverse_u, inverse_v, fx, fy, g):
         slope = dot(n, m)
         k = m[2] / slope
         x, y = k / fx, k / fy
@@ -215,7 +215,7 @@ def _map_gradient(real: type) -> Scalar:
 
 
 @inlined
-def reach(opacity):  # type: ignore[no-untyped-def]
+def reach(opacity):
     """Squared distance, in standard deviations, up to which a disc of this opacity is visible; negative for none."""
     visible = np.float64(opacity) / ALPHA_MIN
     if not visible > 1.0:
@@ -224,7 +224,7 @@ def reach(opacity):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _clamped_ellipse(xx, xy, yy, least):  # type: ignore[no-untyped-def]
+def _clamped_ellipse(xx, xy, yy, least):
     """An ellipse {d : d^T S^-1 d <= 1}, with half axes of at least the root of `least`, widened by `SLACK`."""
     middle, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
     apart = math.sqrt(half * half + xy * xy)
@@ -238,7 +238,7 @@ def _clamped_ellipse(xx, xy, yy, least):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def outline(found, opacity, nearest, near, width, height):  # type: ignore[no-untyped-def]
+def outline(found, opacity, nearest, near, width, height):
     """An ellipse that encloses the region covered by the disc: (dx, dy, xx, xy, yy, half width, half height).
 
     Its centre is an offset from the disc's, and its conic is scaled such that opacity exp(-q / 2) is 1/255 on it. A
@@ -265,7 +265,7 @@ def outline(found, opacity, nearest, near, width, height):  # type: ignore[no-un
 
 
 @inlined
-def crossing_box(m, p, q, deviations, squared, near, fx, fy):  # type: ignore[no-untyped-def]
+def crossing_box(m, p, q, deviations, squared, near, fx, fy):
     """Bounds (left, right, top, bottom) of a disc that crosses the near plane, in pixels from the principal point.
 
     They enclose a rectangle in the disc's plane, with one side along the depth gradient, clipped at the near plane.
@@ -301,7 +301,7 @@ def intersect_maths(real: type) -> Scalar:
     one = real(1.0)
 
     @inlined
-    def intersect(found, dx, dy):  # type: ignore[no-untyped-def]
+    def intersect(found, dx, dy):
         u_x, u_y, v_x, v_y, w_x, w_y = found
         return dx * u_x + dy * u_y, dx * v_x + dy * v_y, dx * w_x + dy * w_y + one
 
@@ -309,7 +309,7 @@ def intersect_maths(real: type) -> Scalar:
 
 
 @inlined
-def offset_gradient(found, g_u, g_v, g_e):  # type: ignore[no-untyped-def]
+def offset_gradient(found, g_u, g_v, g_e):
     """The gradient of the offset from those of the results of `intersect`."""
     u_x, u_y, v_x, v_y, w_x, w_y = found
     return g_u * u_x + g_v * v_x + g_e * w_x, g_u * u_y + g_v * v_y + g_e * w_y

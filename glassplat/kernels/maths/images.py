@@ -45,21 +45,21 @@ def color_space_maths(real: type) -> ColorSpaceMaths:
     gamma, inverse_gamma, slope, inverse_slope = real(GAMMA), real(1 / GAMMA), real(SLOPE), real(1 / SLOPE)
 
     @inlined
-    def linear(color):  # type: ignore[no-untyped-def]
+    def linear(color):
         curved = power(((color if color > low else low) + offset) * inverse_scale, gamma)
         return curved if color > low else color * inverse_slope
 
     @inlined
-    def linear_derivative(color, radiance):  # type: ignore[no-untyped-def]
+    def linear_derivative(color, radiance):
         return gamma * radiance / ((color if color > low else low) + offset) if color > low else inverse_slope
 
     @inlined
-    def encoded(radiance):  # type: ignore[no-untyped-def]
+    def encoded(radiance):
         curved = scale * power(radiance if radiance > low_linear else low_linear, inverse_gamma) - offset
         return curved if radiance > low_linear else slope * radiance
 
     @inlined
-    def encoded_derivative(radiance, color):  # type: ignore[no-untyped-def]
+    def encoded_derivative(radiance, color):
         safe = radiance if radiance > low_linear else low_linear
         return inverse_gamma * (color + offset) / safe if radiance > low_linear else slope
 
@@ -75,7 +75,7 @@ def _fast_power() -> Scalar:
     mantissa_bits, bias = np.int32(23), np.int32(127)
 
     @inlined
-    def power(base, exponent):  # type: ignore[no-untyped-def]
+    def power(base, exponent):
         """base^exponent of normal positive floats, relative error below 1e-6 while the result is within 2^+-8."""
         bits = np.float32(base).view(np.int32)
         whole = np.int32((bits - root_half_bits) >> mantissa_bits)
@@ -95,7 +95,7 @@ def _fast_power() -> Scalar:
 
 
 @inlined
-def _exact_power(base, exponent):  # type: ignore[no-untyped-def]
+def _exact_power(base, exponent):
     return base**exponent
 
 
@@ -144,7 +144,7 @@ def _blur(real: type) -> Scalar:
     w0, w1, w2, w3, w4, w5 = (real(weight) for weight in window()[: RADIUS + 1])
 
     @inlined
-    def blur(values, at, step):  # type: ignore[no-untyped-def]
+    def blur(values, at, step):
         outer = w0 * (values[at] + values[at + 10 * step]) + w1 * (values[at + step] + values[at + 9 * step])
         middle = w2 * (values[at + 2 * step] + values[at + 8 * step]) + w3 * (
             values[at + 3 * step] + values[at + 7 * step]
@@ -158,7 +158,7 @@ def _compare(real: type) -> Scalar:
     one, two, c1, c2 = real(1.0), real(2.0), real(C1), real(C2)
 
     @inlined
-    def compare(mean_a, mean_b, squares, product):  # type: ignore[no-untyped-def]
+    def compare(mean_a, mean_b, squares, product):
         means, mean_squares = mean_a * mean_b, mean_a * mean_a + mean_b * mean_b
         a1, a2 = two * means + c1, two * (product - means) + c2
         b1, b2 = one / (mean_squares + c1), one / (squares - mean_squares + c2)

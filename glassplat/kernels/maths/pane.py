@@ -48,7 +48,7 @@ def pane_maths(real: type) -> PaneMaths:
     zero, one = real(0.0), real(1.0)
 
     @inlined
-    def strength(law, base, cosine):  # type: ignore[no-untyped-def]
+    def strength(law, base, cosine):
         if law == PANE:
             return two_surfaces(base, cosine)
         if law == SCHLICK:
@@ -56,7 +56,7 @@ def pane_maths(real: type) -> PaneMaths:
         return base
 
     @inlined
-    def strength_derivatives(law, base, cosine):  # type: ignore[no-untyped-def]
+    def strength_derivatives(law, base, cosine):
         if law == PANE:
             return two_surfaces_derivatives(base, cosine)
         if law == SCHLICK:
@@ -64,7 +64,7 @@ def pane_maths(real: type) -> PaneMaths:
         return one, zero
 
     @inlined
-    def ray_length(x, y):  # type: ignore[no-untyped-def]
+    def ray_length(x, y):
         return real(math.sqrt(x * x + y * y + one))
 
     return PaneMaths(strength, strength_derivatives, ray_length)
@@ -75,7 +75,7 @@ def build_edge_weighting(real: type) -> Scalar:
     zero, one, two, most = real(0.0), real(1.0), real(2.0), real(FULL_WEIGHT_RATIO)
 
     @inlined
-    def weighted_edges(edges, held, full, has_strength):  # type: ignore[no-untyped-def]
+    def weighted_edges(edges, held, full, has_strength):
         """The cell's contribution to the sum, and its derivative by the edges; the weight counts as constant."""
         weight = one
         if has_strength and held != zero:
@@ -96,7 +96,7 @@ def build_blend_channel(real: type) -> tuple[Scalar, Scalar]:
     one = real(1.0)
 
     @inlined
-    def blend_channel(behind, mirrored, gain, share, linear):  # type: ignore[no-untyped-def]
+    def blend_channel(behind, mirrored, gain, share, linear):
         """The blended channel, and the reflection times its intensity."""
         if linear:
             lit, bright = linear_of(behind), linear_of(mirrored) * gain
@@ -105,7 +105,7 @@ def build_blend_channel(real: type) -> tuple[Scalar, Scalar]:
         return behind + share * (bright - behind), bright
 
     @inlined
-    def blend_channel_gradient(behind, mirrored, gain, share, linear, v_mixed, v_bright):  # type: ignore[no-untyped-def]
+    def blend_channel_gradient(behind, mirrored, gain, share, linear, v_mixed, v_bright):
         """Gradients of the first four arguments, given those of the results of `blend_channel`."""
         if linear:
             lit, shone = linear_of(behind), linear_of(mirrored)
@@ -127,13 +127,13 @@ def _schlick(real: type) -> tuple[Scalar, Scalar]:
     zero, one, five = real(0.0), real(1.0), real(5.0)
 
     @inlined
-    def schlick(base, cosine):  # type: ignore[no-untyped-def]
+    def schlick(base, cosine):
         grazing = one - (cosine if cosine < one else one)
         squared = grazing * grazing
         return base + (one - base) * squared * squared * grazing
 
     @inlined
-    def schlick_derivatives(base, cosine):  # type: ignore[no-untyped-def]
+    def schlick_derivatives(base, cosine):
         grazing = one - (cosine if cosine < one else one)
         squared = grazing * grazing
         fourth = squared * squared
@@ -154,7 +154,7 @@ def _two_surfaces(real: type) -> tuple[Scalar, Scalar]:
     zero, half, one, least = real(0.0), real(0.5), real(1.0), real(LEAST_COSINE)
 
     @inlined
-    def terms(base, cosine):  # type: ignore[no-untyped-def]
+    def terms(base, cosine):
         """Multiples of a^2 + b^2 for both polarisations; then w, 1 - w, c_t, and the clamped cosine."""
         cosine = cosine if cosine > least else least
         cosine = cosine if cosine < one else one
@@ -167,7 +167,7 @@ def _two_surfaces(real: type) -> tuple[Scalar, Scalar]:
         return across, along, w, rest, inside, cosine
 
     @inlined
-    def two_surfaces(base, cosine):  # type: ignore[no-untyped-def]
+    def two_surfaces(base, cosine):
         across, along, w, rest, inside, c = terms(base, cosine)
         # Scaled in the same way: 2 a b, and the second a^2 - b^2, which is 0 at Brewster's angle; the first is w.
         product, difference = (one - base) * c * inside, w * (c * c + c * c - rest)
@@ -175,7 +175,7 @@ def _two_surfaces(real: type) -> tuple[Scalar, Scalar]:
         return half * (first + difference * difference / (along * (along + product * (one + w))))
 
     @inlined
-    def two_surfaces_derivatives(base, cosine):  # type: ignore[no-untyped-def]
+    def two_surfaces_derivatives(base, cosine):
         across, along, w, rest, inside, c = terms(base, cosine)
         inverse_across, inverse_along, inverse_inside = one / across, one / along, one / inside
         first, second = inverse_across * inverse_across, inverse_along * inverse_along

@@ -26,7 +26,7 @@ class SurfaceMaths(NamedTuple):
 
 
 @inlined
-def shortest_axis(x, y, z):  # type: ignore[no-untyped-def]
+def shortest_axis(x, y, z):
     """Index of the smallest of three values, the first among equals."""
     if y < x:
         return 2 if z < y else 1
@@ -41,7 +41,7 @@ def _facing(real: type) -> tuple[Scalar, Scalar]:
     zero, one = real(0.0), real(1.0)
 
     @inlined
-    def chosen(which, a, b, c):  # type: ignore[no-untyped-def]
+    def chosen(which, a, b, c):
         # Weighted sums, because a branch would be unpredictable.
         first, second = real(which == 0), real(which == 1)
         third = one - first - second
@@ -52,7 +52,7 @@ def _facing(real: type) -> tuple[Scalar, Scalar]:
         )
 
     @inlined
-    def normal_of(i, quats, log_scales, means, camera_center):  # type: ignore[no-untyped-def]
+    def normal_of(i, quats, log_scales, means, camera_center):
         quat, inverse_norm = unit_quat(quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3])
         if not (is_finite(inverse_norm) and inverse_norm > zero):
             return zero, zero, zero
@@ -64,7 +64,7 @@ def _facing(real: type) -> tuple[Scalar, Scalar]:
         return side * axis[0], side * axis[1], side * axis[2]
 
     @inlined
-    def quat_gradient(i, quats, log_scales, normal, v_normal):  # type: ignore[no-untyped-def]
+    def quat_gradient(i, quats, log_scales, normal, v_normal):
         none = (zero, zero, zero)
         if dot(normal, normal) == zero:
             return zero, zero, zero, zero
@@ -88,7 +88,7 @@ def surface_maths(real: type) -> SurfaceMaths:
     sigmoid, one = shape_maths(real).sigmoid, real(1.0)
 
     @inlined
-    def describe(i, colors, quats, log_scales, means, logit_strengths, camera_center, extra, channels):  # type: ignore[no-untyped-def]
+    def describe(i, colors, quats, log_scales, means, logit_strengths, camera_center, extra, channels):
         normal = normal_of(i, quats, log_scales, means, camera_center)
         for d in range(3):
             channels[i, d], channels[i, NORMAL_AT + d] = colors[i, d], normal[d]
@@ -97,7 +97,7 @@ def surface_maths(real: type) -> SurfaceMaths:
             channels[i, SURFACE_CHANNELS + e] = extra[i, e]
 
     @inlined
-    def describe_gradient(  # type: ignore[no-untyped-def]
+    def describe_gradient(
         i, quats, log_scales, channels, v_channels, v_colors, v_quats, v_logit_strengths, v_extra
     ):  # fmt: skip
         normal = channels[i, NORMAL_AT], channels[i, NORMAL_AT + 1], channels[i, NORMAL_AT + 2]

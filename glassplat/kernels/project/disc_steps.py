@@ -23,7 +23,7 @@ def _shape(real: type) -> Scalar:
     zero, most = real(0.0), real(MOST_LOG_SCALE)
 
     @inlined
-    def shape(means, quats, log_scales, logit_opacities, n):  # type: ignore[no-untyped-def]
+    def shape(means, quats, log_scales, logit_opacities, n):
         quat, inverse_norm = unit_quat(quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3])
         raw = abs(means[n, 0]) + abs(means[n, 1]) + abs(means[n, 2]) + abs(logit_opacities[n])
         usable = is_finite(raw) and inverse_norm > zero and is_finite(inverse_norm)
@@ -35,7 +35,7 @@ def _shape(real: type) -> Scalar:
 
 
 @inlined
-def cull(c, n, outputs):  # type: ignore[no-untyped-def]
+def cull(c, n, outputs):
     """Writes zeros for one disc in one camera."""
     means2d, maps, depths, opacities, colors, normals, centers, conics, radii = outputs
     depths[c, n] = opacities[c, n] = 0
@@ -48,7 +48,7 @@ def cull(c, n, outputs):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def tangents(rows, offset, mean, axes):  # type: ignore[no-untyped-def]
+def tangents(rows, offset, mean, axes):
     """Both tangents and the centre in camera space."""
     p = dot_products(axes[0], rows[0], rows[1], rows[2])
     q = dot_products(axes[1], rows[0], rows[1], rows[2])
@@ -61,7 +61,7 @@ ZERO, ONE = np.float32(0.0), np.float32(1.0)
 
 
 @inlined
-def facing_sign(axis, mean, lens, c):  # type: ignore[no-untyped-def]
+def facing_sign(axis, mean, lens, c):
     """1 if a disc's axis points to the camera, else -1."""
     back = lens[c, 4] - mean[0], lens[c, 5] - mean[1], lens[c, 6] - mean[2]
     return -ONE if dot(back, axis) < ZERO else ONE
@@ -73,7 +73,7 @@ def _place(real: type) -> Scalar:
     one, alpha_min = real(1.0), real(ALPHA_MIN)
 
     @inlined
-    def place(c, n, mean, shaped, cam_from_world, intrinsics, lens, windows, size, near, outputs):  # type: ignore[no-untyped-def]
+    def place(c, n, mean, shaped, cam_from_world, intrinsics, lens, windows, size, near, outputs):
         _, opacity, _, _, axes, deviations = shaped
         means2d, maps, depths, opacities, _, normals, centers, conics, radii = outputs
         row_x, row_y, row_z, offset = pose(cam_from_world, c)
@@ -114,7 +114,7 @@ def _place(real: type) -> Scalar:
 
 
 @inlined
-def disc_map(array, c, n):  # type: ignore[no-untyped-def]
+def disc_map(array, c, n):
     """The map of a disc in a camera, or its gradient."""
     return array[c, n, 0], array[c, n, 1], array[c, n, 2], array[c, n, 3], array[c, n, 4], array[c, n, 5]
 
@@ -124,7 +124,7 @@ def _place_gradient(real: type) -> Scalar:
     one = real(1.0)
 
     @inlined
-    def place_gradient(  # type: ignore[no-untyped-def]
+    def place_gradient(
         c, n, mean, shaped, cam_from_world, intrinsics, lens, maps, cotangents
     ):  # fmt: skip
         g_means2d, g_maps, g_depths, _, _, g_normals = cotangents
@@ -161,7 +161,7 @@ def _finish(real: type) -> Scalar:
     unit_quat_gradient, one = shape_maths(real).unit_quat_gradient, real(1.0)
 
     @inlined
-    def finish(n, shaped, sums, g_means, g_quats, g_log_scales, g_logit_opacities):  # type: ignore[no-untyped-def]
+    def finish(n, shaped, sums, g_means, g_quats, g_log_scales, g_logit_opacities):
         _, opacity, quat, inverse_norm, _, _ = shaped
         g_mean, g_opacity, (ga_x, ga_y, ga_z), g_scales = sums
         g_means[n, 0], g_means[n, 1], g_means[n, 2] = g_mean

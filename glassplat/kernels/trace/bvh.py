@@ -39,7 +39,7 @@ def _half_widths(real: type, flat: bool) -> Scalar:
     zero, one, slack = real(0.0), real(1.0), real(2.0 * np.finfo(real).eps)
 
     @inlined
-    def squares(frames, g, axis):  # type: ignore[no-untyped-def]
+    def squares(frames, g, axis):
         x, y, z = frames[g, axis, 0], frames[g, axis, 1], frames[g, axis, 2]
         # A row is an axis divided by its deviation; divided by its squared length, it is the axis times the deviation.
         inverse = one / (x * x + y * y + z * z)
@@ -47,7 +47,7 @@ def _half_widths(real: type, flat: bool) -> Scalar:
         return x * x, y * y, z * z
 
     @inlined
-    def half_widths(means, frames, g, extent):  # type: ignore[no-untyped-def]
+    def half_widths(means, frames, g, extent):
         u, v = squares(frames, g, 0), squares(frames, g, 1)
         w = (zero, zero, zero) if flat else squares(frames, g, 2)
         x, y, z = u[0] + v[0] + w[0], u[1] + v[1] + w[1], u[2] + v[2] + w[2]
@@ -65,7 +65,7 @@ def build_fit_leaf(real: type, flat: bool) -> Scalar:
     zero, nowhere, half_widths = real(0.0), real("inf"), _half_widths(real, flat)
 
     @inlined
-    def fit_leaf(means, frames, extents, g, boxes, node, k):  # type: ignore[no-untyped-def]
+    def fit_leaf(means, frames, extents, g, boxes, node, k):
         if not extents[g] > zero:
             return
         x, y, z = half_widths(means, frames, g, extents[g])
@@ -113,7 +113,7 @@ def curve_cells(points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @inlined
-def hilbert_axes(x, y, z):  # type: ignore[no-untyped-def]
+def hilbert_axes(x, y, z):
     """Coordinates transformed, from the largest cube to the smallest, to the axes of the curve within it.
 
     In each cube the curve enters and leaves at corners that lie along one edge; reflecting and exchanging axes brings
@@ -146,7 +146,7 @@ def hilbert_axes(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def curve_position(x, y, z):  # type: ignore[no-untyped-def]
+def curve_position(x, y, z):
     """Position of a cell along the curve."""
     x, y, z = hilbert_axes(x, y, z)
     place = np.int64(0)

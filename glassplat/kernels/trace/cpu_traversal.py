@@ -37,7 +37,7 @@ def _entry(real: type) -> Scalar:
     zero, sooner, later = real(0.0), real(1.0 - SLACK), real(1.0 + SLACK)
 
     @inlined
-    def enter(boxes, node, o, inverse, first, last, entries):  # type: ignore[no-untyped-def]
+    def enter(boxes, node, o, inverse, first, last, entries):
         # Faces are chosen by the sign of the direction, so that rays miss empty boxes (minimum above maximum).
         lowest = node * NODE
         highest = lowest + 3 * WIDTH
@@ -65,17 +65,17 @@ def _intersect_lanes(real: type, flat: bool) -> Scalar:
     zero = real(0.0)
 
     @inlined
-    def row(leaves, at, x, y, z, d):  # type: ignore[no-untyped-def]
+    def row(leaves, at, x, y, z, d):
         """Products of one row of the frames with the offsets, and with the direction."""
         a, b, c = load(leaves, at), load(leaves, at + WIDTH), load(leaves, at + 2 * WIDTH)
         return a * x + b * y + c * z, a * d[0] + b * d[1] + c * d[2]
 
     @inlined
-    def offsets_of(leaves, at, o):  # type: ignore[no-untyped-def]
+    def offsets_of(leaves, at, o):
         return load(leaves, at) - o[0], load(leaves, at + WIDTH) - o[1], load(leaves, at + 2 * WIDTH) - o[2]
 
     @inlined
-    def intersect_discs(leaves, leaf, o, d, first, last, ts, squares):  # type: ignore[no-untyped-def]
+    def intersect_discs(leaves, leaf, o, d, first, last, ts, squares):
         at = leaf * LEAF
         x, y, z = offsets_of(leaves, at, o)
         distance, slope = row(leaves, at + 9 * WIDTH, x, y, z, d)
@@ -90,7 +90,7 @@ def _intersect_lanes(real: type, flat: bool) -> Scalar:
         return bits_of(facing & (t >= first) & (t <= last) & (squared <= farthest))
 
     @inlined
-    def intersect_ellipsoids(leaves, leaf, o, d, first, last, ts, squares):  # type: ignore[no-untyped-def]
+    def intersect_ellipsoids(leaves, leaf, o, d, first, last, ts, squares):
         at = leaf * LEAF
         x, y, z = offsets_of(leaves, at, o)
         e0, f0 = row(leaves, at + 3 * WIDTH, x, y, z, d)
@@ -116,7 +116,7 @@ def pack_leaves(real: type) -> Kernel:
     zero = real(0.0)
 
     @kernel("trace_pack_leaves", real)
-    def pack(means, frames, opacities, order, leaves):  # type: ignore[no-untyped-def]
+    def pack(means, frames, opacities, order, leaves):
         for leaf in prange(leaves.shape[0]):
             for k in range(WIDTH):
                 place = leaf * WIDTH + k
@@ -150,7 +150,7 @@ def next_hits_maths(real: type, flat: bool) -> Scalar:
     zero, nowhere, sooner = real(0.0), real("inf"), real(1.0 - SLACK)
 
     @inlined
-    def next_hits(  # type: ignore[no-untyped-def]
+    def next_hits(
         o, d, inverse, leaves, order, boxes, offsets, first, first_id, most, ts, ids, alphas,
         entries, squares, stack, waiting,
     ):  # fmt: skip

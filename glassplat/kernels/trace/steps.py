@@ -32,13 +32,13 @@ def ray_reader(real: type) -> Scalar:
     zero, one, largest, most = real(0.0), real(1.0), real(LARGEST_INVERSE), real("inf")
 
     @inlined
-    def inverse(x, length):  # type: ignore[no-untyped-def]
+    def inverse(x, length):
         if abs(x) * largest > length:
             return one / x
         return (-largest if x < zero else largest) / length
 
     @inlined
-    def ray(origins, directions, r):  # type: ignore[no-untyped-def]
+    def ray(origins, directions, r):
         o = origins[r, 0], origins[r, 1], origins[r, 2]
         d = directions[r, 0], directions[r, 1], directions[r, 2]
         squared = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
@@ -51,7 +51,7 @@ def ray_reader(real: type) -> Scalar:
 
 
 @inlined
-def shape_of(means, frames, g, o):  # type: ignore[no-untyped-def]
+def shape_of(means, frames, g, o):
     """Offset of one Gaussian from a ray's origin, and its frame."""
     offset = means[g, 0] - o[0], means[g, 1] - o[1], means[g, 2] - o[2]
     first = frames[g, 0, 0], frames[g, 0, 1], frames[g, 0, 2]
@@ -69,7 +69,7 @@ def coverage_maths(real: type, exp2: Scalar) -> Scalar:
     zero, least, most = real(0.0), real(ALPHA_MIN), real(ALPHA_MAX)
 
     @inlined
-    def coverage(opacity, squared):  # type: ignore[no-untyped-def]
+    def coverage(opacity, squared):
         if not squared <= farthest:
             return zero, zero
         covered = opacity * exp2(half_bits * squared)
@@ -89,7 +89,7 @@ def color_backward(real: type) -> Scalar:
     zero, half = real(0.0), real(0.5)
 
     @inlined
-    def backward(sh, degree, unit, v_colors, r, weight, v_sh):  # type: ignore[no-untyped-def]
+    def backward(sh, degree, unit, v_colors, r, weight, v_sh):
         x, y, z = unit[0], unit[1], unit[2]
         red, green, blue = color(sh, 0, degree, x, y, z)
         red, green, blue = red + half, green + half, blue + half
@@ -103,7 +103,7 @@ def color_backward(real: type) -> Scalar:
 
 
 @inlined
-def insert(ts, ids, alphas, count, most, t, g, alpha):  # type: ignore[no-untyped-def]
+def insert(ts, ids, alphas, count, most, t, g, alpha):
     """Inserts a hit into the `most` nearest, ordered by (t, Gaussian); returns their number."""
     place = count if count < most else most - 1
     while place > 0 and (ts[place - 1] > t or (ts[place - 1] == t and ids[place - 1] > g)):
