@@ -108,6 +108,9 @@ inlined = register_jitable(
 )
 """Marks a scalar function that kernels call; it must not create arrays. Compiles for the CPU and for CUDA."""
 
+ZERO, ONE, TWO, ENDLESS = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(np.inf)
+"""Constants of functions for both floating-point types: exact in single precision, they do not promote it to double."""
+
 
 class Kernel:
     """A compiled kernel and its name."""

@@ -12,8 +12,9 @@ those wider than the machine's registers, so that a kernel means the same everyw
             store(values, at, load(values, at) * factor)
 
 Vectors support `+ - * /`, comparisons, which return masks, and unary minus; masks support `&` and `|`. The other
-operand of arithmetic may be a scalar of exactly the element type: a bare literal is float64 and does not compile with
-float32 vectors. Sums and products may be fused, as everywhere in kernels. A comparison with NaN is false.
+operand of arithmetic may be a scalar of the element type or of float32, such as `cpu.ONE`: a bare literal is float64
+and does not compile with float32 vectors. Sums and products may be fused, as everywhere in kernels. A comparison with
+NaN is false.
 
 A row of four pixels with four channels is a vector of 16 lanes; with three channels it is 12 numbers, in vectors of 8
 and 4 lanes. Memory holds all values of an item next to each other, such as the three coordinates of a point or its
@@ -293,15 +294,17 @@ def _arithmetic(symbol: Callable[..., Any], build: Callable[..., Any]) -> None:
     class _Template(AbstractTemplate):
         def generic(self, arguments: Any, keywords: Any) -> Any:
             kinds = [kind for kind in arguments if isinstance(kind, VectorType)]
-            if len(arguments) == 2 and kinds and all(kind in (kinds[0], kinds[0].element) for kind in arguments):
+            if kinds and all(kind in (kinds[0], kinds[0].element, types.float32) for kind in arguments):
                 return signature(kinds[0], *arguments)
             return None
 
     def lower(context: Any, builder: Any, sig: Any, values: Any) -> Any:
         kind = sig.return_type
-        return build(
-            builder, *(v if t == kind else _broadcast(builder, v, kind) for v, t in zip(values, sig.args, strict=True))
+        full = (
+            v if t == kind else _broadcast(builder, context.cast(builder, v, t, kind.element), kind)
+            for v, t in zip(values, sig.args, strict=True)
         )
+        return build(builder, *full)
 
     for arguments in ((VectorType, VectorType), (VectorType, types.Float), (types.Float, VectorType)):
         lower_builtin(symbol, *arguments)(lower)

@@ -19,7 +19,7 @@ from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
+from glassplat.kernels.backend.cpu import ENDLESS, ZERO, Kernel, even_stride, inlined, kernel
 from glassplat.kernels.backend.cpu_vector import (
     absolute,
     bits_of,
@@ -34,7 +34,7 @@ from glassplat.kernels.backend.cpu_vector import (
 from glassplat.kernels.composite import cpu_tile as tile
 from glassplat.kernels.composite.cpu_tile import SPLATS, STOP_AFTER, lane_of, list_block, tile_bounds
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar
-from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, intersect_maths, offset_gradient
+from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, intersect, offset_gradient
 from glassplat.kernels.records import REAL_OF, Discs, TileBins
 
 # Columns of a packed disc: first its outline as a packed splat, whose ORDER column is reused once blocks are known.
@@ -90,7 +90,7 @@ def _fetch(real: type) -> Scalar:
 
 
 def _cover(real: type) -> Scalar:
-    intersect, exp2, full = intersect_maths(real), tile.exp2_of(real), vector_kind(real, tile.LANES).full
+    exp2, full = tile.exp2_of(real), vector_kind(real, tile.LANES).full
     x_centers, y_centers = tile.pixel_centers(real)
     zero, one, farthest = real(0.0), real(1.0), real(MOST_DEVIATIONS**2)
     half_bits, least = real(0.5 / math.log(2.0)), real(math.log2(ALPHA_MIN))
@@ -333,14 +333,10 @@ def _value_of(real: type) -> Scalar:
     return value_of
 
 
-NONE, ENDLESS = np.float32(0.0), np.float32(np.inf)
-"""Exact in single precision, so that expressions are not promoted to double."""
-
-
 @inlined
 def sharpness_of(sharpness):
     """The sharpness, or zero if it is infinite for lack of a low-pass: zero times infinity would be NaN."""
-    return sharpness if sharpness < ENDLESS else NONE
+    return sharpness if sharpness < ENDLESS else ZERO
 
 
 def _unblend(real: type) -> Scalar:

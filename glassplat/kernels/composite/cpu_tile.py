@@ -37,7 +37,7 @@ from glassplat.kernels.backend.cpu_vector import (
     times_power_of_2,
     vector_kind,
 )
-from glassplat.kernels.maths.blending import ALPHA_MIN, EXP2_COEFFICIENTS, Scalar, blend_maths
+from glassplat.kernels.maths.blending import ALPHA_MIN, EXP2_COEFFICIENTS, Scalar, build_screen_form
 from glassplat.kernels.records import REAL_OF, TILE, Splats, TileBins
 
 PIXELS = TILE * TILE
@@ -142,7 +142,7 @@ def finish_state(real: type) -> Scalar:
 
 def pack_of(real: type) -> Scalar:
     """Builds the step that copies one splat's geometry to its packed row."""
-    screen_form = blend_maths(real).screen_form
+    screen_form = build_screen_form(real)
     half, zero, nothing, endless = real(0.5), real(0.0), real(-np.inf), real(np.inf)
     alpha_min, bits = real(ALPHA_MIN), 1.0 / math.log(2.0)
 

@@ -22,7 +22,7 @@ from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.backend.devices import SIMULATED
 from glassplat.kernels.composite.cpu_tile import joined_cameras, tile_bounds
 from glassplat.kernels.composite.cuda_tile import BUCKET, PIXELS, at
-from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar, blend_maths
+from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar, build_reached_rows
 from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, offset_gradient
 from glassplat.kernels.maths.fast_maths import exp2_maths, fused_maths, reciprocal_maths
 from glassplat.kernels.records import REAL_OF, TILE, Discs, TileBins
@@ -39,9 +39,8 @@ KEPT_T, KEPT_DEPTH, KEPT_TOTAL, KEPT_SQUARES, KEPT_VALUES = range(5)
 
 
 def _load(real: type) -> Scalar:
-    maths = blend_maths(real)
-    vertical_reach, row_range = maths.vertical_reach, maths.row_range
-    zero, half, one, endless, alpha_min = real(0.0), real(0.5), real(1.0), real(np.inf), real(ALPHA_MIN)
+    reached_rows, half, alpha_min = build_reached_rows(real), real(0.5), real(ALPHA_MIN)
+    zero, one, endless = real(0.0), real(1.0), real(np.inf)
 
     @inlined
     def load(geometry, i, s, means, maps, opacities, depths, centers, conics, x0, y0, num_rows):
@@ -58,9 +57,8 @@ def _load(real: type) -> Scalar:
         if conics[s, 0] == zero and conics[s, 1] == zero and conics[s, 2] == zero:
             # The disc crosses the near plane and may reach any row.
             return np.int32((1 << num_rows) - 1)
-        reach = vertical_reach(conics[s, 0], conics[s, 1], conics[s, 2], opacity)
-        first, last = row_range(centers[s, 1] - real(y0), reach, num_rows)
-        return np.int32((1 << last) - (1 << first))
+        center_y = centers[s, 1] - real(y0)
+        return reached_rows(center_y, conics[s, 0], conics[s, 1], conics[s, 2], opacity, num_rows)
 
     return load
 

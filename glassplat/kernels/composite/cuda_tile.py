@@ -17,7 +17,7 @@ from torch import Tensor
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.backend.devices import SIMULATED
-from glassplat.kernels.maths.blending import Scalar, blend_maths
+from glassplat.kernels.maths.blending import Scalar, build_reached_rows, build_screen_form
 from glassplat.kernels.maths.fast_maths import exp2_maths, fused_maths
 from glassplat.kernels.records import REAL_OF, TILE, Splats, TileBins
 
@@ -42,8 +42,7 @@ ALIGNMENT = None if SIMULATED else 16
 
 def tile_steps(real: type) -> tuple[Scalar, Scalar]:
     """Builds the steps shared by all blending kernels: `load` and `coverage`."""
-    maths = blend_maths(real)
-    screen_form, vertical_reach, row_range = maths.screen_form, maths.vertical_reach, maths.row_range
+    screen_form, reached_rows = build_screen_form(real), build_reached_rows(real)
     exp2, fused, half = exp2_maths(real), fused_maths(), real(0.5)
 
     @inlined
@@ -54,8 +53,7 @@ def tile_steps(real: type) -> tuple[Scalar, Scalar]:
         geometry[i, MEAN_X], geometry[i, MEAN_Y] = means[s, 0] - real(x0) - half, mean_y - half
         geometry[i, FORM_XX], geometry[i, FORM_XY], geometry[i, FORM_YY] = screen_form(xx, xy, yy)
         geometry[i, OPACITY] = opacity
-        first, last = row_range(mean_y, vertical_reach(xx, xy, yy, opacity), num_rows)
-        return np.int32((1 << last) - (1 << first))
+        return reached_rows(mean_y, xx, xy, yy, opacity, num_rows)
 
     @inlined
     def coverage(geometry, i, x, y):

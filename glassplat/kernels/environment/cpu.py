@@ -24,7 +24,19 @@ from torch import Tensor
 
 from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
 from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.maths.cube import cube_maths, lookup_maths, mirror_ray, mirrored_gradient, over_column, over_row
+from glassplat.kernels.maths.cube import (
+    bilinear,
+    bilinear_gradient,
+    build_cell,
+    build_logistic,
+    from_face,
+    lookup_maths,
+    mirror_ray,
+    mirrored_gradient,
+    on_face,
+    over_column,
+    over_row,
+)
 from glassplat.kernels.maths.projection import dot
 from glassplat.kernels.maths.surface import surface_maths
 from glassplat.kernels.records import NORMAL_AT, NORMAL_MIN, REAL_OF, STRENGTH_AT, SURFACE_CHANNELS, Shaded
@@ -56,7 +68,7 @@ def gradients_like(v_channels: Tensor) -> tuple[Tensor, ...]:
 @cache
 def surface_channels_forward(real: type) -> Kernel:
     """Fills the channels."""
-    describe, zero = surface_maths(real).describe, real(0.0)
+    (describe, _), zero = surface_maths(real), real(0.0)
 
     @kernel("surface_channels_forward", real)
     def forward(colors, radii, quats, log_scales, means, logit_strengths, camera_center, extra, channels):
@@ -72,7 +84,7 @@ def surface_channels_forward(real: type) -> Kernel:
 @cache
 def surface_channels_backward(real: type) -> Kernel:
     """Fills the gradients."""
-    describe_gradient, zero = surface_maths(real).describe_gradient, real(0.0)
+    (_, describe_gradient), zero = surface_maths(real), real(0.0)
 
     @kernel("surface_channels_backward", real)
     def backward(
@@ -346,9 +358,7 @@ def normal_of(blended, row, column):
 
 
 def _cube_positions(real: type) -> Scalar:
-    maths = cube_maths(real)
-    on_face, cell = maths.on_face, maths.cell
-    one, half = real(1.0), real(0.5)
+    cell, one, half = build_cell(real), real(1.0), real(0.5)
 
     @inlined
     def cube_positions(run, whole, row, side, intrinsics, rotation):
@@ -382,10 +392,8 @@ def _cube_positions(real: type) -> Scalar:
 @cache
 def shade_environment_forward(real: type) -> Kernel:
     """Fills rgb, base and reflection."""
-    maths, cube_positions = cube_maths(real), _cube_positions(real)
-    logistic, bilinear = maths.logistic, maths.bilinear
-    shortest = real(NORMAL_MIN**2)
-    zero, one = real(0.0), real(1.0)
+    logistic, cube_positions = build_logistic(real), _cube_positions(real)
+    shortest, zero, one = real(NORMAL_MIN**2), real(0.0), real(1.0)
 
     @inlined
     def sample_cube(run, whole, flat, below):
@@ -439,7 +447,7 @@ def shade_environment_forward(real: type) -> Kernel:
 
 
 def _position_gradients(real: type) -> Scalar:
-    bilinear_gradient, zero = cube_maths(real).bilinear_gradient, real(0.0)
+    zero = real(0.0)
 
     @inlined
     def position_gradients(run, whole, flat, below):
@@ -460,7 +468,6 @@ def _position_gradients(real: type) -> Scalar:
 
 
 def _normal_gradients(real: type) -> Scalar:
-    from_face = cube_maths(real).from_face
     half = real(0.5)
 
     @inlined

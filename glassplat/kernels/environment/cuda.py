@@ -20,7 +20,19 @@ from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.environment.cpu import gradients_like
 from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.maths.cube import cube_maths, lookup_maths, mirror_ray, mirrored_gradient, over_column, over_row
+from glassplat.kernels.maths.cube import (
+    bilinear,
+    bilinear_gradient,
+    build_cell,
+    build_logistic,
+    from_face,
+    lookup_maths,
+    mirror_ray,
+    mirrored_gradient,
+    on_face,
+    over_column,
+    over_row,
+)
 from glassplat.kernels.maths.projection import dot
 from glassplat.kernels.maths.surface import surface_maths
 from glassplat.kernels.records import NORMAL_AT, NORMAL_MIN, REAL_OF, STRENGTH_AT, SURFACE_CHANNELS, Shaded
@@ -49,7 +61,7 @@ def surface_channels_gradients(saved: Sequence[Tensor], v_channels: Tensor) -> t
 @cache
 def surface_channels_forward(real: type) -> Kernel:
     """Fills the channels of visible Gaussians."""
-    describe, zero = surface_maths(real).describe, real(0.0)
+    (describe, _), zero = surface_maths(real), real(0.0)
 
     @kernel("surface_channels_forward", real, "real2 real2 real2 real2 real2 real1 real1 real2 real2")
     def forward(colors, radii, quats, log_scales, means, logit_strengths, camera_center, extra, channels):
@@ -63,7 +75,7 @@ def surface_channels_forward(real: type) -> Kernel:
 @cache
 def surface_channels_backward(real: type) -> Kernel:
     """Fills the gradients of visible Gaussians."""
-    describe_gradient, zero = surface_maths(real).describe_gradient, real(0.0)
+    (_, describe_gradient), zero = surface_maths(real), real(0.0)
 
     @kernel("surface_channels_backward", real, "real2 real2 real2 real2 real2 real2 real2 real1 real2")
     def backward(
@@ -305,8 +317,7 @@ def shade_environment_gradients(
 
 
 def _cube_position(real: type) -> Scalar:
-    maths, one, half = cube_maths(real), real(1.0), real(0.5)
-    on_face, cell = maths.on_face, maths.cell
+    cell, one, half = build_cell(real), real(1.0), real(0.5)
 
     @inlined
     def cube_position(row, column, normal, intrinsics, rotation, size):
@@ -330,8 +341,7 @@ def _cube_position(real: type) -> Scalar:
 @cache
 def shade_environment_forward(real: type) -> Kernel:
     """Fills rgb, base and reflection."""
-    maths, cube_position = cube_maths(real), _cube_position(real)
-    logistic, bilinear = maths.logistic, maths.bilinear
+    logistic, cube_position = build_logistic(real), _cube_position(real)
     shortest, zero, one = real(NORMAL_MIN**2), real(0.0), real(1.0)
 
     @kernel("shade_environment_forward", real, "real real3 real2 real4 real1 real2 real1 real3 real3 real3")
@@ -362,8 +372,7 @@ def shade_environment_forward(real: type) -> Kernel:
 @cache
 def shade_environment_backward(real: type) -> Kernel:
     """Fills the gradients of blended, alpha and the lookups, and the cells and fractions of each pixel."""
-    maths, cube_position = cube_maths(real), _cube_position(real)
-    from_face, bilinear_gradient = maths.from_face, maths.bilinear_gradient
+    cube_position = _cube_position(real)
     shortest, zero, half, one = real(NORMAL_MIN**2), real(0.0), real(0.5), real(1.0)
 
     @kernel(

@@ -1,13 +1,14 @@
 """Scalar maths of blending: the coverage of a pixel by a splat, and the image rows that a splat can reach.
 
-Every function is pure and typed by its factory, so that one source compiles for the CPU and for CUDA.
+Every function is pure and, if it has constants that single precision rounds, typed by its factory: np.float32 or
+np.float64. So one source compiles for the CPU and for CUDA.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -26,35 +27,13 @@ EXP2_COEFFICIENTS = (1.0, 0.693143721, 0.240180143, 0.0552973572, 0.00920579680,
 Scalar = Callable[..., Any]
 
 
-class BlendMaths(NamedTuple):
-    """Scalar functions of blending for one floating-point type.
-
-    Attributes:
-        exp2: 2^t for t <= 0. NaN and anything below -80 give 2^-80, which is far below `ALPHA_MIN`.
-        screen_form: a conic scaled so that a Gaussian falls off as 2^(quadratic form of the offset).
-        vertical_reach: distance in rows from its centre at which a splat's coverage drops to `ALPHA_MIN`; negative if
-            it reaches no pixel.
-        row_range: first and one-past-last of the rows 0 .. count - 1 that a splat reaches.
-    """
-
-    exp2: Scalar
-    screen_form: Scalar
-    vertical_reach: Scalar
-    row_range: Scalar
-
-
-def blend_maths(real: type) -> BlendMaths:
-    """Builds the functions for `real`, np.float32 or np.float64."""
-    exp2 = _fast_exp2(real) if real is np.float32 else _exact_exp2(real)
-    return BlendMaths(exp2, _screen_form(real), _vertical_reach(real), _row_range(real))
-
-
-def _fast_exp2(real: type) -> Scalar:
+def build_exp2(real: type) -> Scalar:
+    """Builds 2^t for t <= 0. NaN and anything below -80 give 2^-80, which is far below `ALPHA_MIN`."""
     c0, c1, c2, c3, c4, c5 = (real(c) for c in EXP2_COEFFICIENTS)
-    lowest = real(-80.0)
+    lowest, natural = real(-80.0), real(math.log(2.0))
 
     @inlined
-    def exp2(t):
+    def fast_exp2(t):
         # This order of the comparison maps NaN to the lowest value too.
         t = t if t > lowest else lowest
         # Truncation towards zero is one vector instruction; math.floor would widen to 64 bits.
@@ -64,21 +43,16 @@ def _fast_exp2(real: type) -> Scalar:
         power = np.int32((whole + np.int32(127)) << np.int32(23)).view(np.float32)
         return fraction * power
 
-    return exp2
-
-
-def _exact_exp2(real: type) -> Scalar:
-    lowest, natural = real(-80.0), real(math.log(2.0))
-
     @inlined
-    def exp2(t):
+    def exact_exp2(t):
         t = t if t > lowest else lowest
         return real(math.exp(t * natural))
 
-    return exp2
+    return fast_exp2 if real is np.float32 else exact_exp2
 
 
-def _screen_form(real: type) -> Scalar:
+def build_screen_form(real: type) -> Scalar:
+    """Builds the scaling of a conic such that a Gaussian falls off as 2^(quadratic form of the offset)."""
     bits = real(-1.0 / math.log(2.0))
     half_bits = real(-0.5 / math.log(2.0))
 
@@ -89,7 +63,11 @@ def _screen_form(real: type) -> Scalar:
     return screen_form
 
 
-def _vertical_reach(real: type) -> Scalar:
+def build_vertical_reach(real: type) -> Scalar:
+    """Builds the distance in rows from its centre at which a splat's coverage drops to `ALPHA_MIN`.
+
+    It is negative if the splat reaches no pixel.
+    """
     zero, one, two, nothing = real(0.0), real(1.0), real(2.0), real(-1.0)
     inverse_alpha_min, slack, endless = real(1.0 / ALPHA_MIN), real(1e-3), real(np.inf)
 
@@ -107,7 +85,8 @@ def _vertical_reach(real: type) -> Scalar:
     return vertical_reach
 
 
-def _row_range(real: type) -> Scalar:
+def build_row_range(real: type) -> Scalar:
+    """Builds the first and one-past-last of the rows 0 .. count - 1 that a splat reaches."""
     half, zero = real(0.5), real(0.0)
 
     @inlined
@@ -121,3 +100,15 @@ def _row_range(real: type) -> Scalar:
         return np.int32(math.ceil(low)), np.int32(high) + np.int32(1)
 
     return row_range
+
+
+def build_reached_rows(real: type) -> Scalar:
+    """Builds the rows 0 .. count - 1 that a splat reaches, as bits."""
+    vertical_reach, row_range = build_vertical_reach(real), build_row_range(real)
+
+    @inlined
+    def reached_rows(center, conic_xx, conic_xy, conic_yy, opacity, count):
+        first, last = row_range(center, vertical_reach(conic_xx, conic_xy, conic_yy, opacity), count)
+        return np.int32((1 << last) - (1 << first))
+
+    return reached_rows

@@ -7,73 +7,46 @@ texels of faces padded by a ring of their neighbours' texels: texel i is cell i 
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from glassplat.kernels.backend.cpu import inlined
-from glassplat.kernels.maths.blending import Scalar, blend_maths
+from glassplat.kernels.backend.cpu import ONE, TWO, ZERO, inlined
+from glassplat.kernels.maths.blending import Scalar, build_exp2
 from glassplat.kernels.maths.projection import combine, dot
 
 
-class CubeMaths(NamedTuple):
-    """Scalar functions of directions for one floating-point type.
+@inlined
+def on_face(x, y, z):
+    """(Axis, face, u, v, 1 / |largest coordinate|) of a direction; u and v are in [-1, 1]."""
+    size_x, size_y, size_z = abs(x), abs(y), abs(z)
+    if size_x >= size_y and size_x >= size_z:
+        axis, major, along, down = 0, x, y, z
+    elif size_y >= size_z:
+        axis, major, along, down = 1, y, z, x
+    else:
+        axis, major, along, down = 2, z, x, y
+    inverse = ONE / abs(major)
+    return axis, 2 * axis + (1 if major < ZERO else 0), along * inverse, down * inverse, inverse
 
-    Attributes:
-        on_face: (axis, face, u, v, 1 / |largest coordinate|) of a direction x, y, z; u and v in [-1, 1].
-        from_face: gradient of x, y, z from those of u and v, given the result of `on_face`.
-        cell: first of the two cells around u or v, and the fraction of the way to the second one. The cell is valid for
-            every value; the fraction of NaN is NaN.
-        bilinear: bilinear interpolation of two cells of a row and the two below them, at the fractions along the row
-            and down.
-        bilinear_gradient: its derivatives with respect to these fractions.
-        logistic: 1 / (1 + exp(-x)).
+
+@inlined
+def from_face(place, g_u, g_v):
+    """Gradient of a direction from those of u and v, given the result of `on_face`."""
+    axis, face, u, v, inverse = place
+    along, down = g_u * inverse, g_v * inverse
+    outwards = -(along * u + down * v)
+    outwards = -outwards if face > 2 * axis else outwards
+    if axis == 0:
+        return outwards, along, down
+    if axis == 1:
+        return down, outwards, along
+    return along, down, outwards
+
+
+def build_cell(real: type) -> Scalar:
+    """Builds the first of the two cells around u or v, and the fraction of the way to the second one.
+
+    The cell is valid for every value; the fraction of NaN is NaN.
     """
-
-    on_face: Scalar
-    from_face: Scalar
-    cell: Scalar
-    bilinear: Scalar
-    bilinear_gradient: Scalar
-    logistic: Scalar
-
-
-def cube_maths(real: type) -> CubeMaths:
-    """Builds the functions for `real`, np.float32 or np.float64."""
-    return CubeMaths(*_faces(real), _cell(real), *_filter(real), _logistic(real))
-
-
-def _faces(real: type) -> tuple[Scalar, Scalar]:
-    zero, one = real(0.0), real(1.0)
-
-    @inlined
-    def on_face(x, y, z):
-        size_x, size_y, size_z = abs(x), abs(y), abs(z)
-        if size_x >= size_y and size_x >= size_z:
-            axis, major, along, down = 0, x, y, z
-        elif size_y >= size_z:
-            axis, major, along, down = 1, y, z, x
-        else:
-            axis, major, along, down = 2, z, x, y
-        inverse = one / abs(major)
-        return axis, 2 * axis + (1 if major < zero else 0), along * inverse, down * inverse, inverse
-
-    @inlined
-    def from_face(place, g_u, g_v):
-        axis, face, u, v, inverse = place
-        along, down = g_u * inverse, g_v * inverse
-        outwards = -(along * u + down * v)
-        outwards = -outwards if face > 2 * axis else outwards
-        if axis == 0:
-            return outwards, along, down
-        if axis == 1:
-            return down, outwards, along
-        return along, down, outwards
-
-    return on_face, from_face
-
-
-def _cell(real: type) -> Scalar:
     half = real(0.5)
 
     @inlined
@@ -88,32 +61,30 @@ def _cell(real: type) -> Scalar:
     return cell
 
 
-def _filter(real: type) -> tuple[Scalar, Scalar]:
-    one = real(1.0)
-
-    @inlined
-    def bilinear(left, right, lower_left, lower_right, along, down):
-        above = left * (one - along) + right * along
-        below = lower_left * (one - along) + lower_right * along
-        return above * (one - down) + below * down
-
-    @inlined
-    def bilinear_gradient(left, right, lower_left, lower_right, along, down):
-        across = right - left
-        twist = lower_right - lower_left - across
-        return across + down * twist, lower_left - left + along * twist
-
-    return bilinear, bilinear_gradient
+@inlined
+def bilinear(left, right, lower_left, lower_right, along, down):
+    """Interpolation of two cells of a row and the two below them, at the fractions along the row and down."""
+    above = left * (ONE - along) + right * along
+    below = lower_left * (ONE - along) + lower_right * along
+    return above * (ONE - down) + below * down
 
 
-def _logistic(real: type) -> Scalar:
-    exp2 = blend_maths(real).exp2
-    zero, one, bits = real(0.0), real(1.0), real(1.0 / np.log(2.0))
+@inlined
+def bilinear_gradient(left, right, lower_left, lower_right, along, down):
+    """Derivatives of `bilinear` with respect to the fractions."""
+    across = right - left
+    twist = lower_right - lower_left - across
+    return across + down * twist, lower_left - left + along * twist
+
+
+def build_logistic(real: type) -> Scalar:
+    """Builds 1 / (1 + exp(-x))."""
+    exp2, bits = build_exp2(real), real(1.0 / np.log(2.0))
 
     @inlined
     def logistic(x):
         small = exp2(-abs(x) * bits)
-        value = (one if x >= zero else small) / (one + small)
+        value = (ONE if x >= ZERO else small) / (ONE + small)
         # `exp2` treats NaN as a very small number.
         return value if x == x else x
 
@@ -122,8 +93,7 @@ def _logistic(real: type) -> Scalar:
 
 def lookup_maths(real: type) -> tuple[Scalar, Scalar]:
     """Lookup of padded faces in direction `i`, and the gradient of that direction."""
-    on_face, from_face, cell, bilinear, bilinear_gradient, _ = cube_maths(real)
-    zero, half = real(0.0), real(0.5)
+    cell, zero, half = build_cell(real), real(0.0), real(0.5)
 
     @inlined
     def look_up(i, padded, directions, found):
@@ -160,10 +130,6 @@ def lookup_maths(real: type) -> tuple[Scalar, Scalar]:
         return face * side + row, column
 
     return look_up, look_up_gradient
-
-
-TWO = np.float32(2.0)
-"""In single precision, where it is exact, so that it does not promote float32."""
 
 
 @inlined

@@ -14,13 +14,12 @@ Every function is pure and, if it has constants, typed by its factory: one sourc
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.backend.cpu import ONE, ZERO, inlined
 from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
-from glassplat.kernels.maths.projection import combine, cross, dot, dot_products, scaled_sum
+from glassplat.kernels.maths.projection import combine, cross, dot, dot_products, scaled, scaled_sum
 
 EDGE_ON = 1e-3
 """Cosine between ray and normal below which a disc is seen edge-on and not intersected."""
@@ -30,26 +29,17 @@ MOST_DEVIATIONS = 3.0
 """Distance from its centre, in standard deviations, at which a Gaussian is cut off (EnvGS, Section 4.2)."""
 
 
-class RayHitMaths(NamedTuple):
-    """Steps for one ray and one Gaussian; vectors are tuples, a frame is a tuple of three rows.
+def ray_hit_maths(real: type, flat: bool) -> tuple[Scalar, Scalar]:
+    """Builds the intersection of a ray with a disc (`flat`) or ellipsoid, and its adjoint.
 
-    Attributes:
-        intersect: (t, q, squared |q|) from offset (centre minus origin), direction and frame; t is not finite where the
-            two do not meet.
-        intersect_gradient: gradients (origin, direction, frame rows) from those of t and of squared |q|. That of the
-            centre is the negative of the origin's.
+    Vectors are tuples, a frame is a tuple of three rows. `intersect` returns (t, q, squared |q|) from offset (centre
+    minus origin), direction and frame; t is not finite where the two do not meet. `intersect_gradient` returns those of
+    (origin, direction, frame rows) from those of t and of squared |q|; the centre's is the negative of the origin's.
     """
-
-    intersect: Scalar
-    intersect_gradient: Scalar
-
-
-def ray_hit_maths(real: type, flat: bool) -> RayHitMaths:
-    """Builds the functions for discs (`flat`) or ellipsoids."""
     return _disc(real) if flat else _ellipsoid(real)
 
 
-def _disc(real: type) -> RayHitMaths:
+def _disc(real: type) -> tuple[Scalar, Scalar]:
     zero, one, two, nowhere, edge_on = real(0.0), real(1.0), real(2.0), real("inf"), real(EDGE_ON)
 
     @inlined
@@ -70,24 +60,13 @@ def _disc(real: type) -> RayHitMaths:
         v_x = combine(v_u, frame[0], v_v, frame[1])
         along_normal = (v_t + dot(v_x, d)) * inverse_slope
         v_origin = combine(one, v_x, -along_normal, frame[2])
-        v_d = t * v_origin[0], t * v_origin[1], t * v_origin[2]
-        v_frame = (
-            (v_u * x[0], v_u * x[1], v_u * x[2]),
-            (v_v * x[0], v_v * x[1], v_v * x[2]),
-            (-along_normal * x[0], -along_normal * x[1], -along_normal * x[2]),
-        )
-        return v_origin, v_d, v_frame
+        return v_origin, scaled(t, v_origin), (scaled(v_u, x), scaled(v_v, x), scaled(-along_normal, x))
 
-    return RayHitMaths(intersect, intersect_gradient)
+    return intersect, intersect_gradient
 
 
-def _ellipsoid(real: type) -> RayHitMaths:
+def _ellipsoid(real: type) -> tuple[Scalar, Scalar]:
     zero, one, two, nowhere = real(0.0), real(1.0), real(2.0), real("inf")
-
-    @inlined
-    def outer(a, b, v, w):
-        """One row of a v^T + b w^T, for numbers a and b."""
-        return a * v[0] + b * w[0], a * v[1] + b * w[1], a * v[2] + b * w[2]
 
     @inlined
     def across(q, f, length):
@@ -100,7 +79,7 @@ def _ellipsoid(real: type) -> RayHitMaths:
 
     @inlined
     def intersect(offset, d, frame):
-        e, f = dot_products(offset, frame[0], frame[1], frame[2]), dot_products(d, frame[0], frame[1], frame[2])
+        e, f = dot_products(offset, frame), dot_products(d, frame)
         length = dot(f, f)
         if not length > zero:
             return nowhere, (zero, zero, zero), nowhere
@@ -110,7 +89,7 @@ def _ellipsoid(real: type) -> RayHitMaths:
 
     @inlined
     def intersect_gradient(offset, d, frame, t, q, v_t, v_squared):
-        e, f = dot_products(offset, frame[0], frame[1], frame[2]), dot_products(d, frame[0], frame[1], frame[2])
+        e, f = dot_products(offset, frame), dot_products(d, frame)
         length = dot(f, f)
         # Repeated, because the first projection leaves a rounding error of its own.
         q = across(q, f, length)
@@ -119,12 +98,15 @@ def _ellipsoid(real: type) -> RayHitMaths:
         v_e = combine(-two * v_squared, q, by_t, f)
         reflected = e[0] - two * t * f[0], e[1] - two * t * f[1], e[2] - two * t * f[2]
         v_f = combine(two * v_squared * t, q, by_t, reflected)
-        v_offset = scaled_sum(v_e, frame[0], frame[1], frame[2])
-        v_d = scaled_sum(v_f, frame[0], frame[1], frame[2])
-        v_frame = (outer(v_e[0], v_f[0], offset, d), outer(v_e[1], v_f[1], offset, d), outer(v_e[2], v_f[2], offset, d))
+        v_offset, v_d = scaled_sum(v_e, frame), scaled_sum(v_f, frame)
+        v_frame = (
+            combine(v_e[0], offset, v_f[0], d),
+            combine(v_e[1], offset, v_f[1], d),
+            combine(v_e[2], offset, v_f[2], d),
+        )
         return (-v_offset[0], -v_offset[1], -v_offset[2]), v_d, v_frame
 
-    return RayHitMaths(intersect, intersect_gradient)
+    return intersect, intersect_gradient
 
 
 LOW_PASS = math.sqrt(0.5)
@@ -135,33 +117,9 @@ SLACK = 1.002
 """Factor by which an outline is wider than the region it encloses, so that no pixel is lost to rounding."""
 
 
-class DiscMaths(NamedTuple):
-    """Steps for one disc in one camera; vectors are tuples.
-
-    Attributes:
-        cross_products: (q x m, m x p, p x q) from tangents and centre.
-        is_not_edge_on: whether a disc is not seen edge-on, from p x q and the centre.
-        pixel_map: the map from these products, centre, inverse deviations and focal lengths.
-        map_gradient: gradients of tangents, centre and the logarithms of the deviations from those of the map.
-    """
-
-    cross_products: Scalar
-    is_not_edge_on: Scalar
-    pixel_map: Scalar
-    map_gradient: Scalar
-
-
-def disc_maths(real: type) -> DiscMaths:
-    """Builds the functions for `real`, np.float32 or np.float64."""
-    return DiscMaths(*_shape(real), _map_gradient(real))
-
-
-def _shape(real: type) -> tuple[Scalar, Scalar, Scalar]:
+def build_is_not_edge_on(real: type) -> Scalar:
+    """Builds the test that a disc is not seen edge-on, from p x q and the centre."""
     edge_on, largest = real(EDGE_ON), real(np.finfo(real).max)
-
-    @inlined
-    def cross_products(p, q, m):
-        return cross(q, m), cross(m, p), cross(p, q)
 
     @inlined
     def is_not_edge_on(n, m):
@@ -169,46 +127,39 @@ def _shape(real: type) -> tuple[Scalar, Scalar, Scalar]:
         # Written so that NaN fails the comparison.
         return edge_on * edge_on * dot(n, n) * dot(m, m) < slope * slope <= largest
 
-    @inlined
-    def pixel_map(a, b, n, m, inverse_u, inverse_v, fx, fy):
-        k = m[2] / dot(n, m)
-        x, y = k / fx, k / fy
-        return (
-            a[0] * inverse_u * x,
-            a[1] * inverse_u * y,
-            b[0] * inverse_v * x,
-            b[1] * inverse_v * y,
-            n[0] * x,
-            n[1] * y,
-        )
-
-    return cross_products, is_not_edge_on, pixel_map
+    return is_not_edge_on
 
 
-def _map_gradient(real: type) -> Scalar:
-    zero, one = real(0.0), real(1.0)
+@inlined
+def pixel_map(p, q, n, m, inverse_u, inverse_v, fx, fy):
+    """The map of a disc, from its tangents, p x q, centre, inverse deviations and focal lengths."""
+    k, a, b = m[2] / dot(n, m), cross(q, m), cross(m, p)
+    x, y = k / fx, k / fy
+    return a[0] * inverse_u * x, a[1] * inverse_u * y, b[0] * inverse_v * x, b[1] * inverse_v * y, n[0] * x, n[1] * y
 
-    @inlined
-    def plus(a, b):
-        return combine(one, a, one, b)
 
-    @inlined
-    def map_gradient(p, q, m, n, found, inverse_u, inverse_v, fx, fy, g):
-        slope = dot(n, m)
-        k = m[2] / slope
-        x, y = k / fx, k / fy
-        along_u, along_v = g[0] * found[0] + g[1] * found[1], g[2] * found[2] + g[3] * found[3]
-        total = along_u + along_v + g[4] * found[4] + g[5] * found[5]
-        g_a = g[0] * inverse_u * x, g[1] * inverse_u * y, zero
-        g_b = g[2] * inverse_v * x, g[3] * inverse_v * y, zero
-        g_slope = -total / slope
-        g_n = combine(g_slope, m, one, (g[4] * x, g[5] * y, zero))
-        g_p = plus(cross(g_b, m), cross(q, g_n))
-        g_q = plus(cross(m, g_a), cross(g_n, p))
-        g_m = combine(g_slope, n, one, plus(cross(g_a, q), cross(p, g_b)))
-        return g_p, g_q, (g_m[0], g_m[1], g_m[2] + total / m[2]), -along_u, -along_v
+@inlined
+def plus(a, b):
+    """The sum a + b."""
+    return combine(ONE, a, ONE, b)
 
-    return map_gradient
+
+@inlined
+def map_gradient(p, q, m, n, found, inverse_u, inverse_v, fx, fy, g):
+    """Gradients of tangents, centre and the logarithms of the deviations, from those of the map."""
+    slope = dot(n, m)
+    k = m[2] / slope
+    x, y = k / fx, k / fy
+    along_u, along_v = g[0] * found[0] + g[1] * found[1], g[2] * found[2] + g[3] * found[3]
+    total = along_u + along_v + g[4] * found[4] + g[5] * found[5]
+    g_a = g[0] * inverse_u * x, g[1] * inverse_u * y, ZERO
+    g_b = g[2] * inverse_v * x, g[3] * inverse_v * y, ZERO
+    g_slope = -total / slope
+    g_n = combine(g_slope, m, ONE, (g[4] * x, g[5] * y, ZERO))
+    g_p = plus(cross(g_b, m), cross(q, g_n))
+    g_q = plus(cross(m, g_a), cross(g_n, p))
+    g_m = combine(g_slope, n, ONE, plus(cross(g_a, q), cross(p, g_b)))
+    return g_p, g_q, (g_m[0], g_m[1], g_m[2] + total / m[2]), -along_u, -along_v
 
 
 # The region of the screen that a disc covers, as an ellipse for `bin_tiles`, in double precision.
@@ -296,16 +247,11 @@ def crossing_box(m, p, q, deviations, squared, near, fx, fy):
     return left, right, top, bottom
 
 
-def intersect_maths(real: type) -> Scalar:
-    """Builds `intersect`: the numerators of u and v, and e, at offsets or vectors of them (`backend/cpu_vector.py`)."""
-    one = real(1.0)
-
-    @inlined
-    def intersect(found, dx, dy):
-        u_x, u_y, v_x, v_y, w_x, w_y = found
-        return dx * u_x + dy * u_y, dx * v_x + dy * v_y, dx * w_x + dy * w_y + one
-
-    return intersect
+@inlined
+def intersect(found, dx, dy):
+    """The numerators of u and v, and e, of a map at offsets or vectors of them (`backend/cpu_vector.py`)."""
+    u_x, u_y, v_x, v_y, w_x, w_y = found
+    return dx * u_x + dy * u_y, dx * v_x + dy * v_y, dx * w_x + dy * w_y + ONE
 
 
 @inlined

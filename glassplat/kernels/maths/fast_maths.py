@@ -10,7 +10,7 @@ from numba import cuda, types
 
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.devices import SIMULATED
-from glassplat.kernels.maths.blending import Scalar, blend_maths
+from glassplat.kernels.maths.blending import Scalar, build_exp2
 
 
 def fused_maths() -> Scalar:
@@ -33,7 +33,7 @@ def fused_maths() -> Scalar:
 def exp2_maths(real: type) -> Scalar:
     """Builds 2^t. In float32 within two units in the last place; 0 for results below the smallest normal number."""
     if SIMULATED or real is not np.float32:
-        return blend_maths(real).exp2
+        return build_exp2(real)
     return _instruction("ex2.approx.ftz.f32")
 
 

@@ -6,10 +6,9 @@ Signs and order are those of 3DGS, so that its files can be read as they are.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
 
 from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.maths.blending import Scalar
 
 MAX_DEGREE = 3
 SH_CONSTANTS = (
@@ -37,25 +36,17 @@ def check_sh_degree(sh_degree: int, coefficients: int) -> None:
         )
 
 
-class ColorMaths(NamedTuple):
-    """Colour of one Gaussian from its coefficients `sh[n]` [K, 3], for one floating-point type.
+def color_maths(real: type) -> tuple[Scalar, Scalar]:
+    """Builds the colour of one Gaussian from its coefficients `sh[n]` [K, 3], and its adjoint.
 
-    Attributes:
-        color: (r, g, b) before the offset and the clamp, seen along a unit direction (x, y, z).
-        color_gradient: adds the gradient of the coefficients to `g_sh[n]` and returns that of the direction.
+    `color` returns (r, g, b) before the offset and the clamp, seen along a unit direction (x, y, z). `color_gradient`
+    adds the gradient of the coefficients to `g_sh[n]` and returns that of the direction.
     """
-
-    color: Callable[..., Any]
-    color_gradient: Callable[..., Any]
-
-
-def color_maths(real: type) -> ColorMaths:
-    """Builds the functions for `real`, np.float32 or np.float64."""
     basis = harmonic_basis(real)
-    return ColorMaths(_color(basis), _color_gradient(real, basis))
+    return _color(basis), _color_gradient(real, basis)
 
 
-def harmonic_basis(real: type) -> Callable[..., Any]:
+def harmonic_basis(real: type) -> Scalar:
     """Builds the function that returns all 16 harmonics of a unit direction (x, y, z)."""
     c0, c1, c_xy, c_zz, c_xx, c_yxx, c_xyz, c_yzz, c_zzz, c_zxx = (real(c) for c in SH_CONSTANTS)
     two, three, four = real(2.0), real(3.0), real(4.0)
@@ -85,7 +76,7 @@ def harmonic_basis(real: type) -> Callable[..., Any]:
     return basis
 
 
-def build_channel(take: Callable[..., Any]) -> Callable[..., Any]:
+def build_channel(take: Scalar) -> Scalar:
     """Builds the function that evaluates one colour channel from harmonics, for scalars or vectors.
 
     `take(sh, n, k, c)` reads channel c of coefficient k.
@@ -109,7 +100,7 @@ def build_channel(take: Callable[..., Any]) -> Callable[..., Any]:
     return channel
 
 
-def build_color_gradient(real: type, put: Callable[..., Any], v_basis: Callable[..., Any]) -> Callable[..., Any]:
+def build_color_gradient(real: type, put: Scalar, v_basis: Scalar) -> Scalar:
     """Builds the adjoint of three colour channels, for scalars or vectors; it returns the gradient of the direction.
 
     `put(g_sh, at, k, b, g)` stores or adds the gradient of coefficient k, from its harmonic b and the gradients g of
@@ -158,7 +149,7 @@ def build_color_gradient(real: type, put: Callable[..., Any], v_basis: Callable[
     return color_gradient
 
 
-def _color(basis: Callable[..., Any]) -> Callable[..., Any]:
+def _color(basis: Scalar) -> Scalar:
     @inlined
     def take(sh, n, k, c):
         return sh[n, k, c]
@@ -173,7 +164,7 @@ def _color(basis: Callable[..., Any]) -> Callable[..., Any]:
     return color
 
 
-def _color_gradient(real: type, basis: Callable[..., Any]) -> Callable[..., Any]:
+def _color_gradient(real: type, basis: Scalar) -> Scalar:
     zero = real(0.0)
 
     @inlined
@@ -195,7 +186,7 @@ def _color_gradient(real: type, basis: Callable[..., Any]) -> Callable[..., Any]
     return color_gradient
 
 
-def _direction_gradients(real: type) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
+def _direction_gradients(real: type) -> tuple[Scalar, Scalar, Scalar]:
     """Gradients of the direction, degree by degree, from the gradients h of the harmonics."""
     _, c1, c_xy, c_zz, c_xx, c_yxx, c_xyz, c_yzz, c_zzz, c_zxx = (real(c) for c in SH_CONSTANTS)
     two, three, four, six, eight = real(2.0), real(3.0), real(4.0), real(6.0), real(8.0)

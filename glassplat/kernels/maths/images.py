@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,24 +20,13 @@ _LOG2 = tuple(2 / math.log(2.0) / k for k in (1, 3, 5, 7, 9))
 _EXP2 = tuple(math.log(2.0) ** k / math.factorial(k) for k in range(8))
 
 
-class ColorSpaceMaths(NamedTuple):
-    """Scalar functions of colour for one floating-point type.
+def color_space_maths(real: type) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    """Builds the scalar functions of colour `linear`, `linear_derivative`, `encoded` and `encoded_derivative`.
 
-    Attributes:
-        linear: linear radiance of an sRGB value (IEC 61966-2-1); continued beyond 1, and linearly below 0.
-        linear_derivative: derivative of `linear`, given the sRGB value and its linear radiance.
-        encoded: sRGB value of a linear radiance, the inverse of `linear`.
-        encoded_derivative: derivative of `encoded`, given the radiance and its sRGB value.
+    `linear` is the linear radiance of an sRGB value (IEC 61966-2-1), continued beyond 1, and linearly below 0. Its
+    derivative is given the sRGB value and its linear radiance. `encoded`, the inverse of `linear`, is the sRGB value of
+    a linear radiance. Its derivative is given the radiance and its sRGB value.
     """
-
-    linear: Scalar
-    linear_derivative: Scalar
-    encoded: Scalar
-    encoded_derivative: Scalar
-
-
-def color_space_maths(real: type) -> ColorSpaceMaths:
-    """Builds the functions for `real`, np.float32 or np.float64."""
     power = _fast_power() if real is np.float32 else _exact_power
     low, low_linear = real(THRESHOLD_SRGB), real(THRESHOLD_LINEAR)
     offset, inverse_scale, scale = real(OFFSET), real(1 / (1 + OFFSET)), real(1 + OFFSET)
@@ -63,7 +51,7 @@ def color_space_maths(real: type) -> ColorSpaceMaths:
         safe = radiance if radiance > low_linear else low_linear
         return inverse_gamma * (color + offset) / safe if radiance > low_linear else slope
 
-    return ColorSpaceMaths(linear, linear_derivative, encoded, encoded_derivative)
+    return linear, linear_derivative, encoded, encoded_derivative
 
 
 def _fast_power() -> Scalar:
@@ -116,31 +104,14 @@ SIGMA = 1.5
 C1, C2 = 0.01**2, 0.03**2
 
 
-class SsimMaths(NamedTuple):
-    """Scalar functions of structural similarity for one floating-point type.
-
-    Attributes:
-        blur: weighted sum of 11 values of an array, `step` apart, the first of them at `at`.
-        compare: similarity of two pixels a and b (Wang et al. 2004, Eq. 13), and its derivatives with respect to the
-            blurred a, the blurred sum of squares a^2 + b^2 and the blurred product a b, from these and the blurred b.
-    """
-
-    blur: Scalar
-    compare: Scalar
-
-
-def ssim_maths(real: type) -> SsimMaths:
-    """Builds the functions for `real`, np.float32 or np.float64."""
-    return SsimMaths(_blur(real), _compare(real))
-
-
 def window() -> list[float]:
     """The 11 weights of the Gaussian window; they sum to one."""
     weights = [math.exp(-0.5 * (offset / SIGMA) ** 2) for offset in range(-RADIUS, RADIUS + 1)]
     return [weight / sum(weights) for weight in weights]
 
 
-def _blur(real: type) -> Scalar:
+def build_blur(real: type) -> Scalar:
+    """Builds the weighted sum of 11 values of an array, `step` apart, the first of them at `at`."""
     w0, w1, w2, w3, w4, w5 = (real(weight) for weight in window()[: RADIUS + 1])
 
     @inlined
@@ -154,7 +125,12 @@ def _blur(real: type) -> Scalar:
     return blur
 
 
-def _compare(real: type) -> Scalar:
+def build_compare(real: type) -> Scalar:
+    """Builds the similarity of two pixels a and b (Wang et al. 2004, Eq. 13), and three derivatives.
+
+    These are with respect to the blurred a, the blurred sum of squares a^2 + b^2 and the blurred product a b, from
+    these and the blurred b.
+    """
     one, two, c1, c2 = real(1.0), real(2.0), real(C1), real(C2)
 
     @inlined

@@ -7,7 +7,7 @@ the CPU and for CUDA.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, get_args
+from typing import get_args
 
 from glassplat.kernels import Fresnel
 from glassplat.kernels.backend.cpu import inlined
@@ -27,22 +27,12 @@ FULL_WEIGHT_RATIO = 2.0
 """Largest ratio s of `kernels.panes.gradient_conflict` with full weight; the weight falls to 0 at twice the ratio."""
 
 
-class PaneMaths(NamedTuple):
-    """Scalar functions of panes for one floating-point type.
+def pane_maths(real: type) -> tuple[Scalar, Scalar, Scalar]:
+    """Builds `strength`, `strength_derivatives` and `ray_length`.
 
-    Attributes:
-        strength: reflectance by a law, given the reflectance R0 at normal incidence and the cosine of the angle.
-        strength_derivatives: derivatives of `strength` by R0 and by the cosine.
-        ray_length: length of the ray (x, y, 1).
+    These are the reflectance by a law, given the reflectance R0 at normal incidence and the cosine of the angle; its
+    derivatives by R0 and by the cosine; and the length of the ray (x, y, 1).
     """
-
-    strength: Scalar
-    strength_derivatives: Scalar
-    ray_length: Scalar
-
-
-def pane_maths(real: type) -> PaneMaths:
-    """Builds the functions for `real`, np.float32 or np.float64."""
     schlick, schlick_derivatives = _schlick(real)
     two_surfaces, two_surfaces_derivatives = _two_surfaces(real)
     zero, one = real(0.0), real(1.0)
@@ -67,7 +57,7 @@ def pane_maths(real: type) -> PaneMaths:
     def ray_length(x, y):
         return real(math.sqrt(x * x + y * y + one))
 
-    return PaneMaths(strength, strength_derivatives, ray_length)
+    return strength, strength_derivatives, ray_length
 
 
 def build_edge_weighting(real: type) -> Scalar:

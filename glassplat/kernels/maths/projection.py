@@ -1,17 +1,17 @@
 """Scalar maths of projection: the shape of a Gaussian in the world and on screen, and the adjoints of both.
 
 Every function is pure, takes and returns scalars and tuples of scalars, and compiles for the CPU and for CUDA. A bare
-float or int literal would promote float32 to float64: functions with constants are typed by their factory.
+float or int literal would promote float32 to float64: functions with constants that single precision rounds, or with
+roots and exponentials, are typed by their factory.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.backend.cpu import ENDLESS, ONE, TWO, inlined
 from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
 
 LOW_PASS = 0.3
@@ -36,8 +36,15 @@ def combine(s, a, t, b):
 
 
 @inlined
-def scaled_sum(v, a, b, c):
-    """The sum x a + y b + z c for v = (x, y, z): a matrix of columns a, b, c times a vector."""
+def scaled(s, v):
+    """The product s v."""
+    return s * v[0], s * v[1], s * v[2]
+
+
+@inlined
+def scaled_sum(v, columns):
+    """The sum x a + y b + z c for v = (x, y, z): a matrix of columns (a, b, c) times a vector."""
+    a, b, c = columns
     return (
         v[0] * a[0] + v[1] * b[0] + v[2] * c[0],
         v[0] * a[1] + v[1] * b[1] + v[2] * c[1],
@@ -46,9 +53,15 @@ def scaled_sum(v, a, b, c):
 
 
 @inlined
-def dot_products(v, a, b, c):
+def dot_products(v, columns):
     """The products (a . v, b . v, c . v): the transpose of that matrix times a vector."""
-    return dot(a, v), dot(b, v), dot(c, v)
+    return dot(columns[0], v), dot(columns[1], v), dot(columns[2], v)
+
+
+@inlined
+def scaled_columns(s, columns):
+    """A matrix with each column multiplied by its own number."""
+    return scaled(s[0], columns[0]), scaled(s[1], columns[1]), scaled(s[2], columns[2])
 
 
 @inlined
@@ -60,8 +73,8 @@ def cross(a, b):
 @inlined
 def cross_squared(a, b):
     """The squared length of a x b."""
-    x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-    return x * x + y * y + z * z
+    product = cross(a, b)
+    return dot(product, product)
 
 
 @inlined
@@ -71,94 +84,67 @@ def tangential(s, v, u):
     return s * (v[0] - radial * u[0]), s * (v[1] - radial * u[1]), s * (v[2] - radial * u[2])
 
 
-class ShapeMaths(NamedTuple):
-    """From raw parameters to a Gaussian's opacity and principal axes, and back.
-
-    Attributes:
-        sigmoid: 1 / (1 + exp(-x)).
-        is_finite: whether a value is neither NaN nor infinite.
-        unit_quat: the normalised quaternion `wxyz`, and the inverse norm, which is not finite or is zero if the
-            quaternion has no direction.
-        rotation: columns of the rotation matrix of a unit quaternion.
-        unit_quat_gradient: gradient to the raw quaternion from the gradients of the three columns.
-    """
-
-    sigmoid: Scalar
-    is_finite: Scalar
-    unit_quat: Scalar
-    rotation: Scalar
-    unit_quat_gradient: Scalar
+# From raw parameters to a Gaussian's opacity and principal axes, and back.
 
 
-def shape_maths(real: type) -> ShapeMaths:
-    """Builds the functions for `real`, np.float32 or np.float64."""
-    one, two = real(1.0), real(2.0)
-    largest = real(np.finfo(real).max)
+@inlined
+def is_finite(x):
+    """Return whether a value is neither NaN nor infinite."""
+    return abs(x) < ENDLESS
+
+
+def build_sigmoid(real: type) -> Scalar:
+    """Builds 1 / (1 + exp(-x))."""
+    one = real(1.0)
 
     @inlined
     def sigmoid(x):
         return one / (one + math.exp(-x))
 
-    @inlined
-    def is_finite(x):
-        return abs(x) <= largest
+    return sigmoid
+
+
+def build_unit_quat(real: type) -> Scalar:
+    """Builds the normalised quaternion `wxyz`, and the inverse norm.
+
+    The latter is not finite or is zero if the quaternion has no direction.
+    """
+    one = real(1.0)
 
     @inlined
     def unit_quat(w, x, y, z):
         inverse_norm = one / math.sqrt(w * w + x * x + y * y + z * z)
         return (w * inverse_norm, x * inverse_norm, y * inverse_norm, z * inverse_norm), inverse_norm
 
-    @inlined
-    def rotation(quat):
-        w, x, y, z = quat
-        return (
-            (one - two * (y * y + z * z), two * (x * y + w * z), two * (x * z - w * y)),
-            (two * (x * y - w * z), one - two * (x * x + z * z), two * (y * z + w * x)),
-            (two * (x * z + w * y), two * (y * z - w * x), one - two * (x * x + y * y)),
-        )
-
-    @inlined
-    def unit_quat_gradient(quat, inverse_norm, g0, g1, g2):
-        w, x, y, z = quat
-        gw = x * (g1[2] - g2[1]) + y * (g2[0] - g0[2]) + z * (g0[1] - g1[0])
-        gx = y * (g1[0] + g0[1]) + z * (g2[0] + g0[2]) + w * (g1[2] - g2[1]) - two * x * (g1[1] + g2[2])
-        gy = x * (g1[0] + g0[1]) + z * (g2[1] + g1[2]) + w * (g2[0] - g0[2]) - two * y * (g0[0] + g2[2])
-        gz = x * (g2[0] + g0[2]) + y * (g2[1] + g1[2]) + w * (g0[1] - g1[0]) - two * z * (g0[0] + g1[1])
-        # The norm of the raw quaternion has no effect, so its direction is taken out of the gradient.
-        radial = w * gw + x * gx + y * gy + z * gz
-        scale = two * inverse_norm
-        return (
-            scale * (gw - radial * w),
-            scale * (gx - radial * x),
-            scale * (gy - radial * y),
-            scale * (gz - radial * z),
-        )
-
-    return ShapeMaths(sigmoid, is_finite, unit_quat, rotation, unit_quat_gradient)
+    return unit_quat
 
 
-class ScreenMaths(NamedTuple):
-    """EWA projection of principal axes to a screen ellipse, and its adjoint.
-
-    Attributes:
-        tangent_limits: (lowest x, highest x, lowest y, highest y) of the tangents for which the Jacobian is taken.
-        screen_covariance: (xx, xy, yy, determinant), low-pass included, from the axes seen along w_x and w_y.
-        half_extents: distances from the centre along x and y, in pixels, at which the coverage drops to `ALPHA_MIN`;
-            (0, 0) if it is never above.
-        covariance_gradient: gradients of the results of `screen_covariance`, from those (xx, xy, yy) of its inverse.
-        footprint_gradient: gradients of w_x and w_y from these, and of the three axes.
-    """
-
-    tangent_limits: Scalar
-    screen_covariance: Scalar
-    half_extents: Scalar
-    covariance_gradient: Scalar
-    footprint_gradient: Scalar
+@inlined
+def rotation(quat):
+    """Columns of the rotation matrix of a unit quaternion."""
+    w, x, y, z = quat
+    return (
+        (ONE - TWO * (y * y + z * z), TWO * (x * y + w * z), TWO * (x * z - w * y)),
+        (TWO * (x * y - w * z), ONE - TWO * (x * x + z * z), TWO * (y * z + w * x)),
+        (TWO * (x * z + w * y), TWO * (y * z - w * x), ONE - TWO * (x * x + y * y)),
+    )
 
 
-def screen_maths(real: type) -> ScreenMaths:
-    """Builds the functions for `real`, np.float32 or np.float64."""
-    return ScreenMaths(_tangent_limits(real), *_screen_covariance(real), *_screen_gradients(real))
+@inlined
+def unit_quat_gradient(quat, inverse_norm, g_columns):
+    """Gradient of the raw quaternion from those of the three columns of its rotation."""
+    (w, x, y, z), (g0, g1, g2) = quat, g_columns
+    gw = x * (g1[2] - g2[1]) + y * (g2[0] - g0[2]) + z * (g0[1] - g1[0])
+    gx = y * (g1[0] + g0[1]) + z * (g2[0] + g0[2]) + w * (g1[2] - g2[1]) - TWO * x * (g1[1] + g2[2])
+    gy = x * (g1[0] + g0[1]) + z * (g2[1] + g1[2]) + w * (g2[0] - g0[2]) - TWO * y * (g0[0] + g2[2])
+    gz = x * (g2[0] + g0[2]) + y * (g2[1] + g1[2]) + w * (g0[1] - g1[0]) - TWO * z * (g0[0] + g1[1])
+    # The norm of the raw quaternion has no effect, so its direction is taken out of the gradient.
+    radial = w * gw + x * gx + y * gy + z * gz
+    scale = TWO * inverse_norm
+    return scale * (gw - radial * w), scale * (gx - radial * x), scale * (gy - radial * y), scale * (gz - radial * z)
+
+
+# EWA projection of principal axes to a screen ellipse, and its adjoint.
 
 
 @inlined
@@ -168,14 +154,15 @@ def clamp(x, lowest, highest):
 
 
 @inlined
-def footprint(row_x, row_y, row_z, scale_x, scale_y, tangent_x, tangent_y):
+def footprint(rows, scale_x, scale_y, tangent_x, tangent_y):
     """World vectors (w_x, w_y) whose dot products with a displacement are its pixels on screen."""
-    w_x = combine(scale_x, row_x, -scale_x * tangent_x, row_z)
-    w_y = combine(scale_y, row_y, -scale_y * tangent_y, row_z)
+    w_x = combine(scale_x, rows[0], -scale_x * tangent_x, rows[2])
+    w_y = combine(scale_y, rows[1], -scale_y * tangent_y, rows[2])
     return w_x, w_y
 
 
-def _tangent_limits(real: type) -> Scalar:
+def build_tangent_limits(real: type) -> Scalar:
+    """Builds (lowest x, highest x, lowest y, highest y) of the tangents for which the Jacobian is taken."""
     margin = real(TANGENT_MARGIN * 0.5)
 
     @inlined
@@ -190,9 +177,9 @@ def _tangent_limits(real: type) -> Scalar:
     return tangent_limits
 
 
-def _screen_covariance(real: type) -> tuple[Scalar, Scalar]:
+def build_screen_covariance(real: type) -> Scalar:
+    """Builds (xx, xy, yy, determinant), low-pass included, from the axes seen along w_x and w_y."""
     low_pass, low_pass_squared = real(LOW_PASS), real(LOW_PASS * LOW_PASS)
-    zero, one, two, inverse_alpha_min = real(0.0), real(1.0), real(2.0), real(1.0 / ALPHA_MIN)
 
     @inlined
     def screen_covariance(v_x, v_y):
@@ -200,6 +187,16 @@ def _screen_covariance(real: type) -> tuple[Scalar, Scalar]:
         # xx yy - xy^2 cancels for needles; Lagrange's identity gives the same as a sum of squares.
         determinant = cross_squared(v_x, v_y) + low_pass * (xx + yy) + low_pass_squared
         return xx + low_pass, xy, yy + low_pass, determinant
+
+    return screen_covariance
+
+
+def build_half_extents(real: type) -> Scalar:
+    """Builds the distances from the centre along x and y, in pixels, at which the coverage drops to `ALPHA_MIN`.
+
+    They are (0, 0) if it is never above.
+    """
+    zero, one, two, inverse_alpha_min = real(0.0), real(1.0), real(2.0), real(1.0 / ALPHA_MIN)
 
     @inlined
     def half_extents(xx, yy, opacity):
@@ -209,11 +206,12 @@ def _screen_covariance(real: type) -> tuple[Scalar, Scalar]:
         reach = two * math.log(visible)
         return math.sqrt(reach * xx), math.sqrt(reach * yy)
 
-    return screen_covariance, half_extents
+    return half_extents
 
 
-def _screen_gradients(real: type) -> tuple[Scalar, Scalar]:
-    one, two, low_pass = real(1.0), real(2.0), real(LOW_PASS)
+def build_covariance_gradient(real: type) -> Scalar:
+    """Builds gradients of the results of `screen_covariance`, from those (xx, xy, yy) of its inverse."""
+    one, low_pass = real(1.0), real(LOW_PASS)
 
     @inlined
     def covariance_gradient(covariance, g_xx, g_xy, g_yy):
@@ -225,22 +223,24 @@ def _screen_gradients(real: type) -> tuple[Scalar, Scalar]:
         by_trace = low_pass * g_determinant
         return g_yy * inverse + by_trace, -g_xy * inverse, g_xx * inverse + by_trace, g_determinant
 
-    @inlined
-    def footprint_gradient(w_x, w_y, v_x, v_y, axes, g_covariance):
-        g_xx, g_xy, g_yy, g_determinant = g_covariance
-        normal = cross(v_x, v_y)
-        gv_x = combine(one, combine(two * g_xx, v_x, g_xy, v_y), two * g_determinant, cross(v_y, normal))
-        gv_y = combine(one, combine(g_xy, v_x, two * g_yy, v_y), two * g_determinant, cross(normal, v_x))
-        gw_x = scaled_sum(gv_x, axes[0], axes[1], axes[2])
-        gw_y = scaled_sum(gv_y, axes[0], axes[1], axes[2])
-        g_axes = (
-            combine(gv_x[0], w_x, gv_y[0], w_y),
-            combine(gv_x[1], w_x, gv_y[1], w_y),
-            combine(gv_x[2], w_x, gv_y[2], w_y),
-        )
-        return gw_x, gw_y, g_axes
+    return covariance_gradient
 
-    return covariance_gradient, footprint_gradient
+
+@inlined
+def footprint_gradient(w_x, w_y, v_x, v_y, axes, g_covariance):
+    """Gradients of w_x and w_y, and of the three axes, from those of the results of `screen_covariance`."""
+    g_xx, g_xy, g_yy, g_determinant = g_covariance
+    normal = cross(v_x, v_y)
+    gv_x = combine(ONE, combine(TWO * g_xx, v_x, g_xy, v_y), TWO * g_determinant, cross(v_y, normal))
+    gv_y = combine(ONE, combine(g_xy, v_x, TWO * g_yy, v_y), TWO * g_determinant, cross(normal, v_x))
+    gw_x = scaled_sum(gv_x, axes)
+    gw_y = scaled_sum(gv_y, axes)
+    g_axes = (
+        combine(gv_x[0], w_x, gv_y[0], w_y),
+        combine(gv_x[1], w_x, gv_y[1], w_y),
+        combine(gv_x[2], w_x, gv_y[2], w_y),
+    )
+    return gw_x, gw_y, g_axes
 
 
 # The region of the screen where a splat's coverage is at least `ALPHA_MIN`, an ellipse around its centre. In double

@@ -5,24 +5,19 @@ The functions read and write rows of arrays, so that one source compiles for the
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.maths.projection import dot, shape_maths
+from glassplat.kernels.maths.projection import (
+    build_sigmoid,
+    build_unit_quat,
+    dot,
+    is_finite,
+    rotation,
+    scaled,
+    scaled_sum,
+    unit_quat_gradient,
+)
 from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS
-
-
-class SurfaceMaths(NamedTuple):
-    """Steps for Gaussian `i`, which must be visible.
-
-    Attributes:
-        describe: writes its channels, with a normal of zeros if its quaternion has no direction.
-        describe_gradient: writes the gradients, given the channels written by `describe`.
-    """
-
-    describe: Scalar
-    describe_gradient: Scalar
 
 
 @inlined
@@ -35,33 +30,24 @@ def shortest_axis(x, y, z):
 
 def _facing(real: type) -> tuple[Scalar, Scalar]:
     """The normal of a Gaussian, and its adjoint."""
-    maths = shape_maths(real)
-    unit_quat, rotation, is_finite = maths.unit_quat, maths.rotation, maths.is_finite
-    unit_quat_gradient = maths.unit_quat_gradient
-    zero, one = real(0.0), real(1.0)
+    unit_quat, zero, one = build_unit_quat(real), real(0.0), real(1.0)
 
     @inlined
-    def chosen(which, a, b, c):
-        # Weighted sums, because a branch would be unpredictable.
+    def chosen(which, columns):
+        # A weighted sum, because a branch would be unpredictable.
         first, second = real(which == 0), real(which == 1)
-        third = one - first - second
-        return (
-            first * a[0] + second * b[0] + third * c[0],
-            first * a[1] + second * b[1] + third * c[1],
-            first * a[2] + second * b[2] + third * c[2],
-        )
+        return scaled_sum((first, second, one - first - second), columns)
 
     @inlined
     def normal_of(i, quats, log_scales, means, camera_center):
         quat, inverse_norm = unit_quat(quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3])
         if not (is_finite(inverse_norm) and inverse_norm > zero):
             return zero, zero, zero
-        first, second, third = rotation(quat)
         shortest = shortest_axis(log_scales[i, 0], log_scales[i, 1], log_scales[i, 2])
-        axis = chosen(shortest, first, second, third)
+        axis = chosen(shortest, rotation(quat))
         towards = camera_center[0] - means[i, 0], camera_center[1] - means[i, 1], camera_center[2] - means[i, 2]
         side = -one if dot(towards, axis) < zero else one
-        return side * axis[0], side * axis[1], side * axis[2]
+        return scaled(side, axis)
 
     @inlined
     def quat_gradient(i, quats, log_scales, normal, v_normal):
@@ -69,23 +55,23 @@ def _facing(real: type) -> tuple[Scalar, Scalar]:
         if dot(normal, normal) == zero:
             return zero, zero, zero, zero
         quat, inverse_norm = unit_quat(quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3])
-        first, second, third = rotation(quat)
         shortest = shortest_axis(log_scales[i, 0], log_scales[i, 1], log_scales[i, 2])
-        axis = chosen(shortest, first, second, third)
+        axis = chosen(shortest, rotation(quat))
         side = -one if dot(normal, axis) < zero else one
-        v = side * v_normal[0], side * v_normal[1], side * v_normal[2]
-        g0 = v if shortest == 0 else none
-        g1 = v if shortest == 1 else none
-        g2 = v if shortest == 2 else none
-        return unit_quat_gradient(quat, inverse_norm, g0, g1, g2)
+        v = scaled(side, v_normal)
+        g_columns = v if shortest == 0 else none, v if shortest == 1 else none, v if shortest == 2 else none
+        return unit_quat_gradient(quat, inverse_norm, g_columns)
 
     return normal_of, quat_gradient
 
 
-def surface_maths(real: type) -> SurfaceMaths:
-    """Builds the functions for `real`, np.float32 or np.float64."""
-    normal_of, quat_gradient = _facing(real)
-    sigmoid, one = shape_maths(real).sigmoid, real(1.0)
+def surface_maths(real: type) -> tuple[Scalar, Scalar]:
+    """Builds the steps for Gaussian `i`, which must be visible.
+
+    `describe` writes its channels, with a normal of zeros if its quaternion has no direction. `describe_gradient`
+    writes the gradients, given these channels.
+    """
+    (normal_of, quat_gradient), sigmoid, one = _facing(real), build_sigmoid(real), real(1.0)
 
     @inlined
     def describe(i, colors, quats, log_scales, means, logit_strengths, camera_center, extra, channels):
@@ -111,4 +97,4 @@ def surface_maths(real: type) -> SurfaceMaths:
         for e in range(v_extra.shape[1]):
             v_extra[i, e] = v_channels[i, SURFACE_CHANNELS + e]
 
-    return SurfaceMaths(describe, describe_gradient)
+    return describe, describe_gradient

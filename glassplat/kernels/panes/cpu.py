@@ -330,7 +330,7 @@ def _blend_run_gradient(real: type) -> Scalar:
 
 
 def _sum_strength_gradients(real: type) -> Scalar:
-    strength_derivatives = pane_maths(real).strength_derivatives
+    _, strength_derivatives, _ = pane_maths(real)
     zero, one, half, dazzling = real(0.0), real(1.0), real(0.5), real(DAZZLING)
 
     @inlined

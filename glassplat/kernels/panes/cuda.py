@@ -337,7 +337,7 @@ def blend_panes_backward(real: type) -> Kernel:
     """Fills the gradients of transmission, mask and reflections, and each pixel's contribution [H, W, 4] to those of
     its pane's normal and base reflectance; all but the first start at zero.
     """
-    pane_strength, strength_derivatives = _pane_strength(real), pane_maths(real).strength_derivatives
+    pane_strength, (_, strength_derivatives, _) = _pane_strength(real), pane_maths(real)
     _, blend_channel_gradient = build_blend_channel(real)
     zero, one, dazzling = real(0.0), real(1.0), real(DAZZLING)
 

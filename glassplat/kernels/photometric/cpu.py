@@ -20,7 +20,7 @@ from torch import Tensor
 
 from glassplat.kernels.backend.cpu import Kernel, inlined, kernel
 from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.maths.images import RADIUS, ssim_maths
+from glassplat.kernels.maths.images import RADIUS, build_blur, build_compare
 from glassplat.kernels.records import REAL_OF
 
 CHANNELS = 3
@@ -83,7 +83,7 @@ def _brightness(real: type) -> Scalar:
 
 
 def _enter(real: type) -> Scalar:
-    blur, brightness, zero = ssim_maths(real).blur, _brightness(real), real(0.0)
+    blur, brightness, zero = build_blur(real), _brightness(real), real(0.0)
 
     @inlined
     def enter(scratch, image, target, y, left, row):
@@ -109,7 +109,7 @@ def _enter(real: type) -> Scalar:
 
 
 def _blur_down(real: type) -> Scalar:
-    blur = ssim_maths(real).blur
+    blur = build_blur(real)
 
     @inlined
     def blur_down(scratch, first, row, planes, count):
@@ -128,7 +128,7 @@ def _blur_down(real: type) -> Scalar:
 
 
 def _compare_row(real: type) -> Scalar:
-    compare = ssim_maths(real).compare
+    compare = build_compare(real)
 
     @inlined
     def compare_row(scratch, row):
@@ -150,7 +150,7 @@ def _compare_row(real: type) -> Scalar:
 
 
 def _blur_derivatives(real: type) -> Scalar:
-    blur, zero = ssim_maths(real).blur, real(0.0)
+    blur, zero = build_blur(real), real(0.0)
 
     @inlined
     def blur_derivatives(scratch, inside, left, rest, row):

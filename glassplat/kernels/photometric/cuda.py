@@ -14,7 +14,7 @@ from torch import Tensor
 
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, kernel
-from glassplat.kernels.maths.images import RADIUS, ssim_maths
+from glassplat.kernels.maths.images import RADIUS, build_blur, build_compare
 from glassplat.kernels.records import REAL_OF, TILE
 
 CHANNELS = 3
@@ -65,8 +65,7 @@ def tile_pixel(i, top, left):
 @cache
 def photometric_forward(real: type) -> Kernel:
     """Fills derivatives [3, H, W, 3], where they are not empty, and each block's sums of L1 and similarity."""
-    blur, compare = ssim_maths(real)
-    zero, white = real(0.0), real(255.0)
+    blur, compare, zero, white = build_blur(real), build_compare(real), real(0.0), real(255.0)
 
     @kernel("photometric_forward", real, "real3 byte3 real4 real2")
     def forward(image, target, derivatives, sums):
@@ -127,7 +126,7 @@ def photometric_forward(real: type) -> Kernel:
 @cache
 def photometric_backward(real: type) -> Kernel:
     """Fills the gradient of the image from the derivatives and the weights [2] of each pixel's L1 and similarity."""
-    blur = ssim_maths(real).blur
+    blur = build_blur(real)
     zero, two, white = real(0.0), real(2.0), real(255.0)
 
     @kernel("photometric_backward", real, "real3 byte3 real4 real1 real3")

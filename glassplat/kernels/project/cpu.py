@@ -8,9 +8,8 @@ chunks in order, so that results do not depend on the number of threads.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
-from typing import Any
 
 import numpy as np
 import torch
@@ -31,7 +30,7 @@ from glassplat.kernels.backend.cpu_vector import (
 )
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.disc import MAP
-from glassplat.kernels.maths.projection import screen_maths
+from glassplat.kernels.maths.projection import build_half_extents
 from glassplat.kernels.project.cpu_lanes import (
     COLUMNS,
     LANES,
@@ -48,24 +47,28 @@ from glassplat.kernels.project.disc_steps import discs
 from glassplat.kernels.project.steps import (
     CHUNK,
     LENS_VALUES,
-    build_cull,
+    build_fill_lenses,
     build_project,
     build_project_back,
     camera_sums,
+    cull,
     vec3,
-    view_steps,
 )
 from glassplat.kernels.records import REAL_OF
 
-WIDTHS = ((2,), (MAP,), (), (), (3,), (3,), (2,), (3,), (2,))
-"""Trailing dimensions of the fields of `ProjectedDiscs`."""
+WIDTHS, DISC_WIDTHS = ((2,), (3,), (), (), (3,), (2,)), ((2,), (MAP,), (), (), (3,), (3,), (2,), (3,), (2,))
+"""Trailing dimensions of the fields of `Projected` and of `ProjectedDiscs`."""
+
+
+def new_outputs(inputs: Sequence[Tensor], widths: Sequence[tuple[int, ...]]) -> tuple[Tensor, ...]:
+    """Uninitialised tensors for the results of a projection."""
+    means, cam_from_world = inputs[0], inputs[5]
+    return tuple(means.new_empty(cam_from_world.shape[0], means.shape[0], *rest) for rest in widths)
 
 
 def project_discs(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, near: float) -> tuple[Tensor, ...]:
     """Fields of `ProjectedDiscs` from raw discs, poses, intrinsics, clip planes, windows; degree -1 skips colours."""
-    means, cam_from_world = inputs[0], inputs[5]
-    real, leading = REAL_OF[means.dtype], (cam_from_world.shape[0], means.shape[0])
-    outputs = tuple(means.new_empty(*leading, *rest) for rest in WIDTHS)
+    real, outputs = REAL_OF[inputs[0].dtype], new_outputs(inputs, DISC_WIDTHS)
     project_discs_forward(real)(
         *(tensor.numpy() for tensor in inputs), real(width), real(height), degree, real(near),
         tuple(tensor.numpy() for tensor in outputs),
@@ -92,7 +95,7 @@ def project_discs_gradients(
 @cache
 def project_discs_forward(real: type) -> Kernel:
     """Fills the fields of `ProjectedDiscs`; zeros where a disc is culled."""
-    fill_lenses, project, chunk_size = view_steps(real).fill_lenses, build_project(real, discs(real)), CHUNK
+    fill_lenses, project, chunk_size = build_fill_lenses(real), build_project(real, discs(real)), CHUNK
 
     @kernel("project_discs_forward", real)
     def forward(
@@ -142,7 +145,7 @@ def _disc_backward(real: type) -> Scalar:
 @cache
 def project_discs_backward(real: type) -> Kernel:
     """Fills the gradients of the discs; adds those of the cameras to [C, 12], rows of (3x3 block, translation)."""
-    fill_lenses, disc_backward = view_steps(real).fill_lenses, _disc_backward(real)
+    fill_lenses, disc_backward = build_fill_lenses(real), _disc_backward(real)
     chunk_size = CHUNK
 
     @kernel("project_discs_backward", real)
@@ -178,7 +181,7 @@ OWN, SHARED = 11, 12
 """Number of gradients of a Gaussian without its coefficients, and of its contributions to a camera's gradient."""
 
 
-def _place_backward(real: type) -> Callable[..., Any]:
+def _place_backward(real: type) -> Scalar:
     place_gradient = place_gradient_of(real)
 
     @inlined
@@ -215,7 +218,7 @@ def _place_backward(real: type) -> Callable[..., Any]:
     return place_backward
 
 
-def _add_coefficients(real: type) -> Callable[..., Any]:
+def _add_coefficients(real: type) -> Scalar:
     load_rows, load, whole = row_loader(real, LANES), vector_kind(real, LANES).load, COLUMNS * LANES
 
     @inlined
@@ -239,10 +242,10 @@ def _add_coefficients(real: type) -> Callable[..., Any]:
     return add_coefficients
 
 
-def _color_backward(real: type) -> Callable[..., Any]:
+def _color_backward(real: type) -> Scalar:
     (tabulate, _), color_gradient = color_steps(real), color_gradient_of(real)
     add_coefficients, add_view = _add_coefficients(real), camera_sums(real)[1]
-    zero, whole = real(0.0), COLUMNS * LANES
+    zero = real(0.0)
 
     @inlined
     def color_backward(
@@ -264,7 +267,7 @@ def _color_backward(real: type) -> Callable[..., Any]:
             gather(columns, 0, listed, first, last, means)
             gather(columns, 3, listed, first, last, g_colors[c])
             tabulate(table, listed, first, last, terms, sh, row_size, positions)
-            x, y, z = color_gradient(table, whole, columns, degree, lens, c)
+            x, y, z = color_gradient(table, columns, degree, lens, c)
             store(columns, 0, x)
             store(columns, LANES, y)
             store(columns, 2 * LANES, z)
@@ -288,7 +291,7 @@ def project_backward(real: type) -> Kernel:
 
     The latter are [C, 12], rows of (3x3 block, translation).
     """
-    fill_lenses = view_steps(real).fill_lenses
+    fill_lenses = build_fill_lenses(real)
     color_backward, place_backward = _color_backward(real), _place_backward(real)
     chunk_size, zero = CHUNK, real(0.0)
 
@@ -338,9 +341,7 @@ def project_backward(real: type) -> Kernel:
 
 def project(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, near: float) -> tuple[Tensor, ...]:
     """Fields of `Projected` from raw Gaussians, poses, intrinsics, clip planes and windows; degree -1 skips colours."""
-    means, cam_from_world = inputs[0], inputs[5]
-    real, leading = REAL_OF[means.dtype], (cam_from_world.shape[0], means.shape[0])
-    outputs = tuple(means.new_empty(*leading, *rest) for rest in ((2,), (3,), (), (), (3,), (2,)))
+    real, outputs = REAL_OF[inputs[0].dtype], new_outputs(inputs, WIDTHS)
     project_forward(real)(
         *(tensor.numpy() for tensor in inputs), real(width), real(height), degree, real(near),
         *(tensor.numpy() for tensor in outputs),
@@ -368,7 +369,7 @@ def project_gradients(
     return found, cameras
 
 
-def build_list_candidates(real: type) -> Callable[..., Any]:
+def build_list_candidates(real: type) -> Scalar:
     """Builds the step that lists the Gaussians of a chunk that may be visible in a camera."""
     load_triples, may_show = load_triples_of(real), may_show_of(real)
 
@@ -400,9 +401,9 @@ def build_list_candidates(real: type) -> Callable[..., Any]:
     return list_candidates
 
 
-def build_place_listed(real: type) -> Callable[..., Any]:
+def build_place_listed(real: type) -> Scalar:
     """Builds the step that fills all outputs but the colours, for the visible ones of the listed Gaussians."""
-    place, half_extents = place_of(real), screen_maths(real).half_extents
+    place, half_extents = place_of(real), build_half_extents(real)
     zero = real(0.0)
     U, V, XX, XY, YY, DEPTH, OPACITY, WIDE, HIGH = (field * LANES for field in range(9))
 
@@ -441,11 +442,10 @@ def build_place_listed(real: type) -> Callable[..., Any]:
     return place_listed
 
 
-def build_color_listed(real: type) -> Callable[..., Any]:
+def build_color_listed(real: type) -> Scalar:
     """Builds the step that fills the colours of listed Gaussians; those with a non-finite colour are culled."""
     tabulate, color = color_steps(real)
-    cull, full = build_cull(real)[0], vector_kind(real, LANES).full
-    zero, half, largest = real(0.0), real(0.5), real(np.finfo(real).max)
+    full, zero, half, largest = vector_kind(real, LANES).full, real(0.0), real(0.5), real(np.finfo(real).max)
 
     @inlined
     def color_listed(
@@ -458,7 +458,7 @@ def build_color_listed(real: type) -> Callable[..., Any]:
             last = min(first + LANES, shown) - 1
             gather(columns, 0, listed, first, last, means)
             tabulate(table, listed, first, last, terms, sh, row_size, positions)
-            red, green, blue = color(table, columns, 0, degree, lens, c)
+            red, green, blue = color(table, columns, degree, lens, c)
             bits = bits_of(absolute(red) + absolute(green) + absolute(blue) <= largest)
             none = full(zero)
             store(columns, 0, maximum(red + half, none))
@@ -470,7 +470,7 @@ def build_color_listed(real: type) -> Callable[..., Any]:
                     colors[c, n, 0], colors[c, n, 1] = columns[i], columns[LANES + i]
                     colors[c, n, 2] = columns[2 * LANES + i]
                 else:
-                    cull(n, c, means2d, conics, depths, opacities, colors, radii)
+                    cull(c, n, (means2d, conics, depths, opacities, colors, radii))
 
     return color_listed
 
@@ -478,7 +478,7 @@ def build_color_listed(real: type) -> Callable[..., Any]:
 @cache
 def project_forward(real: type) -> Kernel:
     """Fills means2d, conics, depths, opacities, colors and radii; zeros where a Gaussian is culled."""
-    fill_lenses = view_steps(real).fill_lenses
+    fill_lenses = build_fill_lenses(real)
     list_candidates, place_listed = build_list_candidates(real), build_place_listed(real)
     color_listed, zero, chunk_size = build_color_listed(real), real(0.0), CHUNK
 

@@ -6,8 +6,6 @@ The maths of single Gaussians (`steps`) accepts vectors too, except for roots an
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -29,15 +27,22 @@ from glassplat.kernels.backend.cpu_vector import (
     transpose,
     vector_kind,
 )
+from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.harmonics import build_channel, build_color_gradient, harmonic_basis
-from glassplat.kernels.maths.projection import LOW_PASS, dot, scaled_sum, shape_maths, tangential
-from glassplat.kernels.project.steps import MOST_SQUARED_DEVIATIONS, build_view, place_gradients, pose, vec3
+from glassplat.kernels.maths.projection import (
+    LOW_PASS,
+    dot,
+    rotation,
+    scaled_columns,
+    scaled_sum,
+    tangential,
+    unit_quat_gradient,
+)
+from glassplat.kernels.project.steps import MOST_SQUARED_DEVIATIONS, build_view, in_camera, place_gradients, vec3
 
 LANES = 16
 COLUMNS = 48
 """Maximum number of coefficients of a Gaussian."""
-
-Step = Callable[..., Any]
 
 
 @inlined
@@ -61,7 +66,7 @@ def gather_shapes(columns, listed, first, last, means, quats, log_scales, logit_
         columns[10 * LANES + i] = logit_opacities[n]
 
 
-def load_triples_of(real: type) -> Step:
+def load_triples_of(real: type) -> Scalar:
     """Builds the step that loads three vectors from an array of triples, starting at Gaussian n."""
     load = vector_kind(real, LANES).load
 
@@ -73,7 +78,7 @@ def load_triples_of(real: type) -> Step:
     return load_triples
 
 
-def _exponential(real: type) -> Step:
+def _exponential(real: type) -> Scalar:
     """Builds e^x; in single precision clamped to normal numbers, with a relative error below 3e-7."""
     full = vector_kind(real, LANES).full
     # Taylor series of 2^f for f in [-1/2, 1/2].
@@ -90,21 +95,20 @@ def _exponential(real: type) -> Step:
     return exp if real is np.float64 else fast
 
 
-def may_show_of(real: type) -> Step:
+def may_show_of(real: type) -> Scalar:
     """Builds a conservative culling test: bits of Gaussians on the kept sides that may reach a camera's window."""
     exponential = _exponential(real)
     zero, one, low_pass, most_squared = real(0.0), real(1.0), real(LOW_PASS), real(MOST_SQUARED_DEVIATIONS)
 
     @inlined
     def may_show(c, mean, log_scales, cam_from_world, intrinsics, lens, near, clip_planes, clips, windows):
-        row_x, row_y, row_z, offset = pose(cam_from_world, c)
-        depth = dot(row_z, mean) + offset[2]
+        _, (x, y, depth) = in_camera(cam_from_world, c, mean)
         kept = depth > near
         if clips:
             kept = kept & (dot(vec3(clip_planes, c), mean) + clip_planes[c, 3] > zero)
         inverse_depth = one / depth
-        u = (dot(row_x, mean) + offset[0]) * inverse_depth * intrinsics[c, 0] + intrinsics[c, 2]
-        v = (dot(row_y, mean) + offset[1]) * inverse_depth * intrinsics[c, 1] + intrinsics[c, 3]
+        u = x * inverse_depth * intrinsics[c, 0] + intrinsics[c, 2]
+        v = y * inverse_depth * intrinsics[c, 1] + intrinsics[c, 3]
         past_x = maximum(windows[c, 0] - u, u - windows[c, 2])
         past_y = maximum(windows[c, 1] - v, v - windows[c, 3])
         size = exponential(maximum(maximum(log_scales[0], log_scales[1]), log_scales[2])) * inverse_depth
@@ -117,17 +121,12 @@ def may_show_of(real: type) -> Step:
     return may_show
 
 
-def shapes(real: type) -> Step:
+def shapes(real: type) -> Scalar:
     """Builds the step that activates columns of quaternions, log scales and logits, which follow the three of means.
 
     It returns unit quaternions, their inverse norms, scales, axes, opacities, and the sum of the raw magnitudes.
     """
-    rotation, exponential, load, one = (
-        shape_maths(real).rotation,
-        _exponential(real),
-        vector_kind(real, LANES).load,
-        real(1.0),
-    )
+    exponential, load, one = _exponential(real), vector_kind(real, LANES).load, real(1.0)
 
     @inlined
     def shape(columns):
@@ -137,21 +136,16 @@ def shapes(real: type) -> Step:
         logit = load(columns, 10 * LANES)
         inverse_norm = one / square_root(w * w + x * x + y * y + z * z)
         quat = w * inverse_norm, x * inverse_norm, y * inverse_norm, z * inverse_norm
-        column_x, column_y, column_z = rotation(quat)
-        s_x, s_y, s_z = exponential(a), exponential(b), exponential(d)
-        axes = (
-            (s_x * column_x[0], s_x * column_x[1], s_x * column_x[2]),
-            (s_y * column_y[0], s_y * column_y[1], s_y * column_y[2]),
-            (s_z * column_z[0], s_z * column_z[1], s_z * column_z[2]),
-        )
+        scales = exponential(a), exponential(b), exponential(d)
+        axes = scaled_columns(scales, rotation(quat))
         raw = absolute(logit) + absolute(a) + absolute(b) + absolute(d)
-        return quat, inverse_norm, (s_x, s_y, s_z), axes, one / (one + exponential(-logit)), raw
+        return quat, inverse_norm, scales, axes, one / (one + exponential(-logit)), raw
 
     return shape
 
 
-def views(real: type) -> Step:
-    """`ViewSteps.view` for vectors."""
+def views(real: type) -> Scalar:
+    """`steps.build_view` for vectors."""
     full = vector_kind(real, LANES).full
 
     @inlined
@@ -161,7 +155,7 @@ def views(real: type) -> Step:
     return build_view(real, held)
 
 
-def place_of(real: type) -> Step:
+def place_of(real: type) -> Scalar:
     """Builds the step that projects Gaussians, from columns of means (3), quaternions (4), log scales (3) and logits.
 
     It returns (mean x and y, conic xx, xy and yy, depth, opacity, covariance xx and yy), and bits of the finite ones.
@@ -173,10 +167,9 @@ def place_of(real: type) -> Step:
     def place(columns, c, cam_from_world, intrinsics, lens):
         mean = load(columns, 0), load(columns, LANES), load(columns, 2 * LANES)
         _, inverse_norm, _, axes, opacity, raw = shape(columns)
-        row_x, row_y, row_z, offset = pose(cam_from_world, c)
-        depth = dot(row_z, mean) + offset[2]
-        position = dot(row_x, mean) + offset[0], dot(row_y, mean) + offset[1], depth
-        tangent, _, _, _, covariance = view((row_x, row_y, row_z), position, axes, intrinsics, lens, c)
+        rows, position = in_camera(cam_from_world, c, mean)
+        depth = position[2]
+        tangent, _, _, _, covariance = view(rows, position, axes, intrinsics, lens, c)
         xx, xy, yy, determinant = covariance
         u = tangent[0] * intrinsics[c, 0] + intrinsics[c, 2]
         v = tangent[1] * intrinsics[c, 1] + intrinsics[c, 3]
@@ -190,7 +183,7 @@ def place_of(real: type) -> Step:
     return place
 
 
-def channel_of(real: type) -> Step:
+def channel_of(real: type) -> Scalar:
     """Builds the step that evaluates one colour channel from harmonics and table columns starting at an index."""
     load = vector_kind(real, LANES).load
 
@@ -201,10 +194,24 @@ def channel_of(real: type) -> Step:
     return build_channel(take)
 
 
-def color_steps(real: type) -> tuple[Step, Step]:
+def directions_of(real: type) -> Scalar:
+    """Builds the unit vectors from a camera's centre to columns of means, and their inverse lengths."""
+    load, one = vector_kind(real, LANES).load, real(1.0)
+
+    @inlined
+    def directions(means, lens, c):
+        x = load(means, 0) - lens[c, 4]
+        y, z = load(means, LANES) - lens[c, 5], load(means, 2 * LANES) - lens[c, 6]
+        inverse_length = one / square_root(x * x + y * y + z * z)
+        return (x * inverse_length, y * inverse_length, z * inverse_length), inverse_length
+
+    return directions
+
+
+def color_steps(real: type) -> tuple[Scalar, Scalar]:
     """Builds the steps that tabulate coefficients, and that evaluate colours from such a table."""
-    load_rows, load, basis = row_loader(real, LANES), vector_kind(real, LANES).load, harmonic_basis(real)
-    channel, one, whole = channel_of(real), real(1.0), COLUMNS * LANES
+    load_rows, basis = row_loader(real, LANES), harmonic_basis(real)
+    channel, directions, whole = channel_of(real), directions_of(real), COLUMNS * LANES
 
     @inlined
     def tabulate(table, listed, first, last, terms, sh, row_size, positions):
@@ -226,24 +233,22 @@ def color_steps(real: type) -> tuple[Step, Step]:
             store_all(table, begin * LANES, transpose(load_rows(source, positions, begin)))
 
     @inlined
-    def color(table, means, at, degree, lens, c):
-        """(Red, green, blue) before offset and clamp, from table columns and columns of means."""
-        x = load(means, 0) - lens[c, 4]
-        y, z = load(means, LANES) - lens[c, 5], load(means, 2 * LANES) - lens[c, 6]
-        inverse_length = one / square_root(x * x + y * y + z * z)
-        b = basis(x * inverse_length, y * inverse_length, z * inverse_length)
-        return (channel(table, at, 0, degree, b), channel(table, at, 1, degree, b), channel(table, at, 2, degree, b))
+    def color(table, means, degree, lens, c):
+        """(Red, green, blue) before offset and clamp, from columns of coefficients and of means."""
+        (x, y, z), _ = directions(means, lens, c)
+        b = basis(x, y, z)
+        return channel(table, 0, 0, degree, b), channel(table, 0, 1, degree, b), channel(table, 0, 2, degree, b)
 
     return tabulate, color
 
 
-def place_gradient_of(real: type) -> Step:
+def place_gradient_of(real: type) -> Scalar:
     """Builds the adjoint of `place`, from the same columns, followed by the gradients of 2D means (2), conics (3),
     depths and opacities.
 
     It returns the gradients of the first columns (11), and each Gaussian's contribution to that of the camera (12).
     """
-    unit_quat_gradient, (full, load) = shape_maths(real).unit_quat_gradient, vector_kind(real, LANES)
+    full, load = vector_kind(real, LANES)
     shape, view, zero, one = shapes(real), views(real), real(0.0), real(1.0)
 
     @inlined
@@ -256,22 +261,15 @@ def place_gradient_of(real: type) -> Step:
     def place_gradient(columns, c, cam_from_world, intrinsics, lens):
         mean = load(columns, 0), load(columns, LANES), load(columns, 2 * LANES)
         quat, inverse_norm, scales, axes, opacity, _ = shape(columns)
-        row_x, row_y, row_z, offset = pose(cam_from_world, c)
-        position = dot(row_x, mean) + offset[0], dot(row_y, mean) + offset[1], dot(row_z, mean) + offset[2]
-        rows = row_x, row_y, row_z
+        rows, position = in_camera(cam_from_world, c, mean)
         g_mean2d = load(columns, 11 * LANES), load(columns, 12 * LANES)
         g_conic = load(columns, 13 * LANES), load(columns, 14 * LANES), load(columns, 15 * LANES)
         seen = view(rows, position, axes, intrinsics, lens, c)
         g, (r_x, r_y, r_z), (a_x, a_y, a_z) = placed(
             rows, position, seen, axes, intrinsics, c, g_mean2d, g_conic, load(columns, 16 * LANES)
         )
-        g_mean = scaled_sum(g, row_x, row_y, row_z)
-        turned = (
-            (scales[0] * a_x[0], scales[0] * a_x[1], scales[0] * a_x[2]),
-            (scales[1] * a_y[0], scales[1] * a_y[1], scales[1] * a_y[2]),
-            (scales[2] * a_z[0], scales[2] * a_z[1], scales[2] * a_z[2]),
-        )
-        g_w, g_i, g_j, g_k = unit_quat_gradient(quat, inverse_norm, turned[0], turned[1], turned[2])
+        g_mean = scaled_sum(g, rows)
+        g_w, g_i, g_j, g_k = unit_quat_gradient(quat, inverse_norm, scaled_columns(scales, (a_x, a_y, a_z)))
         g_logit = load(columns, 17 * LANES) * opacity * (one - opacity)
         own = (
             g_mean[0], g_mean[1], g_mean[2], g_w, g_i, g_j, g_k,
@@ -288,14 +286,14 @@ def place_gradient_of(real: type) -> Step:
     return place_gradient
 
 
-def color_gradient_of(real: type) -> Step:
+def color_gradient_of(real: type) -> Scalar:
     """Builds the adjoint of `color`, from a table of coefficients and columns of means and of gradients of colours.
 
-    It writes the gradients of the coefficients to the table, starting at an index, and returns those of the vector from
+    It writes the gradients of the coefficients to the second half of the table, and returns those of the vector from
     the camera to the mean.
     """
     (full, load), basis, channel = vector_kind(real, LANES), harmonic_basis(real), channel_of(real)
-    zero, half, one = real(0.0), real(0.5), real(1.0)
+    directions, whole, zero, half = directions_of(real), COLUMNS * LANES, real(0.0), real(0.5)
 
     @inlined
     def put(table, at, k, b, g):
@@ -311,17 +309,14 @@ def color_gradient_of(real: type) -> Step:
     adjoint = build_color_gradient(real, put, v_basis)
 
     @inlined
-    def color_gradient(table, at, columns, degree, lens, c):
-        x, y = load(columns, 0) - lens[c, 4], load(columns, LANES) - lens[c, 5]
-        z, none = load(columns, 2 * LANES) - lens[c, 6], full(zero)
-        inverse_length = one / square_root(x * x + y * y + z * z)
-        x, y, z = x * inverse_length, y * inverse_length, z * inverse_length
+    def color_gradient(table, columns, degree, lens, c):
+        ((x, y, z), inverse_length), none = directions(columns, lens, c), full(zero)
         b = basis(x, y, z)
         g = (
             select(channel(table, 0, 0, degree, b) + half > zero, load(columns, 3 * LANES), none),
             select(channel(table, 0, 1, degree, b) + half > zero, load(columns, 4 * LANES), none),
             select(channel(table, 0, 2, degree, b) + half > zero, load(columns, 5 * LANES), none),
         )
-        return tangential(inverse_length, adjoint(table, 0, degree, x, y, z, b, g, table, at, none), (x, y, z))
+        return tangential(inverse_length, adjoint(table, 0, degree, x, y, z, b, g, table, whole, none), (x, y, z))
 
     return color_gradient

@@ -18,16 +18,16 @@ from torch import Tensor
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.maths.disc import MAP
+from glassplat.kernels.project.cpu import DISC_WIDTHS, WIDTHS, new_outputs
 from glassplat.kernels.project.disc_steps import discs
 from glassplat.kernels.project.steps import (
     LENS_VALUES,
     Footprint,
+    build_fill_lenses,
     build_project,
     build_project_back,
     ellipsoids,
     vec3,
-    view_steps,
 )
 from glassplat.kernels.records import REAL_OF
 from glassplat.kernels.screen_statistics import Sums, Views
@@ -39,7 +39,7 @@ POSE = 12
 
 def project(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, near: float) -> tuple[Tensor, ...]:
     """As `glassplat.kernels.project.cpu.project`."""
-    outputs = _outputs(inputs, ((2,), (3,), (), (), (3,), (2,)))
+    outputs = new_outputs(inputs, WIDTHS)
     lens = _lenses(inputs[5], inputs[6], width, height)
     blocks, real = blocks_for(len(inputs[0]), THREADS), REAL_OF[inputs[0].dtype]
     project_forward(real)(blocks, THREADS, *inputs, lens, degree, near, *outputs)
@@ -48,7 +48,7 @@ def project(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, n
 
 def project_discs(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, near: float) -> tuple[Tensor, ...]:
     """As `glassplat.kernels.project.cpu.project_discs`."""
-    outputs = _outputs(inputs, ((2,), (MAP,), (), (), (3,), (3,), (2,), (3,), (2,)))
+    outputs = new_outputs(inputs, DISC_WIDTHS)
     lens = _lenses(inputs[5], inputs[6], width, height)
     blocks, real = blocks_for(len(inputs[0]), THREADS), REAL_OF[inputs[0].dtype]
     project_discs_forward(real)(blocks, THREADS, *inputs, lens, width, height, degree, near, *outputs)
@@ -82,11 +82,6 @@ def _zeros_like(tensors: Sequence[Tensor]) -> list[Tensor]:
     return [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)]
 
 
-def _outputs(inputs: Sequence[Tensor], widths: tuple[tuple[int, ...], ...]) -> tuple[Tensor, ...]:
-    leading = inputs[5].shape[0], inputs[0].shape[0]
-    return tuple(inputs[0].new_empty(*leading, *rest) for rest in widths)
-
-
 def _gradients(
     backward: Any, inputs: Sequence[Tensor], lens: Tensor, degree: int, given: Sequence[Tensor], needs_camera: bool,
     found: list[Tensor],
@@ -112,7 +107,7 @@ def _lenses(cam_from_world: Tensor, intrinsics: Tensor, width: int, height: int)
 @cache
 def camera_lenses(real: type) -> Kernel:
     """Fills the lenses of all cameras in one thread, because there are few."""
-    fill_lenses = view_steps(real).fill_lenses
+    fill_lenses = build_fill_lenses(real)
 
     @kernel("camera_lenses", real, "real2 real3 real2 real real")
     def lenses(lens, cam_from_world, intrinsics, width, height):

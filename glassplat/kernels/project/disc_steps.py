@@ -6,11 +6,31 @@ import math
 
 import numpy as np
 
-from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.backend.cpu import ONE, ZERO, inlined
 from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
-from glassplat.kernels.maths.disc import MAP, MOST_LOG_SCALE, crossing_box, disc_maths, outline, reach
-from glassplat.kernels.maths.projection import combine, dot, dot_products, scaled_sum, shape_maths
-from glassplat.kernels.project.steps import Footprint, pose
+from glassplat.kernels.maths.disc import (
+    MAP,
+    MOST_LOG_SCALE,
+    build_is_not_edge_on,
+    crossing_box,
+    map_gradient,
+    outline,
+    pixel_map,
+    reach,
+)
+from glassplat.kernels.maths.projection import (
+    build_sigmoid,
+    build_unit_quat,
+    combine,
+    cross,
+    dot,
+    dot_products,
+    is_finite,
+    rotation,
+    scaled_sum,
+    unit_quat_gradient,
+)
+from glassplat.kernels.project.steps import Footprint, in_camera
 
 
 def discs(real: type) -> Footprint:
@@ -19,7 +39,7 @@ def discs(real: type) -> Footprint:
 
 
 def _shape(real: type) -> Scalar:
-    sigmoid, is_finite, unit_quat, rotation, _ = shape_maths(real)
+    sigmoid, unit_quat = build_sigmoid(real), build_unit_quat(real)
     zero, most = real(0.0), real(MOST_LOG_SCALE)
 
     @inlined
@@ -48,19 +68,6 @@ def cull(c, n, outputs):
 
 
 @inlined
-def tangents(rows, offset, mean, axes):
-    """Both tangents and the centre in camera space."""
-    p = dot_products(axes[0], rows[0], rows[1], rows[2])
-    q = dot_products(axes[1], rows[0], rows[1], rows[2])
-    m = dot(rows[0], mean) + offset[0], dot(rows[1], mean) + offset[1], dot(rows[2], mean) + offset[2]
-    return p, q, m
-
-
-ZERO, ONE = np.float32(0.0), np.float32(1.0)
-"""Exact in single precision, so that expressions are not promoted to double."""
-
-
-@inlined
 def facing_sign(axis, mean, lens, c):
     """1 if a disc's axis points to the camera, else -1."""
     back = lens[c, 4] - mean[0], lens[c, 5] - mean[1], lens[c, 6] - mean[2]
@@ -68,21 +75,19 @@ def facing_sign(axis, mean, lens, c):
 
 
 def _place(real: type) -> Scalar:
-    cross_products, is_not_edge_on, pixel_map, _ = disc_maths(real)
-    is_finite = shape_maths(real).is_finite
-    one, alpha_min = real(1.0), real(ALPHA_MIN)
+    is_not_edge_on, one, alpha_min = build_is_not_edge_on(real), real(1.0), real(ALPHA_MIN)
 
     @inlined
     def place(c, n, mean, shaped, cam_from_world, intrinsics, lens, windows, size, near, outputs):
         _, opacity, _, _, axes, deviations = shaped
         means2d, maps, depths, opacities, _, normals, centers, conics, radii = outputs
-        row_x, row_y, row_z, offset = pose(cam_from_world, c)
-        p, q, m = tangents((row_x, row_y, row_z), offset, mean, axes)
-        a, b, across = cross_products(p, q, m)
+        rows, m = in_camera(cam_from_world, c, mean)
+        p, q = dot_products(axes[0], rows), dot_products(axes[1], rows)
+        across = cross(p, q)
         if not (is_not_edge_on(across, m) and opacity > alpha_min and is_finite(m[2])):
             return
         fx, fy = intrinsics[c, 0], intrinsics[c, 1]
-        found = pixel_map(a, b, across, m, one / deviations[0], one / deviations[1], fx, fy)
+        found = pixel_map(p, q, across, m, one / deviations[0], one / deviations[1], fx, fy)
         total = abs(found[0]) + abs(found[1]) + abs(found[2]) + abs(found[3]) + abs(found[4]) + abs(found[5])
         if not is_finite(total):
             return
@@ -120,7 +125,6 @@ def disc_map(array, c, n):
 
 
 def _place_gradient(real: type) -> Scalar:
-    cross_products, _, _, map_gradient = disc_maths(real)
     one = real(1.0)
 
     @inlined
@@ -129,22 +133,21 @@ def _place_gradient(real: type) -> Scalar:
     ):  # fmt: skip
         g_means2d, g_maps, g_depths, _, _, g_normals = cotangents
         axes, deviations = shaped[4], shaped[5]
-        row_x, row_y, row_z, offset = pose(cam_from_world, c)
-        rows = row_x, row_y, row_z
-        p, q, m = tangents(rows, offset, mean, axes)
-        across = cross_products(p, q, m)[2]
+        rows, m = in_camera(cam_from_world, c, mean)
+        p, q = dot_products(axes[0], rows), dot_products(axes[1], rows)
+        across = cross(p, q)
         fx, fy, inverse = intrinsics[c, 0], intrinsics[c, 1], one / m[2]
-        pixel_map, g_map = disc_map(maps, c, n), disc_map(g_maps, c, n)
+        found, g_map = disc_map(maps, c, n), disc_map(g_maps, c, n)
         g_p, g_q, g_m, g_u, g_v = map_gradient(
-            p, q, m, across, pixel_map, one / deviations[0], one / deviations[1], fx, fy, g_map
+            p, q, m, across, found, one / deviations[0], one / deviations[1], fx, fy, g_map
         )
         g_x, g_y = g_means2d[c, n, 0] * fx * inverse, g_means2d[c, n, 1] * fy * inverse
         behind = (g_x * m[0] + g_y * m[1]) * inverse
         g_center = g_m[0] + g_x, g_m[1] + g_y, g_m[2] + g_depths[c, n] - behind
         side = facing_sign(axes[2], mean, lens, c)
         g_axes = (
-            scaled_sum(g_p, row_x, row_y, row_z),
-            scaled_sum(g_q, row_x, row_y, row_z),
+            scaled_sum(g_p, rows),
+            scaled_sum(g_q, rows),
             (side * g_normals[c, n, 0], side * g_normals[c, n, 1], side * g_normals[c, n, 2]),
         )
         g_rows = (
@@ -158,17 +161,16 @@ def _place_gradient(real: type) -> Scalar:
 
 
 def _finish(real: type) -> Scalar:
-    unit_quat_gradient, one = shape_maths(real).unit_quat_gradient, real(1.0)
+    one = real(1.0)
 
     @inlined
     def finish(n, shaped, sums, g_means, g_quats, g_log_scales, g_logit_opacities):
         _, opacity, quat, inverse_norm, _, _ = shaped
-        g_mean, g_opacity, (ga_x, ga_y, ga_z), g_scales = sums
+        g_mean, g_opacity, g_axes, g_scales = sums
         g_means[n, 0], g_means[n, 1], g_means[n, 2] = g_mean
         g_logit_opacities[n] = g_opacity * opacity * (one - opacity)
         g_log_scales[n, 0], g_log_scales[n, 1] = g_scales
-        g_quats[n, 0], g_quats[n, 1], g_quats[n, 2], g_quats[n, 3] = unit_quat_gradient(
-            quat, inverse_norm, ga_x, ga_y, ga_z
-        )
+        g_w, g_i, g_j, g_k = unit_quat_gradient(quat, inverse_norm, g_axes)
+        g_quats[n, 0], g_quats[n, 1], g_quats[n, 2], g_quats[n, 3] = g_w, g_i, g_j, g_k
 
     return finish

@@ -3,24 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from glassplat.kernels.backend.cpu import inlined
-from glassplat.kernels.maths.blending import ALPHA_MIN
+from glassplat.kernels.backend.cpu import ZERO, inlined
+from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.maths.projection import (
+    build_covariance_gradient,
+    build_half_extents,
+    build_screen_covariance,
+    build_sigmoid,
+    build_tangent_limits,
+    build_unit_quat,
     clamp,
     combine,
     dot,
     dot_products,
     footprint,
+    footprint_gradient,
+    is_finite,
+    rotation,
+    scaled,
+    scaled_columns,
     scaled_sum,
-    screen_maths,
-    shape_maths,
     tangential,
+    unit_quat_gradient,
 )
 
 CHUNK = 512
@@ -36,59 +45,42 @@ def vec3(array, n):
 
 
 @inlined
-def pose(cam_from_world, c):
-    """Rows of the upper 3x3 block of a camera matrix, and its translation."""
-    row_x = cam_from_world[c, 0, 0], cam_from_world[c, 0, 1], cam_from_world[c, 0, 2]
-    row_y = cam_from_world[c, 1, 0], cam_from_world[c, 1, 1], cam_from_world[c, 1, 2]
-    row_z = cam_from_world[c, 2, 0], cam_from_world[c, 2, 1], cam_from_world[c, 2, 2]
-    return row_x, row_y, row_z, (cam_from_world[c, 0, 3], cam_from_world[c, 1, 3], cam_from_world[c, 2, 3])
+def rows_of(cam_from_world, c):
+    """Rows of the upper 3x3 block of a camera matrix."""
+    return (
+        (cam_from_world[c, 0, 0], cam_from_world[c, 0, 1], cam_from_world[c, 0, 2]),
+        (cam_from_world[c, 1, 0], cam_from_world[c, 1, 1], cam_from_world[c, 1, 2]),
+        (cam_from_world[c, 2, 0], cam_from_world[c, 2, 1], cam_from_world[c, 2, 2]),
+    )
 
 
-class ViewSteps(NamedTuple):
-    """Steps of the kernels that read arrays and pass their values to the scalar maths.
-
-    Attributes:
-        shape: (usable, opacity, unit quaternion, inverse norm, axes) of a Gaussian.
-        view: projection of a Gaussian into a camera, without its colour.
-        fill_lenses: writes `LENS_VALUES` numbers per camera.
-        direction: unit vector from a camera's centre to a mean, and its inverse length.
-    """
-
-    shape: Callable[..., Any]
-    view: Callable[..., Any]
-    fill_lenses: Callable[..., Any]
-    direction: Callable[..., Any]
+@inlined
+def in_camera(cam_from_world, c, mean):
+    """Those rows, and a point in the frame of the camera."""
+    rows = rows_of(cam_from_world, c)
+    x, y, z = dot_products(mean, rows)
+    return rows, (x + cam_from_world[c, 0, 3], y + cam_from_world[c, 1, 3], z + cam_from_world[c, 2, 3])
 
 
-def view_steps(real: type) -> ViewSteps:
-    """Builds the parts for `real`, np.float32 or np.float64."""
-    return ViewSteps(_shape(real), build_view(real, clamp), *_lenses(real))
-
-
-def _shape(real: type) -> Callable[..., Any]:
-    sigmoid, is_finite, unit_quat, rotation, _ = shape_maths(real)
-    zero = real(0.0)
+def build_shape(real: type) -> Scalar:
+    """Builds (usable, opacity, unit quaternion, inverse norm, axes) of an ellipsoid."""
+    sigmoid, unit_quat, zero = build_sigmoid(real), build_unit_quat(real), real(0.0)
 
     @inlined
     def shape(means, quats, log_scales, logit_opacities, n):
         quat, inverse_norm = unit_quat(quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3])
-        column_x, column_y, column_z = rotation(quat)
-        s_x, s_y, s_z = math.exp(log_scales[n, 0]), math.exp(log_scales[n, 1]), math.exp(log_scales[n, 2])
-        axes = (
-            (s_x * column_x[0], s_x * column_x[1], s_x * column_x[2]),
-            (s_y * column_y[0], s_y * column_y[1], s_y * column_y[2]),
-            (s_z * column_z[0], s_z * column_z[1], s_z * column_z[2]),
-        )
+        scales = math.exp(log_scales[n, 0]), math.exp(log_scales[n, 1]), math.exp(log_scales[n, 2])
         raw = abs(means[n, 0]) + abs(means[n, 1]) + abs(means[n, 2]) + abs(logit_opacities[n])
         raw += abs(log_scales[n, 0]) + abs(log_scales[n, 1]) + abs(log_scales[n, 2])
         usable = is_finite(raw) and inverse_norm > zero and is_finite(inverse_norm)
-        return usable, sigmoid(logit_opacities[n]), quat, inverse_norm, axes
+        return usable, sigmoid(logit_opacities[n]), quat, inverse_norm, scaled_columns(scales, rotation(quat))
 
     return shape
 
 
-def _lenses(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    tangent_limits, one = screen_maths(real).tangent_limits, real(1.0)
+def build_fill_lenses(real: type) -> Scalar:
+    """Builds the step that writes `LENS_VALUES` numbers per camera."""
+    tangent_limits, one = build_tangent_limits(real), real(1.0)
 
     @inlined
     def skewed(row, row_z, tangent):
@@ -105,7 +97,7 @@ def _lenses(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
             )
             lens[c, 0], lens[c, 1], lens[c, 2], lens[c, 3] = limits
             # A footprint's length is convex in the tangent, so its maximum is at one of the limits.
-            row_x, row_y, row_z, _ = pose(cam_from_world, c)
+            row_x, row_y, row_z = rows_of(cam_from_world, c)
             lens[c, 7] = max(skewed(row_x, row_z, limits[0]), skewed(row_x, row_z, limits[1]))
             lens[c, 8] = max(skewed(row_y, row_z, limits[2]), skewed(row_y, row_z, limits[3]))
             for j in range(3):
@@ -115,18 +107,25 @@ def _lenses(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
                     + cam_from_world[c, 2, j] * cam_from_world[c, 2, 3]
                 )
 
+    return fill_lenses
+
+
+def build_direction(real: type) -> Scalar:
+    """Builds the unit vector from a camera's centre to a mean, and its inverse length."""
+    one = real(1.0)
+
     @inlined
     def direction(mean, lens, c):
         x, y, z = mean[0] - lens[c, 4], mean[1] - lens[c, 5], mean[2] - lens[c, 6]
         inverse_length = one / math.sqrt(x * x + y * y + z * z)
         return (x * inverse_length, y * inverse_length, z * inverse_length), inverse_length
 
-    return fill_lenses, direction
+    return direction
 
 
-def build_view(real: type, clamped: Callable[..., Any]) -> Callable[..., Any]:
+def build_view(real: type, clamped: Scalar) -> Scalar:
     """Builds `view` for scalars or vectors, given the function that clamps them."""
-    screen_covariance, one = screen_maths(real).screen_covariance, real(1.0)
+    screen_covariance, one = build_screen_covariance(real), real(1.0)
 
     @inlined
     def view(rows, position, axes, intrinsics, lens, c):
@@ -135,8 +134,8 @@ def build_view(real: type, clamped: Callable[..., Any]) -> Callable[..., Any]:
         tangent_x, tangent_y = position[0] * inverse_depth, position[1] * inverse_depth
         held_x, held_y = clamped(tangent_x, lens[c, 0], lens[c, 1]), clamped(tangent_y, lens[c, 2], lens[c, 3])
         scale_x, scale_y = intrinsics[c, 0] * inverse_depth, intrinsics[c, 1] * inverse_depth
-        w_x, w_y = footprint(rows[0], rows[1], rows[2], scale_x, scale_y, held_x, held_y)
-        v_x, v_y = dot_products(w_x, axes[0], axes[1], axes[2]), dot_products(w_y, axes[0], axes[1], axes[2])
+        w_x, w_y = footprint(rows, scale_x, scale_y, held_x, held_y)
+        v_x, v_y = dot_products(w_x, axes), dot_products(w_y, axes)
         return (tangent_x, tangent_y), (held_x, held_y), (w_x, w_y), (v_x, v_y), screen_covariance(v_x, v_y)
 
     return view
@@ -146,21 +145,18 @@ MOST_SQUARED_DEVIATIONS = 1.01 * 2.0 * math.log(1.0 / ALPHA_MIN)
 """Squared number of standard deviations at which even full opacity falls to `ALPHA_MIN`, plus one percent."""
 
 
-def build_place(real: type) -> Callable[..., Any]:
+def build_place(real: type) -> Scalar:
     """Builds `place` for ellipsoids: if one is visible in a camera, fills all its outputs but the colour."""
-    view = view_steps(real).view
-    half_extents = screen_maths(real).half_extents
-    is_finite = shape_maths(real).is_finite
+    view, half_extents = build_view(real, clamp), build_half_extents(real)
     zero, one = real(0.0), real(1.0)
 
     @inlined
     def place(c, n, mean, shaped, cam_from_world, intrinsics, lens, windows, size, near, outputs):
         means2d, conics, depths, opacities, _, radii = outputs
         _, opacity, _, _, axes = shaped
-        row_x, row_y, row_z, offset = pose(cam_from_world, c)
-        depth = dot(row_z, mean) + offset[2]
-        position = dot(row_x, mean) + offset[0], dot(row_y, mean) + offset[1], depth
-        tangent, _, _, _, covariance = view((row_x, row_y, row_z), position, axes, intrinsics, lens, c)
+        rows, position = in_camera(cam_from_world, c, mean)
+        depth = position[2]
+        tangent, _, _, _, covariance = view(rows, position, axes, intrinsics, lens, c)
         xx, xy, yy, determinant = covariance
         u = intrinsics[c, 0] * tangent[0] + intrinsics[c, 2]
         v = intrinsics[c, 1] * tangent[1] + intrinsics[c, 3]
@@ -178,34 +174,32 @@ def build_place(real: type) -> Callable[..., Any]:
     return place
 
 
-def build_cull(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Builds `cull`, which zeroes one ellipsoid in one camera, and `in_front`, a test of near and clip planes."""
-    zero = real(0.0)
-
-    @inlined
-    def cull(n, c, means2d, conics, depths, opacities, colors, radii):
-        depths[c, n] = opacities[c, n] = zero
-        means2d[c, n, 0] = means2d[c, n, 1] = radii[c, n, 0] = radii[c, n, 1] = zero
-        for j in range(3):
-            conics[c, n, j] = colors[c, n, j] = zero
-
-    @inlined
-    def in_front(c, mean, cam_from_world, near, clip_planes, clips):
-        row_z = cam_from_world[c, 2, 0], cam_from_world[c, 2, 1], cam_from_world[c, 2, 2]
-        if not dot(row_z, mean) + cam_from_world[c, 2, 3] > near:
-            return False
-        return not clips or dot(vec3(clip_planes, c), mean) + clip_planes[c, 3] > zero
-
-    return cull, in_front
+@inlined
+def cull(c, n, outputs):
+    """Writes zeros for one ellipsoid in one camera."""
+    means2d, conics, depths, opacities, colors, radii = outputs
+    depths[c, n] = opacities[c, n] = 0
+    for j in range(2):
+        means2d[c, n, j] = radii[c, n, j] = 0
+    for j in range(3):
+        conics[c, n, j] = colors[c, n, j] = 0
 
 
-def place_gradients(real: type, free: Callable[..., Any] | None = None) -> Callable[..., Any]:
+@inlined
+def in_front(c, mean, cam_from_world, near, clip_planes, clips):
+    """Return whether a point is beyond the near plane and on the kept side of the clip plane, if there is one."""
+    row_z = cam_from_world[c, 2, 0], cam_from_world[c, 2, 1], cam_from_world[c, 2, 2]
+    if not dot(row_z, mean) + cam_from_world[c, 2, 3] > near:
+        return False
+    return not clips or dot(vec3(clip_planes, c), mean) + clip_planes[c, 3] > ZERO
+
+
+def place_gradients(real: type, free: Scalar | None = None) -> Scalar:
     """Builds the gradient of one Gaussian in one camera, without its colour, for scalars or vectors.
 
     For vectors, `free(x, held, tangent)` is x where a tangent is not clamped to a limit, and 0 elsewhere.
     """
-    *_, covariance_gradient, footprint_gradient = screen_maths(real)
-    zero, one = real(0.0), real(1.0)
+    covariance_gradient, zero, one = build_covariance_gradient(real), real(0.0), real(1.0)
 
     @inlined
     def free_number(x, held, tangent):
@@ -227,14 +221,13 @@ def place_gradients(real: type, free: Callable[..., Any] | None = None) -> Calla
         g_tangent_x, g_tangent_y = fx * g_mean2d[0] + g_held_x, fy * g_mean2d[1] + g_held_y
         g_log_depth = dot(gw_x, w_x) + dot(gw_y, w_y) + g_tangent_x * tangent[0] + g_tangent_y * tangent[1]
         g_position = inverse_depth * g_tangent_x, inverse_depth * g_tangent_y, g_depth - inverse_depth * g_log_depth
-        g_row_x, g_row_y = combine(scale_x, gw_x, zero, gw_x), combine(scale_y, gw_y, zero, gw_y)
         g_row_z = combine(-scale_x * held[0], gw_x, -scale_y * held[1], gw_y)
-        return g_position, (g_row_x, g_row_y, g_row_z), g_axes
+        return g_position, (scaled(scale_x, gw_x), scaled(scale_y, gw_y), g_row_z), g_axes
 
     return place_gradient
 
 
-def camera_sums(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def camera_sums(real: type) -> tuple[Scalar, Scalar]:
     """Builds steps that add to a camera's gradient [12], rows of (3x3 block, translation), in double precision."""
     one = real(1.0)
 
@@ -263,9 +256,9 @@ def camera_sums(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
     return add_place, add_view
 
 
-def view_gradients(real: type) -> Callable[..., Any]:
+def view_gradients(real: type) -> Scalar:
     """Builds the gradient of the colour of one Gaussian in one camera."""
-    direction, (color, color_gradient) = view_steps(real).direction, color_maths(real)
+    direction, (color, color_gradient) = build_direction(real), color_maths(real)
     zero, half = real(0.0), real(0.5)
 
     @inlined
@@ -299,35 +292,26 @@ class Footprint(NamedTuple):
             axes, two log scales).
     """
 
-    shape: Callable[..., Any]
-    cull: Callable[..., Any]
-    place: Callable[..., Any]
-    place_gradient: Callable[..., Any]
-    finish: Callable[..., Any]
+    shape: Scalar
+    cull: Scalar
+    place: Scalar
+    place_gradient: Scalar
+    finish: Scalar
 
 
 def ellipsoids(real: type) -> Footprint:
     """Builds the footprint of ellipsoids, for one at a time."""
-    shape, culled = view_steps(real).shape, build_cull(real)[0]
-
-    @inlined
-    def cull(c, n, outputs):
-        means2d, conics, depths, opacities, colors, radii = outputs
-        culled(n, c, means2d, conics, depths, opacities, colors, radii)
-
-    return Footprint(shape, cull, build_place(real), _ellipsoid_gradient(real), _finish_ellipsoid(real))
+    return Footprint(build_shape(real), cull, build_place(real), _ellipsoid_gradient(real), _finish_ellipsoid(real))
 
 
-def _ellipsoid_gradient(real: type) -> Callable[..., Any]:
-    view, placed, zero = view_steps(real).view, place_gradients(real), real(0.0)
+def _ellipsoid_gradient(real: type) -> Scalar:
+    view, placed, zero = build_view(real, clamp), place_gradients(real), real(0.0)
 
     @inlined
     def place_gradient(c, n, mean, shaped, cam_from_world, intrinsics, lens, maps, cotangents):
         g_means2d, g_conics, g_depths, _, _ = cotangents
         axes = shaped[4]
-        row_x, row_y, row_z, offset = pose(cam_from_world, c)
-        rows = row_x, row_y, row_z
-        position = dot(row_x, mean) + offset[0], dot(row_y, mean) + offset[1], dot(row_z, mean) + offset[2]
+        rows, position = in_camera(cam_from_world, c, mean)
         g_position, g_rows, g_axes = placed(
             rows, position, view(rows, position, axes, intrinsics, lens, c), axes, intrinsics, c,
             (g_means2d[c, n, 0], g_means2d[c, n, 1]), (g_conics[c, n, 0], g_conics[c, n, 1], g_conics[c, n, 2]),
@@ -338,10 +322,8 @@ def _ellipsoid_gradient(real: type) -> Callable[..., Any]:
     return place_gradient
 
 
-def _finish_ellipsoid(real: type) -> Callable[..., Any]:
-    maths = shape_maths(real)
-    rotation, unit_quat_gradient = maths.rotation, maths.unit_quat_gradient
-    zero, one = real(0.0), real(1.0)
+def _finish_ellipsoid(real: type) -> Scalar:
+    one = real(1.0)
 
     @inlined
     def finish(n, shaped, sums, g_means, g_quats, g_log_scales, g_logit_opacities):
@@ -356,12 +338,8 @@ def _finish_ellipsoid(real: type) -> Callable[..., Any]:
         g_log_scales[n, 0] += dot(axes[0], g_axes[0])
         g_log_scales[n, 1] += dot(axes[1], g_axes[1])
         g_log_scales[n, 2] += dot(axes[2], g_axes[2])
-        g_x, g_y, g_z = (
-            combine(dot(axes[0], x), g_axes[0], zero, x),
-            combine(dot(axes[1], y), g_axes[1], zero, y),
-            combine(dot(axes[2], z), g_axes[2], zero, z),
-        )
-        g_w, g_i, g_j, g_k = unit_quat_gradient(quat, inverse_norm, g_x, g_y, g_z)
+        lengths = dot(axes[0], x), dot(axes[1], y), dot(axes[2], z)
+        g_w, g_i, g_j, g_k = unit_quat_gradient(quat, inverse_norm, scaled_columns(lengths, g_axes))
         g_quats[n, 0] += g_w
         g_quats[n, 1] += g_i
         g_quats[n, 2] += g_j
@@ -370,11 +348,9 @@ def _finish_ellipsoid(real: type) -> Callable[..., Any]:
     return finish
 
 
-def build_project(real: type, kind: Footprint) -> Callable[..., Any]:
+def build_project(real: type, kind: Footprint) -> Scalar:
     """Builds the step that fills the outputs of one Gaussian in all cameras, zeros where it is culled."""
-    direction, in_front = view_steps(real).direction, build_cull(real)[1]
-    shape, cull, place, *_ = kind
-    is_finite, color = shape_maths(real).is_finite, color_maths(real).color
+    (shape, cull, place, *_), direction, (color, _) = kind, build_direction(real), color_maths(real)
     zero, half = real(0.0), real(0.5)
 
     @inlined
@@ -406,7 +382,7 @@ def build_project(real: type, kind: Footprint) -> Callable[..., Any]:
     return project
 
 
-def build_project_back(real: type, kind: Footprint) -> Callable[..., Any]:
+def build_project_back(real: type, kind: Footprint) -> Scalar:
     """Builds the step that adds one visible Gaussian's gradients to the inputs of `finish`, and to its camera's."""
     place_gradient, view_gradient, (add_place, add_view) = kind.place_gradient, view_gradients(real), camera_sums(real)
     zero, one = real(0.0), real(1.0)
@@ -420,8 +396,7 @@ def build_project_back(real: type, kind: Footprint) -> Callable[..., Any]:
         g_center, g_rows, g_axes, g_scales = place_gradient(
             c, n, mean, shaped, cam_from_world, intrinsics, lens, maps, cotangents
         )
-        row_x, row_y, row_z, _ = pose(cam_from_world, c)
-        g_mean = combine(one, g_mean, one, scaled_sum(g_center, row_x, row_y, row_z))
+        g_mean = combine(one, g_mean, one, scaled_sum(g_center, rows_of(cam_from_world, c)))
         ga_x, ga_y = combine(one, ga_x, one, g_axes[0]), combine(one, ga_y, one, g_axes[1])
         ga_z = combine(one, ga_z, one, g_axes[2])
         g_u, g_v, g_opacity = g_u + g_scales[0], g_v + g_scales[1], g_opacity + g_opacities[c, n]

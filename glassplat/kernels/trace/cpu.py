@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
-from glassplat.kernels.maths.blending import ALPHA_MAX, TRANSMITTANCE_MIN, Scalar, blend_maths
+from glassplat.kernels.maths.blending import ALPHA_MAX, TRANSMITTANCE_MIN, Scalar, build_exp2
 from glassplat.kernels.maths.disc import ray_hit_maths
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.records import REAL_OF, Bvh, Shapes
@@ -188,7 +188,7 @@ def trace_collect(real: type, flat: bool) -> Kernel:
 
 def _hit_gradients(real: type, flat: bool) -> Scalar:
     """Builds the step that adds one hit's gradients to its Gaussian's row and to its ray."""
-    intersect_gradient, half, most = ray_hit_maths(real, flat).intersect_gradient, real(0.5), real(ALPHA_MAX)
+    (_, intersect_gradient), half, most = ray_hit_maths(real, flat), real(0.5), real(ALPHA_MAX)
     zero = real(0.0)
 
     @inlined
@@ -211,8 +211,8 @@ def _hit_gradients(real: type, flat: bool) -> Scalar:
 @cache
 def trace_backward(real: type, flat: bool) -> Kernel:
     """Fills each block's rows and their owners, and the gradients, initially zero, of the rays."""
-    coverage, add_gradients = coverage_maths(real, blend_maths(real).exp2), _hit_gradients(real, flat)
-    intersect, hit_color_gradient = ray_hit_maths(real, flat).intersect, color_backward(real)
+    coverage, add_gradients = coverage_maths(real, build_exp2(real)), _hit_gradients(real, flat)
+    (intersect, _), hit_color_gradient = ray_hit_maths(real, flat), color_backward(real)
     zero, half, one, nowhere = real(0.0), real(0.5), real(1.0), real("inf")
 
     @kernel("trace_backward_discs" if flat else "trace_backward_ellipsoids", real)
@@ -336,7 +336,7 @@ def trace(
 def trace_forward(real: type, flat: bool) -> Kernel:
     """Fills colors, alphas, depths and hits, and lists the nearest Gaussians."""
     next_hits, ray = next_hits_maths(real, flat), ray_reader(real)
-    color = color_maths(real).color
+    color, _ = color_maths(real)
     zero, half, one, least = real(0.0), real(0.5), real(1.0), real(TRANSMITTANCE_MIN)
 
     @kernel("trace_forward_discs" if flat else "trace_forward_ellipsoids", real)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from glassplat.kernels.backend.cpu import Kernel, inlined, kernel
 from glassplat.kernels.backend.cpu_vector import bits_of, lowest_bit, maximum, minimum, store, vector_kind
-from glassplat.kernels.maths.blending import Scalar, blend_maths
+from glassplat.kernels.maths.blending import Scalar, build_exp2
 from glassplat.kernels.maths.disc import EDGE_ON, MOST_DEVIATIONS
 from glassplat.kernels.records import REAL_OF
 from glassplat.kernels.trace.steps import LEVEL_BITS, NODE, SLACK, WIDTH, coverage_maths, insert
@@ -146,7 +146,7 @@ def packed_leaves(shapes: Sequence[Tensor], order: Tensor) -> NDArray[Any]:
 def next_hits_maths(real: type, flat: bool) -> Scalar:
     """Builds `next_hits`, which fills (ts, ids, alphas) with up to `most` next hits of a ray; returns their number."""
     enter, intersect = _entry(real), _intersect_lanes(real, flat)
-    coverage = coverage_maths(real, blend_maths(real).exp2)
+    coverage = coverage_maths(real, build_exp2(real))
     zero, nowhere, sooner = real(0.0), real("inf"), real(1.0 - SLACK)
 
     @inlined

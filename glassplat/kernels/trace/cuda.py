@@ -20,7 +20,7 @@ import torch
 from numba import cuda
 from torch import Tensor
 
-from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.backend.cpu import ZERO, inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.maths.blending import ALPHA_MAX, TRANSMITTANCE_MIN, Scalar
 from glassplat.kernels.maths.disc import ray_hit_maths
@@ -137,10 +137,6 @@ def fit_level(real: type) -> Kernel:
     return fit
 
 
-ZERO = np.float32(0.0)
-"""Exact in single precision, so that comparisons are not promoted to double."""
-
-
 @inlined
 def enter(boxes, at, o, inverse, first, last):
     """Distances at which a ray enters and leaves a box, within two bounds; it hits the box if they are in order."""
@@ -157,7 +153,7 @@ def enter(boxes, at, o, inverse, first, last):
 
 def next_hits_maths(real: type, flat: bool) -> Scalar:
     """Builds `next_hits`, which fills (ts, ids, alphas) with a ray's next hits and returns their number."""
-    intersect, coverage = ray_hit_maths(real, flat).intersect, coverage_maths(real, exp2_maths(real))
+    (intersect, _), coverage = ray_hit_maths(real, flat), coverage_maths(real, exp2_maths(real))
     zero, nowhere, sooner, later = real(0.0), real("inf"), real(1.0 - SLACK), real(1.0 + SLACK)
 
     @inlined
@@ -444,7 +440,7 @@ def trace_forward(real: type, flat: bool) -> Kernel:
     Both are one kernel, so that both find the same hits: separate kernels may fuse operations differently, and a
     Gaussian that covers just 1/255 would be hit in only one of them.
     """
-    ray, next_hits, color = ray_reader(real), next_hits_maths(real, flat), color_maths(real).color
+    ray, next_hits, (color, _) = ray_reader(real), next_hits_maths(real, flat), color_maths(real)
     zero, half, one, least = real(0.0), real(0.5), real(1.0), real(TRANSMITTANCE_MIN)
 
     @kernel(
