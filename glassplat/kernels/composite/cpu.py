@@ -467,15 +467,14 @@ def composite_gradients(
 
     That of a mark is in the place of its splat's first channel; that of `absgrad` is empty without `with_absgrad`.
     """
-    real = REAL_OF[channels.dtype]
     cameras, count, num_channels = channels.shape
-    rows = new_pair_rows(bins, num_channels, real)
+    rows = new_pair_rows(bins, tile.row_width(tile.PAIR_VALUES, num_channels), channels.dtype)
     *v_images, v_deviation = v_outputs
     channel, through_mean = -1, False
     if deviation:
         channel, through_mean = deviation.channel, deviation.through_mean
         v_deviation = v_deviation * deviation.where
-    composite_backward(real, with_absgrad)(
+    composite_backward(REAL_OF[channels.dtype], with_absgrad)(
         cameras * count, num_primary < count, num_channels, bins.width, bins.height, channel, through_mean,
         bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.active.numpy(), *saved,
         *(tile.flat(v) for v in (*v_images, v_deviation)), rows,

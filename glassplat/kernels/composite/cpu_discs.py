@@ -515,9 +515,7 @@ def composite_discs_gradients(
 ) -> tuple[Tensor | None, ...]:  # fmt: skip
     """Gradients of means2d, maps, opacities, depths, channels and absgrad; the last is None without `with_absgrad`."""
     (cameras, count, num_channels), real = channels.shape, REAL_OF[channels.dtype]
-    # Zeros, because the rows of inactive tiles are never written.
-    size = len(bins.pair_splats) * tile.row_width(PAIR_VALUES, num_channels)
-    rows = torch.zeros(size, dtype=channels.dtype).numpy()
+    rows = tile.new_pair_rows(bins, tile.row_width(PAIR_VALUES, num_channels), channels.dtype)
     composite_discs_backward(real)(
         cameras * count, num_channels, bins.width, bins.height, *_real_options(real, near, low_pass),
         bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.active.numpy(), *saved,

@@ -293,18 +293,17 @@ def sum_channels_of(real: type, image: int, weight: int, values: int) -> Scalar:
     return sum_channels
 
 
-def new_pair_rows(bins: TileBins, num_values: int, real: type) -> NDArray[Any]:
-    """Flat buffer for one row per pair.
+def new_pair_rows(bins: TileBins, width: int, dtype: torch.dtype) -> NDArray[Any]:
+    """Flat buffer for one row per pair, with a width from `row_width`.
 
     A kernel fills the rows of active tiles. The buffer is zeroed only if other tiles have pairs.
     """
-    size, active = len(bins.pair_splats) * row_width(PAIR_VALUES, num_values), bins.active.long()
-    filled = len(active) == len(bins.tile_offsets) - 1 or len(bins.pair_splats) == int(
+    active, pairs = bins.active.long(), len(bins.pair_splats)
+    filled = len(active) == len(bins.tile_offsets) - 1 or pairs == int(
         (bins.tile_offsets[active + 1] - bins.tile_offsets[active]).sum()
     )
-    dtype = torch.float64 if real is np.float64 else torch.float32
     # An array of PyTorch, because it is aligned to cache lines, and a row fills one.
-    rows: NDArray[Any] = (torch.empty if filled else torch.zeros)(size, dtype=dtype).numpy()
+    rows: NDArray[Any] = (torch.empty if filled else torch.zeros)(pairs * width, dtype=dtype).numpy()
     return rows
 
 
