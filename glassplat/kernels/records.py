@@ -52,6 +52,14 @@ class RawGaussians(NamedTuple):
     sh: Tensor
 
 
+def expected_shapes(gaussians: RawGaussians, scales: int) -> dict[str, tuple[Tensor, tuple[int, ...]]]:
+    """The tensors with their expected shapes for `check_tensors`, given the number of scales per Gaussian."""
+    count = gaussians.means.shape[0]
+    coefficients = gaussians.sh.shape[1] if gaussians.sh.dim() == 3 else 0
+    shapes = (count, 3), (count, 4), (count, scales), (count,), (count, coefficients, 3)
+    return {name: (getattr(gaussians, name), shape) for name, shape in zip(gaussians._fields, shapes, strict=True)}
+
+
 class CameraBatch(NamedTuple):
     """Cameras of one image size: cam_from_world [C, 4, 4], intrinsics [C, 4] as (fx, fy, cx, cy), pixels.
 

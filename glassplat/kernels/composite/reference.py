@@ -11,6 +11,7 @@ from torch import Tensor
 from glassplat.kernels.composite import BlendedDiscs, Composite
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from glassplat.kernels.maths.disc import LOW_PASS, MOST_DEVIATIONS
+from glassplat.kernels.project.reference import where
 from glassplat.kernels.records import LEAST_ALPHA, ON_MEAN, TILE, Deviation, Discs, Splats, TileBins
 
 
@@ -140,12 +141,8 @@ def composite_discs(
     for c in range(bins.num_cameras):
         own = Discs(discs.means2d[c], discs.maps[c], discs.opacities[c], discs.depths[c], discs.outlines)
         found = _camera(own, channels[c], bins, near, low_pass, None if absgrad is None else absgrad[c])
-        blended.append([torch.where(_expand_mask(active[c], x), x, torch.zeros_like(x)) for x in found])
+        blended.append([where(active[c], tensor, torch.zeros_like(tensor)) for tensor in found])
     return BlendedDiscs(*(torch.stack(tensors) for tensors in zip(*blended, strict=True)))
-
-
-def _expand_mask(mask: Tensor, value: Tensor) -> Tensor:
-    return mask.reshape(mask.shape + (1,) * (value.dim() - 2))
 
 
 def _camera(

@@ -13,7 +13,16 @@ from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.backend.devices import kernels_for
 from glassplat.kernels.maths.harmonics import check_sh_degree
-from glassplat.kernels.records import FLAT, SOLID, CameraBatch, Projected, ProjectedDiscs, RawGaussians, check_tensors
+from glassplat.kernels.records import (
+    FLAT,
+    SOLID,
+    CameraBatch,
+    Projected,
+    ProjectedDiscs,
+    RawGaussians,
+    check_tensors,
+    expected_shapes,
+)
 
 
 def projection_inputs(
@@ -28,14 +37,9 @@ def projection_inputs(
         sh_degree: highest degree of the spherical harmonics to evaluate.
         near: smallest depth.
     """
-    count, num_cameras = gaussians.means.shape[0], cameras.cam_from_world.shape[0]
-    coefficients = gaussians.sh.shape[1] if gaussians.sh.dim() == 3 else 0
+    num_cameras = cameras.cam_from_world.shape[0]
     expected = {
-        "means": (gaussians.means, (count, 3)),
-        "quats": (gaussians.quats, (count, 4)),
-        "log_scales": (gaussians.log_scales, (count, scales)),
-        "logit_opacities": (gaussians.logit_opacities, (count,)),
-        "sh": (gaussians.sh, (count, coefficients, 3)),
+        **expected_shapes(gaussians, scales),
         "cam_from_world": (cameras.cam_from_world, (num_cameras, 4, 4)),
         "intrinsics": (cameras.intrinsics, (num_cameras, 4)),
     }
@@ -44,7 +48,7 @@ def projection_inputs(
     if cameras.windows is not None:
         expected["windows"] = (cameras.windows, (num_cameras, 4))
     check_tensors(expected)
-    check_sh_degree(sh_degree, coefficients)
+    check_sh_degree(sh_degree, gaussians.sh.shape[1])
     if not near >= 0:
         raise ValueError(f"near is {near}; expected a depth of at least 0")
     clip_planes = cameras.clip_planes

@@ -29,16 +29,16 @@ def project(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, ne
     with torch.no_grad():
         visible = _project_all(gaussians, cameras, sh_degree, near)[1]
     projected, _ = _project_all(_harmless(gaussians, visible), cameras, sh_degree, near, visible)
-    return Projected(*(_where(visible, tensor, torch.zeros_like(tensor)) for tensor in projected))
+    return Projected(*(where(visible, tensor, torch.zeros_like(tensor)) for tensor in projected))
 
 
 def _harmless(gaussians: RawGaussians, visible: Tensor) -> RawGaussians:
     """Ones for invisible Gaussians: a NaN masked afterwards would still reach gradients, as NaN times zero."""
     seen = visible.any(dim=0)
-    return RawGaussians(*(_where(seen, tensor, torch.ones_like(tensor)) for tensor in gaussians))
+    return RawGaussians(*(where(seen, tensor, torch.ones_like(tensor)) for tensor in gaussians))
 
 
-def _where(mask: Tensor, value: Tensor, other: Tensor) -> Tensor:
+def where(mask: Tensor, value: Tensor, other: Tensor) -> Tensor:
     """`torch.where` with a mask over the leading dimensions."""
     return torch.where(mask.reshape(mask.shape + (1,) * (value.dim() - mask.dim())), value, other)
 
@@ -51,13 +51,13 @@ def _project_all(
     in_camera = gaussians.means @ linear.mT + offset[:, None]
     depths = in_camera[..., 2]
     if visible is not None:
-        in_camera = _where(visible, in_camera, torch.ones_like(in_camera))
+        in_camera = where(visible, in_camera, torch.ones_like(in_camera))
     tangents = in_camera[..., :2] / in_camera[..., 2:]
     means2d = tangents * cameras.intrinsics[:, None, :2] + cameras.intrinsics[:, None, 2:]
     opacities = torch.sigmoid(gaussians.logit_opacities).expand(depths.shape)
     ellipse = _ellipses(gaussians, cameras, tangents, in_camera[..., 2])
     if visible is not None:
-        ellipse = _Ellipses(*(_where(visible, entry, torch.ones_like(entry)) for entry in ellipse))
+        ellipse = _Ellipses(*(where(visible, entry, torch.ones_like(entry)) for entry in ellipse))
     conics = torch.stack([ellipse.yy, -ellipse.xy, ellipse.xx], dim=-1) / ellipse.determinant[..., None]
     reach = 2 * torch.log(opacities / ALPHA_MIN).clamp(min=0)
     radii = torch.sqrt(reach[..., None] * torch.stack([ellipse.xx, ellipse.yy], dim=-1)).detach()
@@ -128,12 +128,16 @@ def sh_basis(directions: Tensor) -> Tensor:
     ], dim=-1)  # fmt: skip
 
 
+def usable(gaussians: RawGaussians) -> Tensor:
+    """Mask [N] of Gaussians with finite parameters, except coefficients, and an orientation."""
+    norm = gaussians.quats.square().sum(-1)
+    raw = torch.cat([*gaussians[:3], gaussians.logit_opacities[:, None]], dim=-1)
+    return raw.isfinite().all(dim=-1) & norm.isfinite() & (norm > 0)
+
+
 def _visible(projected: Projected, gaussians: RawGaussians, cameras: CameraBatch, near: float) -> Tensor:
     """Mask [C, N] of Gaussians beyond the near plane, on the kept side of the clip plane and in the window."""
-    raw = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities[:, None])
-    norm = gaussians.quats.square().sum(-1)
-    usable = torch.cat(raw, dim=-1).isfinite().all(dim=-1) & norm.isfinite() & (norm > 0)
-    visible = usable & (projected.depths > near) & projected.depths.isfinite()
+    visible = usable(gaussians) & (projected.depths > near) & projected.depths.isfinite()
     low, high = projected.means2d - projected.radii, projected.means2d + projected.radii
     return visible & _in_window(low, high, gaussians, cameras) & (projected.radii > 0).all(dim=-1)
 
@@ -158,7 +162,7 @@ def project_discs(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: i
         visible = _visible_discs(_project_all_discs(gaussians, cameras, sh_degree, near), gaussians, cameras, near)
     projected = _project_all_discs(_harmless(gaussians, visible), cameras, sh_degree, near, visible)
     projected = projected._replace(colors=projected.colors.clamp(min=0))
-    return ProjectedDiscs(*(_where(visible, tensor, torch.zeros_like(tensor)) for tensor in projected))
+    return ProjectedDiscs(*(where(visible, tensor, torch.zeros_like(tensor)) for tensor in projected))
 
 
 def _project_all_discs(
@@ -172,9 +176,7 @@ def _project_all_discs(
     p, q = (torch.einsum("cij,nj->cni", linear, turned[..., i]) for i in range(2))
     if visible is not None:
         harmless = torch.eye(3, dtype=centers.dtype)
-        p, q, centers = (
-            _where(visible, value, harmless[i].expand_as(value)) for i, value in enumerate((p, q, centers))
-        )
+        p, q, centers = (where(visible, value, harmless[i].expand_as(value)) for i, value in enumerate((p, q, centers)))
     inverse = torch.exp(-gaussians.log_scales)
     n = torch.linalg.cross(p, q)
     per_slope = (centers[..., 2] / (n * centers).sum(-1))[..., None] / focal
@@ -190,7 +192,7 @@ def _project_all_discs(
     opacities = torch.sigmoid(gaussians.logit_opacities).expand(depths.shape)
     with torch.no_grad():
         ahead = torch.stack([p[..., 2], q[..., 2]], dim=-1) * torch.exp(gaussians.log_scales)
-        nearest = depths - _squared_reach(opacities).sqrt() * ahead.norm(dim=-1)
+        nearest = depths - squared_reach(opacities).sqrt() * ahead.norm(dim=-1)
         outlines = _outlines(maps, opacities, nearest > near, cameras.width, cameras.height)
     towards = -_outwards(gaussians, linear, offset)
     side = torch.where((towards * turned[..., 2]).sum(-1, keepdim=True) < 0, -1.0, 1.0).to(depths.dtype)
@@ -202,7 +204,7 @@ def _project_all_discs(
     )  # fmt: skip
 
 
-def _squared_reach(opacities: Tensor) -> Tensor:
+def squared_reach(opacities: Tensor) -> Tensor:
     """Squared standard deviations up to which rays hit discs; zero for invisible discs."""
     return (2 * torch.log(opacities / ALPHA_MIN)).clamp(min=0, max=MOST_DEVIATIONS**2)
 
@@ -210,36 +212,33 @@ def _squared_reach(opacities: Tensor) -> Tensor:
 def _outlines(maps: Tensor, opacities: Tensor, whole: Tensor, width: int, height: int) -> tuple[Tensor, ...]:
     """Shift of the centre [C, N, 2], conics [C, N, 3] and half extents [C, N, 2] of the ellipses, float64."""
     maps, opacities = maps.double(), opacities.double()
-    squared = _squared_reach(opacities)
+    squared = squared_reach(opacities)
     rows = maps.unflatten(-1, (3, 2))
     u, v, w = (rows[..., i, :] for i in range(3))
     outer = [x[..., :, None] * x[..., None, :] for x in (u, v, w)]
     form = outer[0] + outer[1] - squared[..., None, None] * outer[2]
     determinant = form[..., 0, 0] * form[..., 1, 1] - form[..., 0, 1] ** 2
     whole = whole & (determinant > 0) & (form[..., 0, 0] > 0) & (squared > 0)
-    inverse = torch.linalg.inv(_where(whole, form, torch.eye(2, dtype=form.dtype)))
+    inverse = torch.linalg.inv(where(whole, form, torch.eye(2, dtype=form.dtype)))
     shift = squared[..., None] * (inverse @ w[..., None])[..., 0]
     covariance = (squared * (1 + (w * shift).sum(-1)))[..., None, None] * inverse
     least = DISC_LOW_PASS * squared.sqrt() + shift.norm(dim=-1)
     values, axes = torch.linalg.eigh(torch.where(covariance.isfinite(), covariance, 0))
     values = torch.maximum(values, least[..., None].square()) * SLACK**2
     wide = axes @ torch.diag_embed(values) @ axes.mT
-    conic = torch.linalg.inv(_where(whole, wide, torch.eye(2, dtype=form.dtype)))
+    conic = torch.linalg.inv(where(whole, wide, torch.eye(2, dtype=form.dtype)))
     conic = conic * (2 * torch.log(opacities / ALPHA_MIN))[..., None, None]
     entries = torch.stack([conic[..., 0, 0], conic[..., 0, 1], conic[..., 1, 1]], dim=-1)
     radii = wide.diagonal(dim1=-2, dim2=-1).sqrt()
     image = torch.tensor([width, height], dtype=radii.dtype).expand_as(radii)
     nothing = torch.zeros_like(entries)
-    return _where(whole, shift, nothing[..., :2]), _where(whole, entries, nothing), _where(whole, radii, image)
+    return where(whole, shift, nothing[..., :2]), where(whole, entries, nothing), where(whole, radii, image)
 
 
 def _visible_discs(projected: ProjectedDiscs, gaussians: RawGaussians, cameras: CameraBatch, near: float) -> Tensor:
     """Mask [C, N] of discs beyond the near plane, not edge-on, on the kept side and in the window."""
-    raw = torch.cat([*gaussians[:3], gaussians.logit_opacities[:, None]], dim=-1)
-    norm = gaussians.quats.square().sum(-1)
-    usable = raw.isfinite().all(dim=-1) & norm.isfinite() & (norm > 0)
-    usable &= (gaussians.log_scales.abs() <= MOST_LOG_SCALE).all(dim=-1)
-    visible = usable & (projected.depths > near)
+    sized = (gaussians.log_scales.abs() <= MOST_LOG_SCALE).all(dim=-1)
+    visible = usable(gaussians) & sized & (projected.depths > near)
     visible = visible & projected.maps.isfinite().all(dim=-1) & projected.colors.isfinite().all(dim=-1)
     visible = visible & projected.depths.isfinite() & _is_not_edge_on(gaussians, cameras)
     visible = visible & (projected.opacities > ALPHA_MIN)
@@ -265,7 +264,7 @@ def _crossing_boxes(
     sides = torch.einsum("cij,njk->cnki", linear, axes)
     slopes, depths = sides[..., 2], centers[..., 2:]
     steepness = slopes.norm(dim=-1, keepdim=True)
-    reach = _squared_reach(opacities.double()).sqrt()[..., None]
+    reach = squared_reach(opacities.double()).sqrt()[..., None]
     turn = slopes / steepness
     along = (turn[..., None] * sides).sum(-2)
     across = turn[..., :1] * sides[..., 1, :] - turn[..., 1:] * sides[..., 0, :]

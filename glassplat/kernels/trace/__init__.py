@@ -24,11 +24,20 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.backend.devices import kernels_for
-from glassplat.kernels.maths.blending import ALPHA_MIN
-from glassplat.kernels.maths.disc import MOST_DEVIATIONS, MOST_LOG_SCALE
+from glassplat.kernels.maths.disc import MOST_LOG_SCALE
 from glassplat.kernels.maths.harmonics import check_sh_degree
-from glassplat.kernels.project.reference import rotations
-from glassplat.kernels.records import FLAT, SOLID, Bvh, RawGaussians, Rays, Shapes, Traced, check_tensors
+from glassplat.kernels.project.reference import rotations, squared_reach, usable, where
+from glassplat.kernels.records import (
+    FLAT,
+    SOLID,
+    Bvh,
+    RawGaussians,
+    Rays,
+    Shapes,
+    Traced,
+    check_tensors,
+    expected_shapes,
+)
 
 
 def shapes_of(gaussians: RawGaussians) -> Shapes:
@@ -36,34 +45,22 @@ def shapes_of(gaussians: RawGaussians) -> Shapes:
 
     Gaussians without a valid size or orientation, or with a non-finite parameter, become invisible and get no gradient.
     """
-    usable = _usable(gaussians)
+    with torch.no_grad():
+        valid = usable(gaussians) & gaussians.sh.flatten(1).isfinite().all(dim=1)
+        valid &= (gaussians.log_scales.abs() <= MOST_LOG_SCALE).all(dim=1)
     # Placeholders: a NaN masked afterwards would still reach the gradients, as NaN times zero.
-    tensors = (torch.where(_expand_mask(usable, x), x, torch.ones_like(x)) for x in gaussians)
+    tensors = (where(valid, tensor, torch.ones_like(tensor)) for tensor in gaussians)
     means, quats, log_scales, logit_opacities, sh = tensors
     inverse = torch.exp(-log_scales)
     if log_scales.shape[1] == FLAT:
         inverse = torch.cat([inverse, torch.ones_like(inverse[:, :1])], dim=1)
-    opacities = torch.where(usable, torch.sigmoid(logit_opacities), torch.zeros_like(logit_opacities))
+    opacities = torch.where(valid, torch.sigmoid(logit_opacities), torch.zeros_like(logit_opacities))
     return Shapes(means, rotations(quats).mT * inverse[:, :, None], opacities, sh)
-
-
-@torch.no_grad()
-def _usable(gaussians: RawGaussians) -> Tensor:
-    """Mask [N] of Gaussians with finite parameters and a valid size and orientation."""
-    everything = torch.cat([tensor.flatten(1) if tensor.dim() > 1 else tensor[:, None] for tensor in gaussians], dim=1)
-    norm = gaussians.quats.square().sum(-1)
-    sized = (gaussians.log_scales.abs() <= MOST_LOG_SCALE).all(dim=1)
-    return everything.isfinite().all(dim=1) & norm.isfinite() & (norm > 0) & sized
-
-
-def _expand_mask(mask: Tensor, tensor: Tensor) -> Tensor:
-    return mask.reshape(mask.shape + (1,) * (tensor.dim() - 1))
 
 
 def reach(opacities: Tensor) -> Tensor:
     """Distance [N] in standard deviations up to which rays hit Gaussians; 0 for invisible ones."""
-    squared = 2 * torch.log(opacities / ALPHA_MIN)
-    return squared.clamp(min=0, max=MOST_DEVIATIONS**2).sqrt().nan_to_num()
+    return squared_reach(opacities).sqrt().nan_to_num()
 
 
 @torch.no_grad()
@@ -119,14 +116,8 @@ def _check(
     gaussians: RawGaussians, rays: Rays, bvh: Bvh | None, sh_degree: int, near: float, contributions: Tensor | None
 ) -> None:
     count, num_rays = gaussians.means.shape[0], rays.origins.shape[0]
-    coefficients = gaussians.sh.shape[1] if gaussians.sh.dim() == 3 else 0
-    scales = gaussians.log_scales.shape[1] if gaussians.log_scales.dim() == 2 else 0
     expected = {
-        "means": (gaussians.means, (count, 3)),
-        "quats": (gaussians.quats, (count, 4)),
-        "log_scales": (gaussians.log_scales, (count, FLAT if scales == FLAT else SOLID)),
-        "logit_opacities": (gaussians.logit_opacities, (count,)),
-        "sh": (gaussians.sh, (count, coefficients, 3)),
+        **expected_shapes(gaussians, FLAT if gaussians.log_scales.shape[1:] == (FLAT,) else SOLID),
         "origins": (rays.origins, (num_rays, 3)),
         "directions": (rays.directions, (num_rays, 3)),
     }
@@ -139,7 +130,7 @@ def _check(
         raise ValueError(
             f"bvh is over {bvh.order.shape[0]} Gaussians and there are {count}; build it again with build_bvh"
         )
-    check_sh_degree(sh_degree, coefficients)
+    check_sh_degree(sh_degree, gaussians.sh.shape[1])
     if not near >= 0:
         raise ValueError(f"near is {near}; expected a distance of at least 0")
 
