@@ -26,7 +26,6 @@ from llvmlite import ir
 from numba.core import caching, types
 from numba.core.cpu import CPUContext
 from numba.core.registry import cpu_target
-from numba.extending import intrinsic
 
 from glassplat.kernels.backend.devices import announce_compilation
 
@@ -151,7 +150,6 @@ NAMED_TYPES = (ModuleType, type, BuiltinFunctionType, np.ufunc)
 TEXT_TYPES = (types.Type, ir.Type)
 """Types that are fully described by their text."""
 LIBRARIES = ("numba", "numpy", "llvmlite")
-INTRINSIC = type(intrinsic(lambda typing: None))
 DAMAGE_ERRORS = (EOFError, pickle.UnpicklingError, AttributeError, ImportError, LookupError, TypeError, ValueError)
 """Exceptions on reading a file that is truncated, or was written by another program."""
 
@@ -159,8 +157,8 @@ DAMAGE_ERRORS = (EOFError, pickle.UnpicklingError, AttributeError, ImportError, 
 def fingerprint(function: Callable[..., Any], flags: str) -> str:
     """Digest of everything that a compiled function depends on.
 
-    That is its bytecode and constants, its closure, the globals that it reads, and the same for every function among
-    those. Equal sources give equal digests in every process.
+    That is its bytecode and constants, its closure, the globals that it reads, also from other modules of the package,
+    and the same for every function among those. Equal sources give equal digests in every process.
 
     Args:
         function: a Python function, before compilation.
@@ -191,15 +189,12 @@ def _describe(value: Any, seen: set[int]) -> Iterator[str]:
         yield f"{getattr(value, '__module__', '')} {value.__name__}"
     elif isinstance(value, TEXT_TYPES):
         yield f"{type(value).__name__} {value}"
-    elif isinstance(value, INTRINSIC):
-        yield "intrinsic"
-        yield from _describe(value.__wrapped__, seen)
     elif isinstance(value, FunctionType):
         if id(value) not in seen:
             seen.add(id(value))
             yield from _described_function(value, seen)
     elif type(value).__name__ == "_Intrinsic":
-        # A Numba intrinsic, which is described by its definition.
+        # An intrinsic of Numba or of numba-cuda, which is described by its definition.
         yield from _describe(value._defn, seen)
     else:
         raise TypeError(
@@ -216,8 +211,13 @@ def _described_function(function: FunctionType, seen: set[int]) -> Iterator[str]
         yield f"closes over {name}"
         yield from _describe(cell.cell_contents, seen)
     for name in sorted(_global_names(function.__code__) & function.__globals__.keys()):
+        value = function.__globals__[name]
         yield f"reads {name}"
-        yield from _describe(function.__globals__[name], seen)
+        yield from _describe(value, seen)
+        if isinstance(value, ModuleType) and value.__name__.startswith("glassplat."):
+            for attribute in sorted(vars(value).keys() & set(function.__code__.co_names)):
+                yield f"reads {attribute}"
+                yield from _describe(getattr(value, attribute), seen)
 
 
 def _global_names(code: CodeType) -> set[str]:
