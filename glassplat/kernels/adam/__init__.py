@@ -81,7 +81,4 @@ def _check(update: Update, like: Tensor) -> None:
 
 def _flat(update: Update) -> Update:
     """The same update with flattened tensors."""
-    parameter, gradient, first, second, lr, step, decay = update
-    return Update(
-        parameter.view(-1), gradient.contiguous().view(-1), first.view(-1), second.view(-1), lr, step, decay
-    )  # fmt: skip
+    return Update(*(tensor.contiguous().view(-1) for tensor in update[:4]), *update[4:])

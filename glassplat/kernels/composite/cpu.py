@@ -199,20 +199,6 @@ def _deviate_block(real: type) -> Scalar:
     return deviate_block
 
 
-def _clear(real: type) -> Scalar:
-    full, zero, LANES, PIXELS = vector_kind(real, tile.LANES).full, real(0.0), tile.LANES, tile.PIXELS
-
-    @inlined
-    def clear(planes, groups):
-        """Sets mask and sums to zero."""
-        for i in range(0, PIXELS, LANES):
-            store(planes, MASK + i, full(zero))
-        for i in range(SUMS, SUMS + groups * 4 * PIXELS, LANES):
-            store(planes, i, full(zero))
-
-    return clear
-
-
 def _write_tile(real: type) -> Scalar:
     """Builds the function that writes a tile to the flat images."""
     one = real(1.0)
@@ -301,7 +287,7 @@ def composite_forward(real: type) -> Kernel:
     pack, fetch, reached = tile.pack_of(real), tile.fetch_of(real), tile.reached_of(real)
     blend_plain, blend_mixed = _blend_block(real, False), _blend_block(real, True)
     blend_more, deviate_block = _blend_more(real), _deviate_block(real)
-    begin, clear, finish, write_tile = tile.begin_state(real), _clear(real), tile.finish_state(real), _write_tile(real)
+    begin, finish, write_tile = tile.begin_state(real), tile.finish_state(real), _write_tile(real)
     begin_deviation, zero = _begin_deviation(real), real(0.0)
     BLOCK, ACROSS, BLOCKS, LANES, PIXELS = tile.BLOCK, tile.ACROSS, tile.BLOCKS, tile.LANES, tile.PIXELS
     VALUES, ORDER, CHUNK, GLASS, STATE = tile.VALUES, tile.ORDER, tile.CHUNK, tile.GLASS, tile.STATE
@@ -342,7 +328,7 @@ def composite_forward(real: type) -> Kernel:
                 running = begin(state, at, columns, rows)
                 if start == stop:
                     continue
-                clear(planes, groups)
+                planes[MASK : MASK + PIXELS], planes[SUMS:] = zero, zero
                 for first in range(start, stop, CHUNK):
                     last = min(first + CHUNK, stop)
                     fetch(batch, packed, pair_splats, first, last, width, x0, y0)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
+from glassplat.kernels.backend.cpu import ZERO, Kernel, even_stride, inlined, kernel
 from glassplat.kernels.backend.cpu_vector import (
     absolute,
     deinterleave,
@@ -246,14 +246,12 @@ def _load_deviation(real: type) -> Scalar:
 
 
 def _begin(real: type) -> Scalar:
-    full, load = vector_kind(real, tile.LANES)
-    zero, LANES, PIXELS = real(0.0), tile.LANES, tile.PIXELS
+    load, LANES, PIXELS = vector_kind(real, tile.LANES).load, tile.LANES, tile.PIXELS
 
     @inlined
     def begin(planes, state, at, v_mask, first, width, columns, rows, with_glass):
         """Loads final transmittances; returns the number of pairs up to the last one evaluated by a pixel."""
-        for i in range(0, planes.size, LANES):
-            store(planes, i, full(zero))
+        planes[:] = ZERO
         for i in range(0, PIXELS, LANES):
             store(planes, T + i, load(state, at + tile.T + i))
             store(planes, T_GLASS + i, load(state, at + tile.T_GLASS + i))

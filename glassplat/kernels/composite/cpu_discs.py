@@ -19,7 +19,7 @@ from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.kernels.backend.cpu import ENDLESS, ZERO, Kernel, even_stride, inlined, kernel
+from glassplat.kernels.backend.cpu import ENDLESS, ONE, ZERO, Kernel, even_stride, inlined, kernel
 from glassplat.kernels.backend.cpu_vector import (
     absolute,
     bits_of,
@@ -32,7 +32,7 @@ from glassplat.kernels.backend.cpu_vector import (
     vector_kind,
 )
 from glassplat.kernels.composite import cpu_tile as tile
-from glassplat.kernels.composite.cpu_tile import SPLATS, STOP_AFTER, lane_of, list_block, tile_bounds
+from glassplat.kernels.composite.cpu_tile import PIXELS, SPLATS, STOP_AFTER, lane_of, list_block, tile_bounds
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar
 from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, intersect, offset_gradient
 from glassplat.kernels.records import REAL_OF, Discs, TileBins
@@ -214,25 +214,20 @@ def _blend_channels(real: type) -> Scalar:
     return blend_channels
 
 
-def _write_tile(real: type) -> Scalar:
-    one, PIXELS = real(1.0), tile.PIXELS
-
-    @inlined
-    def write_tile(state, at, planes, images, first, width, columns, rows, channels):
-        """Writes a tile to the flat images, and removes the signs that mark stopped pixels."""
-        image, alpha, depth, median, distortion = images
-        for i in range(PIXELS):
-            state[at + T + i] = abs(state[at + T + i])
-        for y in range(rows):
-            for x in range(columns):
-                pixel, lane = first + y * width + x, lane_of(x, y)
-                alpha[pixel] = one - state[at + T + lane]
-                depth[pixel], median[pixel] = planes[DEPTH_SUM + lane], planes[MIDDLE + lane]
-                distortion[pixel] = planes[DISTORTION + lane]
-                for d in range(channels):
-                    image[pixel * channels + d] = planes[SUMS + d * PIXELS + lane]
-
-    return write_tile
+@inlined
+def write_tile(state, at, planes, images, first, width, columns, rows, channels):
+    """Writes a tile to the flat images, and removes the signs that mark stopped pixels."""
+    image, alpha, depth, median, distortion = images
+    for i in range(PIXELS):
+        state[at + T + i] = abs(state[at + T + i])
+    for y in range(rows):
+        for x in range(columns):
+            pixel, lane = first + y * width + x, lane_of(x, y)
+            alpha[pixel] = ONE - state[at + T + lane]
+            depth[pixel], median[pixel] = planes[DEPTH_SUM + lane], planes[MIDDLE + lane]
+            distortion[pixel] = planes[DISTORTION + lane]
+            for d in range(channels):
+                image[pixel * channels + d] = planes[SUMS + d * PIXELS + lane]
 
 
 @functools.cache
@@ -240,7 +235,7 @@ def composite_discs_forward(real: type) -> Kernel:
     """Builds the kernel that blends all tiles."""
     pack, fetch, reached = _pack(real), _fetch(real), tile.reached_of(real)
     blend_block, blend_channels, begin = _blend_block(real), _blend_channels(real), tile.begin_state(real)
-    write_tile, zero, never = _write_tile(real), real(0.0), real(-1.0)
+    zero, never = real(0.0), real(-1.0)
     BLOCK, ACROSS, BLOCKS, LANES, PIXELS = tile.BLOCK, tile.ACROSS, tile.BLOCKS, tile.LANES, tile.PIXELS
     CHUNK = tile.CHUNK
 
@@ -404,39 +399,33 @@ def _unblend(real: type) -> Scalar:
     return unblend
 
 
-def _begin_gradients(real: type) -> Scalar:
-    zero, one, PIXELS = real(0.0), real(1.0), tile.PIXELS
-
-    @inlined
-    def begin(planes, state, at, v_images, first, width, columns, rows, channels):
-        """Loads a tile's gradients; returns the number of pairs up to the last one blended by a pixel."""
-        v_image, v_alpha, v_depth, v_median, v_distortion = v_images
-        planes[:] = zero
-        most = state[at + LAST]
-        for i in range(PIXELS):
-            planes[T_AT + i] = state[at + T + i]
-            planes[COVERED + i] = one - planes[T_AT + i]
-            most = max(most, state[at + LAST + i])
-        for y in range(rows):
-            for x in range(columns):
-                pixel, i = first + y * width + x, lane_of(x, y)
-                # alpha = 1 - T_AT: its gradient acts like that of a background.
-                planes[BEHIND + i] = -v_alpha[pixel] * planes[T_AT + i]
-                planes[V_DEPTH + i], planes[V_MEDIAN + i] = v_depth[pixel], v_median[pixel]
-                planes[V_DISTORTION + i] = v_distortion[pixel]
-                for d in range(channels):
-                    planes[V_IMAGE + d * PIXELS + i] = v_image[pixel * channels + d]
-        return int(most) + 1
-
-    return begin
+@inlined
+def begin_gradients(planes, state, at, v_images, first, width, columns, rows, channels):
+    """Loads a tile's gradients; returns the number of pairs up to the last one blended by a pixel."""
+    v_image, v_alpha, v_depth, v_median, v_distortion = v_images
+    planes[:] = ZERO
+    most = state[at + LAST]
+    for i in range(PIXELS):
+        planes[T_AT + i] = state[at + T + i]
+        planes[COVERED + i] = ONE - planes[T_AT + i]
+        most = max(most, state[at + LAST + i])
+    for y in range(rows):
+        for x in range(columns):
+            pixel, i = first + y * width + x, lane_of(x, y)
+            # alpha = 1 - T_AT: its gradient acts like that of a background.
+            planes[BEHIND + i] = -v_alpha[pixel] * planes[T_AT + i]
+            planes[V_DEPTH + i], planes[V_MEDIAN + i] = v_depth[pixel], v_median[pixel]
+            planes[V_DISTORTION + i] = v_distortion[pixel]
+            for d in range(channels):
+                planes[V_IMAGE + d * PIXELS + i] = v_image[pixel * channels + d]
+    return int(most) + 1
 
 
 @functools.cache
 def composite_discs_backward(real: type) -> Kernel:
     """Builds the kernel that fills one row of sums per pair, given the final state of each tile."""
     fetch = _fetch(real)
-    unblend, begin = _unblend(real), _begin_gradients(real)
-    sum_channels = tile.sum_channels_of(real, V_IMAGE, WEIGHT, PAIR_VALUES)
+    unblend, sum_channels = _unblend(real), tile.sum_channels_of(real, V_IMAGE, WEIGHT, PAIR_VALUES)
     zero = real(0.0)
     LANES, PIXELS, CHUNK = tile.LANES, tile.PIXELS, tile.CHUNK
     REACHED = (1 << tile.BLOCKS) - 1
@@ -459,7 +448,7 @@ def composite_discs_backward(real: type) -> Kernel:
             planes = np.empty(V_IMAGE + groups * 4 * PIXELS, real)
             sums: Any = np.empty(LANES, real)
             batch = np.empty(CHUNK * width, real)
-            looked_at = begin(planes, state, at, v_images, corner, image_width, columns, lines, num_channels)
+            looked_at = begin_gradients(planes, state, at, v_images, corner, image_width, columns, lines, num_channels)
             rows[(start + looked_at) * row_width : stop * row_width] = zero
             for behind in range(0, looked_at, CHUNK):
                 last = start + looked_at - behind

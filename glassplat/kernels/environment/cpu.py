@@ -22,7 +22,7 @@ from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
+from glassplat.kernels.backend.cpu import ZERO, Kernel, even_stride, inlined, kernel
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.cube import (
     bilinear,
@@ -446,25 +446,20 @@ def shade_environment_forward(real: type) -> Kernel:
     return forward
 
 
-def _position_gradients(real: type) -> Scalar:
-    zero = real(0.0)
-
-    @inlined
-    def position_gradients(run, whole, flat, below):
-        """Gradients of each pixel's position among the cells, from those of its lookup."""
+@inlined
+def position_gradients(run, whole, flat, below):
+    """Gradients of each pixel's position among the cells, from those of its lookup."""
+    for i in range(RUN):
+        run[BY_COLUMN + i], run[BY_ROW + i] = ZERO, ZERO
+    for d in range(3):
         for i in range(RUN):
-            run[BY_COLUMN + i], run[BY_ROW + i] = zero, zero
-        for d in range(3):
-            for i in range(RUN):
-                at, v = whole[FIRST + i] + d, run[V_RAW + d * RUN + i]
-                under = at + below
-                by_column, by_row = bilinear_gradient(
-                    flat[at], flat[at + 3], flat[under], flat[under + 3], run[ALONG + i], run[DOWN + i]
-                )
-                run[BY_COLUMN + i] += v * by_column
-                run[BY_ROW + i] += v * by_row
-
-    return position_gradients
+            at, v = whole[FIRST + i] + d, run[V_RAW + d * RUN + i]
+            under = at + below
+            by_column, by_row = bilinear_gradient(
+                flat[at], flat[at + 3], flat[under], flat[under + 3], run[ALONG + i], run[DOWN + i]
+            )
+            run[BY_COLUMN + i] += v * by_column
+            run[BY_ROW + i] += v * by_row
 
 
 def _normal_gradients(real: type) -> Scalar:
@@ -488,8 +483,7 @@ def _normal_gradients(real: type) -> Scalar:
 @cache
 def shade_environment_backward(real: type) -> Kernel:
     """Fills the gradients of blended, alpha and the lookups, and the cells and fractions of each pixel."""
-    cube_positions, position_gradients = _cube_positions(real), _position_gradients(real)
-    normal_gradients, shortest = _normal_gradients(real), real(NORMAL_MIN**2)
+    cube_positions, normal_gradients, shortest = _cube_positions(real), _normal_gradients(real), real(NORMAL_MIN**2)
     zero, one = real(0.0), real(1.0)
 
     @kernel("shade_environment_backward", real)

@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from typing import get_args
 
+import numpy as np
+
 from glassplat.kernels import Fresnel
-from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.backend.cpu import ONE, TWO, ZERO, inlined
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.images import color_space_maths
 
@@ -60,20 +62,17 @@ def pane_maths(real: type) -> tuple[Scalar, Scalar, Scalar]:
     return strength, strength_derivatives, ray_length
 
 
-def build_edge_weighting(real: type) -> Scalar:
-    """Builds the weighting of a cell of shared edges; `kernels.panes.gradient_conflict` explains it."""
-    zero, one, two, most = real(0.0), real(1.0), real(2.0), real(FULL_WEIGHT_RATIO)
+@inlined
+def weighted_edges(edges, held, full, has_strength):
+    """A cell's contribution to the sum of shared edges, and its derivative by the edges; the weight is constant.
 
-    @inlined
-    def weighted_edges(edges, held, full, has_strength):
-        """The cell's contribution to the sum, and its derivative by the edges; the weight counts as constant."""
-        weight = one
-        if has_strength and held != zero:
-            weight = min(max(two - abs(held) / (most * full), zero), one)
-        slope = weight if edges > zero else -weight
-        return weight * abs(edges), slope if edges != zero else zero
-
-    return weighted_edges
+    `kernels.panes.gradient_conflict` explains the weight.
+    """
+    weight = ONE
+    if has_strength and held != ZERO:
+        weight = min(max(TWO - abs(held) / (np.float32(FULL_WEIGHT_RATIO) * full), ZERO), ONE)
+    slope = weight if edges > ZERO else -weight
+    return weight * abs(edges), slope if edges != ZERO else ZERO
 
 
 def build_blend_channel(real: type) -> tuple[Scalar, Scalar]:

@@ -32,7 +32,7 @@ from glassplat.kernels.backend.cpu_vector import (
 )
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.images import color_space_maths
-from glassplat.kernels.maths.pane import DARKEST, build_blend_channel, build_edge_weighting, pane_maths
+from glassplat.kernels.maths.pane import DARKEST, build_blend_channel, pane_maths, weighted_edges
 from glassplat.kernels.records import DAZZLING, REAL_OF, TILE, PaneHits
 
 
@@ -551,7 +551,7 @@ def conflict_forward(real: type) -> Kernel:
 
     Columns are summed first, and then cells, so that the loops over pixels are contiguous.
     """
-    zero, one, two, darkest, weighted_edges = real(0.0), real(1.0), real(2.0), real(DARKEST), build_edge_weighting(real)
+    zero, one, two, darkest = real(0.0), real(1.0), real(2.0), real(DARKEST)
 
     @kernel("gradient_conflict_forward", real)
     def forward(transmission, reflection, hit, strength, has_strength, cell, derivatives, sums):

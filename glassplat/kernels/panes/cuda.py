@@ -18,7 +18,7 @@ from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.images import color_space_maths
-from glassplat.kernels.maths.pane import DARKEST, build_blend_channel, build_edge_weighting, pane_maths
+from glassplat.kernels.maths.pane import DARKEST, build_blend_channel, pane_maths, weighted_edges
 from glassplat.kernels.panes.cpu import CHANNELS, conflict_count
 from glassplat.kernels.records import DAZZLING, REAL_OF, TILE, PaneHits
 
@@ -521,7 +521,7 @@ def sobel_at(image, y, x, d):
 @cache
 def conflict_forward(real: type) -> Kernel:
     """Fills the sum of each cell and channel, and its derivatives [2, H - 2, W - 2, 3] by the Sobel images."""
-    zero, one, darkest, weighted_edges = real(0.0), real(1.0), real(DARKEST), build_edge_weighting(real)
+    zero, one, darkest = real(0.0), real(1.0), real(DARKEST)
 
     @kernel("gradient_conflict_forward", real, "real3 real3 real2 real2 int real4 real1")
     def forward(transmission, reflection, hit, strength, cell, derivatives, sums):

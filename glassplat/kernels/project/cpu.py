@@ -47,10 +47,10 @@ from glassplat.kernels.project.disc_steps import discs
 from glassplat.kernels.project.steps import (
     CHUNK,
     LENS_VALUES,
+    add_view,
     build_fill_lenses,
     build_project,
     build_project_back,
-    camera_sums,
     cull,
     vec3,
 )
@@ -244,7 +244,7 @@ def _add_coefficients(real: type) -> Scalar:
 
 def _color_backward(real: type) -> Scalar:
     (tabulate, _), color_gradient = color_steps(real), color_gradient_of(real)
-    add_coefficients, add_view = _add_coefficients(real), camera_sums(real)[1]
+    add_coefficients = _add_coefficients(real)
     zero = real(0.0)
 
     @inlined

@@ -33,11 +33,6 @@ from glassplat.kernels.maths.projection import (
 from glassplat.kernels.project.steps import Footprint, in_camera
 
 
-def discs(real: type) -> Footprint:
-    """Builds the footprint of discs for CPU or GPU; their `shape` returns two deviations as its last entry."""
-    return Footprint(_shape(real), cull, _place(real), _place_gradient(real), _finish(real))
-
-
 def _shape(real: type) -> Scalar:
     sigmoid, unit_quat = build_sigmoid(real), build_unit_quat(real)
     zero, most = real(0.0), real(MOST_LOG_SCALE)
@@ -48,7 +43,7 @@ def _shape(real: type) -> Scalar:
         raw = abs(means[n, 0]) + abs(means[n, 1]) + abs(means[n, 2]) + abs(logit_opacities[n])
         usable = is_finite(raw) and inverse_norm > zero and is_finite(inverse_norm)
         usable = usable and abs(log_scales[n, 0]) <= most and abs(log_scales[n, 1]) <= most
-        deviations = math.exp(log_scales[n, 0]), math.exp(log_scales[n, 1])
+        deviations = real(math.exp(log_scales[n, 0])), real(math.exp(log_scales[n, 1]))
         return usable, sigmoid(logit_opacities[n]), quat, inverse_norm, rotation(quat), deviations
 
     return shape
@@ -124,53 +119,48 @@ def disc_map(array, c, n):
     return array[c, n, 0], array[c, n, 1], array[c, n, 2], array[c, n, 3], array[c, n, 4], array[c, n, 5]
 
 
-def _place_gradient(real: type) -> Scalar:
-    one = real(1.0)
-
-    @inlined
-    def place_gradient(
-        c, n, mean, shaped, cam_from_world, intrinsics, lens, maps, cotangents
-    ):  # fmt: skip
-        g_means2d, g_maps, g_depths, _, _, g_normals = cotangents
-        axes, deviations = shaped[4], shaped[5]
-        rows, m = in_camera(cam_from_world, c, mean)
-        p, q = dot_products(axes[0], rows), dot_products(axes[1], rows)
-        across = cross(p, q)
-        fx, fy, inverse = intrinsics[c, 0], intrinsics[c, 1], one / m[2]
-        found, g_map = disc_map(maps, c, n), disc_map(g_maps, c, n)
-        g_p, g_q, g_m, g_u, g_v = map_gradient(
-            p, q, m, across, found, one / deviations[0], one / deviations[1], fx, fy, g_map
-        )
-        g_x, g_y = g_means2d[c, n, 0] * fx * inverse, g_means2d[c, n, 1] * fy * inverse
-        behind = (g_x * m[0] + g_y * m[1]) * inverse
-        g_center = g_m[0] + g_x, g_m[1] + g_y, g_m[2] + g_depths[c, n] - behind
-        side = facing_sign(axes[2], mean, lens, c)
-        g_axes = (
-            scaled_sum(g_p, rows),
-            scaled_sum(g_q, rows),
-            (side * g_normals[c, n, 0], side * g_normals[c, n, 1], side * g_normals[c, n, 2]),
-        )
-        g_rows = (
-            combine(g_p[0], axes[0], g_q[0], axes[1]),
-            combine(g_p[1], axes[0], g_q[1], axes[1]),
-            combine(g_p[2], axes[0], g_q[2], axes[1]),
-        )
-        return g_center, g_rows, g_axes, (g_u, g_v)
-
-    return place_gradient
+@inlined
+def place_gradient(c, n, mean, shaped, cam_from_world, intrinsics, lens, maps, cotangents):
+    """As in `Footprint`."""
+    g_means2d, g_maps, g_depths, _, _, g_normals = cotangents
+    axes, deviations = shaped[4], shaped[5]
+    rows, m = in_camera(cam_from_world, c, mean)
+    p, q = dot_products(axes[0], rows), dot_products(axes[1], rows)
+    across = cross(p, q)
+    fx, fy, inverse = intrinsics[c, 0], intrinsics[c, 1], ONE / m[2]
+    found, g_map = disc_map(maps, c, n), disc_map(g_maps, c, n)
+    g_p, g_q, g_m, g_u, g_v = map_gradient(
+        p, q, m, across, found, ONE / deviations[0], ONE / deviations[1], fx, fy, g_map
+    )
+    g_x, g_y = g_means2d[c, n, 0] * fx * inverse, g_means2d[c, n, 1] * fy * inverse
+    behind = (g_x * m[0] + g_y * m[1]) * inverse
+    g_center = g_m[0] + g_x, g_m[1] + g_y, g_m[2] + g_depths[c, n] - behind
+    side = facing_sign(axes[2], mean, lens, c)
+    g_axes = (
+        scaled_sum(g_p, rows),
+        scaled_sum(g_q, rows),
+        (side * g_normals[c, n, 0], side * g_normals[c, n, 1], side * g_normals[c, n, 2]),
+    )
+    g_rows = (
+        combine(g_p[0], axes[0], g_q[0], axes[1]),
+        combine(g_p[1], axes[0], g_q[1], axes[1]),
+        combine(g_p[2], axes[0], g_q[2], axes[1]),
+    )
+    return g_center, g_rows, g_axes, (g_u, g_v)
 
 
-def _finish(real: type) -> Scalar:
-    one = real(1.0)
+@inlined
+def finish(n, shaped, sums, g_means, g_quats, g_log_scales, g_logit_opacities):
+    """As in `Footprint`."""
+    _, opacity, quat, inverse_norm, _, _ = shaped
+    g_mean, g_opacity, g_axes, g_scales = sums
+    g_means[n, 0], g_means[n, 1], g_means[n, 2] = g_mean
+    g_logit_opacities[n] = g_opacity * opacity * (ONE - opacity)
+    g_log_scales[n, 0], g_log_scales[n, 1] = g_scales
+    g_w, g_i, g_j, g_k = unit_quat_gradient(quat, inverse_norm, g_axes)
+    g_quats[n, 0], g_quats[n, 1], g_quats[n, 2], g_quats[n, 3] = g_w, g_i, g_j, g_k
 
-    @inlined
-    def finish(n, shaped, sums, g_means, g_quats, g_log_scales, g_logit_opacities):
-        _, opacity, quat, inverse_norm, _, _ = shaped
-        g_mean, g_opacity, g_axes, g_scales = sums
-        g_means[n, 0], g_means[n, 1], g_means[n, 2] = g_mean
-        g_logit_opacities[n] = g_opacity * opacity * (one - opacity)
-        g_log_scales[n, 0], g_log_scales[n, 1] = g_scales
-        g_w, g_i, g_j, g_k = unit_quat_gradient(quat, inverse_norm, g_axes)
-        g_quats[n, 0], g_quats[n, 1], g_quats[n, 2], g_quats[n, 3] = g_w, g_i, g_j, g_k
 
-    return finish
+def discs(real: type) -> Footprint:
+    """Builds the footprint of discs for CPU or GPU; their `shape` returns two deviations as its last entry."""
+    return Footprint(_shape(real), cull, _place(real), place_gradient, finish)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from glassplat.kernels.backend.cpu import ZERO, inlined
+from glassplat.kernels.backend.cpu import ONE, ZERO, inlined
 from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.maths.projection import (
@@ -227,33 +227,30 @@ def place_gradients(real: type, free: Scalar | None = None) -> Scalar:
     return place_gradient
 
 
-def camera_sums(real: type) -> tuple[Scalar, Scalar]:
-    """Builds steps that add to a camera's gradient [12], rows of (3x3 block, translation), in double precision."""
-    one = real(1.0)
+@inlined
+def add_place(total, g_rows, g_position, mean):
+    """Adds to a camera's gradient [12], rows of (3x3 block, translation), in double precision."""
+    for i in range(3):
+        g_row = g_rows[0] if i == 0 else (g_rows[1] if i == 1 else g_rows[2])
+        g_i = g_position[0] if i == 0 else (g_position[1] if i == 1 else g_position[2])
+        from_row = combine(ONE, g_row, g_i, mean)
+        total[4 * i + 0] += np.float64(from_row[0])
+        total[4 * i + 1] += np.float64(from_row[1])
+        total[4 * i + 2] += np.float64(from_row[2])
+        total[4 * i + 3] += np.float64(g_i)
 
-    @inlined
-    def add_place(total, g_rows, g_position, mean):
-        for i in range(3):
-            g_row = g_rows[0] if i == 0 else (g_rows[1] if i == 1 else g_rows[2])
-            g_i = g_position[0] if i == 0 else (g_position[1] if i == 1 else g_position[2])
-            from_row = combine(one, g_row, g_i, mean)
-            total[4 * i + 0] += np.float64(from_row[0])
-            total[4 * i + 1] += np.float64(from_row[1])
-            total[4 * i + 2] += np.float64(from_row[2])
-            total[4 * i + 3] += np.float64(g_i)
 
-    @inlined
-    def add_view(total, cam_from_world, c, g_view):
-        # The centre is -A^T t: with mean - centre = mean + A^T t, row i gets t_i g_view and t_i gets row_i . g_view.
-        for i in range(3):
-            row = cam_from_world[c, i, 0], cam_from_world[c, i, 1], cam_from_world[c, i, 2]
-            translation = cam_from_world[c, i, 3]
-            total[4 * i + 0] += np.float64(translation * g_view[0])
-            total[4 * i + 1] += np.float64(translation * g_view[1])
-            total[4 * i + 2] += np.float64(translation * g_view[2])
-            total[4 * i + 3] += np.float64(dot(row, g_view))
-
-    return add_place, add_view
+@inlined
+def add_view(total, cam_from_world, c, g_view):
+    """Adds the contribution of a colour, through the camera's centre."""
+    # The centre is -A^T t: with mean - centre = mean + A^T t, row i gets t_i g_view and t_i gets row_i . g_view.
+    for i in range(3):
+        row = cam_from_world[c, i, 0], cam_from_world[c, i, 1], cam_from_world[c, i, 2]
+        translation = cam_from_world[c, i, 3]
+        total[4 * i + 0] += np.float64(translation * g_view[0])
+        total[4 * i + 1] += np.float64(translation * g_view[1])
+        total[4 * i + 2] += np.float64(translation * g_view[2])
+        total[4 * i + 3] += np.float64(dot(row, g_view))
 
 
 def view_gradients(real: type) -> Scalar:
@@ -301,7 +298,7 @@ class Footprint(NamedTuple):
 
 def ellipsoids(real: type) -> Footprint:
     """Builds the footprint of ellipsoids, for one at a time."""
-    return Footprint(build_shape(real), cull, build_place(real), _ellipsoid_gradient(real), _finish_ellipsoid(real))
+    return Footprint(build_shape(real), cull, build_place(real), _ellipsoid_gradient(real), finish_ellipsoid)
 
 
 def _ellipsoid_gradient(real: type) -> Scalar:
@@ -322,30 +319,25 @@ def _ellipsoid_gradient(real: type) -> Scalar:
     return place_gradient
 
 
-def _finish_ellipsoid(real: type) -> Scalar:
-    one = real(1.0)
-
-    @inlined
-    def finish(n, shaped, sums, g_means, g_quats, g_log_scales, g_logit_opacities):
-        """Adds, because projections of the same Gaussians may share their gradients."""
-        _, opacity, quat, inverse_norm, axes = shaped
-        g_mean, g_opacity, g_axes, _ = sums
-        x, y, z = rotation(quat)
-        g_means[n, 0] += g_mean[0]
-        g_means[n, 1] += g_mean[1]
-        g_means[n, 2] += g_mean[2]
-        g_logit_opacities[n] += g_opacity * opacity * (one - opacity)
-        g_log_scales[n, 0] += dot(axes[0], g_axes[0])
-        g_log_scales[n, 1] += dot(axes[1], g_axes[1])
-        g_log_scales[n, 2] += dot(axes[2], g_axes[2])
-        lengths = dot(axes[0], x), dot(axes[1], y), dot(axes[2], z)
-        g_w, g_i, g_j, g_k = unit_quat_gradient(quat, inverse_norm, scaled_columns(lengths, g_axes))
-        g_quats[n, 0] += g_w
-        g_quats[n, 1] += g_i
-        g_quats[n, 2] += g_j
-        g_quats[n, 3] += g_k
-
-    return finish
+@inlined
+def finish_ellipsoid(n, shaped, sums, g_means, g_quats, g_log_scales, g_logit_opacities):
+    """Adds, because projections of the same Gaussians may share their gradients."""
+    _, opacity, quat, inverse_norm, axes = shaped
+    g_mean, g_opacity, g_axes, _ = sums
+    x, y, z = rotation(quat)
+    g_means[n, 0] += g_mean[0]
+    g_means[n, 1] += g_mean[1]
+    g_means[n, 2] += g_mean[2]
+    g_logit_opacities[n] += g_opacity * opacity * (ONE - opacity)
+    g_log_scales[n, 0] += dot(axes[0], g_axes[0])
+    g_log_scales[n, 1] += dot(axes[1], g_axes[1])
+    g_log_scales[n, 2] += dot(axes[2], g_axes[2])
+    lengths = dot(axes[0], x), dot(axes[1], y), dot(axes[2], z)
+    g_w, g_i, g_j, g_k = unit_quat_gradient(quat, inverse_norm, scaled_columns(lengths, g_axes))
+    g_quats[n, 0] += g_w
+    g_quats[n, 1] += g_i
+    g_quats[n, 2] += g_j
+    g_quats[n, 3] += g_k
 
 
 def build_project(real: type, kind: Footprint) -> Scalar:
@@ -384,7 +376,7 @@ def build_project(real: type, kind: Footprint) -> Scalar:
 
 def build_project_back(real: type, kind: Footprint) -> Scalar:
     """Builds the step that adds one visible Gaussian's gradients to the inputs of `finish`, and to its camera's."""
-    place_gradient, view_gradient, (add_place, add_view) = kind.place_gradient, view_gradients(real), camera_sums(real)
+    place_gradient, view_gradient = kind.place_gradient, view_gradients(real)
     zero, one = real(0.0), real(1.0)
 
     @inlined

@@ -1,18 +1,12 @@
 """Tracing of rays through Gaussians, front to back, with gradients of both, and its bounding volume hierarchy.
 
-Definition: a ray hits a disc where it crosses the disc's plane, and an ellipsoid where its density is largest along the
-ray. Its coverage is opacity x exp(-r^2 / 2) there, with r the distance from the centre in standard deviations; it is at
-most 0.99, and zero below 1/255 or beyond 3 deviations. Hits are blended by distance, equal ones in the order of the
-Gaussians. A ray stops before the Gaussian that would reduce its transmittance below 1e-4. Edge-on discs (cosine below
-1e-3), hits at or before `near`, and non-finite inputs are ignored and get no gradient.
-
 Search: Gaussians are sorted along a Hilbert curve; a leaf bounds eight of them, and a node eight children. The tree
 needs no pointers. A search returns the nearest 16 hits (later ones on the CPU: 64) beyond the last known one, and is
 repeated from there until the ray stops.
 
 Gradients: the forward pass stores the hits of rays that have few; the backward pass repeats the search for other rays,
 with the same code. It sums the rows of each Gaussian in a fixed order: no atomics, the same bits for any number of
-threads. `reference.py` defines the result, by testing every ray against every Gaussian.
+threads. `trace` states the definition, which `reference.py` evaluates by testing every ray against every Gaussian.
 """
 
 from __future__ import annotations
