@@ -1,7 +1,7 @@
 """Scalar maths of a flat pane: its reflectance, and the blending of transmission and reflection.
 
-Rays are (x, y, 1) in the camera frame. Every function is pure and typed by its factory, so that one source compiles for
-the CPU and for CUDA.
+Rays are (x, y, 1) in the camera frame. Every function is pure and, where needed, typed by its factory, so that one
+source compiles for the CPU and for CUDA.
 """
 
 from __future__ import annotations

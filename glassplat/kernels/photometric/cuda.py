@@ -27,7 +27,7 @@ AREA, STRIP = WIDE * WIDE, WIDE * TILE
 def photometric(image: Tensor, target: Tensor, *, with_gradient: bool) -> tuple[Tensor, Tensor, Tensor]:
     """Mean L1, mean similarity, and the similarity's derivatives [3, H, W, 3] (empty unless requested).
 
-    Slopes are the derivatives of each pixel's similarity by the blurred image, squares and product.
+    These are of each pixel's similarity, by the blurred image, squares and product.
     """
     blocks = _blocks(image)
     derivatives = image.new_empty(3 if with_gradient else 0, *image.shape)
