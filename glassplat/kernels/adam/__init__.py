@@ -81,4 +81,4 @@ def _check(update: Update, like: Tensor) -> None:
 
 def _flat(update: Update) -> Update:
     """The same update with flattened tensors."""
-    return Update(*(tensor.contiguous().view(-1) for tensor in update[:4]), *update[4:])
+    return update._replace(**{name: getattr(update, name).contiguous().view(-1) for name in TENSORS})
