@@ -73,8 +73,8 @@ def cross(a, b):
 @inlined
 def cross_squared(a, b):
     """The squared length of a x b."""
-    product = cross(a, b)
-    return dot(product, product)
+    x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    return x * x + y * y + z * z
 
 
 @inlined
