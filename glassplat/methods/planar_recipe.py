@@ -74,6 +74,7 @@ class PlanarRecipe(MethodRecipe):
         view_dependence_weight: weight of the squared SH coefficients beyond the constant one. Mirrored views see
             Gaussians from directions that no photograph covers; the paper has no such term.
         stage_shares: lengths of the three stages in relation to each other (paper: 3000, 3000 and 24,000 iterations).
+            Short first stages leave less time to model reflections behind panes.
         fresnel: angular dependence of the strength: a pane with two surfaces, Schlick's approximation for one surface
             (paper), or none (ablation).
         intensity: False drops the reflection intensity a(u) (ablation).
@@ -109,7 +110,7 @@ class PlanarRecipe(MethodRecipe):
     method = "planar"
     functions = "glassplat.methods.planar:planar"
     view_dependence_weight: NonNegative = 0.02
-    stage_shares: Internal[tuple[Positive, Positive, Positive]] = (0.1, 0.1, 0.8)
+    stage_shares: Internal[tuple[Positive, Positive, Positive]] = (0.05, 0.05, 0.9)
     fresnel: Internal[Fresnel] = "pane"
     intensity: Internal[bool] = True
     blend: Internal[Blend] = "linear"
@@ -136,6 +137,7 @@ class PlanarRecipe(MethodRecipe):
         """As published, as far as the paper specifies it; docs/planar.md lists the rest."""
         return cls(
             view_dependence_weight=0.0,
+            stage_shares=(0.1, 0.1, 0.8),
             fresnel="schlick",
             blend="srgb",
             panes="nearest",
