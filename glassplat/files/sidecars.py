@@ -134,7 +134,7 @@ EDIT_TOLERANCE = 1e-5
 Conversion = Callable[[Tensor], Tensor]
 UNIT: Conversion = partial(torch.nn.functional.normalize, dim=0)
 LOGIT_OF: Conversion = partial(torch.logit, eps=1e-6)
-"""Of a reflectance, which may be 0 or 1."""
+"""Logit of a reflectance, clamped because it may be 0 or 1."""
 LEAST_LENGTH = 1e-6
 LEAST_ANGLE = 1e-3
 """Smallest angle between tangent and normal, radians; below, the rectangle's sides are undefined."""

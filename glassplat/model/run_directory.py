@@ -334,7 +334,8 @@ class RunDirectory:
     def check_photographs(self, dataset: Dataset) -> None:
         """Refuse a capture whose photographs or poses differ from those of the run.
 
-        A missing or additional photograph would change the split into training and test views.
+        A missing or additional photograph would change the split into training and test views. Nothing is compared if
+        the run's cameras cannot be read.
 
         Raises:
             InputError: photographs are missing or additional, or cameras have moved.

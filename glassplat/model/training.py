@@ -314,7 +314,8 @@ def resumed_state(
         changes = option_changes(vars(recorded), vars(settings)) + recipe_changes(directory, recipe)
         raise InputError(
             f"{directory.path} was started with other options: {join_names(changes)}; expected the same to resume it. "
-            "Repeat the original options, with the version of glassplat that began it, or choose another --output"
+            f"Repeat the original options, for example by --config {directory.path / 'recipe.json'}, or choose another "
+            "--output"
         )
     directory.check_photographs(dataset)
     for what, begun, now, differs in (

@@ -257,10 +257,10 @@ def _unreadable_kind(path: Path) -> str | None:
     return "HEIC" if start[4:8] == b"ftyp" and start[8:] in HEIF_BRANDS else None
 
 
-def _natural_sort_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Sorting key for natural order: numbers in a name by their value."""
+def _natural_sort_key(name: str) -> tuple[tuple[tuple[int, int, str], ...], str]:
+    """Sorting key for natural order: numbers in a name by their value, then the name itself."""
     parts = re.findall(r"\d+|\D+", name)
-    return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts)
+    return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts), name
 
 
 def _inspect_photograph(path: Path, name: str, max_size: int, least_side: int = LEAST_SIDE) -> tuple[Photograph, bytes]:

@@ -167,12 +167,16 @@ def write_page(capture: Path, target: Path, planes: Planes | None = None) -> Non
 
 
 def _read_report(path: Path) -> Report:
+    advice = "prepare the capture again to get its report"
     try:
         record = read_json(path)
+    except ValueError as error:
+        raise InputError(f"{error}; {advice}") from error
+    try:
         found: Report = options_from_json(Report, record.get("report") if isinstance(record, dict) else record)
         return found
     except ValueError as error:
-        raise InputError(f"the report in {path}: {error}; prepare the capture again to get its report") from error
+        raise InputError(f"the report in {path}: {error}; {advice}") from error
 
 
 def _page(report: Report, dataset: Dataset, model: Any, planes: Planes | None, title: str) -> str:

@@ -193,7 +193,7 @@ def check_layers(renderer: Renderer, scene: Scene, layers: Sequence[str], method
         problem = f"renders no layer {', '.join(foreign)}" if foreign else "renders nothing without layers"
         reason = "; the scene has no panes" if method == "planar" and not len(scene.planes) else ""
         if "photographed" in foreign:
-            reason = "; only a run trained with --photographer.learn has photographed"
+            reason += "; only a run trained with --photographer.learn has photographed"
         raise InputError(f"{method} {problem}; expected layers out of {', '.join(known)}{reason}")
 
 

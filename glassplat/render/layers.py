@@ -30,7 +30,7 @@ HEAT_STOPS = (
     (249, 201, 50),
     (252, 255, 164),
 )
-"""Lightness rises evenly from black through violet, red and amber to pale yellow: brighter means more, in grey, too."""
+"""Lightness rises evenly from black through violet, red and amber to pale yellow: brighter means more, also in grey."""
 LABEL_COLORS = (
     (86, 180, 233),
     (230, 159, 0),
@@ -41,7 +41,7 @@ LABEL_COLORS = (
     (213, 94, 0),
     (160, 160, 160),
 )
-"""Colours of panes, which differ with impaired colour vision, too (Okabe and Ito)."""
+"""Colours of panes, which colour-blind people can also tell apart (Okabe and Ito)."""
 MEASURED = ("normal", "depth", "median_depth")
 """Layers whose values are not colours; `glassplat render` also writes them as arrays."""
 ERROR_SCALE = 0.2

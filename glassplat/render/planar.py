@@ -209,7 +209,7 @@ class Planar(WithBackground):
         check_channels(scene)
 
     def layers(self, scene: Scene) -> tuple[str, ...]:
-        """Names of the layers for display; those of panes and `photographed` if the scene has panes, a photographer."""
+        """Names of the layers for display: those of panes only with panes, `photographed` only with a photographer."""
         known = (PHOTOGRAPHED,) if len(scene.photographer) else ()
         panes = ("transmission", "without_panes", "reflection", "strength", "mask") if len(scene.planes) else ()
         return ("rgb", *panes, "normal", "depth", "alpha", *known)
@@ -401,7 +401,7 @@ TRUSTED_PART, DISTRUSTED_PART = 0.3, 0.8
 TRUST_WINDOW = 5
 """Pixels over which trust is averaged, against noise."""
 DARKEST = 1e-3
-"""Added to the photographed light, of 1, before shares of it are taken: noise in black pixels has none."""
+"""Added to the photographed light, of 1, before taking shares of it, so that noise in black pixels is a small one."""
 DARKEST_GLASS = 0.1
 """Minimum transmittance of tinted glass, so that details and noise are amplified by at most ten."""
 
@@ -428,7 +428,7 @@ def dereflected_photo(
         name: name of this photograph.
 
     Raises:
-        ValueError: photograph and frame differ in size.
+        ValueError: photograph and frame differ in size, or an exposure needs the layer `alpha`, which is missing.
     """
     if photo.shape != frame.rgb.shape:
         raise ValueError(f"the photograph is {list(photo.shape)}, the frame {list(frame.rgb.shape)}; expected one size")

@@ -128,7 +128,7 @@ def test_planar_resets_opacities_after_turning_reflections(iterations: int) -> N
         [clock.step for clock in clocks if any(type(a) is kind and a.due(clock) for a in joint.actions)]
         for kind in (TurnReflections, ResetOpacity)
     )
-    assert len(turned) == len(cleared) == 1 and turned < cleared == [round(0.22 * iterations)]
+    assert len(turned) == len(cleared) == 1 and turned < cleared == [round(0.12 * iterations)]
 
 
 def test_the_planar_objective_is_that_of_equation_20_but_for_what_holds_intensities_and_glass() -> None:
