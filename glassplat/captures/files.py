@@ -97,11 +97,10 @@ def _load_capture(root: Path) -> Capture:
     names = sorted(path.name for path in root.iterdir())
     found = join_names(names, limit=8) or "nothing"
     message = f"{root} is not a readable capture. Looked for: {looked_for}. Found: {found}."
-    if "recipe.json" in names or scene_source(root) != root:
-        message += (
-            " This is a scene, which `glassplat.load` reads; expected a capture, such as the one that `glassplat info` "
-            "shows for a run"
-        )
+    kind = "run" if "recipe.json" in names else "scene" if scene_source(root) != root else None
+    if kind:
+        message += f" This is a {kind}, which `glassplat.load` reads; expected a capture"
+        message += ", such as the one that `glassplat info` shows for it" if kind == "run" else ""
     elif any(Path(name).suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) for name in names):
         message += f" Photographs become a capture by: glassplat prepare {shlex.quote(str(root))} --output CAPTURE"
     raise UnknownFormatError(message)

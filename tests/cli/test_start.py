@@ -111,7 +111,7 @@ REFUSED = {
     "annotate none": "no folder none",
     "train splat --data none --output new": "no folder none",
     "train splat --data splats.ply --output new": "a file; expected the folder of a capture. `glassplat.load` reads",
-    "train splat --data begun --output new": "This is a scene, which `glassplat.load` reads; expected a capture",
+    "train splat --data begun --output new": "This is a run, which `glassplat.load` reads; expected a capture",
     "train splat --data=capture --data=none --output new": "no folder none",
     "train planar --data capture --output trained": "trained already holds a run",
     "train planar --data capture --output new --resume": "nothing was saved yet in new",

@@ -89,5 +89,5 @@ def test_only_recipes_with_tint_learn_it() -> None:
     for recipe in (PlanarRecipe(), PlanarRecipe(tint=True)):
         stages = recipe.stages(0)
         entries = [stage.setup for stage in stages if isinstance(stage.setup, PaneSetup)]
-        assert [setup.tint for setup in entries] == [recipe.tint]
+        assert [setup.recipe.tint for setup in entries] == [recipe.tint]
         assert any(term.name == "tint" for stage in stages for term in stage.losses) == recipe.tint
