@@ -278,6 +278,11 @@ def test_only_active_tiles_are_drawn() -> None:
         assert not there[~seen].any()
     assert_close(with_gradients(few, composite_discs), with_gradients(few, twin), 1e-3)
 
+    # Bins of every tile with a shorter list of active ones must give the same result.
+    shortened = full._replace(bins=full.bins._replace(active=few.bins.active))
+    expected = with_gradients(few, composite_discs)
+    assert all(torch.equal(t, expected[name]) for name, t in with_gradients(shortened, composite_discs).items())
+
 
 def test_the_number_of_threads_changes_no_bit() -> None:
     case = case_of(scattered(400, dtype=torch.float32), cameras_of(2, (100, 70), torch.float32))

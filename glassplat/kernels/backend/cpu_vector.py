@@ -13,8 +13,8 @@ those wider than the machine's registers, so that a kernel means the same everyw
 
 Vectors support `+ - * /`, comparisons, which return masks, and unary minus; masks support `&` and `|`. The other
 operand of arithmetic may be a scalar of the element type or of float32, such as `cpu.ONE`: a bare literal is float64
-and does not compile with float32 vectors. Sums and products may be fused, as everywhere in kernels. A comparison with
-NaN is false.
+and does not compile with float32 vectors. Comparisons need the element type itself. Sums and products may be fused, as
+everywhere in kernels. A comparison with NaN is false.
 
 A row of four pixels with four channels is a vector of 16 lanes; with three channels it is 12 numbers, in vectors of 8
 and 4 lanes. Memory holds all values of an item next to each other, such as the three coordinates of a point or its

@@ -296,7 +296,8 @@ def sum_channels_of(real: type, image: int, weight: int, values: int) -> Scalar:
 def new_pair_rows(bins: TileBins, width: int, dtype: torch.dtype) -> NDArray[Any]:
     """Flat buffer for one row per pair, with a width from `row_width`.
 
-    A kernel fills the rows of active tiles. The buffer is zeroed only if other tiles have pairs.
+    A kernel fills the rows of active tiles. The buffer is zeroed only if other tiles have pairs. Columns that pad a
+    row stay undefined, and so do their sums, which nothing reads.
     """
     active, pairs = bins.active.long(), len(bins.pair_splats)
     filled = len(active) == len(bins.tile_offsets) - 1 or pairs == int(

@@ -8,7 +8,8 @@ ray through the pixel at offset (dx, dy) from the projected centre meets its pla
 Relative to the centre, none of these suffers from cancellation, however small the disc. The six numbers u_x, u_y, v_x,
 v_y, w_x, w_y are its *map*.
 
-Every function is pure and, if it has constants, typed by its factory: one source compiles for the CPU and for CUDA.
+Every function is pure and, if it has constants that single precision rounds, typed by its factory: one source compiles
+for the CPU and for CUDA.
 """
 
 from __future__ import annotations

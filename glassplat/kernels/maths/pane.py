@@ -26,7 +26,8 @@ LEAST_COSINE = 1e-6
 DARKEST = 0.05
 """sRGB value above which the derivative of linear light is treated as proportional to it, as for a gamma of 2."""
 FULL_WEIGHT_RATIO = 2.0
-"""Largest ratio s of `kernels.panes.gradient_conflict` with full weight; the weight falls to 0 at twice the ratio."""
+"""Largest ratio s of `kernels.panes.gradient_conflict` with full weight; the weight falls to 0 at twice the ratio.
+Both types share it, so it must be exact in single precision."""
 
 
 def pane_maths(real: type) -> tuple[Scalar, Scalar, Scalar]:
