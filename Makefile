@@ -73,7 +73,7 @@ lowest:
 	$(LOWEST)/$(IN_VENV)/uv pip install --quiet --python $(LOWEST) --resolution lowest-direct \
 		--editable '.[prepare,view,video,heic,formats]' $(TESTING)
 	$(LOWEST)/$(IN_VENV)/python -m pytest $(PORTABLE_TESTS) tests/kernels/test_cache.py
-	$(LOWEST)/$(IN_VENV)/glassplat demo --iterations 15 --output $(LOWEST)/demo
+	$(LOWEST)/$(IN_VENV)/glassplat demo --iterations 8 --output $(LOWEST)/demo
 
 dist:
 	rm -rf dist $(RELEASE)

@@ -50,7 +50,7 @@ def last_stage(run: Path) -> Begin:
     def begin() -> tuple[Any, Dataset, TrainState, int]:
         stored = open_run(run, "cpu")
         state = load_checkpoint(stored.directory.checkpoint)
-        state.step = stage_starts(stored.recipe.stages(state.seed), stored.iterations)[-2] + 1
+        state.step = stage_starts(stored.recipe.stages(state.seed, stored.iterations), stored.iterations)[-2] + 1
         return stored.recipe, stored.dataset, state, stored.iterations
 
     return begin
@@ -68,7 +68,7 @@ def step_costs(begins: tuple[Begin, ...] = (first_steps(SCENE),), rounds: int = 
         for view in dataset.train:
             _ = view.photo  # Loads the photograph, as the first pass of training does.
         camera, count = dataset.train[0].camera, len(state.scene.primary)
-        messages = train(recipe.stages(state.seed), dataset, state, iterations)
+        messages = train(recipe.stages(state.seed, iterations), dataset, state, iterations)
         for threads, times in step_clocks(messages, rounds).items():
             clock, processor = (statistics.median(column) for column in zip(*times, strict=True))
             pixels = f"{camera.width}x{camera.height}"

@@ -202,7 +202,7 @@ def is_essential(hint: Any) -> bool:
 SCENE = Path(__file__).parents[1] / "demo_scene"
 DEMO_DOWNSCALE = 3.2
 """Reduces the bundled photographs to 200x150 pixels, which train in minutes on two cores."""
-LEAST_ITERATIONS = 15
+LEAST_ITERATIONS = 8
 """Enough for a step in each stage of `planar`."""
 
 

@@ -395,9 +395,23 @@ def planar_renderer(recipe: PlanarRecipe) -> Planar:
     )
 
 
+PUBLISHED_SHARES, MOST_FIRST_STEPS = (0.1, 0.1, 0.8), 350
+"""Lengths of the three stages (paper), and by default the most iterations of each of the first two: enough to recognise
+mirrors, which needs opaque Gaussians, but too few to model reflections behind panes well (lab/layers.md).
+"""
+
+
+def stage_shares(given: tuple[float, float, float] | None, iterations: int) -> tuple[float, float, float]:
+    """Shares of a run for its three stages, which add up to one."""
+    first, second, third = given or PUBLISHED_SHARES
+    whole, most = first + second + third, 1.0 if given else MOST_FIRST_STEPS / iterations
+    first, second = min(first / whole, most), min(second / whole, most)
+    return first, second, 1 - first - second
+
+
 def planar_stages(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
     """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
-    first, second, third = recipe.stage_shares
+    first, second, third = stage_shares(recipe.stage_shares, iterations)
     strategy = _first_strategy(recipe)
     initialisation = Stage(
         name="1 initialisation",
@@ -411,7 +425,7 @@ def planar_stages(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_I
     )
     stages: tuple[Stage, ...] = (
         initialisation,
-        _adjustment_stage(recipe, second, seed),
+        _adjustment_stage(recipe, first, second, seed),
         _joint_stage(recipe, third),
     )
     stages = with_learned_photographer(recipe.photographer, stages, recipe.densify, seed)
@@ -435,7 +449,7 @@ def plane_rates(factor: float = 1.0) -> dict[str, Rate]:
     }
 
 
-def _adjustment_stage(recipe: PlanarRecipe, share: float, seed: int) -> Stage:
+def _adjustment_stage(recipe: PlanarRecipe, start: float, share: float, seed: int) -> Stage:
     """Stage 2: the reflection's gradient reaches the planes, not the Gaussians."""
     strategy = _first_strategy(recipe)
     return Stage(
@@ -448,7 +462,7 @@ def _adjustment_stage(recipe: PlanarRecipe, share: float, seed: int) -> Stage:
             *strategy.edits,
             actions.GrowSh(Every(recipe.intervals.sh)),
             actions.Densify(recipe.densify, part="glass"),
-            *_seed_actions(recipe, recipe.stage_shares[0] / sum(recipe.stage_shares) + SEED_AFTER_ADJUSTMENT),
+            *_seed_actions(recipe, start + SEED_AFTER_ADJUSTMENT),
             *_early_resets(recipe, strategy),
         ),
         post_steps=(*_glass_post_steps(recipe), *strategy.post_steps),
@@ -459,7 +473,7 @@ def _adjustment_stage(recipe: PlanarRecipe, share: float, seed: int) -> Stage:
 
 def _joint_stage(recipe: PlanarRecipe, share: float) -> Stage:
     """Stage 3: joint optimisation, with perturbed opacities and slowly moving planes."""
-    strategy = strategy_of(recipe)
+    strategy, start = strategy_of(recipe), 1 - share
     perturb_at = Every(
         recipe.intervals.opacity, 0.0, recipe.perturbation.stop, recipe.intervals.least, skip_multiples_of=RESET_TURN
     )
@@ -472,13 +486,13 @@ def _joint_stage(recipe: PlanarRecipe, share: float) -> Stage:
         | plane_rates(JOINT_RATE_FACTOR)
         | ({"primary.log_intensity": Rate(recipe.rates.intensity)} if recipe.intensity else {}),
         actions=(
-            *((TurnReflections((_joint_start(recipe) + TURN_AFTER,)), LightLamps()) if recipe.turn_reflections else ()),
-            *_seed_actions(recipe, _joint_start(recipe) + SEED_AFTER_JOINT),
+            *((TurnReflections((start + TURN_AFTER,)), LightLamps()) if recipe.turn_reflections else ()),
+            *_seed_actions(recipe, start + SEED_AFTER_JOINT),
             *strategy.edits,
             actions.GrowSh(Every(recipe.intervals.sh)),
             actions.Densify(recipe.densify, part="glass"),
             *strategy.resets,
-            *_mcmc_resets(recipe),
+            *_mcmc_resets(recipe, start + MCMC_RESET_AFTER),
             *((FillUnseen(cap=strategy.cap),) if recipe.seed_reflections else ()),
             actions.PerturbOpacity(perturb_at, recipe.perturbation.amplitude, recipe.perturbation.bounds),
         ),
@@ -546,18 +560,11 @@ MCMC_RESET_AFTER = 0.02
 glass were moved, which needs opaque Gaussians."""
 
 
-def _mcmc_resets(recipe: PlanarRecipe) -> tuple[actions.ResetOpacity, ...]:
-    """The single reset of `mcmc`; `default` has its own."""
-    start = _joint_start(recipe) + MCMC_RESET_AFTER
+def _mcmc_resets(recipe: PlanarRecipe, start: float) -> tuple[actions.ResetOpacity, ...]:
+    """The single reset of `mcmc`, after a share of the run; `default` has its own."""
     # A second one would be after the stop.
     once = Every(start, stop=1.5 * start)
     return (actions.ResetOpacity(once),) if recipe.strategy == "mcmc" and recipe.turn_reflections else ()
-
-
-def _joint_start(recipe: PlanarRecipe) -> float:
-    """Share of the run after which joint optimisation starts."""
-    first, second, third = recipe.stage_shares
-    return (first + second) / (first + second + third)
 
 
 def _training_renderer(recipe: PlanarRecipe, gradient: ReflectionGradient) -> Planar:

@@ -73,8 +73,9 @@ class PlanarRecipe(MethodRecipe):
     Attributes:
         view_dependence_weight: weight of the squared SH coefficients beyond the constant one. Mirrored views see
             Gaussians from directions that no photograph covers; the paper has no such term.
-        stage_shares: lengths of the three stages in relation to each other (paper: 3000, 3000 and 24,000 iterations).
-            Short first stages leave less time to model reflections behind panes.
+        stage_shares: lengths of the three stages in relation to each other (paper: 3000, 3000 and 24,000 iterations);
+            None for those, but at most 350 iterations for each of the first two. These model reflections behind panes,
+            more of them the longer they last.
         fresnel: angular dependence of the strength: a pane with two surfaces, Schlick's approximation for one surface
             (paper), or none (ablation).
         intensity: False drops the reflection intensity a(u) (ablation).
@@ -110,7 +111,7 @@ class PlanarRecipe(MethodRecipe):
     method = "planar"
     functions = "glassplat.methods.planar:planar"
     view_dependence_weight: NonNegative = 0.02
-    stage_shares: Internal[tuple[Positive, Positive, Positive]] = (0.05, 0.05, 0.9)
+    stage_shares: Internal[tuple[Positive, Positive, Positive] | None] = None
     fresnel: Internal[Fresnel] = "pane"
     intensity: Internal[bool] = True
     blend: Internal[Blend] = "linear"

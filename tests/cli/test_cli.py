@@ -113,7 +113,7 @@ def test_bad_input_ends_with_one_message(tmp_path: Path, capsys: pytest.CaptureF
     short = ["train", "planar", "--data", str(SCENE), *output, "--iterations", "1"]
     assert main(short) == 2
     told = capsys.readouterr()
-    assert "expected at least 15" in " ".join(told.err.split()) and "training and" not in told.out
+    assert "expected at least 8" in " ".join(told.err.split()) and "training and" not in told.out
     fails_with(["eval", str(empty)], capsys, "is not a run directory")
     assert not (tmp_path / "run").exists()
 
@@ -162,7 +162,7 @@ def test_the_demo_compares_both_methods_and_can_be_repeated(
 ) -> None:
     monkeypatch.setattr("glassplat.cli.train.DEMO_DOWNSCALE", 12.0)
     for _ in range(2):
-        assert main(["demo", "--output", str(tmp_path), "--iterations", "15"]) == 0
+        assert main(["demo", "--output", str(tmp_path), "--iterations", "10"]) == 0
         shown = "".join(capsys.readouterr().out.split())
         assert "planar" in shown and "splat" in shown and "index.html" in shown
     assert (tmp_path / "planar" / "index.html").is_file()

@@ -299,15 +299,15 @@ def test_two_trainings_do_not_share_a_folder(tmp_path: Path) -> None:
 
 def test_a_run_too_short_for_its_stages_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     settings = replace(SETTINGS, iterations=6)
-    with pytest.raises(InputError, match=r"6 iterations are too few for the stage '1 .*'; expected at least 15"):
+    with pytest.raises(InputError, match=r"6 iterations are too few for the stage '2 .*'; expected at least 8"):
         Run(PlanarRecipe(), settings, RunDirectory(tmp_path / "run"), tiny_capture(), resume=False).run_to_end(print)
     assert not (tmp_path / "run").exists()
 
 
 def test_a_scene_that_cannot_be_initialised_leaves_no_folder(tmp_path: Path) -> None:
-    bare, settings = replace(tiny_capture(), pane_labels=()), replace(SETTINGS, iterations=15)
+    bare = replace(tiny_capture(), pane_labels=())
     with pytest.raises(PlaneFitError, match="needs to know the panes"):
-        Run(PlanarRecipe(), settings, RunDirectory(tmp_path / "run"), bare, resume=False).run_to_end(print)
+        Run(PlanarRecipe(), SETTINGS, RunDirectory(tmp_path / "run"), bare, resume=False).run_to_end(print)
     assert not (tmp_path / "run").exists()
 
 

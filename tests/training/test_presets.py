@@ -217,7 +217,7 @@ def test_published_perturbations_and_resets_share_no_stage() -> None:
     perturbed = moments(stages, PerturbOpacity, 30_000)
     assert perturbed == [[], [], [step for step in range(7000, 29_001, 1000) if step % 3000]]
     here = PlanarRecipe().stages(0)
-    assert moments(here, ResetOpacity, 30_000) == [[], [], [6000, 9000, 12_000]]
+    assert moments(here, ResetOpacity, 30_000) == [[], [], [3000, 6000, 9000, 12_000]]
     assert moments(here, PerturbOpacity, 30_000)[2][-1] == 23_000
 
 
@@ -237,11 +237,11 @@ def test_the_last_perturbation_leaves_time_to_settle(iterations: int) -> None:
 
 
 def test_mcmc_grows_from_the_first_stage_on_and_resets_nothing_as_published() -> None:
-    published, ours = (replace(made, strategy="mcmc").stages(0) for made in (PlanarRecipe.paper(), PlanarRecipe()))
+    published, ours = (replace(made, strategy="mcmc").stages(0, 3000) for made in (PlanarRecipe.paper(), PlanarRecipe()))
     assert moments(published, Relocate, 3000)[0] == [100, 200, 300]
     first, second, last = moments(ours, Relocate, 3000)
-    assert first == second == [] and last[0] == 400
-    assert not any(moments(published, ResetOpacity, 3000)) and moments(ours, ResetOpacity, 3000) == [[], [], [360]]
+    assert first == second == [] and last[0] == 700
+    assert not any(moments(published, ResetOpacity, 3000)) and moments(ours, ResetOpacity, 3000) == [[], [], [660]]
 
 
 def test_perturbed_opacities_stay_within_their_bounds() -> None:
