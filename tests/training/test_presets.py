@@ -237,7 +237,8 @@ def test_the_last_perturbation_leaves_time_to_settle(iterations: int) -> None:
 
 
 def test_mcmc_grows_from_the_first_stage_on_and_resets_nothing_as_published() -> None:
-    published, ours = (replace(made, strategy="mcmc").stages(0, 3000) for made in (PlanarRecipe.paper(), PlanarRecipe()))
+    recipes = (PlanarRecipe.paper(), PlanarRecipe())
+    published, ours = (replace(made, strategy="mcmc").stages(0, 3000) for made in recipes)
     assert moments(published, Relocate, 3000)[0] == [100, 200, 300]
     first, second, last = moments(ours, Relocate, 3000)
     assert first == second == [] and last[0] == 700
