@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,12 @@ def test_a_demo_too_short_for_its_stages_leaves_no_folder(tmp_path: Path, capsys
 def test_the_shortest_demo_has_room_for_all_stages() -> None:
     assert not stages_without_step(PlanarRecipe().stages(0, LEAST_ITERATIONS), LEAST_ITERATIONS)
     assert stages_without_step(PlanarRecipe().stages(0, LEAST_ITERATIONS - 1), LEAST_ITERATIONS - 1)
+
+
+@pytest.mark.parametrize("file", ["Dockerfile", "Makefile"])
+def test_demos_outside_the_package_are_as_short_as_possible(file: str) -> None:
+    text = (Path(__file__).parents[2] / file).read_text(encoding="utf-8")
+    assert re.findall(r"glassplat demo --iterations (\d+)", text) == [str(LEAST_ITERATIONS)]
 
 
 @pytest.mark.parametrize("name", ["splat", "planar"])
