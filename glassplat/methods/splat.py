@@ -64,7 +64,7 @@ def _training_renderer(recipe: SplatRecipe, *, normal: bool = False) -> Splat:
 
 
 SEED_AT = (0.105, 0.203)
-"""Shares of a run at which missing objects are searched for, as in `planar`."""
+"""Shares of a run at which missing objects are searched for."""
 
 
 def _seed_actions(recipe: SplatRecipe) -> tuple[actions.SeedUnexplained, ...]:
