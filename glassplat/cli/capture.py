@@ -28,12 +28,13 @@ class Prepare:
         input: folder of photographs, or a video.
         output: the capture; a new folder.
         max_size: reduce photographs to this many pixels along the longer side.
-        frames: photographs to take from a video, at most.
-        lens: COLMAP's model of the lens; opencv and opencv_fisheye for wide ones.
-        mapper: register one photograph after the other, or all at once.
-        least_registered: share of the photographs that have to be registered; with a larger one, more is tried.
-        resume: go on where the command was interrupted.
-        force: replace a capture that was prepared before, or begin an interrupted one again.
+        frames: maximum number of photographs to take from a video.
+        lens: COLMAP's lens model; opencv and opencv_fisheye are for wide lenses.
+        mapper: register photographs one by one, or all at once.
+        least_registered: minimum share of registered photographs; below it, slower settings are tried, and at last the
+            command stops.
+        resume: continue an interrupted preparation.
+        force: replace a capture that was prepared before, or restart an interrupted preparation.
     """
 
     input: tyro.conf.Positional[Path]
@@ -109,5 +110,5 @@ class Annotate(Command):
     open_browser: bool = True
 
     def check(self) -> None:
-        """Refuses what is no folder."""
+        """Checks that the capture is a folder."""
         check_capture_folder(self.capture)

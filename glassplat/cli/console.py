@@ -460,18 +460,18 @@ class Command:
 
     Attributes:
         entry_point: the module in `glassplat.cli`, and the function.
-        interrupt_hint: what an interrupt leaves behind, and how to go on; fields of the command stand in braces.
+        interrupt_hint: state on disk after an interrupt, and how to continue; fields of the command are in braces.
     """
 
     entry_point: ClassVar[str]
     interrupt_hint: ClassVar[str]
 
     def check(self) -> None:
-        """Refuses what can be refused before that takes long."""
+        """Checks options and paths."""
         raise NotImplementedError
 
     def set_up(self) -> None:
-        """Refuses what can be refused, and imports what works."""
+        """Checks options and paths, and imports the module that does the work."""
         self.check()
         import_pytorch_module(f"glassplat.cli.{self.entry_point.partition(':')[0]}")
 
@@ -481,7 +481,7 @@ class Command:
         getattr(importlib.import_module(f"glassplat.cli.{module}"), function)(self, console)
 
     def interrupt_message(self) -> str:
-        """Text after an interrupt: the state on disk, and how to go on."""
+        """Message after an interrupt: the state on disk, and how to continue."""
         return self.interrupt_hint.format(**vars(self))
 
 

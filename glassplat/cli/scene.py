@@ -49,7 +49,7 @@ class Evaluate(Command):
     align: Align = "auto"
 
     def check(self) -> None:
-        """Refuses what is no run."""
+        """Checks that the path is a run."""
         RunDirectory(self.run_directory).check_begun()
         check_folder(self.run_directory)
         print_scene(self.run_directory)
@@ -83,7 +83,7 @@ class Render(Command):
     data: Path | None = None
 
     def check(self) -> None:
-        """Refuses what is no run, and an output that holds something else."""
+        """Checks that the path is a run, and that the output may be written."""
         RunDirectory(self.run_directory).check_begun()
         check_claim(self.output, "render")
         print_scene(self.run_directory)
@@ -99,7 +99,7 @@ class View(Command):
         host: address to listen on; 127.0.0.1 is for this machine only, 0.0.0.0 for the whole network.
         output: folder for edited scenes and keyframes saved in the browser; by default the folder of the scene. If
             others can connect, nothing can be saved without this option.
-        file: what a splat file does not record.
+        file: properties that a splat file does not record.
         edits: changes to the panes.
         device: rendering device; auto uses an NVIDIA GPU if available.
     """
@@ -116,7 +116,7 @@ class View(Command):
     device: DeviceName = "auto"
 
     def check(self) -> None:
-        """Refuses what is no scene, an output that cannot be written, and a port that is taken."""
+        """Checks the scene, the output folder and the port."""
         check_scene(self.scene)
         self.file.check()
         if self.output is not None:
@@ -141,7 +141,7 @@ class Video(Command):
         fps: frames per second.
         width: width of one layer in pixels.
         force: overwrite an existing video.
-        file: what a splat file does not record.
+        file: properties that a splat file does not record.
         edits: changes to the panes.
         device: rendering device; auto uses an NVIDIA GPU if available.
     """
@@ -164,7 +164,7 @@ class Video(Command):
     device: DeviceName = "auto"
 
     def check(self) -> None:
-        """Refuses everything that can be known to be wrong before it takes long."""
+        """Checks the video file, the options and the scene."""
         try:
             with convert_to_input_error():
                 check_encoder(self.output, self.fps)
@@ -202,9 +202,9 @@ class Clean(Command):
         scene: directory of a run, exported folder, or splat file (.ply, .spz, .glb, .splat, .sog, .ksplat).
         output: new folder for the cleaned scene, which `glassplat view` and `export` read like a run; or a new splat
             file.
-        rules: what is removed.
+        rules: rules for removal.
         scale: two points, x y z each in world units, and their distance in metres; `view` measures points.
-        file: what a splat file does not record.
+        file: properties that a splat file does not record.
         device: device to use; auto uses an NVIDIA GPU if available.
     """
 
@@ -248,7 +248,7 @@ class Export(Command):
         credit: author and licence to show on the page.
         url: address at which the page will be published, for link previews; also writes preview.jpg.
         spz_version: version of the SPZ file: 3, which every reader supports, or 4.
-        file: what a splat file does not record.
+        file: properties that a splat file does not record.
         edits: changes to the panes.
         device: rendering device; auto uses an NVIDIA GPU if available.
     """
@@ -312,7 +312,7 @@ class Dereflect(Command):
     data: Path | None = None
 
     def check(self) -> None:
-        """Refuses what is no run, and an output that holds something else."""
+        """Checks that the path is a run, and that the output may be written."""
         RunDirectory(self.run_directory).check_begun()
         check_claim(self.output, "dereflect")
         print_scene(self.run_directory)

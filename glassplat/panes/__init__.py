@@ -22,13 +22,13 @@ class PlaneFit:
         mirror_reflectance: base reflectance of mirrors; one has no finite logit.
         band: half width of the band along a mask's edge in which candidates lie, as a share of the
             image diagonal; the paper's 20 pixels at 960x720.
-        inlier_distance: of RANSAC, as a share of the scene extent.
-        hypotheses: number of planes drawn by RANSAC, and again through the masks.
-        refined: number of the best of them that are refined at last.
-        most_views: number of annotated views that are used; a few that were taken far apart tell enough.
+        inlier_distance: inlier distance of RANSAC, as a share of the scene extent.
+        hypotheses: number of planes drawn by RANSAC, and again from the masks.
+        refined: number of the best planes that are refined in the end.
+        most_views: maximum number of annotated views to use; a few that are far apart suffice.
         least_agreement: intersection over union of the masks on the plane below which the fit is refused.
         margin: factor on the rectangle's sides, which must not cut into the pane.
-        seed: of RANSAC.
+        seed: random seed of RANSAC.
     """
 
     mirror_labels: Annotated[tuple[PaneLabel, ...], ESSENTIAL] = ()

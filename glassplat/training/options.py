@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from glassplat.training.stage import Stage
 
 PUBLISHED_ITERATIONS = 30_000
-"""Length of the runs for which 3DGS, and TR-Gaussians after it, chose their learning rates."""
+"""Length of the runs for which 3DGS chose its learning rates, which TR-Gaussians adopted."""
 FASTEST_ITERATIONS = 3_000
-"""Shorter runs learn no faster than one of this length, the shortest for which higher rates were measured."""
+"""Runs shorter than this use its learning rates: higher ones were not measured."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,10 @@ class Rate:
         decay: share of the run at which `end` is reached.
         per_extent: multiply by the scene extent (for positions).
         rest: factor for every SH coefficient but the constant one; only for `sh`.
-        penalty: weight in the loss of the mean over the Gaussians of the squares of what `rest` scales.
-        short_run_power: a run of fewer iterations than the published 30,000 multiplies the rate by their ratio to this
-            power (`FASTEST_ITERATIONS` at the least), because Adam moves a parameter by about its rate at every step,
-            however small the gradient.
+        penalty: weight in the loss of the mean square, over the Gaussians, of the coefficients that `rest` scales.
+        short_run_power: in a run of n < 30,000 iterations, the rate is multiplied by (30,000 / n) to this power, with n
+            at least `FASTEST_ITERATIONS`, because Adam changes a parameter by about its rate in every step, however
+            small the gradient.
     """
 
     start: float
@@ -63,7 +63,7 @@ class Rate:
     short_run_power: float = 0.0
 
     def at(self, progress: float, extent: float, iterations: int = PUBLISHED_ITERATIONS) -> float:
-        """The rate at a progress in [0, 1] of a run of so many iterations."""
+        """The rate at a progress in [0, 1] of a run of this length."""
         length = min(max(iterations, FASTEST_ITERATIONS), PUBLISHED_ITERATIONS)
         scale = (PUBLISHED_ITERATIONS / length) ** self.short_run_power
         if self.per_extent:
@@ -84,12 +84,12 @@ class GaussianRates:
 
     Attributes:
         means: positions, in scene extents, at the start of the run; decays to 1.6e-6.
-        decay: share of the run at which it has done so.
+        decay: share of the run at which that value is reached.
         sh: constant SH coefficients; a twentieth for the others.
-        opacity, scale, rotation: of the raw values.
-        intensity: of the reflection intensity's logarithm.
-        short_run_power: in a run of n < 30,000 iterations the rates of position, colour, scale and rotation are
-            (30,000 / n) to this power times as large, n being 3,000 at the least; 0 keeps the published ones
+        opacity, scale, rotation: raw values.
+        intensity: logarithm of the reflection intensity.
+        short_run_power: in a run of n < 30,000 iterations, the rates of position, colour, scale and rotation are
+            multiplied by (30,000 / n) to this power, with n at least 3,000; 0 keeps the published rates
             (lab/training.md).
     """
 
@@ -106,10 +106,10 @@ class GaussianRates:
         """The rates by dotted parameter name.
 
         Args:
-            part: of the scene.
-            view_dependence: weight in the loss of the squares of the spherical harmonics beyond the constant one, per
-                Gaussian. What is seen from few directions has coefficients that no photograph decides, and its colour
-                from other directions, from which a pane shows it, is whatever they happen to be (not in the papers).
+            part: part of the scene.
+            view_dependence: weight in the loss of the squared SH coefficients beyond the constant one, per Gaussian.
+                Photographs from few directions do not determine them, and panes show Gaussians from other directions
+                (not in the papers).
         """
         power = self.short_run_power
         return {
@@ -123,7 +123,7 @@ class GaussianRates:
 
 @dataclass(frozen=True)
 class ReflectionRates:
-    """Learning rates of what reflects.
+    """Learning rates of reflections.
 
     Attributes:
         strength: logit of the reflection strength.
@@ -143,18 +143,18 @@ Strategy = Literal["default", "mcmc"]
 
 @dataclass(frozen=True)
 class Intervals:
-    """Schedule of the perturbation of opacities, of the SH degree, and of the end of a run.
+    """Schedule of opacity changes, of the SH degree, and of the end of a run.
 
     Times are shares of the run (3DGS: of 30,000 iterations).
 
     Every third interval ends in a reset of the opacities, as in 3DGS. `planar` perturbs them after the other two, so
-    that the two never meet (TR-Gaussians, Section III-C3).
+    that the two never coincide (TR-Gaussians, Section III-C3).
 
     Attributes:
-        opacity: between changes of the opacities, as a share of the run.
-        least: fewest iterations between them; the scene needs as many to recover.
-        reset_stop: share of the run after which no reset happens. The `mcmc` strategy has none of these.
-        sh: distance between rises of the SH degree, as a share of the run.
+        opacity: time between changes of the opacities.
+        least: minimum number of iterations between them, which the scene needs to recover.
+        reset_stop: time after which no reset happens. The `mcmc` strategy has none of these resets.
+        sh: time between increases of the SH degree.
         averaged_passes: final passes over the views over which the parameters are averaged; 0 keeps the last step.
     """
 
@@ -171,28 +171,27 @@ class DefaultDensify:
 
     A small Gaussian whose mean screen gradient exceeds a threshold is cloned. A large one whose mean absolute gradient,
     summed over pixels without their signs, exceeds another threshold is split in two. Where a large Gaussian smears
-    detail, the gradients of its pixels cancel, and 3DGS, which looks at their sum here too, lets it be.
-    Nearly transparent ones are removed.
+    detail, the signed gradients of its pixels cancel, and 3DGS, which uses their sum, does not split it.
+    Nearly transparent Gaussians are removed.
 
     Attributes:
-        split_by: what tells that a large Gaussian is too large: the absolute gradient `absgrad`, or as in 3DGS the
-            `gradient` that clones small ones.
+        split_by: criterion for splitting large Gaussians: the absolute gradient `absgrad`, or, as in 3DGS, the same
+            `gradient` as for cloning small ones.
         interval: steps between densifications.
-        whole_passes: wait at least for about one pass over the views, twice the interval at the most, so that
-            every Gaussian has been seen when it is judged.
-        adapt_to_size: raise the thresholds where photographs are smaller than a quarter of a megapixel.
+        whole_passes: wait for about one pass over the views, but at most twice the interval, so that every Gaussian has
+            been seen before it is judged.
+        adapt_to_size: raise the thresholds if photographs are smaller than a quarter of a megapixel.
         start: share of the run after which densification begins.
         stop: share of the run after which densification ends.
         gradient_threshold: mean gradient norm, in normalised device coordinates, above which a small Gaussian is
             cloned.
         absgrad_threshold: mean absolute gradient, in the same unit, above which a large Gaussian is split.
-        dense_fraction: Gaussians whose longest axis is above this share of the scene extent are
-            split, smaller ones cloned.
+        dense_fraction: longest axis, as a share of the scene extent, above which a Gaussian is large.
         prune_opacity: opacity below which Gaussians are removed.
-        prune_large_start: share of the run after which what is too large is removed as well; 1 never does.
-        prune_scale_fraction: from `prune_large_start` on, Gaussians with an axis above this share of the
-            scene extent are removed. 3DGS also states a limit of 20 pixels on screen, but clears the radii before it
-            looks at them, so that its published results have none.
+        prune_large_start: share of the run after which oversized Gaussians are removed, too; 1 keeps them.
+        prune_scale_fraction: longest axis, as a share of the scene extent, above which a Gaussian is oversized. 3DGS
+            also states a limit of 20 pixels on screen, but clears the radii before it reads them, so that its published
+            results have none.
         cap: maximum number of Gaussians, including the initial ones; by default `--densify.per-pixel` decides. 0 adds
             none.
         per_pixel: maximum number of Gaussians per pixel of all training photographs, a limit for captures whose
@@ -200,8 +199,8 @@ class DefaultDensify:
             densification only: searches for missing objects and unseen reflections add up to 5 % each.
         least_contribution: contribution in pixels to every training view, directly and mirrored, below which Gaussians
             are removed; 0 keeps them.
-        contribution_moments: shares of the run at which they are: when the set has stopped growing, when `planar`
-            perturbs nothing any longer, and at the end.
+        contribution_moments: shares of the run at which they are removed: when densification ends, when `planar` stops
+            perturbing opacities, and at the end.
     """
 
     split_by: Internal[Literal["absgrad", "gradient"]] = "absgrad"
@@ -223,7 +222,7 @@ class DefaultDensify:
 
     @staticmethod
     def published() -> DefaultDensify:
-        """As 3DGS does it, which removes what is too large once the opacities have been reset."""
+        """As in 3DGS, which removes oversized Gaussians after the first opacity reset."""
         return DefaultDensify(
             split_by="gradient",
             whole_passes=False,
@@ -244,18 +243,18 @@ class McmcDensify:
         interval: steps between relocations.
         start: share of the run after which relocation begins.
         stop: share of the run after which relocation and growth end; the noise goes on.
-        growth: factor by which the number grows in every three hundredth of the run, until the cap: with the published
-            30,000 iterations at every relocation. A single relocation at most doubles it.
+        growth: factor by which the number grows in every three hundredth of the run, up to the cap; in the published
+            30,000 iterations, this is at every relocation. A single relocation at most doubles it.
         noise_rate: noise on the positions, as a multiple of their learning rate; 0 disables it.
-        noise_units: in which variances and learning rate are multiplied: scene `extents`, so that the noise is the same
-            whatever the capture's units, or as published `world` units.
+        noise_units: units of variances and learning rate in their product: scene `extents`, so that the noise does not
+            depend on the units of the capture, or, as published, `world` units.
         opacity_weight: lambda_o, weight of the mean opacity in the loss.
         scale_weight: lambda_Sigma, weight of the mean standard deviation in the loss.
-        reach: what noise and regularisers act on at a step: what its view shows (`shown`; the regularisers on what it
-            shows directly), or as published on `all` Gaussians.
+        reach: Gaussians on which noise and regularisers act in a step: those that its view shows (`shown`; for
+            regularisers, directly), or, as published, `all`.
         initial_spread: standard deviation of the first Gaussians, as a share of the distance to their neighbours. The
-            published 0.1 takes a thousand steps or more to grow over the gaps (lab/gaussians.md). Unused in `planar`,
-            except as published, because its first stages precede MCMC.
+            published 0.1 takes a thousand steps or more to close the gaps (lab/gaussians.md). `planar` uses it only as
+            published, because its first stages otherwise precede MCMC.
     """
 
     cap: Annotated[Count | None, ESSENTIAL, tyro.conf.arg(aliases=("--cap",))] = None
@@ -272,7 +271,7 @@ class McmcDensify:
 
     @staticmethod
     def published() -> McmcDensify:
-        """As 3DGS-MCMC does it."""
+        """As in 3DGS-MCMC."""
         return McmcDensify(reach="all", noise_units="world", initial_spread=0.1)
 
 
@@ -281,14 +280,14 @@ class MirrorSearch:
     """Options for recognising mirrors when reflections begin.
 
     Attributes:
-        begin_found: whether anything is; without, every strength grows from `first_strength` (the papers).
-        views: how many training views to look at.
-        spread: standard deviation over the views of a Gaussian's colour, sRGB, from which it looks like a mirror.
-        strength: reflection strength of what was found.
-        least_opacity: opacities of what was found are raised to this.
-        flatness: of what was found, the shortest axis as a share of the middle one, at most.
-        estimated_normals: turn what was found as the normals say that lie in `normals/` next to the photographs, and
-            only where there are none as the depths say.
+        begin_found: search for mirrors; otherwise, every strength grows from `first_strength` (the papers).
+        views: number of training views to examine.
+        spread: standard deviation over the views of a Gaussian's colour, sRGB, from which it counts as a mirror.
+        strength: initial reflection strength of mirrors.
+        least_opacity: minimum opacity of mirrors.
+        flatness: maximum ratio of the shortest to the middle axis of mirrors.
+        estimated_normals: take the normals of mirrors from `normals/` next to the photographs where they exist, and
+            only otherwise from the depths.
     """
 
     begin_found: bool = True
@@ -305,15 +304,15 @@ class NormalPropagation:
     """Options for growing reflective Gaussians over their neighbours and disturbing the colours of the others.
 
     A reflective Gaussian has a nearly correct normal. Where it overlaps another one, the blended normal is nearly
-    correct too, so that the other receives a gradient that means something.
+    correct, too, so that the other receives a useful gradient.
 
     Attributes:
-        least_opacity: every opacity is raised to this, so that every visible Gaussian counts.
-        least_strength: every reflection strength is raised to this, so that it has a gradient.
+        least_opacity: value to which lower opacities are raised, so that every visible Gaussian counts.
+        least_strength: value to which lower reflection strengths are raised, so that they have a gradient.
         reflective: Gaussians of at least this strength grow (paper: 0.1; its code: 0.02).
-        growth: factor on their two longer axes, or both of a disc; the shortest is the normal and stays.
+        growth: factor on their two longer axes, or on both of a disc; the shortest, the normal, stays.
         sabotage: half width of the uniform noise on the constant colour (paper: 0.1; its code: 0.4 on the constant
-            coefficient, which is 0.113); 0 switches it off (ablation).
+            coefficient, which is 0.113); 0 disables it (ablation).
         sabotaged: Gaussians of at most this strength are disturbed (paper: 0.1; its code: 0.05).
     """
 
@@ -338,7 +337,7 @@ class PhotoExposure:
 
 @dataclass(frozen=True)
 class PoseRefinement:
-    """A small rigid motion of each training camera, by the gradient that the image has to its pose.
+    """A small rigid motion of each training camera, learned by the gradient of its pose.
 
     Attributes:
         rate: initial learning rate, in radians and scene extents; 0 keeps the poses of the capture.
@@ -349,13 +348,13 @@ class PoseRefinement:
 
 @dataclass(frozen=True)
 class Photographer:
-    """Options for the photographer in the panes: Gaussians that the camera carries along.
+    """Options for the photographer in the panes: Gaussians that move with the camera.
 
     Attributes:
         learn: model the photographer's reflection.
         upright: keep the photographer upright when the camera is tilted; otherwise they tilt with it.
         count: number of initial Gaussians.
-        sh_degree: highest degree of their colours.
+        sh_degree: SH degree of their colours.
         rates: learning rates.
     """
 
@@ -371,16 +370,16 @@ Texels = Annotated[int, Range(1, 2048)]
 
 @dataclass(frozen=True)
 class PropagationSchedule:
-    """Schedule of propagation: at the intervals of `Intervals.opacity`, but for those that reset opacities.
+    """Schedule of propagation: at the intervals of `Intervals.opacity`, except those that reset opacities.
 
     Attributes:
-        end: `settled` ends it when what reflects has stopped growing (the paper's criterion), `fixed` at `stop`.
+        end: `settled` ends it when the reflective part has stopped growing (the paper's criterion), `fixed` at `stop`.
         stop: share of the run after which propagation ends.
-        patience: intervals without growth after which it counts as settled; a strength needs some hundred steps to be
-            seen, however short the run. None is needed where nothing reflects nor looks as if it did.
-        pause: steps for which raised opacities are held.
-        last_reset: after the end, reset opacities only if they have been raised since the last time; if not, regular
-            resets go on as if nothing had been propagated.
+        patience: intervals without growth after which it counts as settled; strengths take some hundred steps to show,
+            however short the run. If nothing reflects or looks reflective, it ends at once.
+        pause: steps for which raised opacities are frozen.
+        last_reset: after the end, reset opacities only if they have been raised since the last reset; otherwise,
+            regular resets continue as without propagation.
     """
 
     end: Internal[Literal["settled", "fixed"]] = "settled"
@@ -392,18 +391,18 @@ class PropagationSchedule:
 
 @dataclass(frozen=True)
 class SurroundingsStart:
-    """Options for the first surroundings.
+    """Options for the initial surroundings.
 
     Attributes:
         source: Gaussians in every cell of the scene's box (paper), copies of the scene's Gaussians that do not reflect,
             or both.
-        cells: cells along an edge of the box; by default as many as suit the photographs, at most 32 (paper: 32).
+        cells: cells along an edge of the box; by default half a Gaussian per pixel, and at most 32 cells (paper: 32).
         per_cell: Gaussians in each cell.
         outside: share of the points left out of the box at either end of each axis.
-        opacity: of those in the box.
+        opacity: opacity of the Gaussians in the box.
     """
 
-    source: Annotated[Literal["box", "scene", "both"], ESSENTIAL] = "scene"
+    source: Literal["box", "scene", "both"] = "scene"
     cells: Annotated[int, Range(1, 256)] | None = None
     per_cell: Internal[Annotated[int, Range(1, 1000)]] = 5
     outside: Internal[Annotated[float, Range(0, 0.45)]] = 0.005
@@ -419,7 +418,7 @@ class SurroundingsOptions:
         sh_degree: maximum SH degree of their view-dependent colour.
         rates: learning rates.
         densify: densification and pruning, by gradients in space times half of the distance.
-        reset: share of the run between two resets of their opacities, while they are densified; 0 never resets them.
+        reset: share of the run between two resets of their opacities during densification; 0 never resets them.
     """
 
     start: SurroundingsStart = field(default_factory=SurroundingsStart)
@@ -435,11 +434,11 @@ class SurroundingsOptions:
 
 @dataclass(frozen=True)
 class MethodRecipe:
-    """Options of all methods, whose recipes import PyTorch only where they are used.
+    """Options of all methods. A recipe imports PyTorch only when it is used.
 
     Attributes:
-        method: its name on the command line.
-        functions: module, and beginning of the names, of its functions `*_scene`, `*_renderer` and `*_stages`.
+        method: name of the method on the command line.
+        functions: module and prefix of its functions `*_scene`, `*_renderer` and `*_stages`.
         sh_degree: maximum SH degree of the view-dependent colour.
         ssim_weight: lambda, share of D-SSIM in the photometric loss.
         view_dependence_weight: weight of the squared SH coefficients beyond the constant one.
@@ -469,7 +468,7 @@ class MethodRecipe:
     poses: PoseRefinement = field(default_factory=PoseRefinement)
 
     def initialise(self, dataset: Dataset) -> Scene:
-        """The first scene; raises PlaneFitError where a method needs masks of panes and these do not do."""
+        """The initial scene; raises PlaneFitError if the method needs masks of panes and these do not suffice."""
         scene: Scene = self._function("scene")(self, dataset)
         return scene
 
