@@ -1,6 +1,6 @@
-# Every target sets itself up in .venv; nothing but Python 3.11 (or newer) and make has to be there.
+# Every target creates .venv if necessary; only Python 3.11 (or newer) and make are required.
 # Another interpreter: make test PYTHON=/path/to/python
-# The newest versions in place of the pinned ones: make test CONSTRAINTS=
+# Newest versions instead of the pinned ones: make test CONSTRAINTS=
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3 || command -v python)
 CONSTRAINTS ?= constraints.txt
@@ -10,9 +10,9 @@ BIN := $(VENV)/$(IN_VENV)
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check --no-input
 
-# Tests of what differs between systems and versions; they need neither a browser nor a compiled kernel.
+# Tests of system-dependent code; they need neither a browser nor a compiled kernel.
 PORTABLE_TESTS := tests/files tests/captures tests/scene tests/model/test_run_lock.py tests/cli/test_start.py
-# What releases are made with, and the lowest versions tried in.
+# Environments in which releases are made and lowest versions are tested.
 RELEASE := build/release
 LOWEST := build/lowest
 TESTING := 'pytest>=8.3' 'hypothesis>=6.100' 'gsply>=0.4' 'pygltflib>=1.16'
@@ -21,11 +21,11 @@ TESTING := 'pytest>=8.3' 'hypothesis>=6.100' 'gsply>=0.4' 'pygltflib>=1.16'
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make demo     train both methods on the bundled shop window and say where the pictures are"
-	@echo "make test     style, types and tests, as the continuous integration runs them"
-	@echo "make portable only the tests of what differs between systems: files, captures, scenes, commands"
+	@echo "make demo     train both methods on the bundled shop window and print where the pictures are"
+	@echo "make test     style, types and tests, as in continuous integration"
+	@echo "make portable only the tests of system-dependent code: files, captures, scenes, commands"
 	@echo "make lowest   the same with the lowest version of every dependency"
-	@echo "make dist     wheel and source distribution, checked, installed and tried"
+	@echo "make dist     wheel and source distribution, checked, installed and tested"
 	@echo "make lint     style, types and prose only"
 	@echo "make format   rewrite the sources in the project's format"
 	@echo "make docs     the documentation as a site, in build/docs"
@@ -36,7 +36,7 @@ help:
 
 setup: $(STAMP)
 
-# The stamp is written last, so an interrupted installation starts over.
+# The stamp is written last, so an interrupted installation is repeated.
 $(STAMP): pyproject.toml constraints.txt
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "glassplat needs Python 3.11 or newer; '$(PYTHON)' is not. Try: make PYTHON=/path/to/python3.11" >&2; exit 1; }
@@ -45,7 +45,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(PIP) install $(addprefix --constraint ,$(CONSTRAINTS)) --config-settings editable_mode=compat --editable '.[dev]'
 	@touch $@
 
-# Tests of pages are skipped, and said to be, where there is no Chromium.
+# Without Chromium, tests of pages are skipped, and listed as skipped.
 browser:
 	@command -v chromium >/dev/null || \
 		{ as_root=$$([ "$$(id -u)" = 0 ] || echo sudo); $$as_root apt-get update -q && \
@@ -66,7 +66,7 @@ test: lint
 portable: $(STAMP)
 	$(BIN)/python -m pytest $(PORTABLE_TESTS)
 
-# uv, because pip has no way to ask for the lowest version.
+# uv, because pip cannot select the lowest versions.
 lowest:
 	"$(PYTHON)" -m venv --clear $(LOWEST)
 	$(LOWEST)/$(IN_VENV)/python -m pip --quiet install uv

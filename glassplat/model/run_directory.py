@@ -402,7 +402,7 @@ def check_output(directory: RunDirectory, *, resume: bool) -> None:
     """Check a run's directory before the photographs are read; writes nothing.
 
     Raises:
-        InputError: a fresh run would overwrite something, there is nothing to go on from, another training writes
+        InputError: a fresh run would overwrite something, there is nothing to resume, another training writes
             there, or a link leads out of it.
         NotADirectoryError: it is a file, or goes through one.
         PermissionError: the folder is not writable.
