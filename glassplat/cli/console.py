@@ -317,7 +317,7 @@ def _describe_failure(error: BaseException) -> str:
     if is_one_of(error, GPU_OUT_OF_MEMORY):
         return f"{first_sentence(error)}; {MEMORY_REMEDY}, or use --device cpu; the last checkpoint stays"
     if is_out_of_memory(error):
-        reason = first_sentence(error) or "an allocation failed"
+        reason = first_sentence(error, OUT_OF_MEMORY) or "an allocation failed"
         return f"out of memory ({reason}); {MEMORY_REMEDY}; the last checkpoint stays"
     sentence = first_sentence(error)
     return f"unexpected error, {type(error).__name__}: {sentence}; {save_traceback(error)}"
@@ -332,9 +332,10 @@ def is_out_of_memory(error: BaseException) -> bool:
     return error.__cause__ is not None and is_out_of_memory(error.__cause__)
 
 
-def first_sentence(error: BaseException) -> str:
-    """First sentence of a library's message, which may have many lines."""
-    first = (str(error).strip().splitlines() or [""])[0].split(". ")[0].rstrip(".")
+def first_sentence(error: BaseException, words: tuple[str, ...] = ()) -> str:
+    """First sentence of a library's message, which may have many lines; preferably one with any of the words."""
+    sentences = (str(error).strip().splitlines() or [""])[0].split(". ")
+    first = next((one for one in sentences if any(word in one for word in words)), sentences[0]).rstrip(".")
     return first if len(first) <= LONGEST_QUOTE else f"{first[:LONGEST_QUOTE]} ..."
 
 

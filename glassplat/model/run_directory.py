@@ -380,7 +380,7 @@ class RunDirectory:
         folders = self.scene_folders()
         if not folders:
             raise InputError(
-                f"{self.path} holds no point_cloud/iteration_N; expected a finished run. Train first, or --resume it"
+                f"{self.path} holds no point_cloud/iteration_N; expected a finished run. Continue with --resume"
             )
         step = max(folders)
         try:

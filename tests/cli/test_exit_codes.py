@@ -95,7 +95,7 @@ FAILURES = [
     (raising(OSError(errno.ENOSPC, "No space left on device", "/a/b")), ["/a/b: no space left on device; free some"]),
     (raising(OSError(errno.EIO, "Input/output error")), ["input/output error"]),
     (raising(torch.OutOfMemoryError("CUDA out of memory. Tried 2 GiB.\nMore")), ["CUDA out of memory;", "--device"]),
-    (too_large_for_torch, ["out of memory", "--downscale"]),
+    (too_large_for_torch, ["out of memory (DefaultCPUAllocator: ", " tried to allocate ", "--downscale"]),
     (too_large_for_numpy, ["out of memory", "--downscale"]),
     (raising(MemoryError()), ["out of memory", "--downscale"]),
     (library_without_memory, ["out of memory"]),
