@@ -80,7 +80,7 @@ def check_scene(path: Path) -> None:
     """Checks that a path is a run, an exported scene or a readable splat file."""
     path = scene_source(path)
     if path.is_file() or (path.suffix and not path.is_dir()):
-        check_file(path)
+        check_file(path, LOADABLE)
         return
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; expected {LOADABLE}")
@@ -105,8 +105,10 @@ def _describe_scene(path: Path) -> str:
     return f"a {recipe.method} run of {count_noun(settings.iterations, 'iteration')} on {settings.data}"
 
 
-def check_file(path: Path) -> None:
-    """Checks that a file can be read."""
+def check_file(path: Path, expected: str) -> None:
+    """Checks that a file can be read; the message about a missing one says what was expected."""
+    if not os.path.lexists(path):
+        raise FileNotFoundError(f"{path} does not exist; expected {expected}")
     with convert_to_input_error(), wrap_read_errors(path), path.open("rb"):
         pass
 
@@ -127,7 +129,7 @@ class SplatFile:
     def check(self) -> None:
         """Checks that the panes can be read."""
         if self.planes is not None:
-            check_file(self.planes)
+            check_file(self.planes, "panes as in the planes.json of a capture, a run or an export")
 
     def open(self, path: Path, device: DeviceName) -> Model:
         """The run or the splat file at a path."""

@@ -184,7 +184,7 @@ class Video(Command):
         check_scene(self.scene)
         self.file.check()
         if self.keyframes is not None:
-            check_file(self.keyframes)
+            check_file(self.keyframes, "cameras as in the cameras.json that `glassplat export` writes")
         print_scene(self.scene)
 
 
