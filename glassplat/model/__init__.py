@@ -1,1 +1,1 @@
-"""Public names of `import glassplat`."""
+"""Models that are rendered, edited and saved; training runs and their directories."""
