@@ -11,7 +11,7 @@ COPY . /source
 RUN pip install --no-cache-dir --extra-index-url "$PYTORCH_INDEX" "/source[all]" && rm -r /source
 
 # The kernels lie in the installed package, where every user of the image may read them and only root may write.
-RUN glassplat demo --iterations 15 --output /tmp/demo && rm -r /tmp/demo
+RUN glassplat demo --iterations 8 --output /tmp/demo && rm -r /tmp/demo
 ENV HOME=/tmp
 
 WORKDIR /work

@@ -373,7 +373,7 @@ def planar_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
         raise PlaneFitError(
             f"{found}, and planar needs to know the panes: expected masks of 3 to 10 photographs in "
             f"{dataset.root / 'panes'}, named <photograph's name>.png, each pixel the label 1, 2, ... of a pane, or 0 "
-            "(`glassplat annotate` writes them). `glassplat train splat` needs none"
+            "(`glassplat annotate` writes them), or rectangles in planes.json. `glassplat train splat` needs none"
         )
     known = (*dataset.pane_labels, *(() if dataset.planes is None else dataset.planes.labels))
     if unknown := [label for label in recipe.plane_fit.mirror_labels if label not in known]:
@@ -475,7 +475,11 @@ def _joint_stage(recipe: PlanarRecipe, share: float) -> Stage:
     """Stage 3: joint optimisation, with perturbed opacities and slowly moving planes."""
     strategy, start = strategy_of(recipe), 1 - share
     perturb_at = Every(
-        recipe.intervals.opacity, 0.0, recipe.perturbation.stop, recipe.intervals.least, skip_multiples_of=RESET_TURN
+        recipe.intervals.opacity,
+        start + TURN_AFTER,
+        recipe.perturbation.stop,
+        recipe.intervals.least,
+        skip_multiples_of=RESET_TURN,
     )
     return Stage(
         name="3 joint optimisation",

@@ -20,6 +20,7 @@ from glassplat.training.actions import (
     AddNoise,
     AverageLast,
     Densify,
+    PerturbOpacity,
     Relocate,
     ResetOpacity,
     growth_per_relocation,
@@ -120,15 +121,26 @@ def test_the_strategy_decides_what_happens_to_the_primary_gaussians(recipe: Any)
         assert not {"opacity", "scale"} & {term.name for term in stage.losses}
 
 
-@pytest.mark.parametrize(("iterations", "reset"), [(251, 55), (1234, 271), (7_000, 840), (30_000, 1300)])
-def test_planar_resets_opacities_after_turning_reflections(iterations: int, reset: int) -> None:
-    joint = PlanarRecipe(strategy="mcmc").stages(0, iterations)[-1]
-    clocks = [Clock(step, iterations, views=10) for step in range(1, iterations + 1)]
-    turned, cleared = (
-        [clock.step for clock in clocks if any(type(a) is kind and a.due(clock) for a in joint.actions)]
-        for kind in (TurnReflections, ResetOpacity)
+def steps_of(strategy: Any, iterations: int, *kinds: type) -> list[int]:
+    """The steps of the joint stage of `planar` at which actions of some kinds act."""
+    joint = PlanarRecipe(strategy=strategy).stages(0, iterations)[-1]
+    acting = [action for action in joint.actions if isinstance(action, kinds)]
+    clocks = (
+        Clock(step, iterations, views=10) for step in range(round(iterations * (1 - joint.share)) + 1, iterations)
     )
-    assert len(turned) == len(cleared) == 1 and turned < cleared == [reset]
+    return [clock.step for clock in clocks if any(action.due(clock) for action in acting)]
+
+
+@pytest.mark.parametrize(("iterations", "reset"), [(251, 55), (1234, 271), (7_000, 840), (30_000, 1300)])
+def test_mcmc_resets_opacities_after_turning_reflections(iterations: int, reset: int) -> None:
+    (turned,) = steps_of("mcmc", iterations, TurnReflections)
+    assert steps_of("mcmc", iterations, ResetOpacity) == [reset] and turned < reset
+
+
+@pytest.mark.parametrize("iterations", [1240, 2450, 7_000, 11_000, 22_000, 30_000])
+def test_no_opacity_changes_in_the_joint_stage_before_reflections_are_turned(iterations: int) -> None:
+    (turned,) = steps_of("default", iterations, TurnReflections)
+    assert turned < min(steps_of("default", iterations, ResetOpacity, PerturbOpacity))
 
 
 def test_the_planar_objective_is_that_of_equation_20_but_for_what_holds_intensities_and_glass() -> None:
