@@ -228,36 +228,38 @@ def _dequantise(rows: NDArray, *, normalized: bool) -> NDArray[np.float32]:
     return values
 
 
-TOLERANCE = 1e-4
-LEAST_NODE_SCALE, MOST_SCALE = 1e-9, 1e9
+TOLERANCE, LEAST_NODE_SCALE, MOST_SCALE = 1e-4, 1e-9, 1e9
+"""Largest deviation of a placement's axes from orthogonal ones of one length, and the range of its scale."""
 
 
-def placement_of(node: Mapping[str, Any], outer: Tensor, where: str) -> Tensor:
-    """[4, 4] float64 the placement of a node within that of its parent: a turn, a shift and one positive scale."""
-    own = torch.eye(4, dtype=torch.float64)
+def matrix_of(node: Mapping[str, Any]) -> Tensor:
+    """[4, 4] float64 the transform of a node relative to its parent."""
     if node["matrix"] is not None:
-        own = torch.tensor(node["matrix"], dtype=torch.float64).reshape(4, 4).T
-    else:
-        x, y, z, w = node["rotation"]
-        turn, scales, shift = (
-            torch.tensor(part, dtype=torch.float64) for part in ((w, x, y, z), node["scale"], node["translation"])
-        )
-        own[:3, :3], own[:3, 3] = rotation_from_quat(turn) * scales, shift
-    placement = outer @ own
+        return torch.tensor(node["matrix"], dtype=torch.float64).reshape(4, 4).T
+    own = torch.eye(4, dtype=torch.float64)
+    x, y, z, w = node["rotation"]
+    turn, scales, shift = (
+        torch.tensor(part, dtype=torch.float64) for part in ((w, x, y, z), node["scale"], node["translation"])
+    )
+    # A rotation of length 0 is none, and becomes a scale of 0.
+    own[:3, :3], own[:3, 3] = rotation_from_quat(turn) * scales * (math.hypot(x, y, z, w) > TOLERANCE), shift
+    return own
+
+
+def check_placement(placement: Tensor, where: str) -> None:
+    """Raises ValueError unless a transform [4, 4] is a turn, a shift and one positive scale."""
     rotation, scale = _rotation_and_scale(placement)
     shear = float((rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max())
-    is_turned = math.hypot(*node["rotation"]) > TOLERANCE and float(torch.linalg.det(rotation)) > 0
     if (
-        own[3].tolist() != [0, 0, 0, 1]
+        placement[3].tolist() != [0, 0, 0, 1]
         or not LEAST_NODE_SCALE <= scale <= MOST_SCALE
         or not shear < TOLERANCE
-        or not is_turned
+        or not float(torch.linalg.det(rotation)) > 0
     ):
         raise ValueError(
-            f"{where} skews, mirrors or stretches splats; expected a turn, a shift and one scale: apply the transform "
-            "first"
+            f"{where}, together with the nodes above it, skews, mirrors or stretches splats; expected a turn, a shift "
+            "and one scale: apply the transforms first"
         )
-    return placement
 
 
 def _rotation_and_scale(placement: Tensor) -> tuple[Tensor, float]:
@@ -333,20 +335,19 @@ def read_glb(path: Path | str) -> Gaussians:
     file = GltfReader(Path(path))
     splats_of = functools.cache(functools.partial(_splat_primitives, file))
     every = (
-        (primitive, f"primitive {index} of mesh {mesh} in {path}", placement)
-        for mesh, placement in _placed_meshes(file)
+        (primitive, f"primitive {index} of mesh {mesh} in {path}", node, placement)
+        for mesh, node, placement in _placed_meshes(file)
         for index, primitive in enumerate(splats_of(mesh))
     )
     shown = list(itertools.islice(every, MOST_PARTS + 1))
     if len(shown) > MOST_PARTS:
         raise ValueError(f"{path} shows more than {MOST_PARTS} sets of splats; expected fewer: join them")
-    count = sum(file.count(primitive.get("POSITION", 0)) for primitive, _, _ in shown)
+    count = sum(file.count(primitive.get("POSITION", 0)) for primitive, _, _, _ in shown)
     if count > max(PLAIN_COUNT, file.size / BYTES_PER_GAUSSIAN):
         raise ValueError(f"{path} shows {count} Gaussians out of {file.size} bytes; no scene does: it is damaged")
     found = []
-    for primitive, where, placement in shown:
-        if isinstance(placement, ValueError):
-            raise placement
+    for primitive, where, node, placement in shown:
+        check_placement(placement, f"node {node} of {path}")
         found.append(place_gaussians(_read_primitive(file, primitive, where), placement))
     if not found:
         raise ValueError(f"{path} shows no splats: expected a primitive of points with {EXTENSION} in its scene")
@@ -394,11 +395,8 @@ def _glb_bytes(gaussians: Gaussians) -> bytes:
     )
 
 
-def _placed_meshes(file: GltfReader) -> list[tuple[int, Tensor | ValueError]]:
-    """The meshes that the scene shows, with their placements; a file without scenes shows all its nodes.
-
-    Unsupported placements are returned as errors, because they matter only for meshes with splats.
-    """
+def _placed_meshes(file: GltfReader) -> list[tuple[int, int, Tensor]]:
+    """The meshes that the scene shows, each with its node and placement; a file without scenes shows all its nodes."""
     if len(file.list_of("nodes")) > MOST_NODES:
         raise ValueError(f"{file.path} has more than {MOST_NODES} nodes; expected fewer: export its splats alone")
     scenes = file.list_of("scenes")
@@ -410,8 +408,8 @@ def _placed_meshes(file: GltfReader) -> list[tuple[int, Tensor | ValueError]]:
         every = range(len(file.list_of("nodes")))
         below = {child for node in every for child in file.entry("nodes", node, NODE)["children"]}
         roots = [node for node in every if node not in below]
-    pending: list[tuple[int, Tensor | ValueError]] = [(node, torch.eye(4, dtype=torch.float64)) for node in roots]
-    found: list[tuple[int, Tensor | ValueError]] = []
+    pending: list[tuple[int, Tensor]] = [(node, torch.eye(4, dtype=torch.float64)) for node in roots]
+    found: list[tuple[int, int, Tensor]] = []
     seen: set[int] = set()
     while pending:
         number, placement = pending.pop()
@@ -419,13 +417,9 @@ def _placed_meshes(file: GltfReader) -> list[tuple[int, Tensor | ValueError]]:
             raise ValueError(f"node {number} of {file.path} hangs below two others; expected a tree: it is damaged")
         seen.add(number)
         node = file.entry("nodes", number, NODE)
-        if isinstance(placement, Tensor):
-            try:
-                placement = placement_of(node, placement, f"node {number} of {file.path}")
-            except ValueError as error:
-                placement = error
+        placement = placement @ matrix_of(node)
         if node["mesh"] is not None:
-            found.append((node["mesh"], placement))
+            found.append((node["mesh"], number, placement))
         pending += [(child, placement) for child in node["children"]]
     return found
 

@@ -209,8 +209,26 @@ def test_nodes_that_lead_to_no_splats_may_be_placed_in_any_way(tmp_path: Path) -
 
     path, before = written(tmp_path), read_glb(written(tmp_path))
     assert torch.equal(read_glb(edited(path, decorate)).means, before.means)
-    with pytest.raises(ValueError, match=r"node 1 of .* skews, mirrors or stretches splats"):
+    with pytest.raises(ValueError, match=r"node 2 of .* above it, skews, mirrors or stretches splats"):
         read_glb(edited(written(tmp_path), hang))
+
+
+@pytest.mark.parametrize(
+    ("outer", "inner", "is_supported"), [([2, 1, -1], [0.5, 1, -1], True), ([1.00006] * 2 + [1], None, False)]
+)
+def test_transforms_count_together(
+    outer: list[float], inner: list[float] | None, is_supported: bool, tmp_path: Path
+) -> None:
+    def nest(document: dict[str, Any]) -> None:
+        document["nodes"] = [{"mesh": 0, "scale": inner or outer}, {"children": [0], "scale": outer}]
+        document["scenes"] = [{"nodes": [1]}]
+
+    path, before = written(tmp_path), read_glb(written(tmp_path))
+    if is_supported:
+        torch.testing.assert_close(read_glb(edited(path, nest)).means, before.means)
+    else:
+        with pytest.raises(ValueError, match=r"node 0 of .*, together with the nodes above it"):
+            read_glb(edited(path, nest))
 
 
 def test_a_file_without_scenes_shows_its_nodes_where_their_parents_put_them(tmp_path: Path) -> None:
