@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import json
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +23,8 @@ from PIL import Image
 
 from glassplat.captures import colmap_library as library
 from glassplat.errors import InputError
-from glassplat.files.writing import atomic_write
+from glassplat.files.records import read_json
+from glassplat.files.writing import atomic_write, write_text
 from glassplat.options import short_repr
 from glassplat.prepare.photographs import Listener, Photograph, read_photograph
 from glassplat.training.messages import Working
@@ -80,6 +82,8 @@ LensName = Literal["simple_pinhole", "simple_radial", "radial", "opencv", "openc
 DEFAULT_FOCAL = 1.2
 """Default focal length, in longer image sides, of photographs without EXIF: roughly a phone's main lens."""
 SEED = 0
+NUMBERING = "photographs.json"
+"""File that lists the names of the photographs in the order of their indices."""
 DATABASE_ERROR_WORDS = ("SQLite", "database", "basic_string")
 """Parts of COLMAP's messages if its database fails; the last one if a text is missing in it."""
 
@@ -134,10 +138,22 @@ class FeatureDatabase:
                 _add_image(database, self.image_name(index), *rigs[_camera_key(photograph)])
 
     def write_images(self, listen: Listener) -> None:
-        """Writes missing greyscale images: upright, reduced."""
+        """Writes missing greyscale images: upright, reduced.
+
+        Raises:
+            InputError: the images there, and so the features, are not those of these photographs in this order.
+        """
         self.image_folder.mkdir(parents=True, exist_ok=True)
         targets = [self.image_folder / name for name in self.image_names]
         missing = [index for index, target in enumerate(targets) if not target.is_file()]
+        record, names = self.image_folder / NUMBERING, [photograph.name for photograph in self.photographs]
+        if len(missing) == len(targets):
+            write_text(record, json.dumps(names))
+        elif not record.is_file() or read_json(record) != names:
+            raise InputError(
+                f"{self.image_folder.parent} was started by another version of glassplat, which selected or numbered "
+                "the photographs differently; start again with --force"
+            )
         for done, index in enumerate(missing):
             listen(Working("reading the photographs", done, len(missing)))
             with atomic_write(targets[index]) as temporary:

@@ -136,7 +136,7 @@ class WorkFolder:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _check_unchanged(self, known: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
-        """Refuse to continue with other settings or photographs, because poses and features are stored by index."""
+        """Refuse to continue with other settings or photographs."""
         changed = sorted(key for key in {*known, *settings} if known.get(key) != settings.get(key))
         if set(changed) - {PHOTOGRAPHS_KEY}:
             raise InputError(
@@ -144,14 +144,9 @@ class WorkFolder:
                 f"{join_names([key for key in changed if key != PHOTOGRAPHS_KEY])}; give the same "
                 "to --resume, or start again with --force"
             )
-        before, now = known.get(PHOTOGRAPHS_KEY), settings[PHOTOGRAPHS_KEY]
         if not changed:
-            if list(before or ()) != list(now):
-                raise InputError(
-                    f"{self.folder} was started by another version of glassplat, which numbered the photographs "
-                    "differently; start again with --force"
-                )
             return
+        before, now = known.get(PHOTOGRAPHS_KEY), settings[PHOTOGRAPHS_KEY]
         if not isinstance(before, dict):
             raise InputError(
                 f"{self.folder} does not record the photographs it was started with; start again with --force"

@@ -23,6 +23,7 @@ from glassplat.errors import InputError
 from glassplat.prepare import preparation, report_page
 from glassplat.prepare.colmap import run_interruptible
 from glassplat.prepare.preparation import PAGE, RECORD, Preparation, prepare
+from glassplat.training.messages import Working
 from tests.prepare.conftest import Heard
 from tests.prepare.test_video import film
 
@@ -150,15 +151,29 @@ def test_resuming_work_without_recorded_photographs_is_refused(photographs: Path
         prepare(task, heard, resume=True)
 
 
+@pytest.mark.parametrize(
+    "change", [lambda names: names[::-1], lambda names: names[1:], None], ids=["order", "selection", "no record"]
+)
 def test_resuming_work_whose_photographs_are_numbered_differently_is_refused(
-    photographs: Path, tmp_path: Path, heard: Heard
+    change: Callable[[list[str]], list[str]] | None, photographs: Path, tmp_path: Path
 ) -> None:
-    task = begun(photographs, tmp_path / "capture")
-    settings = tmp_path / "capture.partial" / "settings.json"
-    known = json.loads(settings.read_text())
-    settings.write_text(json.dumps({**known, "photographs": dict(reversed(known["photographs"].items()))}))
-    with pytest.raises(InputError, match=r"another version of glassplat, which numbered .* --force"):
-        prepare(task, heard, resume=True)
+    """In another order, or selected by another rule for masks and duplicates; or it is not known."""
+
+    def listen(message: Any) -> None:
+        if message == Working("reading the photographs", 1, message.total):
+            raise KeyboardInterrupt
+
+    task = Preparation(photographs, tmp_path / "capture")
+    for resume in (False, True):
+        with pytest.raises(KeyboardInterrupt):
+            prepare(task, listen, resume=resume)
+    numbering = tmp_path / "capture.partial" / "grey" / "photographs.json"
+    if change is None:
+        numbering.unlink()
+    else:
+        numbering.write_text(json.dumps(change(json.loads(numbering.read_text()))))
+    with pytest.raises(InputError, match=r"another version of glassplat, which selected or numbered .* --force"):
+        prepare(task, listen, resume=True)
 
 
 def test_what_was_interrupted_is_neither_begun_again_nor_gone_on_with_by_other_options(
