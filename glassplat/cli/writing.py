@@ -184,24 +184,34 @@ LARGEST_FACTOR = 1e6
 
 def write_clean(command: Clean, console: Console) -> None:
     """Writes the clean scene, and reports what was removed."""
-    model = command.file.open(command.scene, command.device)
+    factor, model = _scale_factor(command), command.file.open(command.scene, command.device)
+    if command.output.suffix:
+        models.check_replaces_nothing(model if factor is None else model.scale(factor), command.output)
     cleaned, found = model.clean(command.rules)
     summary = ", ".join(f"{count} {rule}" for rule, count in found.items() if count) or "no floaters"
     print_line(console, f"{len(cleaned.scene.primary)} of {len(model.scene.primary)} Gaussians kept; found {summary}")
     if (count := found["outside"]) > len(model.scene.primary) / 2:
         print_warning(console, f"--box removes {count} Gaussians, more than half; is it in the scene's own units?")
-    if command.scale is not None:
-        *points, metres = command.scale
-        factor = metres / math.dist(points[:3], points[3:])
-        if not 1 / LARGEST_FACTOR <= factor <= LARGEST_FACTOR:
-            raise InputError(
-                f"--scale makes the scene {factor:.3g} times as large; expected {1 / LARGEST_FACTOR:g} to "
-                f"{LARGEST_FACTOR:g}: give two places in the scene's own units, and their distance in metres"
-            )
+    if factor is not None:
         cleaned = cleaned.scale(factor)
         print_line(console, f"one unit is now a metre; it was {factor:.4g} m")
     cleaned.save(command.output)
-    print_line(console, f"next: glassplat view {shell_word(command.output)}")
+    is_page, name = command.output.suffix.lower() == ".html", shell_word(command.output)
+    print_line(console, f"next: {f'open {name} in a browser' if is_page else f'glassplat view {name}'}")
+
+
+def _scale_factor(command: Clean) -> float | None:
+    """Metres per unit of the scene; None if it keeps its units."""
+    if command.scale is None:
+        return None
+    *points, metres = command.scale
+    factor = metres / math.dist(points[:3], points[3:])
+    if not 1 / LARGEST_FACTOR <= factor <= LARGEST_FACTOR:
+        raise InputError(
+            f"--scale makes the scene {factor:.3g} times as large; expected {1 / LARGEST_FACTOR:g} to "
+            f"{LARGEST_FACTOR:g}: give two places in the scene's own units, and their distance in metres"
+        )
+    return factor
 
 
 def write_files(command: Export, console: Console) -> None:

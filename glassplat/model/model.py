@@ -357,15 +357,8 @@ class Model:
         writing.check_scene_name(path)
         if not kind:
             return save_folder(self, path, overwrite=overwrite)
-        names = (PLANES, GLASS, CAMERAS, *(() if self.scene.environment.is_empty else (ENVIRONMENT, PANORAMA)))
-        sidecars = [path.with_name(name) for name in names] if kind in writing.SPLAT_WRITERS else []
-        targets = [] if overwrite else [path, *_differing_files(self, sidecars)]
-        found = [str(target) for target in targets if target.exists()]
-        if found:
-            raise FileExistsError(
-                f"{join_names(found)} already exists; nothing was written. Choose another folder; in Python, "
-                "overwrite=True replaces files"
-            )
+        if not overwrite:
+            check_replaces_nothing(self, path)
         writing.make_folder(path.parent)
         if kind not in writing.SPLAT_WRITERS:
             save_page(self, path, self.name or path.stem)
@@ -411,6 +404,19 @@ EXPORT_STEM = "scene"
 """File name, without suffix, of exported splats."""
 SETTINGS_FILE = "settings.json"
 PANORAMA, ENVIRONMENT = "environment.png", "environment.json"
+
+
+def check_replaces_nothing(model: Model, path: Path) -> None:
+    """Raises FileExistsError if a file would be replaced by another one when a model is saved as a file at `path`."""
+    names = (PLANES, GLASS, CAMERAS, *(() if model.scene.environment.is_empty else (ENVIRONMENT, PANORAMA)))
+    is_splat = path.suffix.lower().removeprefix(".") in writing.SPLAT_WRITERS
+    sidecars = [path.with_name(name) for name in names] if is_splat else []
+    found = [str(target) for target in [path, *_differing_files(model, sidecars)] if target.exists()]
+    if found:
+        raise FileExistsError(
+            f"{join_names(found)} already exists; nothing was written. Choose another folder; in Python, "
+            "overwrite=True replaces files"
+        )
 
 
 def _differing_files(model: Model, sidecars: Sequence[Path]) -> list[Path]:

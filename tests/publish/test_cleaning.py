@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -139,3 +140,27 @@ def test_the_command_writes_another_scene_in_metres(tmp_path: Path, capsys: pyte
         assert main(["clean", str(run), "--output", str(tmp_path / "no"), "--scale", *"000001", metres]) == 2
         assert "expected 1e-06 to 1e+06" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "no").exists()
+
+
+@pytest.mark.parametrize(("name", "advice"), [("x.html", "next: open .*x.html in"), ("x.ply", "next: glassplat view")])
+def test_a_page_is_opened_in_a_browser_and_any_other_scene_in_the_viewer(
+    name: str, advice: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["clean", str(write_run(tmp_path / "run")), "--output", str(tmp_path / "new" / name)]) == 0
+    assert re.search(advice, " ".join(capsys.readouterr().out.split()))
+
+
+@pytest.mark.parametrize("scale", [[], ["--scale", *"0000012"]])
+def test_files_of_another_scene_next_to_the_output_are_noticed_before_the_work(
+    scale: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, output = write_run(tmp_path / "run"), tmp_path / "new" / "x.ply"
+    assert main(["clean", str(run), "--output", str(output), *scale]) == 0
+    output.unlink()
+    assert main(["clean", str(run), "--output", str(output), *scale]) == 0
+    output.unlink()
+    (output.parent / "planes.json").write_text("[]")
+    monkeypatch.setattr(Model, "clean", None)
+    assert main(["clean", str(run), "--output", str(output), *scale]) == 2
+    assert "planes.json already exists; nothing was written" in " ".join(capsys.readouterr().err.split())
+    assert not output.exists()
