@@ -271,9 +271,13 @@ LAMP_SEARCH_AT, FILL_UNSEEN_AT = (0.4, 0.6), (0.5,)
 
 @dataclass(frozen=True)
 class LightLamps(AtShares):
-    """Removes images of lamps from behind glass, and makes the lamps as bright as their reflections."""
+    """Removes images of lamps from behind glass, and makes the lamps as bright as their reflections.
 
-    shares: tuple[float, ...] = LAMP_SEARCH_AT
+    Attributes:
+        renderer: renders the finished scene.
+    """
+
+    renderer: Planar
     name: str = "light lamps"
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
@@ -284,7 +288,7 @@ class LightLamps(AtShares):
         if not rows:
             return False
         photographs = material.reduced_photographs(scene, dataset.train)
-        lamps = material.mirrored_lamps(scene, scene.planes.select(rows), photographs)
+        lamps = material.mirrored_lamps(scene, scene.planes.select(rows), photographs, renderer=self.renderer)
         if lamps is None:
             return False
         log_gains = scene.primary.channels["log_intensity"] + lamps.gains.log()
@@ -474,6 +478,7 @@ def _adjustment_stage(recipe: PlanarRecipe, start: float, share: float, seed: in
 def _joint_stage(recipe: PlanarRecipe, share: float) -> Stage:
     """Stage 3: joint optimisation, with perturbed opacities and slowly moving planes."""
     strategy, start = strategy_of(recipe), 1 - share
+    turn = TurnReflections((start + TURN_AFTER,)), LightLamps(LAMP_SEARCH_AT, planar_renderer(recipe))
     perturb_at = Every(
         recipe.intervals.opacity,
         start + TURN_AFTER,
@@ -490,7 +495,7 @@ def _joint_stage(recipe: PlanarRecipe, share: float) -> Stage:
         | plane_rates(JOINT_RATE_FACTOR)
         | ({"primary.log_intensity": Rate(recipe.rates.intensity)} if recipe.intensity else {}),
         actions=(
-            *((TurnReflections((start + TURN_AFTER,)), LightLamps()) if recipe.turn_reflections else ()),
+            *(turn if recipe.turn_reflections else ()),
             *_seed_actions(recipe, start + SEED_AFTER_JOINT),
             *strategy.edits,
             actions.GrowSh(Every(recipe.intervals.sh)),

@@ -17,6 +17,7 @@ from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.kernels.records import DAZZLING
 from glassplat.options import BLACK, WHITE
 from glassplat.render.layers import gather_mirrored_pixels, gather_pixels, window_means, window_sums
+from glassplat.render.panes import blend_conversions
 from glassplat.render.planar import DirectPass, Planar
 from glassplat.render.splat import Splat
 from glassplat.scene import SH_ZERO, logit
@@ -481,7 +482,7 @@ class Lamps(NamedTuple):
 
 
 @torch.no_grad()
-def mirrored_lamps(scene: Scene, panes: Planes, photographs: Sequence[Photograph]) -> Lamps | None:
+def mirrored_lamps(scene: Scene, panes: Planes, photographs: Sequence[Photograph], *, renderer: Planar) -> Lamps | None:
     """Lamps mirrored by panes of glass, with the radiance of their reflections; None if there are none.
 
     A photograph does not show how much brighter than white a lamp is, but its reflection, a few percent as bright,
@@ -490,10 +491,10 @@ def mirrored_lamps(scene: Scene, panes: Planes, photographs: Sequence[Photograph
     reflection of white wherever a pane mirrors them. Gaussians behind the pane that are seen only where it mirrors a
     lamp are its mirror image.
 
-    The photographs are downscaled training views.
+    The photographs are downscaled training views, and the renderer is that of the finished scene.
     """
-    alone = replace(scene, planes=panes)
-    lamps = _detect_lamps(alone, photographs)
+    alone, renderer = replace(scene, planes=panes), replace(renderer, nearest_only=True)
+    lamps = _detect_lamps(alone, photographs, renderer)
     if not bool(lamps.any()):
         return None
     lit = [_lit_pixels(alone, lamps, photograph.camera) for photograph in photographs]
@@ -503,18 +504,19 @@ def mirrored_lamps(scene: Scene, panes: Planes, photographs: Sequence[Photograph
     dark = torch.full_like(scene.primary.logit_opacities, logit(1e-3))
     opacities = torch.where(images, torch.minimum(dark, scene.primary.logit_opacities), scene.primary.logit_opacities)
     without = replace(alone, primary=scene.primary.with_tensors({"logit_opacities": opacities}))
-    return Lamps(images, torch.where(lamps, _lamp_gains(without, lit, photographs), 1))
+    return Lamps(images, torch.where(lamps, _lamp_gains(without, lit, photographs, renderer), 1))
 
 
-def _detect_lamps(scene: Scene, photographs: Sequence[Photograph]) -> Tensor:
+def _detect_lamps(scene: Scene, photographs: Sequence[Photograph], renderer: Planar) -> Tensor:
     """[N] bool: Gaussians that are clipped where seen directly, and brighter than white where mirrored."""
+    decode, _ = blend_conversions(renderer.blend)
     clipped, direct, bright, mirrored = scene.primary.means.new_zeros(4, len(scene.primary))
     for photograph in photographs:
-        strength = Planar(nearest_only=True)(scene, photograph.camera).layers["strength"]
+        strength = renderer(scene, photograph.camera).layers["strength"]
         past, through = photograph.valid & (strength <= 0), photograph.valid & (strength > 0)
         darkest = photograph.pixels.amin(dim=-1)
         shown = gather_pixels(scene, photograph.camera, torch.stack([past & (darkest > CLIPPED), past], dim=-1).float())
-        enough = linear_from_srgb(darkest.clamp(0, 1)) > DAZZLING * strength
+        enough = decode(darkest.clamp(0, 1)) > DAZZLING * strength
         lit = torch.stack([through & enough, through], dim=-1).float()
         there = gather_mirrored_pixels(scene, photograph.camera, lit)
         clipped, direct = clipped + shown[:, 0], direct + shown[:, 1]
@@ -554,15 +556,16 @@ def _lamp_images(scene: Scene, seen: Sequence[LitPixels], photographs: Sequence[
     return bright & (through > FEWEST_SEEN) & (near > LAMP_SHARE * through)
 
 
-def _lamp_gains(scene: Scene, seen: Sequence[LitPixels], photographs: Sequence[Photograph]) -> Tensor:
+def _lamp_gains(scene: Scene, seen: Sequence[LitPixels], photographs: Sequence[Photograph], renderer: Planar) -> Tensor:
     """[N] ratios of the radiance that photographs leave to reflections of lamps to the rendered one; 1 if unseen."""
+    decode, _ = blend_conversions(renderer.blend)
     observed, rendered = scene.primary.means.new_zeros(2, len(scene.primary))
     for photograph, (_, lit) in zip(photographs, seen, strict=True):
-        layers = Planar(nearest_only=True)(scene, photograph.camera).layers
+        layers = renderer(scene, photograph.camera).layers
         strength = layers["strength"].clamp(min=1e-2)[..., None]
-        behind = linear_from_srgb(layers["transmission"].clamp(0, 1))
-        radiance = (linear_from_srgb(photograph.pixels.clamp(0, 1)) - (1 - strength) * behind) / strength
-        values = torch.stack([radiance.clamp(min=0), linear_from_srgb(layers["reflection"].clamp(min=0))]).mean(dim=-1)
+        behind = decode(layers["transmission"].clamp(0, 1))
+        radiance = (decode(photograph.pixels.clamp(0, 1)) - (1 - strength) * behind) / strength
+        values = torch.stack([radiance.clamp(min=0), decode(layers["reflection"].clamp(min=0))]).mean(dim=-1)
         sums = gather_mirrored_pixels(scene, photograph.camera, (values * (lit & photograph.valid)).movedim(0, -1))
         observed, rendered = observed + sums[:, 0], rendered + sums[:, 1]
     gains = (observed / rendered.clamp(min=1e-6)).clamp(1, MOST_GAIN)

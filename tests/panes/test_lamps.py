@@ -31,6 +31,7 @@ LAMP = (0.9, 0.0, 1.0)
 IMAGE = (0.9, 0.0, 3.0)
 RADIANCE = 6.0
 RED = (255, 60, 60)
+DEFAULT = Planar()
 
 
 def camera(x: float) -> Camera:
@@ -69,11 +70,11 @@ def shining(lamp: Gaussians) -> Gaussians:
     return lamp.with_tensors({"log_intensity": torch.full((len(lamp),), math.log(RADIANCE))})
 
 
-def photographs_of(scene: Scene) -> list[Photograph]:
+def photographs_of(scene: Scene, renderer: Planar = DEFAULT) -> list[Photograph]:
     return [
         Photograph(view, rgb, torch.ones_like(rgb[..., 0], dtype=torch.bool), None)
         for view in CAMERAS
-        for rgb in [Planar()(scene, view).rgb.clamp(0, 1)]
+        for rgb in [renderer(scene, view).rgb.clamp(0, 1)]
     ]
 
 
@@ -85,13 +86,22 @@ def test_the_image_of_a_lamp_is_found_and_the_lamp_gets_its_radiance(ignored: in
         photographs[number] = photographs[number]._replace(pixels=black, valid=torch.zeros_like(black[..., 0]).bool())
     first = scene_of(wall(4.0), panel(LAMP), panel(IMAGE))
     with CountedElements():
-        lamps = mirrored_lamps(first, first.planes, photographs)
+        lamps = mirrored_lamps(first, first.planes, photographs, renderer=DEFAULT)
     assert lamps is not None
     before, lamp = len(wall(4.0)), len(panel(LAMP))
     assert bool(lamps.images[before + lamp :].float().mean() > 0.7) and not bool(lamps.images[: before + lamp].any())
     gains = lamps.gains[before : before + lamp]
     assert bool((gains > 1).float().mean() > 0.5) and not bool((lamps.gains[:before] != 1).any())
     assert 0.7 * RADIANCE < float(gains[gains > 1].median()) < 1.3 * RADIANCE
+
+
+@pytest.mark.parametrize("renderer", [Planar((0.5, 0.5, 0.5)), Planar(blend="srgb")], ids=["background", "blend"])
+def test_lamps_get_their_radiance_as_the_run_renders_them(renderer: Planar) -> None:
+    first, lit = scene_of(panel(LAMP), panel(IMAGE)), scene_of(shining(panel(LAMP)))
+    lamps = mirrored_lamps(first, first.planes, photographs_of(lit, renderer), renderer=renderer)
+    assert lamps is not None
+    gains = lamps.gains[: len(panel(LAMP))]
+    assert 0.85 * RADIANCE < float(gains[gains > 1].median()) < 1.15 * RADIANCE
 
 
 @pytest.mark.parametrize(
@@ -107,7 +117,10 @@ def test_the_image_of_a_lamp_is_found_and_the_lamp_gets_its_radiance(ignored: in
 )
 def test_no_lamp_is_found_without_need(photographed: list[Gaussians], first: list[Gaussians]) -> None:
     scene = scene_of(wall(4.0), *first)
-    assert mirrored_lamps(scene, scene.planes, photographs_of(scene_of(wall(4.0), *photographed))) is None
+    assert (
+        mirrored_lamps(scene, scene.planes, photographs_of(scene_of(wall(4.0), *photographed)), renderer=DEFAULT)
+        is None
+    )
 
 
 @pytest.mark.parametrize(
@@ -119,7 +132,7 @@ def test_a_lamp_is_one_in_most_photographs(early: list[Gaussians], count: int) -
     first = scene_of(wall(4.0), panel(LAMP), panel(IMAGE))
     late = photographs_of(scene_of(wall(4.0), shining(panel(LAMP))))
     photographs = photographs_of(scene_of(wall(4.0), *early))[:count] + late[count:]
-    assert mirrored_lamps(first, first.planes, photographs) is None
+    assert mirrored_lamps(first, first.planes, photographs, renderer=DEFAULT) is None
 
 
 @pytest.mark.parametrize("ignored", [(True, True), (True, False), (False, True)], ids=["all", "past", "in the glass"])
@@ -130,7 +143,7 @@ def test_ignored_pixels_make_no_lamp(ignored: tuple[bool, bool]) -> None:
         one._replace(valid=~torch.where(glass, ignored[1], ignored[0]))
         for one, glass in zip(photographs_of(lit), in_glass, strict=True)
     ]
-    assert mirrored_lamps(first, first.planes, hidden) is None
+    assert mirrored_lamps(first, first.planes, hidden, renderer=DEFAULT) is None
 
 
 def test_what_stands_before_the_glass_is_not_the_image_of_a_lamp() -> None:
@@ -138,7 +151,7 @@ def test_what_stands_before_the_glass_is_not_the_image_of_a_lamp() -> None:
     haze = panel((0.57, 0.0, 1.9))
     haze = haze.with_tensors({"logit_opacities": torch.full((len(haze),), -4.0)})
     first = scene_of(wall(4.0), panel(LAMP), panel(IMAGE), haze)
-    lamps = mirrored_lamps(first, first.planes, photographs)
+    lamps = mirrored_lamps(first, first.planes, photographs, renderer=DEFAULT)
     assert lamps is not None and not bool(lamps.images[-len(haze) :].any())
 
 
@@ -184,7 +197,7 @@ def capture_of(scene: Scene) -> Dataset:
 
 def test_lamps_are_brightened_at_their_moments_and_their_images_removed() -> None:
     capture = capture_of(scene_of(wall(4.0), shining(panel(LAMP))))
-    state, action = state_of(scene_of(wall(4.0), panel(LAMP), panel(IMAGE))), LightLamps((0.4, 0.6))
+    state, action = state_of(scene_of(wall(4.0), panel(LAMP), panel(IMAGE))), LightLamps((0.4, 0.6), DEFAULT)
     assert [step for step in range(101) if action.due(Clock(step, 100, 5))] == [40, 60]
     before = len(state.scene.primary)
     assert finished(action.apply(state, capture, Clock(40, 100, 5)))
@@ -201,7 +214,7 @@ def test_brightening_lamps_does_not_prevent_densification() -> None:
     capture = capture_of(scene_of(wall(4.0), shining(panel(LAMP))))
     state = state_of(scene_of(wall(4.0), panel(LAMP), panel(IMAGE)))
     state.statistics["primary"] = ScreenStatistics(*torch.ones(3, 2, len(state.scene.primary)))
-    assert finished(LightLamps((0.5,)).apply(state, capture, Clock(50, 100, 5)))
+    assert finished(LightLamps((0.5,), DEFAULT).apply(state, capture, Clock(50, 100, 5)))
     left = len(state.scene.primary)
     eager = DefaultDensify(gradient_threshold=0.1, absgrad_threshold=0.1, per_pixel=0)
     assert Densify(eager).apply(state, capture, Clock(50, 100, 5))
