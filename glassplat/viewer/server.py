@@ -9,6 +9,7 @@ import io
 import logging
 import re
 import socket
+import threading
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
@@ -252,6 +253,8 @@ class Viewer:
         self.loop: RenderLoop[drawing.ViewRequest] = RenderLoop(self._draw, self._show, self._fail)
         self._thread: RenderThread | None = None
         self._clients: dict[int, Client] = {}
+        # Held while a client is laid out, so that each one has the controls of the current scene.
+        self._layout_lock = threading.Lock()
         logging.getLogger("websockets").setLevel(logging.CRITICAL)
         # A browser may disconnect at any time; users need no warning.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
@@ -303,11 +306,12 @@ class Viewer:
 
     def replace_scene(self, scene: Scene, renderer: Renderer) -> None:
         """Replaces the displayed scene; to be called by the rendering thread. `refresh` renders it."""
-        previous = self.state
-        self.state = replace(previous, scene=scene, renderer=renderer)
-        if (scene.planes.labels, self.state.layers) != (previous.scene.planes.labels, previous.layers):
-            for client in list(self._clients.values()):
-                controls.log_errors(client.lay_out_panes)()
+        with self._layout_lock:
+            previous = self.state
+            self.state = replace(previous, scene=scene, renderer=renderer)
+            if (scene.planes.labels, self.state.layers) != (previous.scene.planes.labels, previous.layers):
+                for client in list(self._clients.values()):
+                    controls.log_errors(client.lay_out_panes)()
 
     def refresh(self, status: str = "") -> None:
         """Requests the views of all clients again, and shows them a status line."""
@@ -316,7 +320,8 @@ class Viewer:
             controls.log_errors(client.request_render)()
 
     def _on_connect(self, handle: Any) -> None:
-        client = self._clients[handle.client_id] = Client(handle, self)
+        with self._layout_lock:
+            client = self._clients[handle.client_id] = Client(handle, self)
         client.request_render()
         if handle.client_id not in self._server.get_clients():  # It disconnected before it was registered here.
             self._on_disconnect(handle)

@@ -28,7 +28,7 @@ from glassplat.model.watching import WatchedTraining, current_renderer
 from glassplat.render.splat import Splat
 from glassplat.scene.panes import Planes
 from glassplat.training.messages import Message
-from glassplat.viewer import gate
+from glassplat.viewer import gate, server
 from glassplat.viewer.render_loop import vacant_port
 from glassplat.viewer.server import Viewer
 from tests.browser_needed import needs_browser
@@ -219,6 +219,37 @@ def test_only_the_controls_of_panes_are_replaced_when_panes_change() -> None:
             while not browser.removed:
                 await asyncio.sleep(0.02)
             assert not {browser.labels()[label] for label in ("Layer", "Go to")} & {*browser.removed}
+
+    try:
+        asyncio.run(look())
+    finally:
+        viewer.stop()
+
+
+def test_a_client_that_connects_while_panes_change_has_the_controls_of_the_new_scene(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class InterruptedClient(server.Client):
+        """Laid out while another thread replaces the scene."""
+
+        def __init__(self, handle: Any, viewer: Viewer) -> None:
+            super().__init__(handle, viewer)
+            bare = replace(STATE.scene, planes=Planes.empty())
+            self.replacing = threading.Thread(target=viewer.replace_scene, args=(bare, Splat()))
+            self.replacing.start()
+            self.replacing.join(0.1)
+
+    monkeypatch.setattr(server, "Client", InterruptedClient)
+    viewer = Viewer(STATE, "127.0.0.1", free_port())
+
+    async def look() -> None:
+        async with ViewerClient(viewer.address) as browser:
+            await browser.look()
+            while not viewer._clients:
+                await asyncio.sleep(0.02)
+            (client,) = viewer._clients.values()
+            client.replacing.join()
+            assert client._panes is None
 
     try:
         asyncio.run(look())
