@@ -191,16 +191,20 @@ def _gather(projected: Projected | ProjectedDiscs, values: Tensor, blend: Callab
 
 
 def window_means(image: Tensor, region: Tensor, radius: int) -> Tensor:
-    """[H, W, D] float64 means over the part of each window (see `window_sums`) inside a region [H, W]."""
+    """[H, W, D] float64 means over the part of each window (see `window_sums`) inside a region [H, W].
+
+    Values outside the region may be NaN.
+    """
     inside = region.to(image.dtype)[..., None]
-    sums = window_sums(torch.cat([image * inside, inside], dim=-1), radius)
+    sums = window_sums(torch.cat([torch.where(inside > 0, image, 0), inside], dim=-1), radius)
     return sums[..., :-1] / sums[..., -1:].clamp(min=1)
 
 
 def window_sums(image: Tensor, radius: int) -> Tensor:
     """[H, W, D] float64 sums over the square of pixels up to `radius` away, cut off at the image's border.
 
-    Differences of running sums along each axis, so that the cost does not depend on the window.
+    Differences of running sums along each axis, so that the cost does not depend on the window. A NaN therefore reaches
+    all sums below and to the right of it.
     """
     sums = image.double()
     for axis in (0, 1):

@@ -58,3 +58,5 @@ def test_sums_and_means_over_windows_are_those_of_every_pixel_by_itself(reach: i
             torch.testing.assert_close(window_sums(image, reach)[row, column], image[window].sum(dim=(0, 1)))
             expected = inside.sum(dim=0) / max(len(inside), 1)
             torch.testing.assert_close(window_means(image, region, reach)[row, column], expected)
+    broken = torch.where(region[..., None], image, torch.nan)
+    assert torch.equal(window_means(broken, region, reach), window_means(image, region, reach))
