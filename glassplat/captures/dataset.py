@@ -224,7 +224,7 @@ def make_dataset(
         *_mask_warnings(files),
         *(["Transparent pixels of the photographs are ignored."] if ignores_transparent else ()),
         *point_warnings,
-        *_far_origin_warnings(train, extent),
+        *far_origin_warnings(torch.stack([view.camera.center for view in train]), extent),
     )
     truth = root / "gt"
     return Dataset(
@@ -294,9 +294,9 @@ def _extent(train: tuple[View, ...]) -> float:
     return EXTENT_MARGIN * radius
 
 
-def _far_origin_warnings(train: tuple[View, ...], extent: float) -> tuple[str, ...]:
-    """Warning if coordinates are too large for float32 to resolve the scene."""
-    centers = torch.stack([view.camera.center.double() for view in train])
+def far_origin_warnings(centers: torch.Tensor, extent: float) -> tuple[str, ...]:
+    """Warning if the coordinates of cameras [V, 3] are too large for float32 to resolve a scene of this extent."""
+    centers = centers.double()
     ratio = float(centers.mean(0).norm()) / extent
     if ratio <= FARTHEST_ORIGIN:
         return ()

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from glassplat.captures.dataset import EXTENT_MARGIN, Dataset, check_dataset, with_corrected_cameras
+from glassplat.captures import dataset as captures
 from glassplat.errors import InputError, convert_to_input_error, count_noun, join_names
 from glassplat.files import writing
 from glassplat.files.ply import read_gaussians, write_gaussians
@@ -177,7 +177,7 @@ class Model:
         """Cameras on an orbit, or on a loop in front of a scene photographed from one side."""
         return orbit(list(self.viewpoints.values()), self.scene.extent, frames)
 
-    def evaluate(self, dataset: Dataset) -> dict[str, Any]:
+    def evaluate(self, dataset: captures.Dataset) -> dict[str, Any]:
         """Metrics over the test views of a data set, by name: `psnr`, `ssim`, `pane_psnr` ...
 
         If a metric is None, `<name>_reason` has the reason. Unlike `glassplat eval`, it takes panes from the ground
@@ -187,14 +187,14 @@ class Model:
         Raises:
             InputError: `dataset` is something else, or its photographs lie over another background than the model's.
         """
-        check_dataset(dataset)
+        captures.check_dataset(dataset)
         from glassplat.evaluate.evaluate import evaluate  # Imported here, because training rarely needs it.
 
         resolve_background(with_background(self.recipe, BLACK), dataset)
         scene, renderer = self.scene, with_photographer(self.renderer, "separate")
         if dataset.test:
             scene = scene.to(dataset.test[0].camera.cam_from_world.dtype)
-        return evaluate(scene, renderer, with_corrected_cameras(dataset, scene)).results
+        return evaluate(scene, renderer, captures.with_corrected_cameras(dataset, scene)).results
 
     def to(self, device: torch.device | torch.dtype | str) -> Model:
         """The same on another device, or in another precision, as float64 for `torch.autograd.gradcheck`.
@@ -628,8 +628,10 @@ def _from_file(path: Path, device: DeviceName, planes_file: Path | None, up: Up)
         centers = torch.stack([camera.center for _, camera in cameras])
         radius = float((centers - centers.mean(0)).norm(dim=1).max())
         # As for training; with a single camera, from the Gaussians.
-        extent = EXTENT_MARGIN * (radius or web_page.bounding_ball(gaussians)[1])
+        extent = captures.EXTENT_MARGIN * (radius or web_page.bounding_ball(gaussians)[1])
         scene = Scene(with_intensity(gaussians), extent, glass=glass, planes=planes)
+    for warning in captures.far_origin_warnings(centers, extent):
+        log.warning("%s: %s", path, warning)
     if lost:
         log.warning("%d Gaussians of %s are left out: they contain NaN or values too large to draw", lost, path)
     recipe = recipe_of_splats(scene.primary)

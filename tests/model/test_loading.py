@@ -59,6 +59,17 @@ def test_panes_that_may_be_of_another_file_are_mentioned(
     assert f", of {tmp_path / 'out' / 'planes.json'}" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("offset", [0.0, 5e5])
+def test_a_file_in_georeferenced_coordinates_is_warned_of(
+    offset: float, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    gaussians = typical()
+    write_gaussians(tmp_path / "a.ply", gaussians.with_tensors({"means": gaussians.means + offset}))
+    with caplog.at_level(logging.WARNING, "glassplat"):
+        load(tmp_path / "a.ply", device="cpu")
+    assert ("a.ply: The cameras are" in caplog.text and "single precision blurs" in caplog.text) == bool(offset)
+
+
 def test_a_file_of_discs_is_drawn_as_discs(tmp_path: Path) -> None:
     solid = true_scene().primary
     discs = replace(solid, log_scales=solid.log_scales[:, :2].contiguous())
