@@ -183,7 +183,7 @@ def test_docstrings_name_only_attributes_that_exist() -> None:
     assert not stale, stale
 
 
-DESCRIBED = ("methods", "panes", "render", "scene", "training")
+DESCRIBED = ("captures", "evaluate", "files", "methods", "panes", "render", "scene", "training")
 """Folders in which every constant number says what it is."""
 
 

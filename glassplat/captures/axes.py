@@ -13,11 +13,11 @@ from glassplat.captures.view import View, sample_evenly
 from glassplat.scene.camera import Camera, nearest_to_lines
 from glassplat.scene.panes import in_image
 
-LEAST_SEEN = 0.05
-"""Largest share that counts as nothing seen; some stray points lie in front of a camera with either axes."""
-MOST_SEEN = 0.5
-MOST_CAMERAS, MOST_POINTS, MOST_MASKS = 64, 2000, 24
-LEAST_SIGHTINGS = 3
+LEAST_SEEN, MOST_SEEN = 0.05, 0.5
+"""Largest share that counts as nothing seen, because some stray points lie in front of a camera with either axes, and
+share above which the scene is seen."""
+MOST_CAMERAS, MOST_POINTS, MOST_MASKS, LEAST_SIGHTINGS = 64, 2000, 24, 3
+"""Maximum numbers of cameras, points and masks examined, and minimum number of masks of a pane that locate it."""
 BOX_MARGIN = 0.5
 """Tolerance around a mask's box for the pane's centre, in sizes of the box; photographs may crop panes."""
 

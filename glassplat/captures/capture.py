@@ -14,6 +14,7 @@ from glassplat.captures.cameras import Lens
 from glassplat.errors import InputError
 
 HIGHEST_COLOR = 255
+"""Largest value of a colour channel of a point."""
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,8 @@ from glassplat.options import short_repr
 UNIT_TOLERANCE = 1e-2
 """Largest deviation of a quaternion's length from one, as rounding in a text file."""
 
-_OBSERVATION_BYTES = 24  # x, y as doubles and the id of a point
-_TRACK_BYTES = 8  # id of an image, index of an observation
+_OBSERVATION_BYTES, _TRACK_BYTES = 24, 8
+"""Bytes of an observation (x, y as doubles, id of a point) and of its entry in a track (id of an image, index)."""
 
 
 @dataclass(frozen=True)

@@ -75,8 +75,8 @@ def rectangle_points(plane: Planes) -> torch.Tensor:
 
 __all__ = ["Dataset", "PointCloud", "View", "load_dataset"]
 
-TEST_EVERY = 8
-EXTENT_MARGIN = 1.1
+TEST_EVERY, EXTENT_MARGIN = 8, 1.1
+"""Interval between test views, and the extent in largest distances of a camera from their mean, both as in 3DGS."""
 FARTHEST_ORIGIN = 1e3
 """Distance of the cameras from the origin, in extents, at which float32 moves them by up to 1e-4 extents."""
 SAME_POSITION = 1e-6

@@ -25,15 +25,15 @@ from glassplat.files import images
 
 HIGHEST_MASK_LABEL = 64
 """Grey values up to this one are labels if none is brighter; masks painted for viewing are never that dark."""
-THRESHOLD = 128
-WHITE = 255
+THRESHOLD, WHITE = 128, 255
+"""Grey value from which a pixel of a black-and-white mask counts as white, and the value of white."""
 SOFT_SHARE = 0.05
 """Largest share of grey pixels at the edges of a black-and-white mask."""
 FEW_SHADES = 4
 """Minimum number of greys of an antialiased edge; fewer are intended labels."""
 LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
-LOSSY_NOISE = 24
-SIXTEEN_TO_EIGHT = 257
+LOSSY_NOISE, SIXTEEN_TO_EIGHT = 24, 257
+"""Largest deviation from black and white due to lossy compression, and the ratio of 16-bit to 8-bit grey values."""
 
 
 @dataclass(frozen=True)
@@ -145,8 +145,8 @@ def _check_black_and_white(counts: NDArray[np.int64], path: Path, lossy: bool) -
 PANE_FOLDER, MASK_FOLDER, IGNORE_FOLDER = "panes", "masks", "ignore"
 PLANES = "planes.json"
 MASK_SUFFIX = "_mask"
-FRAMED_BY_PANE = 0.8
-MOSTLY_PANE = 0.5
+FRAMED_BY_PANE, MOSTLY_PANE = 0.8, 0.5
+"""White share of the image border above which masks are inverted, and above which a warning is given."""
 
 Polarity = Literal["auto", "bright", "dark"]
 """Value of binary masks that marks the pane; `auto` decides by the values along the image borders."""

@@ -24,13 +24,12 @@ from glassplat.files.ply_table import point_colors, read_table
 if TYPE_CHECKING:
     from glassplat.scene.camera import Camera
 
-GREY = 128
-SPHERE_COUNT = 20_000
-BOX_COUNT = 100_000
-BOX_HALF_SIZE = 1.3
+GREY, SEED = 128, 0
+"""Colour and seed of random points."""
+SPHERE_COUNT, BOX_COUNT, BOX_HALF_SIZE = 20_000, 100_000, 1.3
+"""Numbers of random points in a sphere, and in the cube of synthetic scenes; half the side of this cube."""
 MOST_HALF_SIZES = 10.0
 """Distance of cameras from which the cube is a small part of the picture; synthetic scenes have three half sizes."""
-SEED = 0
 LEAST_CROSSING = 1e-2
 """Smallest eigenvalue of the mean of I - d d^T for which optical axes count as crossing (about 6 degrees apart)."""
 MOST_CAMERAS = 0.8

@@ -41,6 +41,7 @@ from glassplat.options import WHITE, Rgb
 from glassplat.scene.camera import Camera, to_device
 
 GIGABYTE = 1e9
+"""Bytes."""
 MEMORY_SHARE = 0.25
 """Default share of the machine's memory for photographs."""
 UNKNOWN_MEMORY = 8 * GIGABYTE
@@ -52,6 +53,7 @@ AHEAD_SHARE = 0.25
 PIXEL_BYTES = 5
 """Bytes per pixel of a view: three of the photograph, one of the pane labels, one of the ignore mask."""
 MOST_THREADS = 4
+"""Maximum number of threads that read photographs."""
 DISK_RATE = 2e8
 """Bytes per second of a slow disk."""
 DISK_RESERVE = 5 * GIGABYTE

@@ -69,10 +69,10 @@ def marked_regions(planes: Planes) -> PaneRegions:
     return PaneRegions("masks, and in views without one the planes fitted to them", region, planes)
 
 
-ALIGNMENT_STEPS = 40
+ALIGNMENT_STEPS, SSIM_SHARE = 40, 0.2
+"""Steps of the alignment of test views, and the weight of SSIM in its loss."""
 FIRST_RATE, LAST_RATE = 1.5e-3, 5e-5
 """First and last learning rate of the alignment, in radians and extents; it decays exponentially."""
-SSIM_SHARE = 0.2
 Listener = Callable[[int, int], None]
 
 

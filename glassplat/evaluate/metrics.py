@@ -418,6 +418,7 @@ def _mean_error(errors: Tensor | str, region: Tensor | str, too_few: str) -> Out
 
 
 SMALLEST_SIDE = 32
+"""Minimum side of an image for LPIPS, pixels."""
 
 
 @dataclass(frozen=True)

@@ -70,12 +70,14 @@ large.addEventListener("click", () => large.close());
 
 
 NARROWEST_PANEL, WIDEST_PANEL = 280, 640
-MARGIN, GAP = 16, 10
-CAPTION_SIZE, TITLE_SIZE = 15, 19
-CAPTION_MARGIN = 9
+"""Widths of an image on a sheet below and above which it is scaled, pixels."""
+MARGIN, GAP, CAPTION_SIZE, CAPTION_MARGIN, TITLE_SIZE = 16, 10, 15, 9, 19
+"""Space around and between images, heights of the letters of captions and title, and space above captions, pixels."""
 CAPTION_HEIGHT, TITLE_HEIGHT = CAPTION_SIZE + CAPTION_MARGIN, 34
 BACKGROUND, TEXT, MUTED_TEXT = (22, 24, 28), (236, 236, 236), (160, 166, 174)
+"""Colours of a sheet, 0 to 255."""
 SMALLEST_STRENGTH_SCALE = 0.05
+"""Minimum strength that is drawn white."""
 COLORED = ("transmission", "base", "reflection", "environment")
 COLUMNS = (*COLORED, "strength", "normal", "mask")
 """Layers in the order in which they are shown."""
@@ -239,9 +241,8 @@ def _one_line(text: str) -> str:
     return " ".join(text.splitlines())
 
 
-MOST_VIEWS = 2
-SMALLEST_SHARE = 0.05
-"""Minimum share of the image that must show a pane for a view to be included."""
+MOST_VIEWS, SMALLEST_SHARE = 2, 0.05
+"""Maximum number of views, and minimum share of the image that must show a pane for a view to be included."""
 
 
 class LayerUses:

@@ -34,6 +34,7 @@ from glassplat.scene.camera import quat_from_rotation, quat_product, rotation_fr
 from glassplat.scene.gaussians import DISC_SCALES, Gaussians, rotate_half_turn
 
 NUM_DIRECTIONS = 64
+"""Number of directions that determine the rotation of up to 16 SH coefficients."""
 
 
 def rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
@@ -55,11 +56,12 @@ def rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
 
 MAGIC, VERSION = b"glTF", 2
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
-JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
-FLOAT, ARRAY_BUFFER = 5126, 34962
+JSON_CHUNK, BINARY_CHUNK, FLOAT, ARRAY_BUFFER = 0x4E4F534A, 0x004E4942, 5126, 34962
+"""Codes of glTF for the types of chunks, for float32, and for the data of vertices."""
 COMPONENTS: dict[int, str] = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", FLOAT: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 MOST_BYTES = 2**32 - 1
+"""Largest file: the header stores its size in 32 bits."""
 
 INDEX = records.Integer(0, 2**31)
 ACCESSOR: dict[str, records.Field] = {
@@ -284,7 +286,8 @@ def place_gaussians(gaussians: Gaussians, placement: Tensor) -> Gaussians:
 
 
 EXTENSION = "KHR_gaussian_splatting"
-POINTS = 0
+POINTS, HIGHEST_DEGREE = 0, 3
+"""Code of glTF for a primitive of points, and the highest SH degree of the extension."""
 ROTATION, SCALE, OPACITY = (f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY"))
 CHANNEL = "_GLASSPLAT_"
 """glTF leaves names that begin with an underscore to applications."""
@@ -294,10 +297,10 @@ SPLATS: dict[str, records.Field] = {
     "projection": records.Optional(records.Choice(("perspective",)), "perspective"),
 }
 """Properties that the renderers support; the sorting method is not checked."""
-HIGHEST_DEGREE = 3
 HALF_TURN_Z = (-1.0, -1.0, 1.0)
 """Signs of a half turn around z, which converts to the frame of glTF and back."""
 LEAST_SHARE, LEAST_SCALE = 1e-7, 1e-12
+"""Minimum opacity and scale, for finite raw values."""
 PLAIN_COUNT, BYTES_PER_GAUSSIAN = 2**20, 8
 """A file of B bytes may show B / 8 Gaussians, or a million; real ones take forty bytes, bombs repeat one often."""
 MOST_NODES, MOST_PARTS = 10_000, 2000

@@ -35,6 +35,7 @@ COMPRESSION = 4
 """Compression level of PNG files, up to 9: half the time of Pillow's default 6 for 5 % more bytes."""
 GREY_MODES_16 = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 _FULL_SCALE_16 = 65535
+"""Value of white in 16 bits."""
 
 # Harmless damaged tags cause warnings that name no file; harmful ones raise errors.
 warnings.filterwarnings("ignore", module=r"PIL\.")
@@ -192,6 +193,7 @@ def _is_adobe_rgb(image: Image.Image) -> bool:
 
 
 ADOBE_GAMMA = 2.19921875
+"""Exponent of radiance in Adobe RGB (1998)."""
 ADOBE_PRIMARIES = {
     b"rXYZ": (0.60974, 0.31111, 0.01947),
     b"gXYZ": (0.20528, 0.62567, 0.06087),

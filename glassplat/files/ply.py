@@ -15,14 +15,16 @@ from glassplat.scene import SH_ZERO
 from glassplat.scene.gaussians import DISC_SCALES, PER_GAUSSIAN, Gaussians
 
 CHUNK = 256
+"""Number of consecutive Gaussians with common bounds in a compressed PLY."""
 PACKED_COLUMNS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 BOUNDS = tuple(f"{end}_{name}" for end in ("min", "max") for name in ("x", "y", "z", "scale_x", "scale_y", "scale_z"))
 COLOR_BOUNDS = tuple(f"{end}_{name}" for end in ("min", "max") for name in "rgb")
-HARMONICS = (9, 24, 45)
-HARMONIC_RANGE = 8.0
-ELEVEN_TEN_ELEVEN = ((21, 11), (11, 10), (0, 11))
+HARMONICS, HARMONIC_RANGE = (9, 24, 45), 8.0
+"""Numbers of values beyond SH degree 0 for the degrees 1 to 3, and the range of these values, centred at 0."""
+ELEVEN_TEN_ELEVEN, TEN_BITS = ((21, 11), (11, 10), (0, 11)), ((20, 10), (10, 10), (0, 10))
+"""Lowest bit and number of bits of each part of a packed word with three parts."""
 EIGHT_BITS = ((24, 8), (16, 8), (8, 8), (0, 8))
-TEN_BITS = ((20, 10), (10, 10), (0, 10))
+"""The same for four parts."""
 
 Floats = NDArray[np.float32]
 
@@ -129,6 +131,7 @@ REQUIRED = (*POSITION, "opacity", *DISC_SCALE, *ROTATION)
 CHANNEL_PREFIXES = ("log_", "logit_", "raw_")
 """Raw values are named after their activation; these prefixes distinguish channels from foreign properties."""
 SH_COEFFICIENTS = (1, 4, 9, 16)
+"""Number of SH coefficients, by degree."""
 
 
 def is_channel(name: str) -> bool:

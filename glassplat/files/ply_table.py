@@ -21,8 +21,8 @@ SCALAR_TYPES = {
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
 BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
-LONGEST_HEADER_LINE = 4096
-MOST_HEADER_LINES = 10_000
+LONGEST_HEADER_LINE, MOST_HEADER_LINES = 4096, 10_000
+"""Limits of a header, so that a file without its end is not read as one."""
 
 
 @dataclass(frozen=True)

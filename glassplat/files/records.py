@@ -56,9 +56,8 @@ def read_text(path: Path) -> str:
         ) from error
 
 
-DEEPEST = 32
-MOST_DIGITS = 20
-"""Enough for every 64-bit integer."""
+DEEPEST, MOST_DIGITS = 32, 20
+"""Maximum levels of nesting and digits of an integer, enough for every one of 64 bits."""
 
 
 def read_json(path: Path) -> Any:
@@ -124,6 +123,7 @@ def _too_deep(where: str) -> str:
 
 
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
+"""Range of integers of 64 bits."""
 
 
 class Field:

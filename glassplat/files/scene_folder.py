@@ -29,14 +29,14 @@ PRIMARY, GLASS, PLANES = "point_cloud.ply", "glass.ply", "planes.json"
 ENVIRONMENT, SURROUNDINGS, EXPOSURES = "environment.safetensors", "surroundings.ply", "exposures.json"
 PHOTOGRAPHER, POSES = "photographer.ply", "poses.json"
 FILES = (PRIMARY, GLASS, PLANES, ENVIRONMENT, SURROUNDINGS, EXPOSURES, PHOTOGRAPHER, POSES)
-LARGEST_COLOR = 1e6
-LARGEST_LOG = 40.0
-"""Largest logarithm; the square of its exponential fits float32."""
+LARGEST_COLOR, LARGEST_LOG = 1e6, 40.0
+"""Largest colour or other channel, and largest logarithm; the square of its exponential fits float32."""
 EXTENT = records.Number(above=1 / records.LARGEST_COORDINATE, most=4 * records.LARGEST_COORDINATE)
 """World units; squares of smaller values may underflow float32."""
 SH_DEGREE = records.Integer(0, 3)
 DIRECTION = records.Nullable(records.ListOf(records.Number(-1.001, 1.001), 3))
 UNIT_TOLERANCE = 1e-3
+"""Largest deviation of a direction's length from one."""
 HEADER: dict[str, records.Field] = {
     "extent": EXTENT,
     "active_sh_degree": SH_DEGREE,
@@ -162,6 +162,7 @@ def _read_drawable(path: Path) -> Gaussians:
 
 SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
 LEAST_SCALE = 1e-12
+"""Minimum scale, for a finite logarithm."""
 
 
 def read_splats(path: Path | str) -> Gaussians:

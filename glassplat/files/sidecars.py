@@ -34,6 +34,7 @@ from glassplat.scene.scene import Environment
 
 HEADER_KEY = "glassplat"
 LONGEST_REASON = 200
+"""Maximum number of characters of a library's message that are repeated."""
 
 
 class TensorsFile(NamedTuple):
@@ -135,11 +136,11 @@ Conversion = Callable[[Tensor], Tensor]
 UNIT: Conversion = partial(torch.nn.functional.normalize, dim=0)
 LOGIT_OF: Conversion = partial(torch.logit, eps=1e-6)
 """Logit of a reflectance, clamped because it may be 0 or 1."""
-LEAST_LENGTH = 1e-6
-LEAST_ANGLE = 1e-3
-"""Smallest angle between tangent and normal, radians; below, the rectangle's sides are undefined."""
-LEAST_HALF_SIZE = 1e-9
-LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE = 1e-6, 1.0
+LEAST_LENGTH, LEAST_ANGLE = 1e-6, 1e-3
+"""Smallest length of tangent and normal, and smallest angle between them, radians; below, the rectangle's sides are
+undefined."""
+LEAST_HALF_SIZE, LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE = 1e-9, 1e-6, 1.0
+"""Smallest half side, and range of the readable transmittance."""
 VECTOR = records.ListOf(records.COORDINATE, 3)
 LOGIT = records.Number(-1e3, 1e3)
 PLANE: dict[str, records.Field] = {
@@ -284,6 +285,7 @@ def _log_transmittances(entries: list[dict[str, Any]]) -> Tensor | None:
 
 
 LARGEST_SIDE = 2**17
+"""Largest side of a camera's image, pixels."""
 FOCAL = records.Number(above=0, most=1e9)
 CAMERA: dict[str, records.Field] = {
     "img_name": records.Text(),
@@ -352,10 +354,8 @@ def _camera_entry(index: int, name: str, camera: Camera) -> dict[str, Any]:
     }
 
 
-LARGEST_ENTRY = 1e3
-TRANSFORM = records.ListOf(records.ListOf(records.Number(-LARGEST_ENTRY, LARGEST_ENTRY), 4), 3)
-LARGEST_TWIST = 1e2
-TWIST = records.ListOf(records.Number(-LARGEST_TWIST, LARGEST_TWIST), 6)
+TRANSFORM = records.ListOf(records.ListOf(records.Number(-1e3, 1e3), 4), 3)
+TWIST = records.ListOf(records.Number(-1e2, 1e2), 6)
 Correction = TypeVar("Correction", bound=PerPhotograph)
 ENTRIES: dict[type[PerPhotograph], records.Field] = {Exposures: TRANSFORM, PoseCorrections: TWIST}
 """Required values of a photograph, by kind of correction."""

@@ -37,10 +37,10 @@ HALF_TURN_X = (1.0, -1.0, -1.0)
 HARMONICS = (0, 3, 8, 15, 24)
 """Number of SH coefficients beyond degree 0, by degree; those of degree 4 are skipped."""
 MOST_HARMONICS = HARMONICS[3]
-COLOR_SCALE = 0.15
-LOWEST_LOG_SCALE, STEPS_PER_LOG = -10.0, 16.0
-LARGEST_POSITION = 2**23 - 1
-MOST_FRACTIONAL_BITS = 20
+COLOR_SCALE, LOWEST_LOG_SCALE, STEPS_PER_LOG = 0.15, -10.0, 16.0
+"""Factor on SH coefficients of degree 0, lowest log scale, and quantisation steps per unit of log scale."""
+LARGEST_POSITION, MOST_FRACTIONAL_BITS = 2**23 - 1, 20
+"""Largest position as an integer, and maximum number of its fractional bits."""
 QUAT_STEPS = 511
 """Quantisation steps of the three smallest quaternion components, on either side of zero."""
 
@@ -170,13 +170,12 @@ def _to_bytes(values: NDArray[np.float32]) -> Bytes:
     return np.rint(values).clip(0, 255).astype(np.uint8).reshape(-1)
 
 
-MAGIC = 0x5053474E
+MAGIC, GZIP_WINDOW, VERSIONS = 0x5053474E, 31, (1, 2, 3, 4)
+"""First number of a file, zlib's code for gzip streams, and the versions that are read."""
 GZIP = b"\x1f\x8b"
 HEADER = struct.Struct("<IIIBBBB")
 STREAMED_HEADER = struct.Struct("<IIIBBBBI12x")
 STREAM = struct.Struct("<QQ")
-VERSIONS = (1, 2, 3, 4)
-GZIP_WINDOW = 31
 PLAIN_COUNT, GAUSSIANS_PER_BYTE = 2**20, 2
 """A file of B bytes may declare 2 B Gaussians, or a million; real ones take ten bytes, bombs 0.01."""
 
