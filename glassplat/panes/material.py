@@ -106,13 +106,15 @@ class Photograph(NamedTuple):
     """A downscaled photograph, used to distinguish mirrors from glass.
 
     camera: scaled to its size; pixels [H, W, 3] in [0, 1], at the scene's exposure; valid [H, W] bool, pixels that
-    count; labels [H, W] of panes, None if it is not annotated.
+    count; labels [H, W] of panes, None if it is not annotated; clipped [H, W] bool, pixels that its own exposure may
+    have clipped.
     """
 
     camera: Camera
     pixels: Tensor
     valid: Tensor
     labels: Tensor | None
+    clipped: Tensor
 
 
 class ComparedPart(NamedTuple):
@@ -137,8 +139,9 @@ def reduced_photograph(scene: Scene, view: View) -> Photograph:
     camera = view.camera.to(device)
     factor = min(1.0, REDUCED_WIDTH / camera.width)
     size = (max(round(factor * camera.height), 1), max(round(factor * camera.width), 1))
-    pixels = scene.exposures.apply_inverse(view.photo.to(device).float() / 255, view.name)
-    pixels = torch.nn.functional.interpolate(pixels.movedim(-1, 0)[None], size, mode="area")[0].movedim(0, -1)
+    photo = (view.photo.to(device).float() / 255).movedim(-1, 0)
+    photo = torch.nn.functional.interpolate(photo[None], size, mode="area")[0].movedim(0, -1)
+    pixels, clipped = scene.exposures.apply_inverse(photo, view.name), photo.amin(dim=-1) > CLIPPED
     valid = torch.ones_like(pixels[..., 0], dtype=torch.bool)
     if view.ignored is not None:
         ignored = view.ignored.to(device)[None, None].float()
@@ -146,7 +149,7 @@ def reduced_photograph(scene: Scene, view: View) -> Photograph:
     labels = None if view.pane_labels is None else view.pane_labels.to(device)
     if labels is not None:
         labels = torch.nn.functional.interpolate(labels[None, None].float(), size, mode="nearest-exact")[0, 0]
-    return Photograph(camera.resize(size[1], size[0]), pixels, valid, labels)
+    return Photograph(camera.resize(size[1], size[0]), pixels, valid, labels, clipped)
 
 
 def mirror_candidate(scene: Scene, label: int, photographs: Sequence[Photograph]) -> MirrorCandidate:
@@ -515,7 +518,7 @@ def _detect_lamps(scene: Scene, photographs: Sequence[Photograph], renderer: Pla
         strength = renderer(scene, photograph.camera).layers["strength"]
         past, through = photograph.valid & (strength <= 0), photograph.valid & (strength > 0)
         darkest = photograph.pixels.amin(dim=-1)
-        shown = gather_pixels(scene, photograph.camera, torch.stack([past & (darkest > CLIPPED), past], dim=-1).float())
+        shown = gather_pixels(scene, photograph.camera, torch.stack([past & photograph.clipped, past], dim=-1).float())
         enough = decode(darkest.clamp(0, 1)) > DAZZLING * strength
         lit = torch.stack([through & enough, through], dim=-1).float()
         there = gather_mirrored_pixels(scene, photograph.camera, lit)

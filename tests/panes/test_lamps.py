@@ -13,9 +13,18 @@ from torch import Tensor
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import PointCloud, View
 from glassplat.methods.planar import FillUnseen, LightLamps
-from glassplat.panes.material import Photograph, _ends_of_rays, mirrored_image, mirrored_lamps, unseen_positions
+from glassplat.panes.material import (
+    CLIPPED,
+    Photograph,
+    _ends_of_rays,
+    mirrored_image,
+    mirrored_lamps,
+    reduced_photographs,
+    unseen_positions,
+)
 from glassplat.render.planar import Planar
 from glassplat.scene.camera import Camera, mirror_matrices
+from glassplat.scene.corrections import Exposures
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene, glass_gaussians
@@ -72,7 +81,7 @@ def shining(lamp: Gaussians) -> Gaussians:
 
 def photographs_of(scene: Scene, renderer: Planar = DEFAULT) -> list[Photograph]:
     return [
-        Photograph(view, rgb, torch.ones_like(rgb[..., 0], dtype=torch.bool), None)
+        Photograph(view, rgb, torch.ones_like(rgb[..., 0], dtype=torch.bool), None, rgb.amin(dim=-1) > CLIPPED)
         for view in CAMERAS
         for rgb in [renderer(scene, view).rgb.clamp(0, 1)]
     ]
@@ -208,6 +217,21 @@ def test_lamps_are_brightened_at_their_moments_and_their_images_removed() -> Non
     mirrors = scene_of(wall(4.0), panel(LAMP), panel(IMAGE))
     mirrors = replace(mirrors, planes=replace(mirrors.planes, mirrors=(1,)))
     assert not finished(action.apply(state_of(mirrors), capture, Clock(40, 100, 5)))
+
+
+@pytest.mark.parametrize("change", [0.1, -0.1])
+def test_lamps_are_clipped_in_the_colours_of_their_photographs(change: float) -> None:
+    """White of a brighter photograph is grey in the scene's colours, and grey of a darker one is white."""
+    capture = capture_of(scene_of(wall(4.0), shining(panel(LAMP))))
+    exposed = [
+        replace(view, read_photo=lambda photo=view.photo: ((1 + change) * photo.float()).clamp(max=255).to(torch.uint8))
+        for view in capture.train
+    ]
+    affine = change * torch.eye(3, 4).repeat(len(exposed), 1, 1)
+    exposures = Exposures(affine, tuple(view.name for view in exposed))
+    first = replace(scene_of(wall(4.0), panel(LAMP), panel(IMAGE)), exposures=exposures)
+    lamps = mirrored_lamps(first, first.planes, reduced_photographs(first, exposed), renderer=DEFAULT)
+    assert (lamps is not None) == (change > 0)
 
 
 def test_brightening_lamps_does_not_prevent_densification() -> None:
