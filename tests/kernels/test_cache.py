@@ -190,8 +190,19 @@ def test_every_input_of_a_kernel_changes_its_fingerprint(old: str, new: str) -> 
     assert fingerprint(made_from(KERNEL_SOURCE), "fast") != fingerprint(made_from(changed), "fast")
 
 
-def test_a_constant_read_through_a_module_changes_the_fingerprint(monkeypatch: pytest.MonkeyPatch) -> None:
-    source = "from glassplat.kernels.maths import disc\n\ndef made(x):\n    return x + disc.MOST_DEVIATIONS\n"
+@pytest.mark.parametrize(
+    ("imported", "read"),
+    [
+        ("from glassplat.kernels.maths import disc", "disc.MOST_DEVIATIONS"),
+        ("import glassplat.kernels.maths.disc", "glassplat.kernels.maths.disc.MOST_DEVIATIONS"),
+        ("from glassplat.kernels.maths import disc", "(lambda: disc.MOST_DEVIATIONS)()"),
+    ],
+    ids=["module", "package", "nested function"],
+)
+def test_a_constant_read_through_a_module_changes_the_fingerprint(
+    monkeypatch: pytest.MonkeyPatch, imported: str, read: str
+) -> None:
+    source = f"{imported}\n\ndef made(x):\n    return x + {read}\n"
     before = fingerprint(made_from(source), "fast")
     monkeypatch.setattr("glassplat.kernels.maths.disc.MOST_DEVIATIONS", 4.0)
     assert fingerprint(made_from(source), "fast") != before

@@ -150,6 +150,7 @@ NAMED_TYPES = (ModuleType, type, BuiltinFunctionType, np.ufunc)
 TEXT_TYPES = (types.Type, ir.Type)
 """Types that are fully described by their text."""
 LIBRARIES = ("numba", "numpy", "llvmlite")
+PACKAGE = __name__.partition(".")[0]
 DAMAGE_ERRORS = (EOFError, pickle.UnpicklingError, AttributeError, ImportError, LookupError, TypeError, ValueError)
 """Exceptions on reading a file that is truncated, or was written by another program."""
 
@@ -210,21 +211,29 @@ def _described_function(function: FunctionType, seen: set[int]) -> Iterator[str]
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
         yield f"closes over {name}"
         yield from _describe(cell.cell_contents, seen)
-    for name in sorted(_global_names(function.__code__) & function.__globals__.keys()):
-        value = function.__globals__[name]
-        yield f"reads {name}"
+    for path in sorted(_global_paths(function.__code__)):
+        if path[0] not in function.__globals__:
+            continue  # A built-in function.
+        value = function.__globals__[path[0]]
+        for name in path[1:]:
+            if isinstance(value, ModuleType) and value.__name__.partition(".")[0] == PACKAGE:
+                value = getattr(value, name)
+        yield f"reads {'.'.join(path)}"
         yield from _describe(value, seen)
-        if isinstance(value, ModuleType) and value.__name__.startswith("glassplat."):
-            for attribute in sorted(vars(value).keys() & set(function.__code__.co_names)):
-                yield f"reads {attribute}"
-                yield from _describe(getattr(value, attribute), seen)
 
 
-def _global_names(code: CodeType) -> set[str]:
-    """Names of the globals that a code object and those nested in it read."""
-    read = {step.argval for step in dis.get_instructions(code) if step.opname == "LOAD_GLOBAL"}
+def _global_paths(code: CodeType) -> set[tuple[str, ...]]:
+    """Globals that a code object and those nested in it read, each with the attributes that follow it."""
+    found: set[tuple[str, ...]] = set()
+    path: tuple[str, ...] = ()
+    for step in dis.get_instructions(code):
+        if step.opname == "LOAD_GLOBAL":
+            path = (step.argval,)
+        elif step.opname != "EXTENDED_ARG":
+            path = (*path, step.argval) if path and step.opname in ("LOAD_ATTR", "LOAD_METHOD") else ()
+        found.add(path)
     nested = (constant for constant in code.co_consts if isinstance(constant, CodeType))
-    return read.union(*map(_global_names, nested))
+    return found.union(*map(_global_paths, nested)) - {()}
 
 
 def load_data(files: Iterable[caching.IndexDataCacheFile], key: Any) -> Any:
