@@ -73,11 +73,8 @@ def add_views(sums: Sums, views: Views) -> None:
         return
     real = REAL_OF[sums.view_count.dtype]
     weight = np.ascontiguousarray(np.atleast_2d(views.weight), real)
-    gradients = (tensor.detach().contiguous().numpy() for tensor in views[:3])
-    add_views_kernel(real)(
-        *(tensor.numpy() for tensor in sums), *gradients, weight,
-        views.width, views.height, 1 + views.direct,
-    )  # fmt: skip
+    gradients = (tensor.detach().contiguous() for tensor in views[:3])
+    add_views_kernel(real)(*sums, *gradients, weight, views.width, views.height, 1 + views.direct)
 
 
 @functools.cache

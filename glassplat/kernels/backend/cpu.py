@@ -31,6 +31,7 @@ import numpy as np
 from numba import types
 from numba.extending import intrinsic, register_jitable
 from numba.np.arrayobj import populate_array
+from torch import Tensor
 
 from glassplat.kernels.backend.cpu_cache import KernelCache
 
@@ -121,8 +122,8 @@ class Kernel:
         self._run: Callable[..., Any] = self._first_run if parallel else dispatcher
 
     def __call__(self, *arguments: Any) -> Any:
-        """Runs the kernel; the first call compiles it unless it is cached on disk."""
-        return self._run(*arguments)
+        """Runs the kernel on the memory of tensors; the first call compiles it unless it is cached on disk."""
+        return self._run(*map(_array, arguments))
 
     def _first_run(self, *arguments: Any) -> Any:
         """Starts the threads, which determines the threading layer and how a parallel kernel may be entered."""
@@ -133,6 +134,13 @@ class Kernel:
     def compilations(self) -> int:
         """Number of compilations in this process, one for each combination of argument types."""
         return int(self.dispatcher._cache.compilations)
+
+
+def _array(argument: Any) -> Any:
+    """An argument with its tensors as arrays, which share their memory."""
+    if isinstance(argument, tuple):
+        return tuple(map(_array, argument))
+    return argument.numpy() if isinstance(argument, Tensor) else argument
 
 
 def kernel(name: str, real: type, *, parallel: bool = True) -> Callable[[Callable[..., Any]], Kernel]:

@@ -23,20 +23,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.kernels.backend.cpu import ZERO, Kernel, even_stride, inlined, kernel
+from glassplat.kernels.maths import cube
 from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.maths.cube import (
-    bilinear,
-    bilinear_gradient,
-    build_cell,
-    build_logistic,
-    from_face,
-    lookup_maths,
-    mirror_ray,
-    mirrored_gradient,
-    on_face,
-    over_column,
-    over_row,
-)
 from glassplat.kernels.maths.projection import dot
 from glassplat.kernels.maths.surface import surface_maths
 from glassplat.kernels.records import NORMAL_AT, NORMAL_MIN, REAL_OF, STRENGTH_AT, SURFACE_CHANNELS, Shaded
@@ -46,15 +34,14 @@ def surface_channels(inputs: Sequence[Tensor]) -> Tensor:
     """See `glassplat.kernels.environment.surface_channels`; inputs in its order."""
     colors, extra = inputs[0], inputs[-1]
     channels = colors.new_empty(colors.shape[0], SURFACE_CHANNELS + extra.shape[1])
-    surface_channels_forward(REAL_OF[colors.dtype])(*(tensor.numpy() for tensor in (*inputs, channels)))
+    surface_channels_forward(REAL_OF[colors.dtype])(*inputs, channels)
     return channels
 
 
 def surface_channels_gradients(saved: Sequence[Tensor], v_channels: Tensor) -> tuple[Tensor, ...]:
     """Gradients of colors, quats, logit strengths and extra, given radii, quats, log scales and channels."""
     found = gradients_like(v_channels)
-    tensors = (*saved, v_channels, *found)
-    surface_channels_backward(REAL_OF[v_channels.dtype])(*(tensor.numpy() for tensor in tensors))
+    surface_channels_backward(REAL_OF[v_channels.dtype])(*saved, v_channels, *found)
     return found
 
 
@@ -110,7 +97,7 @@ def padded_faces(texels: Tensor) -> Tensor:
     """Faces [6, S + 2, S + 2, D] with a ring of their neighbours' texels, as in the reference."""
     size, depth = texels.shape[1], texels.shape[3]
     padded = texels.new_empty(6, size + 2, size + 2, depth)
-    pad_faces(REAL_OF[texels.dtype])(texels.numpy(), padded.numpy())
+    pad_faces(REAL_OF[texels.dtype])(texels, padded)
     return padded
 
 
@@ -127,12 +114,11 @@ def texel_gradients(first_cells: Tensor, fractions: Tensor, gradients: Tensor, s
     real, side, depth = REAL_OF[gradients.dtype], size + 2, gradients.shape[1]
     starts = torch.zeros(6 * side + 1, dtype=torch.int64)
     order = torch.empty(first_cells.shape[0], dtype=torch.int32)
-    sort_lookups(real)(first_cells.numpy(), starts.numpy(), order.numpy())
+    sort_lookups(real)(first_cells, starts, order)
     rows = gradients.new_empty(6 * side, 2, side * depth)
-    lookups = (first_cells, fractions, gradients, starts, order)
-    sum_lookups(real)(*(tensor.numpy() for tensor in lookups), rows.numpy())
+    sum_lookups(real)(first_cells, fractions, gradients, starts, order, rows)
     texels = gradients.new_empty(6, size, size, depth)
-    fold_faces(real)(rows.view(6, side, 2, side, depth).numpy(), texels.numpy())
+    fold_faces(real)(rows.view(6, side, 2, side, depth), texels)
     return texels
 
 
@@ -153,7 +139,7 @@ def pad_faces(real: type) -> Kernel:
             target = padded[face, row + 1]
             if outside:
                 for column in range(size):
-                    f, r, c = over_row(face, low, column, size)
+                    f, r, c = cube.over_row(face, low, column, size)
                     for d in range(depth):
                         target[column + 1, d] = texels[f, r, c, d]
             else:
@@ -163,8 +149,8 @@ def pad_faces(real: type) -> Kernel:
                     to[i] = copied[i]
             for side in range(2):
                 column, cell = (size - 1, size + 1) if side == 0 else (0, 0)
-                f, r, c = over_column(face, side, inner, size)
-                g, s, e = over_row(face, low, column, size)
+                f, r, c = cube.over_column(face, side, inner, size)
+                g, s, e = cube.over_row(face, low, column, size)
                 for d in range(depth):
                     beside = texels[f, r, c, d]
                     target[cell, d] = (
@@ -249,15 +235,15 @@ def fold_faces(real: type) -> Kernel:
             for side in range(2):
                 outer, inner = (size + 1, size - 1) if side == 0 else (0, 0)
                 for i in range(size):
-                    f, r, c = over_column(face, side, i, size)
-                    g, s, e = over_row(face, side, i, size)
+                    f, r, c = cube.over_column(face, side, i, size)
+                    g, s, e = cube.over_row(face, side, i, size)
                     for d in range(depth):
                         texels[f, r, c, d] += cell(sums, face, i + 1, outer, d)
                         texels[g, s, e, d] += cell(sums, face, outer, i + 1, d)
                 for other in range(2):
                     outer_row, inner_row = (size + 1, size - 1) if other == 0 else (0, 0)
-                    f, r, c = over_column(face, side, inner_row, size)
-                    g, s, e = over_row(face, other, inner, size)
+                    f, r, c = cube.over_column(face, side, inner_row, size)
+                    g, s, e = cube.over_row(face, other, inner, size)
                     for d in range(depth):
                         share = cell(sums, face, outer_row, outer, d) * third
                         texels[face, inner_row, inner, d] += share
@@ -270,7 +256,7 @@ def fold_faces(real: type) -> Kernel:
 def cube_lookup(texels: Tensor, directions: Tensor) -> Tensor:
     """Look up texels [6, S, S, D] in directions [P, 3], as [P, D]."""
     found = texels.new_empty(directions.shape[0], texels.shape[3])
-    cube_lookup_forward(REAL_OF[texels.dtype])(padded_faces(texels).numpy(), directions.numpy(), found.numpy())
+    cube_lookup_forward(REAL_OF[texels.dtype])(padded_faces(texels), directions, found)
     return found
 
 
@@ -280,15 +266,14 @@ def cube_lookup_gradients(texels: Tensor, directions: Tensor, cotangents: Tensor
     first_cells = torch.empty(directions.shape[0], 2, dtype=torch.int32)
     fractions = directions.new_empty(directions.shape[0], 2)
     inputs = (padded_faces(texels), directions, cotangents)
-    outputs = (v_directions, first_cells, fractions)
-    cube_lookup_backward(REAL_OF[texels.dtype])(*(tensor.numpy() for tensor in (*inputs, *outputs)))
+    cube_lookup_backward(REAL_OF[texels.dtype])(*inputs, v_directions, first_cells, fractions)
     return texel_gradients(first_cells, fractions, cotangents, texels.shape[1]), v_directions
 
 
 @cache
 def cube_lookup_forward(real: type) -> Kernel:
     """Fills the lookups in padded faces."""
-    look_up, _ = lookup_maths(real)
+    look_up, _ = cube.lookup_maths(real)
 
     @kernel("cube_lookup_forward", real)
     def forward(padded, directions, found):
@@ -301,7 +286,7 @@ def cube_lookup_forward(real: type) -> Kernel:
 @cache
 def cube_lookup_backward(real: type) -> Kernel:
     """Fills the gradients of the directions, and the cells and fractions of each lookup."""
-    _, look_up_gradient = lookup_maths(real)
+    _, look_up_gradient = cube.lookup_maths(real)
 
     @kernel("cube_lookup_backward", real)
     def backward(padded, directions, v_found, v_directions, first_cells, fractions):
@@ -330,8 +315,7 @@ def shade_environment(inputs: Sequence[Tensor], least_strength: float) -> Shaded
     blended, alpha, texels, *rest = inputs
     real = REAL_OF[blended.dtype]
     shaded = Shaded(*(alpha.new_empty(*alpha.shape, 3) for _ in range(3)))
-    tensors = (blended, alpha, padded_faces(texels), *rest, *shaded)
-    shade_environment_forward(real)(real(least_strength), *(tensor.numpy() for tensor in tensors))
+    shade_environment_forward(real)(real(least_strength), blended, alpha, padded_faces(texels), *rest, *shaded)
     return shaded
 
 
@@ -345,8 +329,8 @@ def shade_environment_gradients(
     first_cells = torch.empty(*alpha.shape, 2, dtype=torch.int32)
     fractions, v_raw = alpha.new_empty(*alpha.shape, 2), alpha.new_empty(*alpha.shape, 3)
     lookups = (first_cells, fractions, v_raw)
-    tensors = (blended, padded_faces(texels), *rest, *found, *cotangents, v_blended, v_alpha, *lookups)
-    shade_environment_backward(real)(real(least_strength), *(tensor.numpy() for tensor in tensors))
+    inputs = (blended, padded_faces(texels), *rest, *found, *cotangents)
+    shade_environment_backward(real)(real(least_strength), *inputs, v_blended, v_alpha, *lookups)
     first_cells, fractions, v_raw = (tensor.flatten(0, 1) for tensor in lookups)
     return v_blended, v_alpha, texel_gradients(first_cells, fractions, v_raw, texels.shape[1])
 
@@ -358,7 +342,7 @@ def normal_of(blended, row, column):
 
 
 def _cube_positions(real: type) -> Scalar:
-    cell, one, half = build_cell(real), real(1.0), real(0.5)
+    cell, one, half = cube.build_cell(real), real(1.0), real(0.5)
 
     @inlined
     def cube_positions(run, whole, row, side, intrinsics, rotation):
@@ -374,8 +358,8 @@ def _cube_positions(real: type) -> Scalar:
             x = (real(whole[COLUMN + i]) + start) * inverse_f
             ray = x * across_x + from_x, x * across_y + from_y, x * across_z + from_z
             normal = run[NORMAL + i], run[NORMAL + RUN + i], run[NORMAL + 2 * RUN + i]
-            to = mirror_ray(ray, normal)
-            axis, face, u, v, inverse = on_face(to[0], to[1], to[2])
+            to = cube.mirror_ray(ray, normal)
+            axis, face, u, v, inverse = cube.on_face(to[0], to[1], to[2])
             left, along = cell(u, size)
             top, down = cell(v, size)
             run[RAY + i], run[RAY + RUN + i], run[RAY + 2 * RUN + i] = ray
@@ -392,7 +376,7 @@ def _cube_positions(real: type) -> Scalar:
 @cache
 def shade_environment_forward(real: type) -> Kernel:
     """Fills rgb, base and reflection."""
-    logistic, cube_positions = build_logistic(real), _cube_positions(real)
+    logistic, cube_positions = cube.build_logistic(real), _cube_positions(real)
     shortest, zero, one = real(NORMAL_MIN**2), real(0.0), real(1.0)
 
     @inlined
@@ -402,7 +386,9 @@ def shade_environment_forward(real: type) -> Kernel:
             for i in range(RUN):
                 at, along, down = whole[FIRST + i] + d, run[ALONG + i], run[DOWN + i]
                 under = at + below
-                run[SEEN + d * RUN + i] = bilinear(flat[at], flat[at + 3], flat[under], flat[under + 3], along, down)
+                run[SEEN + d * RUN + i] = cube.bilinear(
+                    flat[at], flat[at + 3], flat[under], flat[under + 3], along, down
+                )
         for i in range(3 * RUN):
             run[SEEN + i] = logistic(run[SEEN + i])
 
@@ -455,7 +441,7 @@ def position_gradients(run, whole, flat, below):
         for i in range(RUN):
             at, v = whole[FIRST + i] + d, run[V_RAW + d * RUN + i]
             under = at + below
-            by_column, by_row = bilinear_gradient(
+            by_column, by_row = cube.bilinear_gradient(
                 flat[at], flat[at + 3], flat[under], flat[under + 3], run[ALONG + i], run[DOWN + i]
             )
             run[BY_COLUMN + i] += v * by_column
@@ -471,10 +457,10 @@ def _normal_gradients(real: type) -> Scalar:
         cells_per_u = half * real(side - np.int32(2))
         for i in range(RUN):
             position = whole[AXIS + i], whole[FACE + i], run[PLACE + i], run[PLACE + RUN + i], run[PLACE + 2 * RUN + i]
-            g = from_face(position, run[BY_COLUMN + i] * cells_per_u, run[BY_ROW + i] * cells_per_u)
+            g = cube.from_face(position, run[BY_COLUMN + i] * cells_per_u, run[BY_ROW + i] * cells_per_u)
             ray = run[RAY + i], run[RAY + RUN + i], run[RAY + 2 * RUN + i]
             normal = run[NORMAL + i], run[NORMAL + RUN + i], run[NORMAL + 2 * RUN + i]
-            x, y, z = mirrored_gradient(ray, normal, g)
+            x, y, z = cube.mirrored_gradient(ray, normal, g)
             run[NORMAL + i], run[NORMAL + RUN + i], run[NORMAL + 2 * RUN + i] = x, y, z
 
     return normal_gradients

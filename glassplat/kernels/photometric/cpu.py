@@ -54,7 +54,7 @@ def photometric(image: Tensor, target: Tensor, *, with_gradient: bool) -> tuple[
     height, width, _ = image.shape
     ssim_gradient = image.new_empty(image.shape if with_gradient else (0, 0, CHANNELS))
     sums = np.zeros((-(-height // ROWS) * -(-width * CHANNELS // COLUMNS), 2), np.float64)
-    _forward(REAL_OF[image.dtype])(_rows(image), _rows(target), _rows(ssim_gradient), sums)
+    _forward(REAL_OF[image.dtype])(image.flatten(1), target.flatten(1), ssim_gradient.flatten(1), sums)
     l1, ssim = (torch.tensor(total / image.numel(), dtype=image.dtype) for total in sums.sum(axis=0))
     return l1, ssim, ssim_gradient
 
@@ -63,12 +63,8 @@ def photometric_gradient(image: Tensor, target: Tensor, ssim_gradient: Tensor, v
     """Gradient of the image, given the results of the forward pass."""
     real, v_image = REAL_OF[image.dtype], torch.empty_like(image)
     weights = (real(v.item() / image.numel()) for v in (v_l1, v_ssim))
-    _backward(real)(_rows(image), _rows(target), _rows(ssim_gradient), *weights, _rows(v_image))
+    _backward(real)(image.flatten(1), target.flatten(1), ssim_gradient.flatten(1), *weights, v_image.flatten(1))
     return v_image
-
-
-def _rows(image: Tensor) -> NDArray[Any]:
-    return image.numpy().reshape(image.shape[0], image.shape[1] * CHANNELS)
 
 
 def _brightness(real: type) -> Scalar:

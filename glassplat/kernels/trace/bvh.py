@@ -93,7 +93,7 @@ def hilbert_codes(points: Tensor) -> Tensor:
     """
     cells, finite = curve_cells(points)
     positions = torch.empty(len(points), dtype=torch.int64)
-    hilbert_positions(REAL_OF[points.dtype])(cells.numpy(), positions.numpy())
+    hilbert_positions(REAL_OF[points.dtype])(cells, positions)
     return torch.where(finite, positions, torch.iinfo(torch.int64).max)
 
 
