@@ -213,7 +213,7 @@ import numpy as np
 from glassplat.kernels.backend.cpu_vector import constant, store, vector_kind
 
 def factory(real, lanes):
-    load, offsets = vector_kind(real, lanes).load, constant(real, (1.0,) * lanes)
+    load, offsets = vector_kind(lanes).load, constant(real, (1.0,) * lanes)
 
     def compiled(values):
         store(values, 0, load(values, 0) + offsets())

@@ -10,7 +10,7 @@ from numba.core.errors import TypingError
 from numpy.typing import NDArray
 
 from glassplat.kernels.backend import cpu_vector as vector
-from glassplat.kernels.backend.cpu import Kernel, inlined, kernel
+from glassplat.kernels.backend.cpu import ZERO, Kernel, inlined, kernel
 from glassplat.kernels.backend.cpu_vector import (
     ROW,
     constant,
@@ -34,7 +34,7 @@ def numbers(real: type, count: int, low: float = -2.0, high: float = 2.0) -> NDA
 
 
 def arithmetic(real: type, lanes: int) -> Kernel:
-    load, half, two = vector_kind(real, lanes).load, real(0.5), real(2)
+    load, half, two = vector_kind(lanes).load, real(0.5), real(2)
 
     @kernel("vector_arithmetic", real, parallel=False)
     def compute(a, b, out):
@@ -57,13 +57,13 @@ def test_arithmetic_is_that_of_each_lane(real: type, lanes: int) -> None:
 
 
 def choices(real: type, lanes: int) -> Kernel:
-    full, load = vector_kind(real, lanes)
+    full, load = vector_kind(lanes)
     select, bits_of, zero = vector.select, vector.bits_of, real(0)
 
     @kernel("vector_choices", real, parallel=False)
     def compute(a, b, out, bits):
         x, y = load(a, 0), load(b, 0)
-        masks = (x < y, x <= y, x > y, x >= y, x < zero, (x < y) & (x > zero), (x < y) | (x > zero))
+        masks = (x < y, x <= y, x > y, x >= y, x < zero, (x < y) & (x > ZERO), (x < y) | (x > zero))
         for i in range(7):
             bits[i] = bits_of(masks[i])
             store(out, i * lanes, select(masks[i], x, full(zero)))
@@ -86,7 +86,7 @@ def test_masks_choose_lane_by_lane_and_never_where_there_is_nan(real: type, lane
 
 
 def functions(real: type, lanes: int) -> Kernel:
-    load = vector_kind(real, lanes).load
+    load = vector_kind(lanes).load
     ramp = constant(real, tuple(range(lanes)))
     fraction, times_power_of_2 = vector.fraction, vector.times_power_of_2
 
@@ -114,7 +114,7 @@ def test_functions_are_those_of_each_lane(real: type, lanes: int) -> None:
 
 
 def reorders(real: type, lanes: int) -> Kernel:
-    load = vector_kind(real, lanes).load
+    load = vector_kind(lanes).load
 
     @kernel("vector_reorders", real, parallel=False)
     def compute(a, out):
@@ -137,7 +137,7 @@ def test_four_vectors_interleave_and_come_apart_again(real: type, lanes: int) ->
 
 
 def three_channels(real: type) -> Kernel:
-    load = vector_kind(real, ROW).load
+    load = vector_kind(ROW).load
 
     @kernel("vector_three_channels", real, parallel=False)
     def compute(row, three, four):
@@ -159,7 +159,7 @@ def test_the_fourth_channel_of_a_row_is_left_out_and_comes_back_as_zero(real: ty
 
 
 def four_sums(real: type) -> Kernel:
-    load = vector_kind(real, 4).load
+    load = vector_kind(4).load
 
     @kernel("vector_sums", real, parallel=False)
     def compute(a, out):
@@ -169,7 +169,7 @@ def four_sums(real: type) -> Kernel:
 
 
 def sixteen_sums(real: type) -> Kernel:
-    load = vector_kind(real, 16).load
+    load = vector_kind(16).load
 
     @kernel("vector_sums_of_16", real, parallel=False)
     def compute(a, out):
@@ -219,7 +219,7 @@ def test_an_item_is_an_element() -> None:
 
 
 def test_vectors_pass_through_functions_and_loops() -> None:
-    full, load = vector_kind(np.float32, 16)
+    full, load = vector_kind(16)
     zero = np.float32(0)
 
     @inlined
@@ -243,7 +243,7 @@ def test_vectors_pass_through_functions_and_loops() -> None:
 
 
 def test_a_literal_that_would_be_float64_is_refused() -> None:
-    load = vector_kind(np.float32, 8).load
+    load = vector_kind(8).load
 
     @kernel("vector_literal", np.float32, parallel=False)
     def compute(values):
@@ -254,7 +254,7 @@ def test_a_literal_that_would_be_float64_is_refused() -> None:
 
 
 def test_only_contiguous_arrays_of_the_same_type_are_loaded() -> None:
-    load = vector_kind(np.float32, 8).load
+    load = vector_kind(8).load
 
     @kernel("vector_load", np.float32, parallel=False)
     def compute(values, out):

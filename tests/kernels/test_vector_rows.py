@@ -22,7 +22,7 @@ kinds = pytest.mark.parametrize(
 
 
 def sorting(real: type, lanes: int) -> Kernel:
-    load = vector_kind(real, lanes).load
+    load = vector_kind(lanes).load
 
     @kernel("vector_thirds", real, parallel=False)
     def compute(values, columns, again):
@@ -45,7 +45,7 @@ def test_triples_are_taken_apart_and_put_together(real: type, lanes: int) -> Non
 
 
 def turning(real: type, lanes: int) -> Kernel:
-    load_rows = row_loader(real, lanes)
+    load_rows = row_loader(lanes)
 
     @kernel("vector_transposed", real, parallel=False)
     def compute(values, positions, at, out):

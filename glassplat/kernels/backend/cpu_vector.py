@@ -4,7 +4,7 @@ A kernel that uses them chooses itself what a vector holds, instead of leaving t
 keeps sums in registers across loops. Vectors have one element type and a power-of-two number of lanes. LLVM splits
 those wider than the machine's registers, so that a kernel means the same everywhere.
 
-    full, load = vector_kind(np.float32, 8)
+    full, load = vector_kind(8)
 
     @kernel("scale", np.float32)
     def scale(values, factor):
@@ -12,9 +12,8 @@ those wider than the machine's registers, so that a kernel means the same everyw
             store(values, at, load(values, at) * factor)
 
 Vectors support `+ - * /`, comparisons, which return masks, and unary minus; masks support `&` and `|`. The other
-operand of arithmetic may be a scalar of the element type or of float32, such as `cpu.ONE`: a bare literal is float64
-and does not compile with float32 vectors. Comparisons need the element type itself. Sums and products may be fused, as
-everywhere in kernels. A comparison with NaN is false.
+operand may be a scalar of the element type or of float32, such as `cpu.ONE`: a bare literal is float64 and does not
+compile with float32 vectors. Sums and products may be fused, as everywhere in kernels. A comparison with NaN is false.
 
 A row of four pixels with four channels is a vector of 16 lanes; with three channels it is 12 numbers, in vectors of 8
 and 4 lanes. Memory holds all values of an item next to each other, such as the three coordinates of a point or its
@@ -37,6 +36,7 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 from glassplat.kernels.backend.cpu import FAST_MATH
 
 FLAGS = tuple(sorted(FAST_MATH))
+REALS = (types.float32, types.float64)
 MASK_BITS = 64
 """Lanes of the widest mask."""
 
@@ -77,7 +77,7 @@ class _MaskModel(models.PrimitiveModel):
 
 
 class VectorKind(NamedTuple):
-    """Operations on vectors of one element type and number of lanes.
+    """Operations on vectors of one number of lanes; their element type is that of the argument.
 
     Attributes:
         full: a scalar in every lane.
@@ -88,24 +88,24 @@ class VectorKind(NamedTuple):
     load: Intrinsic
 
 
-def vector_kind(real: type, lanes: int) -> VectorKind:
-    """The functions for vectors of `lanes` numbers of type `real`, np.float32 or np.float64."""
-    kind = VectorType(types.float64 if real is np.float64 else types.float32, lanes)
+def vector_kind(lanes: int) -> VectorKind:
+    """The functions for vectors of `lanes` numbers, float32 or float64."""
 
     @intrinsic
     def full(typing, value):
-        if value == kind.element:
+        if value in REALS:
+            kind = VectorType(value, lanes)
             return codegen(kind, (value,), lambda builder, x: _broadcast(builder, x, kind))
 
     @intrinsic
     def load(typing, array, at):
         def generate(context, builder, sig, arguments):
-            value = builder.load(_pointer(context, builder, sig, arguments, kind))
-            value.align = kind.element.bitwidth // 8
+            value = builder.load(_pointer(context, builder, sig, arguments, sig.return_type))
+            value.align = array.dtype.bitwidth // 8
             return value
 
-        if _is_flat(array, kind.element):
-            return kind(array, types.intp), generate
+        if _is_flat(array, *REALS):
+            return VectorType(array.dtype, lanes)(array, types.intp), generate
 
     return VectorKind(full, load)
 
@@ -280,6 +280,11 @@ def _broadcast(builder: Any, x: Any, kind: VectorType) -> Any:
     return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(index, kind.lanes), [0] * kind.lanes))
 
 
+def _as_vector(context: Any, builder: Any, value: Any, given: Any, kind: VectorType) -> Any:
+    """An operand as a vector; the type of a scalar may be float32 in place of the element type."""
+    return value if given == kind else _broadcast(builder, context.cast(builder, value, given, kind.element), kind)
+
+
 def _call(builder: Any, name: str, kind: VectorType, *values: Any) -> Any:
     vector = llvm_type(kind)
     full_name = f"llvm.{name}.v{kind.lanes}f{kind.element.bitwidth}"
@@ -300,10 +305,7 @@ def _arithmetic(symbol: Callable[..., Any], build: Callable[..., Any]) -> None:
 
     def lower(context: Any, builder: Any, sig: Any, values: Any) -> Any:
         kind = sig.return_type
-        full = (
-            v if t == kind else _broadcast(builder, context.cast(builder, v, t, kind.element), kind)
-            for v, t in zip(values, sig.args, strict=True)
-        )
+        full = (_as_vector(context, builder, v, t, kind) for v, t in zip(values, sig.args, strict=True))
         return build(builder, *full)
 
     for arguments in ((VectorType, VectorType), (VectorType, types.Float), (types.Float, VectorType)):
@@ -314,14 +316,14 @@ def _comparison(symbol: Callable[..., Any], name: str) -> None:
     @infer_global(symbol)
     class _Template(AbstractTemplate):
         def generic(self, arguments: Any, keywords: Any) -> Any:
-            if isinstance(arguments[0], VectorType) and arguments[1] in (arguments[0], arguments[0].element):
-                return signature(MaskType(arguments[0].lanes), *arguments)
+            kind = arguments[0]
+            if isinstance(kind, VectorType) and arguments[1] in (kind, kind.element, types.float32):
+                return signature(MaskType(kind.lanes), *arguments)
             return None
 
     def lower(context: Any, builder: Any, sig: Any, values: Any) -> Any:
-        kind = sig.args[0]
-        other = values[1] if sig.args[1] == kind else _broadcast(builder, values[1], kind)
-        return builder.fcmp_ordered(name, values[0], other)
+        kind, other = sig.args
+        return builder.fcmp_ordered(name, values[0], _as_vector(context, builder, values[1], other, kind))
 
     for second in (VectorType, types.Float):
         lower_builtin(symbol, VectorType, second)(lower)
@@ -487,14 +489,14 @@ def transpose(typing, rows):
         return codegen(rows, (rows,), build)
 
 
-def row_loader(real: type, lanes: int) -> Callable[..., Any]:
+def row_loader(lanes: int) -> Intrinsic:
     """Builds a function that loads `lanes` vectors of an array, each starting `at` elements after a given position."""
-    kind = VectorType(types.float64 if real is np.float64 else types.float32, lanes)
     index = ir.IntType(64)
 
     @intrinsic
     def load_rows(typing, array, positions, at):
         def generate(context, builder, sig, arguments):
+            kind = sig.return_type.dtype
             data, firsts = (context.make_array(sig.args[i])(context, builder, arguments[i]).data for i in range(2))
             rows = []
             for i in range(lanes):
@@ -505,8 +507,8 @@ def row_loader(real: type, lanes: int) -> Callable[..., Any]:
                 rows.append(row)
             return cgutils.pack_array(builder, rows, llvm_type(kind))
 
-        fits = _is_flat(array, kind.element) and _is_flat(positions, types.int64)
-        return (types.UniTuple(kind, lanes)(array, positions, types.intp), generate) if fits else None
+        if _is_flat(array, *REALS) and _is_flat(positions, types.int64):
+            return types.UniTuple(VectorType(array.dtype, lanes), lanes)(array, positions, types.intp), generate
 
     return load_rows
 
@@ -530,5 +532,5 @@ def store_all(typing, array, at, vectors):
         return types.void(array, types.intp, vectors), generate
 
 
-def _is_flat(array: Any, element: types.Type) -> bool:
-    return isinstance(array, types.Array) and array.ndim == 1 and array.layout == "C" and array.dtype == element
+def _is_flat(array: Any, *elements: types.Type) -> bool:
+    return isinstance(array, types.Array) and array.ndim == 1 and array.layout == "C" and array.dtype in elements

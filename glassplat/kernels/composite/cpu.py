@@ -34,10 +34,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numba import prange
-from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
+from glassplat.kernels.backend.cpu import ONE, Kernel, even_stride, inlined, kernel
 from glassplat.kernels.backend.cpu_vector import (
     absolute,
     bits_of,
@@ -66,6 +65,12 @@ from glassplat.kernels.composite.cpu_tile import (
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar
 from glassplat.kernels.records import LEAST_ALPHA, ON_MEAN, REAL_OF, Deviation, Splats, TileBins
 
+full, load = vector_kind(tile.LANES)
+load_row = vector_kind(tile.BLOCK).load
+BLOCK, ACROSS, BLOCKS, LANES, PIXELS = tile.BLOCK, tile.ACROSS, tile.BLOCKS, tile.LANES, tile.PIXELS
+T, LAST, T_GLASS, LAST_GLASS, STATE = tile.T, tile.LAST, tile.T_GLASS, tile.LAST_GLASS, tile.STATE
+MEAN_X, MEAN_Y, ORDER, VALUES = tile.MEAN_X, tile.MEAN_Y, tile.ORDER, tile.VALUES
+
 # Planes of a tile's results; SUMS has one per channel. T_AGAIN, CENTER, DEVIATION and LEAN belong to the second
 # traversal, which sums distances from the mean of the first.
 MASK, T_AGAIN, CENTER, DEVIATION, LEAN, SUMS = (plane * tile.PIXELS for plane in range(6))
@@ -73,13 +78,10 @@ MASK, T_AGAIN, CENTER, DEVIATION, LEAN, SUMS = (plane * tile.PIXELS for plane in
 
 def _blend_block(real: type, with_glass: bool) -> Scalar:
     """Builds the loop over the splats of a block, with or without glass splats."""
-    full, load = vector_kind(real, tile.LANES)
     x_centers, y_centers = tile.pixel_centers(real)
     exp2 = tile.exp2_of(real)
     zero, t_min, alpha_max = real(0.0), real(TRANSMITTANCE_MIN), real(ALPHA_MAX)
     least = real(math.log2(ALPHA_MIN))
-    T, LAST, T_GLASS, LAST_GLASS = tile.T, tile.LAST, tile.T_GLASS, tile.LAST_GLASS
-    MEAN_X, MEAN_Y, ORDER, VALUES, PIXELS = tile.MEAN_X, tile.MEAN_Y, tile.ORDER, tile.VALUES, tile.PIXELS
 
     @inlined
     def blend_block(state, at_state, planes, at, batch, width, entries, count, x, y, weights, keep):
@@ -121,7 +123,7 @@ def _blend_block(real: type, with_glass: bool) -> Scalar:
                 s2 = s2 + weight * item(batch, splat + VALUES + 2)
                 s3 = s3 + weight * item(batch, splat + VALUES + 3)
             if keep:
-                store(weights, e * tile.LANES, weight)
+                store(weights, e * LANES, weight)
             e += 1
             if e % STOP_AFTER == 0 and bits_of(t > zero) == 0:
                 break
@@ -140,39 +142,31 @@ def _blend_block(real: type, with_glass: bool) -> Scalar:
     return blend_block
 
 
-def _blend_more(real: type) -> Scalar:
-    load = vector_kind(real, tile.LANES).load
-    VALUES, PIXELS = tile.VALUES, tile.PIXELS
-
-    @inlined
-    def blend_more(planes, at, batch, width, entries, count, column, weights):
-        """Blends four more channels, starting at `column` of a splat, with the stored weights."""
-        at += SUMS + (column - VALUES) * PIXELS
-        s0, s1 = load(planes, at), load(planes, at + PIXELS)
-        s2, s3 = load(planes, at + 2 * PIXELS), load(planes, at + 3 * PIXELS)
-        for e in range(count):
-            k = item(entries, e)
-            if k >= 0:
-                value, weight = k * width + column, load(weights, e * tile.LANES)
-                s0 = s0 + weight * item(batch, value)
-                s1 = s1 + weight * item(batch, value + 1)
-                s2 = s2 + weight * item(batch, value + 2)
-                s3 = s3 + weight * item(batch, value + 3)
-        store(planes, at, s0)
-        store(planes, at + PIXELS, s1)
-        store(planes, at + 2 * PIXELS, s2)
-        store(planes, at + 3 * PIXELS, s3)
-
-    return blend_more
+@inlined
+def _blend_more(planes, at, batch, width, entries, count, column, weights):
+    """Blends four more channels, starting at `column` of a splat, with the stored weights."""
+    at += SUMS + (column - VALUES) * PIXELS
+    s0, s1 = load(planes, at), load(planes, at + PIXELS)
+    s2, s3 = load(planes, at + 2 * PIXELS), load(planes, at + 3 * PIXELS)
+    for e in range(count):
+        k = item(entries, e)
+        if k >= 0:
+            value, weight = k * width + column, load(weights, e * LANES)
+            s0 = s0 + weight * item(batch, value)
+            s1 = s1 + weight * item(batch, value + 1)
+            s2 = s2 + weight * item(batch, value + 2)
+            s3 = s3 + weight * item(batch, value + 3)
+    store(planes, at, s0)
+    store(planes, at + PIXELS, s1)
+    store(planes, at + 2 * PIXELS, s2)
+    store(planes, at + 3 * PIXELS, s3)
 
 
 def _deviate_block(real: type) -> Scalar:
-    full, load = vector_kind(real, tile.LANES)
     x_centers, y_centers = tile.pixel_centers(real)
     exp2 = tile.exp2_of(real)
     zero, alpha_max, least = real(0.0), real(ALPHA_MAX), real(math.log2(ALPHA_MIN))
     on_mean = real(ON_MEAN * np.finfo(real).eps)
-    MEAN_X, MEAN_Y, ORDER, LAST = tile.MEAN_X, tile.MEAN_Y, tile.ORDER, tile.LAST
 
     @inlined
     def deviate_block(state, at_state, planes, at, batch, width, entries, count, x, y, column):
@@ -199,47 +193,42 @@ def _deviate_block(real: type) -> Scalar:
     return deviate_block
 
 
-def _write_tile(real: type) -> Scalar:
-    """Builds the function that writes a tile to the flat images."""
-    one = real(1.0)
-    load, load_row = vector_kind(real, tile.LANES).load, vector_kind(real, tile.BLOCK).load
-    BLOCK, ACROSS, LANES, PIXELS, T = tile.BLOCK, tile.ACROSS, tile.LANES, tile.PIXELS, tile.T
+@inlined
+def _write_whole_block(state, at, planes, i, image, alpha, first, width, channels):
+    """Writes a block of three or four channels that lies within the image; `first` is its first pixel."""
+    s0, s1 = load(planes, SUMS + i), load(planes, SUMS + PIXELS + i)
+    s2, s3 = load(planes, SUMS + 2 * PIXELS + i), load(planes, SUMS + 3 * PIXELS + i)
+    rows = interleave((s0, s1, s2, s3))
+    for y in range(BLOCK):
+        store(alpha, first + y * width, ONE - load_row(state, at + T + i + y * BLOCK))
+        if channels == 4:
+            store(image, (first + y * width) * 4, rows[y])
+        else:
+            eight, four = drop_fourths(rows[y])
+            store(image, (first + y * width) * 3, eight)
+            store(image, (first + y * width) * 3 + 8, four)
 
-    @inlined
-    def write_whole_block(state, at, planes, i, image, alpha, first, width, channels):
-        """Writes a block of three or four channels that lies within the image; `first` is its first pixel."""
-        s0, s1 = load(planes, SUMS + i), load(planes, SUMS + PIXELS + i)
-        s2, s3 = load(planes, SUMS + 2 * PIXELS + i), load(planes, SUMS + 3 * PIXELS + i)
-        rows = interleave((s0, s1, s2, s3))
-        for y in range(BLOCK):
-            store(alpha, first + y * width, one - load_row(state, at + T + i + y * BLOCK))
-            if channels == 4:
-                store(image, (first + y * width) * 4, rows[y])
-            else:
-                eight, four = drop_fourths(rows[y])
-                store(image, (first + y * width) * 3, eight)
-                store(image, (first + y * width) * 3 + 8, four)
 
-    @inlined
-    def write_block(state, at, planes, i, image, alpha, first, width, columns, rows, channels):
-        for y in range(min(BLOCK, rows)):
-            for x in range(min(BLOCK, columns)):
-                pixel, lane = first + y * width + x, i + y * BLOCK + x
-                alpha[pixel] = one - state[at + T + lane]
-                for d in range(channels):
-                    image[pixel * channels + d] = planes[SUMS + d * PIXELS + lane]
+@inlined
+def _write_block(state, at, planes, i, image, alpha, first, width, columns, rows, channels):
+    for y in range(min(BLOCK, rows)):
+        for x in range(min(BLOCK, columns)):
+            pixel, lane = first + y * width + x, i + y * BLOCK + x
+            alpha[pixel] = ONE - state[at + T + lane]
+            for d in range(channels):
+                image[pixel * channels + d] = planes[SUMS + d * PIXELS + lane]
 
-    @inlined
-    def write_tile(state, at, planes, image, alpha, first, width, columns, rows, channels):
-        for b in range(tile.BLOCKS):
-            x, y = b % ACROSS * BLOCK, b // ACROSS * BLOCK
-            corner = first + y * width + x
-            if 3 <= channels <= 4 and x + BLOCK <= columns and y + BLOCK <= rows:
-                write_whole_block(state, at, planes, b * LANES, image, alpha, corner, width, channels)
-            elif x < columns and y < rows:
-                write_block(state, at, planes, b * LANES, image, alpha, corner, width, columns - x, rows - y, channels)
 
-    return write_tile
+@inlined
+def write_tile(state, at, planes, image, alpha, first, width, columns, rows, channels):
+    """Writes a tile to the flat images."""
+    for b in range(BLOCKS):
+        x, y = b % ACROSS * BLOCK, b // ACROSS * BLOCK
+        corner = first + y * width + x
+        if 3 <= channels <= 4 and x + BLOCK <= columns and y + BLOCK <= rows:
+            _write_whole_block(state, at, planes, b * LANES, image, alpha, corner, width, channels)
+        elif x < columns and y < rows:
+            _write_block(state, at, planes, b * LANES, image, alpha, corner, width, columns - x, rows - y, channels)
 
 
 @inlined
@@ -261,7 +250,6 @@ def write_deviation(planes, where, deviation, first, width, columns, rows):
 
 def _begin_deviation(real: type) -> Scalar:
     one, zero, least_alpha = real(1.0), real(0.0), real(LEAST_ALPHA)
-    PIXELS = tile.PIXELS
 
     @inlined
     def begin_deviation(state, at, planes, channel, where, first, width, columns, rows):
@@ -271,7 +259,7 @@ def _begin_deviation(real: type) -> Scalar:
             for x in range(columns):
                 wanted |= where[first + y * width + x] != zero
         for i in range(PIXELS):
-            covered = one - state[at + tile.T + i]
+            covered = one - state[at + T + i]
             total = planes[SUMS + channel * PIXELS + i]
             planes[CENTER + i] = total / max(covered, least_alpha) if covered > least_alpha else zero
             planes[T_AGAIN + i] = one
@@ -284,14 +272,10 @@ def _begin_deviation(real: type) -> Scalar:
 @functools.cache
 def composite_forward(real: type) -> Kernel:
     """Builds the kernel that blends all tiles."""
-    pack, fetch, reached = tile.pack_of(real), tile.fetch_of(real), tile.reached_of(real)
-    blend_plain, blend_mixed = _blend_block(real, False), _blend_block(real, True)
-    blend_more, deviate_block = _blend_more(real), _deviate_block(real)
-    begin, finish, write_tile = tile.begin_state(real), tile.finish_state(real), _write_tile(real)
+    pack, reached, begin = tile.pack_of(real), tile.reached_of(real), tile.begin_state(real)
+    blend_plain, blend_mixed, deviate_block = _blend_block(real, False), _blend_block(real, True), _deviate_block(real)
     begin_deviation, zero = _begin_deviation(real), real(0.0)
-    BLOCK, ACROSS, BLOCKS, LANES, PIXELS = tile.BLOCK, tile.ACROSS, tile.BLOCKS, tile.LANES, tile.PIXELS
-    VALUES, ORDER, CHUNK, GLASS, STATE = tile.VALUES, tile.ORDER, tile.CHUNK, tile.GLASS, tile.STATE
-    TILES = tile.TILES
+    CHUNK, GLASS, TILES = tile.CHUNK, tile.GLASS, tile.TILES
 
     @kernel("composite_forward", real)
     def forward(
@@ -331,7 +315,7 @@ def composite_forward(real: type) -> Kernel:
                 planes[MASK : MASK + PIXELS], planes[SUMS:] = zero, zero
                 for first in range(start, stop, CHUNK):
                     last = min(first + CHUNK, stop)
-                    fetch(batch, packed, pair_splats, first, last, width, x0, y0)
+                    tile.fetch(batch, packed, pair_splats, first, last, width, x0, y0)
                     any_glass = False
                     for p in range(first, last):
                         bits = reached(batch, (p - first) * width) & running
@@ -358,7 +342,7 @@ def composite_forward(real: type) -> Kernel:
                                 state, at + i, planes, i, batch, width, entries, count, x, y, weights, groups > 1
                             )
                         for group in range(1, groups):
-                            blend_more(planes, i, batch, width, entries, taken, VALUES + 4 * group, weights)
+                            _blend_more(planes, i, batch, width, entries, taken, VALUES + 4 * group, weights)
                         if not runs:
                             running &= ~(np.int64(1) << b)
                             # Splats that the stopped block has skipped must not reach it in the backward pass.
@@ -368,7 +352,7 @@ def composite_forward(real: type) -> Kernel:
                     if running == 0:
                         stop = last
                         break
-                finish(state, at)
+                tile.finish_state(state, at)
                 corner = (camera * height + y0) * image_width + x0
                 write_tile(state, at, planes, image, alpha, corner, image_width, columns, rows, num_channels)
                 if num_primary < splats_per_camera:
@@ -379,7 +363,7 @@ def composite_forward(real: type) -> Kernel:
                     continue
                 for first in range(start, stop, CHUNK):
                     last = min(first + CHUNK, stop)
-                    fetch(batch, packed, pair_splats, first, last, width, x0, y0)
+                    tile.fetch(batch, packed, pair_splats, first, last, width, x0, y0)
                     for p in range(first, last):
                         batch[(p - first) * width + ORDER] = real(np.int32(p - start))
                     for b in range(BLOCKS):
@@ -408,10 +392,10 @@ class Saved(NamedTuple):
     minus that of splats below.
     """
 
-    packed: NDArray[Any]
-    pairs: NDArray[np.int32]
-    state: NDArray[Any]
-    spread: NDArray[Any]
+    packed: Tensor
+    pairs: Tensor
+    state: Tensor
+    spread: Tensor
 
 
 def composite(
@@ -430,16 +414,15 @@ def composite(
     image, alpha, mask = (torch.from_numpy(np.zeros(size, REAL_OF[dtype])) for size in sizes)
     deviated = torch.zeros(shape if deviation else (0, 0, 0), dtype=dtype)
     # Arrays of PyTorch, because they are aligned to cache lines, and a packed splat fills one.
-    lengths = cameras * count * tile.row_width(tile.VALUES, num_channels), tiles * tile.STATE
-    packed, state = (torch.empty(length, dtype=dtype).numpy() for length in lengths)
-    spread = torch.zeros(tiles * 2 * tile.PIXELS if deviation else 0, dtype=dtype).numpy()
-    saved = Saved(packed, np.empty(len(bins.pair_splats), np.int32), state, spread)
+    lengths = cameras * count * tile.row_width(VALUES, num_channels), tiles * STATE
+    packed, state = (torch.empty(length, dtype=dtype) for length in lengths)
+    spread = torch.zeros(tiles * 2 * PIXELS if deviation else 0, dtype=dtype)
+    saved = Saved(packed, torch.empty(len(bins.pair_splats), dtype=torch.int32), state, spread)
     where = tile.flat(deviation.where.detach()) if deviation else spread
     composite_forward(REAL_OF[channels.dtype])(
-        *(t.numpy() for t in tile.joined_cameras((*splats[:3], channels))), marks.numpy(), count, num_primary,
-        bins.width, bins.height,
+        *tile.joined_cameras((*splats[:3], channels)), marks, count, num_primary, bins.width, bins.height,
         deviation.channel if deviation else -1, where,
-        bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.splat_offsets.numpy(), bins.active.numpy(),
+        bins.pair_splats, bins.tile_offsets, bins.splat_offsets, bins.active,
         *saved, *(tile.flat(output) for output in (image, alpha, mask, deviated)),
     )  # fmt: skip
     return image, alpha, mask, deviated, saved
@@ -462,7 +445,7 @@ def composite_gradients(
         v_deviation = v_deviation * deviation.where
     composite_backward(REAL_OF[channels.dtype], with_absgrad)(
         cameras * count, num_primary < count, num_channels, bins.width, bins.height, channel, through_mean,
-        bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.active.numpy(), *saved,
+        bins.pair_splats, bins.tile_offsets, bins.active, *saved,
         *(tile.flat(v) for v in (*v_images, v_deviation)), rows,
     )  # fmt: skip
     return sum_pair_rows(rows, bins, splats, num_channels, with_absgrad)

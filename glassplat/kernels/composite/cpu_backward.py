@@ -33,6 +33,10 @@ from glassplat.kernels.composite.cpu_tile import PAIR_VALUES, exponent, lane_of,
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, Scalar
 from glassplat.kernels.records import LEAST_ALPHA, ON_MEAN
 
+(full, load), load_eight = vector_kind(tile.LANES), vector_kind(2 * tile.BLOCK).load
+load_row = vector_kind(tile.BLOCK).load
+BLOCK, ACROSS, LANES, PIXELS, VALUES = tile.BLOCK, tile.ACROSS, tile.LANES, tile.PIXELS, tile.VALUES
+
 # Planes of the backward pass; V_IMAGE has one per channel. T and T_GLASS are transmittances in front of the current
 # splat, BEHIND and BEHIND_GLASS the gradient-weighted sums behind it, WEIGHT its blending weight.
 T, T_GLASS, BEHIND, BEHIND_GLASS, V_MASK, V_DEVIATION, CENTER, WEIGHT, V_IMAGE = (
@@ -45,14 +49,11 @@ LEAN = PAIR_VALUES + tile.GROUP
 
 
 def _unblend(real: type, with_absgrad: bool, of_glass: bool) -> Scalar:
-    full, load = vector_kind(real, tile.LANES)
     x_centers, y_centers = tile.pixel_centers(real)
-    exp2, dot_more, sided = tile.exp2_of(real), _dot_more(real), _sided(real)
+    exp2, sided = tile.exp2_of(real), _sided(real)
     zero, one, two, alpha_max = real(0.0), real(1.0), real(2.0), real(ALPHA_MAX)
     least = real(math.log2(ALPHA_MIN))
-    BLOCK, ACROSS, LANES, PIXELS = tile.BLOCK, tile.ACROSS, tile.LANES, tile.PIXELS
     MEAN_X, MEAN_Y, FORM_XX, FORM_XY, FORM_YY = tile.MEAN_X, tile.MEAN_Y, tile.FORM_XX, tile.FORM_XY, tile.FORM_YY
-    ORDER, VALUES = tile.ORDER, tile.VALUES
     OWN_T, OWN_BEHIND, LAST = (T_GLASS, BEHIND_GLASS, tile.LAST_GLASS) if of_glass else (T, BEHIND, tile.LAST)
 
     @inlined
@@ -73,7 +74,7 @@ def _unblend(real: type, with_absgrad: bool, of_glass: bool) -> Scalar:
             dy = y_centers() + (real(b // ACROSS * BLOCK) - item(batch, splat + MEAN_Y))
             bits = exponent(batch, splat, dx, dy)
             coverage = exp2(bits)
-            shown = (bits >= least) & (load(state, at + LAST + i) >= item(batch, splat + ORDER))
+            shown = (bits >= least) & (load(state, at + LAST + i) >= item(batch, splat + tile.ORDER))
             alpha = select(shown, minimum(coverage, most), none)
             inverse = one / (one - alpha)
             t, behind = load(planes, OWN_T + i) * inverse, load(planes, OWN_BEHIND + i)
@@ -89,7 +90,7 @@ def _unblend(real: type, with_absgrad: bool, of_glass: bool) -> Scalar:
                 dot = v0 * item(batch, splat + VALUES) + v1 * item(batch, splat + VALUES + 1)
                 dot = dot + (v2 * item(batch, splat + VALUES + 2) + v3 * item(batch, splat + VALUES + 3))
                 if groups > 1:
-                    dot = dot_more(dot, planes, i, batch, splat, groups, deviating)
+                    dot = _dot_more(dot, planes, i, batch, splat, groups, deviating)
                     store(planes, WEIGHT + i, weight)
                 elif deviating >= 0:
                     center = load(planes, CENTER + i)
@@ -117,7 +118,7 @@ def _unblend(real: type, with_absgrad: bool, of_glass: bool) -> Scalar:
 
 
 def _sided(real: type) -> Scalar:
-    full, zero, on_mean = vector_kind(real, tile.LANES).full, real(0.0), real(ON_MEAN * np.finfo(real).eps)
+    zero, on_mean = real(0.0), real(ON_MEAN * np.finfo(real).eps)
 
     @inlined
     def sided(difference, center, slope):
@@ -128,29 +129,22 @@ def _sided(real: type) -> Scalar:
     return sided
 
 
-def _dot_more(real: type) -> Scalar:
-    load = vector_kind(real, tile.LANES).load
-    PIXELS, VALUES = tile.PIXELS, tile.VALUES
-
-    @inlined
-    def dot_more(dot, planes, i, batch, splat, groups, deviating):
-        """Adds channels beyond the first four to the dot product, and the deviation of one channel."""
-        for d in range(4, groups * 4, 4):
-            v, value = V_IMAGE + d * PIXELS + i, splat + VALUES + d
-            dot = dot + (load(planes, v) * item(batch, value) + load(planes, v + PIXELS) * item(batch, value + 1))
-            v, value = v + 2 * PIXELS, value + 2
-            dot = dot + (load(planes, v) * item(batch, value) + load(planes, v + PIXELS) * item(batch, value + 1))
-        if deviating >= 0:
-            difference = item(batch, splat + VALUES + deviating) - load(planes, CENTER + i)
-            dot = dot + load(planes, V_DEVIATION + i) * absolute(difference)
-        return dot
-
-    return dot_more
+@inlined
+def _dot_more(dot, planes, i, batch, splat, groups, deviating):
+    """Adds channels beyond the first four to the dot product, and the deviation of one channel."""
+    for d in range(4, groups * 4, 4):
+        v, value = V_IMAGE + d * PIXELS + i, splat + VALUES + d
+        dot = dot + (load(planes, v) * item(batch, value) + load(planes, v + PIXELS) * item(batch, value + 1))
+        v, value = v + 2 * PIXELS, value + 2
+        dot = dot + (load(planes, v) * item(batch, value) + load(planes, v + PIXELS) * item(batch, value + 1))
+    if deviating >= 0:
+        difference = item(batch, splat + VALUES + deviating) - load(planes, CENTER + i)
+        dot = dot + load(planes, V_DEVIATION + i) * absolute(difference)
+    return dot
 
 
 def _sum_more(real: type) -> Scalar:
-    full, load = vector_kind(real, tile.LANES)
-    zero, LANES, VALUES, sided = real(0.0), tile.LANES, tile.VALUES, _sided(real)
+    zero, sided = real(0.0), _sided(real)
     sum_channels = tile.sum_channels_of(real, V_IMAGE, WEIGHT, PAIR_VALUES)
 
     @inlined
@@ -174,55 +168,50 @@ def _sum_more(real: type) -> Scalar:
     return sum_more
 
 
-def _load_gradients(real: type) -> Scalar:
-    load, load_eight, load_row = (vector_kind(real, lanes).load for lanes in (tile.LANES, 2 * tile.BLOCK, tile.BLOCK))
-    BLOCK, ACROSS, LANES, PIXELS = tile.BLOCK, tile.ACROSS, tile.LANES, tile.PIXELS
+@inlined
+def _load_row_of_four(v_image, pixel, channels):
+    if channels == 4:
+        return load(v_image, pixel * 4)
+    return pad_fourths(load_eight(v_image, pixel * 3), load_row(v_image, pixel * 3 + 8))
 
-    @inlined
-    def load_row_of_four(v_image, pixel, channels):
-        if channels == 4:
-            return load(v_image, pixel * 4)
-        return pad_fourths(load_eight(v_image, pixel * 3), load_row(v_image, pixel * 3 + 8))
 
-    @inlined
-    def load_whole_block(planes, i, v_image, v_alpha, first, width, channels):
-        """Loads a block of three or four channels that lies within the image; `first` is its first pixel."""
-        r0, r1 = load_row_of_four(v_image, first, channels), load_row_of_four(v_image, first + width, channels)
-        r2 = load_row_of_four(v_image, first + 2 * width, channels)
-        r3 = load_row_of_four(v_image, first + 3 * width, channels)
-        v0, v1, v2, v3 = deinterleave((r0, r1, r2, r3))
-        store(planes, V_IMAGE + i, v0)
-        store(planes, V_IMAGE + PIXELS + i, v1)
-        store(planes, V_IMAGE + 2 * PIXELS + i, v2)
-        store(planes, V_IMAGE + 3 * PIXELS + i, v3)
-        for y in range(BLOCK):
-            store(planes, BEHIND + i + y * BLOCK, load_row(v_alpha, first + y * width))
+@inlined
+def _load_whole_block(planes, i, v_image, v_alpha, first, width, channels):
+    """Loads a block of three or four channels that lies within the image; `first` is its first pixel."""
+    r0, r1 = _load_row_of_four(v_image, first, channels), _load_row_of_four(v_image, first + width, channels)
+    r2 = _load_row_of_four(v_image, first + 2 * width, channels)
+    r3 = _load_row_of_four(v_image, first + 3 * width, channels)
+    v0, v1, v2, v3 = deinterleave((r0, r1, r2, r3))
+    store(planes, V_IMAGE + i, v0)
+    store(planes, V_IMAGE + PIXELS + i, v1)
+    store(planes, V_IMAGE + 2 * PIXELS + i, v2)
+    store(planes, V_IMAGE + 3 * PIXELS + i, v3)
+    for y in range(BLOCK):
+        store(planes, BEHIND + i + y * BLOCK, load_row(v_alpha, first + y * width))
 
-    @inlined
-    def load_gradients(planes, v_image, v_alpha, first, width, columns, rows, channels):
-        """Fills V_IMAGE and BEHIND; pixels outside the image stay zero."""
-        for b in range(tile.BLOCKS):
-            x0, y0 = b % ACROSS * BLOCK, b // ACROSS * BLOCK
-            corner = first + y0 * width + x0
-            if 3 <= channels <= 4 and x0 + BLOCK <= columns and y0 + BLOCK <= rows:
-                load_whole_block(planes, b * LANES, v_image, v_alpha, corner, width, channels)
-                continue
-            for y in range(min(BLOCK, rows - y0)):
-                for x in range(min(BLOCK, columns - x0)):
-                    pixel, i = corner + y * width + x, b * LANES + y * BLOCK + x
-                    planes[BEHIND + i] = v_alpha[pixel]
-                    for d in range(channels):
-                        planes[V_IMAGE + d * PIXELS + i] = v_image[pixel * channels + d]
-        # alpha = 1 - T: its gradient acts like that of a background.
-        for i in range(0, PIXELS, LANES):
-            store(planes, BEHIND + i, -load(planes, BEHIND + i) * load(planes, T + i))
 
-    return load_gradients
+@inlined
+def _load_gradients(planes, v_image, v_alpha, first, width, columns, rows, channels):
+    """Fills V_IMAGE and BEHIND; pixels outside the image stay zero."""
+    for b in range(tile.BLOCKS):
+        x0, y0 = b % ACROSS * BLOCK, b // ACROSS * BLOCK
+        corner = first + y0 * width + x0
+        if 3 <= channels <= 4 and x0 + BLOCK <= columns and y0 + BLOCK <= rows:
+            _load_whole_block(planes, b * LANES, v_image, v_alpha, corner, width, channels)
+            continue
+        for y in range(min(BLOCK, rows - y0)):
+            for x in range(min(BLOCK, columns - x0)):
+                pixel, i = corner + y * width + x, b * LANES + y * BLOCK + x
+                planes[BEHIND + i] = v_alpha[pixel]
+                for d in range(channels):
+                    planes[V_IMAGE + d * PIXELS + i] = v_image[pixel * channels + d]
+    # alpha = 1 - T: its gradient acts like that of a background.
+    for i in range(0, PIXELS, LANES):
+        store(planes, BEHIND + i, -load(planes, BEHIND + i) * load(planes, T + i))
 
 
 def _load_deviation(real: type) -> Scalar:
     one, zero, least_alpha = real(1.0), real(0.0), real(LEAST_ALPHA)
-    PIXELS = tile.PIXELS
 
     @inlined
     def load_deviation(planes, spread, n, channel, through_mean, v_deviation, first, width, columns, rows):
@@ -236,7 +225,7 @@ def _load_deviation(real: type) -> Scalar:
                 covered = one - planes[T + i]
                 planes[V_DEVIATION + i], planes[CENTER + i] = v, middle
                 if v != zero and through_mean and covered > least_alpha:
-                    # The mean is the channel's sum over the coverage; alpha's gradient acts as in `load_gradients`.
+                    # The mean is the channel's sum over the coverage; alpha's gradient acts as in `_load_gradients`.
                     v_sum = -v * lean / covered
                     planes[V_IMAGE + channel * PIXELS + i] += v_sum
                     planes[BEHIND + i] += v_sum * middle * planes[T + i]
@@ -245,44 +234,35 @@ def _load_deviation(real: type) -> Scalar:
     return load_deviation
 
 
-def _begin(real: type) -> Scalar:
-    load, LANES, PIXELS = vector_kind(real, tile.LANES).load, tile.LANES, tile.PIXELS
-
-    @inlined
-    def begin(planes, state, at, v_mask, first, width, columns, rows, with_glass):
-        """Loads final transmittances; returns the number of pairs up to the last one evaluated by a pixel."""
-        planes[:] = ZERO
-        for i in range(0, PIXELS, LANES):
-            store(planes, T + i, load(state, at + tile.T + i))
-            store(planes, T_GLASS + i, load(state, at + tile.T_GLASS + i))
-        if with_glass:
-            for y in range(rows):
-                for x in range(columns):
-                    planes[V_MASK + lane_of(x, y)] = v_mask[first + y * width + x]
-        latest = load(state, at + tile.LAST)
-        for i in range(0, PIXELS, LANES):
-            of_both = maximum(load(state, at + tile.LAST + i), load(state, at + tile.LAST_GLASS + i))
-            latest = maximum(latest, of_both)
-        # WEIGHT serves as scratch here, because it is written again before it is read.
-        store(planes, WEIGHT, latest)
-        most = planes[WEIGHT]
-        for i in range(1, LANES):
-            most = max(most, planes[WEIGHT + i])
-        return int(most) + 1
-
-    return begin
+@inlined
+def _begin(planes, state, at, v_mask, first, width, columns, rows, with_glass):
+    """Loads final transmittances; returns the number of pairs up to the last one evaluated by a pixel."""
+    planes[:] = ZERO
+    for i in range(0, PIXELS, LANES):
+        store(planes, T + i, load(state, at + tile.T + i))
+        store(planes, T_GLASS + i, load(state, at + tile.T_GLASS + i))
+    if with_glass:
+        for y in range(rows):
+            for x in range(columns):
+                planes[V_MASK + lane_of(x, y)] = v_mask[first + y * width + x]
+    latest = load(state, at + tile.LAST)
+    for i in range(0, PIXELS, LANES):
+        of_both = maximum(load(state, at + tile.LAST + i), load(state, at + tile.LAST_GLASS + i))
+        latest = maximum(latest, of_both)
+    # WEIGHT serves as scratch here, because it is written again before it is read.
+    store(planes, WEIGHT, latest)
+    most = planes[WEIGHT]
+    for i in range(1, LANES):
+        most = max(most, planes[WEIGHT + i])
+    return int(most) + 1
 
 
 @functools.cache
 def composite_backward(real: type, with_absgrad: bool) -> Kernel:
     """Builds the kernel that fills one row of sums per pair, given the final state of each tile."""
-    fetch = tile.fetch_of(real)
     unblend_primary, unblend_glass = _unblend(real, with_absgrad, False), _unblend(real, with_absgrad, True)
-    begin, sum_more = _begin(real), _sum_more(real)
-    load_gradients, load_deviation = _load_gradients(real), _load_deviation(real)
-    zero = real(0.0)
-    LANES, PIXELS, STATE, CHUNK, GLASS = tile.LANES, tile.PIXELS, tile.STATE, tile.CHUNK, tile.GLASS
-    ORDER, REACHED, TILES = tile.ORDER, (1 << tile.BLOCKS) - 1, tile.TILES
+    sum_more, load_deviation, zero = _sum_more(real), _load_deviation(real), real(0.0)
+    CHUNK, TILES, REACHED = tile.CHUNK, tile.TILES, (1 << tile.BLOCKS) - 1
 
     @kernel("composite_backward_absgrad" if with_absgrad else "composite_backward", real)
     def backward(
@@ -304,9 +284,9 @@ def composite_backward(real: type, with_absgrad: bool) -> Kernel:
                 if start == stop:
                     continue
                 camera, x0, y0, columns, lines = tile_bounds(active[n], image_width, height)
-                corner, at = (camera * height + y0) * image_width + x0, n * STATE
-                looked_at = begin(planes, state, at, v_mask, corner, image_width, columns, lines, with_glass)
-                load_gradients(planes, v_image, v_alpha, corner, image_width, columns, lines, num_channels)
+                corner, at = (camera * height + y0) * image_width + x0, n * tile.STATE
+                looked_at = _begin(planes, state, at, v_mask, corner, image_width, columns, lines, with_glass)
+                _load_gradients(planes, v_image, v_alpha, corner, image_width, columns, lines, num_channels)
                 deviating = channel
                 if channel >= 0 and not load_deviation(
                     planes, spread, n, channel, through_mean, v_deviation, corner, image_width, columns, lines
@@ -316,15 +296,15 @@ def composite_backward(real: type, with_absgrad: bool) -> Kernel:
                 for behind in range(0, looked_at, CHUNK):
                     last = start + looked_at - behind
                     first = max(last - CHUNK, start)
-                    fetch(batch, packed, pair_splats, first, last, width, x0, y0)
+                    tile.fetch(batch, packed, pair_splats, first, last, width, x0, y0)
                     for k in range(last - first):
                         p = last - 1 - k
                         splat, row = (p - first) * width, p * row_width
-                        batch[splat + ORDER] = real(np.int32(p - start))
+                        batch[splat + tile.ORDER] = real(np.int32(p - start))
                         blocks = np.int64(pairs[p]) & REACHED
                         if blocks == 0:
                             rows[row : row + row_width] = zero
-                        elif (pairs[p] >> GLASS) & 1:
+                        elif (pairs[p] >> tile.GLASS) & 1:
                             unblend_glass(planes, state, at, batch, splat, blocks, groups, deviating, rows, row)
                             rows[row + LANES : row + row_width] = zero
                         else:

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numba import prange
-from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.kernels.backend.cpu import ENDLESS, ONE, ZERO, Kernel, even_stride, inlined, kernel
@@ -36,6 +35,9 @@ from glassplat.kernels.composite.cpu_tile import PIXELS, SPLATS, STOP_AFTER, lan
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar
 from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, intersect, offset_gradient
 from glassplat.kernels.records import REAL_OF, Discs, TileBins
+
+full, load = vector_kind(tile.LANES)
+BLOCK, ACROSS, BLOCKS, LANES, CHUNK = tile.BLOCK, tile.ACROSS, tile.BLOCKS, tile.LANES, tile.CHUNK
 
 # Columns of a packed disc: first its outline as a packed splat, whose ORDER column is reused once blocks are known.
 CENTER_X, CENTER_Y, U_X, U_Y, V_X, V_Y, W_X, W_Y, BITS, Z, INVERSE_Z, VALUES = range(tile.VALUES, tile.VALUES + 12)
@@ -75,23 +77,17 @@ def _pack(real: type) -> Scalar:
     return pack
 
 
-def _fetch(real: type) -> Scalar:
-    fetch_splats = tile.fetch_of(real)
-
-    @inlined
-    def fetch(batch, packed, pair_splats, first, last, width, x0, y0):
-        """Copies the packed discs of consecutive pairs to a contiguous batch, with centres relative to the tile."""
-        fetch_splats(batch, packed, pair_splats, first, last, width, x0, y0)
-        for k in range(last - first):
-            batch[k * width + CENTER_X] -= real(x0)
-            batch[k * width + CENTER_Y] -= real(y0)
-
-    return fetch
+@inlined
+def _fetch(batch, packed, pair_splats, first, last, width, x0, y0):
+    """Copies the packed discs of consecutive pairs to a contiguous batch, with centres relative to the tile."""
+    tile.fetch(batch, packed, pair_splats, first, last, width, x0, y0)
+    for k in range(last - first):
+        batch[k * width + CENTER_X] -= np.float32(x0)
+        batch[k * width + CENTER_Y] -= np.float32(y0)
 
 
 def _cover(real: type) -> Scalar:
-    exp2, full = tile.exp2_of(real), vector_kind(real, tile.LANES).full
-    x_centers, y_centers = tile.pixel_centers(real)
+    exp2, (x_centers, y_centers) = tile.exp2_of(real), tile.pixel_centers(real)
     zero, one, farthest = real(0.0), real(1.0), real(MOST_DEVIATIONS**2)
     half_bits, least = real(0.5 / math.log(2.0)), real(math.log2(ALPHA_MIN))
     far = real(4 * MOST_DEVIATIONS**2)
@@ -137,7 +133,6 @@ DEPTH_SUM, MIDDLE, DISTORTION, SUMS = (plane * tile.PIXELS for plane in range(4)
 
 def _blend_block(real: type) -> Scalar:
     """Builds the loop over the discs of a block."""
-    full, load = vector_kind(real, tile.LANES)
     cover = _cover(real)
     zero, half, one, t_min, alpha_max = real(0.0), real(0.5), real(1.0), real(TRANSMITTANCE_MIN), real(ALPHA_MAX)
 
@@ -171,7 +166,7 @@ def _blend_block(real: type) -> Scalar:
             middle, middle_at = select(halfway, z, middle), select(halfway, position, middle_at)
             last = select(weight > zero, position, last)
             t = select(alive, after, -absolute(t))
-            store(weights, e * tile.LANES, weight)
+            store(weights, e * LANES, weight)
             e += 1
             if e % STOP_AFTER == 0 and bits_of(t > zero) == 0:
                 break
@@ -189,29 +184,23 @@ def _blend_block(real: type) -> Scalar:
     return blend_block
 
 
-def _blend_channels(real: type) -> Scalar:
-    load, zero = vector_kind(real, tile.LANES).load, real(0.0)
-    PIXELS, LANES = tile.PIXELS, tile.LANES
-
-    @inlined
-    def blend_channels(planes, at, batch, width, entries, count, column, weights):
-        """Blends four channels, starting at `column` of a disc."""
-        s0, s1 = load(planes, at), load(planes, at + PIXELS)
-        s2, s3 = load(planes, at + 2 * PIXELS), load(planes, at + 3 * PIXELS)
-        for e in range(count):
-            weight, value = load(weights, e * LANES), item(entries, e) * width + column
-            # Skips discs that no pixel of the block shows, because their channels can be non-finite.
-            if bits_of(weight > zero) != 0:
-                s0 = s0 + weight * item(batch, value)
-                s1 = s1 + weight * item(batch, value + 1)
-                s2 = s2 + weight * item(batch, value + 2)
-                s3 = s3 + weight * item(batch, value + 3)
-        store(planes, at, s0)
-        store(planes, at + PIXELS, s1)
-        store(planes, at + 2 * PIXELS, s2)
-        store(planes, at + 3 * PIXELS, s3)
-
-    return blend_channels
+@inlined
+def _blend_channels(planes, at, batch, width, entries, count, column, weights):
+    """Blends four channels, starting at `column` of a disc."""
+    s0, s1 = load(planes, at), load(planes, at + PIXELS)
+    s2, s3 = load(planes, at + 2 * PIXELS), load(planes, at + 3 * PIXELS)
+    for e in range(count):
+        weight, value = load(weights, e * LANES), item(entries, e) * width + column
+        # Skips discs that no pixel of the block shows, because their channels can be non-finite.
+        if bits_of(weight > ZERO) != 0:
+            s0 = s0 + weight * item(batch, value)
+            s1 = s1 + weight * item(batch, value + 1)
+            s2 = s2 + weight * item(batch, value + 2)
+            s3 = s3 + weight * item(batch, value + 3)
+    store(planes, at, s0)
+    store(planes, at + PIXELS, s1)
+    store(planes, at + 2 * PIXELS, s2)
+    store(planes, at + 3 * PIXELS, s3)
 
 
 @inlined
@@ -233,11 +222,8 @@ def write_tile(state, at, planes, images, first, width, columns, rows, channels)
 @functools.cache
 def composite_discs_forward(real: type) -> Kernel:
     """Builds the kernel that blends all tiles."""
-    pack, fetch, reached = _pack(real), _fetch(real), tile.reached_of(real)
-    blend_block, blend_channels, begin = _blend_block(real), _blend_channels(real), tile.begin_state(real)
+    pack, reached, begin, blend_block = _pack(real), tile.reached_of(real), tile.begin_state(real), _blend_block(real)
     zero, never = real(0.0), real(-1.0)
-    BLOCK, ACROSS, BLOCKS, LANES, PIXELS = tile.BLOCK, tile.ACROSS, tile.BLOCKS, tile.LANES, tile.PIXELS
-    CHUNK = tile.CHUNK
 
     @kernel("composite_discs_forward", real)
     def forward(
@@ -272,7 +258,7 @@ def composite_discs_forward(real: type) -> Kernel:
             weights: Any = np.empty(CHUNK * LANES, real)
             for first in range(start, stop, CHUNK):
                 last = min(first + CHUNK, stop)
-                fetch(batch, packed, pair_splats, first, last, width, x0, y0)
+                _fetch(batch, packed, pair_splats, first, last, width, x0, y0)
                 for p in range(first, last):
                     pairs[p] = reached(batch, (p - first) * width) & running
                     batch[(p - first) * width + ORDER] = real(np.int32(p - start))
@@ -286,7 +272,7 @@ def composite_discs_forward(real: type) -> Kernel:
                         state, at + i, planes, i, batch, width, entries, count, x, y, near, sharpness, weights
                     )
                     for group in range(groups):
-                        blend_channels(
+                        _blend_channels(
                             planes, SUMS + 4 * group * PIXELS + i, batch, width, entries, taken, VALUES + 4 * group,
                             weights,
                         )  # fmt: skip
@@ -313,19 +299,13 @@ T_AT, BEHIND, COVERED, WEIGHT, V_DEPTH, V_MEDIAN, V_DISTORTION, V_IMAGE = (plane
 UP, VP, E, AROUND, G, V_Z, ABSGRAD, PAIR_VALUES = 0, 3, 6, 9, 11, 12, 13, 16
 
 
-def _value_of(real: type) -> Scalar:
-    load = vector_kind(real, tile.LANES).load
-    PIXELS = tile.PIXELS
-
-    @inlined
-    def value_of(planes, i, batch, splat, groups):
-        """Dot product of a disc's channels with the gradients of the image, for a block."""
-        dot = load(planes, V_IMAGE + i) * item(batch, splat + VALUES)
-        for d in range(1, 4 * groups):
-            dot = dot + load(planes, V_IMAGE + d * PIXELS + i) * item(batch, splat + VALUES + d)
-        return dot
-
-    return value_of
+@inlined
+def _value_of(planes, i, batch, splat, groups):
+    """Dot product of a disc's channels with the gradients of the image, for a block."""
+    dot = load(planes, V_IMAGE + i) * item(batch, splat + VALUES)
+    for d in range(1, 4 * groups):
+        dot = dot + load(planes, V_IMAGE + d * PIXELS + i) * item(batch, splat + VALUES + d)
+    return dot
 
 
 @inlined
@@ -335,10 +315,7 @@ def sharpness_of(sharpness):
 
 
 def _unblend(real: type) -> Scalar:
-    full, load = vector_kind(real, tile.LANES)
-    cover, value_of = _cover(real), _value_of(real)
-    zero, one, two, alpha_max = real(0.0), real(1.0), real(2.0), real(ALPHA_MAX)
-    BLOCK, ACROSS, LANES = tile.BLOCK, tile.ACROSS, tile.LANES
+    cover, zero, one, two, alpha_max = _cover(real), real(0.0), real(1.0), real(2.0), real(ALPHA_MAX)
 
     @inlined
     def unblend(planes, state, at, batch, splat, blocks, groups, near, sharpness, row, row_at):
@@ -369,7 +346,7 @@ def _unblend(real: type) -> Scalar:
             total, covered = load(state, at + TOTAL + i), load(planes, COVERED + i)
             v_depth, v_distortion = load(planes, V_DEPTH + i), load(planes, V_DISTORTION + i)
             spread = (apart * covered - total * two) * apart + load(state, at + SQUARES + i)
-            value = value_of(planes, i, batch, splat, groups) + v_depth * z + v_distortion * spread
+            value = _value_of(planes, i, batch, splat, groups) + v_depth * z + v_distortion * spread
             behind = load(planes, BEHIND + i)
             v_alpha = t * value - behind * rest
             store(planes, BEHIND + i, behind + weight * value)
@@ -424,11 +401,8 @@ def begin_gradients(planes, state, at, v_images, first, width, columns, rows, ch
 @functools.cache
 def composite_discs_backward(real: type) -> Kernel:
     """Builds the kernel that fills one row of sums per pair, given the final state of each tile."""
-    fetch = _fetch(real)
     unblend, sum_channels = _unblend(real), tile.sum_channels_of(real, V_IMAGE, WEIGHT, PAIR_VALUES)
-    zero = real(0.0)
-    LANES, PIXELS, CHUNK = tile.LANES, tile.PIXELS, tile.CHUNK
-    REACHED = (1 << tile.BLOCKS) - 1
+    zero, REACHED = real(0.0), (1 << BLOCKS) - 1
 
     @kernel("composite_discs_backward", real)
     def backward(
@@ -453,7 +427,7 @@ def composite_discs_backward(real: type) -> Kernel:
             for behind in range(0, looked_at, CHUNK):
                 last = start + looked_at - behind
                 first = max(last - CHUNK, start)
-                fetch(batch, packed, pair_splats, first, last, width, x0, y0)
+                _fetch(batch, packed, pair_splats, first, last, width, x0, y0)
                 for k in range(last - first):
                     p = last - 1 - k
                     splat, row = (p - first) * width, p * row_width
@@ -473,9 +447,9 @@ class Saved(NamedTuple):
     each active tile's final state.
     """
 
-    packed: NDArray[Any]
-    pairs: NDArray[np.int32]
-    state: NDArray[Any]
+    packed: Tensor
+    pairs: Tensor
+    state: Tensor
 
 
 def composite_discs(
@@ -487,12 +461,12 @@ def composite_discs(
     images = [channels.new_zeros(s) for s in ((*shape, num_channels), shape, shape, shape, shape)]
     # Arrays of PyTorch, because they are aligned to cache lines, and a packed disc fills whole ones.
     sizes = cameras * count * tile.row_width(VALUES, num_channels), len(bins.active) * STATE
-    packed, state = (torch.empty(size, dtype=channels.dtype).numpy() for size in sizes)
-    saved = Saved(packed, np.zeros(len(bins.pair_splats), np.int32), state)
+    packed, state = (torch.empty(size, dtype=channels.dtype) for size in sizes)
+    saved = Saved(packed, torch.zeros(len(bins.pair_splats), dtype=torch.int32), state)
     composite_discs_forward(real)(
-        *(t.numpy() for t in tile.joined_cameras((*discs[:4], *discs.outlines[:2], channels))), bins.width, bins.height,
-        *_real_options(real, near, low_pass), bins.pair_splats.numpy(), bins.tile_offsets.numpy(),
-        bins.splat_offsets.numpy(), bins.active.numpy(), *saved, tuple(tile.flat(image) for image in images),
+        *tile.joined_cameras((*discs[:4], *discs.outlines[:2], channels)), bins.width, bins.height,
+        *_real_options(real, near, low_pass), bins.pair_splats, bins.tile_offsets, bins.splat_offsets, bins.active,
+        *saved, tuple(tile.flat(image) for image in images),
     )  # fmt: skip
     image, alpha, depth, median, distortion = images
     return image, alpha, depth, median, distortion, saved
@@ -507,16 +481,12 @@ def composite_discs_gradients(
     rows = tile.new_pair_rows(bins, tile.row_width(PAIR_VALUES, num_channels), channels.dtype)
     composite_discs_backward(real)(
         cameras * count, num_channels, bins.width, bins.height, *_real_options(real, near, low_pass),
-        bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.active.numpy(), *saved,
-        tuple(tile.flat(v) for v in v_outputs), rows,
+        bins.pair_splats, bins.tile_offsets, bins.active, *saved, tuple(tile.flat(v) for v in v_outputs), rows,
     )  # fmt: skip
     widths = ((2,), (MAP,), (), (), (num_channels,), (2,))
     found = [channels.new_zeros(cameras, count, *rest) for rest in widths]
-    sum_disc_rows(real)(
-        rows, bins.pair_slots.numpy(), bins.splat_offsets.numpy(), discs.maps.numpy().reshape(-1, MAP),
-        discs.opacities.numpy().reshape(-1),
-        *(tensor.numpy().reshape(cameras * count, *tensor.shape[2:]) for tensor in found),
-    )  # fmt: skip
+    arrays = tile.joined_cameras((discs.maps, discs.opacities, *found))
+    sum_disc_rows(real)(rows, bins.pair_slots, bins.splat_offsets, *arrays)
     return (*found[:5], found[5] if with_absgrad else None)
 
 
@@ -528,8 +498,7 @@ def _real_options(real: type, near: float, low_pass: float) -> tuple[Any, Any]:
 @functools.cache
 def sum_disc_rows(real: type) -> Kernel:
     """Fills the gradients, initially zero, of each disc from the rows of its pairs, in a fixed order."""
-    full, load = vector_kind(real, tile.LANES)
-    zero, LANES = real(0.0), tile.LANES
+    zero = real(0.0)
 
     @kernel("sum_disc_rows", real)
     def sum_rows(rows, slots, offsets, maps, opacities, v_means, v_maps, v_opacities, v_depths, v_channels, v_absgrad):

@@ -13,12 +13,10 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 import torch
 from numba import prange
-from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
@@ -44,6 +42,7 @@ PIXELS = TILE * TILE
 BLOCK = 4
 """Edge of a block in pixels."""
 LANES = BLOCK * BLOCK
+full, load = vector_kind(LANES)
 BLOCKS = PIXELS // LANES
 ACROSS = TILE // BLOCK
 """Blocks in a row of a tile."""
@@ -88,10 +87,9 @@ def joined_cameras(tensors: Iterable[Tensor]) -> tuple[Tensor, ...]:
     return tuple(tensor.flatten(0, 1) for tensor in tensors)
 
 
-def flat(tensor: Tensor) -> NDArray[Any]:
-    """A tensor as an array of one dimension."""
-    array: NDArray[Any] = tensor.contiguous().numpy().reshape(-1)
-    return array
+def flat(tensor: Tensor) -> Tensor:
+    """A tensor with one dimension, contiguous."""
+    return tensor.contiguous().view(-1)
 
 
 def pixel_centers(real: type) -> tuple[Scalar, Scalar]:
@@ -103,7 +101,6 @@ def pixel_centers(real: type) -> tuple[Scalar, Scalar]:
 
 def begin_state(real: type) -> Scalar:
     """Builds the function that initialises the state of a tile."""
-    full = vector_kind(real, LANES).full
     zero, one, never = real(0.0), real(1.0), real(-1.0)
 
     @inlined
@@ -126,18 +123,12 @@ def begin_state(real: type) -> Scalar:
     return begin
 
 
-def finish_state(real: type) -> Scalar:
-    """Builds the function that finishes the state of a tile after its last splat."""
-    load = vector_kind(real, LANES).load
-
-    @inlined
-    def finish(state, at):
-        """Removes the signs that mark stopped pixels."""
-        for i in range(0, PIXELS, LANES):
-            store(state, at + T + i, absolute(load(state, at + T + i)))
-            store(state, at + T_GLASS + i, absolute(load(state, at + T_GLASS + i)))
-
-    return finish
+@inlined
+def finish_state(state, at):
+    """Removes the signs that mark stopped pixels, after the last splat of a tile."""
+    for i in range(0, PIXELS, LANES):
+        store(state, at + T + i, absolute(load(state, at + T + i)))
+        store(state, at + T_GLASS + i, absolute(load(state, at + T_GLASS + i)))
 
 
 def pack_of(real: type) -> Scalar:
@@ -170,26 +161,20 @@ def tile_bounds(tile, width, height):
     return camera, x0, y0, min(TILE, width - x0), min(TILE, height - y0)
 
 
-def fetch_of(real: type) -> Scalar:
-    """Builds the step that copies packed splats of consecutive pairs to a batch, with means relative to the tile."""
-    load = vector_kind(real, LANES).load
-
-    @inlined
-    def fetch(batch, packed, pair_splats, first, last, width, x0, y0):
-        for p in range(first, last):
-            source, target = pair_splats[p] * np.int64(width), (p - first) * width
-            for column in range(0, width, LANES):
-                store(batch, target + column, load(packed, source + column))
-        for k in range(last - first):
-            batch[k * width + MEAN_X] -= real(x0)
-            batch[k * width + MEAN_Y] -= real(y0)
-
-    return fetch
+@inlined
+def fetch(batch, packed, pair_splats, first, last, width, x0, y0):
+    """Copies packed splats of consecutive pairs to a batch, with means relative to the tile."""
+    for p in range(first, last):
+        source, target = pair_splats[p] * np.int64(width), (p - first) * width
+        for column in range(0, width, LANES):
+            store(batch, target + column, load(packed, source + column))
+    for k in range(last - first):
+        batch[k * width + MEAN_X] -= np.float32(x0)
+        batch[k * width + MEAN_Y] -= np.float32(y0)
 
 
 def reached_of(real: type) -> Scalar:
     """Builds the step that returns the blocks of a tile that a fetched splat reaches, as bits."""
-    full = vector_kind(real, LANES).full
     lefts = constant(real, tuple(b % ACROSS * BLOCK + 0.5 for b in range(BLOCKS)))
     tops = constant(real, tuple(b // ACROSS * BLOCK + 0.5 for b in range(BLOCKS)))
     zero, last, least = real(0.0), real(BLOCK - 1), real(math.log2(ALPHA_MIN) - SLACK)
@@ -270,7 +255,6 @@ G, G_X, G_Y, G_XX, G_XY, G_YY, ABSGRAD_X, ABSGRAD_Y, PAIR_VALUES = range(9)
 
 def sum_channels_of(real: type, image: int, weight: int, values: int) -> Scalar:
     """Builds the step that sums gradients of channels, given the planes of gradients and weights, and a column."""
-    full, load = vector_kind(real, LANES)
     zero = real(0.0)
 
     @inlined
@@ -293,7 +277,7 @@ def sum_channels_of(real: type, image: int, weight: int, values: int) -> Scalar:
     return sum_channels
 
 
-def new_pair_rows(bins: TileBins, width: int, dtype: torch.dtype) -> NDArray[Any]:
+def new_pair_rows(bins: TileBins, width: int, dtype: torch.dtype) -> Tensor:
     """Flat buffer for one row per pair, with a width from `row_width`.
 
     A kernel fills the rows of active tiles. The buffer is zeroed only if other tiles have pairs. Columns that pad a
@@ -303,31 +287,27 @@ def new_pair_rows(bins: TileBins, width: int, dtype: torch.dtype) -> NDArray[Any
     filled = len(active) == len(bins.tile_offsets) - 1 or pairs == int(
         (bins.tile_offsets[active + 1] - bins.tile_offsets[active]).sum()
     )
-    # An array of PyTorch, because it is aligned to cache lines, and a row fills one.
-    rows: NDArray[Any] = (torch.empty if filled else torch.zeros)(pairs * width, dtype=dtype).numpy()
-    return rows
+    # PyTorch aligns it to cache lines, and a row fills one.
+    return (torch.empty if filled else torch.zeros)(pairs * width, dtype=dtype)
 
 
 def sum_pair_rows(
-    rows: NDArray[Any], bins: TileBins, splats: Splats, num_values: int, with_absgrad: bool
+    rows: Tensor, bins: TileBins, splats: Splats, num_values: int, with_absgrad: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Sums over tiles: gradients of means2d, conics, opacities, values [C, G, num_values], absgrad [C, G, 2 or 0]."""
     absgrad_width = 2 if with_absgrad else 0
     shape = tuple(splats.opacities.shape)
     widths = ((2,), (3,), (), (num_values,), (absgrad_width,))
-    v_means, v_conics, v_opacities, v_values, v_absgrad = (splats.opacities.new_empty(*shape, *w) for w in widths)
+    found = [splats.opacities.new_empty(*shape, *w) for w in widths]
     _sum_rows(REAL_OF[splats.means2d.dtype])(
-        rows, bins.pair_slots.numpy(), bins.splat_offsets.numpy(),
-        splats.conics.numpy().reshape(-1, 3), splats.opacities.numpy().reshape(-1),
-        v_means.numpy().reshape(-1, 2), v_conics.numpy().reshape(-1, 3), v_opacities.numpy().reshape(-1),
-        v_values.numpy().reshape(-1, num_values), v_absgrad.numpy().reshape(v_opacities.numel(), absgrad_width),
-    )  # fmt: skip
+        rows, bins.pair_slots, bins.splat_offsets, *joined_cameras((splats.conics, splats.opacities, *found))
+    )
+    v_means, v_conics, v_opacities, v_values, v_absgrad = found
     return v_means, v_conics, v_opacities, v_values, v_absgrad
 
 
 @functools.cache
 def _sum_rows(real: type) -> Kernel:
-    full, load = vector_kind(real, LANES)
     zero, half, nats = real(0.0), real(0.5), real(math.log(2.0))
 
     @kernel("sum_pair_rows", real)

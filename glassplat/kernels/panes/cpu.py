@@ -19,7 +19,7 @@ from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
+from glassplat.kernels.backend.cpu import ONE, ZERO, Kernel, even_stride, inlined, kernel
 from glassplat.kernels.backend.cpu_vector import (
     bits_of,
     deinterleave,
@@ -48,8 +48,7 @@ def pane_hits(
     windows = centers.new_zeros(count, 4)
     visible = centers.new_empty(0, 0) if mask is None else mask
     before = (index.new_empty(0, 0), centers.new_empty(0, 0)) if beyond is None else (beyond.pane, beyond.depth)
-    tensors = (*inputs, visible, *before, index, depth, tiles, windows)
-    pane_hits_forward(real)(*(tensor.numpy() for tensor in tensors))
+    pane_hits_forward(real)(*inputs, visible, *before, index, depth, tiles, windows)
     return PaneHits(index, depth, tiles, windows)
 
 
@@ -112,6 +111,7 @@ def pane_hits_forward(real: type) -> Kernel:
 
 
 LANES = 16
+load_lanes = vector_kind(LANES).load
 RUN = 32
 """Pixels of a run, a multiple of the lanes."""
 
@@ -130,7 +130,7 @@ def blend_panes(inputs: Sequence[Tensor], switches: tuple[int, bool, bool]) -> t
     """The fields of `BlendedPanes`; inputs in the order of the kernel, switches (law, intensity, linear)."""
     transmission, mask = inputs[:2]
     outputs = tuple(torch.empty_like(like) for like in (transmission, transmission, mask))
-    blend_panes_forward(REAL_OF[mask.dtype])(*_arrays(inputs), *switches, *_arrays(outputs))
+    blend_panes_forward(REAL_OF[mask.dtype])(*inputs, *switches, *outputs)
     return outputs
 
 
@@ -139,12 +139,8 @@ def blend_panes_gradients(
 ) -> tuple[Tensor, ...]:
     """Gradients of the first five inputs."""
     found = tuple(torch.zeros_like(tensor) for tensor in inputs[:5])
-    blend_panes_backward(REAL_OF[found[0].dtype])(*_arrays(inputs), *switches, *_arrays(cotangents), *_arrays(found))
+    blend_panes_backward(REAL_OF[found[0].dtype])(*inputs, *switches, *cotangents, *found)
     return found
-
-
-def _arrays(tensors: Sequence[Tensor]) -> list[Any]:
-    return [tensor.numpy() for tensor in tensors]
 
 
 @inlined
@@ -158,68 +154,56 @@ def _span(pane, row, k):
     return first, last
 
 
-def _load(real: type) -> Scalar:
-    load_lanes, zero, one = vector_kind(real, LANES).load, real(0.0), real(1.0)
-    load_triples = _copies(real)[0]
-
-    @inlined
-    def load(run, transmission, mask, reflections, pane, intensity, row, k, first, count):
-        """Copies the pixels of a run; entries beyond its end count as not shown. Colour images are flat."""
-        height, width = mask.shape
-        pixel = row * width + first
-        mirrored = k * height * width + pixel
-        if count == RUN:
-            for i in range(RUN):
-                run[MASK + i] = mask[row, first + i] if pane[row, first + i] == k else zero
-            for i in range(0, RUN, LANES):
-                load_triples(run, BEHIND + i, transmission, pixel + i)
-                at = 4 * (mirrored + i)
-                four = (
-                    load_lanes(reflections, at), load_lanes(reflections, at + LANES),
-                    load_lanes(reflections, at + 2 * LANES), load_lanes(reflections, at + 3 * LANES),
-                )  # fmt: skip
-                red, green, blue, gain = deinterleave(four)
-                store(run, MIRRORED + i, red)
-                store(run, MIRRORED + RUN + i, green)
-                store(run, MIRRORED + 2 * RUN + i, blue)
-                store(run, GAIN + i, gain + one)
-        else:
-            for i in range(RUN):
-                x = min(i, count - 1)
-                shown = (pane[row, first + x] == k) & (i < count)
-                run[MASK + i] = mask[row, first + x] if shown else zero
-                run[GAIN + i] = one + reflections[4 * (mirrored + x) + 3]
-                for d in range(3):
-                    run[BEHIND + d * RUN + i] = transmission[3 * (pixel + x) + d]
-                    run[MIRRORED + d * RUN + i] = reflections[4 * (mirrored + x) + d]
-        if not intensity:
-            for i in range(RUN):
-                run[GAIN + i] = one
-
-    return load
+@inlined
+def _load_triples(run, at, image, pixel):
+    """Copies colours of `LANES` consecutive pixels of a flat image to three planes of a run."""
+    first, second = load_lanes(image, 3 * pixel), load_lanes(image, 3 * pixel + LANES)
+    red, green, blue = split_triples(first, second, load_lanes(image, 3 * pixel + 2 * LANES))
+    store(run, at, red)
+    store(run, at + RUN, green)
+    store(run, at + 2 * RUN, blue)
 
 
-def _copies(real: type) -> tuple[Scalar, Scalar]:
-    """Builds the copies between colours of `LANES` consecutive pixels of a flat image and three planes of a run."""
-    load_lanes = vector_kind(real, LANES).load
+@inlined
+def _store_triples(run, at, image, pixel):
+    """Copies them back."""
+    rows = join_triples(load_lanes(run, at), load_lanes(run, at + RUN), load_lanes(run, at + 2 * RUN))
+    store_all(image, 3 * pixel, rows)
 
-    @inlined
-    def load_triples(run, at, image, pixel):
-        rows = (
-            load_lanes(image, 3 * pixel), load_lanes(image, 3 * pixel + LANES),
-            load_lanes(image, 3 * pixel + 2 * LANES),
-        )  # fmt: skip
-        red, green, blue = split_triples(rows[0], rows[1], rows[2])
-        store(run, at, red)
-        store(run, at + RUN, green)
-        store(run, at + 2 * RUN, blue)
 
-    @inlined
-    def store_triples(run, at, image, pixel):
-        rows = join_triples(load_lanes(run, at), load_lanes(run, at + RUN), load_lanes(run, at + 2 * RUN))
-        store_all(image, 3 * pixel, rows)
-
-    return load_triples, store_triples
+@inlined
+def _load(run, transmission, mask, reflections, pane, intensity, row, k, first, count):
+    """Copies the pixels of a run; entries beyond its end count as not shown. Colour images are flat."""
+    height, width = mask.shape
+    pixel = row * width + first
+    mirrored = k * height * width + pixel
+    if count == RUN:
+        for i in range(RUN):
+            run[MASK + i] = mask[row, first + i] if pane[row, first + i] == k else ZERO
+        for i in range(0, RUN, LANES):
+            _load_triples(run, BEHIND + i, transmission, pixel + i)
+            at = 4 * (mirrored + i)
+            four = (
+                load_lanes(reflections, at), load_lanes(reflections, at + LANES),
+                load_lanes(reflections, at + 2 * LANES), load_lanes(reflections, at + 3 * LANES),
+            )  # fmt: skip
+            red, green, blue, gain = deinterleave(four)
+            store(run, MIRRORED + i, red)
+            store(run, MIRRORED + RUN + i, green)
+            store(run, MIRRORED + 2 * RUN + i, blue)
+            store(run, GAIN + i, gain + ONE)
+    else:
+        for i in range(RUN):
+            x = min(i, count - 1)
+            shown = (pane[row, first + x] == k) & (i < count)
+            run[MASK + i] = mask[row, first + x] if shown else ZERO
+            run[GAIN + i] = ONE + reflections[4 * (mirrored + x) + 3]
+            for d in range(3):
+                run[BEHIND + d * RUN + i] = transmission[3 * (pixel + x) + d]
+                run[MIRRORED + d * RUN + i] = reflections[4 * (mirrored + x) + d]
+    if not intensity:
+        for i in range(RUN):
+            run[GAIN + i] = ONE
 
 
 def _fill_strengths(real: type) -> Scalar:
@@ -263,9 +247,7 @@ def _blend_run(real: type) -> Scalar:
 @cache
 def blend_panes_forward(real: type) -> Kernel:
     """Fills rgb, reflection and strength."""
-    load, fill_strengths = _load(real), _fill_strengths(real)
-    blend_run, store_triples = _blend_run(real), _copies(real)[1]
-    load_lanes, zero = vector_kind(real, LANES).load, real(0.0)
+    fill_strengths, blend_run, zero = _fill_strengths(real), _blend_run(real), real(0.0)
 
     @kernel("blend_panes_forward", real)
     def forward(
@@ -284,7 +266,7 @@ def blend_panes_forward(real: type) -> Kernel:
                 begin, end = _span(pane, row, k)
                 for first in range(begin, end, RUN):
                     count = min(RUN, end - first)
-                    load(run, behind, mask, mirrored, pane, intensity, row, k, first, count)
+                    _load(run, behind, mask, mirrored, pane, intensity, row, k, first, count)
                     fill_strengths(run, normals, bases, k, row, first, intrinsics, law)
                     for d in range(3):
                         blend_run(run, d, linear)
@@ -292,8 +274,8 @@ def blend_panes_forward(real: type) -> Kernel:
                         share = load_lanes(run, SHARE + start)
                         if bits_of(share > zero) == ALL:
                             pixel = row * width + first + start
-                            store_triples(run, RGB + start, mixed, pixel)
-                            store_triples(run, BRIGHT + start, bright, pixel)
+                            _store_triples(run, RGB + start, mixed, pixel)
+                            _store_triples(run, BRIGHT + start, bright, pixel)
                             store(shares, pixel, share)
                             continue
                         for i in range(start, min(count, start + LANES)):
@@ -356,10 +338,8 @@ def _sum_strength_gradients(real: type) -> Scalar:
 @cache
 def blend_panes_backward(real: type) -> Kernel:
     """Fills the gradients of transmission, mask, reflections, normals and base reflectances; all start at zero."""
-    load, fill_strengths = _load(real), _fill_strengths(real)
     blend_run_gradient, sum_strength_gradients = _blend_run_gradient(real), _sum_strength_gradients(real)
-    load_lanes, (load_triples, store_triples) = vector_kind(real, LANES).load, _copies(real)
-    zero = real(0.0)
+    fill_strengths, zero = _fill_strengths(real), real(0.0)
 
     @kernel("blend_panes_backward", real)
     def backward(
@@ -381,14 +361,14 @@ def blend_panes_backward(real: type) -> Kernel:
                 begin, end = _span(pane, row, k)
                 for first in range(begin, end, RUN):
                     count = min(RUN, end - first)
-                    load(run, behind, mask, mirrored, pane, intensity, row, k, first, count)
+                    _load(run, behind, mask, mirrored, pane, intensity, row, k, first, count)
                     y = fill_strengths(run, normals, bases, k, row, first, intrinsics, law)
                     for i in range(RUN):
                         run[V_SHARE + i], run[V_GAIN + i] = v_strength[row, first + min(i, count - 1)], zero
                     for start in range(0, count, LANES):
                         if start + LANES <= count:
-                            load_triples(run, V_RGB + start, v_mixed, row * width + first + start)
-                            load_triples(run, V_BRIGHT + start, v_bright, row * width + first + start)
+                            _load_triples(run, V_RGB + start, v_mixed, row * width + first + start)
+                            _load_triples(run, V_BRIGHT + start, v_bright, row * width + first + start)
                             continue
                         for i in range(start, RUN):
                             column = first + min(i, count - 1)
@@ -409,7 +389,7 @@ def blend_panes_backward(real: type) -> Kernel:
                         if bits_of(load_lanes(run, SHARE + start) > zero) == ALL:
                             pixel = row * width + first + start
                             store(v_marked, pixel, load_lanes(run, V_SHARE + start) * load_lanes(run, RAW + start))
-                            store_triples(run, V_RGB + start, v_behind, pixel)
+                            _store_triples(run, V_RGB + start, v_behind, pixel)
                             at = 4 * (k * height * width + pixel)
                             v = V_BRIGHT + start
                             four = (
@@ -442,8 +422,8 @@ def layer_derivatives(
 ) -> tuple[Tensor, Tensor]:
     """The derivatives by transmission and reflection [H, W]; see `glassplat.kernels.panes.layer_derivatives`."""
     through, mirrored = torch.empty_like(strength), torch.empty_like(strength)
-    layers = (tensor.numpy() for tensor in (strength, transmission, reflection, where))
-    layer_derivatives_kernel(REAL_OF[strength.dtype])(*layers, linear, through.numpy(), mirrored.numpy())
+    layers = (strength, transmission, reflection, where)
+    layer_derivatives_kernel(REAL_OF[strength.dtype])(*layers, linear, through, mirrored)
     return through, mirrored
 
 
@@ -526,8 +506,7 @@ def gradient_conflict(
     derivatives = transmission.new_zeros(2, height + 2, CHANNELS * (width + 2))
     sums = torch.zeros(-(-(height - 2) // cell), dtype=torch.float64)
     images = (transmission, reflection, hit, hit if strength is None else strength)
-    forward = conflict_forward(REAL_OF[hit.dtype])
-    forward(*(t.numpy() for t in images), strength is not None, cell, derivatives.numpy(), sums.numpy())
+    conflict_forward(REAL_OF[hit.dtype])(*images, strength is not None, cell, derivatives, sums)
     return (sums.sum() / conflict_count(height, width)).to(transmission.dtype), derivatives
 
 
@@ -536,7 +515,7 @@ def gradient_conflict_gradient(derivatives: Tensor, v_mean: Tensor) -> Tensor:
     real, height, width = REAL_OF[derivatives.dtype], derivatives.shape[1] - 2, derivatives.shape[2] // CHANNELS - 2
     v_transmission = derivatives.new_empty(height, width, CHANNELS)
     factor = real(v_mean.item() / conflict_count(height, width))
-    conflict_backward(real)(derivatives.numpy(), factor, v_transmission.numpy())
+    conflict_backward(real)(derivatives, factor, v_transmission)
     return v_transmission
 
 

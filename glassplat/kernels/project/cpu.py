@@ -22,38 +22,18 @@ from glassplat.kernels.backend.cpu_vector import (
     bits_of,
     lowest_bit,
     maximum,
-    row_loader,
     store,
     store_all,
     transpose,
-    vector_kind,
 )
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.disc import MAP
 from glassplat.kernels.maths.projection import build_half_extents
-from glassplat.kernels.project.cpu_lanes import (
-    COLUMNS,
-    LANES,
-    color_gradient_of,
-    color_steps,
-    gather,
-    gather_shapes,
-    load_triples_of,
-    may_show_of,
-    place_gradient_of,
-    place_of,
-)
+from glassplat.kernels.project import cpu_lanes as lanes
+from glassplat.kernels.project import steps
+from glassplat.kernels.project.cpu_lanes import COLUMNS, LANES, full, gather, gather_shapes, load, load_rows
 from glassplat.kernels.project.disc_steps import discs
-from glassplat.kernels.project.steps import (
-    CHUNK,
-    LENS_VALUES,
-    add_view,
-    build_fill_lenses,
-    build_project,
-    build_project_back,
-    cull,
-    vec3,
-)
+from glassplat.kernels.project.steps import CHUNK, LENS_VALUES, vec3
 from glassplat.kernels.records import REAL_OF
 
 WIDTHS, DISC_WIDTHS = ((2,), (3,), (), (), (3,), (2,)), ((2,), (MAP,), (), (), (3,), (3,), (2,), (3,), (2,))
@@ -69,10 +49,7 @@ def new_outputs(inputs: Sequence[Tensor], widths: Sequence[tuple[int, ...]]) -> 
 def project_discs(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, near: float) -> tuple[Tensor, ...]:
     """Fields of `ProjectedDiscs` from raw discs, poses, intrinsics, clip planes, windows; degree -1 skips colours."""
     real, outputs = REAL_OF[inputs[0].dtype], new_outputs(inputs, DISC_WIDTHS)
-    project_discs_forward(real)(
-        *(tensor.numpy() for tensor in inputs), real(width), real(height), degree, real(near),
-        tuple(tensor.numpy() for tensor in outputs),
-    )  # fmt: skip
+    project_discs_forward(real)(*inputs, real(width), real(height), degree, real(near), outputs)
     return outputs
 
 
@@ -85,17 +62,15 @@ def project_discs_gradients(
     found = [torch.zeros_like(tensor) for tensor in inputs[:5]]
     cameras = torch.zeros(inputs[5].shape[0], 12, dtype=torch.float64)
     project_discs_backward(real)(
-        *(tensor.numpy() for tensor in inputs), real(width), real(height), degree,
-        *(tensor.numpy() for tensor in seen), tuple(tensor.numpy() for tensor in cotangents), needs_camera,
-        *(tensor.numpy() for tensor in (*found, cameras)),
-    )  # fmt: skip
+        *inputs, real(width), real(height), degree, *seen, tuple(cotangents), needs_camera, *found, cameras
+    )
     return found, cameras
 
 
 @cache
 def project_discs_forward(real: type) -> Kernel:
     """Fills the fields of `ProjectedDiscs`; zeros where a disc is culled."""
-    fill_lenses, project, chunk_size = build_fill_lenses(real), build_project(real, discs(real)), CHUNK
+    fill_lenses, project, chunk_size = steps.build_fill_lenses(real), steps.build_project(real, discs(real)), CHUNK
 
     @kernel("project_discs_forward", real)
     def forward(
@@ -119,7 +94,7 @@ def project_discs_forward(real: type) -> Kernel:
 def _disc_backward(real: type) -> Scalar:
     """Fills the gradients, initially zero, of one disc from all cameras."""
     footprint, zero = discs(real), real(0.0)
-    shape, finish, project_back = footprint.shape, footprint.finish, build_project_back(real, footprint)
+    shape, finish, project_back = footprint.shape, footprint.finish, steps.build_project_back(real, footprint)
 
     @inlined
     def disc_backward(
@@ -145,7 +120,7 @@ def _disc_backward(real: type) -> Scalar:
 @cache
 def project_discs_backward(real: type) -> Kernel:
     """Fills the gradients of the discs; adds those of the cameras to [C, 12], rows of (3x3 block, translation)."""
-    fill_lenses, disc_backward = build_fill_lenses(real), _disc_backward(real)
+    fill_lenses, disc_backward = steps.build_fill_lenses(real), _disc_backward(real)
     chunk_size = CHUNK
 
     @kernel("project_discs_backward", real)
@@ -182,7 +157,7 @@ OWN, SHARED = 11, 12
 
 
 def _place_backward(real: type) -> Scalar:
-    place_gradient = place_gradient_of(real)
+    place_gradient = lanes.place_gradient_of(real)
 
     @inlined
     def place_backward(
@@ -218,34 +193,28 @@ def _place_backward(real: type) -> Scalar:
     return place_backward
 
 
-def _add_coefficients(real: type) -> Scalar:
-    load_rows, load, whole = row_loader(real, LANES), vector_kind(real, LANES).load, COLUMNS * LANES
-
-    @inlined
-    def add_coefficients(listed, first, last, table, positions, terms, g_sh, row_size):
-        """Adds the second half of the table, one column per coefficient, to `g_sh`, which is flat."""
-        if row_size != COLUMNS:
-            for i in range(last + 1 - first):
-                for k in range(3 * terms):
-                    g_sh[listed[first + i] * row_size + k] += table[whole + k * LANES + i]
-            return
-        for i in range(LANES):
-            positions[i] = i * LANES
-        for begin in range(0, 3 * terms, LANES):
-            for k in range(3 * terms, begin + LANES):
-                table[whole + k * LANES : whole + (k + 1) * LANES] = 0
-            store_all(table, 0, transpose(load_rows(table, positions, whole + begin * LANES)))
-            for i in range(last + 1 - first):
-                at = listed[first + i] * row_size + begin
-                store(g_sh, at, load(g_sh, at) + load(table, i * LANES))
-
-    return add_coefficients
+@inlined
+def _add_coefficients(listed, first, last, table, positions, terms, g_sh, row_size):
+    """Adds the second half of the table, one column per coefficient, to `g_sh`, which is flat."""
+    whole = COLUMNS * LANES
+    if row_size != COLUMNS:
+        for i in range(last + 1 - first):
+            for k in range(3 * terms):
+                g_sh[listed[first + i] * row_size + k] += table[whole + k * LANES + i]
+        return
+    for i in range(LANES):
+        positions[i] = i * LANES
+    for begin in range(0, 3 * terms, LANES):
+        for k in range(3 * terms, begin + LANES):
+            table[whole + k * LANES : whole + (k + 1) * LANES] = 0
+        store_all(table, 0, transpose(load_rows(table, positions, whole + begin * LANES)))
+        for i in range(last + 1 - first):
+            at = listed[first + i] * row_size + begin
+            store(g_sh, at, load(g_sh, at) + load(table, i * LANES))
 
 
 def _color_backward(real: type) -> Scalar:
-    (tabulate, _), color_gradient = color_steps(real), color_gradient_of(real)
-    add_coefficients = _add_coefficients(real)
-    zero = real(0.0)
+    color_gradient, zero = lanes.color_gradient_of(real), real(0.0)
 
     @inlined
     def color_backward(
@@ -266,12 +235,12 @@ def _color_backward(real: type) -> Scalar:
             last = min(first + LANES, touched) - 1
             gather(columns, 0, listed, first, last, means)
             gather(columns, 3, listed, first, last, g_colors[c])
-            tabulate(table, listed, first, last, terms, sh, row_size, positions)
+            lanes.tabulate(table, listed, first, last, terms, sh, row_size, positions)
             x, y, z = color_gradient(table, columns, degree, lens, c)
             store(columns, 0, x)
             store(columns, LANES, y)
             store(columns, 2 * LANES, z)
-            add_coefficients(listed, first, last, table, positions, terms, g_sh, row_size)
+            _add_coefficients(listed, first, last, table, positions, terms, g_sh, row_size)
             for i in range(last + 1 - first):
                 n = listed[first + i]
                 for k in range(3):
@@ -280,7 +249,7 @@ def _color_backward(real: type) -> Scalar:
                 sum_y += np.float64(columns[LANES + i])
                 sum_z += np.float64(columns[2 * LANES + i])
         if needs_camera:
-            add_view(total, cam_from_world, c, (sum_x, sum_y, sum_z))
+            steps.add_view(total, cam_from_world, c, (sum_x, sum_y, sum_z))
 
     return color_backward
 
@@ -291,7 +260,7 @@ def project_backward(real: type) -> Kernel:
 
     The latter are [C, 12], rows of (3x3 block, translation).
     """
-    fill_lenses = build_fill_lenses(real)
+    fill_lenses = steps.build_fill_lenses(real)
     color_backward, place_backward = _color_backward(real), _place_backward(real)
     chunk_size, zero = CHUNK, real(0.0)
 
@@ -342,10 +311,7 @@ def project_backward(real: type) -> Kernel:
 def project(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, near: float) -> tuple[Tensor, ...]:
     """Fields of `Projected` from raw Gaussians, poses, intrinsics, clip planes and windows; degree -1 skips colours."""
     real, outputs = REAL_OF[inputs[0].dtype], new_outputs(inputs, WIDTHS)
-    project_forward(real)(
-        *(tensor.numpy() for tensor in inputs), real(width), real(height), degree, real(near),
-        *(tensor.numpy() for tensor in outputs),
-    )  # fmt: skip
+    project_forward(real)(*inputs, real(width), real(height), degree, real(near), *outputs)
     return outputs
 
 
@@ -362,16 +328,15 @@ def project_gradients(
     found = [torch.empty_like(tensor) for tensor in inputs[:5]] if accumulated is None else accumulated
     cameras = torch.zeros(inputs[5].shape[0], 12, dtype=torch.float64)
     project_backward(real)(
-        *(tensor.numpy() for tensor in inputs), real(width), real(height), degree,
-        *(tensor.numpy() for tensor in (radii, *cotangents)), needs_camera, accumulated is None,
-        *(tensor.numpy() for tensor in (*found, cameras)),
+        *inputs, real(width), real(height), degree, radii, *cotangents, needs_camera, accumulated is None,
+        *found, cameras,
     )  # fmt: skip
     return found, cameras
 
 
 def build_list_candidates(real: type) -> Scalar:
     """Builds the step that lists the Gaussians of a chunk that may be visible in a camera."""
-    load_triples, may_show = load_triples_of(real), may_show_of(real)
+    may_show = lanes.may_show_of(real)
 
     @inlined
     def list_candidates(
@@ -382,12 +347,12 @@ def build_list_candidates(real: type) -> Scalar:
         found, count = 0, means.size // 3
         for n in range(begin, end, LANES):
             if n + LANES <= count:
-                mean, scales = load_triples(means, n), load_triples(log_scales, n)
+                mean, scales = lanes.load_triples(means, n), lanes.load_triples(log_scales, n)
             else:
                 for i in range(3 * LANES):
                     source = min(n + i // 3, count - 1) * 3 + i % 3
                     ends[i], ends[3 * LANES + i] = means[source], log_scales[source]
-                mean, scales = load_triples(ends, 0), load_triples(ends, LANES)
+                mean, scales = lanes.load_triples(ends, 0), lanes.load_triples(ends, LANES)
             bits = may_show(
                 c, mean, scales, cam_from_world, intrinsics, lens, near, clip_planes, clips, windows
             )  # fmt: skip
@@ -403,7 +368,7 @@ def build_list_candidates(real: type) -> Scalar:
 
 def build_place_listed(real: type) -> Scalar:
     """Builds the step that fills all outputs but the colours, for the visible ones of the listed Gaussians."""
-    place, half_extents = place_of(real), build_half_extents(real)
+    place, half_extents = lanes.place_of(real), build_half_extents(real)
     zero = real(0.0)
     U, V, XX, XY, YY, DEPTH, OPACITY, WIDE, HIGH = (field * LANES for field in range(9))
 
@@ -444,8 +409,7 @@ def build_place_listed(real: type) -> Scalar:
 
 def build_color_listed(real: type) -> Scalar:
     """Builds the step that fills the colours of listed Gaussians; those with a non-finite colour are culled."""
-    tabulate, color = color_steps(real)
-    full, zero, half, largest = vector_kind(real, LANES).full, real(0.0), real(0.5), real(np.finfo(real).max)
+    color, zero, half, largest = lanes.color_of(real), real(0.0), real(0.5), real(np.finfo(real).max)
 
     @inlined
     def color_listed(
@@ -457,7 +421,7 @@ def build_color_listed(real: type) -> Scalar:
         for first in range(0, shown, LANES):
             last = min(first + LANES, shown) - 1
             gather(columns, 0, listed, first, last, means)
-            tabulate(table, listed, first, last, terms, sh, row_size, positions)
+            lanes.tabulate(table, listed, first, last, terms, sh, row_size, positions)
             red, green, blue = color(table, columns, degree, lens, c)
             bits = bits_of(absolute(red) + absolute(green) + absolute(blue) <= largest)
             none = full(zero)
@@ -470,7 +434,7 @@ def build_color_listed(real: type) -> Scalar:
                     colors[c, n, 0], colors[c, n, 1] = columns[i], columns[LANES + i]
                     colors[c, n, 2] = columns[2 * LANES + i]
                 else:
-                    cull(c, n, (means2d, conics, depths, opacities, colors, radii))
+                    steps.cull(c, n, (means2d, conics, depths, opacities, colors, radii))
 
     return color_listed
 
@@ -478,7 +442,7 @@ def build_color_listed(real: type) -> Scalar:
 @cache
 def project_forward(real: type) -> Kernel:
     """Fills means2d, conics, depths, opacities, colors and radii; zeros where a Gaussian is culled."""
-    fill_lenses = build_fill_lenses(real)
+    fill_lenses = steps.build_fill_lenses(real)
     list_candidates, place_listed = build_list_candidates(real), build_place_listed(real)
     color_listed, zero, chunk_size = build_color_listed(real), real(0.0), CHUNK
 

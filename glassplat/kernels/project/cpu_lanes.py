@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.backend.cpu import ONE, inlined
 from glassplat.kernels.backend.cpu_vector import (
     absolute,
     bits_of,
@@ -27,20 +27,15 @@ from glassplat.kernels.backend.cpu_vector import (
     transpose,
     vector_kind,
 )
+from glassplat.kernels.maths import projection
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.harmonics import build_channel, build_color_gradient, harmonic_basis
-from glassplat.kernels.maths.projection import (
-    LOW_PASS,
-    dot,
-    rotation,
-    scaled_columns,
-    scaled_sum,
-    tangential,
-    unit_quat_gradient,
-)
+from glassplat.kernels.maths.projection import dot, rotation, scaled_columns, scaled_sum
 from glassplat.kernels.project.steps import MOST_SQUARED_DEVIATIONS, build_view, in_camera, place_gradients, vec3
 
 LANES = 16
+full, load = vector_kind(LANES)
+load_rows = row_loader(LANES)
 COLUMNS = 48
 """Maximum number of coefficients of a Gaussian."""
 
@@ -66,21 +61,15 @@ def gather_shapes(columns, listed, first, last, means, quats, log_scales, logit_
         columns[10 * LANES + i] = logit_opacities[n]
 
 
-def load_triples_of(real: type) -> Scalar:
-    """Builds the step that loads three vectors from an array of triples, starting at Gaussian n."""
-    load = vector_kind(real, LANES).load
-
-    @inlined
-    def load_triples(array, n):
-        at = 3 * n
-        return split_triples(load(array, at), load(array, at + LANES), load(array, at + 2 * LANES))
-
-    return load_triples
+@inlined
+def load_triples(array, n):
+    """Loads three vectors from an array of triples, starting at Gaussian n."""
+    at = 3 * n
+    return split_triples(load(array, at), load(array, at + LANES), load(array, at + 2 * LANES))
 
 
 def _exponential(real: type) -> Scalar:
     """Builds e^x; in single precision clamped to normal numbers, with a relative error below 3e-7."""
-    full = vector_kind(real, LANES).full
     # Taylor series of 2^f for f in [-1/2, 1/2].
     e0, e1, e2, e3, e4, e5, e6, e7 = (real(math.log(2.0) ** k / math.factorial(k)) for k in range(8))
     bits, half, zero, lowest, highest = real(1 / math.log(2.0)), real(0.5), real(0.0), real(-125.0), real(126.0)
@@ -98,7 +87,7 @@ def _exponential(real: type) -> Scalar:
 def may_show_of(real: type) -> Scalar:
     """Builds a conservative culling test: bits of Gaussians on the kept sides that may reach a camera's window."""
     exponential = _exponential(real)
-    zero, one, low_pass, most_squared = real(0.0), real(1.0), real(LOW_PASS), real(MOST_SQUARED_DEVIATIONS)
+    zero, one, low_pass, most_squared = real(0.0), real(1.0), real(projection.LOW_PASS), real(MOST_SQUARED_DEVIATIONS)
 
     @inlined
     def may_show(c, mean, log_scales, cam_from_world, intrinsics, lens, near, clip_planes, clips, windows):
@@ -126,7 +115,7 @@ def shapes(real: type) -> Scalar:
 
     It returns unit quaternions, their inverse norms, scales, axes, opacities, and the sum of the raw magnitudes.
     """
-    exponential, load, one = _exponential(real), vector_kind(real, LANES).load, real(1.0)
+    exponential, one = _exponential(real), real(1.0)
 
     @inlined
     def shape(columns):
@@ -144,15 +133,9 @@ def shapes(real: type) -> Scalar:
     return shape
 
 
-def views(real: type) -> Scalar:
-    """`steps.build_view` for vectors."""
-    full = vector_kind(real, LANES).full
-
-    @inlined
-    def held(tangent, low, high):
-        return minimum(maximum(tangent, full(low)), full(high))
-
-    return build_view(real, held)
+@inlined
+def _held(tangent, low, high):
+    return minimum(maximum(tangent, full(low)), full(high))
 
 
 def place_of(real: type) -> Scalar:
@@ -160,7 +143,7 @@ def place_of(real: type) -> Scalar:
 
     It returns (mean x and y, conic xx, xy and yy, depth, opacity, covariance xx and yy), and bits of the finite ones.
     """
-    shape, view, load = shapes(real), views(real), vector_kind(real, LANES).load
+    shape, view = shapes(real), build_view(real, _held)
     zero, one, largest = real(0.0), real(1.0), real(np.finfo(real).max)
 
     @inlined
@@ -183,54 +166,47 @@ def place_of(real: type) -> Scalar:
     return place
 
 
-def channel_of(real: type) -> Scalar:
-    """Builds the step that evaluates one colour channel from harmonics and table columns starting at an index."""
-    load = vector_kind(real, LANES).load
-
-    @inlined
-    def take(table, at, k, c):
-        return load(table, at + (3 * k + c) * LANES)
-
-    return build_channel(take)
+@inlined
+def _take(table, at, k, c):
+    return load(table, at + (3 * k + c) * LANES)
 
 
-def directions_of(real: type) -> Scalar:
-    """Builds the unit vectors from a camera's centre to columns of means, and their inverse lengths."""
-    load, one = vector_kind(real, LANES).load, real(1.0)
-
-    @inlined
-    def directions(means, lens, c):
-        x = load(means, 0) - lens[c, 4]
-        y, z = load(means, LANES) - lens[c, 5], load(means, 2 * LANES) - lens[c, 6]
-        inverse_length = one / square_root(x * x + y * y + z * z)
-        return (x * inverse_length, y * inverse_length, z * inverse_length), inverse_length
-
-    return directions
+channel = build_channel(_take)
+"""One colour channel, from harmonics and table columns starting at an index."""
 
 
-def color_steps(real: type) -> tuple[Scalar, Scalar]:
-    """Builds the steps that tabulate coefficients, and that evaluate colours from such a table."""
-    load_rows, basis = row_loader(real, LANES), harmonic_basis(real)
-    channel, directions, whole = channel_of(real), directions_of(real), COLUMNS * LANES
+@inlined
+def directions(means, lens, c):
+    """Unit vectors from a camera's centre to columns of means, and their inverse lengths."""
+    x = load(means, 0) - lens[c, 4]
+    y, z = load(means, LANES) - lens[c, 5], load(means, 2 * LANES) - lens[c, 6]
+    inverse_length = ONE / square_root(x * x + y * y + z * z)
+    return (x * inverse_length, y * inverse_length, z * inverse_length), inverse_length
 
-    @inlined
-    def tabulate(table, listed, first, last, terms, sh, row_size, positions):
-        """Copies the first `terms` coefficients of listed Gaussians, three numbers each, to columns of a table's first
-        half; `sh` is flat, with rows of `row_size`.
 
-        The second half of the table is scratch, for rows near the end of `sh`, where vector loads would overrun.
-        """
-        inside = listed[last] * row_size + (3 * terms + LANES - 1) // LANES * LANES <= sh.size
-        for i in range(LANES):
-            n = listed[min(first + i, last)]
-            positions[i] = n * row_size
-            if not inside:
-                for k in range(3 * terms):
-                    table[whole + i * COLUMNS + k] = sh[n * row_size + k]
-                positions[i] = whole + i * COLUMNS
-        source = sh if inside else table
-        for begin in range(0, 3 * terms, LANES):
-            store_all(table, begin * LANES, transpose(load_rows(source, positions, begin)))
+@inlined
+def tabulate(table, listed, first, last, terms, sh, row_size, positions):
+    """Copies the first `terms` coefficients of listed Gaussians, three numbers each, to columns of a table's first
+    half; `sh` is flat, with rows of `row_size`.
+
+    The second half of the table is scratch, for rows near the end of `sh`, where vector loads would overrun.
+    """
+    inside = listed[last] * row_size + (3 * terms + LANES - 1) // LANES * LANES <= sh.size
+    for i in range(LANES):
+        n = listed[min(first + i, last)]
+        positions[i] = n * row_size
+        if not inside:
+            for k in range(3 * terms):
+                table[COLUMNS * (LANES + i) + k] = sh[n * row_size + k]
+            positions[i] = COLUMNS * (LANES + i)
+    source = sh if inside else table
+    for begin in range(0, 3 * terms, LANES):
+        store_all(table, begin * LANES, transpose(load_rows(source, positions, begin)))
+
+
+def color_of(real: type) -> Scalar:
+    """Builds the step that evaluates colours from a table of coefficients."""
+    basis = harmonic_basis(real)
 
     @inlined
     def color(table, means, degree, lens, c):
@@ -239,7 +215,7 @@ def color_steps(real: type) -> tuple[Scalar, Scalar]:
         b = basis(x, y, z)
         return channel(table, 0, 0, degree, b), channel(table, 0, 1, degree, b), channel(table, 0, 2, degree, b)
 
-    return tabulate, color
+    return color
 
 
 def place_gradient_of(real: type) -> Scalar:
@@ -248,8 +224,7 @@ def place_gradient_of(real: type) -> Scalar:
 
     It returns the gradients of the first columns (11), and each Gaussian's contribution to that of the camera (12).
     """
-    full, load = vector_kind(real, LANES)
-    shape, view, zero, one = shapes(real), views(real), real(0.0), real(1.0)
+    shape, view, zero, one = shapes(real), build_view(real, _held), real(0.0), real(1.0)
 
     @inlined
     def free(x, held, tangent):
@@ -269,7 +244,7 @@ def place_gradient_of(real: type) -> Scalar:
             rows, position, seen, axes, intrinsics, c, g_mean2d, g_conic, load(columns, 16 * LANES)
         )
         g_mean = scaled_sum(g, rows)
-        g_w, g_i, g_j, g_k = unit_quat_gradient(quat, inverse_norm, scaled_columns(scales, (a_x, a_y, a_z)))
+        g_w, g_i, g_j, g_k = projection.unit_quat_gradient(quat, inverse_norm, scaled_columns(scales, (a_x, a_y, a_z)))
         g_logit = load(columns, 17 * LANES) * opacity * (one - opacity)
         own = (
             g_mean[0], g_mean[1], g_mean[2], g_w, g_i, g_j, g_k,
@@ -286,27 +261,27 @@ def place_gradient_of(real: type) -> Scalar:
     return place_gradient
 
 
+@inlined
+def _put(table, at, k, b, g):
+    store(table, at + 3 * k * LANES, b * g[0])
+    store(table, at + (3 * k + 1) * LANES, b * g[1])
+    store(table, at + (3 * k + 2) * LANES, b * g[2])
+
+
+@inlined
+def _v_basis(table, at, k, g):
+    begin = at + 3 * k * LANES
+    return load(table, begin) * g[0] + load(table, begin + LANES) * g[1] + load(table, begin + 2 * LANES) * g[2]
+
+
 def color_gradient_of(real: type) -> Scalar:
     """Builds the adjoint of `color`, from a table of coefficients and columns of means and of gradients of colours.
 
     It writes the gradients of the coefficients to the second half of the table, and returns those of the vector from
     the camera to the mean.
     """
-    (full, load), basis, channel = vector_kind(real, LANES), harmonic_basis(real), channel_of(real)
-    directions, whole, zero, half = directions_of(real), COLUMNS * LANES, real(0.0), real(0.5)
-
-    @inlined
-    def put(table, at, k, b, g):
-        store(table, at + 3 * k * LANES, b * g[0])
-        store(table, at + (3 * k + 1) * LANES, b * g[1])
-        store(table, at + (3 * k + 2) * LANES, b * g[2])
-
-    @inlined
-    def v_basis(table, at, k, g):
-        begin = at + 3 * k * LANES
-        return load(table, begin) * g[0] + load(table, begin + LANES) * g[1] + load(table, begin + 2 * LANES) * g[2]
-
-    adjoint = build_color_gradient(real, put, v_basis)
+    adjoint = build_color_gradient(real, _put, _v_basis)
+    basis, whole, zero, half = harmonic_basis(real), COLUMNS * LANES, real(0.0), real(0.5)
 
     @inlined
     def color_gradient(table, columns, degree, lens, c):
@@ -317,6 +292,8 @@ def color_gradient_of(real: type) -> Scalar:
             select(channel(table, 0, 1, degree, b) + half > zero, load(columns, 4 * LANES), none),
             select(channel(table, 0, 2, degree, b) + half > zero, load(columns, 5 * LANES), none),
         )
-        return tangential(inverse_length, adjoint(table, 0, degree, x, y, z, b, g, table, whole, none), (x, y, z))
+        return projection.tangential(
+            inverse_length, adjoint(table, 0, degree, x, y, z, b, g, table, whole, none), (x, y, z)
+        )
 
     return color_gradient

@@ -13,13 +13,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
 
 import numba
 import numpy as np
 import torch
 from numba import prange
-from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
@@ -27,22 +25,10 @@ from glassplat.kernels.maths.blending import ALPHA_MAX, TRANSMITTANCE_MIN, Scala
 from glassplat.kernels.maths.disc import ray_hit_maths
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.records import REAL_OF, Bvh, Shapes
-from glassplat.kernels.trace import reach
+from glassplat.kernels.trace import reach, steps
 from glassplat.kernels.trace.bvh import build_fit_leaf, hilbert_codes, level_offsets
-from glassplat.kernels.trace.cpu_traversal import arrays_of, next_hits_maths, packed_leaves
-from glassplat.kernels.trace.steps import (
-    CHUNK,
-    CONTRIBUTION_AT,
-    FRAME_AT,
-    GEOMETRY,
-    OPACITY_AT,
-    STACK,
-    WIDTH,
-    color_backward,
-    coverage_maths,
-    ray_reader,
-    shape_of,
-)
+from glassplat.kernels.trace.cpu_traversal import flat_boxes, next_hits_maths, packed_leaves
+from glassplat.kernels.trace.steps import CHUNK, CONTRIBUTION_AT, FRAME_AT, GEOMETRY, OPACITY_AT, STACK, WIDTH
 
 
 def build_bvh(shapes: Shapes, *, flat: bool) -> Bvh:
@@ -52,8 +38,8 @@ def build_bvh(shapes: Shapes, *, flat: bool) -> Bvh:
     offsets = torch.tensor(level_offsets(count))
     boxes = shapes.means.new_empty(int(offsets[-1]), 6, WIDTH)
     extents = reach(shapes.opacities)
-    inputs = (tensor.detach().contiguous().numpy() for tensor in (shapes.means, shapes.frames, extents, order, offsets))
-    fit_boxes(real, flat)(*inputs, boxes.numpy())
+    inputs = (tensor.detach().contiguous() for tensor in (shapes.means, shapes.frames, extents, order, offsets))
+    fit_boxes(real, flat)(*inputs, boxes)
     return Bvh(order, boxes, offsets)
 
 
@@ -110,43 +96,33 @@ def trace_gradients(
     num_blocks = -(-hits.shape[0] // GRADIENT_BLOCK)
     distinct = torch.zeros(num_blocks, dtype=torch.int64)
     places = np.full((numba.get_num_threads(), 2, count), -1, np.int32)
-    inputs = tuple(tensor.numpy() for tensor in (*shapes[:3], *rays))
     trace_collect(real, flat)(
-        packed_leaves(shapes, bvh[0]), *inputs[3:], *arrays_of(bvh), real(near), kept.numpy(), hit_offsets.numpy(),
-        places, hit_ids.numpy(), distinct.numpy(),
-    )  # fmt: skip
+        packed_leaves(shapes, bvh[0]), *rays, *flat_boxes(bvh), real(near), kept, hit_offsets, places, hit_ids, distinct
+    )
     row_offsets = torch.cat([distinct.new_zeros(1), distinct.cumsum(0)])
     num_rows = int(row_offsets[-1])
     owners = torch.empty(num_rows, dtype=torch.int32)
     # Uninitialised: rows are cleared at their first use, and the allocator can reuse memory of the previous step.
-    rows, sh_rows = (means.new_empty(num_rows, *shape).numpy() for shape in ((GEOMETRY,), sh.shape[1:]))
+    rows, sh_rows = (means.new_empty(num_rows, *shape) for shape in ((GEOMETRY,), sh.shape[1:]))
     v_rays = tuple(torch.zeros_like(ray) for ray in rays)
     places[...] = -1
     trace_backward(real, flat)(
-        *inputs, sh.numpy(), degree, hit_offsets.numpy(), hit_ids.numpy(), row_offsets.numpy(), places,
-        *(tensor.numpy() for tensor in (*outputs[:3], *cotangents)),
-        owners.numpy(), rows, sh_rows, *(tensor.numpy() for tensor in v_rays),
+        *shapes[:3], *rays, sh, degree, hit_offsets, hit_ids, row_offsets, places, *outputs[:3], *cotangents,
+        owners, rows, sh_rows, *v_rays,
     )  # fmt: skip
-    sums, v_sh = _sum_rows(rows, sh_rows, owners, count, real)
-    v_means, v_frames, v_opacities, v_contributions = sums.tensor_split((FRAME_AT, OPACITY_AT, CONTRIBUTION_AT), dim=1)
-    return v_means, v_frames.reshape(-1, 3, 3), v_opacities[:, 0], v_sh, *v_rays, v_contributions
-
-
-def _sum_rows(
-    rows: NDArray[Any], sh_rows: NDArray[Any], owners: Tensor, count: int, real: type
-) -> tuple[Tensor, Tensor]:
-    """Sums [N, 15] over the rows of each Gaussian, and [N, K, 3] over those of its harmonics."""
+    # Zeros of NumPy, because untouched pages take no memory.
+    sums, v_sh = (torch.from_numpy(np.zeros((count, *shape), real)) for shape in ((GEOMETRY,), sh.shape[1:]))
     order = torch.argsort(owners, stable=True)
     offsets = torch.cat([owners.new_zeros(1, dtype=torch.int64), torch.bincount(owners, minlength=count).cumsum(0)])
-    sums, sh_sums = np.zeros((count, GEOMETRY), real), np.zeros((count, *sh_rows.shape[1:]), real)
-    sum_block_rows(real)(rows, sh_rows, order.numpy(), offsets.numpy(), sums, sh_sums)
-    return torch.from_numpy(sums), torch.from_numpy(sh_sums)
+    sum_block_rows(real)(rows, sh_rows, order, offsets, sums, v_sh)
+    v_means, v_frames, v_opacities, v_contributions = sums.tensor_split((FRAME_AT, OPACITY_AT, CONTRIBUTION_AT), dim=1)
+    return v_means, v_frames.reshape(-1, 3, 3), v_opacities[:, 0], v_sh, *v_rays, v_contributions
 
 
 @cache
 def trace_collect(real: type, flat: bool) -> Kernel:
     """Fills `hit_ids`, the Gaussians hit by each ray, nearest first, and the number of distinct ones in each block."""
-    next_hits, ray = next_hits_maths(real, flat), ray_reader(real)
+    next_hits, ray = next_hits_maths(real, flat), steps.ray_reader(real)
 
     @kernel("trace_collect_discs" if flat else "trace_collect_ellipsoids", real)
     def collect(leaves, origins, directions, order, boxes, offsets, near, kept, hit_offsets, places, hit_ids, distinct):
@@ -211,8 +187,8 @@ def _hit_gradients(real: type, flat: bool) -> Scalar:
 @cache
 def trace_backward(real: type, flat: bool) -> Kernel:
     """Fills each block's rows and their owners, and the gradients, initially zero, of the rays."""
-    coverage, add_gradients = coverage_maths(real, build_exp2(real)), _hit_gradients(real, flat)
-    (intersect, _), hit_color_gradient = ray_hit_maths(real, flat), color_backward(real)
+    coverage, add_gradients = steps.coverage_maths(real, build_exp2(real)), _hit_gradients(real, flat)
+    (intersect, _), hit_color_gradient = ray_hit_maths(real, flat), steps.color_backward(real)
     zero, half, one, nowhere = real(0.0), real(0.5), real(1.0), real("inf")
 
     @kernel("trace_backward_discs" if flat else "trace_backward_ellipsoids", real)
@@ -245,7 +221,7 @@ def trace_backward(real: type, flat: bool) -> Kernel:
                         sh_rows[free] = zero
                         free += 1
                     row = own[g]
-                    offset, frame = shape_of(means, frames, g, o)
+                    offset, frame = steps.shape_of(means, frames, g, o)
                     t, q, squared = intersect(offset, d, frame)
                     # At a threshold, a hit of the search may be missed here because of different rounding.
                     if not t < nowhere:
@@ -321,21 +297,15 @@ def trace(
         torch.empty(count, dtype=torch.int32),
         torch.empty(-(-count // BLOCK), num_kept, BLOCK, dtype=torch.int32),
     )
-    trace_forward(real, flat)(
-        packed_leaves(shapes, bvh[0]),
-        *(tensor.numpy() for tensor in (shapes[3], *rays)),
-        *arrays_of(bvh),
-        degree,
-        real(near),
-        *(tensor.numpy() for tensor in outputs),
-    )
+    leaves = packed_leaves(shapes, bvh[0])
+    trace_forward(real, flat)(leaves, shapes[3], *rays, *flat_boxes(bvh), degree, real(near), *outputs)
     return outputs
 
 
 @cache
 def trace_forward(real: type, flat: bool) -> Kernel:
     """Fills colors, alphas, depths and hits, and lists the nearest Gaussians."""
-    next_hits, ray = next_hits_maths(real, flat), ray_reader(real)
+    next_hits, ray = next_hits_maths(real, flat), steps.ray_reader(real)
     color, _ = color_maths(real)
     zero, half, one, least = real(0.0), real(0.5), real(1.0), real(TRANSMITTANCE_MIN)
 

@@ -8,10 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
 
 from numba import prange
-from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.kernels.backend.cpu import Kernel, inlined, kernel
@@ -21,19 +19,19 @@ from glassplat.kernels.maths.disc import EDGE_ON, MOST_DEVIATIONS
 from glassplat.kernels.records import REAL_OF
 from glassplat.kernels.trace.steps import LEVEL_BITS, NODE, SLACK, WIDTH, coverage_maths, insert
 
+full, load = vector_kind(WIDTH)
 LEAF = 13 * WIDTH
 """Numbers per leaf: means, rows of frames and opacities, each for all its positions."""
 
 
-def arrays_of(bvh: Sequence[Tensor]) -> tuple[NDArray[Any], ...]:
-    """Order, flat boxes and level offsets, as arrays for the kernels."""
+def flat_boxes(bvh: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    """Order, flat boxes and level offsets."""
     order, boxes, offsets = bvh
-    return order.numpy(), boxes.numpy().reshape(-1), offsets.numpy()
+    return order, boxes.view(-1), offsets
 
 
 def _entry(real: type) -> Scalar:
     """Builds the step that writes a ray's entry distances of a node's boxes, and returns the boxes hit, as bits."""
-    full, load = vector_kind(real, WIDTH)
     zero, sooner, later = real(0.0), real(1.0 - SLACK), real(1.0 + SLACK)
 
     @inlined
@@ -61,8 +59,7 @@ def _intersect_lanes(real: type, flat: bool) -> Scalar:
 
     It vectorises the intersection of `maths/disc.py`.
     """
-    load, edge_on, farthest = vector_kind(real, WIDTH).load, real(EDGE_ON**2), real(MOST_DEVIATIONS**2)
-    zero = real(0.0)
+    zero, edge_on, farthest = real(0.0), real(EDGE_ON**2), real(MOST_DEVIATIONS**2)
 
     @inlined
     def row(leaves, at, x, y, z, d):
@@ -134,13 +131,12 @@ def pack_leaves(real: type) -> Kernel:
     return pack
 
 
-def packed_leaves(shapes: Sequence[Tensor], order: Tensor) -> NDArray[Any]:
+def packed_leaves(shapes: Sequence[Tensor], order: Tensor) -> Tensor:
     """Flat contents of the leaves of a hierarchy."""
     means, frames, opacities = shapes[:3]
     leaves = means.new_empty(-(-order.shape[0] // WIDTH), 13, WIDTH)
-    inputs = (tensor.numpy() for tensor in (means, frames, opacities, order, leaves))
-    pack_leaves(REAL_OF[means.dtype])(*inputs)
-    return leaves.numpy().reshape(-1)
+    pack_leaves(REAL_OF[means.dtype])(means, frames, opacities, order, leaves)
+    return leaves.view(-1)
 
 
 def next_hits_maths(real: type, flat: bool) -> Scalar:
