@@ -19,20 +19,8 @@ from torch import Tensor
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.environment.cpu import gradients_like
+from glassplat.kernels.maths import cube
 from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.maths.cube import (
-    bilinear,
-    bilinear_gradient,
-    build_cell,
-    build_logistic,
-    from_face,
-    lookup_maths,
-    mirror_ray,
-    mirrored_gradient,
-    on_face,
-    over_column,
-    over_row,
-)
 from glassplat.kernels.maths.projection import dot
 from glassplat.kernels.maths.surface import surface_maths
 from glassplat.kernels.records import NORMAL_AT, NORMAL_MIN, REAL_OF, STRENGTH_AT, SURFACE_CHANNELS, Shaded
@@ -136,8 +124,8 @@ def pad_faces(real: type) -> Kernel:
         beyond_row, beyond_column = row == 0 or row > size, column == 0 or column > size
         found = texels[face, inner_row, inner_column, d]
         if beyond_row or beyond_column:
-            f, r, c = over_column(face, 1 if column == 0 else 0, inner_row, size)
-            g, s, e = over_row(face, 1 if row == 0 else 0, inner_column, size)
+            f, r, c = cube.over_column(face, 1 if column == 0 else 0, inner_row, size)
+            g, s, e = cube.over_row(face, 1 if row == 0 else 0, inner_column, size)
             if beyond_row and beyond_column:
                 found = (found + texels[f, r, c, d] + texels[g, s, e, d]) * third
             else:
@@ -264,7 +252,7 @@ def cube_lookup_gradients(texels: Tensor, directions: Tensor, cotangents: Tensor
 @cache
 def cube_lookup_forward(real: type) -> Kernel:
     """Fills the lookups in padded faces."""
-    look_up, _ = lookup_maths(real)
+    look_up, _ = cube.lookup_maths(real)
 
     @kernel("cube_lookup_forward", real, "real4 real2 real2")
     def forward(padded, directions, found):
@@ -278,7 +266,7 @@ def cube_lookup_forward(real: type) -> Kernel:
 @cache
 def cube_lookup_backward(real: type) -> Kernel:
     """Fills the gradients of the directions, and the cells and fractions of each lookup."""
-    _, look_up_gradient = lookup_maths(real)
+    _, look_up_gradient = cube.lookup_maths(real)
 
     @kernel("cube_lookup_backward", real, "real4 real2 real2 real2 int1 real2")
     def backward(padded, directions, v_found, v_directions, first_cells, fractions):
@@ -317,7 +305,7 @@ def shade_environment_gradients(
 
 
 def _cube_position(real: type) -> Scalar:
-    cell, one, half = build_cell(real), real(1.0), real(0.5)
+    cell, one, half = cube.build_cell(real), real(1.0), real(0.5)
 
     @inlined
     def cube_position(row, column, normal, intrinsics, rotation, size):
@@ -329,8 +317,8 @@ def _cube_position(real: type) -> Scalar:
             x * rotation[1, 0] + y * rotation[1, 1] + rotation[1, 2],
             x * rotation[2, 0] + y * rotation[2, 1] + rotation[2, 2],
         )
-        to = mirror_ray(ray, normal)
-        at = on_face(to[0], to[1], to[2])
+        to = cube.mirror_ray(ray, normal)
+        at = cube.on_face(to[0], to[1], to[2])
         left, along = cell(at[2], size)
         top, down = cell(at[3], size)
         return ray, at, left, along, top, down
@@ -341,7 +329,7 @@ def _cube_position(real: type) -> Scalar:
 @cache
 def shade_environment_forward(real: type) -> Kernel:
     """Fills rgb, base and reflection."""
-    logistic, cube_position = build_logistic(real), _cube_position(real)
+    logistic, cube_position = cube.build_logistic(real), _cube_position(real)
     shortest, zero, one = real(NORMAL_MIN**2), real(0.0), real(1.0)
 
     @kernel("shade_environment_forward", real, "real real3 real2 real4 real1 real2 real1 real3 real3 real3")
@@ -361,7 +349,7 @@ def shade_environment_forward(real: type) -> Kernel:
         _, at, left, along, top, down = cube_position(row, column, normal, intrinsics, rotation, padded.shape[1] - 2)
         upper, lower = padded[at[1], top], padded[at[1], top + 1]
         for d in range(3):
-            raw = bilinear(upper[left, d], upper[left + 1, d], lower[left, d], lower[left + 1, d], along, down)
+            raw = cube.bilinear(upper[left, d], upper[left + 1, d], lower[left, d], lower[left + 1, d], along, down)
             seen, behind = logistic(raw), base[row, column, d]
             reflection[row, column, d] = seen
             rgb[row, column, d] = behind + share * (seen - behind)
@@ -410,13 +398,15 @@ def shade_environment_backward(real: type) -> Kernel:
             v_share += v * (seen - base[row, column, d])
             v = (v * share + v_reflection[row, column, d]) * seen * (one - seen)
             v_raw[i, d] = v
-            by = bilinear_gradient(upper[left, d], upper[left + 1, d], lower[left, d], lower[left + 1, d], along, down)
+            by = cube.bilinear_gradient(
+                upper[left, d], upper[left + 1, d], lower[left, d], lower[left + 1, d], along, down
+            )
             by_column += v * by[0]
             by_row += v * by[1]
         v_pixel[STRENGTH_AT] = v_share
         cells_per_u = half * real(side - 2)
-        g = from_face(at, by_column * cells_per_u, by_row * cells_per_u)
-        x, y, z = mirrored_gradient(ray, normal, g)
+        g = cube.from_face(at, by_column * cells_per_u, by_row * cells_per_u)
+        x, y, z = cube.mirrored_gradient(ray, normal, g)
         v_pixel[NORMAL_AT], v_pixel[NORMAL_AT + 1], v_pixel[NORMAL_AT + 2] = x, y, z
         first_cells[i] = (face * side + top) * side + left
         fractions[i, 0], fractions[i, 1] = along, down

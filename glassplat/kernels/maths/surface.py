@@ -6,17 +6,9 @@ The functions read and write rows of arrays, so that one source compiles for the
 from __future__ import annotations
 
 from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.maths import projection
 from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.maths.projection import (
-    build_sigmoid,
-    build_unit_quat,
-    dot,
-    is_finite,
-    rotation,
-    scaled,
-    scaled_sum,
-    unit_quat_gradient,
-)
+from glassplat.kernels.maths.projection import dot, rotation, scaled, scaled_sum
 from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS
 
 
@@ -30,7 +22,7 @@ def shortest_axis(x, y, z):
 
 def _facing(real: type) -> tuple[Scalar, Scalar]:
     """The normal of a Gaussian, and its adjoint."""
-    unit_quat, zero, one = build_unit_quat(real), real(0.0), real(1.0)
+    unit_quat, zero, one = projection.build_unit_quat(real), real(0.0), real(1.0)
 
     @inlined
     def chosen(which, columns):
@@ -41,7 +33,7 @@ def _facing(real: type) -> tuple[Scalar, Scalar]:
     @inlined
     def normal_of(i, quats, log_scales, means, camera_center):
         quat, inverse_norm = unit_quat(quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3])
-        if not (is_finite(inverse_norm) and inverse_norm > zero):
+        if not (projection.is_finite(inverse_norm) and inverse_norm > zero):
             return zero, zero, zero
         shortest = shortest_axis(log_scales[i, 0], log_scales[i, 1], log_scales[i, 2])
         axis = chosen(shortest, rotation(quat))
@@ -60,7 +52,7 @@ def _facing(real: type) -> tuple[Scalar, Scalar]:
         side = -one if dot(normal, axis) < zero else one
         v = scaled(side, v_normal)
         g_columns = v if shortest == 0 else none, v if shortest == 1 else none, v if shortest == 2 else none
-        return unit_quat_gradient(quat, inverse_norm, g_columns)
+        return projection.unit_quat_gradient(quat, inverse_norm, g_columns)
 
     return normal_of, quat_gradient
 
@@ -71,7 +63,7 @@ def surface_maths(real: type) -> tuple[Scalar, Scalar]:
     `describe` writes its channels, with a normal of zeros if its quaternion has no direction. `describe_gradient`
     writes the gradients, given these channels.
     """
-    (normal_of, quat_gradient), sigmoid, one = _facing(real), build_sigmoid(real), real(1.0)
+    (normal_of, quat_gradient), sigmoid, one = _facing(real), projection.build_sigmoid(real), real(1.0)
 
     @inlined
     def describe(i, colors, quats, log_scales, means, logit_strengths, camera_center, extra, channels):

@@ -18,17 +18,10 @@ from torch import Tensor
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.maths.blending import Scalar
+from glassplat.kernels.project import steps
 from glassplat.kernels.project.cpu import DISC_WIDTHS, WIDTHS, new_outputs
 from glassplat.kernels.project.disc_steps import discs
-from glassplat.kernels.project.steps import (
-    LENS_VALUES,
-    Footprint,
-    build_fill_lenses,
-    build_project,
-    build_project_back,
-    ellipsoids,
-    vec3,
-)
+from glassplat.kernels.project.steps import LENS_VALUES, Footprint, vec3
 from glassplat.kernels.records import REAL_OF
 from glassplat.kernels.screen_statistics import Sums, Views
 
@@ -107,7 +100,7 @@ def _lenses(cam_from_world: Tensor, intrinsics: Tensor, width: int, height: int)
 @cache
 def camera_lenses(real: type) -> Kernel:
     """Fills the lenses of all cameras in one thread, because there are few."""
-    fill_lenses = build_fill_lenses(real)
+    fill_lenses = steps.build_fill_lenses(real)
 
     @kernel("camera_lenses", real, "real2 real3 real2 real real")
     def lenses(lens, cam_from_world, intrinsics, width, height):
@@ -120,7 +113,7 @@ def camera_lenses(real: type) -> Kernel:
 @cache
 def project_forward(real: type) -> Kernel:
     """Fills means2d, conics, depths, opacities, colors and radii; zeros where an ellipsoid is culled."""
-    project_one, zero = build_project(real, ellipsoids(real)), real(0.0)
+    project_one, zero = steps.build_project(real, steps.ellipsoids(real)), real(0.0)
 
     @kernel(
         "project_forward",
@@ -143,7 +136,7 @@ def project_forward(real: type) -> Kernel:
 @cache
 def project_discs_forward(real: type) -> Kernel:
     """Fills the fields of `ProjectedDiscs`; zeros where a disc is culled."""
-    project_one = build_project(real, discs(real))
+    project_one = steps.build_project(real, discs(real))
 
     @kernel(
         "project_discs_forward",
@@ -168,7 +161,7 @@ def project_discs_forward(real: type) -> Kernel:
 def _backward_body(real: type, footprint: Footprint) -> Scalar:
     """Builds the body of a backward kernel: sums Gaussians' gradients over cameras, and cameras' over a block."""
     zero, threads, pose = real(0.0), THREADS, POSE
-    shape, finish, project_back = footprint.shape, footprint.finish, build_project_back(real, footprint)
+    shape, finish, project_back = footprint.shape, footprint.finish, steps.build_project_back(real, footprint)
 
     @inlined
     def backward_body(
@@ -212,7 +205,7 @@ def _backward_body(real: type, footprint: Footprint) -> Scalar:
 @cache
 def project_backward(real: type) -> Kernel:
     """Adds to the gradients of ellipsoids, and fills each block's sums for each camera [blocks, C, 12]."""
-    backward_body = _backward_body(real, ellipsoids(real))
+    backward_body = _backward_body(real, steps.ellipsoids(real))
 
     @kernel(
         "project_backward",

@@ -7,35 +7,16 @@ import math
 import numpy as np
 
 from glassplat.kernels.backend.cpu import ONE, ZERO, inlined
+from glassplat.kernels.maths import disc, projection
 from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
-from glassplat.kernels.maths.disc import (
-    MAP,
-    MOST_LOG_SCALE,
-    build_is_not_edge_on,
-    crossing_box,
-    map_gradient,
-    outline,
-    pixel_map,
-    reach,
-)
-from glassplat.kernels.maths.projection import (
-    build_sigmoid,
-    build_unit_quat,
-    combine,
-    cross,
-    dot,
-    dot_products,
-    is_finite,
-    rotation,
-    scaled_sum,
-    unit_quat_gradient,
-)
+from glassplat.kernels.maths.disc import MAP
+from glassplat.kernels.maths.projection import combine, cross, dot, dot_products, is_finite, rotation, scaled_sum
 from glassplat.kernels.project.steps import Footprint, in_camera
 
 
 def _shape(real: type) -> Scalar:
-    sigmoid, unit_quat = build_sigmoid(real), build_unit_quat(real)
-    zero, most = real(0.0), real(MOST_LOG_SCALE)
+    sigmoid, unit_quat = projection.build_sigmoid(real), projection.build_unit_quat(real)
+    zero, most = real(0.0), real(disc.MOST_LOG_SCALE)
 
     @inlined
     def shape(means, quats, log_scales, logit_opacities, n):
@@ -70,7 +51,7 @@ def facing_sign(axis, mean, lens, c):
 
 
 def _place(real: type) -> Scalar:
-    is_not_edge_on, one, alpha_min = build_is_not_edge_on(real), real(1.0), real(ALPHA_MIN)
+    is_not_edge_on, one, alpha_min = disc.build_is_not_edge_on(real), real(1.0), real(ALPHA_MIN)
 
     @inlined
     def place(c, n, mean, shaped, cam_from_world, intrinsics, lens, windows, size, near, outputs):
@@ -82,18 +63,18 @@ def _place(real: type) -> Scalar:
         if not (is_not_edge_on(across, m) and opacity > alpha_min and is_finite(m[2])):
             return
         fx, fy = intrinsics[c, 0], intrinsics[c, 1]
-        found = pixel_map(p, q, across, m, one / deviations[0], one / deviations[1], fx, fy)
+        found = disc.pixel_map(p, q, across, m, one / deviations[0], one / deviations[1], fx, fy)
         total = abs(found[0]) + abs(found[1]) + abs(found[2]) + abs(found[3]) + abs(found[4]) + abs(found[5])
         if not is_finite(total):
             return
         slope_u, slope_v = np.float64(p[2] * deviations[0]), np.float64(q[2] * deviations[1])
-        nearest = np.float64(m[2]) - math.sqrt(reach(opacity) * (slope_u * slope_u + slope_v * slope_v))
-        dx, dy, xx, xy, yy, wide, high = outline(found, opacity, nearest, np.float64(near), size[0], size[1])
+        nearest = np.float64(m[2]) - math.sqrt(disc.reach(opacity) * (slope_u * slope_u + slope_v * slope_v))
+        dx, dy, xx, xy, yy, wide, high = disc.outline(found, opacity, nearest, np.float64(near), size[0], size[1])
         u, v = fx * m[0] / m[2] + intrinsics[c, 2], fy * m[1] / m[2] + intrinsics[c, 3]
         x, y = u + real(dx), v + real(dy)
         left, right, top, bottom = x - real(wide), x + real(wide), y - real(high), y + real(high)
         if xx == 0.0:
-            reached = crossing_box(m, p, q, deviations, reach(opacity), np.float64(near), fx, fy)
+            reached = disc.crossing_box(m, p, q, deviations, disc.reach(opacity), np.float64(near), fx, fy)
             left, right = real(reached[0]) + intrinsics[c, 2], real(reached[1]) + intrinsics[c, 2]
             top, bottom = real(reached[2]) + intrinsics[c, 3], real(reached[3]) + intrinsics[c, 3]
         # Written so that NaN fails every comparison and the disc stays culled.
@@ -129,7 +110,7 @@ def place_gradient(c, n, mean, shaped, cam_from_world, intrinsics, lens, maps, c
     across = cross(p, q)
     fx, fy, inverse = intrinsics[c, 0], intrinsics[c, 1], ONE / m[2]
     found, g_map = disc_map(maps, c, n), disc_map(g_maps, c, n)
-    g_p, g_q, g_m, g_u, g_v = map_gradient(
+    g_p, g_q, g_m, g_u, g_v = disc.map_gradient(
         p, q, m, across, found, ONE / deviations[0], ONE / deviations[1], fx, fy, g_map
     )
     g_x, g_y = g_means2d[c, n, 0] * fx * inverse, g_means2d[c, n, 1] * fy * inverse
@@ -157,7 +138,7 @@ def finish(n, shaped, sums, g_means, g_quats, g_log_scales, g_logit_opacities):
     g_means[n, 0], g_means[n, 1], g_means[n, 2] = g_mean
     g_logit_opacities[n] = g_opacity * opacity * (ONE - opacity)
     g_log_scales[n, 0], g_log_scales[n, 1] = g_scales
-    g_w, g_i, g_j, g_k = unit_quat_gradient(quat, inverse_norm, g_axes)
+    g_w, g_i, g_j, g_k = projection.unit_quat_gradient(quat, inverse_norm, g_axes)
     g_quats[n, 0], g_quats[n, 1], g_quats[n, 2], g_quats[n, 3] = g_w, g_i, g_j, g_k
 
 

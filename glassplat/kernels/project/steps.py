@@ -8,29 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from glassplat.kernels.backend.cpu import ONE, ZERO, inlined
+from glassplat.kernels.maths import projection
 from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
 from glassplat.kernels.maths.harmonics import color_maths
-from glassplat.kernels.maths.projection import (
-    build_covariance_gradient,
-    build_half_extents,
-    build_screen_covariance,
-    build_sigmoid,
-    build_tangent_limits,
-    build_unit_quat,
-    clamp,
-    combine,
-    dot,
-    dot_products,
-    footprint,
-    footprint_gradient,
-    is_finite,
-    rotation,
-    scaled,
-    scaled_columns,
-    scaled_sum,
-    tangential,
-    unit_quat_gradient,
-)
+from glassplat.kernels.maths.projection import combine, dot, dot_products, rotation, scaled, scaled_columns, scaled_sum
 
 CHUNK = 512
 """Gaussians per task; affects the rounding of results, so do not tune it per machine."""
@@ -64,7 +45,7 @@ def in_camera(cam_from_world, c, mean):
 
 def build_shape(real: type) -> Scalar:
     """Builds (usable, opacity, unit quaternion, inverse norm, axes) of an ellipsoid."""
-    sigmoid, unit_quat, zero = build_sigmoid(real), build_unit_quat(real), real(0.0)
+    sigmoid, unit_quat, zero = projection.build_sigmoid(real), projection.build_unit_quat(real), real(0.0)
 
     @inlined
     def shape(means, quats, log_scales, logit_opacities, n):
@@ -72,7 +53,7 @@ def build_shape(real: type) -> Scalar:
         scales = math.exp(log_scales[n, 0]), math.exp(log_scales[n, 1]), math.exp(log_scales[n, 2])
         raw = abs(means[n, 0]) + abs(means[n, 1]) + abs(means[n, 2]) + abs(logit_opacities[n])
         raw += abs(log_scales[n, 0]) + abs(log_scales[n, 1]) + abs(log_scales[n, 2])
-        usable = is_finite(raw) and inverse_norm > zero and is_finite(inverse_norm)
+        usable = projection.is_finite(raw) and inverse_norm > zero and projection.is_finite(inverse_norm)
         return usable, sigmoid(logit_opacities[n]), quat, inverse_norm, scaled_columns(scales, rotation(quat))
 
     return shape
@@ -80,7 +61,7 @@ def build_shape(real: type) -> Scalar:
 
 def build_fill_lenses(real: type) -> Scalar:
     """Builds the step that writes `LENS_VALUES` numbers per camera."""
-    tangent_limits, one = build_tangent_limits(real), real(1.0)
+    tangent_limits, one = projection.build_tangent_limits(real), real(1.0)
 
     @inlined
     def skewed(row, row_z, tangent):
@@ -125,7 +106,7 @@ def build_direction(real: type) -> Scalar:
 
 def build_view(real: type, clamped: Scalar) -> Scalar:
     """Builds `view` for scalars or vectors, given the function that clamps them."""
-    screen_covariance, one = build_screen_covariance(real), real(1.0)
+    screen_covariance, one = projection.build_screen_covariance(real), real(1.0)
 
     @inlined
     def view(rows, position, axes, intrinsics, lens, c):
@@ -134,7 +115,7 @@ def build_view(real: type, clamped: Scalar) -> Scalar:
         tangent_x, tangent_y = position[0] * inverse_depth, position[1] * inverse_depth
         held_x, held_y = clamped(tangent_x, lens[c, 0], lens[c, 1]), clamped(tangent_y, lens[c, 2], lens[c, 3])
         scale_x, scale_y = intrinsics[c, 0] * inverse_depth, intrinsics[c, 1] * inverse_depth
-        w_x, w_y = footprint(rows, scale_x, scale_y, held_x, held_y)
+        w_x, w_y = projection.footprint(rows, scale_x, scale_y, held_x, held_y)
         v_x, v_y = dot_products(w_x, axes), dot_products(w_y, axes)
         return (tangent_x, tangent_y), (held_x, held_y), (w_x, w_y), (v_x, v_y), screen_covariance(v_x, v_y)
 
@@ -147,7 +128,7 @@ MOST_SQUARED_DEVIATIONS = 1.01 * 2.0 * math.log(1.0 / ALPHA_MIN)
 
 def build_place(real: type) -> Scalar:
     """Builds `place` for ellipsoids: if one is visible in a camera, fills all its outputs but the colour."""
-    view, half_extents = build_view(real, clamp), build_half_extents(real)
+    view, half_extents = build_view(real, projection.clamp), projection.build_half_extents(real)
     zero, one = real(0.0), real(1.0)
 
     @inlined
@@ -164,7 +145,7 @@ def build_place(real: type) -> Scalar:
         # Written so that NaN fails every comparison and the Gaussian stays culled.
         across = u + reach_x > windows[c, 0] and u - reach_x < windows[c, 2]
         down = v + reach_y > windows[c, 1] and v - reach_y < windows[c, 3]
-        if across and down and reach_x > zero and is_finite(determinant) and is_finite(depth):
+        if across and down and reach_x > zero and projection.is_finite(determinant) and projection.is_finite(depth):
             inverse = one / determinant
             means2d[c, n, 0], means2d[c, n, 1] = u, v
             conics[c, n, 0], conics[c, n, 1], conics[c, n, 2] = yy * inverse, -xy * inverse, xx * inverse
@@ -199,7 +180,7 @@ def place_gradients(real: type, free: Scalar | None = None) -> Scalar:
 
     For vectors, `free(x, held, tangent)` is x where a tangent is not clamped to a limit, and 0 elsewhere.
     """
-    covariance_gradient, zero, one = build_covariance_gradient(real), real(0.0), real(1.0)
+    covariance_gradient, zero, one = projection.build_covariance_gradient(real), real(0.0), real(1.0)
 
     @inlined
     def free_number(x, held, tangent):
@@ -214,7 +195,7 @@ def place_gradients(real: type, free: Scalar | None = None) -> Scalar:
         fx, fy, inverse_depth = intrinsics[c, 0], intrinsics[c, 1], one / position[2]
         scale_x, scale_y = fx * inverse_depth, fy * inverse_depth
         g_covariance = covariance_gradient(covariance, g_conic[0], g_conic[1], g_conic[2])
-        gw_x, gw_y, g_axes = footprint_gradient(w_x, w_y, v_x, v_y, axes, g_covariance)
+        gw_x, gw_y, g_axes = projection.footprint_gradient(w_x, w_y, v_x, v_y, axes, g_covariance)
         # w_x = (fx / z) (row_x - held_x row_z); a tangent clamped to its limit passes no gradient.
         g_held_x = free(-scale_x * dot(gw_x, rows[2]), held[0], tangent[0])
         g_held_y = free(-scale_y * dot(gw_y, rows[2]), held[1], tangent[1])
@@ -268,7 +249,7 @@ def view_gradients(real: type) -> Scalar:
             g_color[1] if green + half > zero else zero,
             g_color[2] if blue + half > zero else zero,
         )
-        return tangential(inverse_length, color_gradient(sh, n, degree, x, y, z, passed, g_sh), (x, y, z))
+        return projection.tangential(inverse_length, color_gradient(sh, n, degree, x, y, z, passed, g_sh), (x, y, z))
 
     return view_gradient
 
@@ -302,7 +283,7 @@ def ellipsoids(real: type) -> Footprint:
 
 
 def _ellipsoid_gradient(real: type) -> Scalar:
-    view, placed, zero = build_view(real, clamp), place_gradients(real), real(0.0)
+    view, placed, zero = build_view(real, projection.clamp), place_gradients(real), real(0.0)
 
     @inlined
     def place_gradient(c, n, mean, shaped, cam_from_world, intrinsics, lens, maps, cotangents):
@@ -333,7 +314,7 @@ def finish_ellipsoid(n, shaped, sums, g_means, g_quats, g_log_scales, g_logit_op
     g_log_scales[n, 1] += dot(axes[1], g_axes[1])
     g_log_scales[n, 2] += dot(axes[2], g_axes[2])
     lengths = dot(axes[0], x), dot(axes[1], y), dot(axes[2], z)
-    g_w, g_i, g_j, g_k = unit_quat_gradient(quat, inverse_norm, scaled_columns(lengths, g_axes))
+    g_w, g_i, g_j, g_k = projection.unit_quat_gradient(quat, inverse_norm, scaled_columns(lengths, g_axes))
     g_quats[n, 0] += g_w
     g_quats[n, 1] += g_i
     g_quats[n, 2] += g_j
@@ -364,7 +345,7 @@ def build_project(real: type, kind: Footprint) -> Scalar:
                 continue
             (x, y, z), _ = direction(mean, lens, c)
             red, green, blue = color(sh, n, degree, x, y, z)
-            if is_finite(abs(red) + abs(green) + abs(blue)):
+            if projection.is_finite(abs(red) + abs(green) + abs(blue)):
                 colors[c, n, 0] = max(red + half, zero)
                 colors[c, n, 1] = max(green + half, zero)
                 colors[c, n, 2] = max(blue + half, zero)

@@ -27,25 +27,9 @@ from glassplat.kernels.maths.disc import ray_hit_maths
 from glassplat.kernels.maths.fast_maths import exp2_maths
 from glassplat.kernels.maths.harmonics import MAX_DEGREE, color_maths
 from glassplat.kernels.records import REAL_OF, Bvh, Shapes
-from glassplat.kernels.trace import reach
+from glassplat.kernels.trace import reach, steps
 from glassplat.kernels.trace.bvh import build_fit_leaf, curve_cells, curve_position, level_offsets
-from glassplat.kernels.trace.steps import (
-    CHUNK,
-    CONTRIBUTION_AT,
-    FRAME_AT,
-    GEOMETRY,
-    LEVEL_BITS,
-    NODE,
-    OPACITY_AT,
-    SLACK,
-    STACK,
-    WIDTH,
-    color_backward,
-    coverage_maths,
-    insert,
-    ray_reader,
-    shape_of,
-)
+from glassplat.kernels.trace.steps import CHUNK, FRAME_AT, GEOMETRY, LEVEL_BITS, NODE, OPACITY_AT, STACK, WIDTH
 
 THREADS = 128
 MOST_KEPT, KEPT_BYTES = 64, 2**28
@@ -153,8 +137,8 @@ def enter(boxes, at, o, inverse, first, last):
 
 def next_hits_maths(real: type, flat: bool) -> Scalar:
     """Builds `next_hits`, which fills (ts, ids, alphas) with a ray's next hits and returns their number."""
-    (intersect, _), coverage = ray_hit_maths(real, flat), coverage_maths(real, exp2_maths(real))
-    zero, nowhere, sooner, later = real(0.0), real("inf"), real(1.0 - SLACK), real(1.0 + SLACK)
+    (intersect, _), coverage = ray_hit_maths(real, flat), steps.coverage_maths(real, exp2_maths(real))
+    zero, nowhere, sooner, later = real(0.0), real("inf"), real(1.0 - steps.SLACK), real(1.0 + steps.SLACK)
 
     @inlined
     def next_hits(
@@ -188,7 +172,7 @@ def next_hits_maths(real: type, flat: bool) -> Scalar:
                     top += 1
                     continue
                 g = order[child + k]
-                offset, frame = shape_of(means, frames, g, o)
+                offset, frame = steps.shape_of(means, frames, g, o)
                 t, _, squared = intersect(offset, d, frame)
                 if not (t > first or (t == first and g > first_id)):
                     continue
@@ -196,7 +180,7 @@ def next_hits_maths(real: type, flat: bool) -> Scalar:
                     continue
                 _, alpha = coverage(opacities[g], squared)
                 if alpha > zero:
-                    count = insert(ts, ids, alphas, count, CHUNK, t, g, alpha)
+                    count = steps.insert(ts, ids, alphas, count, CHUNK, t, g, alpha)
                     if count == CHUNK:
                         farthest, farthest_id = ts[CHUNK - 1], ids[CHUNK - 1]
         return count
@@ -230,7 +214,7 @@ class Hits(NamedTuple):
 @cache
 def trace_ray_gradients(real: type, flat: bool) -> Kernel:
     """Fills rays, weights and v_squares of hits, and the gradients of origins and directions, zero without hits."""
-    ray, hit_color_gradient = ray_reader(real), color_backward(real)
+    ray, hit_color_gradient = steps.ray_reader(real), steps.color_backward(real)
     intersect, intersect_gradient = ray_hit_maths(real, flat)
     zero, half, one, most, nowhere = real(0.0), real(0.5), real(1.0), real(ALPHA_MAX), real("inf")
 
@@ -259,7 +243,7 @@ def trace_ray_gradients(real: type, flat: bool) -> Kernel:
         by_origin, by_direction, by_unit = (zero, zero, zero), (zero, zero, zero), (zero, zero, zero)
         for place in range(starts[r], starts[r + 1]):
             g, alpha = hit_ids[place], hit_alphas[place]
-            offset, frame = shape_of(means, frames, g, o)
+            offset, frame = steps.shape_of(means, frames, g, o)
             t, q, _ = intersect(offset, d, frame)
             weight, value, v_squared = alpha * left, zero, zero
             # At the threshold, differently fused operations may find a disc edge-on.
@@ -290,7 +274,7 @@ def trace_ray_gradients(real: type, flat: bool) -> Kernel:
 @cache
 def trace_gaussian_gradients(real: type, flat: bool) -> Kernel:
     """Fills the gradients, initially zero, of Gaussians that rays hit, one block of one warp for each."""
-    ray, hit_color_gradient = ray_reader(real), color_backward(real)
+    ray, hit_color_gradient = steps.ray_reader(real), steps.color_backward(real)
     intersect, intersect_gradient = ray_hit_maths(real, flat)
     zero, two, nowhere = real(0.0), real(2.0), real("inf")
 
@@ -309,7 +293,7 @@ def trace_gaussian_gradients(real: type, flat: bool) -> Kernel:
         row[FRAME_AT + 3], row[FRAME_AT + 4], row[FRAME_AT + 5] = v_frame[1]
         row[FRAME_AT + 6], row[FRAME_AT + 7], row[FRAME_AT + 8] = v_frame[2]
         row[OPACITY_AT] = -two * v_squared / opacity
-        row[CONTRIBUTION_AT], row[CONTRIBUTION_AT + 1] = weight, weight * (t * length)
+        row[steps.CONTRIBUTION_AT], row[steps.CONTRIBUTION_AT + 1] = weight, weight * (t * length)
 
     @kernel(
         "trace_gradients_discs" if flat else "trace_gradients_ellipsoids",
@@ -334,7 +318,7 @@ def trace_gaussian_gradients(real: type, flat: bool) -> Kernel:
                 hit = order[first + lane]
                 r, weight = hit_rays[hit], weights[hit]
                 o, d, _, length, _ = ray(origins, directions, r)
-                offset, frame = shape_of(means, frames, g, o)
+                offset, frame = steps.shape_of(means, frames, g, o)
                 fill(rows[lane], offset, d, frame, length, weight, v_depths[r], v_squares[hit], opacities[g])
                 if degree >= 0:
                     for k in range(HARMONICS):
@@ -358,7 +342,7 @@ def trace_gaussian_gradients(real: type, flat: bool) -> Kernel:
         elif lane == OPACITY_AT:
             v_opacities[g] = geometry
         elif lane < GEOMETRY:
-            v_contributions[g, lane - CONTRIBUTION_AT] = geometry
+            v_contributions[g, lane - steps.CONTRIBUTION_AT] = geometry
         if lane < used:
             v_sh[g, lane // 3, lane % 3] = first_color
         if lane + WARP < used:
@@ -440,7 +424,7 @@ def trace_forward(real: type, flat: bool) -> Kernel:
     Both are one kernel, so that both find the same hits: separate kernels may fuse operations differently, and a
     Gaussian that covers just 1/255 would be hit in only one of them.
     """
-    ray, next_hits, (color, _) = ray_reader(real), next_hits_maths(real, flat), color_maths(real)
+    ray, next_hits, (color, _) = steps.ray_reader(real), next_hits_maths(real, flat), color_maths(real)
     zero, half, one, least = real(0.0), real(0.5), real(1.0), real(TRANSMITTANCE_MIN)
 
     @kernel(
