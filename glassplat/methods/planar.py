@@ -58,10 +58,10 @@ class PaneSetup:
         """Edits `state`, and yields its progress."""
         recipe = self.recipe
         yield Working("fitting planes to the masks", 0, 1)
-        scene = self._with_glass(state.scene, capture_planes(dataset, state.scene.primary.means, recipe.plane_fit))
+        scene = self.with_glass(state.scene, capture_planes(dataset, state.scene.primary.means, recipe.plane_fit))
         if recipe.detect_mirrors or recipe.plane_fit.mirror_labels:
             # The search for mirrors aligns them.
-            scene = self._with_glass(scene, (yield from self._find_mirrors(scene, dataset)))
+            scene = self.with_glass(scene, (yield from self.find_mirrors(scene, dataset)))
         planes = scene.planes if recipe.fixed_mirrors else replace(scene.planes, mirrors=())
         state.scene = replace(scene, planes=planes.that_may_tint() if recipe.tint else planes)
         state.statistics.clear()
@@ -72,22 +72,23 @@ class PaneSetup:
             yield from seed_reflection(state, dataset, panes)
         return True
 
-    def _with_glass(self, scene: Scene, planes: Planes) -> Scene:
+    def with_glass(self, scene: Scene, planes: Planes) -> Scene:
         """The scene with these planes, and glass on them."""
         glass = glass_gaussians(planes, count=self.recipe.glass_count, seed=self.seed)
         return replace(scene, planes=planes, glass=glass)
 
-    def _find_mirrors(self, scene: Scene, dataset: Dataset) -> Generator[Working, None, Planes]:
-        """The scene's planes with detected mirrors marked and aligned.
+    def find_mirrors(self, scene: Scene, dataset: Dataset) -> Generator[Working, None, Planes]:
+        """The scene's planes with further mirrors marked and aligned.
 
-        If the recipe names mirrors, only these are; planes of planes.json are as stated there.
+        If the recipe names mirrors, these are added, else detected ones; planes of planes.json are as stated there.
         """
         fit = self.recipe.plane_fit
         given = Planes.empty() if dataset.planes is None else dataset.planes
-        fitted = [label for label in scene.planes.labels if label not in given.labels]
+        known = scene.planes.mirrors
+        fitted = [label for label in scene.planes.labels if label not in (*given.labels, *known)]
         candidates = yield from mirror_candidates(scene, dataset, fitted)
         detected = detected_mirrors(scene.planes, candidates)
-        mirrors = tuple(dict.fromkeys((*given.mirrors, *(fit.mirror_labels or detected))))
+        mirrors = tuple(dict.fromkeys((*known, *(fit.mirror_labels or detected))))
         log.info("mirrors among the panes: %s", name_labels(mirrors) or "none")
         aligned = [candidates[label].pane for label in detected if label in mirrors]
         return with_mirrors(with_poses_of(scene.planes, aligned), mirrors, fit.mirror_reflectance)
@@ -240,9 +241,33 @@ def mirror_virtual_gaussians(state: TrainState, dataset: Dataset, mirrors: Plane
         log.info("%d Gaussians behind %s moved to the front", moved, name_panes(mirrors, "mirror"))
 
 
+@dataclass(frozen=True)
+class DetectMirrors(AtShares):
+    """Detects mirrors again, which needs Gaussians that cover what they reflect.
+
+    Attributes:
+        panes: the entry of panes, which has detected the others.
+    """
+
+    panes: PaneSetup
+    name: str = "detect mirrors"
+
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
+        """Edits `state` if necessary, and yields its progress."""
+        known = state.scene.planes.mirrors
+        planes = yield from self.panes.find_mirrors(state.scene, dataset)
+        rows = [row for row, label in enumerate(planes.labels) if label in planes.mirrors and label not in known]
+        if rows:
+            state.scene = self.panes.with_glass(state.scene, planes)
+            state.statistics.clear()
+            for mirrors in coplanar_panes(planes.select(rows), mirrors=True):
+                mirror_virtual_gaussians(state, dataset, mirrors)
+        return bool(rows)
+
+
 TURN_AFTER = 0.005
-"""Share of a run after the start of joint optimisation at which reflections behind glass are moved: before the first
-opacity reset. Repetitions would move real objects."""
+"""Share of a run after the start of joint optimisation at which reflections behind glass are moved, and mirrors are
+detected again: before the first opacity reset. Repetitions would move real objects."""
 
 
 @dataclass(frozen=True)
@@ -430,7 +455,7 @@ def planar_stages(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_I
     stages: tuple[Stage, ...] = (
         initialisation,
         _adjustment_stage(recipe, first, second, seed),
-        _joint_stage(recipe, third),
+        _joint_stage(recipe, third, seed),
     )
     stages = with_learned_photographer(recipe.photographer, stages, recipe.densify, seed)
     return with_learned_corrections(recipe, stages)
@@ -475,10 +500,12 @@ def _adjustment_stage(recipe: PlanarRecipe, start: float, share: float, seed: in
     )
 
 
-def _joint_stage(recipe: PlanarRecipe, share: float) -> Stage:
+def _joint_stage(recipe: PlanarRecipe, share: float, seed: int) -> Stage:
     """Stage 3: joint optimisation, with perturbed opacities and slowly moving planes."""
     strategy, start = strategy_of(recipe), 1 - share
     turn = TurnReflections((start + TURN_AFTER,)), LightLamps(LAMP_SEARCH_AT, planar_renderer(recipe))
+    detect = DetectMirrors((start + TURN_AFTER,), PaneSetup(recipe, seed))
+    is_automatic = recipe.detect_mirrors and recipe.fixed_mirrors and not recipe.plane_fit.mirror_labels
     perturb_at = Every(
         recipe.intervals.opacity,
         start + TURN_AFTER,
@@ -495,6 +522,7 @@ def _joint_stage(recipe: PlanarRecipe, share: float) -> Stage:
         | plane_rates(JOINT_RATE_FACTOR)
         | ({"primary.log_intensity": Rate(recipe.rates.intensity)} if recipe.intensity else {}),
         actions=(
+            *((detect,) if is_automatic else ()),
             *(turn if recipe.turn_reflections else ()),
             *_seed_actions(recipe, start + SEED_AFTER_JOINT),
             *strategy.edits,
