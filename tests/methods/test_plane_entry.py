@@ -12,6 +12,7 @@ import torch
 from glassplat.captures.view import PointCloud
 from glassplat.methods import planar
 from glassplat.methods.planar import (
+    DetectMirrors,
     PaneSetup,
     TurnReflections,
     coplanar_panes,
@@ -113,22 +114,40 @@ def test_few_points_behind_a_pane_are_no_evidence() -> None:
     assert not finished(seed_reflection(state_of(replace(scene, primary=case)), replace(capture, points=few), PANE))
 
 
-def test_glass_lies_on_the_plane_of_an_aligned_mirror(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = true_scene()
+def entered(monkeypatch: pytest.MonkeyPatch, *compared: int) -> TrainState:
+    """The state after panes were set up, and after further searches, with so many pixels compared in each search."""
+    scene, left = true_scene(), list(compared)
     state = state_of(replace(scene, planes=Planes.empty(), glass=scene.glass.select(torch.zeros(0).long())))
 
     def judged(scene: Scene, dataset: Any, labels: Any) -> Any:
         yield from ()
         aligned = material.move_pane(scene, torch.tensor([0.02, 0.01, 0.05])).planes
-        return {aligned.labels[0]: MirrorCandidate(aligned, MirrorRegression(0.9, 0.9), 1000, 1000)}
+        return {label: MirrorCandidate(aligned, MirrorRegression(0.9, 0.9), left.pop(0), 1000) for label in labels}
 
     monkeypatch.setattr(planar, "mirror_candidates", judged)
     monkeypatch.setattr(planar, "capture_planes", lambda *_: PANE)
-    finished(PaneSetup(PlanarRecipe(glass_count=50), seed=0)(state, tiny_capture()))
+    setup = PaneSetup(PlanarRecipe(glass_count=50, seed_reflections=False), seed=0)
+    finished(setup(state, tiny_capture()))
+    for _ in compared[1:]:
+        before, known = state.scene, state.scene.planes.mirrors
+        found = finished(DetectMirrors((0.5,), setup).apply(state, tiny_capture(), Clock(1, 2, 6)))
+        assert found == (state.scene is not before) == (state.scene.planes.mirrors != known)
+    return state
+
+
+def test_glass_lies_on_the_plane_of_an_aligned_mirror(monkeypatch: pytest.MonkeyPatch) -> None:
+    state = entered(monkeypatch, 1000)
     planes, glass = state.scene.planes, state.scene.glass
     assert planes.mirrors == planes.labels
     heights = (glass.means - planes.centers[0]) @ planes.normals[0]
-    assert float(heights.abs().max()) < 1e-3 * scene.extent
+    assert float(heights.abs().max()) < 1e-3 * state.scene.extent
+
+
+def test_a_mirror_that_is_recognised_later_is_like_one_recognised_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    unknown, later, once = (entered(monkeypatch, *compared).scene for compared in ((0, 0), (0, 0, 1000, 0), (1000, 0)))
+    assert unknown.planes.mirrors == () and later.planes.mirrors == once.planes.mirrors == PANE.labels
+    for name, tensor in once.parameters().items():
+        assert torch.equal(tensor, later.parameters()[name]), name
 
 
 def split_in_two(whole: Planes) -> Planes:
