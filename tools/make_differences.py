@@ -64,7 +64,8 @@ REASONS: dict[str, dict[str, str]] = {
     "splat": ALL,
     "planar": {
         "view_dependence_weight": "Mirrored views see Gaussians from directions that no photograph shows.",
-        "stage_shares": "The longer panes are missing, the more Gaussians model reflections behind them.",
+        "stage_shares": "The first two stages have at most 350 steps: the longer panes are missing, the more Gaussians "
+        "model reflections behind them.",
         "fresnel": "A pane has two surfaces; Schlick's curve is a third too low at 70°.",
         "blend": "Light adds up linearly.",
         "panes": "Panes behind panes caused half of the error of a glass case.",

@@ -243,7 +243,7 @@ def matrix_of(node: Mapping[str, Any]) -> Tensor:
     turn, scales, shift = (
         torch.tensor(part, dtype=torch.float64) for part in ((w, x, y, z), node["scale"], node["translation"])
     )
-    # A rotation of length 0 is none, and becomes a scale of 0.
+    # A quaternion of length 0 is invalid; it becomes a scale of 0, which `check_placement` refuses.
     own[:3, :3], own[:3, 3] = rotation_from_quat(turn) * scales * (math.hypot(x, y, z, w) > TOLERANCE), shift
     return own
 

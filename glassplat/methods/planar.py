@@ -80,7 +80,7 @@ class PaneSetup:
     def find_mirrors(self, scene: Scene, dataset: Dataset) -> Generator[Working, None, Planes]:
         """The scene's planes with further mirrors marked and aligned.
 
-        If the recipe names mirrors, these are added, else detected ones; planes of planes.json are as stated there.
+        Mirrors named in the recipe are added, otherwise detected ones; planes of planes.json are as stated there.
         """
         fit = self.recipe.plane_fit
         given = Planes.empty() if dataset.planes is None else dataset.planes
@@ -243,10 +243,12 @@ def mirror_virtual_gaussians(state: TrainState, dataset: Dataset, mirrors: Plane
 
 @dataclass(frozen=True)
 class DetectMirrors(AtShares):
-    """Detects mirrors again, which needs Gaussians that cover what they reflect.
+    """Detects mirrors that were missed in the setup of panes, when Gaussians covered too little of what they reflect.
+
+    If there are any, the glass of all panes is placed anew.
 
     Attributes:
-        panes: the entry of panes, which has detected the others.
+        panes: the setup of panes, which detected the other mirrors.
     """
 
     panes: PaneSetup
@@ -259,6 +261,8 @@ class DetectMirrors(AtShares):
         rows = [row for row, label in enumerate(planes.labels) if label in planes.mirrors and label not in known]
         if rows:
             state.scene = self.panes.with_glass(state.scene, planes)
+            for name in [name for name in state.optimizer.moments if name.startswith("glass.")]:
+                del state.optimizer.moments[name]
             state.statistics.clear()
             for mirrors in coplanar_panes(planes.select(rows), mirrors=True):
                 mirror_virtual_gaussians(state, dataset, mirrors)
@@ -425,22 +429,24 @@ def planar_renderer(recipe: PlanarRecipe) -> Planar:
 
 
 PUBLISHED_SHARES, MOST_FIRST_STEPS = (0.1, 0.1, 0.8), 350
-"""Lengths of the three stages (paper), and by default the most iterations of each of the first two: enough to recognise
-mirrors, which needs opaque Gaussians, but too few to model reflections behind panes well (lab/layers.md).
+"""Lengths of the three stages (paper), and by default the maximum length of each of the first two: usually enough to
+recognise mirrors, which needs opaque Gaussians, but too short to model reflections behind panes well (lab/layers.md).
 """
 
 
 def stage_shares(given: tuple[float, float, float] | None, iterations: int) -> tuple[float, float, float]:
-    """Shares of a run for its three stages, which add up to one."""
-    first, second, third = given or PUBLISHED_SHARES
-    whole, most = first + second + third, 1.0 if given else MOST_FIRST_STEPS / iterations
-    first, second = min(first / whole, most), min(second / whole, most)
-    return first, second, 1 - first - second
+    """Lengths of the three stages in relation to each other, in a run of some iterations."""
+    shares = given or PUBLISHED_SHARES
+    if given or shares[0] * iterations <= MOST_FIRST_STEPS:
+        return shares
+    first = MOST_FIRST_STEPS / iterations
+    return first, first, 1 - 2 * first
 
 
 def planar_stages(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
     """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
-    first, second, third = stage_shares(recipe.stage_shares, iterations)
+    first, second, third = shares = stage_shares(recipe.stage_shares, iterations)
+    adjustment, joint = first / sum(shares), (first + second) / sum(shares)
     strategy = _first_strategy(recipe)
     initialisation = Stage(
         name="1 initialisation",
@@ -454,8 +460,8 @@ def planar_stages(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_I
     )
     stages: tuple[Stage, ...] = (
         initialisation,
-        _adjustment_stage(recipe, first, second, seed),
-        _joint_stage(recipe, third, seed),
+        _adjustment_stage(recipe, adjustment, second, seed),
+        _joint_stage(recipe, joint, third, seed),
     )
     stages = with_learned_photographer(recipe.photographer, stages, recipe.densify, seed)
     return with_learned_corrections(recipe, stages)
@@ -491,7 +497,7 @@ def _adjustment_stage(recipe: PlanarRecipe, start: float, share: float, seed: in
             *strategy.edits,
             actions.GrowSh(Every(recipe.intervals.sh)),
             actions.Densify(recipe.densify, part="glass"),
-            *_seed_actions(recipe, start + SEED_AFTER_ADJUSTMENT),
+            *_seed_actions(recipe, start + min(SEED_AFTER_ADJUSTMENT, 0.5 * share)),
             *_early_resets(recipe, strategy),
         ),
         post_steps=(*_glass_post_steps(recipe), *strategy.post_steps),
@@ -500,9 +506,9 @@ def _adjustment_stage(recipe: PlanarRecipe, start: float, share: float, seed: in
     )
 
 
-def _joint_stage(recipe: PlanarRecipe, share: float, seed: int) -> Stage:
+def _joint_stage(recipe: PlanarRecipe, start: float, share: float, seed: int) -> Stage:
     """Stage 3: joint optimisation, with perturbed opacities and slowly moving planes."""
-    strategy, start = strategy_of(recipe), 1 - share
+    strategy = strategy_of(recipe)
     turn = TurnReflections((start + TURN_AFTER,)), LightLamps(LAMP_SEARCH_AT, planar_renderer(recipe))
     detect = DetectMirrors((start + TURN_AFTER,), PaneSetup(recipe, seed))
     is_automatic = recipe.detect_mirrors and recipe.fixed_mirrors and not recipe.plane_fit.mirror_labels

@@ -74,8 +74,8 @@ class PlanarRecipe(MethodRecipe):
         view_dependence_weight: weight of the squared SH coefficients beyond the constant one. Mirrored views see
             Gaussians from directions that no photograph covers; the paper has no such term.
         stage_shares: lengths of the three stages in relation to each other (paper: 3000, 3000 and 24,000 iterations);
-            None for those, but at most 350 iterations for each of the first two. These model reflections behind panes,
-            more of them the longer they last.
+            None for the paper's, but at most 350 iterations for each of the first two. The longer these last, the more
+            reflections they model by Gaussians behind panes.
         fresnel: angular dependence of the strength: a pane with two surfaces, Schlick's approximation for one surface
             (paper), or none (ablation).
         intensity: False drops the reflection intensity a(u) (ablation).

@@ -380,7 +380,8 @@ class RunDirectory:
         folders = self.scene_folders()
         if not folders:
             raise InputError(
-                f"{self.path} holds no point_cloud/iteration_N; expected a finished run. Continue with --resume"
+                f"{self.path} holds no point_cloud/iteration_N; expected a finished run. Finish it with "
+                "`glassplat train ... --resume`"
             )
         step = max(folders)
         try:

@@ -521,6 +521,6 @@ def to_planes(panes: Sequence[FittedRectangle], labels: Sequence[int], options: 
 def with_mirrors(planes: Planes, labels: tuple[int, ...], reflectance: float) -> Planes:
     """The planes, with those of the given labels made mirrors of fixed base reflectance."""
     kept = tuple(label for label in planes.labels if label in labels)
-    mirrors = torch.tensor([label in kept for label in planes.labels], device=planes.centers.device)
+    mirrors = torch.tensor([label in kept for label in planes.labels], dtype=torch.bool, device=planes.centers.device)
     fixed = torch.full_like(planes.logit_reflectances, logit(reflectance))
     return replace(planes, logit_reflectances=torch.where(mirrors, fixed, planes.logit_reflectances), mirrors=kept)

@@ -151,8 +151,8 @@ class FeatureDatabase:
             write_text(record, json.dumps(names))
         elif not record.is_file() or read_json(record) != names:
             raise InputError(
-                f"{self.image_folder.parent} was started by another version of glassplat, which selected or numbered "
-                "the photographs differently; start again with --force"
+                f"{self.image_folder.parent} does not hold these photographs in this order: other ones "
+                "were selected, or another version of glassplat started it; start again with --force"
             )
         for done, index in enumerate(missing):
             listen(Working("reading the photographs", done, len(missing)))

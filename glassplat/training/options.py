@@ -396,13 +396,14 @@ class SurroundingsStart:
     Attributes:
         source: Gaussians in every cell of the scene's box (paper), copies of the scene's Gaussians that do not reflect,
             or both.
-        cells: cells along an edge of the box; by default half a Gaussian per pixel, and at most 32 cells (paper: 32).
+        cells: cells along an edge of the box; by default as many as give half a Gaussian per pixel, at most 32 (paper:
+            32).
         per_cell: Gaussians in each cell.
         outside: share of the points left out of the box at either end of each axis.
         opacity: opacity of the Gaussians in the box.
     """
 
-    source: Literal["box", "scene", "both"] = "scene"
+    source: Annotated[Literal["box", "scene", "both"], ESSENTIAL] = "scene"
     cells: Annotated[int, Range(1, 256)] | None = None
     per_cell: Internal[Annotated[int, Range(1, 1000)]] = 5
     outside: Internal[Annotated[float, Range(0, 0.45)]] = 0.005

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from glassplat.cli.main import main
-from glassplat.cli.train import SCENE
+from glassplat.cli.train import LEAST_ITERATIONS, SCENE
 
 PROMISED = {
     "method", "iterations", "resolution", "split", "seed", "num_gaussians", "train_seconds", "seconds_per_frame",
@@ -162,7 +162,7 @@ def test_the_demo_compares_both_methods_and_can_be_repeated(
 ) -> None:
     monkeypatch.setattr("glassplat.cli.train.DEMO_DOWNSCALE", 12.0)
     for _ in range(2):
-        assert main(["demo", "--output", str(tmp_path), "--iterations", "10"]) == 0
+        assert main(["demo", "--output", str(tmp_path), "--iterations", str(LEAST_ITERATIONS)]) == 0
         shown = "".join(capsys.readouterr().out.split())
         assert "planar" in shown and "splat" in shown and "index.html" in shown
     assert (tmp_path / "planar" / "index.html").is_file()

@@ -22,7 +22,7 @@ from glassplat.methods.planar import (
     seed_reflection,
 )
 from glassplat.methods.planar_recipe import PlanarRecipe
-from glassplat.panes import material
+from glassplat.panes import PlaneFit, material
 from glassplat.panes.fit import with_mirrors
 from glassplat.panes.material import (
     MirrorCandidate,
@@ -130,8 +130,10 @@ def entered(monkeypatch: pytest.MonkeyPatch, *compared: int) -> TrainState:
     finished(setup(state, tiny_capture()))
     for _ in compared[1:]:
         before, known = state.scene, state.scene.planes.mirrors
+        state.optimizer.moments["glass.means"] = (torch.ones_like(before.glass.means),) * 2
         found = finished(DetectMirrors((0.5,), setup).apply(state, tiny_capture(), Clock(1, 2, 6)))
         assert found == (state.scene is not before) == (state.scene.planes.mirrors != known)
+        assert found == ("glass.means" not in state.optimizer.moments)
     return state
 
 
@@ -148,6 +150,20 @@ def test_a_mirror_that_is_recognised_later_is_like_one_recognised_at_once(monkey
     assert unknown.planes.mirrors == () and later.planes.mirrors == once.planes.mirrors == PANE.labels
     for name, tensor in once.parameters().items():
         assert torch.equal(tensor, later.parameters()[name]), name
+
+
+@pytest.mark.parametrize(
+    ("recipe", "expected"),
+    [
+        (PlanarRecipe(), 1),
+        (PlanarRecipe.paper(), 0),
+        (PlanarRecipe(detect_mirrors=False), 0),
+        (PlanarRecipe(fixed_mirrors=False), 0),
+        (PlanarRecipe(plane_fit=PlaneFit(mirror_labels=(1,))), 0),
+    ],
+)
+def test_only_mirrors_that_nobody_names_are_searched_for_again(recipe: PlanarRecipe, expected: int) -> None:
+    assert sum(isinstance(action, DetectMirrors) for action in recipe.stages(0)[-1].actions) == expected
 
 
 def split_in_two(whole: Planes) -> Planes:

@@ -172,7 +172,9 @@ def test_resuming_work_whose_photographs_are_numbered_differently_is_refused(
         numbering.unlink()
     else:
         numbering.write_text(json.dumps(change(json.loads(numbering.read_text()))))
-    with pytest.raises(InputError, match=r"another version of glassplat, which selected or numbered .* --force"):
+    with pytest.raises(
+        InputError, match=r"in this order: other ones were selected, or another version of glassplat .* --force"
+    ):
         prepare(task, listen, resume=True)
 
 

@@ -34,7 +34,7 @@ def looking_away(view: View) -> View:
 
 def stages_of(recipe: SplatRecipe | PlanarRecipe | DeferredRecipe) -> tuple[Stage, ...]:
     panes = recipe.method == "planar"
-    return tuple(replace(s, setup=place_true_planes) if s.setup and panes else s for s in recipe.stages(seed=0))
+    return tuple(replace(s, setup=place_true_planes) if s.setup and panes else s for s in recipe.stages(0, 24))
 
 
 def fresh_state() -> TrainState:

@@ -69,7 +69,8 @@ def trained(recipe: SplatRecipe | PlanarRecipe, scale: float, turn: torch.Tensor
     """The scene, and the loss at every step."""
     dataset = moved_capture(scale, turn)
     stages = tuple(
-        replace(stage, setup=place_true_planes(scale, turn)) if stage.setup else stage for stage in recipe.stages(0)
+        replace(stage, setup=place_true_planes(scale, turn)) if stage.setup else stage
+        for stage in recipe.stages(0, ITERATIONS)
     )
     state = TrainState(recipe.initialise(dataset), 0)
     losses = [m.loss for m in train(stages, dataset, state, ITERATIONS) if hasattr(m, "loss")]

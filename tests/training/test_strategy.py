@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from glassplat.captures.view import View
-from glassplat.methods.planar import TurnReflections
+from glassplat.methods.planar import TurnReflections, stage_shares
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.recipe import recipe_from_json, recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
@@ -23,6 +23,7 @@ from glassplat.training.actions import (
     PerturbOpacity,
     Relocate,
     ResetOpacity,
+    SeedUnexplained,
     growth_per_relocation,
     mcmc_cap,
     threshold_factor,
@@ -32,7 +33,7 @@ from glassplat.training.loop import differentiate, train
 from glassplat.training.losses import PhotometricLoss
 from glassplat.training.messages import ActionDone, Message, StepDone
 from glassplat.training.options import DefaultDensify, Intervals, McmcDensify
-from glassplat.training.stage import Clock, Stage, TrainState
+from glassplat.training.stage import Clock, Stage, TrainState, stage_starts
 from tests.training.tiny_capture import tiny_capture, true_scene
 
 OFTEN = McmcDensify(interval=2, start=0.1, cap=45)
@@ -121,6 +122,18 @@ def test_the_strategy_decides_what_happens_to_the_primary_gaussians(recipe: Any)
         assert not {"opacity", "scale"} & {term.name for term in stage.losses}
 
 
+def test_the_first_stages_are_a_tenth_of_a_run_and_at_most_350_steps() -> None:
+    assert stage_shares(None, 1500) == stage_shares(None, 3500) == (0.1, 0.1, 0.8)
+    for iterations in (3501, 7000, 30_000):
+        assert stage_starts(PlanarRecipe().stages(0, iterations), iterations) == [0, 350, 700, iterations]
+    assert stage_shares((0.3, 0.2, 1.0), 30_000) == (0.3, 0.2, 1.0)
+
+
+def test_the_search_for_missing_objects_is_within_the_second_stage_of_long_runs() -> None:
+    stages = PlanarRecipe().stages(0, 100_000)
+    assert [a.shares for a in stages[1].actions if isinstance(a, SeedUnexplained)] == [(0.00525,)]
+
+
 def steps_of(strategy: Any, iterations: int, *kinds: type) -> list[int]:
     """The steps of the joint stage of `planar` at which actions of some kinds act."""
     joint = PlanarRecipe(strategy=strategy).stages(0, iterations)[-1]
@@ -131,14 +144,15 @@ def steps_of(strategy: Any, iterations: int, *kinds: type) -> list[int]:
     return [clock.step for clock in clocks if any(action.due(clock) for action in acting)]
 
 
-@pytest.mark.parametrize(("iterations", "reset"), [(251, 55), (1234, 271), (7_000, 840), (30_000, 1300)])
-def test_mcmc_resets_opacities_after_turning_reflections(iterations: int, reset: int) -> None:
-    (turned,) = steps_of("mcmc", iterations, TurnReflections)
-    assert steps_of("mcmc", iterations, ResetOpacity) == [reset] and turned < reset
+@pytest.mark.parametrize("iterations", [251, 1234, 7_000, 30_000])
+def test_mcmc_resets_opacities_after_turning_reflections(iterations: int) -> None:
+    (turned,), reset = steps_of("mcmc", iterations, TurnReflections), min(0.2 * iterations, 700) + 0.02 * iterations
+    assert steps_of("mcmc", iterations, ResetOpacity) == [round(reset)] and turned < reset
 
 
 @pytest.mark.parametrize("iterations", [1240, 2450, 7_000, 11_000, 22_000, 30_000])
 def test_no_opacity_changes_in_the_joint_stage_before_reflections_are_turned(iterations: int) -> None:
+    """Perturbations came first in runs of 1240, 2450, 11,000 and 22,000 iterations."""
     (turned,) = steps_of("default", iterations, TurnReflections)
     assert turned < min(steps_of("default", iterations, ResetOpacity, PerturbOpacity))
 
