@@ -17,7 +17,7 @@ from glassplat.captures.dataset import Dataset, detached_camera
 from glassplat.captures.view import View, copy_ignored_pixels
 from glassplat.errors import InputError
 from glassplat.evaluate import metrics
-from glassplat.evaluate.truth import GroundTruth, TrueSurface, TrueView, load_truth, true_surface
+from glassplat.evaluate.truth import TrueSurface, TrueView, load_truth, true_surface
 from glassplat.kernels.photometric import photometric
 from glassplat.render.frame import Frame, Renderer
 from glassplat.render.panes import nearest_hits, panes_in_camera
@@ -139,9 +139,6 @@ TOO_FEW = f"fewer than {metrics.SMALLEST_REGION} pixels show a pane"
 SCENE_COLORS, NEIGHBOURS_COLORS = "the scene's own", "mean of the neighbouring photographs, by name"
 """Exposures assumed for test views."""
 
-Truths = tuple[GroundTruth | None, TrueView | None]
-"""Ground truth of the data set, and of one view."""
-
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -245,6 +242,7 @@ def evaluate(
         raise InputError(f"{dataset.root} has no test views; expected at least one image to compare with")
     truth = load_truth(dataset.truth)
     lpips = metrics.load_lpips()
+    missing = NO_TRUTH if truth is None else NO_VIEW_TRUTH
     regions = regions or (RENDERED_REGIONS if truth is None else TRUE_REGIONS)
     # With a photographer, frames hold two images, with and without the photographer; rendering without is timed.
     timed = with_photographer(renderer, "absent") if len(scene.photographer) else renderer
@@ -261,7 +259,7 @@ def evaluate(
         pane = regions.find(view, frame, true_view)
         exposures = learned.interpolate(view.name)
         shown = in_photograph_colors(frame, exposures, view.name)
-        measured = _measure(shown, seconds, view, pane, truth=(truth, true_view), surface=surface, lpips=lpips)
+        measured = _measure(shown, seconds, view, pane, truth=true_view or missing, surface=surface, lpips=lpips)
         measurements[view.name] = measured
         listen(EvaluatedView(view, frame, true_view, surface, metrics.json_values(measured.metrics), exposures))
     gain = _add_reflection(measurements.values())
@@ -314,11 +312,11 @@ def _measure(
     view: View,
     pane: Tensor | str,
     *,
-    truth: Truths,
+    truth: TrueView | str,
     surface: TrueSurface | None,
     lpips: metrics.Lpips | str,
 ) -> _Measurement:
-    """Every metric of one view except the reflection's, which needs all views."""
+    """Every metric of one view except the reflection's, which needs all views; `truth` may be why there is none."""
     image, photo, counted = frame.photographed, view.photo, None if view.ignored is None else ~view.ignored
     if counted is not None:
         image = copy_ignored_pixels(image, view)
@@ -331,10 +329,10 @@ def _measure(
         "ssim": ALL_IGNORED if _is_too_small(counted) else metrics.ssim(image, photo),
         "lpips": ALL_IGNORED if _is_too_small(counted) else _lpips(lpips, image, photo),
         "pane_psnr": pane if isinstance(pane, str) else _region_psnr(image, photo, pane, TOO_FEW),
-        "transmission_psnr": _transmission_psnr(frame, *truth),
+        "transmission_psnr": _transmission_psnr(frame, truth),
         **metrics.surface_metrics(frame, photo, surface),
     }
-    return _Measurement(measured, seconds, _reflection_pixels(frame, *truth))
+    return _Measurement(measured, seconds, _reflection_pixels(frame, truth))
 
 
 def _lpips(lpips: metrics.Lpips | str, image: Tensor, photo: Tensor) -> metrics.Outcome:
@@ -369,27 +367,25 @@ def _is_too_small(region: Tensor | None) -> bool:
     return region is not None and int(region.sum()) < metrics.SMALLEST_REGION
 
 
-def _transmission_psnr(frame: Frame, truth: GroundTruth | None, true_view: TrueView | None) -> metrics.Outcome:
-    if true_view is None:
-        return NO_TRUTH if truth is None else NO_VIEW_TRUTH
-    pane = true_view.labels > 0
+def _transmission_psnr(frame: Frame, truth: TrueView | str) -> metrics.Outcome:
+    if isinstance(truth, str):
+        return truth
+    pane = truth.labels > 0
     reason = TOO_FEW if _is_too_small(pane) else "the pane is a mirror, which transmits nothing"
     image = frame.layers.get("transmission", frame.rgb)
-    return _region_psnr(image, true_view.transmission, pane & (true_view.strength < MIRROR_STRENGTH), reason)
+    return _region_psnr(image, truth.transmission, pane & (truth.strength < MIRROR_STRENGTH), reason)
 
 
-def _reflection_pixels(
-    frame: Frame, truth: GroundTruth | None, true_view: TrueView | None
-) -> tuple[Tensor, Tensor] | str:
+def _reflection_pixels(frame: Frame, truth: TrueView | str) -> tuple[Tensor, Tensor] | str:
     """Rendered and true reflection [P, 3] at the pane's pixels; the true one in [0, 1], with lamps clipped to white."""
     if "reflection" not in frame.layers:
         return "the method renders no reflection"
-    if true_view is None:
-        return NO_TRUTH if truth is None else NO_VIEW_TRUTH
-    pane = true_view.labels > 0
+    if isinstance(truth, str):
+        return truth
+    pane = truth.labels > 0
     if _is_too_small(pane):
         return TOO_FEW
-    return frame.layers["reflection"][pane], true_view.reflection[pane].to(torch.float32) / 255
+    return frame.layers["reflection"][pane], truth.reflection[pane].to(torch.float32) / 255
 
 
 def _add_reflection(measurements: Iterable[_Measurement]) -> float | None:
@@ -444,7 +440,7 @@ def _footnotes(
     if isinstance(lpips, str):
         backbone = metrics.json_values({"lpips": lpips, "lpips_backbone": lpips})
     else:
-        backbone = {"lpips_backbone": lpips.backbone}
+        backbone = {"lpips_backbone": metrics.LPIPS_BACKBONE}
     if results["pane_psnr"] is None:
         region = metrics.json_values({"pane_region": results["pane_psnr_reason"]})
     else:

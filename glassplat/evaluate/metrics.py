@@ -12,7 +12,6 @@ from __future__ import annotations
 import importlib.metadata
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +19,7 @@ import torch
 from torch import Tensor
 
 from glassplat.errors import convert_to_input_error
-from glassplat.evaluate.truth import UNKNOWN_SURFACE, GroundTruth, TruePlane, TrueSurface
+from glassplat.evaluate.truth import UNKNOWN_SURFACE, GroundTruth, TrueSurface
 from glassplat.files.sidecars import read_equirect
 from glassplat.kernels.photometric import photometric
 from glassplat.render.deferred import equirect_from_environment
@@ -136,11 +135,11 @@ def format_value(value: object, pattern: str) -> str:
 
 def shown_metrics(results: Mapping[str, Any]) -> dict[str, Metric]:
     """The metrics to show for an evaluation: general ones always, those of surfaces only if they are known."""
-    always, known = METRICS | FACTS, SURFACE_METRICS | SURFACE_FACTS
+    always = METRICS | FACTS
     return {
         name: metric
         for name, metric in (METRICS | SURFACE_METRICS | FACTS | SURFACE_FACTS).items()
-        if (name in always and name in results) or (name in known and results.get(name) is not None)
+        if name in results and (name in always or results[name] is not None)
     }
 
 
@@ -308,7 +307,10 @@ def plane_table(
             "base_reflectance": planes.base_reflectances[index].item(),
         } | {name: values[index].tolist() for name, values in glass.items()}
         if label in true_planes:
-            entry |= _plane_errors(entry, true_planes[label], extent)
+            true = true_planes[label]
+            turn, offset = _plane_difference(entry, true.center, true.normal)
+            difference = abs(entry["base_reflectance"] - true.base_reflectance)
+            entry |= dict(zip(PLANE_ERRORS, (turn, offset / extent, difference), strict=True))
         else:
             entry |= dict.fromkeys(PLANE_ERRORS) | {f"{name}_reason": missing for name in PLANE_ERRORS}
         if marked is not None and label in marked.labels:
@@ -322,15 +324,6 @@ def plane_table(
 def missing_panes(planes: Planes, truth: GroundTruth | None) -> list[int]:
     """Labels of true panes without a fitted plane."""
     return [] if truth is None else sorted({plane.label for plane in truth.planes} - set(planes.labels))
-
-
-def _plane_errors(fitted: dict[str, Any], true: TruePlane, extent: float) -> dict[str, float]:
-    turn, offset = _plane_difference(fitted, true.center, true.normal)
-    return {
-        "normal_error_deg": turn,
-        "offset_error": offset / extent,
-        "base_reflectance_error": abs(fitted["base_reflectance"] - true.base_reflectance),
-    }
 
 
 def _plane_difference(fitted: dict[str, Any], center: Sequence[float], normal: Sequence[float]) -> tuple[float, float]:
@@ -421,51 +414,32 @@ SMALLEST_SIDE = 32
 """Minimum side of an image for LPIPS, pixels."""
 
 
-@dataclass(frozen=True)
-class Lpips:
-    """LPIPS with one backbone.
-
-    Attributes:
-        network: the distance of two batches [1, 3, H, W] in [0, 1].
-        backbone: name of the network; values of different networks are not comparable.
-    """
-
-    network: Callable[[Tensor, Tensor], Tensor]
-    backbone: str = "vgg"
-
-    def __call__(self, image: Tensor, target: Tensor) -> float:
-        """The distance of two sRGB images [H, W, 3], uint8 or floating point in [0, 1].
-
-        Images enter the network scaled to [-1, 1], as the authors define it. (3DGS's own script feeds
-        [0, 1], so its published numbers differ slightly.)
-
-        Raises:
-            ValueError: shapes disagree, or a side is shorter than 32 pixels.
-        """
-        if image.shape != target.shape or image.ndim != 3 or image.shape[-1] != 3:
-            raise ValueError(
-                f"expected two images [H, W, 3] of one size, got {list(image.shape)}, {list(target.shape)}"
-            )
-        if min(image.shape[:2]) < SMALLEST_SIDE:
-            raise ValueError(f"LPIPS needs at least {SMALLEST_SIDE} pixels a side, got {list(image.shape[:2])}")
-        with torch.no_grad():
-            return float(self.network(_as_batch(image), _as_batch(target)))
+LPIPS_BACKBONE = "vgg"
+"""The network that splatting papers use; values of different networks are not comparable."""
+Lpips = Callable[[Tensor, Tensor], float]
+"""The distance of two images [H, W, 3], uint8, at least `SMALLEST_SIDE` pixels a side."""
 
 
 def load_lpips() -> Lpips | str:
-    """LPIPS with the backbone that splatting papers use, or the reason why it is unavailable.
+    """LPIPS, or the reason why it is unavailable.
 
-    torchmetrics needs torchvision, which downloads the weights of the network on first use.
+    Images enter the network scaled to [-1, 1], as the authors define it. (3DGS's own script feeds [0, 1], so its
+    published numbers differ slightly.) torchmetrics needs torchvision, which downloads the weights on first use.
     """
     try:
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
-        network = LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True)
+        network = LearnedPerceptualImagePatchSimilarity(net_type=LPIPS_BACKBONE, normalize=True)
     except ImportError:
         return "pip install 'glassplat[lpips]'"
     except (OSError, RuntimeError) as error:  # torchvision of another build, or weights that are unavailable.
         return _build_mismatch() or f"torchmetrics cannot load it: {error}"
-    return Lpips(network)
+
+    def distance(image: Tensor, target: Tensor) -> float:
+        with torch.no_grad():
+            return float(network(_as_batch(image), _as_batch(target)))
+
+    return distance
 
 
 def _build_mismatch() -> str | None:
@@ -484,9 +458,7 @@ def _build_mismatch() -> str | None:
 
 def _as_batch(image: Tensor) -> Tensor:
     """[1, 3, H, W] in [0, 1]."""
-    pixels = image.detach().cpu()
-    values = pixels.to(torch.float32) / 255 if pixels.dtype == torch.uint8 else pixels.to(torch.float32).clamp(0, 1)
-    return values.permute(2, 0, 1)[None]
+    return (image.cpu().to(torch.float32) / 255).permute(2, 0, 1)[None]
 
 
 NO_ENVIRONMENT = "the method learns no environment"

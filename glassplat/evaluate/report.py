@@ -245,33 +245,6 @@ MOST_VIEWS, SMALLEST_SHARE = 2, 0.05
 """Maximum number of views, and minimum share of the image that must show a pane for a view to be included."""
 
 
-class LayerUses:
-    """Selects the views that show most of a pane, and draws them."""
-
-    def __init__(self, blend: Blend) -> None:
-        """Starts without views; `blend` is the colour space in which the run blends the reflection."""
-        self._blend = blend
-        self._rows: list[tuple[float, list[Panel]]] = []
-
-    def add(self, evaluated: EvaluatedView) -> None:
-        """Keeps the panels of a view if it shows more of a pane than those kept so far."""
-        frame, photo = evaluated.frame, evaluated.view.photo
-        share = float((frame.layers["strength"] > 0).float().mean())
-        if share < SMALLEST_SHARE:
-            return
-        plain = dereflected_photo(frame, photo, self._blend, exposures=evaluated.exposures, name=evaluated.view.name)
-        row = [
-            Panel(f"photograph {evaluated.view.name}", photo),
-            Panel("without reflections (glassplat dereflect)", plain),
-            Panel("pane as a mirror (glassplat render)", metrics.quantize(as_mirror_image(frame, self._blend))),
-        ]
-        self._rows = sorted([*self._rows, (share, row)], key=lambda kept: -kept[0])[:MOST_VIEWS]
-
-    def image(self) -> NDArray[np.uint8] | None:
-        """Image [H, W, 3] of the views kept, one per row; None if no view shows a pane."""
-        return compose_sheet([row for _, row in self._rows], "Uses of the layers", "") if self._rows else None
-
-
 USES_FILE = "uses.png"
 SETTINGS = ("iterations", "seed", "resolution", "split", "lpips_backbone", "pane_region")
 
@@ -293,7 +266,8 @@ class Report:
         """
         self._folder = folder
         self._sheets = sheet_names([view.name for view in dataset.test])
-        self._uses = LayerUses(blend) if blend is not None else None
+        self._blend = blend
+        self._uses: list[tuple[float, list[Panel]]] = []
 
     def add(self, evaluated: EvaluatedView) -> None:
         """Draws one view; called by `evaluate`."""
@@ -307,8 +281,22 @@ class Report:
             subtitle=subtitle,
         )
         write_image(self._folder / self._sheets[view.name], sheet)
-        if self._uses is not None:
-            self._uses.add(evaluated)
+        if self._blend is not None:
+            self._add_uses(evaluated, self._blend)
+
+    def _add_uses(self, evaluated: EvaluatedView, blend: Blend) -> None:
+        """Keeps what the layers of a view are good for, if it shows more of a pane than the views kept so far."""
+        frame, photo = evaluated.frame, evaluated.view.photo
+        share = float((frame.layers["strength"] > 0).float().mean())
+        if share < SMALLEST_SHARE:
+            return
+        plain = dereflected_photo(frame, photo, blend, exposures=evaluated.exposures, name=evaluated.view.name)
+        row = [
+            Panel(f"photograph {evaluated.view.name}", photo),
+            Panel("without reflections (glassplat dereflect)", plain),
+            Panel("pane as a mirror (glassplat render)", metrics.quantize(as_mirror_image(frame, blend))),
+        ]
+        self._uses = sorted([*self._uses, (share, row)], key=lambda kept: -kept[0])[:MOST_VIEWS]
 
     def finish(self, results: Mapping[str, Any], per_view: Mapping[str, Mapping[str, Any]]) -> None:
         """Writes the overview.
@@ -317,10 +305,11 @@ class Report:
             results: as `evaluate` returns them, with additions of the caller.
             per_view: as `evaluate` returns it.
         """
-        uses = self._uses.image() if self._uses is not None else None
-        if uses is not None:
-            write_image(self._folder / USES_FILE, uses)
-        page = overview_page(results, per_view, self._sheets, uses=None if uses is None else USES_FILE)
+        if self._uses:
+            write_image(
+                self._folder / USES_FILE, compose_sheet([row for _, row in self._uses], "Uses of the layers", "")
+            )
+        page = overview_page(results, per_view, self._sheets, uses=USES_FILE if self._uses else None)
         write_text(self._folder / "index.html", page)
 
 
@@ -400,21 +389,23 @@ def _definition_list(known: Mapping[str, metrics.Metric]) -> str:
 def _plane_table(planes: list[Mapping[str, Any]]) -> str:
     if not planes:
         return ""
-    columns = {
-        n: column for n, column in metrics.PLANE_COLUMNS.items() if any(plane.get(n) is not None for plane in planes)
-    }
+    columns = _with_values(metrics.PLANE_COLUMNS, planes)
     rows = [[_format(plane.get(name), column.pattern) for name, column in columns.items()] for plane in planes]
     return _table([column.label for column in columns.values()], rows)
 
 
 def _view_table(per_view: Mapping[str, Mapping[str, Any]], sheets: Mapping[str, str]) -> str:
-    columns = metrics.METRICS | metrics.SURFACE_METRICS
-    shown = {n: column for n, column in columns.items() if any(row.get(n) is not None for row in per_view.values())}
+    shown = _with_values(metrics.METRICS | metrics.SURFACE_METRICS, list(per_view.values()))
     rows = [
         [_link(name, sheets), *(_format(row.get(metric), column.pattern) for metric, column in shown.items())]
         for name, row in per_view.items()
     ]
     return _table(["view", *(column.label for column in shown.values())], rows)
+
+
+def _with_values(columns: Mapping[str, metrics.Metric], rows: Sequence[Mapping[str, Any]]) -> dict[str, metrics.Metric]:
+    """The columns in which a row has a value."""
+    return {n: column for n, column in columns.items() if any(row.get(n) is not None for row in rows)}
 
 
 def _table(head: list[str], rows: list[list[str]]) -> str:
@@ -436,9 +427,7 @@ def _figure(name: str, path: str, description: str) -> str:
 
 
 def _metrics_line(values: Mapping[str, Any]) -> str:
-    known = {
-        n: metric for n, metric in (metrics.METRICS | metrics.SURFACE_METRICS).items() if values.get(n) is not None
-    }
+    known = _with_values(metrics.METRICS | metrics.SURFACE_METRICS, [values])
     return "    ".join(f"{metric.label} {_format(values[n], metric.pattern)}" for n, metric in known.items())
 
 

@@ -214,16 +214,13 @@ def test_no_test_views_are_refused(case) -> None:
 
 
 def test_lpips_is_loaded_with_its_backbone(case, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Constant:
-        backbone = "alex"
+    def constant(image: torch.Tensor, target: torch.Tensor) -> float:
+        assert image.dtype == target.dtype == torch.uint8
+        return 0.25
 
-        def __call__(self, image: torch.Tensor, target: torch.Tensor) -> float:
-            assert image.dtype == target.dtype == torch.uint8
-            return 0.25
-
-    monkeypatch.setattr("glassplat.evaluate.metrics.load_lpips", Constant)
+    monkeypatch.setattr("glassplat.evaluate.metrics.load_lpips", lambda: constant)
     results = evaluate(case.scene, case.renderer, case.dataset).results
-    assert (results["lpips"], results["lpips_backbone"]) == (0.25, "alex")
+    assert (results["lpips"], results["lpips_backbone"]) == (0.25, "vgg")
 
 
 def test_plain_gives_a_reason_for_every_missing_number() -> None:
