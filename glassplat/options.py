@@ -136,18 +136,9 @@ def check_options(options: Any) -> None:
         InputError: a value is out of range, or values contradict each other; the message names the option.
     """
     try:
-        check_value(type(options), options, "")
+        check_value(type(options), options)
     except OptionError as error:
         raise InputError(f"{as_option(error.name)} is {short_repr(error.value)}; expected {error.expected}") from error
-
-
-def options_from_json(kind: type, value: Any) -> Any:
-    """An instance of a dataclass from parsed JSON; missing fields get their defaults.
-
-    Raises:
-        InputError: it is not an object, a field is unknown, or a value is invalid; the message names the field.
-    """
-    return check_value(kind, value, "")
 
 
 def as_option(name: str) -> str:
@@ -155,16 +146,16 @@ def as_option(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
-def check_value(hint: Any, value: Any, name: str) -> Any:
+def check_value(hint: Any, value: Any, name: str = "") -> Any:
     """The value converted to the type of its annotation, if valid.
 
     Args:
         hint: annotation of a field, or a dataclass.
-        value: a value of this type, or its JSON form.
+        value: a value of this type, or its JSON form; missing fields of a dataclass get their defaults.
         name: name of the field, for messages.
 
     Raises:
-        OptionError: the value is invalid.
+        InputError: the value is invalid, or a field is unknown or missing; the message names it.
     """
     hint, requirements = unwrap_annotation(hint)
     result = _convert_value(hint, value, name, requirements)

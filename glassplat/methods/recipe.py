@@ -13,7 +13,7 @@ from glassplat.files.records import parse_json
 from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.splat_recipe import SplatRecipe
-from glassplat.options import BLACK, WHITE, Rgb, options_from_json, short_repr
+from glassplat.options import BLACK, WHITE, Rgb, check_value, short_repr
 
 if TYPE_CHECKING:
     from glassplat.captures.dataset import Dataset
@@ -61,7 +61,7 @@ def recipe_from_json(text: str, where: str = "the recipe") -> Any:
         known = {field.name for field in dataclasses.fields(kind)}
         fields = {name: value for name, value in fields.items() if name in known}
     try:
-        return options_from_json(kind, fields)
+        return check_value(kind, fields)
     except InputError as error:
         raise InputError(f"{where} cannot be read by this version: {error}. {REMEDY}") from error
 

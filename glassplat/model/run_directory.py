@@ -25,7 +25,7 @@ from glassplat.captures.masks import Polarity
 from glassplat.errors import InputError, convert_to_input_error, join_names
 from glassplat.files.records import parse_json, read_text
 from glassplat.files.writing import check_folder, check_links, make_folder, remove_unfinished, write_text
-from glassplat.options import Downscale, PositiveCount, Seed, options_from_json
+from glassplat.options import Downscale, PositiveCount, Seed, check_value
 from glassplat.training.messages import Message, StepDone, Working
 from glassplat.training.ranks import is_leader
 
@@ -297,7 +297,7 @@ class RunDirectory:
         with convert_to_input_error():
             written = parse_json(self._read_file(path.name), str(path))
         try:
-            return options_from_json(RunSettings, written)
+            return check_value(RunSettings, written)
         except InputError as error:
             raise InputError(f"{path} cannot be read: {error}; train again") from error
 

@@ -21,7 +21,7 @@ from glassplat.errors import InputError
 from glassplat.evaluate.report import STYLE
 from glassplat.files.records import read_json
 from glassplat.files.writing import write_text
-from glassplat.options import options_from_json
+from glassplat.options import check_value
 from glassplat.panes.material import virtual_points
 from glassplat.prepare.preparation import RECORD, Report
 from glassplat.scene.camera import NumpyCamera
@@ -173,7 +173,7 @@ def _read_report(path: Path) -> Report:
     except ValueError as error:
         raise InputError(f"{error}; {advice}") from error
     try:
-        found: Report = options_from_json(Report, record.get("report") if isinstance(record, dict) else record)
+        found: Report = check_value(Report, record.get("report") if isinstance(record, dict) else record)
         return found
     except ValueError as error:
         raise InputError(f"the report in {path}: {error}; {advice}") from error

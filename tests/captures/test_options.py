@@ -21,8 +21,8 @@ from glassplat.options import (
     Share,
     as_option,
     check_options,
+    check_value,
     expectation,
-    options_from_json,
     unwrap_annotation,
 )
 from tests.methods.number_fields import number_fields
@@ -64,11 +64,11 @@ GOOD = {
 
 
 def test_json_values_become_options() -> None:
-    made = options_from_json(Outer, GOOD)
+    made = check_value(Outer, GOOD)
     inner = Inner(2.0, 5)
     assert made == Outer("n", inner, False, (0, 0.5, 1), (0.1, 0.1, 0.9), "b", {}, Path("y"), 0.25)
     assert isinstance(made.inner.rate, float) and isinstance(made.color, tuple)
-    assert options_from_json(Outer, {"name": "n"}) == Outer("n")
+    assert check_value(Outer, {"name": "n"}) == Outer("n")
     check_options(made)
 
 
@@ -104,7 +104,7 @@ def test_an_option_out_of_range_is_named_as_it_is_typed(fields: dict[str, Any], 
 @pytest.mark.parametrize(("fields", "option", "expected"), WRONG, ids=str)
 def test_a_file_with_such_a_value_is_refused_too(fields: dict[str, Any], option: str, expected: str) -> None:
     with pytest.raises(InputError, match=r"expected|do not fit"):
-        options_from_json(Outer, {"name": "n", **fields})
+        check_value(Outer, {"name": "n", **fields})
 
 
 @pytest.mark.parametrize(
@@ -145,13 +145,13 @@ def test_a_file_with_such_a_value_is_refused_too(fields: dict[str, Any], option:
 )
 def test_a_file_of_another_kind_is_refused(value: Any) -> None:
     with pytest.raises(InputError) as raised:
-        options_from_json(Outer, value)
+        check_value(Outer, value)
     assert len(str(raised.value)) < 400
 
 
 def test_a_number_of_too_many_digits_to_print_is_refused() -> None:
     with pytest.raises(InputError, match="digits"):
-        options_from_json(Inner, {"most": 10**5000})
+        check_value(Inner, {"most": 10**5000})
 
 
 def test_options_are_named_by_their_fields() -> None:
