@@ -445,9 +445,24 @@ LOADING_LINE = "loading PyTorch ..."
 
 
 def import_pytorch_module(module: str) -> Any:
-    """Imports a module that needs PyTorch, by its dotted name."""
-    with _without_garbage_collection(), _show_loading_line(message_console(stderr=True), module):
+    """Imports a module that needs PyTorch, by its dotted name.
+
+    A terminal shows a line meanwhile. Garbage collection is off, and exempts the imported objects afterwards.
+    """
+    console, is_collecting = message_console(stderr=True), gc.isenabled()
+    is_shown = module not in sys.modules and console.is_interactive
+    if is_shown:
+        console.print(LOADING_LINE, end="", highlight=False)
+    if is_collecting:
+        gc.disable()
+    try:
         return importlib.import_module(module)
+    finally:
+        if is_collecting:
+            gc.freeze()
+            gc.enable()
+        if is_shown:
+            console.control(Control(ControlType.CARRIAGE_RETURN, (ControlType.ERASE_IN_LINE, 2)))
 
 
 def import_uninterrupted(module: str) -> Any:
@@ -484,30 +499,3 @@ class Command:
     def interrupt_message(self) -> str:
         """Message after an interrupt: the state on disk, and how to continue."""
         return self.interrupt_hint.format(**vars(self))
-
-
-@contextmanager
-def _show_loading_line(console: Console, module: str) -> Iterator[None]:
-    """Shows the line during the import, in a terminal and if the module is not loaded yet."""
-    if module in sys.modules or not console.is_interactive:
-        yield
-        return
-    console.print(LOADING_LINE, end="", highlight=False)
-    try:
-        yield
-    finally:
-        console.control(Control(ControlType.CARRIAGE_RETURN, (ControlType.ERASE_IN_LINE, 2)))
-
-
-@contextmanager
-def _without_garbage_collection() -> Iterator[None]:
-    """Disables garbage collection during imports, and exempts the imported objects from later ones."""
-    if not gc.isenabled():
-        yield
-        return
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.freeze()
-        gc.enable()
