@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import torch
@@ -12,7 +11,7 @@ from glassplat.captures.dataset import Dataset, load_dataset, make_dataset
 from glassplat.captures.files import CaptureFiles
 from glassplat.captures.view import sample_evenly
 from glassplat.cli.console import shell_word
-from glassplat.cli.info import FEW_VIEWS, Finding, describe_broken
+from glassplat.cli.info import FEW_VIEWS, Report, describe_broken
 from glassplat.errors import InputError, convert_to_input_error, count_noun
 from glassplat.files.records import read_json
 from glassplat.files.scene_folder import read_scene, read_splats
@@ -33,29 +32,26 @@ MASKS_SAMPLED = 16
 """Number of photographs in which the share of ignored pixels is measured."""
 
 
-def remaining_parts(files: CaptureFiles) -> Iterator[Finding]:
-    """Findings on a capture beyond its list of files."""
+def describe_capture(files: CaptureFiles, report: Report) -> None:
+    """Photographs, panes and planes of a capture."""
     dataset = make_dataset(files)
-    finding = Finding()
-    sizes = sorted({f"{v.camera.width}x{v.camera.height}" for v in (*dataset.train, *dataset.test)})
-    finding.facts["photographs"] = (
-        f"{len(dataset.train)} to train, {len(dataset.test)} to test ({dataset.split}), {', '.join(sizes[:3])}"
+    views = (*dataset.train, *dataset.test)
+    sizes = sorted({f"{v.camera.width}x{v.camera.height}" for v in views})
+    report.add(
+        "photographs",
+        f"{len(dataset.train)} to train, {len(dataset.test)} to test ({dataset.split}), {', '.join(sizes[:3])}",
     )
-    finding.problems += dataset.warnings
-    if len(dataset.train) + len(dataset.test) < FEW_VIEWS:
-        finding.problems.append(
-            f"only {count_noun(len(dataset.train) + len(dataset.test), 'photograph')}; 30 or more work better"
-        )
+    report.problems += dataset.warnings
+    if len(views) < FEW_VIEWS:
+        report.problems.append(f"only {count_noun(len(views), 'photograph')}; 30 or more work better")
     if dataset.measured_points and len(dataset.points) < FEW_POINTS:
-        finding.problems.append(
+        report.problems.append(
             f"{count_noun(len(dataset.points), 'point')} only; more photographs with more overlap give more"
         )
-    yield finding
-    yield _panes_part(files.root, dataset)
-    yield _planes_part(files.root, dataset)
-    decoded = Finding()
-    describe_broken([view.image_path for view in (*dataset.train, *dataset.test)], decoded, LEAST_SIDE)
-    yield decoded
+    _describe_panes(files.root, dataset, report)
+    if dataset.pane_labels or dataset.planes is not None:
+        _describe_planes(files.root, dataset, report)
+    describe_broken([view.image_path for view in views], report, LEAST_SIDE)
 
 
 def write_capture_page(path: Path, target: Path) -> None:
@@ -65,55 +61,49 @@ def write_capture_page(path: Path, target: Path) -> None:
     write_page(path, target, capture_planes(dataset, None, PlaneFit()) if marked else None)
 
 
-def _panes_part(path: Path, dataset: Dataset) -> Finding:
+def _describe_panes(path: Path, dataset: Dataset, report: Report) -> None:
     """Marked panes, and the quality of the marks."""
-    finding = Finding()
     if masked := [view for view in (*dataset.train, *dataset.test) if view.read_ignored is not None]:
         sampled = [view.ignored for view in sample_evenly(masked, MASKS_SAMPLED)]
         shares = [float(ignored.double().mean()) for ignored in sampled if ignored is not None]
-        finding.facts["ignored"] = (
+        report.add(
+            "ignored",
             f"about {sum(shares) / len(shares):.0%} of {count_noun(len(masked), 'photograph')}, by masks, "
-            "transparency, or the lens"
+            "transparency, or the lens",
         )
     if estimated := sum(view.read_normals is not None for view in dataset.train):
-        finding.facts["normals"] = (
-            f"estimated for {count_noun(estimated, 'training photograph')}; deferred and traced use them"
+        report.add(
+            "normals", f"estimated for {count_noun(estimated, 'training photograph')}; deferred and traced use them"
         )
     annotated = sum(view.is_annotated for view in dataset.train)
     if not dataset.pane_labels and dataset.planes is None:
-        finding.facts["panes"] = "none marked"
-        finding.next.append(f"glassplat annotate {shell_word(path)}    marks panes")
-        finding.next.append(f"glassplat train splat --data {shell_word(path)} --output RUN    needs none")
-        return finding
+        report.add("panes", "none marked")
+        report.next.append(f"glassplat annotate {shell_word(path)}    marks panes")
+        report.next.append(f"glassplat train splat --data {shell_word(path)} --output RUN    needs none")
+        return
     given = () if dataset.planes is None else dataset.planes.labels
     labels = name_labels((*dataset.pane_labels, *given))
-    finding.facts["panes"] = f"{labels}; masks of {count_noun(annotated, 'training photograph')}" + (
-        f", planes.json gives {name_labels(given)}" if given else ""
-    )
+    also = f", planes.json gives {name_labels(given)}" if given else ""
+    report.add("panes", f"{labels}; masks of {count_noun(annotated, 'training photograph')}{also}")
     if annotated < FEW_MASKS and not given:
-        finding.problems.append(
+        report.problems.append(
             f"{count_noun(annotated, 'mask')} only; three to ten, from positions far apart, work better"
         )
-    return finding
 
 
-def _planes_part(path: Path, dataset: Dataset) -> Finding:
-    """Finding on the marked panes: fitted planes and the points behind them; takes seconds."""
-    finding = Finding()
-    if not dataset.pane_labels and dataset.planes is None:
-        return finding
+def _describe_planes(path: Path, dataset: Dataset, report: Report) -> None:
+    """Planes fitted to the marked panes, and the points behind them; takes seconds."""
     try:
         planes = capture_planes(dataset, None, PlaneFit())
     except PlaneFitError as error:
-        finding.problems.append(str(error))
-        finding.next.append(f"glassplat annotate {shell_word(path)}    marks panes by their corners instead")
-        return finding
+        report.problems.append(str(error))
+        report.next.append(f"glassplat annotate {shell_word(path)}    marks panes by their corners instead")
+        return
     if dataset.measured_points:
         cameras = [view.camera for view in dataset.train]
         behind = int(virtual_points(dataset.points.positions, planes, cameras).sum())
-        finding.facts["points behind panes"] = f"{behind} ({behind / max(len(dataset.points), 1):.0%})"
-    finding.next.append(f"glassplat train planar --data {shell_word(path)} --output RUN")
-    return finding
+        report.add("points behind panes", f"{behind} ({behind / max(len(dataset.points), 1):.0%})")
+    report.next.append(f"glassplat train planar --data {shell_word(path)} --output RUN")
 
 
 MEASURES = {"psnr": "PSNR", "pane_psnr": "PSNR over panes", "ssim": "SSIM", "lpips": "LPIPS"}
@@ -121,17 +111,14 @@ MANY_FAINT = 0.5
 FAINT = 0.01
 
 
-def splats_part(path: Path) -> Finding:
-    """Finding on a file of Gaussians, with the panes next to it, as `load` reads them."""
+def describe_splats(path: Path, report: Report) -> None:
+    """A file of Gaussians, with the panes next to it, as `load` reads them."""
     planes_path = path.with_name(PLANES)
     with convert_to_input_error():
         gaussians = read_splats(path)
         planes = read_planes(planes_path) if planes_path.is_file() else Planes.empty()
-    finding = Finding()
-    _describe_scene(Scene(gaussians, extent=1.0, planes=planes), finding)
-    if len(planes) and path.stem != EXPORT_STEM:
-        finding.facts["panes"] += f", of {planes_path}"
-    return finding
+    origin = "" if path.stem == EXPORT_STEM else f", of {planes_path}"
+    _describe_scene(Scene(gaussians, extent=1.0, planes=planes), report, origin)
 
 
 def resume_command(directory: RunDirectory) -> str:
@@ -146,108 +133,110 @@ def resume_command(directory: RunDirectory) -> str:
     return " ".join([*words, "--resume"])
 
 
-def trained_part(directory: RunDirectory) -> Finding:
-    """Finding on the state of a training run."""
-    finding = Finding()
+def describe_trained(directory: RunDirectory, report: Report) -> None:
+    """State of a training run."""
     try:
         scene, step = directory.latest_scene()
     except InputError as error:
-        try:
-            reached = read_progress(directory.checkpoint).step
-        except (FileNotFoundError, InputError):
-            finding.problems.append(str(error))
-            finding.next.append("the train command that began it, again")
-            return finding
-        if reached < directory.settings().iterations:
-            finding.problems.append(f"interrupted at step {reached} of {directory.settings().iterations}")
-        else:
-            finding.problems.append(f"the scene is damaged, but can be written again: {error}")
-        finding.next.append(resume_command(directory))
-        return finding
-    finding.facts["trained to"] = step
+        _describe_interrupted(directory, str(error), report)
+        return
+    report.add("trained to", step)
     if not (directory.path / CAMERAS).is_file():
-        finding.problems.append(f"{CAMERAS} is missing, which view, video and export need")
-        finding.next.append(resume_command(directory))
-    _describe_scene(scene, finding)
-    _describe_results(directory, finding)
-    return finding
+        report.problems.append(f"{CAMERAS} is missing, which view, video and export need")
+        report.next.append(resume_command(directory))
+    _describe_scene(scene, report)
+    _describe_results(directory, report)
 
 
-def imported_part(directory: RunDirectory) -> Finding:
-    """Finding on a scene in the layout of a run, but without a capture."""
-    finding = Finding()
-    _describe_scene(directory.latest_scene()[0], finding)
-    _suggest_viewing(directory.path, finding)
-    return finding
+def _describe_interrupted(directory: RunDirectory, problem: str, report: Report) -> None:
+    """A run without a readable scene, and how to continue it."""
+    try:
+        reached = read_progress(directory.checkpoint).step
+    except (FileNotFoundError, InputError):
+        report.problems.append(problem)
+        report.next.append("the train command that began it, again")
+        return
+    iterations = directory.settings().iterations
+    is_finished = reached >= iterations
+    report.problems.append(
+        f"the scene is damaged, but can be written again: {problem}"
+        if is_finished
+        else f"interrupted at step {reached} of {iterations}"
+    )
+    report.next.append(resume_command(directory))
 
 
-def scene_part(path: Path) -> Finding:
-    """Finding on the scene in a folder."""
+def describe_imported(directory: RunDirectory, report: Report) -> None:
+    """A scene in the layout of a run, but without a capture."""
+    _describe_scene(directory.latest_scene()[0], report)
+    _suggest_viewing(directory.path, report)
+
+
+def describe_folder(path: Path, report: Report) -> None:
+    """The scene in a folder."""
     with convert_to_input_error():
         scene = read_scene(path)
-    finding = Finding()
-    _describe_scene(scene, finding)
-    return finding
+    _describe_scene(scene, report)
 
 
-def _describe_scene(scene: Scene, finding: Finding) -> None:
-    _describe_gaussians(scene.primary, finding)
-    finding.facts["Gaussians"] = scene.num_gaussians
+def _describe_scene(scene: Scene, report: Report, panes_origin: str = "") -> None:
+    """Gaussians, panes and surroundings; `panes_origin` is appended to the panes."""
+    report.add("Gaussians", scene.num_gaussians)
+    _describe_gaussians(scene.primary, report)
     if scene.num_gaussians > len(scene.primary):
         sets = (f"{len(part)} {name}" for name, part in scene.gaussian_sets().items() if len(part))
-        finding.facts["sets of Gaussians"] = ", ".join(sets)
+        report.add("sets of Gaussians", ", ".join(sets))
     planes = scene.planes
     if len(planes):
         descriptions = (
             f"{label}{' (mirror)' if label in planes.mirrors else f' (R0 {float(reflectance):.3f})'}"
             for label, reflectance in zip(planes.labels, planes.base_reflectances, strict=True)
         )
-        finding.facts["panes"] = ", ".join(descriptions)
+        report.add("panes", ", ".join(descriptions) + panes_origin)
     if len(scene.photographer):
-        finding.facts["photographer"] = f"{len(scene.photographer)} Gaussians, shown by panes in photographs only"
+        report.add("photographer", f"{len(scene.photographer)} Gaussians, shown by panes in photographs only")
     if not scene.environment.is_empty:
-        finding.facts["environment"] = f"a cube map of {scene.environment.size} texels a side"
+        report.add("environment", f"a cube map of {scene.environment.size} texels a side")
 
 
-def _describe_gaussians(gaussians: Gaussians, finding: Finding) -> None:
-    """Number, colours, extent and problems of Gaussians."""
-    finding.facts["Gaussians"] = len(gaussians)
+def _describe_gaussians(gaussians: Gaussians, report: Report) -> None:
+    """Colours, extent and problems of Gaussians."""
     if not len(gaussians):
-        finding.problems.append("it holds no Gaussian")
+        report.problems.append("it holds no Gaussian")
         return
     if gaussians.max_sh_degree >= 0:
-        finding.facts["SH degree"] = gaussians.max_sh_degree
+        report.add("SH degree", gaussians.max_sh_degree)
     finite = torch.isfinite(gaussians.means).all(dim=1)
     if not bool(finite.all()):
-        finding.problems.append(f"{int((~finite).sum())} Gaussians have non-finite positions; they are not drawn")
+        report.problems.append(f"{int((~finite).sum())} Gaussians have non-finite positions; they are not drawn")
     means = gaussians.means[finite]
     if not len(means):
         return
     low, high = (torch.quantile(means[:: max(1, len(means) // 100_000)], share, dim=0) for share in (0.02, 0.98))
     spans = " x ".join(f"{float(side):.3g}" for side in high - low)
-    finding.facts["size of the middle 96 %"] = f"{spans} world units"
+    report.add("size of the middle 96 %", f"{spans} world units")
     faint = float((torch.sigmoid(gaussians.logit_opacities) < FAINT).float().mean())
     if faint > MANY_FAINT:
-        finding.problems.append(f"{faint:.0%} of the Gaussians are nearly invisible")
+        report.problems.append(f"{faint:.0%} of the Gaussians are nearly invisible")
 
 
-def _describe_results(directory: RunDirectory, finding: Finding) -> None:
+def _describe_results(directory: RunDirectory, report: Report) -> None:
     path = directory.path
     if not directory.results.is_file():
         data = "" if Path(directory.settings().data).is_dir() else " --data CAPTURE"
-        finding.next.append(f"glassplat eval {shell_word(path)}{data}    evaluates it on its test views")
+        report.next.append(f"glassplat eval {shell_word(path)}{data}    evaluates it on its test views")
     else:
         try:
             results = read_json(directory.results)
             measures = [f"{label} {results[name]:.3f}" for name, label in MEASURES.items() if results.get(name)]
-            finding.facts["measured"] = ", ".join(measures)
+            report.add("measured", ", ".join(measures))
         except (ValueError, TypeError, AttributeError):
-            finding.problems.append(f"{directory.results} is damaged; evaluate it again")
-    _suggest_viewing(path, finding)
+            report.problems.append(f"{directory.results} is damaged; evaluate it again")
+    _suggest_viewing(path, report)
 
 
-def _suggest_viewing(path: Path, finding: Finding) -> None:
-    finding.next.append(f"glassplat view {shell_word(path)}    shows it in the browser")
-    finding.next.append(
+def _suggest_viewing(path: Path, report: Report) -> None:
+    report.next.append(f"glassplat view {shell_word(path)}    shows it in the browser")
+    report.next.append(
         f"glassplat export {shell_word(path)} --output PAGE    exports a web page and files for other programs"
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -38,36 +38,45 @@ DETAILS_MODULE = "glassplat.cli.details"
 
 
 @dataclass
-class Finding:
-    """Kind and state of a path, with suitable commands.
-
-    Slow checks are reported in parts: finders yield them, and each adds to the previous ones.
+class Report:
+    """Kind and state of a path, with suitable commands. Facts are printed as they are found, because checks are slow.
 
     Attributes:
-        kind: short description, in the first part.
+        path: the examined path.
+        console: receives kind and facts; None for JSON.
+        kind: short description.
         facts: by name, in order of display.
         problems: obstacles and deficiencies, in full sentences.
         next: commands for the next step, each with its purpose.
     """
 
+    path: Path
+    console: Console | None
     kind: str = ""
     facts: dict[str, Any] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     next: list[str] = field(default_factory=list)
 
-    def add(self, part: Finding) -> None:
-        """Adds the next part."""
-        self.kind = self.kind or part.kind
-        self.facts |= part.facts
-        self.problems += part.problems
-        self.next += part.next
+    def begin(self, kind: str, **facts: Any) -> None:
+        """Adds the kind and the first facts."""
+        self.kind = kind
+        if self.console is not None:
+            print_line(self.console, f"{self.path}: {kind}")
+        for name, fact in facts.items():
+            self.add(name, fact)
+
+    def add(self, name: str, fact: Any) -> None:
+        """Adds a fact."""
+        self.facts[name] = fact
+        if self.console is not None:
+            print_line(self.console, f"  {name}: {fact}")
 
 
-Finder = Callable[[Path], Iterator[Finding]]
-"""Examines a path, and yields findings part by part."""
+Examiner = Callable[[Path, Report], None]
+"""Examines a path and adds to its report."""
 
 
-def capture_finding(path: Path) -> Iterator[Finding]:
+def examine_capture(path: Path, report: Report) -> None:
     """A capture that can be trained.
 
     Raises:
@@ -75,25 +84,26 @@ def capture_finding(path: Path) -> Iterator[Finding]:
         InputError: it cannot be read.
     """
     files = read_capture(path)
-    capture, points = files.capture, files.capture.points
-    finding = Finding("a capture", {"format": capture.format_name})
-    finding.facts["points"] = "none (random ones are used)" if points is None else len(points)
-    _describe_preparation(files.root, finding)
-    yield finding
-    yield from import_uninterrupted(DETAILS_MODULE).remaining_parts(files)
+    points = files.capture.points
+    report.begin("a capture", format=files.capture.format_name)
+    report.add("points", "none (random ones are used)" if points is None else len(points))
+    _describe_preparation(files.root, report)
+    import_uninterrupted(DETAILS_MODULE).describe_capture(files, report)
 
 
-def _describe_preparation(path: Path, finding: Finding) -> None:
+def _describe_preparation(path: Path, report: Report) -> None:
     """Facts from the report of `glassplat prepare` in the capture."""
     try:
-        report = read_json(path / RECORD)["report"]
-        finding.facts["prepared"] = (
-            f"{report['registered']} of {report['photographs']} photographs registered, "
-            f"mean reprojection error {report['reprojection_error']:.2f} pixels"
+        prepared = read_json(path / RECORD)["report"]
+        registered = (
+            f"{prepared['registered']} of {prepared['photographs']} photographs registered, "
+            f"mean reprojection error {prepared['reprojection_error']:.2f} pixels"
         )
-        finding.problems += report["advice"]
+        advice = list(prepared["advice"])
     except (OSError, ValueError, KeyError, TypeError):
         return  # Not all captures are made by `prepare`.
+    report.add("prepared", registered)
+    report.problems += advice
 
 
 def is_photograph(path: Path) -> bool:
@@ -101,7 +111,7 @@ def is_photograph(path: Path) -> bool:
     return path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)
 
 
-def photographs_finding(path: Path) -> Iterator[Finding]:
+def examine_photographs(path: Path, report: Report) -> None:
     """A folder of photographs without poses."""
     below = [one for one in files_below(path) if not is_hidden(one.relative_to(path))]
     found = sorted(one for one in below if is_photograph(one) and one.is_file())
@@ -110,45 +120,47 @@ def photographs_finding(path: Path) -> Iterator[Finding]:
         raise InputError(f"{path} is not a known kind of folder; expected {KINDS}; it holds {names}")
     masks = masks_below(path, found)
     found = [one for one in found if one not in masks]
-    yield Finding("photographs without poses", {"photographs": len(found), **({"masks": len(masks)} if masks else {})})
-    finding = Finding()
-    sound = len(found) - describe_broken(found, finding, LEAST_SIDE)
+    report.begin("photographs without poses", photographs=len(found))
+    if masks:
+        report.add("masks", len(masks))
+    sound = len(found) - describe_broken(found, report, LEAST_SIDE)
     if sound < FEW_VIEWS:
-        finding.problems.append(f"only {count_noun(sound, 'photograph')}; 30 or more work better")
-    finding.next.append(f"glassplat prepare {shell_word(path)} --output CAPTURE    estimates their camera poses")
-    yield finding
+        report.problems.append(f"only {count_noun(sound, 'photograph')}; 30 or more work better")
+    report.next.append(f"glassplat prepare {shell_word(path)} --output CAPTURE    estimates their camera poses")
 
 
-def describe_broken(photographs: Sequence[Path], finding: Finding, least_side: int) -> int:
+def describe_broken(photographs: Sequence[Path], report: Report, least_side: int) -> int:
     """Decodes photographs to find broken and small ones; returns their number."""
     if broken := broken_photographs(photographs, least_side):
-        finding.problems.append(
+        report.problems.append(
             f"{len(broken)} are broken, tiny or of a kind that cannot be read ({join_names(broken)}); replace or "
             "remove them"
         )
     return len(broken)
 
 
-def video_finding(path: Path) -> Iterator[Finding]:
+def examine_video(path: Path, report: Report) -> None:
     """A video, or a file with a video's suffix."""
     size = path.stat().st_size
     try:
         facts = video_facts(path)
     except NoOpenCVError as error:
-        yield Finding("a video, by its name", {"bytes": size}, [str(error)])
+        report.begin("a video, by its name", bytes=size)
+        report.problems.append(str(error))
         return
     if facts is None:
-        problem = "OpenCV cannot read a frame of it; convert it to an MP4, or give a folder of photographs"
-        yield Finding("a file with a video's suffix", {"bytes": size}, [problem])
+        report.begin("a file with a video's suffix", bytes=size)
+        report.problems.append(
+            "OpenCV cannot read a frame of it; convert it to an MP4, or give a folder of photographs"
+        )
         return
-    finding = Finding("a video", {"bytes": size, **facts})
-    finding.next.append(
+    report.begin("a video", bytes=size, **facts)
+    report.next.append(
         f"glassplat prepare {shell_word(path)} --output CAPTURE    extracts frames and estimates their camera poses"
     )
-    yield finding
 
 
-def preparation_finding(path: Path) -> Iterator[Finding]:
+def examine_preparation(path: Path, report: Report) -> None:
     """The folder of an interrupted preparation."""
     settings = path / "settings.json"
     with convert_to_input_error():
@@ -158,58 +170,55 @@ def preparation_finding(path: Path) -> Iterator[Finding]:
     defaults = Preparation(Path(source), Path(output)).record()
     changed = {key: given[key] for key in defaults if given.get(key, defaults[key]) != defaults[key] and key != "input"}
     options = "".join(f" --{name} {shell_word(str(value))}" for name, value in changed.items())
-    finding = Finding("an interrupted preparation", {"of": source})
-    finding.problems.append("it is not finished")
-    finding.next.append(f"glassplat prepare {shell_word(source)} --output {shell_word(output)}{options} --resume")
-    yield finding
+    report.begin("an interrupted preparation", of=source)
+    report.problems.append("it is not finished")
+    report.next.append(f"glassplat prepare {shell_word(source)} --output {shell_word(output)}{options} --resume")
 
 
-def splat_finding(path: Path) -> Iterator[Finding]:
+def examine_splats(path: Path, report: Report) -> None:
     """A file of Gaussians."""
-    first = Finding("a splat file", {"bytes": path.stat().st_size})
+    report.begin("a splat file", bytes=path.stat().st_size)
     if (path.parent / SCENE_FILE).is_file():
-        first.facts["next to it"] = ", ".join(sorted(one.name for one in path.parent.iterdir() if one != path))
-    yield first
-    yield import_uninterrupted(DETAILS_MODULE).splats_part(path)
+        report.add("next to it", ", ".join(sorted(one.name for one in path.parent.iterdir() if one != path)))
+    import_uninterrupted(DETAILS_MODULE).describe_splats(path, report)
 
 
-def run_finding(path: Path) -> Iterator[Finding]:
+def examine_run(path: Path, report: Report) -> None:
     """The directory of a training run, or of a scene in that layout."""
     directory = RunDirectory(path)
     if directory.import_record.is_file():
-        yield Finding("a scene without a capture")
-        yield import_uninterrupted(DETAILS_MODULE).imported_part(directory)
+        report.begin("a scene without a capture")
+        import_uninterrupted(DETAILS_MODULE).describe_imported(directory, report)
         return
     recipe, settings = directory.recipe(), directory.settings()
-    finding = Finding(f"a {recipe.method} run")
-    finding.facts |= {"capture": settings.data, "iterations": settings.iterations, "downscale": settings.downscale}
+    report.begin(
+        f"a {recipe.method} run", capture=settings.data, iterations=settings.iterations, downscale=settings.downscale
+    )
     if not os.path.isdir(settings.data):
-        finding.problems.append(f"its capture is no longer at {settings.data}; give its new location with --data")
-    yield finding
-    yield import_uninterrupted(DETAILS_MODULE).trained_part(directory)
+        report.problems.append(f"its capture is no longer at {settings.data}; give its new location with --data")
+    import_uninterrupted(DETAILS_MODULE).describe_trained(directory, report)
 
 
-def runs_finding(path: Path) -> Iterator[Finding]:
+def examine_runs(path: Path, report: Report) -> None:
     """A folder of training runs, as `glassplat demo` writes it."""
     runs = sorted(recipe.parent for recipe in path.glob("*/recipe.json"))
-    commands = [f"glassplat info {shell_word(run)}" for run in runs]
-    yield Finding("a folder of runs", {"runs": ", ".join(run.name for run in runs)}, next=commands)
+    report.begin("a folder of runs", runs=", ".join(run.name for run in runs))
+    report.next += [f"glassplat info {shell_word(run)}" for run in runs]
 
 
-def scene_finding(path: Path) -> Iterator[Finding]:
-    """A folder that a scene was exported to."""
-    yield Finding("an exported scene", {"files": ", ".join(sorted(one.name for one in path.iterdir()))})
-    yield import_uninterrupted(DETAILS_MODULE).scene_part(path)
+def examine_scene(path: Path, report: Report) -> None:
+    """A folder with the scene of a run."""
+    report.begin("an exported scene", files=", ".join(sorted(one.name for one in path.iterdir())))
+    import_uninterrupted(DETAILS_MODULE).describe_folder(path, report)
 
 
-def export_finding(path: Path) -> Iterator[Finding]:
+def examine_export(path: Path, report: Report) -> None:
     """A folder that `glassplat export` wrote."""
-    yield Finding("an exported scene", {"files": ", ".join(sorted(one.name for one in path.iterdir()))})
-    yield import_uninterrupted(DETAILS_MODULE).splats_part(scene_source(path))
-    opened = [f"glassplat view {shell_word(path)}    shows it in the browser"]
+    report.begin("an exported scene", files=", ".join(sorted(one.name for one in path.iterdir())))
+    import_uninterrupted(DETAILS_MODULE).describe_splats(scene_source(path), report)
+    report.next.append(f"glassplat view {shell_word(path)}    shows it in the browser")
     if (path / "index.html").is_file():
-        opened.append(f"open {path / 'index.html'} in a browser, or share it: it needs no server")
-    yield Finding(next=opened)
+        report.next.append(f"open {path / 'index.html'} in a browser, or share it: it needs no server")
 
 
 @dataclass(frozen=True)
@@ -228,7 +237,7 @@ class Info:
 
     def set_up(self) -> None:
         """Checks that the path is known, and that its report can be written."""
-        finder_of(self.path)
+        examiner_of(self.path)
         if self.page is None:
             return
         if not (self.path / RECORD).is_file():
@@ -239,69 +248,60 @@ class Info:
 
     def run(self, console: Console) -> None:
         """Examines the path, and prints findings as they come."""
-        whole = Finding()
-        for part in finder_of(self.path)(self.path):
-            if not self.json:
-                self._print_facts(part, console)
-            whole.add(part)
+        report = Report(self.path, None if self.json else console)
+        examiner_of(self.path)(self.path, report)
         if self.page is not None:
             import_uninterrupted(DETAILS_MODULE).write_capture_page(self.path, self.page)
         if self.json:
-            healthy = not whole.problems
-            found = {"path": str(self.path), "kind": whole.kind, "healthy": healthy, **vars(whole)}
+            found = {"path": str(self.path), "kind": report.kind, "healthy": not report.problems}
+            found |= {"facts": report.facts, "problems": report.problems, "next": report.next}
             console.file.write(json.dumps(found, indent=1) + "\n")
             return
-        for problem in whole.problems:
+        for problem in report.problems:
             print_warning(console, problem)
-        for command in whole.next:
+        for command in report.next:
             print_line(console, f"next: {command}")
-
-    def _print_facts(self, part: Finding, console: Console) -> None:
-        if part.kind:
-            print_line(console, f"{self.path}: {part.kind}")
-        for name, fact in part.facts.items():
-            print_line(console, f"  {name}: {fact}")
 
     def interrupt_message(self) -> str:
         """Message after an interrupt: nothing has changed."""
         return "nothing was changed"
 
 
-def finder_of(path: Path) -> Finder:
+def examiner_of(path: Path) -> Examiner:
     """Function that examines a path."""
     if not os.path.lexists(path):
         raise FileNotFoundError(f"{path} does not exist; expected {KINDS}")
-    return _finder_of_folder(path) if path.is_dir() else _finder_of_file(path)
+    return _examiner_of_folder(path) if path.is_dir() else _examiner_of_file(path)
 
 
-def _finder_of_file(path: Path) -> Finder:
+def _examiner_of_file(path: Path) -> Examiner:
     suffix = path.suffix.lower()
     if suffix in SPLAT_SUFFIXES:
-        return splat_finding
+        return examine_splats
     if suffix in VIDEO_SUFFIXES:
-        return video_finding
+        return examine_video
     raise InputError(f"{path} is not a known kind of file; expected {KINDS}")
 
 
-def _finder_of_folder(path: Path) -> Finder:
+def _examiner_of_folder(path: Path) -> Examiner:
     if (path / "recipe.json").is_file():
-        return run_finding
+        return examine_run
     if RunDirectory(path).is_saved:
         raise InputError(f"{path} holds a scene, but no recipe.json; expected what `glassplat train --output` wrote")
     if path.name.endswith(".partial") and (path / "settings.json").is_file():
-        return preparation_finding
+        return examine_preparation
     if (path / SCENE_FILE).is_file():
-        return scene_finding
+        return examine_scene
     if scene_source(path) != path:
-        return export_finding
+        return examine_export
     if all(map(is_photograph, path.iterdir())):
-        return photographs_finding
-    return _capture_or_photographs
+        return examine_photographs
+    return _examine_capture_or_photographs
 
 
-def _capture_or_photographs(path: Path) -> Iterator[Finding]:
+def _examine_capture_or_photographs(path: Path, report: Report) -> None:
     try:
-        yield from capture_finding(path)
+        examine_capture(path, report)
     except UnknownFormatError:
         holds_runs = any(path.glob("*/recipe.json")) and not any(is_photograph(one) for one in path.iterdir())
-        yield from (runs_finding if holds_runs else photographs_finding)(path)
+        (examine_runs if holds_runs else examine_photographs)(path, report)
