@@ -307,18 +307,12 @@ def _move_edges(marks: Marks, cameras: Sequence[NumpyCamera], pane: PaneShape, s
     """[K, 3] the corners of a pane, some edges of which are moved to their marks in a single view."""
     corners = pane.corners()
     for number in single:
-        corners = _move_edge(corners, number, _edge_on_plane(marks.edges[number], cameras, pane))
+        line = _edge_on_plane(marks.edges[number], cameras, pane)
+        around = [corners[(number + step) % len(corners)] for step in (-1, 0, 1, 2)]
+        first, second = (_intersect_lines(line, (around[before], around[before + 1])) for before in (0, 2))
+        if first is not None and second is not None:
+            corners[number], corners[(number + 1) % len(corners)] = first, second
     return corners
-
-
-def _move_edge(corners: Array, edge: int, line: tuple[Array, Array] | None) -> Array:
-    """[K, 3] an outline with one edge moved to a line in its plane."""
-    around = [corners[(edge + step) % len(corners)] for step in (-1, 0, 1, 2)]
-    first, second = (_intersect_lines(line, (around[before], around[before + 1])) for before in (0, 2))
-    found = corners.copy()
-    if first is not None and second is not None:
-        found[edge], found[(edge + 1) % len(corners)] = first, second
-    return found
 
 
 def _edge_on_plane(

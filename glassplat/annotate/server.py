@@ -9,7 +9,6 @@ from __future__ import annotations
 import errno
 import json
 from collections.abc import Callable
-from functools import cached_property
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
@@ -24,10 +23,10 @@ from glassplat.files.records import parse_json
 
 LARGEST_BODY = 8_000_000
 PAGE_FILES = {
-    "/page.js": ("page.js", "text/javascript"),
-    "/drawing.js": ("drawing.js", "text/javascript"),
-    "/marking.js": ("marking.js", "text/javascript"),
-    "/style.css": ("style.css", "text/css"),
+    "/page.js": "text/javascript",
+    "/drawing.js": "text/javascript",
+    "/marking.js": "text/javascript",
+    "/style.css": "text/css",
 }
 POLICY = "default-src 'self'; img-src 'self' blob: data:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
 
@@ -59,10 +58,6 @@ class AnnotationServer(ThreadingHTTPServer):
         """Address to open in the browser."""
         return f"http://{LOCALHOST}:{self.server_address[1]}/?key={self.access.key}"
 
-    def finish(self) -> None:
-        """Stops serving; may be called from any thread."""
-        Thread(target=self.shutdown, daemon=True).start()
-
     def handle_error(self, request: object, client_address: object) -> None:
         """Ignores errors of connections that browsers close during a response."""
 
@@ -89,7 +84,6 @@ class PageHandler(BaseHTTPRequestHandler):
 
     def _respond(self, work: Callable[[], None]) -> None:
         try:
-            self.__dict__.pop("_path", None)  # A connection may serve several requests.
             self.server.access.check_host(self._host)
             work()
         except RefusedError as refused:
@@ -101,14 +95,13 @@ class PageHandler(BaseHTTPRequestHandler):
             self._send_json({"error": str(error)}, HTTPStatus.BAD_REQUEST)
 
     def _get(self) -> None:
-        path = self._path.path
+        path = urlsplit(self.path).path
         if path == "/":
             self._send_page()
             return
         self._check_key()
         if path in PAGE_FILES:
-            name, kind = PAGE_FILES[path]
-            self._send((resources.files("glassplat.annotate") / "page" / name).read_bytes(), kind)
+            self._send_file(path.removeprefix("/"), PAGE_FILES[path])
         elif path == "/capture":
             self._send_json(self.server.session.describe())
         elif path.startswith("/photo/"):
@@ -121,7 +114,7 @@ class PageHandler(BaseHTTPRequestHandler):
     def _post(self) -> None:
         self.server.access.check_origin(self.headers.get("Origin"), self._host)
         self._check_key()
-        path, session = self._path.path, self.server.session
+        path, session = urlsplit(self.path).path, self.server.session
         body = self._body()
         if path == "/document":
             self._send_json(session.save(parse_json(body, "the document of the page")))
@@ -131,14 +124,10 @@ class PageHandler(BaseHTTPRequestHandler):
             self._send_json(session.finish())
         elif path == "/close":
             self.server.is_finished = True
-            self._send_json({})  # Sent before the shutdown, which does not wait for this thread.
-            self.server.finish()
+            self._send_json({})  # Sent before the shutdown, which waits for the loop of the server.
+            Thread(target=self.server.shutdown, daemon=True).start()
         else:
             raise RefusedError(HTTPStatus.NOT_FOUND, "there is no such page")
-
-    @cached_property
-    def _path(self) -> Any:
-        return urlsplit(self.path)
 
     @property
     def _host(self) -> str:
@@ -159,7 +148,10 @@ class PageHandler(BaseHTTPRequestHandler):
             self._send(b"", "text/plain", HTTPStatus.OK, login_headers)
             return
         self._check_key()
-        self._send((resources.files("glassplat.annotate") / "page" / "index.html").read_bytes(), "text/html")
+        self._send_file("index.html", "text/html")
+
+    def _send_file(self, name: str, kind: str) -> None:
+        self._send((resources.files("glassplat.annotate") / "page" / name).read_bytes(), kind)
 
     def _send_photograph(self, number: str, longest: int) -> None:
         if not number.isdecimal() or len(number) > 9 or int(number) >= len(self.server.session.views):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 from collections import OrderedDict
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
@@ -174,15 +173,6 @@ class ChangedElsewhereError(ValueError):
         self.response = {"document": merged.document, "renamed": merged.renamed, "version": version}
 
 
-@dataclass(frozen=True)
-class SolvedPane:
-    """A pane with its fit, or the reason why there is none."""
-
-    pane: MarkedPane
-    fit: PaneFit | None
-    problem: str = ""
-
-
 class Session:
     """A capture, its marks, and the fits to them.
 
@@ -285,17 +275,17 @@ class Session:
         found = grab_outlines(photo, np.array(fields["points"], dtype=np.float64))
         return {"outlines": [np.round(outline, 2).tolist() for outline in found]}
 
-    def solve(self, pane: MarkedPane) -> SolvedPane:
-        """Fits one pane."""
+    def solve(self, pane: MarkedPane) -> PaneFit | str:
+        """Fits one pane, or tells why it has no fit."""
         marks = pane.marks(self._view_numbers)
         if len(marks.corners) < 3 or not marks.views():
-            return SolvedPane(pane, None, "mark the corners in order around the pane")
+            return "mark the corners in order around the pane"
         try:
-            return SolvedPane(pane, fit_pane(marks, self.cameras, pane.shape))
+            return fit_pane(marks, self.cameras, pane.shape)
         except TooFewMarksError as error:
-            return SolvedPane(pane, None, str(error))
+            return str(error)
         except ValueError as error:
-            return SolvedPane(pane, None, f"{error}; check the order of the corners")
+            return f"{error}; check the order of the corners"
 
     def finish(self) -> dict[str, Any]:
         """Writes masks and planes of all marked panes, including those of another program; returns a summary.
@@ -303,7 +293,7 @@ class Session:
         If no pane is marked any more, earlier output is removed.
         """
         panes = parse_document(self._current_document()["document"], "the document")
-        solved = [(one.pane, one.fit) for one in map(self.solve, panes) if one.fit is not None]
+        solved = [(pane, fit) for pane in panes if not isinstance(fit := self.solve(pane), str)]
         if not solved:
             is_marked = any(places for pane in panes for places in (*pane.corners, *pane.edges))
             removed = [] if is_marked else remove_results(self.root)
@@ -322,18 +312,17 @@ class Session:
         """Record of a pane for the page; the cached one if its corners, edges and shape are unchanged."""
         marked, known = repr((pane.corners, pane.edges, pane.shape)), self._records.get(pane.label)
         if known is None or known[0] != marked:
-            known = self._records[pane.label] = marked, self._make_record(self.solve(pane))
+            known = self._records[pane.label] = marked, self._make_record(pane, self.solve(pane))
         return known[1]
 
-    def _make_record(self, solved: SolvedPane) -> dict[str, Any]:
-        """Record of a pane and its fit for the page."""
-        pane, fit = solved.pane, solved.fit
+    def _make_record(self, pane: MarkedPane, fit: PaneFit | str) -> dict[str, Any]:
+        """Record for the page of a pane and its fit, or of why there is none."""
         marks = pane.marks(self._view_numbers)
-        if fit is None:
+        if isinstance(fit, str):
             return {
                 "label": pane.label,
                 "solved": False,
-                "message": self._crossing_warning(marks) or solved.problem,
+                "message": self._crossing_warning(marks) or fit,
                 "next": [{"view": number} for number in self._second_views(marks)],
                 "lines": self._sight_lines(marks),
             }
