@@ -306,22 +306,19 @@ class WorkProgress:
         self._what = ""
         self._begun = self._shown = 0.0
         self._first = 0
-        self._bar: progress.Progress | None = None
-        self._task: progress.TaskID | None = None
+        columns = (
+            progress.TextColumn("{task.description}", markup=False),
+            progress.BarColumn(),
+            progress.MofNCompleteColumn(),
+            progress.TimeElapsedColumn(),
+            progress.TextColumn("left"),
+            progress.TimeRemainingColumn(compact=True),
+        )
+        bar = progress.Progress(*columns, console=console, refresh_per_second=4)
+        self._bar = bar if console.is_interactive else None
 
     def __enter__(self) -> WorkProgress:
-        if self._console.is_interactive:
-            columns = (
-                progress.TextColumn("{task.description}", markup=False),
-                progress.BarColumn(),
-                progress.MofNCompleteColumn(),
-            )
-            times = (
-                progress.TimeElapsedColumn(),
-                progress.TextColumn("left"),
-                progress.TimeRemainingColumn(compact=True),
-            )
-            self._bar = progress.Progress(*columns, *times, console=self._console, refresh_per_second=4)
+        if self._bar is not None:
             self._bar.start()
         return self
 
@@ -341,12 +338,12 @@ class WorkProgress:
             self._show_line(message)
 
     def _show_bar(self, bar: progress.Progress, step: messages.Working) -> None:
-        if step.what != self._what or self._task is None:
-            if self._task is not None:
-                bar.remove_task(self._task)
-            self._task = bar.add_task(step.what, total=step.total, completed=step.done)
+        if step.what != self._what:
+            for task in bar.task_ids:
+                bar.remove_task(task)
+            bar.add_task(step.what, total=step.total, completed=step.done)
             self._what = step.what
-        bar.update(self._task, completed=step.done)
+        bar.update(bar.task_ids[0], completed=step.done)
 
     def _show_line(self, step: messages.Working) -> None:
         now = self._clock()
