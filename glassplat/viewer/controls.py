@@ -46,7 +46,12 @@ MOST_OPEN = 4
 
 
 class PaneGizmo:
-    """Arrows and arcs that move and rotate one pane, with its outline; hidden until `show` is called."""
+    """Arrows and arcs that move and rotate one pane, with its outline.
+
+    Attributes:
+        label: of the pane.
+        handle: viser's gizmo, hidden at first; its position applies in both cases.
+    """
 
     def __init__(self, scene: Any, planes: Planes, row: int) -> None:
         """Adds the gizmo at the position of the pane.
@@ -56,13 +61,13 @@ class PaneGizmo:
             planes: of the displayed scene.
             row: index of the pane.
         """
-        self.label, self._name = planes.labels[row], f"/panes/{planes.labels[row]}"
+        self.label, name = planes.labels[row], f"/panes/{planes.labels[row]}"
         axes = torch.stack([*(axis[row] for axis in planes.axes()), planes.normals[row]], dim=1)
         self._start = wxyz_of(axes.detach().double().cpu().numpy())
         self._center = planes.centers[row].detach().double().cpu().numpy()
         half = planes.half_sizes[row].detach().double().cpu().numpy()
-        self._handle = scene.add_transform_controls(
-            self._name,
+        self.handle = scene.add_transform_controls(
+            name,
             scale=HANDLE_SHARE * float(half.mean()),
             wxyz=self._start,
             position=self._center,
@@ -71,32 +76,20 @@ class PaneGizmo:
         )
         corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * [*half, 0]
         scene.add_line_segments(
-            f"{self._name}/outline",
+            f"{name}/outline",
             np.stack([corners, np.roll(corners, -1, axis=0)], axis=1).astype(np.float32),
             LABEL_COLORS[row % len(LABEL_COLORS)],
             thickness=OUTLINE_PIXELS,
             thickness_units="screen",
         )
 
-    def listen(self, changed: Callable[[], None]) -> None:
-        """Calls `changed` whenever the pane is moved."""
-        self._handle.on_update(log_errors(lambda _: changed()))
-
-    def show(self, visible: bool) -> None:
-        """Shows or hides the gizmo; its position applies in both cases."""
-        self._handle.visible = visible
-
     def reset(self) -> None:
         """Resets the gizmo to the pane's original pose."""
-        self._handle.wxyz, self._handle.position = self._start, self._center
-
-    def remove(self) -> None:
-        """Removes the gizmo and its outline from the view."""
-        self._handle.remove()
+        self.handle.wxyz, self.handle.position = self._start, self._center
 
     def pane_move(self) -> PaneMove | None:
         """Movement of the pane; None if it was not moved."""
-        wxyz, position = np.asarray(self._handle.wxyz), np.asarray(self._handle.position)
+        wxyz, position = np.asarray(self.handle.wxyz), np.asarray(self.handle.position)
         if np.array_equal(wxyz, self._start) and np.array_equal(position, self._center):
             return None
         rotation = np.array([1.0, 0, 0, 0])
@@ -133,10 +126,9 @@ class PaneControls:
 
     def listen(self, changed: Callable[[], None]) -> None:
         """Calls `changed` whenever the request changes, and shows the gizmo of the selected pane."""
-        for control in (self._glass, *self._reflectances.values(), self._gain):
+        handles = (gizmo.handle for gizmo in self._gizmos)
+        for control in (self._glass, *self._reflectances.values(), self._gain, *handles):
             control.on_update(log_errors(lambda _: changed()))
-        for gizmo in self._gizmos:
-            gizmo.listen(changed)
         self._chosen.on_update(log_errors(lambda _: self._show_gizmo()))
         self._reset_button.on_click(log_errors(lambda _: self._reset(changed)))
 
@@ -158,11 +150,11 @@ class PaneControls:
         """Removes the controls, and the gizmos from the view."""
         self._folder.remove()
         for gizmo in self._gizmos:
-            gizmo.remove()
+            gizmo.handle.remove()
 
     def _show_gizmo(self) -> None:
         for gizmo in self._gizmos:
-            gizmo.show(str(gizmo.label) == self._chosen.value)
+            gizmo.handle.visible = str(gizmo.label) == self._chosen.value
 
     def _reset(self, changed: Callable[[], None]) -> None:
         for gizmo in self._gizmos:
@@ -236,17 +228,14 @@ MEASURE_COLOR = (86, 180, 233)
 class MeasureControls:
     """A checkbox, and the distance between the last two points clicked while it is checked."""
 
-    def __init__(self, handle: Any) -> None:
-        """Starts without points; `lay_out` adds the controls."""
+    def __init__(self, handle: Any, clicked: Callable[[np.ndarray], None]) -> None:
+        """Lays out the controls; `clicked` is called with the direction [3] of each click."""
         self._handle = handle
         self._points: list[np.ndarray] = []
         self._is_listening = False
-
-    def lay_out(self, clicked: Callable[[np.ndarray], None]) -> None:
-        """Adds the controls; `clicked` is called with the direction [3] of each click."""
-        with self._handle.gui.add_folder("Measure", expand_by_default=False):
-            self._enabled = self._handle.gui.add_checkbox("Click two points", False)
-            self._message = self._handle.gui.add_markdown(self._distance())
+        with handle.gui.add_folder("Measure", expand_by_default=False):
+            self._enabled = handle.gui.add_checkbox("Click two points", False)
+            self._message = handle.gui.add_markdown(self._distance())
         self._enabled.on_update(log_errors(lambda _: self._listen_to_clicks(clicked)))
 
     def add_point(self, point: np.ndarray) -> None:
@@ -284,15 +273,24 @@ KEYFRAME_COLOR = (249, 140, 10)
 
 
 class KeyframeControls:
-    """A folder of controls, and the keyframes, shown as frusta in the view. They survive a new layout."""
+    """A folder of controls, and the keyframes, shown as frusta in the view."""
 
-    def __init__(self, handle: Any, extent: float, camera: Callable[[], Camera | None]) -> None:
-        """Starts without keyframes; `lay_out` adds the controls.
+    def __init__(
+        self,
+        handle: Any,
+        extent: float,
+        camera: Callable[[], Camera | None],
+        move_camera: Callable[[Camera], None],
+        save: Callable[[str], None] | None,
+    ) -> None:
+        """Lays out the controls.
 
         Args:
             handle: of the client.
             extent: of the scene, world units.
             camera: returns the client's current camera, None while unknown.
+            move_camera: moves the client's camera.
+            save: writes the keyframes under a name; None if writing is not allowed.
         """
         self._handle, self._extent, self._camera = handle, extent, camera
         self._frusta: list[Any] = []
@@ -301,15 +299,7 @@ class KeyframeControls:
         # viser calls the callbacks of quick successive clicks concurrently.
         self._lock = threading.Lock()
         self._move_lock = threading.Lock()
-
-    def lay_out(self, move_camera: Callable[[Camera], None], save: Callable[[str], None] | None) -> None:
-        """Adds the controls.
-
-        Args:
-            move_camera: moves the client's camera.
-            save: writes the keyframes under a name; None if writing is not allowed.
-        """
-        gui = self._handle.gui
+        gui = handle.gui
         with gui.add_folder("Keyframes", expand_by_default=False):
             self._count = gui.add_markdown(self._count_text())
             gui.add_button("Add this view").on_click(log_errors(lambda _: self.add()))

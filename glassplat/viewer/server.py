@@ -46,14 +46,28 @@ class Client:
     def __init__(self, handle: Any, viewer: Viewer) -> None:
         """Lays out the controls and moves to the first view; the caller then calls `request_render`."""
         self._handle, self._viewer = handle, viewer
-        self._status, self._nearest = "", viewer.first
-        self._panes: controls.PaneControls | None = None
-        self._clean: controls.CleanControls | None = None
-        self._measure = controls.MeasureControls(handle)
-        self.keyframes = controls.KeyframeControls(handle, viewer.state.scene.extent, self.camera)
-        self._failure = ""
+        self._nearest, self._failure = viewer.first, ""
         self._waiting: Any = handle.add_notification(*WAITING_NOTIFICATION, loading=True, with_close_button=False)
-        self.lay_out()
+        gui, state = handle.gui, viewer.state
+        self._status_line = gui.add_markdown("") if viewer.buttons else None
+        for name, act in viewer.buttons.items():
+            gui.add_button(name).on_click(controls.log_errors(lambda _, act=act: act()))
+        self._layer = gui.add_dropdown("Layer", state.layers)
+        self._panes: controls.PaneControls | None = None
+        # A scene in training changes at every step.
+        self._clean = None if viewer.buttons else controls.CleanControls(gui, state)
+        self._measure = controls.MeasureControls(handle, self.measure)
+        self._photographs = controls.PhotographControls(gui, state, viewer.first)
+        save = None if state.writer is None else self.save_keyframes
+        self.keyframes = controls.KeyframeControls(handle, state.scene.extent, self.camera, self.move_camera, save)
+        if state.writer is not None:
+            self._add_save_controls(f"{state.title}-edited")
+        # After all are created, because a control may fire as soon as it listens.
+        self.lay_out_panes()
+        self._layer.on_update(controls.log_errors(lambda _: self.request_render()))
+        if self._clean is not None:
+            self._clean.listen(self.request_render)
+        self._photographs.listen(self.go_to_photograph)
         self.go_to_photograph(viewer.first)
         handle.camera.on_update(controls.log_errors(lambda _: self.request_render()))
 
@@ -75,7 +89,6 @@ class Client:
 
     def show_status(self, status: str) -> None:
         """Shows a line above the controls."""
-        self._status = status
         if self._status_line is not None:
             self._status_line.content = escape_markdown(status)
 
@@ -128,28 +141,6 @@ class Client:
             self._handle.camera.look_at = tuple(position + ahead * rotation[2])
             self._handle.camera.near, self._handle.camera.far = (share * extent for share in CLIPPING_PLANES)
             self._handle.camera.fov = 2 * float(np.arctan(camera.height / 2 / camera.fy))
-
-    def lay_out(self) -> None:
-        """Lays out the controls."""
-        gui, state = self._handle.gui, self._viewer.state
-        self._status_line = gui.add_markdown(escape_markdown(self._status)) if self._viewer.buttons else None
-        for name, act in self._viewer.buttons.items():
-            gui.add_button(name).on_click(controls.log_errors(lambda _, act=act: act()))
-        self._layer = gui.add_dropdown("Layer", state.layers)
-        # A scene in training changes at every step.
-        self._clean = None if self._viewer.buttons else controls.CleanControls(gui, state)
-        self._measure.lay_out(self.measure)
-        self._photographs = controls.PhotographControls(gui, state, self._nearest)
-        # After all are created, because a control may fire as soon as it listens.
-        self.lay_out_panes()
-        self._layer.on_update(controls.log_errors(lambda _: self.request_render()))
-        if self._clean is not None:
-            self._clean.listen(self.request_render)
-        self._photographs.listen(self.go_to_photograph)
-        self.keyframes.lay_out(self.move_camera, None if state.writer is None else self.save_keyframes)
-        if state.writer is not None:
-            self._add_save_controls(f"{state.title}-edited")
-        self._photographs.show_nearest(self._nearest)
 
     def lay_out_panes(self) -> None:
         """Lays out the controls of the scene's panes and the list of layers, replacing existing ones.

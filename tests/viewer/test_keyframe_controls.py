@@ -48,8 +48,7 @@ class Page:
 
 def test_quick_clicks_at_once_leave_keyframes_that_fit_together() -> None:
     page, went = Page(), list[Camera]()
-    controls = KeyframeControls(page, 1.0, lambda: random.choice(CAMERAS))
-    controls.lay_out(went.append, None)
+    controls = KeyframeControls(page, 1.0, lambda: random.choice(CAMERAS), went.append, None)
     failures: list[BaseException] = []
 
     def click(seed: int) -> None:
@@ -76,8 +75,7 @@ def test_quick_clicks_at_once_leave_keyframes_that_fit_together() -> None:
 
 def test_the_number_of_keyframes_is_limited() -> None:
     page = Page()
-    controls = KeyframeControls(page, 1.0, lambda: CAMERAS[0])
-    controls.lay_out(lambda camera: None, None)
+    controls = KeyframeControls(page, 1.0, lambda: CAMERAS[0], lambda camera: None, None)
     for _ in range(MOST_KEYFRAMES + 5):
         page.buttons["Add this view"](None)
     assert len(controls.keyframes) == MOST_KEYFRAMES
@@ -92,8 +90,7 @@ def test_stopping_playback_stops_the_camera_at_once() -> None:
         moved.append(camera)
 
     cameras = iter(CAMERAS)
-    controls = KeyframeControls(page, 1.0, lambda: next(cameras))
-    controls.lay_out(go, None)
+    controls = KeyframeControls(page, 1.0, lambda: next(cameras), go, None)
     for name in ("Add this view", "Add this view", "Play or stop"):
         page.buttons[name](None)
     assert began.wait(10)
