@@ -18,7 +18,7 @@ from rich.console import Console
 
 from glassplat.captures.files import CaptureFiles, read_capture
 from glassplat.captures.masks import Polarity
-from glassplat.cli.console import import_pytorch_module, message_console, print_line, unknown_name_message
+from glassplat.cli.console import Command, message_console, print_line, unknown_name_message
 from glassplat.cli.places import check_targets
 from glassplat.errors import InputError, convert_to_input_error
 from glassplat.files.records import read_text
@@ -35,7 +35,7 @@ RecipeKind = TypeVar("RecipeKind", bound=MethodRecipe)
 
 
 @dataclass(frozen=True)
-class Train(Generic[RecipeKind]):
+class Train(Command, Generic[RecipeKind]):
     """Train a scene from photographs.
 
     Attributes:
@@ -55,6 +55,8 @@ class Train(Generic[RecipeKind]):
         view: watch the training in the browser.
     """
 
+    entry_point = "runs:train"
+
     recipe: Annotated[RecipeKind, tyro.conf.arg(name="")]
     data: Path
     output: Path
@@ -70,15 +72,18 @@ class Train(Generic[RecipeKind]):
     config: Path | None = None
     view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
 
-    def set_up(self) -> None:
-        """Checks options, capture and output, prints a summary of the capture, and imports the training code."""
+    def check(self) -> None:
+        """Checks options, capture and output, and prints a summary of the capture."""
         if real_path(self.output) == real_path(self.data):
             raise InputError(f"{self.output} is the capture itself; choose another folder for --output")
         if self.recipe.strategy != "mcmc" and self.recipe.mcmc.cap is not None:
             raise InputError("--cap belongs to --strategy mcmc; expected that strategy, or --densify.cap")
         check_output(RunDirectory(self.output), resume=self.resume)
         print_line(message_console(), self.files)
-        import_pytorch_module("glassplat.cli.runs")
+
+    def set_up(self) -> None:
+        """Checks options and paths, imports the training code, and checks the length of the stages."""
+        super().set_up()
         self.recipe.renderer()  # Imports the method's modules before anything is written.
         from glassplat.training.stage import check_length
 
@@ -88,12 +93,6 @@ class Train(Generic[RecipeKind]):
     def files(self) -> CaptureFiles:
         """Contents of the capture's folder, read at first use, without PyTorch."""
         return read_capture(self.data, mask_polarity=self.mask_polarity)
-
-    def run(self, console: Console) -> None:
-        """Trains, with a progress bar or lines."""
-        from glassplat.cli.runs import train
-
-        train(self, console)
 
     def interrupt_message(self) -> str:
         """Message after an interrupt: the state on disk, and how to continue."""
