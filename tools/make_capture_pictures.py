@@ -23,11 +23,12 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 import glassplat
+from glassplat.access import LOCALHOST
 from glassplat.cli.serving import photograph_readers
 from glassplat.model.model import viewer_state
 from glassplat.prepare.preparation import PAGE
 from glassplat.scene.camera import NumpyCamera
-from glassplat.viewer.render_loop import LOCALHOST, vacant_port
+from glassplat.viewer.render_loop import vacant_port
 from glassplat.viewer.server import Viewer
 from tools.browser import Browser, wait_until
 from tools.marking_page import MarkingPage, marking_page

@@ -11,7 +11,7 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from glassplat.access import is_local
+from glassplat.access import LOCALHOST, is_local
 from glassplat.captures.dataset import TEST_EVERY, Dataset, load_dataset, make_dataset, with_corrected_cameras
 from glassplat.captures.view import GIGABYTE, PointCloud, View
 from glassplat.cli.console import print_line, print_warning, shell_word
@@ -195,7 +195,7 @@ def _viewer_listener(command: Train[Any], training: Training, dataset: Dataset, 
         yield lambda message: None
         return
     from glassplat.model.watching import WatchedTraining
-    from glassplat.viewer.render_loop import LOCALHOST, vacant_port
+    from glassplat.viewer.render_loop import vacant_port
 
     port = vacant_port(LOCALHOST)
     watched = WatchedTraining(

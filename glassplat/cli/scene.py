@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from glassplat.access import LOCALHOST
 from glassplat.cli.console import Command
 from glassplat.cli.places import SceneEdits, SplatFile, Split, check_claim, check_file, check_scene, print_scene
 from glassplat.errors import InputError, convert_to_input_error
@@ -17,7 +18,7 @@ from glassplat.kernels.backend.devices import DeviceName
 from glassplat.model.run_directory import RunDirectory
 from glassplat.options import Cleaning, Coordinate, Downscale, Positive, Range
 from glassplat.publish.film import check_encoder
-from glassplat.viewer.render_loop import LOCALHOST, check_port
+from glassplat.viewer.render_loop import check_port
 
 PaneSource = Literal["auto", "truth", "masks", "rendered"]
 Align = Literal["auto", "always", "never"]

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from glassplat.access import LOCALHOST
 from glassplat.captures import dataset as captures
 from glassplat.errors import InputError, convert_to_input_error, count_noun, join_names
 from glassplat.files import writing
@@ -43,7 +44,7 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene, covering_glass, with_intensity, with_pane
 from glassplat.viewer.drawing import ViewerState, Writer
-from glassplat.viewer.render_loop import LOCALHOST, vacant_port
+from glassplat.viewer.render_loop import vacant_port
 from glassplat.viewer.server import Viewer
 
 NOTEBOOK_WIDTH = 480

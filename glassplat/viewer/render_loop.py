@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from glassplat.errors import InputError
 
-LOCALHOST = "127.0.0.1"
 FIRST_PORT, MOST_PORTS = 8080, 100
 
 
