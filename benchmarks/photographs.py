@@ -25,7 +25,7 @@ from PIL import Image
 from torch import Tensor
 
 from glassplat.captures.dataset import load_dataset, read_photographs_in_background
-from glassplat.captures.view import DiskCache, PixelCache, PixelSource, PointCloud, View
+from glassplat.captures.view import DiskCache, PixelCache, PointCloud, Reader, View
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.training.loop import train
 from glassplat.training.messages import StepDone
@@ -41,10 +41,10 @@ class Waited(PixelCache):
 
     seconds = 0.0
 
-    def get(self, source: PixelSource) -> Tensor:
+    def get(self, reader: Reader) -> Tensor:
         """Returns the pixels, as in the base class."""
         begun = time.perf_counter()
-        found = super().get(source)
+        found = super().get(reader)
         if threading.current_thread() is threading.main_thread():
             self.seconds += time.perf_counter() - begun
         return found
@@ -76,13 +76,13 @@ def write_capture(photographs: list[Path], count: int, distortion: float, folder
 def read_seconds(views: tuple[View, ...], folder: Path) -> tuple[float, float]:
     """CPU seconds per photograph: reading its file, and reading the undistorted, reduced copy from the spool."""
     spool, begun = DiskCache(folder), time.thread_time()
-    pixels = [(PixelSource(view.read_photo), view.read_photo()) for view in views]
+    pixels = [view.read_photo() for view in views]
     read = time.thread_time()
-    for source, photo in pixels:
-        spool.put(source, photo)
+    for view, photo in zip(views, pixels, strict=True):
+        spool.put(view.read_photo, photo)
     put = time.thread_time()
-    for source, _ in pixels:
-        spool.get(source)
+    for view in views:
+        spool.get(view.read_photo)
     again = time.thread_time() - put
     spool.close()
     return (read - begun) / len(views), again / len(views)

@@ -72,25 +72,8 @@ def sample_evenly(items: Sequence[Item], most: int) -> list[Item]:
     return [items[len(items) * number // count] for number in range(count)]
 
 
-class PixelSource:
-    """Pixels that can be read again; sources with the same reader are equal.
-
-    Attributes:
-        is_mask: the values are converted to booleans: true above zero.
-    """
-
-    def __init__(self, reader: Callable[[], Tensor], *, is_mask: bool = False) -> None:
-        self._reader, self.is_mask = reader, is_mask
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, PixelSource) and self._reader is other._reader
-
-    def __hash__(self) -> int:
-        return id(self._reader)
-
-    def read(self) -> Tensor:
-        """The pixels, read from their file."""
-        return self._reader() > 0 if self.is_mask else self._reader()
+Reader = Callable[[], Tensor]
+"""Reads pixels, the same ones every time; caches store them by their reader."""
 
 
 class DiskCache:
@@ -102,15 +85,15 @@ class DiskCache:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._file: IO[bytes] | None = None
-        self._entries: dict[PixelSource, tuple[int, tuple[int, ...], np.dtype[np.generic]]] = {}
+        self._entries: dict[Reader, tuple[int, tuple[int, ...], np.dtype[np.generic]]] = {}
         self._is_full = False
         self._lock = Lock()
 
-    def put(self, source: PixelSource, pixels: Tensor) -> None:
-        """Stores the pixels of a source if there is room."""
+    def put(self, reader: Reader, pixels: Tensor) -> None:
+        """Stores the pixels of a reader if there is room."""
         values = pixels.numpy()
         with self._lock:
-            if self._is_full or source in self._entries:
+            if self._is_full or reader in self._entries:
                 return
             try:
                 if shutil.disk_usage(self._folder).free < values.nbytes + DISK_RESERVE:
@@ -123,14 +106,14 @@ class DiskCache:
             except OSError:
                 self._release()  # Under a quota, this space may be needed for a checkpoint.
                 return
-            self._entries[source] = offset, values.shape, values.dtype
+            self._entries[reader] = offset, values.shape, values.dtype
 
-    def get(self, source: PixelSource) -> Tensor | None:
-        """The pixels of a source; None if they are not stored."""
+    def get(self, reader: Reader) -> Tensor | None:
+        """The pixels of a reader; None if they are not stored."""
         with self._lock:
-            if self._file is None or source not in self._entries:
+            if self._file is None or reader not in self._entries:
                 return None
-            offset, shape, dtype = self._entries[source]
+            offset, shape, dtype = self._entries[reader]
             values = np.empty(shape, dtype)
             try:
                 self._file.seek(offset)
@@ -174,10 +157,10 @@ class PixelCache:
         self.ahead = int(max(min(self.budget * AHEAD_SHARE / view - 1, MOST_AHEAD), 1))
         self._free_bytes = self.budget - (self.ahead + 1) * view
         self._transient_limit = (self.ahead + 1) * view
-        self._resident: dict[PixelSource, Tensor] = {}
-        self._transient: OrderedDict[PixelSource, Tensor] = OrderedDict()
+        self._resident: dict[Reader, Tensor] = {}
+        self._transient: OrderedDict[Reader, Tensor] = OrderedDict()
         self._transient_bytes = 0
-        self._pending: dict[PixelSource, Future[Tensor]] = {}
+        self._pending: dict[Reader, Future[Tensor]] = {}
         self._disk_cache: DiskCache | None = None
         self._lock = Lock()
 
@@ -190,28 +173,28 @@ class PixelCache:
         """Return whether some pixels had to be kept temporarily, because there is no more room."""
         return bool(self._transient)
 
-    def get(self, source: PixelSource) -> Tensor:
-        """The pixels of a source, read now unless they are cached or being read.
+    def get(self, reader: Reader) -> Tensor:
+        """The pixels of a reader, read now unless they are cached or being read.
 
         Raises:
             InputError: they cannot be read.
         """
         with self._lock:
-            if (found := self._look_up(source)) is not None:
+            if (found := self._look_up(reader)) is not None:
                 return found
-            is_mine = source not in self._pending
-            future = self._pending.setdefault(source, Future())
+            is_mine = reader not in self._pending
+            future = self._pending.setdefault(reader, Future())
         if is_mine:
-            self._read(source, future)
+            self._read(reader, future)
         return future.result()
 
-    def read_ahead(self, source: PixelSource) -> None:
+    def read_ahead(self, reader: Reader) -> None:
         """Reads pixels in a background thread; after a failure, `get` reads them again and raises the error."""
         with self._lock:
-            if source in self._pending or self._look_up(source) is not None:
+            if reader in self._pending or self._look_up(reader) is not None:
                 return
-            future = self._pending[source] = Future()
-        reading_threads().submit(self._read, source, future)
+            future = self._pending[reader] = Future()
+        reading_threads().submit(self._read, reader, future)
 
     @contextmanager
     def cache_on_disk(self, folder: Path) -> Iterator[None]:
@@ -223,39 +206,39 @@ class PixelCache:
             self._disk_cache = None
             disk_cache.close()
 
-    def _look_up(self, source: PixelSource) -> Tensor | None:
-        if source in self._transient:
-            self._transient.move_to_end(source)
-        return self._resident.get(source, self._transient.get(source))
+    def _look_up(self, reader: Reader) -> Tensor | None:
+        if reader in self._transient:
+            self._transient.move_to_end(reader)
+        return self._resident.get(reader, self._transient.get(reader))
 
     @torch.inference_mode(False)  # The first caller may not need gradients; a later one may.
-    def _read(self, source: PixelSource, future: Future[Tensor]) -> None:
+    def _read(self, reader: Reader, future: Future[Tensor]) -> None:
         disk_cache = self._disk_cache
         try:
-            stored = None if disk_cache is None else disk_cache.get(source)
+            stored = None if disk_cache is None else disk_cache.get(reader)
             begun = time.thread_time()
-            pixels = source.read() if stored is None else stored
+            pixels = reader() if stored is None else stored
             is_costly = stored is None and time.thread_time() - begun > pixels.nbytes / DISK_RATE
         except BaseException as error:  # noqa: BLE001 - Raised by `get`.
             with self._lock:
-                del self._pending[source]
+                del self._pending[reader]
             future.set_exception(error)
             return
         with self._lock:
-            del self._pending[source]
-            stays = self._store(source, pixels)
+            del self._pending[reader]
+            stays = self._store(reader, pixels)
         future.set_result(pixels)
         if disk_cache is not None and is_costly and not stays:
-            disk_cache.put(source, pixels)
+            disk_cache.put(reader, pixels)
 
-    def _store(self, source: PixelSource, pixels: Tensor) -> bool:
+    def _store(self, reader: Reader, pixels: Tensor) -> bool:
         """Caches pixels; returns whether they stay permanently."""
         size = pixels.numel() * pixels.element_size()
         if size <= self._free_bytes:
             self._free_bytes -= size
-            self._resident[source] = pixels
+            self._resident[reader] = pixels
             return True
-        self._transient[source] = pixels
+        self._transient[reader] = pixels
         self._transient_bytes += size
         while self._transient_bytes > self._transient_limit and len(self._transient) > 1:
             _, oldest = self._transient.popitem(last=False)
@@ -313,10 +296,10 @@ class View:
     name: str
     camera: Camera
     image_path: Path
-    read_photo: Callable[[], Tensor]
-    read_pane_labels: Callable[[], Tensor] | None = None
-    read_ignored: Callable[[], Tensor] | None = None
-    read_normals: Callable[[], Tensor] | None = None
+    read_photo: Reader
+    read_pane_labels: Reader | None = None
+    read_ignored: Reader | None = None
+    read_normals: Reader | None = None
     memory: PixelCache = field(default_factory=lambda: PixelCache(math.inf), repr=False, compare=False)
 
     def __repr__(self) -> str:
@@ -329,12 +312,12 @@ class View:
         Raises:
             InputError: the file cannot be read; the message names it.
         """
-        return self.memory.get(PixelSource(self.read_photo))
+        return self.memory.get(self.read_photo)
 
     @property
     def pane_labels(self) -> Tensor | None:
         """[H, W] uint8 pane label per pixel, 0 for no pane; None if the view is not annotated."""
-        return None if self.read_pane_labels is None else self.memory.get(PixelSource(self.read_pane_labels))
+        return None if self.read_pane_labels is None else self.memory.get(self.read_pane_labels)
 
     @property
     def mask_paths(self) -> list[Path]:
@@ -346,7 +329,7 @@ class View:
     @property
     def ignored(self) -> Tensor | None:
         """[H, W] bool, the pixels excluded from training and evaluation; None if there are none."""
-        return None if self.read_ignored is None else self.memory.get(PixelSource(self.read_ignored, is_mask=True))
+        return None if self.read_ignored is None else self.memory.get(self.read_ignored)
 
     @property
     def normals(self) -> Tensor | None:
@@ -355,15 +338,13 @@ class View:
         Raises:
             InputError: the file cannot be read, or its aspect ratio differs from the photograph's.
         """
-        return None if self.read_normals is None else self.memory.get(PixelSource(self.read_normals))
+        return None if self.read_normals is None else self.memory.get(self.read_normals)
 
     def read_ahead(self) -> None:
         """Reads the pixels for training on this view in background threads."""
-        self.memory.read_ahead(PixelSource(self.read_photo))
-        if self.read_pane_labels is not None:
-            self.memory.read_ahead(PixelSource(self.read_pane_labels))
-        if self.read_ignored is not None:
-            self.memory.read_ahead(PixelSource(self.read_ignored, is_mask=True))
+        for reader in (self.read_photo, self.read_pane_labels, self.read_ignored):
+            if reader is not None:
+                self.memory.read_ahead(reader)
 
     @property
     def is_annotated(self) -> bool:
@@ -396,7 +377,7 @@ def _return_pixels(pixels: Tensor) -> Tensor:
     return pixels
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PhotoFile:
     """Reader of the pixels of one view; `background` is seen through transparent pixels.
 
@@ -439,9 +420,9 @@ class IgnoredFiles:
     blank: cameras.PixelMap | None = None
 
     def __call__(self) -> Tensor:
-        """[H, W] uint8, above zero where any mask is, or outside the photograph."""
+        """[H, W] bool, true where any mask is, or outside the photograph."""
         blank = [] if self.blank is None else [torch.from_numpy(self.blank.blank_mask())]
-        return torch.stack([*blank, *(mask.ignored() for mask in self.masks)]).amax(dim=0)
+        return torch.stack([*blank, *(mask.ignored() for mask in self.masks)]).amax(dim=0) > 0
 
 
 def prepare_view(
@@ -568,7 +549,7 @@ def rotate_to_world(normals: Tensor, camera: Camera) -> Tensor:
     return normals @ camera.cam_from_world[:3, :3].to(normals)
 
 
-def normals_reader(path: Path | None, camera: Camera) -> Callable[[], Tensor] | None:
+def normals_reader(path: Path | None, camera: Camera) -> Reader | None:
     """Reader of a file of estimated normals, at a camera's size; None for None."""
     return None if path is None else partial(read_normals_file, path, camera)
 

@@ -277,7 +277,7 @@ def test_metrics_leave_ignored_pixels_out() -> None:
         assert passed_by[name] < clean[name] - 5
         assert ignoring[name] == pytest.approx(clean[name], abs=3.0)
     assert ignoring["ssim"] > passed_by["ssim"] + 0.02
-    nothing = measured(replace(passed, read_ignored=lambda: torch.ones(28, 40)))
+    nothing = measured(replace(passed, read_ignored=lambda: torch.ones(28, 40, dtype=torch.bool)))
     assert nothing["psnr"] is None and "ignored" in nothing["psnr_reason"]
 
 

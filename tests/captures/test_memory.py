@@ -16,7 +16,7 @@ import torch
 
 from glassplat.captures import view as view_module
 from glassplat.captures.dataset import load_dataset
-from glassplat.captures.view import MOST_AHEAD, PixelCache, PixelSource, default_budget, machine_memory
+from glassplat.captures.view import MOST_AHEAD, PixelCache, default_budget, machine_memory
 from glassplat.errors import InputError
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.scene.scene import Scene
@@ -40,7 +40,7 @@ class Files:
 
     def __init__(self, count: int) -> None:
         self.times: Counter[int] = Counter()
-        self.sources = [PixelSource(self._reader(number)) for number in range(count)]
+        self.readers = [self._reader(number) for number in range(count)]
 
     def _reader(self, number: int):
         def read() -> torch.Tensor:
@@ -53,7 +53,7 @@ class Files:
 def test_photographs_that_fit_in_memory_are_read_once() -> None:
     files, memory = Files(10), PixelCache(math.inf, largest=SIZE)
     for _ in range(3):
-        assert [int(memory.get(source)[0, 0]) for source in files.sources] == list(range(10))
+        assert [int(memory.get(reader)[0, 0]) for reader in files.readers] == list(range(10))
     assert set(files.times.values()) == {1}
     assert not memory.is_full
 
@@ -61,8 +61,8 @@ def test_photographs_that_fit_in_memory_are_read_once() -> None:
 def test_part_of_the_photographs_stays_cached_within_the_memory_limit() -> None:
     files, memory = Files(100), PixelCache(60 * WHOLE, largest=SIZE)
     for _ in range(3):
-        for source in files.sources:
-            memory.get(source)
+        for reader in files.readers:
+            memory.get(reader)
         held = [*memory._resident.values(), *memory._transient.values()]
         assert sum(tensor.numel() for tensor in held) <= memory.budget
     assert memory.is_full
@@ -71,15 +71,15 @@ def test_part_of_the_photographs_stays_cached_within_the_memory_limit() -> None:
 
 def test_a_step_reads_its_photograph_even_beyond_the_memory_limit() -> None:
     files, memory = Files(4), PixelCache(1, largest=SIZE)
-    assert [int(memory.get(source)[0, 0]) for source in files.sources] == [0, 1, 2, 3]
-    assert memory.get(files.sources[3]) is memory.get(files.sources[3])
+    assert [int(memory.get(reader)[0, 0]) for reader in files.readers] == [0, 1, 2, 3]
+    assert memory.get(files.readers[3]) is memory.get(files.readers[3])
     assert len(memory._transient) <= 3
     assert memory.ahead == 1
     assert PixelCache(math.inf).ahead == MOST_AHEAD
 
 
 def numbers(memory: PixelCache, files: Files) -> list[int]:
-    return [int(memory.get(source)[0, 0]) for source in files.sources]
+    return [int(memory.get(reader)[0, 0]) for reader in files.readers]
 
 
 class Failing(io.BytesIO):
@@ -112,7 +112,7 @@ def test_slow_photographs_beyond_the_budget_are_cached_on_disk(slow_files: Files
 
 
 def test_masks_come_back_from_disk_as_they_were(slow_files: Files, tmp_path: Path) -> None:
-    memory, mask = PixelCache(1, largest=SIZE), PixelSource(lambda: torch.arange(SIZE) % 3, is_mask=True)
+    memory, mask = PixelCache(1, largest=SIZE), lambda: torch.arange(SIZE) % 3 > 0
     with memory.cache_on_disk(tmp_path):
         first = memory.get(mask)
         numbers(memory, slow_files)
@@ -159,23 +159,27 @@ def test_a_full_disk_cache_frees_its_space(slow_files: Files, tmp_path: Path) ->
         assert len(spool._entries) > 10
         spool._file.close()
         spool._file = Failing()
-        spool.put(PixelSource(lambda: torch.zeros(SIZE)), torch.zeros(SIZE))
+        spool.put(lambda: torch.zeros(SIZE), torch.zeros(SIZE))
         assert spool._file is None and not spool._entries
         assert numbers(memory, slow_files) == list(range(20))
 
 
 def test_concurrent_requests_share_one_read() -> None:
     files, memory, gate = Files(1), PixelCache(math.inf), Event()
-    slow = PixelSource(lambda: gate.wait(30) and torch.zeros(1))
+
+    def slow() -> torch.Tensor:
+        gate.wait(30)
+        return torch.zeros(1)
+
     memory.read_ahead(slow)
     asking = Thread(target=lambda: memory.get(slow))
     asking.start()
     gate.set()
     asking.join()
     assert memory.get(slow) is memory.get(slow)
-    memory.read_ahead(files.sources[0])
-    memory.get(files.sources[0])
-    memory.read_ahead(files.sources[0])
+    memory.read_ahead(files.readers[0])
+    memory.get(files.readers[0])
+    memory.read_ahead(files.readers[0])
     assert files.times == {0: 1}
 
 
@@ -185,9 +189,9 @@ def test_an_unreadable_file_raises_an_error_at_its_use() -> None:
 
     memory = PixelCache(math.inf)
     for _ in range(2):
-        memory.read_ahead(PixelSource(broken))
+        memory.read_ahead(broken)
         with pytest.raises(InputError, match="cut off"):
-            memory.get(PixelSource(broken))
+            memory.get(broken)
 
 
 def test_another_reader_of_a_view_of_the_same_name_is_another_photograph(capture) -> None:

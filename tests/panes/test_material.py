@@ -135,7 +135,7 @@ def test_photographs_are_reduced_with_all_that_belongs_to_them() -> None:
     labels = torch.zeros(camera.height, camera.width, dtype=torch.uint8)
     labels[:, : 2 * REDUCED_WIDTH] = 1
     view = View.in_memory("x", camera, photo=photo, pane_labels=labels)
-    ignoring = replace(view, read_ignored=lambda: (torch.arange(camera.height) < 6)[:, None].expand_as(labels).float())
+    ignoring = replace(view, read_ignored=lambda: (torch.arange(camera.height) < 6)[:, None].expand_as(labels))
     found = reduced_photograph(scene, ignoring)
     assert (found.camera.width, found.camera.height) == (REDUCED_WIDTH, 3 * REDUCED_WIDTH // 4)
     assert found.camera.fx == pytest.approx(camera.fx / 4)
