@@ -20,7 +20,7 @@ from PIL import Image, ImageCms
 from glassplat.annotate.document import ANNOTATIONS, read_document
 from glassplat.captures import colmap_library as library
 from glassplat.captures.colmap import pose_matrix, read_model
-from glassplat.captures.masks import read_mask_values
+from glassplat.captures.masks import read_mask
 from glassplat.captures.transforms import load_transforms
 from glassplat.captures.view import View, estimated_normals, normals_reader
 from glassplat.files.glb import write_glb
@@ -312,7 +312,7 @@ READERS: dict[str, Reader] = {
     "log": Reader("log.jsonl", lambda path: lines_until(path, 10), _log_seeds),
     "annotations": Reader(ANNOTATIONS, lambda path: read_document(path.parent), _annotations_seeds),
     "photograph": Reader("a.png", read_colors, _picture_seeds, most_mib=LARGEST_PICTURE_MIB),
-    "mask": Reader("a.png", read_mask_values, _mask_seeds, most_mib=LARGEST_PICTURE_MIB),
+    "mask": Reader("a.png", read_mask, _mask_seeds, most_mib=LARGEST_PICTURE_MIB),
     "panorama": Reader(
         "a.exr", read_equirect, lambda folder: write_equirect(folder / "a.exr", torch.rand(4, 8, 3)), most_mib=2048
     ),

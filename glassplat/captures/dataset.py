@@ -18,7 +18,7 @@ from glassplat.captures.axes import axes_evidence
 from glassplat.captures.cameras import blank_share
 from glassplat.captures.capture import Capture, Shot
 from glassplat.captures.files import CaptureFiles, read_capture
-from glassplat.captures.masks import IGNORE_FOLDER, MASK_FOLDER, PLANES, AlphaMask, Polarity, ignored_share
+from glassplat.captures.masks import IGNORE_FOLDER, MASK_FOLDER, PLANES, Mask, Polarity, ignored_share, read_transparent
 from glassplat.captures.transforms import points_in_view
 from glassplat.captures.view import (
     GIGABYTE,
@@ -198,6 +198,7 @@ def make_dataset(
     with convert_to_input_error():
         transparent = any(is_transparent(shot.image_path) for shot in shots)
     ignores_transparent = transparent and capture.ignores_transparent
+    transparent_masks = {s.name: [Mask(s.image_path, read_transparent)] for s in shots if ignores_transparent}
     shown = background if transparent and not ignores_transparent else None
     normals = normals_paths({shot.name: shot.image_path for shot in shots})
     prepared = [
@@ -206,7 +207,7 @@ def make_dataset(
             masks.masks.get(shot.name),
             downscale=downscale,
             background=None if ignores_transparent else background,
-            ignored=(*files.ignored.get(shot.name, ()), *([AlphaMask(shot.image_path)] if ignores_transparent else ())),
+            ignored=(*files.ignored.get(shot.name, ()), *transparent_masks.get(shot.name, ())),
             normals=normals.get(shot.name),
         )
         for shot in shots

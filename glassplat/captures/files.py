@@ -10,7 +10,7 @@ from pathlib import Path
 
 from glassplat.captures import colmap, mirror_nerf, transforms
 from glassplat.captures.capture import Capture, Loader, Shot
-from glassplat.captures.masks import IgnoredMask, MaskSet, Polarity, find_masks
+from glassplat.captures.masks import Mask, MaskSet, Polarity, find_masks
 from glassplat.errors import InputError, UnknownFormatError, join_names
 from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
 from glassplat.files.records import is_encodable, readable_name
@@ -41,7 +41,7 @@ class CaptureFiles:
     capture: Capture
     shots: tuple[Shot, ...]
     masks: MaskSet
-    ignored: Mapping[str, tuple[IgnoredMask, ...]]
+    ignored: Mapping[str, tuple[Mask, ...]]
     mask_polarity: Polarity
 
     def __str__(self) -> str:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from functools import partial
 from os.path import lexists, normpath
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -49,21 +50,12 @@ class MaskValues:
     pixels: NDArray[np.uint8]
 
 
-def read_mask_values(path: Path) -> MaskValues:
-    """Read one mask file."""
-    return _read_values(path, with_greys=False)
-
-
-def read_mask_at_threshold(path: Path) -> MaskValues:
-    """Read one mask file of a format that thresholds greys at one half; label images are unchanged."""
-    return _read_values(path, with_greys=True)
-
-
-def _read_values(path: Path, *, with_greys: bool) -> MaskValues:
+def read_mask(path: Path, *, at_threshold: bool = False) -> MaskValues:
+    """Read one mask file; `at_threshold` for a format that thresholds greys at one half, which changes no labels."""
     shades, lossy = _read_shades(path), path.suffix.lower() in LOSSY_SUFFIXES
     if not lossy and not (shades > HIGHEST_MASK_LABEL).any():
         return MaskValues("labels" if shades.any() else "empty", shades)
-    if not with_greys:
+    if not at_threshold:
         _check_black_and_white(np.bincount(shades.ravel(), minlength=WHITE + 1), path, lossy)
     pixels = (shades >= THRESHOLD).astype(np.uint8)
     return MaskValues("binary" if pixels.any() else "empty", pixels)
@@ -153,71 +145,50 @@ Polarity = Literal["auto", "bright", "dark"]
 
 
 @dataclass(frozen=True)
-class PaneMask:
-    """One mask file and its interpretation.
+class Mask:
+    """One mask file, of panes or of ignored pixels.
 
     Attributes:
         path: the file.
-        inverted: dark pixels mark the pane.
-        read: interprets the stored values.
+        read: returns its labels [H, W]: of panes, or above zero on pixels to ignore.
     """
 
     path: Path
-    inverted: bool
-    read: Callable[[Path], MaskValues] = read_mask_values
+    read: Callable[[Path], NDArray[np.uint8]]
 
     def labels(self) -> NDArray[np.uint8]:
-        """[H, W] pane label of each pixel of the file, 0 for no pane."""
-        return _labels(self.read(self.path), self.inverted)
+        """[H, W] label of each pixel of the file."""
+        return self.read(self.path)
+
+
+def read_pane_labels(path: Path, *, at_threshold: bool = False, inverted: bool = False) -> NDArray[np.uint8]:
+    """[H, W] pane label of each pixel, 0 for no pane; if inverted, dark pixels mark the pane."""
+    return _labels(read_mask(path, at_threshold=at_threshold), inverted)
+
+
+def read_black(path: Path) -> NDArray[np.uint8]:
+    """[H, W] 1 where a mask is black: below one half, or zero if no value exceeds the highest label."""
+    shades = _brightness(path)
+    return (shades < (THRESHOLD if shades.max() > HIGHEST_MASK_LABEL else 1)).astype(np.uint8)
+
+
+def read_transparent(path: Path) -> NDArray[np.uint8]:
+    """[H, W] 1 where a photograph is transparent: opacity below one half."""
+    with convert_to_input_error():
+        pixels = images.read_image(path)
+    return (pixels[:, :, 3] < THRESHOLD).astype(np.uint8) if pixels.shape[2] == 4 else np.zeros_like(pixels[..., 0])
 
 
 @dataclass(frozen=True)
 class MaskSet:
     """The masks of a capture by name of the photograph, all their labels, and warnings for the user."""
 
-    masks: Mapping[str, PaneMask]
+    masks: Mapping[str, Mask]
     labels: tuple[int, ...] = ()
     warnings: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class KeepMask:
-    """A mask file whose black pixels are ignored: below one half, or zero if no value exceeds the highest label.
-
-    Attributes:
-        path: the file; if any pixel is transparent, opacity is used in place of colour.
-    """
-
-    path: Path
-
-    def labels(self) -> NDArray[np.uint8]:
-        """[H, W] 1 where a pixel is ignored."""
-        shades = _brightness(self.path)
-        return (shades < (THRESHOLD if shades.max() > HIGHEST_MASK_LABEL else 1)).astype(np.uint8)
-
-
-@dataclass(frozen=True)
-class AlphaMask:
-    """A photograph whose transparent pixels (opacity below one half) are ignored.
-
-    Attributes:
-        path: the photograph.
-    """
-
-    path: Path
-
-    def labels(self) -> NDArray[np.uint8]:
-        """[H, W] 1 where a pixel is ignored."""
-        with convert_to_input_error():
-            pixels = images.read_image(self.path)
-        return (pixels[:, :, 3] < THRESHOLD).astype(np.uint8) if pixels.shape[2] == 4 else np.zeros_like(pixels[..., 0])
-
-
-IgnoredMask = AlphaMask | KeepMask | PaneMask
-"""A mask whose `labels()` are above zero on pixels to ignore."""
-
-
-def ignored_share(masks: Sequence[IgnoredMask]) -> float:
+def ignored_share(masks: Sequence[Mask]) -> float:
     """Largest share of a photograph that any one of its masks excludes."""
     return max(float((mask.labels() > 0).mean()) for mask in masks)
 
@@ -229,7 +200,7 @@ def find_masks(
     *,
     panes: Mapping[str, Path] | None = None,
     keep_masks: Mapping[str, Path] | None = None,
-) -> tuple[MaskSet, Mapping[str, tuple[IgnoredMask, ...]]]:
+) -> tuple[MaskSet, Mapping[str, tuple[Mask, ...]]]:
     """The masks of panes of a capture, and those of pixels to ignore, by name of the photograph, which may have two.
 
     Panes are in `panes/`; pixels that are black in `masks/`, or above black in `ignore/`, are ignored. For a photograph
@@ -248,7 +219,7 @@ def find_masks(
     ignored, keep_masks = find_ignored(root, photographs), keep_masks or {}
     if panes is not None:
         # The format assigns files to photographs, and thresholds greys at one half.
-        known = _interpret_masks(root, panes, "bright" if polarity == "auto" else polarity, read_mask_at_threshold)
+        known = _interpret_masks(root, panes, "bright" if polarity == "auto" else polarity, at_threshold=True)
         return known, _join_masks(keep_masks, ignored)
     paths = _match_masks(root / PANE_FOLDER, photographs)
     if not paths and (root / PANE_FOLDER).is_dir():
@@ -256,11 +227,11 @@ def find_masks(
     masks, warnings = _find_keep_masks(root, photographs, {normpath(path) for path in keep_masks.values()})
     earlier = _pane_masks_reason(root, masks, marked=bool(paths))
     if earlier is not None:
-        found = _interpret_masks(root, masks, polarity, read_mask_values)
+        found = _interpret_masks(root, masks, polarity)
         renaming = f"{earlier} {next(iter(masks.values())).parent} is read as panes; rename it to {PANE_FOLDER}/."
         warnings = (renaming, *warnings)
         return replace(found, warnings=(*warnings, *found.warnings)), _join_masks(keep_masks, ignored)
-    found = _interpret_masks(root, paths, polarity, read_mask_values) if paths else MaskSet({})
+    found = _interpret_masks(root, paths, polarity) if paths else MaskSet({})
     return replace(found, warnings=(*found.warnings, *warnings)), _join_masks({**masks, **keep_masks}, ignored)
 
 
@@ -314,15 +285,15 @@ def _brightness(path: Path) -> NDArray[np.uint8]:
     return np.array(image.convert("RGB")).max(axis=2)
 
 
-def _join_masks(keep_masks: Mapping[str, Path], ignored: Mapping[str, PaneMask]) -> dict[str, tuple[IgnoredMask, ...]]:
+def _join_masks(keep_masks: Mapping[str, Path], ignored: Mapping[str, Mask]) -> dict[str, tuple[Mask, ...]]:
     """All masks of ignored pixels, by name of the photograph."""
-    joined: dict[str, tuple[IgnoredMask, ...]] = {name: (KeepMask(path),) for name, path in keep_masks.items()}
+    joined: dict[str, tuple[Mask, ...]] = {name: (Mask(path, read_black),) for name, path in keep_masks.items()}
     for name, mask in ignored.items():
         joined[name] = (*joined.get(name, ()), mask)
     return joined
 
 
-def find_ignored(root: Path, photographs: Mapping[str, Path]) -> Mapping[str, PaneMask]:
+def find_ignored(root: Path, photographs: Mapping[str, Path]) -> Mapping[str, Mask]:
     """The masks in `ignore/`, by name of the photograph.
 
     Pixels of any value above black are ignored; the value itself, such as a class index, does not matter.
@@ -332,20 +303,21 @@ def find_ignored(root: Path, photographs: Mapping[str, Path]) -> Mapping[str, Pa
         photographs: path of every photograph by name.
     """
     paths = _match_masks(root / IGNORE_FOLDER, photographs)
-    found = {name: PaneMask(path, inverted=False) for name, path in paths.items()}
+    found = {name: Mask(path, read_pane_labels) for name, path in paths.items()}
     for mask in found.values():
         mask.labels()
     return found
 
 
 def _interpret_masks(
-    root: Path, paths: Mapping[str, Path], polarity: Polarity, read: Callable[[Path], MaskValues]
+    root: Path, paths: Mapping[str, Path], polarity: Polarity, *, at_threshold: bool = False
 ) -> MaskSet:
     """Read all masks once, to decide kind, polarity and labels from the whole set."""
-    values = {name: read(path) for name, path in paths.items()}
+    values = {name: read_mask(path, at_threshold=at_threshold) for name, path in paths.items()}
     _check_same_kind(values, paths)
     inverted, warnings = _decide_polarity(list(values.values()), polarity)
-    masks = {name: PaneMask(path, inverted, read) for name, path in paths.items()}
+    read = partial(read_pane_labels, at_threshold=at_threshold, inverted=inverted)
+    masks = {name: Mask(path, read) for name, path in paths.items()}
     found = {name: _present_labels(_labels(mask_values, inverted)) for name, mask_values in values.items()}
     labels = sorted(set().union(*found.values()))
     if not labels:

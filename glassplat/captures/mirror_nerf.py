@@ -19,6 +19,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +27,7 @@ import numpy as np
 
 from glassplat.captures import transforms
 from glassplat.captures.capture import Capture, RawPoints, Shot
-from glassplat.captures.masks import MASK_FOLDER, PANE_FOLDER, PaneMask, read_mask_at_threshold
+from glassplat.captures.masks import MASK_FOLDER, PANE_FOLDER, Mask, read_pane_labels
 from glassplat.errors import InputError, convert_to_input_error, count_noun, join_names
 from glassplat.files.images import IMAGE_SUFFIXES, image_size
 
@@ -168,7 +169,7 @@ def _axes_evidence(shots: tuple[Shot, ...], masks: Mapping[str, Path], points: R
 def _view(shot: Shot, mask: Path | None) -> View:
     from glassplat.captures.view import prepare_view
 
-    pane_mask = None if mask is None else PaneMask(mask, inverted=False, read=read_mask_at_threshold)
+    pane_mask = None if mask is None else Mask(mask, partial(read_pane_labels, at_threshold=True))
     return prepare_view(shot, pane_mask)[0]
 
 

@@ -34,7 +34,7 @@ from torch import Tensor
 
 from glassplat.captures import cameras
 from glassplat.captures.capture import RawPoints, Shot
-from glassplat.captures.masks import IgnoredMask, PaneMask
+from glassplat.captures.masks import Mask
 from glassplat.errors import InputError, convert_to_input_error
 from glassplat.files.images import image_size, read_colors, read_image_float
 from glassplat.options import WHITE, Rgb
@@ -399,7 +399,7 @@ class PhotoFile:
 class MaskFile:
     """Reader of the labels of one view; `size` is the photograph's, before undistortion."""
 
-    mask: IgnoredMask
+    mask: Mask
     size: tuple[int, int]
     pixel_map: cameras.PixelMap
 
@@ -427,11 +427,11 @@ class IgnoredFiles:
 
 def prepare_view(
     shot: Shot,
-    mask: PaneMask | None,
+    mask: Mask | None,
     *,
     downscale: float = 1.0,
     background: Rgb | None = WHITE,
-    ignored: Sequence[IgnoredMask] = (),
+    ignored: Sequence[Mask] = (),
     normals: Path | None = None,
 ) -> tuple[View, bool]:
     """Checks one photograph against its camera and sets up its readers; decodes no pixels.
@@ -491,7 +491,7 @@ def _reduced_size(pinhole: cameras.Lens, downscale: float, name: str) -> tuple[i
     return width, height
 
 
-def _mask_file(mask: IgnoredMask, size: tuple[int, int], pixel_map: cameras.PixelMap) -> MaskFile:
+def _mask_file(mask: Mask, size: tuple[int, int], pixel_map: cameras.PixelMap) -> MaskFile:
     """The mask at the photograph's size, which it must have up to an integer factor."""
     with convert_to_input_error():
         mask_size = image_size(mask.path)

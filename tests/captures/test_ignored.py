@@ -17,7 +17,7 @@ import glassplat.evaluate.evaluate
 import glassplat.evaluate.metrics
 from glassplat.captures.cameras import PixelMap
 from glassplat.captures.dataset import load_dataset
-from glassplat.captures.masks import AlphaMask
+from glassplat.captures.masks import Mask, read_transparent
 from glassplat.captures.view import IgnoredFiles, MaskFile, PhotoFile, View
 from glassplat.errors import InputError
 from glassplat.evaluate.evaluate import evaluate
@@ -64,7 +64,7 @@ def test_excluded_pixels_do_not_bleed_into_a_reduced_photograph(size: tuple[int,
     inside = (rows - 13.3) ** 2 + (columns - 19.1) ** 2 < 11.0**2
     path, pixel_map = tmp_path / "0.png", PixelMap(None, *size)
     Image.fromarray(np.where(inside[..., None], np.uint8([200, 180, 160, 255]), np.uint8([0, 0, 0, 0]))).save(path)
-    ignored = IgnoredFiles((MaskFile(AlphaMask(path), (40, 28), pixel_map),))()
+    ignored = IgnoredFiles((MaskFile(Mask(path, read_transparent), (40, 28), pixel_map),))()
     kept = PhotoFile(path, pixel_map, None)()[ignored == 0]
     assert len(kept) > 0.4 * inside.sum() * size[0] * size[1] / inside.size
     assert kept.unique(dim=0).tolist() == [[200, 180, 160]]

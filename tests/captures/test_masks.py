@@ -11,7 +11,7 @@ import torch
 from PIL import Image, ImageOps
 
 from glassplat.captures.dataset import Dataset, load_dataset
-from glassplat.captures.masks import MaskSet, find_masks, mask_paths, read_mask_values
+from glassplat.captures.masks import MaskSet, find_masks, mask_paths, read_mask
 from glassplat.captures.view import View
 from glassplat.errors import InputError
 
@@ -350,9 +350,9 @@ def test_several_colours_are_refused(capture) -> None:
 
 def test_a_mask_in_colour_takes_little_memory(tmp_path: Path) -> None:
     Image.new("RGB", (2048, 1024), (255, 0, 0)).save(tmp_path / "a.png")
-    read_mask_values(tmp_path / "a.png")
+    read_mask(tmp_path / "a.png")
     tracemalloc.start()
-    read_mask_values(tmp_path / "a.png")
+    read_mask(tmp_path / "a.png")
     _, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert most < 16 * 2048 * 1024, "bytes a pixel, of arrays of ours; Pillow's own are not counted"
