@@ -94,45 +94,6 @@ SCENE: dict[str, records.Field] = {"nodes": records.Optional(records.ListOf(INDE
 ASSET: dict[str, records.Field] = {"version": records.Text()}
 
 
-class GltfWriter:
-    """Collects arrays, and writes them with a document that refers to them by index."""
-
-    def __init__(self) -> None:
-        self._accessors: list[dict[str, Any]] = []
-        self._views: list[dict[str, Any]] = []
-        self._parts: list[bytes] = []
-        self._size = 0
-
-    def add(self, values: NDArray[np.float32], *, bounded: bool = False) -> int:
-        """Adds float32 rows [N] or [N, 2 to 4]; returns the index of their accessor.
-
-        Args:
-            values: at least one row.
-            bounded: write the minimum and maximum of each column, as required for positions.
-        """
-        data = np.ascontiguousarray(values, dtype="<f4")
-        kind = "SCALAR" if data.ndim == 1 else f"VEC{data.shape[1]}"
-        accessor = {"bufferView": len(self._views), "componentType": FLOAT, "count": len(data), "type": kind}
-        bounds = {"min": data.min(axis=0).tolist(), "max": data.max(axis=0).tolist()} if bounded else {}
-        self._accessors.append(accessor | bounds)
-        self._views.append({"buffer": 0, "byteOffset": self._size, "byteLength": data.nbytes, "target": ARRAY_BUFFER})
-        self._parts.append(data.tobytes())
-        self._size += data.nbytes
-        return len(self._accessors) - 1
-
-    def to_bytes(self, document: Mapping[str, Any]) -> bytes:
-        """The GLB of a document together with the arrays."""
-        whole = {**document, "accessors": self._accessors, "bufferViews": self._views}
-        whole["buffers"] = [{"byteLength": self._size}]
-        text = json.dumps(whole, separators=(",", ":"), allow_nan=False).encode()
-        text += b" " * (-len(text) % 4)
-        size = HEADER.size + 2 * CHUNK.size + len(text) + self._size
-        if size > MOST_BYTES:
-            raise ValueError(f"a GLB of {size} bytes cannot be written; expected at most {MOST_BYTES}: use PLY or SPZ")
-        head = HEADER.pack(MAGIC, VERSION, size) + CHUNK.pack(len(text), JSON_CHUNK) + text
-        return head + CHUNK.pack(self._size, BINARY_CHUNK) + b"".join(self._parts)
-
-
 class GltfReader:
     """A GLB file with an embedded buffer; entries are validated when they are used."""
 
@@ -372,30 +333,53 @@ def _glb_bytes(gaussians: Gaussians) -> bytes:
     quats = torch.where(quats.norm(dim=1, keepdim=True) > 0, quats, quats.new_tensor([1.0, 0.0, 0.0, 0.0]))
     opacities = torch.sigmoid(rotated.logit_opacities)
     diffuse = linear_from_srgb((rotated.sh[:, 0] * SH_ZERO + 0.5).clamp(0, 1))
-    writer = GltfWriter()
-    attributes = {
-        "POSITION": writer.add(as_numpy(rotated.means), bounded=True),
-        "COLOR_0": writer.add(as_numpy(torch.cat([diffuse, opacities[:, None]], dim=1))),
-        ROTATION: writer.add(as_numpy(quats.roll(-1, dims=1))),
-        SCALE: writer.add(as_numpy(rotated.deviations)),
-        OPACITY: writer.add(as_numpy(opacities)),
-    }
-    for index, name in enumerate(_harmonic_names(rotated.sh.shape[1])):
-        attributes[name] = writer.add(as_numpy(rotated.sh[:, index]))
-    for name, values in rotated.channels.items():
-        attributes[CHANNEL + name.upper()] = writer.add(as_numpy(values))
-    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
-    primitive = {"mode": POINTS, "attributes": attributes, "extensions": {EXTENSION: splats}}
-    return writer.to_bytes(
+    return _pack_document(
         {
-            "asset": {"version": "2.0", "generator": "glassplat"},
-            "extensionsUsed": [EXTENSION],
-            "scene": 0,
-            "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0}],
-            "meshes": [{"primitives": [primitive]}],
+            "POSITION": rotated.means,
+            "COLOR_0": torch.cat([diffuse, opacities[:, None]], dim=1),
+            ROTATION: quats.roll(-1, dims=1),
+            SCALE: rotated.deviations,
+            OPACITY: opacities,
+            **dict(zip(_harmonic_names(rotated.sh.shape[1]), rotated.sh.unbind(1), strict=True)),
+            **{CHANNEL + name.upper(): values for name, values in rotated.channels.items()},
         }
     )
+
+
+def _pack_document(attributes: Mapping[str, Tensor]) -> bytes:
+    """The GLB of one primitive with attributes [N] or [N, 2 to 4], the positions first."""
+    arrays = [np.ascontiguousarray(as_numpy(values), dtype="<f4") for values in attributes.values()]
+    *starts, total = itertools.accumulate((data.nbytes for data in arrays), initial=0)
+    kinds = ["SCALAR" if data.ndim == 1 else f"VEC{data.shape[1]}" for data in arrays]
+    accessors: list[dict[str, Any]] = [
+        {"bufferView": index, "componentType": FLOAT, "count": len(data), "type": kind}
+        for index, (data, kind) in enumerate(zip(arrays, kinds, strict=True))
+    ]
+    # Positions require the minimum and maximum of each column.
+    accessors[0] |= {"min": arrays[0].min(axis=0).tolist(), "max": arrays[0].max(axis=0).tolist()}
+    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
+    names = {name: index for index, name in enumerate(attributes)}
+    document = {
+        "asset": {"version": "2.0", "generator": "glassplat"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"mode": POINTS, "attributes": names, "extensions": {EXTENSION: splats}}]}],
+        "accessors": accessors,
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": start, "byteLength": data.nbytes, "target": ARRAY_BUFFER}
+            for data, start in zip(arrays, starts, strict=True)
+        ],
+        "buffers": [{"byteLength": total}],
+    }
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    size = HEADER.size + 2 * CHUNK.size + len(text) + total
+    if size > MOST_BYTES:
+        raise ValueError(f"a GLB of {size} bytes cannot be written; expected at most {MOST_BYTES}: use PLY or SPZ")
+    head = HEADER.pack(MAGIC, VERSION, size) + CHUNK.pack(len(text), JSON_CHUNK) + text
+    return head + CHUNK.pack(total, BINARY_CHUNK) + b"".join(data.tobytes() for data in arrays)
 
 
 def _placed_meshes(file: GltfReader) -> list[tuple[int, int, Tensor]]:
