@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import math
 import os
 import re
 import tempfile
@@ -67,9 +66,8 @@ def write_tensors(path: Path | str, tensors: Mapping[str, Tensor], header: Mappi
 
 def system_error(text: str) -> OSError:
     """The operating system's error with its errno, recovered from the text of a library's error."""
-    if match := re.search(
-        r"\(os error (\d+)\)", text
-    ):  # As written by libraries in Rust; on Windows with its own numbers.
+    # As written by libraries in Rust; on Windows with its own numbers.
+    if match := re.search(r"\(os error (\d+)\)", text):
         return OSError(int(match[1]), text, None, int(match[1]))
     number = next((number for number in errno.errorcode if os.strerror(number) in text), None)
     return OSError(text) if number is None else OSError(number, text)
@@ -174,13 +172,26 @@ def planes_json(planes: Planes) -> str:
     programs (world units, the capture's frame), and the raw values raw_normal and logit_reflectance for continued
     training. If glass may be tinted, it also has the RGB transmittance and its raw log_transmittance (see `Planes`).
     """
-    entries = [_pane_entry(planes, index) for index in range(len(planes))]
-    for entry in entries:
-        broken = [key for key, value in entry.items() if not _finite(value)]
+    columns = {
+        "center": planes.centers,
+        "normal": planes.normals,
+        "tangent": planes.tangents,
+        "half_sizes": planes.half_sizes,
+        "base_reflectance": planes.base_reflectances,
+        "raw_normal": planes.raw_normals,
+        "logit_reflectance": planes.logit_reflectances,
+    }
+    if planes.transmittances is not None and planes.log_transmittances is not None:
+        columns["transmittance"] = planes.transmittances.clamp(LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE)
+        columns["log_transmittance"] = planes.log_transmittances
+    entries = []
+    for row, label in enumerate(planes.labels):
+        broken = [key for key, values in columns.items() if not bool(values[row].isfinite().all())]
         if broken:
-            raise ValueError(
-                f"plane {entry['label']} cannot be written: {', '.join(broken)} must be finite, but is not"
-            )
+            raise ValueError(f"plane {label} cannot be written: {', '.join(broken)} must be finite, but is not")
+        # Values of float32 survive the round trip through decimal doubles.
+        values = {key: column[row].tolist() for key, column in columns.items()}
+        entries.append({"label": int(label), "mirror": label in planes.mirrors, **values})
     return json.dumps(entries, indent=1, allow_nan=False) + "\n"
 
 
@@ -195,7 +206,9 @@ def read_planes(path: Path | str) -> Planes:
         ValueError: not a list of planes, a missing or malformed value, or a repeated label.
     """
     path = Path(path)
-    entries = [_checked_entry(entry, index, path) for index, entry in enumerate(_load_entries(path), start=1)]
+    if not isfile(path):
+        raise FileNotFoundError(f"no planes file at {path}; expected the planes.json of a run")
+    entries = [_checked_entry(entry, where) for entry, where in _read_list(path, "plane")]
     if not entries:
         return Planes.empty()
     labels = tuple(entry["label"] for entry in entries)
@@ -215,46 +228,16 @@ def read_planes(path: Path | str) -> Planes:
     )
 
 
-def _pane_entry(planes: Planes, index: int) -> dict[str, Any]:
-    """One plane as plain numbers; float32 values survive the round trip through decimal doubles."""
-    return {
-        "label": int(planes.labels[index]),
-        "mirror": planes.labels[index] in planes.mirrors,
-        "center": planes.centers[index].tolist(),
-        "normal": planes.normals[index].tolist(),
-        "tangent": planes.tangents[index].tolist(),
-        "half_sizes": planes.half_sizes[index].tolist(),
-        "base_reflectance": planes.base_reflectances[index].item(),
-        "raw_normal": planes.raw_normals[index].tolist(),
-        "logit_reflectance": planes.logit_reflectances[index].item(),
-    } | {name: values[index].tolist() for name, values in _glass(planes).items()}
-
-
-def _glass(planes: Planes) -> dict[str, Tensor]:
-    """Additional values of panes whose glass may be tinted, one row per pane."""
-    glass = {}
-    if planes.transmittances is not None and planes.log_transmittances is not None:
-        glass["transmittance"] = planes.transmittances.clamp(LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE)
-        glass["log_transmittance"] = planes.log_transmittances
-    return glass
-
-
-def _finite(value: Any) -> bool:
-    return all(_finite(one) for one in value) if isinstance(value, list) else math.isfinite(value)
-
-
-def _load_entries(path: Path) -> list[Any]:
-    if not os.path.isfile(path):
-        raise FileNotFoundError(f"no planes file at {path}; expected the planes.json of a run")
+def _read_list(path: Path, what: str) -> list[tuple[Any, str]]:
+    """The objects listed in a file, each with its name for messages, such as "plane 1 in planes.json"."""
     entries = records.read_json(path)
     if not isinstance(entries, list):
-        raise ValueError(f"{path} holds {short_repr(entries)}; expected a list with one object per plane")
-    return entries
+        raise ValueError(f"{path} holds {short_repr(entries)}; expected a list with one object per {what}")
+    return [(entry, f"{what} {index} in {path}") for index, entry in enumerate(entries, start=1)]
 
 
-def _checked_entry(entry: Any, index: int, path: Path) -> dict[str, Any]:
+def _checked_entry(entry: Any, where: str) -> dict[str, Any]:
     """One plane; checks its fields, and that its rectangle is not degenerate."""
-    where = f"plane {index} in {path}"
     plane = records.check_fields(entry, PLANE, where)
     normal, tangent = (torch.tensor(plane[key], dtype=torch.float64) for key in ("normal", "tangent"))
     for key, vector in (("normal", normal), ("tangent", tangent)):
@@ -312,17 +295,27 @@ def write_cameras(path: Path | str, cameras: Iterable[tuple[str, Camera]]) -> No
         path: the file.
         cameras: image name and camera, in the order of ids.
     """
-    entries = [_camera_entry(index, name, camera) for index, (name, camera) in enumerate(cameras)]
+    entries = [
+        {
+            "id": index,
+            "img_name": name,
+            "width": camera.width,
+            "height": camera.height,
+            "position": camera.center.tolist(),
+            "rotation": camera.cam_from_world[:3, :3].T.tolist(),
+            "fy": camera.fy,
+            "fx": camera.fx,
+            "cx": camera.cx,
+            "cy": camera.cy,
+        }
+        for index, (name, camera) in enumerate(cameras)
+    ]
     write_text(path, json.dumps(entries, indent=1, allow_nan=False) + "\n")
 
 
 def read_cameras(path: Path | str) -> list[tuple[str, Camera]]:
     """Reads names and float32 cameras, in order, from a file of `write_cameras` or another 3DGS program."""
-    path = Path(path)
-    entries = records.read_json(path)
-    if not isinstance(entries, list):
-        raise ValueError(f"{path} holds {short_repr(entries)}; expected a list with one object per camera")
-    return [_camera(entry, f"camera {index} in {path}") for index, entry in enumerate(entries, start=1)]
+    return [_camera(entry, where) for entry, where in _read_list(Path(path), "camera")]
 
 
 def _camera(entry: Any, where: str) -> tuple[str, Camera]:
@@ -337,21 +330,6 @@ def _camera(entry: Any, where: str) -> tuple[str, Camera]:
     width, height = values["width"], values["height"]
     cx, cy = (side / 2 if values[key] is None else values[key] for key, side in (("cx", width), ("cy", height)))
     return values["img_name"], Camera(cam_from_world.float(), values["fx"], values["fy"], cx, cy, width, height)
-
-
-def _camera_entry(index: int, name: str, camera: Camera) -> dict[str, Any]:
-    return {
-        "id": index,
-        "img_name": name,
-        "width": camera.width,
-        "height": camera.height,
-        "position": camera.center.tolist(),
-        "rotation": camera.cam_from_world[:3, :3].T.tolist(),
-        "fy": camera.fy,
-        "fx": camera.fx,
-        "cx": camera.cx,
-        "cy": camera.cy,
-    }
 
 
 TRANSFORM = records.ListOf(records.ListOf(records.Number(-1e3, 1e3), 4), 3)
@@ -419,17 +397,15 @@ def write_environment(path: Path | str, environment: Environment) -> None:
 def read_environment(path: Path | str) -> Environment:
     """Reads an environment that `write_environment` wrote."""
     path = Path(path)
-    if not os.path.isfile(path):
+    if not isfile(path):
         raise FileNotFoundError(f"no environment at {path}; expected the environment.safetensors of a run")
     with open_tensors(path, FORMAT, "an environment") as file:
-        region = records.check_fields(file.header, {"region": records.Optional(REGION)}, f"the header of {path}")[
-            "region"
-        ]
+        header = records.check_fields(file.header, {"region": records.Optional(REGION)}, f"the header of {path}")
         raw = file.tensors().get("raw")
     if raw is None or not (raw.is_floating_point() and bool(torch.isfinite(raw).all())):
         raise ValueError(f"{path} holds no tensor `raw` of finite numbers; expected the texels of an environment")
     try:
-        return Environment(raw, region)
+        return Environment(raw, header["region"])
     except ValueError as error:
         raise ValueError(f"{path} holds no environment: {error}") from error
 
@@ -453,7 +429,10 @@ def read_equirect(path: Path | str) -> Tensor:
         image = srgb_from_linear(torch.from_numpy(_read_exr(path)))
     else:
         _check_size(path, *image_size(path))
-        image = torch.from_numpy(_rgb(read_image_float(path), path))
+        pixels = read_image_float(path)
+        if pixels.shape[2] < 3:
+            raise ValueError(f"{path} is grey; expected a panorama in colour")
+        image = torch.from_numpy(np.ascontiguousarray(pixels[:, :, :3]))
     if not bool(torch.isfinite(image).all()):
         raise ValueError(f"{path} contains non-finite values; expected radiance of at least 0")
     return image.clamp(0, 1)
@@ -521,10 +500,3 @@ def _read_from_exr(path: Path, read: Callable[[Any], Any], **options: bool) -> A
             return read(file)
     except (RuntimeError, ValueError, KeyError) as error:
         raise ValueError(f"cannot read {path} as OpenEXR ({error}); replace the file or remove it") from error
-
-
-def _rgb(pixels: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
-    """RGB of an image, without transparency."""
-    if pixels.shape[2] < 3:
-        raise ValueError(f"{path} is grey; expected a panorama in colour")
-    return np.ascontiguousarray(pixels[:, :, :3])
