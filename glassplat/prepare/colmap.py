@@ -12,10 +12,11 @@ import json
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, wait
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,30 +50,23 @@ def run_interruptible(work: Callable[[Any], Result], poll: Callable[[], None] = 
         KeyboardInterrupt: the command was interrupted; the work has ended.
     """
     token = library.pycolmap.CancellationToken()
-    results: list[Result] = []
-    errors: list[BaseException] = []
-    # Not `join`: if a signal interrupts it, it treats the thread as ended, and the next call returns at once.
-    ended = threading.Event()
+    future: Future[Result] = Future()
 
     def run() -> None:
         try:
-            results.append(work(token))
+            future.set_result(work(token))
         except BaseException as error:  # noqa: BLE001 - Raised again in the calling thread.
-            errors.append(error)
-        finally:
-            ended.set()
+            future.set_exception(error)
 
     threading.Thread(target=run, name="pycolmap", daemon=True).start()
     try:
-        while not ended.wait(POLL_SECONDS):
+        while not wait([future], POLL_SECONDS).done:
             poll()
     except BaseException:
         token.cancel()
-        ended.wait()  # Waits for writes to the database, so that it is consistent.
+        wait([future])  # Waits for writes to the database, so that it is consistent.
         raise
-    if errors:
-        raise errors[0]
-    return results[0]
+    return future.result()
 
 
 Item = TypeVar("Item")
@@ -178,8 +172,8 @@ class FeatureDatabase:
             )
 
         with self._open() as database:
-            progress = _DatabaseProgress("extracting features", _image_ids(database), database.exists_keypoints, listen)
-            run_interruptible(work, progress.report)
+            ids = _image_ids(database)
+            _run_with_progress(work, "extracting features", ids, database.exists_keypoints, listen)
 
     def match(self, pairs: Sequence[tuple[int, int]], features: FeatureOptions, listen: Listener) -> None:
         """Matches pairs of photographs, by index, that are not matched yet."""
@@ -206,10 +200,9 @@ class FeatureDatabase:
         with self._open() as database:
             ids = _image_ids(database)
             items = [(ids[one], ids[other]) for one, other in pairs]
-            progress = _DatabaseProgress(
-                "matching photographs", items, lambda two: database.exists_two_view_geometry(*two), listen
+            _run_with_progress(
+                work, "matching photographs", items, lambda two: database.exists_two_view_geometry(*two), listen
             )
-            run_interruptible(work, progress.report)
 
     def feature_counts(self) -> NDArray[np.int64]:
         """[P] number of features of each photograph."""
@@ -256,21 +249,21 @@ def check_database(path: Path) -> Iterator[None]:
         ) from error
 
 
-class _DatabaseProgress(Generic[Item]):
-    """Progress of COLMAP: counts the items with results in the database while COLMAP runs.
+def _run_with_progress(
+    work: Callable[[Any], Any], what: str, items: Sequence[Item], exists: Callable[[Item], bool], listen: Listener
+) -> None:
+    """Runs work of COLMAP; its progress is the number of items whose results exist in the database.
 
     The database is read by COLMAP's SQLite. Python's is another copy in this process: closing a file in one drops the
     locks of the other, which then crashes with a bus error (sqlite.org/howtocorrupt.html, 2.2.1).
     """
+    missing = list(items)
 
-    def __init__(self, what: str, items: Sequence[Item], exists: Callable[[Item], bool], listen: Listener) -> None:
-        self._what, self._total = what, len(items)
-        self._missing, self._exists, self._listen = items, exists, listen
+    def report() -> None:
+        missing[:] = [item for item in missing if not exists(item)]
+        listen(Working(what, len(items) - len(missing), len(items)))
 
-    def report(self) -> None:
-        """Checks the items missing at the last call, and reports progress."""
-        self._missing = [item for item in self._missing if not self._exists(item)]
-        self._listen(Working(self._what, self._total - len(self._missing), self._total))
+    run_interruptible(work, report)
 
 
 def _image_ids(database: Any) -> list[int]:
@@ -408,12 +401,14 @@ def register_photographs(
     output = database.with_suffix(".models")
     output.mkdir(exist_ok=True)
     listen(Working(REGISTERING, 0, count))
-    if mapper == "incremental":
-        work = _incremental_mapping(database, output, options, count, listen)
-    else:
-        work = _global_mapping(database, output)
+
+    def global_mapping(token: Any) -> dict:
+        chosen = library.pycolmap.GlobalPipelineOptions(random_seed=SEED)
+        return library.pycolmap.global_mapping(database, output, output, options=chosen)
+
+    incremental = _incremental_mapping(database, output, options, count, listen)
     with check_database(database):
-        found = run_interruptible(work)
+        found = run_interruptible(incremental if mapper == "incremental" else global_mapping)
     return sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 
@@ -452,8 +447,3 @@ def _incremental_mapping(
         )
 
     return work
-
-
-def _global_mapping(database: Path, output: Path) -> Callable[[Any], dict]:
-    options = library.pycolmap.GlobalPipelineOptions(random_seed=SEED)
-    return lambda token: library.pycolmap.global_mapping(database, output, output, options=options)
