@@ -65,7 +65,11 @@ def model_suffix(folder: Path) -> str | None:
 def read_model(folder: Path) -> SparseModel:
     """Read cameras, images and points; points may be in the other format (binary or text), or missing."""
     suffix = model_suffix(folder) or ".txt"
-    lenses = _by_id(_read_records(folder / f"cameras{suffix}"), folder / f"cameras{suffix}")
+    cameras = _read_records(folder / f"cameras{suffix}")
+    lenses: dict[int, Lens] = dict(cameras)
+    if len(lenses) < len(cameras):
+        path = folder / f"cameras{suffix}"
+        raise InputError(f"{path} has two cameras of one id; expected every id once: export the model again")
     images = tuple(_read_records(folder / f"images{suffix}"))
     if not images:
         raise InputError(f"{folder / f'images{suffix}'} registers no photograph; expected a finished reconstruction")
@@ -91,13 +95,6 @@ def pose_matrix(image: ModelImage) -> NDArray[np.float64]:
     ]
     pose[:3, 3] = image.translation
     return pose
-
-
-def _by_id(records: list[tuple[int, Any]], path: Path) -> dict[int, Any]:
-    found = dict(records)
-    if len(found) < len(records):
-        raise InputError(f"{path} has two cameras of one id; expected every id once: export the model again")
-    return found
 
 
 def _read_records(path: Path) -> list[Any]:
@@ -246,7 +243,7 @@ def load_colmap(root: Path) -> Capture | None:
         test_shots=None,
         points=model.points if len(model.points) else None,
         format_name="COLMAP",
-        warnings=(*_other_models_warning(root, folder), *_transforms_warning(root)),
+        warnings=tuple(_unread_warnings(root, folder)),
         ignores_transparent=True,
     )
 
@@ -282,22 +279,19 @@ def _names_on_disk(images: Path, names: list[str]) -> list[str]:
     return [name if isfile(images / name) else spelled.get(normalize("NFC", name), name) for name in names]
 
 
-def _other_models_warning(root: Path, used: Path) -> tuple[str, ...]:
-    """Warning of further models: COLMAP splits what it cannot connect, and only one can be trained at a time."""
+def _unread_warnings(root: Path, used: Path) -> Iterator[str]:
+    """Warnings of further models, because COLMAP splits what it cannot connect, and of a `transforms.json`.
+
+    Only one model can be trained at a time; a `transforms.json` may define another split.
+    """
     sparse = root / "sparse"
     folders = [path for path in sparse.iterdir() if path.is_dir()] if sparse.is_dir() else []
     others = sorted(folder.name for folder in folders if folder != used and model_suffix(folder))
-    if not others:
-        return ()
-    return (f"{used} is used; there are more models in {sparse} ({join_names(others)}), which are ignored.",)
-
-
-def _transforms_warning(root: Path) -> tuple[str, ...]:
-    """Warning if there is also a `transforms.json`, which may define another split."""
+    if others:
+        yield f"{used} is used; there are more models in {sparse} ({join_names(others)}), which are ignored."
     unread = [name for name in (SINGLE_FILE, TRAIN_FILE) if (root / name).is_file()]
-    if not unread:
-        return ()
-    return (
-        f"The COLMAP model of {root} is read, and not {join_names(unread)}: neither its poses, nor its split, nor its "
-        "masks. Move one of them away.",
-    )
+    if unread:
+        yield (
+            f"The COLMAP model of {root} is read, and not {join_names(unread)}: neither its poses, nor its split, nor "
+            "its masks. Move one of them away."
+        )

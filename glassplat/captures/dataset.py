@@ -16,7 +16,7 @@ import torch
 
 from glassplat.captures.axes import axes_evidence
 from glassplat.captures.cameras import blank_share
-from glassplat.captures.capture import Capture, Shot
+from glassplat.captures.capture import Capture
 from glassplat.captures.files import CaptureFiles, read_capture
 from glassplat.captures.masks import IGNORE_FOLDER, MASK_FOLDER, PLANES, Mask, Polarity, ignored_share, read_transparent
 from glassplat.captures.transforms import points_in_view
@@ -220,9 +220,7 @@ def make_dataset(
     warnings = (
         *capture.warnings,
         *masks.warnings,
-        *_view_warnings([view.name for view, is_rescaled in prepared if is_rescaled], shown),
-        *_blank_warnings(shots),
-        *_mask_warnings(files),
+        *_view_warnings(files, [view.name for view, is_rescaled in prepared if is_rescaled], shown),
         *(["Transparent pixels of the photographs are ignored."] if ignores_transparent else ()),
         *point_warnings,
         *far_origin_warnings(torch.stack([view.camera.center for view in train]), extent),
@@ -317,10 +315,15 @@ def _points_and_warnings(root: Path, capture: Capture, train: tuple[View, ...]) 
     if capture.points is None:
         make = capture.random_points or (lambda: points_in_view([view.camera for view in train]))
         points = PointCloud.of(make())
-        unread = _unread_points_advice(root / NERFSTUDIO_POINTS)
-        return points, [
-            f"The {capture.format_name} capture has no points; {len(points)} random points are used instead.{unread}"
-        ]
+        warning = f"The {capture.format_name} capture has no points; {len(points)} random points are used instead."
+        if (path := root / NERFSTUDIO_POINTS).is_file():
+            folder = path.parents[2]
+            warning += (
+                f" Those of {path} are not read: make a sparse_pc.ply of them, named by ply_file_path, with a newer "
+                f"ns-process-data; or read the COLMAP model, {folder}, with the photographs linked as "
+                f"{folder / 'images'}."
+            )
+        return points, [warning]
     found = PointCloud.of(capture.points)
     # Comparisons with NaN are false.
     usable = (found.positions.abs() <= LARGEST_COORDINATE).all(dim=1)
@@ -332,52 +335,29 @@ def _points_and_warnings(root: Path, capture: Capture, train: tuple[View, ...]) 
     return kept, [f"{int((~usable).sum())} points are ignored: non-finite, or beyond {LARGEST_COORDINATE:g}."]
 
 
-def _unread_points_advice(path: Path) -> str:
-    """Advice on the points of the COLMAP model in a nerfstudio capture; empty if there is no such model."""
-    if not path.is_file():
-        return ""
-    folder = path.parents[2]
-    return (
-        f" Those of {path} are not read: make a sparse_pc.ply of them, named by ply_file_path, with a newer "
-        f"ns-process-data; or read the COLMAP model, {folder}, with the photographs linked as {folder / 'images'}."
-    )
-
-
-def _view_warnings(rescaled: list[str], background: Rgb | None) -> list[str]:
-    """Warnings of assumptions about photographs, one for all of them."""
-    warnings = []
+def _view_warnings(files: CaptureFiles, rescaled: list[str], background: Rgb | None) -> Iterator[str]:
+    """Warnings about lenses, transparent pixels and masks, each for all photographs; decodes only a few masks."""
     if rescaled:
-        warnings.append(
+        yield (
             f"Intrinsics were scaled for {join_names(rescaled)}, because these are scaled copies of the calibrated "
             "photographs."
         )
     if background is not None:
-        warnings.append(f"The photographs have transparent pixels; they are laid over sRGB {background}.")
-    return warnings
-
-
-def _blank_warnings(shots: Sequence[Shot]) -> list[str]:
-    """Warning if large parts of undistorted photographs lie outside the field of view of the lens."""
-    share = max(blank_share(shot.lens) for shot in shots)
-    if share <= MUCH_BLANK:
-        return []
-    return [
-        f"The lens is so wide that up to {share:.1%} of an undistorted photograph was outside its view; these "
-        "pixels are ignored."
-    ]
-
-
-def _mask_warnings(files: CaptureFiles) -> list[str]:
-    """Warning if masks exclude most of the photographs; decodes only a few masks."""
+        yield f"The photographs have transparent pixels; they are laid over sRGB {background}."
+    blank = max(blank_share(shot.lens) for shot in files.shots)
+    if blank > MUCH_BLANK:
+        yield (
+            f"The lens is so wide that up to {blank:.1%} of an undistorted photograph was outside its view; these "
+            "pixels are ignored."
+        )
     names = sample_evenly(sorted(files.ignored), FEW_MASKS)
     shares = [ignored_share(files.ignored[name]) for name in names]
     share = sum(shares) / max(len(shares), 1) * len(files.ignored) / len(files.shots)
-    if share <= MUCH_IGNORED:
-        return []
-    meaning = f"black in {MASK_FOLDER}/ is ignored, and white in {IGNORE_FOLDER}/; are the masks inverted?"
-    if all(shot.name in files.ignored and ignored_share(files.ignored[shot.name]) == 1 for shot in files.shots):
-        raise InputError(f"masks exclude all pixels of all photographs of {files.root}: {meaning}")
-    return [f"Masks exclude about {share:.0%} of the photographs: {meaning}"]
+    if share > MUCH_IGNORED:
+        meaning = f"black in {MASK_FOLDER}/ is ignored, and white in {IGNORE_FOLDER}/; are the masks inverted?"
+        if all(shot.name in files.ignored and ignored_share(files.ignored[shot.name]) == 1 for shot in files.shots):
+            raise InputError(f"masks exclude all pixels of all photographs of {files.root}: {meaning}")
+        yield f"Masks exclude about {share:.0%} of the photographs: {meaning}"
 
 
 @torch.no_grad()

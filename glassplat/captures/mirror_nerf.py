@@ -33,7 +33,6 @@ from glassplat.files.images import IMAGE_SUFFIXES, image_size
 
 if TYPE_CHECKING:
     from glassplat.captures.axes import AxesEvidence
-    from glassplat.captures.view import View
 
 FORMAT_DESCRIPTION = f"a Mirror-NeRF scene ({transforms.TRAIN_FILE} and {MASK_FOLDER}/)"
 SYNTHETIC_MASK = "MirrorMask_"
@@ -160,17 +159,11 @@ def _mask_names(photograph: Path) -> list[str]:
 def _axes_evidence(shots: tuple[Shot, ...], masks: Mapping[str, Path], points: RawPoints | None) -> AxesEvidence | None:
     """Evidence for the axes of the poses, from some masks or else the points."""
     from glassplat.captures.axes import axes_evidence  # Needs PyTorch, unlike the other formats.
-    from glassplat.captures.view import PointCloud
+    from glassplat.captures.view import PointCloud, prepare_view
 
-    views = [_view(shot, masks.get(shot.name)) for shot in shots]
+    read = partial(read_pane_labels, at_threshold=True)
+    views = [prepare_view(s, Mask(masks[s.name], read) if s.name in masks else None)[0] for s in shots]
     return axes_evidence(views, None if points is None else PointCloud.of(points).positions)
-
-
-def _view(shot: Shot, mask: Path | None) -> View:
-    from glassplat.captures.view import prepare_view
-
-    pane_mask = None if mask is None else Mask(mask, partial(read_pane_labels, at_threshold=True))
-    return prepare_view(shot, pane_mask)[0]
 
 
 def _correct_axes(capture: Capture, evidence: AxesEvidence | None) -> Capture:
@@ -190,14 +183,10 @@ def _correct_axes(capture: Capture, evidence: AxesEvidence | None) -> Capture:
         f"The poses are read in OpenCV axes: with OpenGL axes {evidence.as_read:.0%} of the {evidence.source} lie in "
         f"front of the cameras, with OpenCV axes {evidence.flipped:.0%}."
     )
-    return replace(
-        capture,
-        shots=_flip_axes(capture.shots),
-        test_shots=None if capture.test_shots is None else _flip_axes(capture.test_shots),
-        warnings=(*capture.warnings, warning),
-    )
 
+    def flip(shots: tuple[Shot, ...]) -> tuple[Shot, ...]:
+        return tuple(replace(s, cam_from_world=transforms.OPENCV_FROM_OPENGL @ s.cam_from_world) for s in shots)
 
-def _flip_axes(shots: tuple[Shot, ...]) -> tuple[Shot, ...]:
-    """The photographs with the y and z axes of their cameras negated."""
-    return tuple(replace(shot, cam_from_world=transforms.OPENCV_FROM_OPENGL @ shot.cam_from_world) for shot in shots)
+    test_shots = None if capture.test_shots is None else flip(capture.test_shots)
+    warnings = (*capture.warnings, warning)
+    return replace(capture, shots=flip(capture.shots), test_shots=test_shots, warnings=warnings)

@@ -100,7 +100,8 @@ def lens_from_settings(settings: Mapping[str, Any], image_path: Path, name: str)
     """
     with convert_to_input_error():
         found = records.check_fields(settings, LENS, f"the lens of {name}")
-        width, height = _size(found, image_path)
+        given = found["w"] is not None and found["h"] is not None
+        width, height = (round(found["w"]), round(found["h"])) if given else image_size(image_path)
         fx, fy = _focal_lengths(found, width, height, name)
     found |= zip(DISTORTION_PARAMS, found["distortion_params"] or (), strict=False)
     model = found["camera_model"] or (FISHEYE if found["is_fisheye"] else "OPENCV")
@@ -129,30 +130,21 @@ def _lens(model: str, pinhole: list[float], coefficients: list[float], size: tup
     return make_lens("PINHOLE", pinhole, size)
 
 
-def _size(found: Mapping[str, Any], image_path: Path) -> tuple[int, int]:
-    """Width and height to which the intrinsics refer."""
-    if found["w"] is None or found["h"] is None:
-        return image_size(image_path)
-    return round(found["w"]), round(found["h"])
-
-
 def _focal_lengths(found: Mapping[str, Any], width: int, height: int, name: str) -> tuple[float, float]:
-    """fx and fy in pixels; if only one is given, it is used for both."""
-    along_x = _focal_length(found["fl_x"], found["camera_angle_x"], width)
-    along_y = _focal_length(found["fl_y"], found["camera_angle_y"], height)
+    """fx and fy in pixels, from lengths or else from opening angles; if only one is given, it is used for both."""
+    along_x, along_y = (
+        0.5 * size / math.tan(0.5 * angle_rad) if length is None and angle_rad is not None else length
+        for length, angle_rad, size in (
+            (found["fl_x"], found["camera_angle_x"], width),
+            (found["fl_y"], found["camera_angle_y"], height),
+        )
+    )
     fx, fy = along_x or along_y, along_y or along_x
     if not fx or not fy:
         raise ValueError(
             f"the lens of {name} has no focal length; expected fl_x in pixels or camera_angle_x in radians"
         )
     return fx, fy
-
-
-def _focal_length(length: float | None, angle_rad: float | None, size: int) -> float | None:
-    """Focal length from the length in pixels, or else from the opening angle."""
-    if length is not None or angle_rad is None:
-        return length
-    return 0.5 * size / math.tan(0.5 * angle_rad)
 
 
 POINT_FILES = ("points3d.ply", "points3D.ply", "sparse_pc.ply")
@@ -328,7 +320,7 @@ def _load_split(root: Path) -> Capture:
         test_shots=tuple(shots[tested].values()) if tested in shots else None,
         points=read_points(root, files[TRAIN_FILE]),
         format_name=TRAIN_FILE,
-        random_points=points_in_box if _is_blender(files[TRAIN_FILE]) and _surrounds_box(shots[TRAIN_FILE]) else None,
+        random_points=points_in_box if _surrounds_box(files[TRAIN_FILE], shots[TRAIN_FILE]) else None,
         warnings=(*_unused_priors(files[TRAIN_FILE]), *([NO_TEST_FILE_WARNING] if VAL_FILE in shots else ())),
         keep_masks=kept,
     )
@@ -371,15 +363,15 @@ def _unused_priors(settings: Settings) -> list[str]:
     ]
 
 
-def _is_blender(settings: Settings) -> bool:
-    """Return whether a Blender script wrote the file: its lens has nothing but the opening angle."""
-    return "camera_angle_x" in settings and "fl_x" not in settings and "w" not in settings
+def _surrounds_box(settings: Settings, shots: Mapping[str, Shot]) -> bool:
+    """Return whether a Blender script wrote the file, and the cameras are as far from the cube as in synthetic scenes.
 
-
-def _surrounds_box(shots: Mapping[str, Shot]) -> bool:
-    """Return whether half of the cameras are as far from the cube of `points_in_box` as in the synthetic scenes."""
+    The lens of such a file has nothing but the opening angle; half of the cameras decide. The cube is that of
+    `points_in_box`.
+    """
+    is_blender = "camera_angle_x" in settings and "fl_x" not in settings and "w" not in settings
     distance = float(np.median([np.linalg.norm(shot.cam_from_world[:3, 3]) for shot in shots.values()]))
-    return BOX_HALF_SIZE < distance < MOST_HALF_SIZES * BOX_HALF_SIZE
+    return is_blender and BOX_HALF_SIZE < distance < MOST_HALF_SIZES * BOX_HALF_SIZE
 
 
 def _listed_split(
