@@ -6,8 +6,8 @@ import hashlib
 import importlib
 import math
 import re
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -92,33 +92,39 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
         )
         paths = [path for path in paths if path not in masks]
     names = capture_names(paths, folder)
-    found: dict[bytes, Photograph] = {}
-    duplicates: list[tuple[Path, bytes]] = []
+    copies: dict[bytes, list[Photograph]] = defaultdict(list)
     broken: dict[str, InputError] = {}
     for done, path in enumerate(paths):
         listen(Working("checking the photographs", done, len(paths)))
         try:
             photograph, contents = _inspect_photograph(path, names[path], max_size)
+            copies[contents].append(photograph)
         except InputError as error:
             broken[path.name] = error
-            continue
-        kept, duplicate = found.get(contents, photograph), photograph
-        if len(kept.name) > len(photograph.name):
-            kept, duplicate = photograph, kept  # `IMG 9 copy.jpg` sorts before `IMG 9.jpg`; keep the latter.
-        found[contents] = kept
-        if duplicate is not kept:
-            duplicates.append((duplicate.path, contents))
     if broken:
-        raise _unusable_error(broken, len(paths))
-    duplicate_names = [f"{path.name} (as {found[contents].path.name})" for path, contents in duplicates]
+        first = next(iter(broken.values()))
+        if len(broken) == 1:
+            raise first
+        raise InputError(
+            f"{len(broken)} of {len(paths)} photographs cannot be used ({join_names(list(broken))}); replace or remove "
+            f"them. The first: {first}"
+        )
+    # `IMG 9 copy.jpg` sorts before `IMG 9.jpg`; keep the latter.
+    found = {contents: min(same, key=lambda one: len(one.name)) for contents, same in copies.items()}
+    duplicates = [
+        f"{one.path.name} (as {found[contents].path.name})"
+        for contents, same in copies.items()
+        for one in same
+        if one is not found[contents]
+    ]
     if len(found) < FEWEST_PHOTOGRAPHS:
-        again = f", and duplicates of them ({join_names(duplicate_names)})" if duplicate_names else ""
+        again = f", and duplicates of them ({join_names(duplicates)})" if duplicates else ""
         raise InputError(
             f"{folder} holds too few photographs: {len(found)}{again}; expected at least {FEWEST_PHOTOGRAPHS}, better "
             "30 or more, taken a step apart"
         )
-    if duplicate_names:
-        listen(Note(f"Skipped duplicates: {join_names(duplicate_names)}."))
+    if duplicates:
+        listen(Note(f"Skipped duplicates: {join_names(duplicates)}."))
     cut_out = [one.path for one in found.values() if one.transparent]
     if cut_out:
         listen(
@@ -138,17 +144,6 @@ def file_states(source: Path) -> dict[str, list[int]]:
         state = path.stat()
         found[readable_name(path.relative_to(folder))] = [state.st_size, state.st_mtime_ns]
     return found
-
-
-def _unusable_error(broken: Mapping[str, InputError], count: int) -> InputError:
-    """Error that names the unusable ones of `count` photographs."""
-    first = next(iter(broken.values()))
-    if len(broken) == 1:
-        return first
-    return InputError(
-        f"{len(broken)} of {count} photographs cannot be used ({join_names(list(broken))}); replace or remove them. "
-        f"The first: {first}"
-    )
 
 
 def broken_photographs(paths: Sequence[Path], least_side: int) -> list[str]:
@@ -316,19 +311,6 @@ CORNERS = {"maxCorners": 200, "qualityLevel": 0.01, "minDistance": 7}
 FEWEST_CORNERS = 10
 
 
-@dataclass(frozen=True)
-class FrameStatistics:
-    """Measurements for each frame of a video, from a first pass.
-
-    Attributes:
-        travelled: [F] cumulative image motion since the first frame, in longer image sides.
-        sharpness: [F] variance of the Laplacian of the reduced frame.
-    """
-
-    travelled: NDArray[np.float64]
-    sharpness: NDArray[np.float64]
-
-
 def extract_frames(video: Path, folder: Path, most: int, listen: Listener) -> list[Path]:
     """Writes selected frames of a video as PNG files into a folder, named by their index in the video.
 
@@ -339,11 +321,11 @@ def extract_frames(video: Path, folder: Path, most: int, listen: Listener) -> li
         listen: receives the progress.
     """
     cv2 = _import_opencv()
-    statistics = _measure_motion(cv2, video, listen)
-    chosen = chosen_frames(statistics, most)
+    travelled, sharpness = _measure_motion(cv2, video, listen)
+    chosen = chosen_frames(travelled, sharpness, most)
     if len(chosen) < FEWEST_FRAMES:
         raise InputError(
-            f"{video} has {len(chosen)} sufficiently different views in {len(statistics.sharpness)} frames; expected "
+            f"{video} has {len(chosen)} sufficiently different views in {len(sharpness)} frames; expected "
             f"at least {FEWEST_FRAMES}: walk slowly past the subject, with enough light"
         )
     folder.mkdir(parents=True, exist_ok=True)
@@ -356,13 +338,18 @@ def extract_frames(video: Path, folder: Path, most: int, listen: Listener) -> li
     return list(paths.values())
 
 
-def chosen_frames(statistics: FrameStatistics, most: int) -> NDArray[np.int64]:
-    """Indices of the sharpest frame in each interval of equal motion, which is at least `LEAST_SPACING`."""
-    path = statistics.travelled
-    spacing = max(float(path[-1] - path[0]) / most, LEAST_SPACING)
+def chosen_frames(travelled: NDArray[np.float64], sharpness: NDArray[np.float64], most: int) -> NDArray[np.int64]:
+    """Indices of the sharpest frame in each interval of equal motion, which is at least `LEAST_SPACING`.
+
+    Args:
+        travelled: [F] cumulative image motion since the first frame, in longer image sides.
+        sharpness: [F] of each frame.
+        most: maximum number of intervals.
+    """
+    spacing = max(float(travelled[-1] - travelled[0]) / most, LEAST_SPACING)
     # The last frame belongs to the last interval.
-    interval = np.minimum(np.floor((path - path[0]) / spacing).astype(np.int64), most - 1)
-    order = np.lexsort((-statistics.sharpness, interval))
+    interval = np.minimum(np.floor((travelled - travelled[0]) / spacing).astype(np.int64), most - 1)
+    order = np.lexsort((-sharpness, interval))
     firsts = np.unique(interval[order], return_index=True)[1]
     return np.sort(order[firsts])
 
@@ -394,14 +381,17 @@ def _import_opencv() -> Any:
         ) from error
 
 
-def _measure_motion(cv2: Any, video: Path, listen: Listener) -> FrameStatistics:
+def _measure_motion(cv2: Any, video: Path, listen: Listener) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """[F] motion up to each frame, and [F] variance of the Laplacian of the reduced frame."""
     travelled, sharpness = [], []
     before, distance = None, 0.0
     total = _frame_count(cv2, video)
     for number, frame in enumerate(_read_frames(cv2, video)):
         if number % 10 == 0:
             listen(Working("reading the video", min(number, total), total))
-        small = _reduce_to_grey(cv2, frame)
+        scale = min(1.0, SMALL_SIDE / max(frame.shape[:2]))
+        size = [max(1, round(side * scale)) for side in frame.shape[1::-1]]
+        small = cv2.resize(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), size, interpolation=cv2.INTER_AREA)
         if before is not None:
             distance += _motion(cv2, before, small)
         travelled.append(distance)
@@ -409,7 +399,7 @@ def _measure_motion(cv2: Any, video: Path, listen: Listener) -> FrameStatistics:
         before = small
     if not travelled:
         raise InputError(f"{video} has no frame that OpenCV can read; expected a video, or a folder of photographs")
-    return FrameStatistics(np.array(travelled), np.array(sharpness))
+    return np.array(travelled), np.array(sharpness)
 
 
 def _frame_count(cv2: Any, video: Path) -> int:
@@ -430,12 +420,6 @@ def _read_frames(cv2: Any, video: Path) -> Iterator[NDArray[np.uint8]]:
             yield frame
     finally:
         capture.release()
-
-
-def _reduce_to_grey(cv2: Any, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    scale = min(1.0, SMALL_SIDE / max(frame.shape[:2]))
-    size = [max(1, round(side * scale)) for side in frame.shape[1::-1]]
-    return cv2.resize(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), size, interpolation=cv2.INTER_AREA)
 
 
 def _motion(cv2: Any, before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:

@@ -29,7 +29,6 @@ from glassplat.prepare.photographs import (
     PHOTOGRAPH_SUFFIX,
     VIDEO_SUFFIXES,
     Listener,
-    Photograph,
     extract_frames,
     file_states,
     masks_among,
@@ -263,24 +262,27 @@ class Report:
 def make_report(solution: Solution) -> Report:
     """The report of a solution; zeros if it has no model."""
     photographs = solution.database.photographs
-    missing = [readable_name(one.path.name) for one in solution.missing()]
     model = solution.models[0] if solution.models else None
-    features = int(np.median(solution.database.feature_counts()))
+    used = {image.camera_id for image in image_numbers(model).values()} if model else set()
     report = Report(
         photographs=len(photographs),
         registered=solution.registered,
-        missing=tuple(missing),
+        missing=tuple(readable_name(one.path.name) for one in solution.missing()),
         groups=_group_sizes(solution),
         points=int(model.num_points3D()) if model else 0,
         reprojection_error=float(model.compute_mean_reprojection_error()) if model else 0.0,
         track_length=float(model.compute_mean_track_length()) if model else 0.0,
-        features=features,
-        cameras=tuple(_describe_lenses(model)) if model else (),
+        features=int(np.median(solution.database.feature_counts())),
+        cameras=tuple(
+            f"{camera.width}x{camera.height}, focal length {camera.mean_focal_length():.0f} pixels"
+            for key, camera in (sorted(model.cameras.items()) if model else ())
+            if key in used
+        ),
         attempt=solution.attempt,
         attempts=solution.attempts_made,
         advice=(),
     )
-    return replace(report, advice=tuple(_advice(report, missing, solution)))
+    return replace(report, advice=tuple(_advice(report, model)))
 
 
 def _group_sizes(solution: Solution) -> tuple[int, ...]:
@@ -295,45 +297,31 @@ def _group_sizes(solution: Solution) -> tuple[int, ...]:
     return tuple(sizes)
 
 
-def _describe_lenses(model: Any) -> list[str]:
-    """Descriptions of the lenses of registered photographs."""
-    used = {image.camera_id for image in model.images.values() if image.has_pose}
-    return [
-        f"{camera.width}x{camera.height}, focal length {camera.mean_focal_length():.0f} pixels"
-        for key, camera in sorted(model.cameras.items())
-        if key in used
-    ]
-
-
-def _advice(report: Report, missing: list[str], solution: Solution) -> list[str]:
-    advice = []
-    if missing:
-        advice.append(
-            f"take more photographs around {join_names(missing, 3)}: in steps of half a metre, with two thirds "
-            f"overlap, and some that show the surroundings of the glass"
+def _advice(report: Report, model: Any) -> Iterator[str]:
+    if report.missing:
+        yield (
+            f"take more photographs around {join_names(list(report.missing), 3)}: in steps of half a metre, with two "
+            "thirds overlap, and some that show the surroundings of the glass"
         )
     if len(report.groups) > 1:
-        advice.append(
+        yield (
             f"the photographs fall into {len(report.groups)} groups without matches between them "
             f"({', '.join(map(str, report.groups))} photographs): take some that connect them, or prepare each "
             "group separately"
         )
     if report.features < FEW_FEATURES:
-        advice.append(
+        yield (
             f"photographs have only {report.features} features (median): use more light, a steadier camera, "
-            f"or a larger --max-size"
+            "or a larger --max-size"
         )
     if report.points and report.track_length < SHORT_TRACK:
-        advice.append("points are visible in few photographs: take more, in smaller steps")
+        yield "points are visible in few photographs: take more, in smaller steps"
     if report.reprojection_error > LARGE_ERROR:
-        advice.append(
-            "points have large errors for a static scene: make sure that nothing large moves, or try --lens opencv"
-        )
-    model, (least, most) = solution.models[0] if solution.models else None, PLAUSIBLE_FOCALS
-    cameras = [] if model is None else model.cameras.values()
+        yield "points have large errors for a static scene: make sure that nothing large moves, or try --lens opencv"
+    least, most = PLAUSIBLE_FOCALS
+    cameras = model.cameras.values() if model else ()
     if any(not least <= one.mean_focal_length() / max(one.width, one.height) <= most for one in cameras):
-        advice.append("a focal length is implausible: take photographs from different distances")
-    return advice
+        yield "a focal length is implausible: take photographs from different distances"
 
 
 @dataclass(frozen=True)
@@ -385,7 +373,11 @@ def _prepare(task: Preparation, work_folder: WorkFolder, listen: Listener, *, re
     missing = writing.missing_folders(work_folder.folder.parent)
     begun = work_folder.begin(settings, resume=resume, force=force)
     try:
-        photographs = _read_photographs(task, work_folder, listen)
+        source = task.source
+        if is_video(source):
+            source = work_folder.folder / "frames"
+            extract_frames(task.source, source, task.frames, listen)
+        photographs = photographs_in(source, task.max_size, listen)
         begun = False
         solution = best_solution(
             photographs, work_folder.folder, listen, lens=task.lens, mapper=task.mapper, least=task.least_registered
@@ -424,15 +416,6 @@ def check_paths(task: Preparation) -> None:
         raise InputError(
             f"a disk is mounted at {task.output}, which a finished capture cannot replace; choose a new folder in it"
         )
-
-
-def _read_photographs(task: Preparation, work_folder: WorkFolder, listen: Listener) -> list[Photograph]:
-    """Photographs of the folder or the video."""
-    if not is_video(task.source):
-        return photographs_in(task.source, task.max_size, listen)
-    frames = work_folder.folder / "frames"
-    extract_frames(task.source, frames, task.frames, listen)
-    return photographs_in(frames, task.max_size, listen)
 
 
 def _check_enough(report: Report, task: Preparation) -> None:

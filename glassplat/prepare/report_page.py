@@ -97,20 +97,15 @@ def _page_map(points: Array, required: Array) -> Callable[[Array], Array]:
     return lambda one: np.asarray((one - middle) * scale + np.array(PLAN_SIZE) / 2)
 
 
-def _point_circles(pixels: Array, colors: NDArray[np.generic], behind: NDArray[np.bool_]) -> list[str]:
+def _point_circles(pixels: Array, colors: NDArray[np.uint8], behind: NDArray[np.bool_]) -> list[str]:
     every = max(1, -(-len(pixels) // MOST_POINTS))
     inside = np.all((pixels >= 0) & (pixels <= np.array(PLAN_SIZE)), axis=1).reshape(-1)
     shown = [int(row) for row in np.flatnonzero(inside)[::every]]
     return [
         f'<circle cx="{pixels[row][0]:.1f}" cy="{pixels[row][1]:.1f}" r="1.3" '
-        f'fill="{"#ff4fd8" if behind[row] else _hex(colors[row])}"/>'
+        f'fill="#{"ff4fd8" if behind[row] else colors[row].tobytes().hex()}"/>'
         for row in shown
     ]
-
-
-def _hex(color: NDArray[np.generic]) -> str:
-    red, green, blue = (int(one) for one in color)
-    return f"#{red:02x}{green:02x}{blue:02x}"
 
 
 def _polyline(pixels: Array, color: str, width: float) -> str:

@@ -11,7 +11,7 @@ import pytest
 from glassplat.errors import InputError
 from glassplat.files.images import image_size
 from glassplat.prepare import photographs as video
-from glassplat.prepare.photographs import FrameStatistics, chosen_frames, extract_frames
+from glassplat.prepare.photographs import chosen_frames, extract_frames
 from tests.prepare.conftest import Heard
 
 WIDTH, HEIGHT = 320, 240
@@ -60,13 +60,13 @@ def test_existing_frames_are_kept(tmp_path: Path, heard: Heard) -> None:
 
 
 def test_the_sharpest_frame_of_each_segment_is_chosen() -> None:
-    footage = FrameStatistics(np.array([0.0, 0.01, 0.03, 0.05, 0.051, 0.09]), np.array([1.0, 5.0, 2.0, 1.0, 3.0, 1.0]))
-    assert chosen_frames(footage, 3).tolist() == [1, 4, 5]
+    travelled, sharpness = np.array([0.0, 0.01, 0.03, 0.05, 0.051, 0.09]), np.array([1.0, 5.0, 2.0, 1.0, 3.0, 1.0])
+    assert chosen_frames(travelled, sharpness, 3).tolist() == [1, 4, 5]
 
 
 @pytest.mark.parametrize("most", [8, 16, 20])
 def test_no_more_frames_than_wanted_are_chosen(most: int) -> None:
-    assert len(chosen_frames(FrameStatistics(np.linspace(0, 3, 70), np.ones(70)), most)) == most
+    assert len(chosen_frames(np.linspace(0, 3, 70), np.ones(70), most)) == most
 
 
 @pytest.mark.parametrize("still", [True, False])
