@@ -177,19 +177,14 @@ class PixelMap:
 
     def map_labels(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Maps [H, W] at the photograph's size to [height, width] by the nearest pixel; labels are not blended."""
-        if self.lens is not None:
-            labels = undistort(labels, self.lens.as_colmap(), "NEAREST_NEIGHBOR")
-        return nearest_resize(labels, self.width, self.height)
+        return nearest_resize(self._undistort_labels(labels), self.width, self.height)
 
     def map_ignored(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Maps [H, W] at the photograph's size to [height, width]; 1 where any averaged pixel has a label."""
-        if self.lens is not None:
-            labels = undistort(labels, self.lens.as_colmap(), "NEAREST_NEIGHBOR")
-        return self.reduce_labels(labels)
+        return self.reduce_labels(self._undistort_labels(labels))
 
-    def blank_mask(self) -> NDArray[np.uint8]:
-        """[height, width], 1 where any averaged pixel lies outside the distorted photograph."""
-        return _cached_blank_mask(self)
+    def _undistort_labels(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return labels if self.lens is None else undistort(labels, self.lens.as_colmap(), "NEAREST_NEIGHBOR")
 
     def reduce_labels(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Maps [H, W] at the undistorted size to [height, width]; 1 where any averaged pixel has a label."""
@@ -323,9 +318,9 @@ def blank_share(lens: Lens) -> float:
     return share if share > LEAST_BLANK else 0.0
 
 
-@lru_cache(maxsize=8)
-def _cached_blank_mask(pixel_map: PixelMap) -> NDArray[np.uint8]:
-    """Cached `PixelMap.blank_mask`: as slow as undistorting a photograph, and the same for all of a lens."""
+@lru_cache(maxsize=8)  # Making it is as slow as undistorting a photograph, and the same for all of a lens.
+def blank_mask(pixel_map: PixelMap) -> NDArray[np.uint8]:
+    """[height, width], 1 where any averaged pixel lies outside the distorted photograph."""
     shape = (pixel_map.height, pixel_map.width)
     return pixel_map.reduce_labels(blank_pixels(pixel_map.lens)) if pixel_map.lens else np.zeros(shape, np.uint8)
 

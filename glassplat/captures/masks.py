@@ -239,14 +239,18 @@ def _find_keep_masks(
     root: Path, photographs: Mapping[str, Path], named: Set[str]
 ) -> tuple[dict[str, Path], tuple[str, ...]]:
     """Masks in `masks/` and next to photographs, except those named by the format; a warning on unmatched ones."""
-    unmatched: list[str] = []
-    masks = _match_masks(root / MASK_FOLDER, photographs, siblings=_sibling_masks, unmatched=unmatched, named=named)
+    folder, taken = root / MASK_FOLDER, {*named, *(normpath(path) for path in photographs.values())}
+    found, unmatched = _match_files(folder, photographs, named)
+    for name, path in photographs.items():
+        siblings = (path.with_name(f"{path.stem}{MASK_SUFFIX}{suffix}") for suffix in images.IMAGE_SUFFIXES)
+        found[name] += [mask for mask in siblings if mask.is_file() and normpath(mask) not in taken]
+    masks = _only_masks(found)
+    if unmatched and not (masks or named):
+        raise InputError(_unmatched_message(folder, unmatched, photographs))
+    if not (masks or named) and folder.is_dir():
+        raise InputError(f"{folder} holds no mask images; add masks, or remove the folder")
     if not unmatched:
-        if not (masks or named) and (root / MASK_FOLDER).is_dir():
-            raise InputError(f"{root / MASK_FOLDER} holds no mask images; add masks, or remove the folder")
         return masks, ()
-    if not (masks or named):
-        raise InputError(_unmatched_message(root / MASK_FOLDER, unmatched, photographs))
     belong = "1 mask belongs" if len(unmatched) == 1 else f"{len(unmatched)} masks belong"
     return masks, (f"{belong} to no photograph ({join_names(sorted(unmatched))}).",)
 
@@ -318,7 +322,8 @@ def _interpret_masks(
     inverted, warnings = _decide_polarity(list(values.values()), polarity)
     read = partial(read_pane_labels, at_threshold=at_threshold, inverted=inverted)
     masks = {name: Mask(path, read) for name, path in paths.items()}
-    found = {name: _present_labels(_labels(mask_values, inverted)) for name, mask_values in values.items()}
+    counts = {name: np.bincount(_labels(one, inverted).ravel()) for name, one in values.items()}
+    found = {name: {*np.flatnonzero(count).tolist()} - {0} for name, count in counts.items()}
     labels = sorted(set().union(*found.values()))
     if not labels:
         raise InputError(f"no mask of {root} marks a pane; expected values 1..K, or 255, on the panes")
@@ -333,28 +338,23 @@ def _labels(values: MaskValues, inverted: bool) -> NDArray[np.uint8]:
     return (values.pixels == 0).astype(np.uint8) if inverted else values.pixels
 
 
-def _present_labels(labels: NDArray[np.uint8]) -> set[int]:
-    """The labels above zero that are present."""
-    return {int(label) for label in np.flatnonzero(np.bincount(labels.ravel())) if label > 0}
+def _match_masks(folder: Path, photographs: Mapping[str, Path]) -> dict[str, Path]:
+    """Path of the mask in a folder by name of the photograph, sorted by name; each mask must have a photograph."""
+    found, unmatched = _match_files(folder, photographs)
+    if unmatched:
+        raise InputError(_unmatched_message(folder, unmatched, photographs))
+    return _only_masks(found)
 
 
-def _match_masks(
-    folder: Path,
-    photographs: Mapping[str, Path],
-    *,
-    siblings: Callable[[Path], list[Path]] = lambda path: [],
-    unmatched: list[str] | None = None,
-    named: Set[str] = frozenset(),
-) -> dict[str, Path]:
-    """Mask path by name of the photograph, sorted by name; in the folder, or next to the photographs.
-
-    Masks without a photograph are appended to `unmatched`, or else refused; the paths in `named` are skipped.
-    """
-    found: dict[str, list[Path]] = defaultdict(list)
+def _match_files(
+    folder: Path, photographs: Mapping[str, Path], skipped: Set[str] = frozenset()
+) -> tuple[defaultdict[str, list[Path]], list[str]]:
+    """Masks in a folder by name of the photograph, and those without a photograph; the skipped paths are left out."""
+    found = defaultdict[str, list[Path]](list)
+    unmatched: list[str] = []
     keys = _owners_by_key(photographs if folder.is_dir() else ())
-    without_photograph: list[str] = []
     for path in _image_files(folder, keys[0]):
-        if normpath(path) in named:
+        if normpath(path) in skipped:
             continue
         owners = _owners(path.relative_to(folder), keys)
         if len(owners) > 1:
@@ -365,14 +365,12 @@ def _match_masks(
         if owners:
             found[owners[0]].append(path)
         else:
-            without_photograph.append(path.relative_to(folder).as_posix())
-    if without_photograph and unmatched is None:
-        raise InputError(_unmatched_message(folder, without_photograph, photographs))
-    if unmatched is not None:
-        unmatched.extend(without_photograph)
-    taken = {*named, *(normpath(path) for path in photographs.values())}
-    for name, path in photographs.items():
-        found[name].extend(mask for mask in siblings(path) if normpath(mask) not in taken)
+            unmatched.append(path.relative_to(folder).as_posix())
+    return found, unmatched
+
+
+def _only_masks(found: Mapping[str, list[Path]]) -> dict[str, Path]:
+    """The mask of each photograph that has one, sorted by name."""
     for name, several in found.items():
         if len(several) > 1:
             raise InputError(f"{name} has {len(several)} masks: {join_names([str(p) for p in several])}; keep one")
@@ -402,12 +400,6 @@ def _image_files(folder: Path, hidden: Container[str]) -> Iterator[Path]:
         if not path.is_file():
             raise InputError(f"mask {path} is not a readable file; replace or remove it")
         yield path
-
-
-def _sibling_masks(photograph: Path) -> list[Path]:
-    """Masks in the photograph's own folder."""
-    candidates = (photograph.with_name(f"{photograph.stem}{MASK_SUFFIX}{suffix}") for suffix in images.IMAGE_SUFFIXES)
-    return [path for path in candidates if path.is_file()]
 
 
 def mask_paths(photographs: Iterable[str]) -> dict[str, Path]:

@@ -421,7 +421,7 @@ class IgnoredFiles:
 
     def __call__(self) -> Tensor:
         """[H, W] bool, true where any mask is, or outside the photograph."""
-        blank = [] if self.blank is None else [torch.from_numpy(self.blank.blank_mask())]
+        blank = [] if self.blank is None else [torch.from_numpy(cameras.blank_mask(self.blank))]
         return torch.stack([*blank, *(mask.ignored() for mask in self.masks)]).amax(dim=0) > 0
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from glassplat.captures import colmap_library as library
-from glassplat.captures.cameras import Lens, PixelMap, blank_share, make_lens, undistort
+from glassplat.captures.cameras import PixelMap, blank_mask, blank_share, make_lens, undistort
 from glassplat.captures.masks import IGNORE_FOLDER
 from glassplat.errors import InputError, join_names
 from glassplat.files.images import write_image
@@ -152,7 +152,11 @@ def write_capture(solution: Solution, folder: Path, listen: Listener) -> None:
     """
     model = solution.models[0]
     lenses = {key: library.pycolmap.Camera(camera.todict()) for key, camera in model.cameras.items()}
-    wide = _wide_lenses(lenses)
+    checked = {
+        key: make_lens(camera.model_name, list(camera.params), (camera.width, camera.height))
+        for key, camera in lenses.items()
+    }
+    wide = {key: lens for key, lens in checked.items() if blank_share(lens)}
     _undistort_model(model)
     images = image_numbers(model)
     for done, (number, image) in enumerate(sorted(images.items())):
@@ -165,22 +169,13 @@ def write_capture(solution: Solution, folder: Path, listen: Listener) -> None:
         if image.camera_id in wide:
             mask = (folder / IGNORE_FOLDER / photograph.name).with_suffix(".png")
             height, width = pixels.shape[:2]
-            write_image(mask, 255 * PixelMap(wide[image.camera_id], width, height).blank_mask())
+            write_image(mask, 255 * blank_mask(PixelMap(wide[image.camera_id], width, height)))
         image.name = photograph.name
     listen(Working("colouring points from the photographs", 0, len(images)))
     model.extract_colors_for_all_images(folder / "images")
     sparse = folder / "sparse" / "0"
     sparse.mkdir(parents=True, exist_ok=True)
     model.write_binary(sparse)
-
-
-def _wide_lenses(cameras: dict[int, Any]) -> dict[int, Lens]:
-    """The lenses whose undistorted photographs have regions without pixels."""
-    lenses = {
-        key: make_lens(camera.model_name, list(camera.params), (camera.width, camera.height))
-        for key, camera in cameras.items()
-    }
-    return {key: lens for key, lens in lenses.items() if blank_share(lens)}
 
 
 def _undistort_model(model: Any) -> None:
