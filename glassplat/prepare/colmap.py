@@ -347,24 +347,20 @@ def pairs_to_match(descriptors: Sequence[NDArray[np.uint8]]) -> Pairs:
 
 def _signatures(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
     """[P, WORDS * 128] unit vectors; zeros where a photograph has no features."""
-    from scipy.cluster.vq import kmeans2  # Slow to import, and needed for many photographs only.
+    from scipy.cluster.vq import kmeans2, vq  # Slow to import, and needed for many photographs only.
 
     everything = np.concatenate(descriptors)
     rng = np.random.default_rng(SEED)
     sample = everything[rng.permutation(len(everything))[:SAMPLED]]
     words, _ = kmeans2(sample, min(WORDS, len(sample)), minit="points", rng=rng)
-    return np.stack([_signature(part, words) for part in descriptors])
-
-
-def _signature(features: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.float32]:
-    from scipy.cluster.vq import vq
-
-    sums = np.zeros_like(words)
-    if len(features):
-        nearest, _ = vq(features, words)
-        np.add.at(sums, nearest, features - words[nearest])
-    sums = np.sign(sums) * np.sqrt(np.abs(sums))
-    return (sums / max(float(np.linalg.norm(sums)), 1e-9)).ravel()
+    signatures = np.zeros((len(descriptors), *words.shape), words.dtype)
+    for sums, features in zip(signatures, descriptors, strict=True):
+        if len(features):
+            nearest, _ = vq(features, words)
+            np.add.at(sums, nearest, features - words[nearest])
+        sums[:] = np.sign(sums) * np.sqrt(np.abs(sums))
+        sums /= max(float(np.linalg.norm(sums)), 1e-9)
+    return signatures.reshape(len(descriptors), -1)
 
 
 Mapper = Literal["incremental", "global"]
