@@ -151,11 +151,12 @@ def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
         raise ValueError(
             f"cannot store channels {unreadable}: a raw channel's name begins with one of {CHANNEL_PREFIXES}"
         )
-    color_names, colors = _color_columns(gaussians.sh)
+    constant, bands = gaussians.sh[:, :1].flatten(1), gaussians.sh[:, 1:].transpose(1, 2).flatten(1)
+    color_names = [*COLOR[: constant.shape[1]], *(f"f_rest_{i}" for i in range(bands.shape[1]))]
     scale_names = DISC_SCALE if gaussians.are_discs else SCALE
     names = [*POSITION, *NORMAL, *color_names, "opacity", *scale_names, *ROTATION, *gaussians.channels]
     normals = torch.zeros_like(gaussians.means)
-    columns = [gaussians.means, normals, colors, gaussians.logit_opacities[:, None], gaussians.log_scales]
+    columns = [gaussians.means, normals, constant, bands, gaussians.logit_opacities[:, None], gaussians.log_scales]
     columns += [gaussians.quats, *(channel[:, None] for channel in gaussians.channels.values())]
     rows = torch.cat([column.detach().to("cpu", torch.float32) for column in columns], dim=1)
     write_table(Path(path), names, rows.numpy())
@@ -184,15 +185,6 @@ def read_gaussians(path: Path | str) -> Gaussians:
         sh=sh,
         channels={name: column for name, column in columns.items() if is_channel(name)},
     )
-
-
-def _color_columns(sh: Tensor) -> tuple[list[str], Tensor]:
-    """Names and values [N, 3 K] of the colour properties; bands above 0 are stored channel by channel."""
-    count = sh.shape[1]
-    if count == 0:
-        return [], sh.reshape(sh.shape[0], 0)
-    rest = sh[:, 1:].transpose(1, 2).reshape(sh.shape[0], 3 * (count - 1))
-    return [*COLOR, *(f"f_rest_{i}" for i in range(rest.shape[1]))], torch.cat([sh[:, 0], rest], dim=1)
 
 
 def _read_sh(columns: Mapping[str, Tensor], path: Path) -> Tensor:

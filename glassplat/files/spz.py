@@ -298,11 +298,8 @@ def _read_gzip(data: bytes, path: Path) -> tuple[Layout, list[Bytes]]:
             f"{path} is cut off: its header announces {layout.number} Gaussians, which take {size} bytes, but "
             f"it has {len(body)}; copy or export it again"
         )
-    whole, at, sections = np.frombuffer(body, dtype=np.uint8), 0, []
-    for length in layout.sizes():
-        sections.append(whole[at : at + length])
-        at += length
-    return layout, sections
+    *ends, _ = np.cumsum(layout.sizes())
+    return layout, np.split(np.frombuffer(body, dtype=np.uint8, count=size), ends)
 
 
 def _read_streams(data: bytes, path: Path) -> tuple[Layout, list[Bytes]]:
