@@ -20,9 +20,9 @@ from filelock import FileLock, Timeout
 from glassplat import __version__
 from glassplat.captures.colmap_library import quiet_pycolmap
 from glassplat.captures.masks import IGNORE_FOLDER
-from glassplat.errors import InputError, join_names
+from glassplat.errors import InputError, convert_to_input_error, join_names
 from glassplat.files import writing
-from glassplat.files.records import read_json, readable_name
+from glassplat.files.records import ListOf, Optional, Text, check_fields, read_json, readable_name
 from glassplat.prepare.colmap import LensName, Mapper
 from glassplat.prepare.photographs import (
     FEWEST_PHOTOGRAPHS,
@@ -173,7 +173,9 @@ class WorkFolder:
                 "it with --force"
             )
         others = [name for name in found if name not in (*WRITTEN_NAMES, IGNORE_FOLDER) and not name.startswith(".")]
-        own = read_json(self.output / RECORD).get(MASKS_KEY, ())
+        record = self.output / RECORD
+        with convert_to_input_error():
+            own = check_fields(read_json(record), {MASKS_KEY: Optional(ListOf(Text()), ())}, str(record))[MASKS_KEY]
         others += [
             path.relative_to(self.output).as_posix()
             for path in sorted((self.output / IGNORE_FOLDER).rglob("*"))

@@ -117,6 +117,14 @@ def test_force_removes_only_what_was_prepared(tmp_path: Path, name: str) -> None
     WorkFolder(output).begin({}, resume=False, force=True)
 
 
+@pytest.mark.parametrize("record", ["[]", "{", '{"masks": 5}'])
+def test_force_keeps_a_capture_whose_record_is_damaged(record: str, tmp_path: Path) -> None:
+    (tmp_path / "capture").mkdir()
+    (tmp_path / "capture" / RECORD).write_text(record)
+    with pytest.raises(InputError, match=r"prepare\.json"):
+        WorkFolder(tmp_path / "capture").begin({}, resume=False, force=True)
+
+
 def test_a_mount_point_is_refused_as_output(
     photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
