@@ -16,7 +16,7 @@ from glassplat.captures.dataset import Dataset
 from glassplat.methods import mirrors
 from glassplat.methods.splat import image_term, strategy_of
 from glassplat.methods.splat_recipe import Primitive, SplatRecipe
-from glassplat.methods.surroundings import AddEnvironment, AddSurroundings, BeginReflections
+from glassplat.methods.surroundings import BeginReflections, add_environment
 from glassplat.options import BLACK
 from glassplat.render.deferred import INVISIBLE, Deferred
 from glassplat.render.splat import Splat
@@ -114,7 +114,7 @@ def _reflection_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
             ),
         ),
         post_steps=strategy.post_steps,
-        setup=reflection_setup(recipe),
+        setup=BeginReflections(recipe),
         densify_until=strategy.densify_until,
         is_finished=mirrors.found_nothing,
     )
@@ -147,7 +147,7 @@ def _matte_stages(recipe: DeferredRecipe, primitive: Primitive, seed: int, itera
             "gives better images. Reflections need %d --iterations; --least-iterations 1 forces them",
             iterations, recipe.least_iterations,
         )  # fmt: skip
-        _environment_setup(recipe)(state, dataset)
+        add_environment(recipe, state, dataset, texels=recipe.initial_texels)
 
     return replace(first, setup=setup), *later
 
@@ -159,17 +159,6 @@ def _rates_of_splat(recipe: DeferredRecipe) -> GaussianRates:
         if recipe.raise_rates_matte
         else recipe.rates
     )
-
-
-def reflection_setup(recipe: DeferredRecipe) -> BeginReflections:
-    """Setup that starts reflections."""
-    renderer = Splat(recipe.background or BLACK, depth=False)
-    return BeginReflections(_environment_setup(recipe), None, recipe.search, renderer, reset_sh_degree=True)
-
-
-def _environment_setup(recipe: DeferredRecipe) -> AddEnvironment:
-    """Setup that adds the environment."""
-    return AddEnvironment(min(recipe.first_texels, recipe.texels), recipe.region, recipe.find_region)
 
 
 def _edit_actions(recipe: DeferredRecipe, strategy: DensificationStrategy) -> tuple[Action, ...]:
@@ -257,11 +246,12 @@ def traced_stages(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHED_I
         refinement = replace(refinement, losses=distant.losses, renderer=distant.renderer)
     if recipe.mirrors == "environment":
         return bootstrap, distant, refinement
-    setup = reflection_setup(recipe.distant())
-    surroundings = AddSurroundings(recipe.surroundings.start, recipe.surroundings.sh_degree)
-    setup = replace(setup, surroundings=surroundings, reset_sh_degree=not recipe.harmonics_from_start)
-    if recipe.mirrors == "surroundings":
-        setup = replace(setup, environment=replace(setup.environment, texels=0))
+    setup = BeginReflections(
+        recipe,
+        recipe.surroundings,
+        has_environment=recipe.mirrors == "both",
+        reset_sh_degree=not recipe.harmonics_from_start,
+    )
     near = replace(_traced_stage(recipe, distant), setup=setup)
     return bootstrap, near, _traced_stage(recipe, refinement)
 

@@ -91,6 +91,11 @@ class GlossyOptions(MethodRecipe):
     reflection_rates: Internal[ReflectionRates] = field(default_factory=ReflectionRates)
     intervals: Intervals = field(default_factory=lambda: Intervals(opacity=0.005, least=150))
 
+    @property
+    def initial_texels(self) -> int:
+        """Edge length of the faces of the initial environment."""
+        return min(self.first_texels, self.texels)
+
     def contradiction(self) -> str | None:
         """Contradiction between the options, if any."""
         if self.schedule.stop <= self.bootstrap:

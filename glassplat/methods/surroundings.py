@@ -6,6 +6,7 @@ import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -13,15 +14,19 @@ from torch import Tensor
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import PointCloud
 from glassplat.methods.mirrors import mirror_lookalikes, turn_into_mirrors
-from glassplat.render.frame import Renderer
+from glassplat.options import BLACK
+from glassplat.render.splat import Splat
 from glassplat.scene import logit
 from glassplat.scene.camera import Camera, nearest_to_lines
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Environment
 from glassplat.training.densify import apply_edit, as_discs, morton_order, zero_moments
 from glassplat.training.messages import Working
-from glassplat.training.options import MirrorSearch, SurroundingsStart
 from glassplat.training.stage import TrainState
+
+if TYPE_CHECKING:
+    from glassplat.methods.glossy_recipes import GlossyOptions
+    from glassplat.training.options import SurroundingsOptions
 
 LARGEST_MISS = 0.35
 """Maximum distance of an optical axis from the common point, as a share of the camera's distance."""
@@ -142,101 +147,74 @@ def copied_surroundings(primary: Gaussians, chosen: Tensor, *, sh_degree: int) -
     return replace(kept, sh=sh, channels={}, active_sh_degree=min(kept.active_sh_degree, sh_degree))
 
 
-@dataclass(frozen=True)
-class AddEnvironment:
-    """Adds an environment of random noise.
+def add_environment(recipe: GlossyOptions, state: TrainState, dataset: Dataset, *, texels: int) -> None:
+    """Adds an environment of random noise, with faces of some texels or none, and the region of reflections.
 
-    Attributes:
-        texels: texels along the edge of a face; 0 for none, if only near surroundings are reflected.
-        region: centre and radius of the sphere outside which nothing reflects, world units; None for everywhere.
-        find_region: without a region, use the place that the cameras surround, if there is one.
+    That is the recipe's, or else the place that the cameras surround, if the recipe looks for it and there is one.
     """
-
-    texels: int
-    region: tuple[float, float, float, float] | None = None
-    find_region: bool = True
-
-    def __call__(self, state: TrainState, dataset: Dataset) -> None:
-        """Edits `state`."""
-        environment = state.scene.environment
-        if self.texels:
-            environment = Environment.random(self.texels, generator=state.generator("environment"))
-        region = self.region
-        if region is None and self.find_region:
-            region = reflective_region([view.camera for view in dataset.train])
-        state.scene = replace(state.scene, environment=replace(environment, region=region))
+    environment = state.scene.environment
+    if texels:
+        environment = Environment.random(texels, generator=state.generator("environment"))
+    region = recipe.region
+    if region is None and recipe.find_region:
+        region = reflective_region([view.camera for view in dataset.train])
+    state.scene = replace(state.scene, environment=replace(environment, region=region))
 
 
-@dataclass(frozen=True)
-class AddSurroundings:
-    """Adds Gaussians as surroundings for reflections.
-
-    Attributes:
-        start: options of the surroundings.
-        sh_degree: maximum SH degree of their colours.
-    """
-
-    start: SurroundingsStart
-    sh_degree: int
-
-    def __call__(self, state: TrainState, dataset: Dataset, matte: Tensor) -> None:
-        """Edits `state`; `matte` [N] bool are the primary Gaussians that may be copied."""
-        parts = []
-        if self.start.source != "box":
-            copies = copied_surroundings(state.scene.primary, matte, sh_degree=self.sh_degree)
-            parts = [copies] if len(copies) else []
-        # There is nothing to copy if everything reflects.
-        if self.start.source != "scene" or not parts:
-            parts.append(self._gaussians_in_box(state, dataset))
-        # The set with the highest active SH degree, which the result has, comes first.
-        found = reduce(Gaussians.concat, parts)
-        ordered, _ = apply_edit(found, {}, morton_order(found.means), part="surroundings")
-        state.scene = replace(state.scene, surroundings=ordered)
-
-    def _gaussians_in_box(self, state: TrainState, dataset: Dataset) -> Gaussians:
-        cells = self.start.cells or suitable_cells(dataset.photograph_pixels, self.start.per_cell)
-        found = surroundings_in_box(
-            percentile_box(dataset.points, self.start.outside),
-            cells=cells,
-            per_cell=self.start.per_cell,
-            sh_degree=self.sh_degree,
-            opacity=self.start.opacity,
+def add_surroundings(options: SurroundingsOptions, state: TrainState, dataset: Dataset, matte: Tensor) -> None:
+    """Adds Gaussians as surroundings for reflections; `matte` [N] bool are the primary ones that may be copied."""
+    start, primary, parts = options.start, state.scene.primary, []
+    if start.source != "box":
+        copies = copied_surroundings(primary, matte, sh_degree=options.sh_degree)
+        parts = [copies] if len(copies) else []
+    # There is nothing to copy if everything reflects.
+    if start.source != "scene" or not parts:
+        spread = surroundings_in_box(
+            percentile_box(dataset.points, start.outside),
+            cells=start.cells or suitable_cells(dataset.photograph_pixels, start.per_cell),
+            per_cell=start.per_cell,
+            sh_degree=options.sh_degree,
+            opacity=start.opacity,
             generator=state.generator("surroundings"),
         )
-        return as_discs(found, seed=state.seed) if state.scene.primary.are_discs else found
+        parts.append(as_discs(spread, seed=state.seed) if primary.are_discs else spread)
+    # The set with the highest active SH degree, which the result has, comes first.
+    found = reduce(Gaussians.concat, parts)
+    ordered, _ = apply_edit(found, {}, morton_order(found.means), part="surroundings")
+    state.scene = replace(state.scene, surroundings=ordered)
 
 
 @dataclass(frozen=True)
 class BeginReflections:
-    """Adds the surroundings, and turns Gaussians that look like mirrors into mirrors.
+    """Adds what is reflected, and turns Gaussians that look like mirrors into mirrors.
 
     Attributes:
-        environment: adds an environment and the region of reflections.
-        surroundings: adds near surroundings; None if only the environment is reflected.
-        mirrors: search for mirrors.
-        renderer: renderer of the previous stage.
+        recipe: options of environment and mirrors.
+        surroundings: options of near surroundings; None if only the environment is reflected.
+        has_environment: add an environment, and not only its region.
         reset_sh_degree: if mirrors were found, reset the SH degree to 0, because higher coefficients have learned their
             reflections.
     """
 
-    environment: AddEnvironment
-    surroundings: AddSurroundings | None
-    mirrors: MirrorSearch
-    renderer: Renderer
-    reset_sh_degree: bool = False
+    recipe: GlossyOptions
+    surroundings: SurroundingsOptions | None = None
+    has_environment: bool = True
+    reset_sh_degree: bool = True
 
     def __call__(self, state: TrainState, dataset: Dataset) -> Generator[Working, None, bool]:
         """Edits `state`."""
-        self.environment(state, dataset)
+        recipe, search = self.recipe, self.recipe.search
+        add_environment(recipe, state, dataset, texels=recipe.initial_texels if self.has_environment else 0)
         copies = self.surroundings is not None and self.surroundings.start.source != "box"
         seen = mirrors = torch.zeros(len(state.scene.primary), dtype=torch.bool)
-        if self.mirrors.begin_found or copies:
+        if search.begin_found or copies:
             yield Working("looking for mirrors", 0, 1)
-            seen, mirrors = mirror_lookalikes(self.mirrors, state.scene, dataset.train, self.renderer)
+            renderer = Splat(recipe.background or BLACK, depth=False)
+            seen, mirrors = mirror_lookalikes(search, state.scene, dataset.train, renderer)
         if self.surroundings is not None:
-            self.surroundings(state, dataset, seen & ~mirrors)
-        if self.mirrors.begin_found:
-            primary = turn_into_mirrors(self.mirrors, state.scene, dataset.train, mirrors)
+            add_surroundings(self.surroundings, state, dataset, seen & ~mirrors)
+        if search.begin_found:
+            primary = turn_into_mirrors(search, state.scene, dataset.train, mirrors)
             if self.reset_sh_degree and bool(mirrors.any()):
                 primary = replace(primary, active_sh_degree=0)
             state.scene = replace(state.scene, primary=primary)

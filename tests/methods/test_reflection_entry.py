@@ -11,12 +11,11 @@ from torch import Tensor
 
 from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
 from glassplat.methods.mirrors import GrowShAfterPropagation
-from glassplat.methods.surroundings import AddEnvironment, AddSurroundings, BeginReflections
-from glassplat.render.splat import Splat
+from glassplat.methods.surroundings import BeginReflections
 from glassplat.scene import logit
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import GrowSh, ResetOpacity
-from glassplat.training.options import MirrorSearch, SurroundingsStart
+from glassplat.training.options import MirrorSearch
 from glassplat.training.stage import TrainState
 from tests.training.progress_of import followed
 from tests.training.tiny_capture import tiny_capture
@@ -49,8 +48,8 @@ def begun(
     state.scene = replace(state.scene, primary=replace(state.scene.primary, active_sh_degree=1))
     ones = {name: torch.ones_like(tensor) for name, tensor in state.scene.primary.tensors().items()}
     state.optimizer.moments = {f"primary.{name}": (tensor, tensor.clone()) for name, tensor in ones.items()}
-    around = AddSurroundings(SurroundingsStart("scene"), 1) if near else None
-    setup = BeginReflections(AddEnvironment(2), around, search or MirrorSearch(), Splat(), reset_sh_degree)
+    recipe = TracedRecipe(first_texels=2, search=search or MirrorSearch())
+    setup = BeginReflections(recipe, recipe.surroundings if near else None, reset_sh_degree=reset_sh_degree)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("glassplat.methods.surroundings.mirror_lookalikes", found)
         messages, _ = followed(setup(state, tiny_capture()))

@@ -15,7 +15,7 @@ from glassplat.methods.glossy_recipes import TracedRecipe
 from glassplat.methods.mirrors import GrowShAfterPropagation, Propagate, RefineEnvironment
 from glassplat.methods.recipe import recipe_from_json, recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
-from glassplat.methods.surroundings import AddSurroundings
+from glassplat.methods.surroundings import add_surroundings
 from glassplat.render.traced import Traced, mirrored_contributions
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Environment, Scene
@@ -64,7 +64,7 @@ def surrounded_state(start: SurroundingsStart | None = None) -> TrainState:
     """A state with surroundings, as at the start of their stage but without the preceding training."""
     state = fresh_state()
     matte = torch.ones(len(state.scene.primary), dtype=torch.bool)
-    AddSurroundings(start or RECIPE.surroundings.start, 1)(state, tiny_capture(), matte)
+    add_surroundings(SurroundingsOptions(start or RECIPE.surroundings.start), state, tiny_capture(), matte)
     return state
 
 
@@ -183,14 +183,16 @@ def test_copies_keep_their_harmonics_outside_the_box() -> None:
     primary = replace(state.scene.primary, active_sh_degree=1)
     state.scene = replace(state.scene, primary=primary)
     everything = torch.ones(len(primary), dtype=torch.bool)
-    AddSurroundings(SurroundingsStart("both", cells=2), 1)(state, tiny_capture(), everything)
+    start = SurroundingsStart("both", cells=2)
+    add_surroundings(SurroundingsOptions(start), state, tiny_capture(), everything)
     assert len(state.scene.surroundings) == 40 + len(primary) and state.scene.surroundings.active_sh_degree == 1
 
 
 def test_a_fully_reflective_scene_has_no_surroundings_to_copy() -> None:
     state = fresh_state()
     nothing = torch.zeros(len(state.scene.primary), dtype=torch.bool)
-    AddSurroundings(SurroundingsStart("scene", cells=2), 1)(state, tiny_capture(), nothing)
+    start = SurroundingsStart("scene", cells=2)
+    add_surroundings(SurroundingsOptions(start), state, tiny_capture(), nothing)
     assert len(state.scene.surroundings) == 40
 
 
