@@ -35,7 +35,7 @@ single precision moves cameras by a percent of these distances."""
 
 def report_masks(label: int, plane: masks.FramedPlanes, views: Sequence[masks.PaneView]) -> None:
     """Logs how well each mask of a pane fits the others on its plane, and warns of those that do not fit, by name."""
-    matching, overlap = matching_outline_shares(plane, views), masks.agreement_per_view(plane.planes, views)
+    matching, overlap = matching_outline_shares(plane, views), masks.agreement_per_view(plane, views)
     shares = ["nothing to compare" if np.isnan(share) else f"{share:.0%}" for share in matching]
     found = [f"{view.name} {share}" for view, share in zip(views, shares, strict=True)]
     areas = ", ".join(f"{name} ({area:.2f})" for name, area in zip(found, overlap, strict=True))
@@ -70,7 +70,7 @@ def matching_outline_shares(plane: masks.FramedPlanes, views: Sequence[masks.Pan
     """
     views = [_without_shared_edges(view) for view in views]
     tolerance = max(MIDDLE_TOLERANCE, *(1 / view.diagonal for view in views))
-    matches = edge_matches(plane.planes, views, edges_per_view=EDGES_PER_VIEW)
+    matches = edge_matches(plane, views, edges_per_view=EDGES_PER_VIEW)
     matching = 1 / (1 + matches.residuals(plane.frames, tolerance)[0] ** 2)
     compared = matches.compared[0] & ~np.isnan(matching)
     shares = np.full(len(views), np.nan)
@@ -283,7 +283,7 @@ def _fit_plane(
 
 def _find_fault(plane: masks.FramedPlanes, objective: Objective, options: PlaneFit) -> ValueError | None:
     """The reason not to trust the plane of a pane; None if there is none."""
-    agreement = float(masks.mask_agreement(plane.planes, objective.views)[0])
+    agreement = float(masks.mask_agreement(plane, objective.views)[0])
     if agreement < options.least_agreement:
         return ValueError(
             f"no plane brings its masks together; on the best one they overlap by {agreement:.2f}, "
@@ -331,7 +331,7 @@ def _place_by_mirror_images(pane: _PanePlane, cloud: Array, cameras: Sequence[Ca
     if pane.is_settled or not (pane.fault is None or pane.is_undetermined):
         return pane
     try:
-        outlined = _fit_rectangle(pane.plane.planes, pane.evidence.views, options.margin)
+        outlined = _fit_rectangle(pane.plane, pane.evidence.views, options.margin)
     except ValueError:
         return pane
     some = cameras[:: -(-len(cameras) // MOST_CAMERAS)]
@@ -339,18 +339,17 @@ def _place_by_mirror_images(pane: _PanePlane, cloud: Array, cameras: Sequence[Ca
     panes = to_planes([outlined], [pane.label], options)
     seen = virtual_points(torch.from_numpy(cloud).float(), panes, some).numpy()
     behind, others, extent = cloud[seen], cloud[~seen], pane.evidence.extent
-    images = search.plane_of_mirror_images(pane.plane.planes, outlined.center, behind, others, extent)
+    images = search.plane_of_mirror_images(pane.plane, outlined.center, behind, others, extent)
     if images is None or not images.is_clear:
         return pane
-    plane = masks.FramedPlanes(images.plane, pane.plane.frames)
-    if _excess_contradiction(pane, plane) > MOST_EXCESS:
+    if _excess_contradiction(pane, images.plane) > MOST_EXCESS:
         return pane
     log.info(
         "pane %d: %.0f points seen through it are mirror images of others on a plane %.2f degrees from that of its "
         "masks, which has %.0f; using that plane",
-        pane.label, images.pairs, np.degrees(search.angle(pane.plane, plane)), images.before,
+        pane.label, images.pairs, np.degrees(search.angle(pane.plane, images.plane)), images.before,
     )  # fmt: skip
-    return replace(pane, plane=plane, fault=None, is_settled=True)
+    return replace(pane, plane=images.plane, fault=None, is_settled=True)
 
 
 def _excess_contradiction(pane: _PanePlane, plane: masks.FramedPlanes) -> float:
@@ -368,7 +367,7 @@ def _groups_in_one_surface(found: Sequence[_PanePlane]) -> list[list[int]]:
             return False
         # One of the planes may be tilted about its own middle, and so miss the other's middle by far.
         pairs = (first, second), (second, first)
-        rises = [abs(a.plane.planes.distances(b.evidence.anchors(b.plane.planes))) for a, b in pairs]
+        rises = [abs(a.plane.distances(b.evidence.anchors(b.plane))) for a, b in pairs]
         return float(np.min(rises)) <= MOST_SURFACE_OFFSET * first.evidence.extent
 
     return [group for group in connected_components(list(panes), may_share) if len(group) > 1]
@@ -404,7 +403,7 @@ def _finish_pane(pane: _PanePlane, options: PlaneFit, unmarked: Sequence[tuple[s
             photographs = _photographs_to_mark(views, unmarked)
             log.warning("pane %d: %s; annotate it from places farther apart%s", pane.label, reason, photographs)
         report_masks(pane.label, pane.plane, views)
-        return _fit_rectangle(pane.plane.planes, views, options.margin)
+        return _fit_rectangle(pane.plane, views, options.margin)
     except ValueError as error:
         raise PlaneFitError(
             f"pane {pane.label}, annotated in {len(views)} views: {error}. Check that label {pane.label} is the "
@@ -493,7 +492,7 @@ def _tilt_message(degrees: float, objective: Objective) -> str:
     )
 
 
-def _fit_rectangle(plane: masks.PlaneEquations, views: Sequence[masks.PaneView], margin: float) -> FittedRectangle:
+def _fit_rectangle(plane: masks.FramedPlanes, views: Sequence[masks.PaneView], margin: float) -> FittedRectangle:
     centers = np.stack([view.center for view in views])
     normal = plane.normals[0]
     if (np.sign(plane.distances(centers)[0])).sum() < 0:

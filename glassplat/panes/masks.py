@@ -67,16 +67,18 @@ def min_area_rectangle(points: Array) -> Rectangle:
 
 
 @dataclass(frozen=True)
-class PlaneEquations:
-    """H planes, the points x with normal . x = offset.
+class FramedPlanes:
+    """H planes, the points x with normal . x = offset, and the frames around their panes.
 
     Attributes:
         normals: [H, 3] unit normals.
         offsets: [H] signed distances of the planes from the origin.
+        frames: [H] heights of the frames above the glass, world units.
     """
 
     normals: Array
     offsets: Array
+    frames: Array
 
     def __len__(self) -> int:
         return len(self.offsets)
@@ -85,47 +87,27 @@ class PlaneEquations:
         """[H, N] signed distances of points [N, 3]."""
         return self.normals @ points.T - self.offsets[:, None]
 
-    def select(self, index: NDArray[np.int64]) -> PlaneEquations:
-        """The planes at `index`."""
-        return PlaneEquations(self.normals[index], self.offsets[index])
-
-
-@dataclass(frozen=True)
-class FramedPlanes:
-    """Planes with the heights of the frames around them.
-
-    Attributes:
-        planes: H planes.
-        frames: [H] heights of the frames above the glass, world units.
-    """
-
-    planes: PlaneEquations
-    frames: Array
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
     def select(self, index: NDArray[np.int64]) -> FramedPlanes:
         """The planes at `index`."""
-        return FramedPlanes(self.planes.select(index), self.frames[index])
+        return FramedPlanes(self.normals[index], self.offsets[index], self.frames[index])
 
 
 def join_planes(parts: Sequence[FramedPlanes]) -> FramedPlanes:
     """The planes of several sets, concatenated."""
-    normals = np.concatenate([part.planes.normals for part in parts])
-    offsets = np.concatenate([part.planes.offsets for part in parts])
-    return FramedPlanes(PlaneEquations(normals, offsets), np.concatenate([part.frames for part in parts]))
+    normals = np.concatenate([part.normals for part in parts])
+    offsets = np.concatenate([part.offsets for part in parts])
+    return FramedPlanes(normals, offsets, np.concatenate([part.frames for part in parts]))
 
 
-def in_plane_axes(planes: PlaneEquations) -> tuple[Array, Array]:
+def in_plane_axes(planes: FramedPlanes) -> tuple[Array, Array]:
     """Two unit vectors [H, 3] per plane, perpendicular to its normal and to each other."""
     first = np.cross(planes.normals, np.eye(3)[np.argmin(np.abs(planes.normals), axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return first, np.cross(planes.normals, first)
 
 
-def random_planes(points: Array, count: int, rng: np.random.Generator) -> PlaneEquations:
-    """Planes through random triplets of points [N, 3]; up to `count`, because nearly collinear triplets are dropped.
+def random_planes(points: Array, count: int, rng: np.random.Generator) -> FramedPlanes:
+    """Planes, without frames, through random triplets of points [N, 3]. Nearly collinear triplets are dropped.
 
     Args:
         points: [N, 3] at least three positions.
@@ -139,7 +121,7 @@ def random_planes(points: Array, count: int, rng: np.random.Generator) -> PlaneE
     spread = np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - a, axis=1)
     usable = area > 0.1 * np.maximum(spread, np.finfo(np.float64).tiny)
     normals = normals[usable] / area[usable, None]
-    return PlaneEquations(normals, np.einsum("hd,hd->h", normals, a[usable]))
+    return FramedPlanes(normals, np.einsum("hd,hd->h", normals, a[usable]), np.zeros(len(normals)))
 
 
 Mask = NDArray[np.bool_]
@@ -468,7 +450,7 @@ UNKNOWN_WEIGHT = 0.05
 """Weight of pixels that leave the other image; it penalises planes on which hardly anything can be compared."""
 
 
-def intersect_rays(planes: PlaneEquations, origin: Array, directions: Array) -> tuple[Array, Mask]:
+def intersect_rays(planes: FramedPlanes, origin: Array, directions: Array) -> tuple[Array, Mask]:
     """Intersections [H, P, 3] of rays with planes, and [H, P] bool: those in front of the origin.
 
     Args:
@@ -483,7 +465,7 @@ def intersect_rays(planes: PlaneEquations, origin: Array, directions: Array) -> 
     return origin + np.where(hit, along, 0)[..., None] * directions, hit
 
 
-def mask_agreement(planes: PlaneEquations, views: Sequence[PaneView], *, pixels_per_view: int = RAYS_PER_VIEW) -> Array:
+def mask_agreement(planes: FramedPlanes, views: Sequence[PaneView], *, pixels_per_view: int = RAYS_PER_VIEW) -> Array:
     """[H] agreement of the masks on each plane: intersection over union, pooled over pairs of views.
 
     Args:
@@ -496,14 +478,14 @@ def mask_agreement(planes: PlaneEquations, views: Sequence[PaneView], *, pixels_
     return agreement
 
 
-def agreement_per_view(plane: PlaneEquations, views: Sequence[PaneView]) -> Array:
+def agreement_per_view(plane: FramedPlanes, views: Sequence[PaneView]) -> Array:
     """[V] agreement of the mask of each view with those of all others on one plane; as in `mask_agreement`."""
     both, either = (pairs[0] + pairs[0].T for pairs in _overlaps(plane, views, RAYS_PER_VIEW))
     agreement: Array = both.sum(axis=1) / np.maximum(either.sum(axis=1), 1)
     return agreement
 
 
-def _overlaps(planes: PlaneEquations, views: Sequence[PaneView], pixels_per_view: int) -> tuple[Array, Array]:
+def _overlaps(planes: FramedPlanes, views: Sequence[PaneView], pixels_per_view: int) -> tuple[Array, Array]:
     """Pixel counts of the intersection and the union of the masks of two views; [H, V, V], from and to."""
     grids = [view.pixel_grid(pixels_per_view) for view in views]
     seen = [pixels[view.is_unoccluded(pixels)] for view, pixels in zip(views, grids, strict=True)]

@@ -12,7 +12,7 @@ both follow from the geometry:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,6 @@ from glassplat.panes.masks import (
     UNKNOWN_WEIGHT,
     FramedPlanes,
     PaneView,
-    PlaneEquations,
     Rectangle,
     cameras_of,
     in_plane_axes,
@@ -66,7 +65,7 @@ class EdgeMatches:
         return (self.distances - hidden) / np.sqrt(tolerance**2 + (UNEVEN_FRAME * hidden) ** 2)
 
 
-def edge_matches(planes: PlaneEquations, views: Sequence[PaneView], *, edges_per_view: int) -> EdgeMatches:
+def edge_matches(planes: FramedPlanes, views: Sequence[PaneView], *, edges_per_view: int) -> EdgeMatches:
     """Maps the mask edge of each view into every other view.
 
     Args:
@@ -87,7 +86,7 @@ def edge_matches(planes: PlaneEquations, views: Sequence[PaneView], *, edges_per
     return EdgeMatches(found.distances, found.shifts, found.compared, misalignments, edges.sources)
 
 
-def _side_misalignments(planes: PlaneEquations, outward: Array) -> Array:
+def _side_misalignments(planes: FramedPlanes, outward: Array) -> Array:
     """[H, P] sine of twice the angle between directions in the plane and the nearest side of the pane.
 
     Its sign is relative to the dominant direction of the edges, whatever the axes of the plane: a sign that flips after
@@ -110,8 +109,8 @@ LEAST_RAY_COSINE = 0.1
 """Cosine between a plane's normal and a ray through the mask below which a random plane is dropped."""
 
 
-def planes_through_masks(views: Sequence[PaneView], count: int, rng: np.random.Generator) -> PlaneEquations:
-    """Up to `count` random planes, each through a pixel of a mask and facing that camera.
+def planes_through_masks(views: Sequence[PaneView], count: int, rng: np.random.Generator) -> FramedPlanes:
+    """Up to `count` random planes without frames, each through a pixel of a mask and facing that camera.
 
     Depths are log-uniform, normals uniform on the hemisphere; planes at grazing angles are dropped.
 
@@ -136,12 +135,13 @@ def planes_through_masks(views: Sequence[PaneView], count: int, rng: np.random.G
     normals *= np.where(towards < 0, -1, 1)[:, None]
     usable = np.abs(towards) > LEAST_RAY_COSINE
     points = centers[source] + depths[:, None] * rays
-    return PlaneEquations(normals[usable], np.einsum("hd,hd->h", normals, points)[usable])
+    offsets = np.einsum("hd,hd->h", normals, points)
+    return FramedPlanes(normals[usable], offsets[usable], np.zeros(int(usable.sum())))
 
 
 def sample_nearby(
-    planes: PlaneEquations, anchors: Array, count: int, *, tilt: float, shift: Array | float, rng: np.random.Generator
-) -> PlaneEquations:
+    planes: FramedPlanes, anchors: Array, count: int, *, tilt: float, shift: Array | float, rng: np.random.Generator
+) -> FramedPlanes:
     """[H * (1 + count)] each plane followed by `count` random ones around it.
 
     Args:
@@ -159,14 +159,14 @@ def sample_nearby(
     return move_planes(planes.select(index), anchors[index], steps.reshape(-1, 3))
 
 
-def move_planes(planes: PlaneEquations, anchors: Array, steps: Array) -> PlaneEquations:
+def move_planes(planes: FramedPlanes, anchors: Array, steps: Array) -> FramedPlanes:
     """Each plane after a small move [H, 3]: two tilts about the point nearest to its anchor [H, 3], and a shift."""
     normals, (first, second) = planes.normals, in_plane_axes(planes)
     heights = np.einsum("hd,hd->h", normals, anchors) - planes.offsets
     feet = anchors - heights[:, None] * normals
     tilted = normals + steps[:, :1] * first + steps[:, 1:2] * second
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
-    return PlaneEquations(tilted, np.einsum("hd,hd->h", tilted, feet) + steps[:, 2])
+    return replace(planes, normals=tilted, offsets=np.einsum("hd,hd->h", tilted, feet) + steps[:, 2])
 
 
 COARSE_TOLERANCE, MIDDLE_TOLERANCE, FINE_TOLERANCE = TOLERANCES = (0.01, 0.004, 0.002)
@@ -222,17 +222,17 @@ class Objective:
     extent: float
     distance: float
 
-    def inlier_share(self, planes: PlaneEquations) -> Array:
+    def inlier_share(self, planes: FramedPlanes) -> Array:
         """[H] share of the points near each plane; 0 if there are no points."""
         if not len(self.points):
             return np.zeros(len(planes))
         return np.asarray((np.abs(planes.distances(self.points)) <= self.distance).mean(axis=1))
 
-    def agreement(self, planes: PlaneEquations) -> Array:
+    def agreement(self, planes: FramedPlanes) -> Array:
         """[H] agreement of the masks on each plane (`mask_agreement`)."""
         return mask_agreement(planes, self.views, pixels_per_view=max(OVERLAP_PIXELS // len(self.views), 1))
 
-    def anchors(self, planes: PlaneEquations) -> Array:
+    def anchors(self, planes: FramedPlanes) -> Array:
         """[H, 3] a point near the middle of the pane on each plane, from the middles of the masks."""
         centers, weight_sums = np.zeros((len(planes), 3)), np.zeros(len(planes))
         for view in self.views:
@@ -245,7 +245,7 @@ class Objective:
             weight_sums += weights
         return centers / np.maximum(weight_sums, np.finfo(np.float64).tiny)[:, None]
 
-    def camera_distance(self, planes: PlaneEquations) -> Array:
+    def camera_distance(self, planes: FramedPlanes) -> Array:
         """[H] median distance of the cameras from the middle of the pane."""
         centers = np.stack([view.center for view in self.views])
         away: Array = np.median(np.linalg.norm(self.anchors(planes)[:, None] - centers, axis=2), axis=1)
@@ -261,13 +261,13 @@ class Objective:
             edges: number of edge points in all views together.
         """
         tolerance = max(tolerance, *(1 / view.diagonal for view in self.views))
-        matches = edge_matches(planes.planes, self.views, edges_per_view=max(edges // len(self.views), 1))
+        matches = edge_matches(planes, self.views, edges_per_view=max(edges // len(self.views), 1))
         hypotheses = len(planes)
         known = matches.compared.sum(axis=(1, 2))
         unknown = UNKNOWN_WEIGHT * (matches.misalignments.shape[1] * (len(self.views) - 1) - known)
         edge_weight = 1 / np.maximum(known + unknown, 1)
         edge_residuals = matches.residuals(planes.frames, tolerance).reshape(hypotheses, -1)
-        point_residuals = planes.planes.distances(self.points) / self.distance
+        point_residuals = planes.distances(self.points) / self.distance
         frames = planes.frames[:, None] / (USUAL_FRAME * self.extent)
         residuals = (edge_residuals, matches.misalignments / OUTLINE_TOLERANCE, point_residuals, frames)
         outline_weight = OUTLINE_WEIGHT / matches.misalignments.shape[1]
@@ -300,15 +300,15 @@ class JointObjective:
         """Radius of the capture in world units."""
         return self.parts[0].extent
 
-    def agreement(self, planes: PlaneEquations) -> Array:
+    def agreement(self, planes: FramedPlanes) -> Array:
         """[H] agreement of the masks on each plane, averaged over the panes."""
         return _mean([part.agreement(planes) for part in self.parts])
 
-    def anchors(self, planes: PlaneEquations) -> Array:
+    def anchors(self, planes: FramedPlanes) -> Array:
         """[H, 3] a point near the middle of all panes on each plane."""
         return _mean([part.anchors(planes) for part in self.parts])
 
-    def camera_distance(self, planes: PlaneEquations) -> Array:
+    def camera_distance(self, planes: FramedPlanes) -> Array:
         """[H] median distance of the cameras from the middle of a pane, averaged over the panes."""
         return _mean([part.camera_distance(planes) for part in self.parts])
 
@@ -335,7 +335,7 @@ LEAST_AGREEING_SHARE = 0.34
 """Minimum share, of the views of a point, that show the pane there; others may be occluded."""
 
 
-def pane_rectangle(plane: PlaneEquations, views: Sequence[PaneView], axes: Array) -> Rectangle:
+def pane_rectangle(plane: FramedPlanes, views: Sequence[PaneView], axes: Array) -> Rectangle:
     """The smallest rectangle, on one plane, around the region of the pane in the masks.
 
     The paper's Appendix A bounds the inliers of the plane fit. Here the masks' pixels are projected onto the plane
@@ -366,7 +366,7 @@ def pane_rectangle(plane: PlaneEquations, views: Sequence[PaneView], axes: Array
     return min_area_rectangle(grid[_without_specks(inside.reshape(grid.shape[:2]))])
 
 
-def _pixels_on_plane(plane: PlaneEquations, view: PaneView) -> Array:
+def _pixels_on_plane(plane: FramedPlanes, view: PaneView) -> Array:
     """[P, 3] points of the plane that are seen through the pixels of a mask."""
     pixels = view.pixel_grid(OUTLINE_PIXELS)
     directions = view.directions(pixels[view.covers(pixels)])

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from glassplat.kernels.plane_search import Field, sum_mirrored
-from glassplat.panes.masks import FramedPlanes, PlaneEquations, join_planes, random_planes
+from glassplat.panes.masks import FramedPlanes, join_planes, random_planes
 from glassplat.panes.objective import (
     COARSE_TOLERANCE,
     EDGE_POINTS,
@@ -65,7 +66,7 @@ def _minimise(planes: FramedPlanes, objective: Evidence, tolerance: float) -> Fr
     """All planes after damped Gauss-Newton steps; converged planes are moved no further."""
     count = len(planes)
     damping, active = np.full(count, FIRST_DAMPING), np.arange(count)
-    anchors, scales = objective.anchors(planes.planes), _scales(planes, objective)
+    anchors, scales = objective.anchors(planes), _scales(planes, objective)
     for _ in range(ITERATIONS):
         moving = planes.select(active)
         cost, hessian, gradient = _gauss_newton(moving, objective, tolerance, anchors[active], scales[active])
@@ -87,7 +88,7 @@ def _minimise(planes: FramedPlanes, objective: Evidence, tolerance: float) -> Fr
 def _scales(planes: FramedPlanes, objective: Evidence) -> Array:
     """[H, 4] units of each plane's parameters: a radian for two tilts, a distance of the cameras, a scene extent."""
     ones = np.ones(len(planes))
-    return np.stack([ones, ones, objective.camera_distance(planes.planes), objective.extent * ones], axis=1)
+    return np.stack([ones, ones, objective.camera_distance(planes), objective.extent * ones], axis=1)
 
 
 def _gauss_newton(
@@ -127,7 +128,7 @@ def _derivative_products(first: Array, second: Array) -> Array:
 
 def _step_planes(planes: FramedPlanes, anchors: Array, steps: Array) -> FramedPlanes:
     """The planes after steps [H, 4]: two tilts, a shift, and a change of the frame's height, clamped at 0."""
-    return FramedPlanes(move_planes(planes.planes, anchors, steps[:, :3]), np.maximum(planes.frames + steps[:, 3], 0))
+    return replace(move_planes(planes, anchors, steps[:, :3]), frames=np.maximum(planes.frames + steps[:, 3], 0))
 
 
 def tilt_uncertainty(planes: FramedPlanes, objective: Evidence, tolerance: float) -> Array:
@@ -135,7 +136,7 @@ def tilt_uncertainty(planes: FramedPlanes, objective: Evidence, tolerance: float
 
     It follows from the Gauss-Newton matrix at the plane, where shift and frame height are free to adapt.
     """
-    anchors, scales = objective.anchors(planes.planes), _scales(planes, objective)
+    anchors, scales = objective.anchors(planes), _scales(planes, objective)
     here, residuals = _perturbed_terms(planes, objective, tolerance, anchors, scales)
     # Where an edge point enters or leaves an image, its residual jumps from or to zero, which is not a derivative.
     jacobian = np.where((residuals == 0) == (here.residuals == 0), residuals - here.residuals, 0) / STEP
@@ -215,7 +216,7 @@ def contradiction(
 ) -> Array:
     """[H] evidence against planes: cost, averaged over tolerances, less mask agreement; no unit, near 0 on the pane."""
     costs = [objective.terms(planes, tolerance, edges=edges).cost for tolerance in tolerances]
-    mean: Array = np.mean(costs, axis=0) - AGREEMENT_WEIGHT * objective.agreement(planes.planes)
+    mean: Array = np.mean(costs, axis=0) - AGREEMENT_WEIGHT * objective.agreement(planes)
     return mean
 
 
@@ -229,9 +230,9 @@ def first_hypotheses(objective: Objective, count: int, rng: np.random.Generator)
     if len(objective.points) >= 3:
         through = random_planes(objective.points, count, rng)
         drawn.append(through.select(np.argsort(-objective.inlier_share(through), kind="stable")[: count // 4]))
-    usual = USUAL_FRAME * objective.extent
-    planes = join_planes([FramedPlanes(part, np.full(len(part), usual)) for part in drawn])
-    scores = objective.agreement(planes.planes) + AGREEMENT_WEIGHT * objective.inlier_share(planes.planes)
+    planes = join_planes(drawn)
+    planes = replace(planes, frames=np.full(len(planes), USUAL_FRAME * objective.extent))
+    scores = objective.agreement(planes) + AGREEMENT_WEIGHT * objective.inlier_share(planes)
     pool = planes.select(np.argsort(-scores, kind="stable")[:POOL_SIZE])
     best_first = _best_planes(pool, objective, least=KEPT_BY_AREAS)
     costs = contradiction(best_first, objective, (SEARCH_ROUNDS[0][2],), edges=COARSE_EDGES)
@@ -245,11 +246,11 @@ def _follow_beam(
 ) -> FramedPlanes:
     """The best of the planes sampled around each plane of the beam, best first."""
     tilt, shift, tolerance = search_round
-    shifts = shift * objective.camera_distance(beam.planes)
-    around = sample_nearby(beam.planes, objective.anchors(beam.planes), SAMPLES_EACH, tilt=tilt, shift=shifts, rng=rng)
+    shifts = shift * objective.camera_distance(beam)
+    around = sample_nearby(beam, objective.anchors(beam), SAMPLES_EACH, tilt=tilt, shift=shifts, rng=rng)
     factors = np.exp(FRAME_SPREAD * rng.standard_normal((len(beam), 1 + SAMPLES_EACH)))
     factors[:, 0] = 1
-    family = FramedPlanes(around, (beam.frames[:, None] * factors).ravel())
+    family = replace(around, frames=(beam.frames[:, None] * factors).ravel())
     costs = objective.terms(family, tolerance, edges=COARSE_EDGES).cost.reshape(factors.shape)
     best = np.arange(len(beam)) * (1 + SAMPLES_EACH) + costs.argmin(axis=1)
     return family.select(best[np.argsort(costs.min(axis=1), kind="stable")])
@@ -272,7 +273,7 @@ def _best_planes(planes: FramedPlanes, objective: Evidence, *, least: int = 0) -
 
     Where other panes or posts occlude much of a pane, edges that meet by chance may fit better than its own.
     """
-    agreement = objective.agreement(planes.planes)
+    agreement = objective.agreement(planes)
     kept = (agreement >= LEAST_OF_BEST * agreement.max()) | (np.arange(len(planes)) < least)
     return planes.select(np.flatnonzero(kept))
 
@@ -311,14 +312,14 @@ def highest_scoring_plane(label: int, fits: Sequence[PlaneCandidate], evidence: 
         verdict = "kept" if fit is fits[kept] else f"{apart:.2f} degrees from the one that is kept"
         log.debug(
             "pane %d: the plane fitted to %s scores %.3f, with %.0f %% of %d points along its edge on it; %s",
-            label, fit.source, found, 100 * evidence.inlier_share(fit.plane.planes)[0], len(evidence.points), verdict,
+            label, fit.source, found, 100 * evidence.inlier_share(fit.plane)[0], len(evidence.points), verdict,
         )  # fmt: skip
     return fits[kept].plane
 
 
 def angle(one: FramedPlanes, other: FramedPlanes) -> float:
     """Angle in radians between the first planes of two sets, regardless of the signs of their normals."""
-    first, second = one.planes.normals[0], other.planes.normals[0]
+    first, second = one.normals[0], other.normals[0]
     return float(np.arctan2(np.linalg.norm(np.cross(first, second)), abs(first @ second)))
 
 
@@ -349,7 +350,7 @@ class MirrorImages(NamedTuple):
         peak: ratio of the number of pairs to that of the best plane tilted elsewhere.
     """
 
-    plane: PlaneEquations
+    plane: FramedPlanes
     pairs: float
     before: float
     peak: float
@@ -362,7 +363,7 @@ class MirrorImages(NamedTuple):
 
 
 def plane_of_mirror_images(
-    plane: PlaneEquations, middle: Array, behind: Array, others: Array, extent: float
+    plane: FramedPlanes, middle: Array, behind: Array, others: Array, extent: float
 ) -> MirrorImages | None:
     """The plane near the first one of `plane` that maps most points seen through a pane onto others.
 
@@ -390,7 +391,7 @@ def plane_of_mirror_images(
     turns = np.tan(np.radians(np.arange(-IMAGE_TILT, IMAGE_TILT + 1e-9, IMAGE_TILT_STEP)))
     shifts = extent * np.arange(-IMAGE_SHIFT, IMAGE_SHIFT + 1e-9, IMAGE_SHIFT_STEP)
 
-    def moved_planes(steps: Array) -> PlaneEquations:
+    def moved_planes(steps: Array) -> FramedPlanes:
         index = np.zeros(len(steps), np.int64)
         return move_planes(plane.select(index), middle[None][index], steps)
 

@@ -11,8 +11,8 @@ import torch
 from glassplat.kernels.plane_search import STEEPEST, Cameras, Edges, Field, follow_edges, sum_mirrored
 from glassplat.panes.masks import (
     UNKNOWN_WEIGHT,
+    FramedPlanes,
     PaneView,
-    PlaneEquations,
     agreement_per_view,
     intersect_rays,
     mask_agreement,
@@ -37,7 +37,7 @@ def views() -> list[PaneView]:
 
 
 @pytest.fixture(scope="module")
-def planes() -> PlaneEquations:
+def planes() -> FramedPlanes:
     """The pane's plane, planes near it, arbitrary planes, and planes with a camera on or behind them."""
     rng = np.random.default_rng(0)
     normals = np.concatenate([np.tile(FRONT.normal, (30, 1)) + 0.05 * rng.standard_normal((30, 3)), SIDE.normal[None]])
@@ -45,10 +45,10 @@ def planes() -> PlaneEquations:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     offsets = normals @ FRONT.center + 0.2 * rng.standard_normal(len(normals))
     offsets[0], offsets[-2:] = FRONT.normal @ FRONT.center, (-1.0, -1.5)
-    return PlaneEquations(normals, offsets)
+    return FramedPlanes(normals, offsets, np.zeros(len(normals)))
 
 
-def pixel_and_frame(planes: PlaneEquations, view: PaneView, points: Array, outward: Array) -> tuple[Array, Array]:
+def pixel_and_frame(planes: FramedPlanes, view: PaneView, points: Array, outward: Array) -> tuple[Array, Array]:
     """Size on the plane of a pixel across an edge, and of the part hidden by a frame of height one; [H, P] each."""
     height = np.abs(planes.normals @ view.center - planes.offsets)[:, None]
     beyond = np.einsum("hpd,hpd->hp", outward, view.center - points)
@@ -57,7 +57,7 @@ def pixel_and_frame(planes: PlaneEquations, view: PaneView, points: Array, outwa
     return depth * np.sqrt(1 + steep**2) / np.sqrt(view.intrinsics[:2].prod()), np.clip(steep, 0, STEEPEST)
 
 
-def test_followed_edges_are_those_of_the_definition(views: list[PaneView], planes: PlaneEquations) -> None:
+def test_followed_edges_are_those_of_the_definition(views: list[PaneView], planes: FramedPlanes) -> None:
     matches = edge_matches(planes, views, edges_per_view=40)
     seen = []
     for number, view in enumerate(views):
@@ -92,7 +92,7 @@ def test_followed_edges_are_those_of_the_definition(views: list[PaneView], plane
 
 
 def test_edges_are_unknown_where_distances_are_unknown(views: list[PaneView]) -> None:
-    plane = PlaneEquations(FRONT.normal[None], np.array([FRONT.normal @ FRONT.center]))
+    plane = FRONT.plane
     known = edge_matches(plane, views, edges_per_view=60)
     blind = replace(views[1], distance=np.full(views[1].distance.shape, np.nan))
     found = edge_matches(plane, [views[0], blind, *views[2:]], edges_per_view=60)
@@ -121,7 +121,7 @@ def test_images_of_any_size_are_interpolated_up_to_their_rims(shape: tuple[int, 
     np.testing.assert_allclose(found.distances[0, 1], expected, rtol=1e-9, atol=1e-12)
 
 
-def test_overlaps_are_those_of_the_definition(views: list[PaneView], planes: PlaneEquations) -> None:
+def test_overlaps_are_those_of_the_definition(views: list[PaneView], planes: FramedPlanes) -> None:
     both, either = np.zeros((2, len(views), len(views), len(planes)))
     for number, source in enumerate(views):
         pixels = source.pixel_grid(90)
@@ -158,7 +158,7 @@ def test_a_field_is_summed_over_mirror_images() -> None:
     np.testing.assert_allclose(sum_mirrored(normals, offsets, points, Field(values, corner, cell)), expected, rtol=1e-6)
 
 
-def test_threads_change_no_bit(views: list[PaneView], planes: PlaneEquations) -> None:
+def test_threads_change_no_bit(views: list[PaneView], planes: FramedPlanes) -> None:
     def compute() -> list[torch.Tensor]:
         matches = edge_matches(planes, views, edges_per_view=40)
         return [torch.from_numpy(found) for found in (matches.distances, matches.shifts, matches.misalignments)]

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
+from glassplat.panes.masks import FramedPlanes
 from glassplat.render.deferred import view_directions
 from glassplat.scene.camera import Camera
 from glassplat.scene.panes import Planes
@@ -22,6 +23,11 @@ class Pane:
     normal: np.ndarray
     tangent: np.ndarray
     half_sizes: tuple[float, float]
+
+    @property
+    def plane(self) -> FramedPlanes:
+        """Its plane, without a frame."""
+        return FramedPlanes(self.normal[None], np.array([self.normal @ self.center]), np.zeros(1))
 
     @property
     def bitangent(self) -> np.ndarray:

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from glassplat.panes.masks import FramedPlanes, PaneView, PlaneEquations, pane_views
+from glassplat.panes.masks import PaneView, pane_views
 from glassplat.panes.objective import Objective, edge_matches, move_planes
 from glassplat.panes.search import refine_planes, tilt_uncertainty
 from tests.panes.pane_scene import EYES, FRONT, framed_scene_of, scene_of
 
-TRUTH = PlaneEquations(FRONT.normal[None], np.array([FRONT.normal @ FRONT.center]))
+TRUTH = FRONT.plane
 BEYOND = ((2.6, 0.0, 0.3), (-1.9, 0.4, 0.6), (0.2, 0.2, -1.2))
 HEIGHT = 0.12
 PIXEL = 1 / np.hypot(220, 300)
@@ -37,11 +37,11 @@ def test_a_frame_explains_edges_that_do_not_meet() -> None:
 def test_refinement_measures_the_frame() -> None:
     views = pane_views(framed_scene_of(FRONT, HEIGHT, BEYOND), 1)
     objective = Objective(views, np.zeros((0, 3)), 3.0, 0.03)
-    start = FramedPlanes(PlaneEquations(TRUTH.normals, TRUTH.offsets + 0.01), np.array([0.06]))
+    start = replace(TRUTH, offsets=TRUTH.offsets + 0.01, frames=np.array([0.06]))
     found = refine_planes(start, objective, (0.01, 0.004))
     assert found.frames[0] == pytest.approx(HEIGHT, rel=0.15)
-    assert found.planes.offsets[0] == pytest.approx(TRUTH.offsets[0], abs=0.01)
-    assert found.planes.normals[0] @ TRUTH.normals[0] > np.cos(np.radians(0.5))
+    assert found.offsets[0] == pytest.approx(TRUTH.offsets[0], abs=0.01)
+    assert found.normals[0] @ TRUTH.normals[0] > np.cos(np.radians(0.5))
 
 
 def upper(view: PaneView) -> np.ndarray:
@@ -52,20 +52,19 @@ def upper(view: PaneView) -> np.ndarray:
 
 def test_doubt_is_small_where_all_sides_are_seen_and_large_where_one_is() -> None:
     views = pane_views(scene_of([FRONT]), 1)
-    planes = FramedPlanes(TRUTH, np.zeros(1))
     nothing = (np.zeros((0, 3)), 3.0, 0.03)
-    assert tilt_uncertainty(planes, Objective(views, *nothing), 0.004)[0] < np.radians(1)
+    assert tilt_uncertainty(TRUTH, Objective(views, *nothing), 0.004)[0] < np.radians(1)
     level = [
         replace(view, edge=view.edge[sides], outward=view.outward[sides]) for view in views for sides in [upper(view)]
     ]
-    assert tilt_uncertainty(planes, Objective(level, *nothing), 0.004)[0] > np.radians(10)
+    assert tilt_uncertainty(TRUTH, Objective(level, *nothing), 0.004)[0] > np.radians(10)
 
 
 def test_edges_cut_by_the_image_border_do_not_reduce_the_uncertainty() -> None:
     views = pane_views(scene_of([FRONT], [*EYES, (0.9, -0.5, 0.9), (-0.5, 0.4, 1.0)]), 1)
     steps = 1e-3 * np.random.default_rng(0).standard_normal((40, 3))
     around = move_planes(TRUTH.select(np.zeros(40, dtype=np.int64)), np.tile(FRONT.center, (40, 1)), steps)
-    doubts = tilt_uncertainty(FramedPlanes(around, np.zeros(40)), Objective(views, np.zeros((0, 3)), 2.0, 0.02), 0.004)
+    doubts = tilt_uncertainty(around, Objective(views, np.zeros((0, 3)), 2.0, 0.02), 0.004)
     assert doubts.max() < 1.1 * doubts.min()
 
 

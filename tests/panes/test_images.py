@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from glassplat.panes.fit import fit_planes
-from glassplat.panes.masks import PlaneEquations
+from glassplat.panes.masks import FramedPlanes
 from glassplat.panes.search import MirrorImages, _proximity_field, plane_of_mirror_images
 from glassplat.scene.camera import rotation_from_quat
 from tests.panes.pane_scene import EYES, FRONT, Pane, normal_error, offset_error, scene_of
@@ -40,14 +40,14 @@ def images_of(points: np.ndarray, seed: int) -> np.ndarray:
     return mirrored + np.random.default_rng(seed).normal(scale=NOISE, size=mirrored.shape)
 
 
-def turned(degrees: float, shift: float) -> PlaneEquations:
+def turned(degrees: float, shift: float) -> FramedPlanes:
     """The pane's plane, rotated about an axis in it and moved along its normal."""
     angle = np.radians(degrees)
     normal = np.cos(angle) * FRONT.normal + np.sin(angle) * np.array([0.6, 0.8, 0.0])
-    return PlaneEquations(normal[None], np.array([normal @ FRONT.center + shift]))
+    return replace(FRONT, normal=normal, center=FRONT.center + shift * normal).plane
 
 
-def searched(plane: PlaneEquations, behind: np.ndarray, others: np.ndarray) -> MirrorImages:
+def searched(plane: FramedPlanes, behind: np.ndarray, others: np.ndarray) -> MirrorImages:
     middle = FRONT.center + (plane.offsets[0] - plane.normals[0] @ FRONT.center) * plane.normals[0]
     found = plane_of_mirror_images(plane, middle, behind, others, EXTENT)
     assert found is not None
@@ -93,7 +93,7 @@ def test_neither_units_nor_the_frame_matter() -> None:
     behind, plane = images_of(room, 1), turned(7, 0.05)
     turn = rotation_from_quat(torch.tensor([0.8, 0.3, -0.2, 0.5], dtype=torch.float64)).numpy()
     scale, middle = 40.0, FRONT.center + 0.05 * plane.normals[0]
-    moved = PlaneEquations(plane.normals @ turn.T, scale * plane.offsets)
+    moved = replace(plane, normals=plane.normals @ turn.T, offsets=scale * plane.offsets)
     first = plane_of_mirror_images(plane, middle, behind, room, EXTENT)
     elsewhere = [scale * points @ turn.T for points in (middle, behind, room)]
     second = plane_of_mirror_images(moved, *elsewhere, scale * EXTENT)

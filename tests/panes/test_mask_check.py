@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from glassplat.panes import PlaneFit
 from glassplat.panes.fit import fit_planes, matching_outline_shares, outlier_masks, report_masks
-from glassplat.panes.masks import FramedPlanes, PlaneEquations, pane_views
+from glassplat.panes.masks import pane_views
 from tests.panes.pane_scene import EYES, FRONT, Annotations, Pane, frame_and_clutter, scene_of
 
 QUICK = PlaneFit(hypotheses=300, refined=2)
@@ -54,16 +55,14 @@ def test_masks_are_not_called_wrong_where_poses_are_imprecise(
         view.cam_from_world[:3, 3] += 0.3 * (offset > 0)
     for view in views:
         view.cam_from_world[:3, 3] -= view.cam_from_world[:3, :3] @ [0, 0, offset]
-    distance = FRONT.normal @ (FRONT.center + np.array([0, 0, offset]))
-    report_masks(1, FramedPlanes(PlaneEquations(FRONT.normal[None], np.array([distance])), np.zeros(1)), views)
+    report_masks(1, replace(FRONT, center=FRONT.center + np.array([0, 0, offset])).plane, views)
     assert caplog.text.count("do not fit") == count
 
 
 def test_views_without_an_outline_are_no_evidence() -> None:
     (camera, labels), *others = scene_of([FRONT])
     views = pane_views([(camera, labels.new_ones(labels.shape)), *others], 1)
-    plane = FramedPlanes(PlaneEquations(FRONT.normal[None], np.array([FRONT.normal @ FRONT.center])), np.zeros(1))
-    assert not outlier_masks(matching_outline_shares(plane, views)[1:]).any()
+    assert not outlier_masks(matching_outline_shares(FRONT.plane, views)[1:]).any()
 
 
 def test_outliers_are_distinguished_from_masks_without_comparison() -> None:

@@ -11,7 +11,7 @@ import torch
 
 from glassplat.panes import PlaneFit
 from glassplat.panes.fit import fit_planes
-from glassplat.panes.masks import FramedPlanes, PlaneEquations, pane_views
+from glassplat.panes.masks import pane_views
 from glassplat.panes.objective import Objective
 from glassplat.panes.search import PlaneCandidate, first_hypotheses, highest_scoring_plane, score
 from tests.panes.pane_scene import FRONT, Pane, camera_from, frame_and_clutter, label_image, normal_error, scene_of
@@ -31,10 +31,6 @@ def turned(pane: Pane, degrees: float) -> Pane:
 
 MEASURED = frame_and_clutter([FRONT], frame=60, wall=200)
 MISLEADING = frame_and_clutter([turned(FRONT, 10)], frame=400, wall=200)
-
-
-def framed(pane: Pane) -> FramedPlanes:
-    return FramedPlanes(PlaneEquations(pane.normal[None], np.array([pane.normal @ pane.center])), np.zeros(1))
 
 
 def test_the_measured_points_win_where_gaussians_mislead(caplog: pytest.LogCaptureFixture) -> None:
@@ -62,7 +58,7 @@ def test_gaussians_determine_the_plane_if_measured_points_do_not(caplog: pytest.
 def test_the_better_plane_is_kept_in_either_order(degrees: float) -> None:
     views = pane_views(scene_of([FRONT]), 1)
     evidence = Objective(views, np.zeros((0, 3)), EXTENT, 0.01 * EXTENT)
-    fits = [PlaneCandidate("one", framed(FRONT)), PlaneCandidate("other", framed(turned(FRONT, degrees)))]
+    fits = [PlaneCandidate("one", FRONT.plane), PlaneCandidate("other", turned(FRONT, degrees).plane)]
     assert highest_scoring_plane(1, fits, evidence) is fits[0].plane
     assert highest_scoring_plane(1, fits[::-1], evidence) is fits[0].plane
 
@@ -70,8 +66,8 @@ def test_the_better_plane_is_kept_in_either_order(degrees: float) -> None:
 def test_a_plane_behind_an_impossible_frame_is_kept_only_where_there_is_no_other() -> None:
     views = pane_views(scene_of([FRONT]), 1)
     evidence = Objective(views, np.zeros((0, 3)), EXTENT, 0.01 * EXTENT)
-    high = replace(framed(FRONT), frames=np.array([0.3 * EXTENT]))
-    fits = [PlaneCandidate("one", high), PlaneCandidate("other", framed(turned(FRONT, 40.0)))]
+    high = replace(FRONT.plane, frames=np.array([0.3 * EXTENT]))
+    fits = [PlaneCandidate("one", high), PlaneCandidate("other", turned(FRONT, 40.0).plane)]
     assert score(high, evidence) > score(fits[1].plane, evidence)
     assert highest_scoring_plane(1, fits, evidence) is fits[1].plane
     assert highest_scoring_plane(1, fits[:1], evidence) is high
@@ -83,7 +79,7 @@ def test_virtual_points_behind_a_mirror_do_not_contradict_its_plane() -> None:
     virtual = np.random.default_rng(0).uniform([-2, -1, 2.5], [2, 1, 6], (5000, 3))
     evidence = Objective(views, virtual, EXTENT, 0.01 * EXTENT)
     wall = replace(FRONT, center=FRONT.center + np.array([0, 0, 0.6]))
-    assert score(framed(FRONT), evidence) > score(framed(wall), evidence) + 0.2
+    assert score(FRONT.plane, evidence) > score(wall.plane, evidence) + 0.2
 
 
 def test_the_score_does_not_depend_on_the_unit_of_length() -> None:
@@ -95,7 +91,7 @@ def test_the_score_does_not_depend_on_the_unit_of_length() -> None:
         points = factor * frame_and_clutter([FRONT], wall=0).numpy()
         evidence = Objective(pane_views(annotations, 1), points, factor * EXTENT, 0.01 * factor * EXTENT)
         pane = replace(turned(FRONT, 2), center=factor * FRONT.center)
-        return score(framed(pane), evidence)
+        return score(pane.plane, evidence)
 
     assert scaled(1000.0) == pytest.approx(scaled(1.0), rel=1e-9)
 
@@ -117,5 +113,5 @@ def test_a_pane_that_fills_the_photographs_is_among_the_first_hypotheses() -> No
     evidence = Objective(views, np.zeros((0, 3)), EXTENT, 0.01 * EXTENT)
     for seed in range(8):
         followed = first_hypotheses(evidence, 300, np.random.default_rng((seed, 1)))
-        cosines = np.abs(followed.planes.normals @ wide.normal)
+        cosines = np.abs(followed.normals @ wide.normal)
         assert np.degrees(np.arccos(cosines.max())) < 15

@@ -9,7 +9,7 @@ import torch
 
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.fit import fit_planes
-from glassplat.panes.masks import FramedPlanes, PlaneEquations, mask_agreement, pane_views
+from glassplat.panes.masks import mask_agreement, pane_views
 from glassplat.panes.objective import Objective, sample_nearby
 from glassplat.scene.camera import Camera, rotation_from_quat
 from glassplat.scene.panes import Planes
@@ -114,16 +114,15 @@ def test_same_seed_same_planes_and_bad_points_are_passed_over() -> None:
 
 def test_masks_agree_on_the_true_plane_and_on_no_other() -> None:
     views = pane_views(scene_of([FRONT]), 1)
-    truth = PlaneEquations(FRONT.normal[None], np.array([FRONT.normal @ FRONT.center]))
-    around = sample_nearby(truth, FRONT.center[None], 100, tilt=0.2, shift=0.2, rng=np.random.default_rng(0))
+    around = sample_nearby(FRONT.plane, FRONT.center[None], 100, tilt=0.2, shift=0.2, rng=np.random.default_rng(0))
     agreement = mask_agreement(around, views)
     assert agreement[0] > 0.97
     assert (agreement[1:] < agreement[0]).all()
     objective = Objective(views, np.zeros((0, 3)), EXTENT, 0.01 * EXTENT)
-    cost = objective.terms(FramedPlanes(around, np.zeros(len(around))), 0.004).cost
+    cost = objective.terms(around, 0.004).cost
     assert cost[0] < 0.1
     assert (cost[1:] > cost[0]).all()
-    behind = PlaneEquations(truth.normals, truth.offsets + 5)
+    behind = replace(FRONT.plane, offsets=FRONT.plane.offsets + 5)
     assert mask_agreement(behind, views)[0] < 0.01
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from glassplat.panes.masks import PlaneEquations, random_planes
+from glassplat.panes.masks import FramedPlanes, random_planes
 from glassplat.panes.objective import Objective
 
 
@@ -22,6 +22,6 @@ def test_points_on_a_line_or_all_the_same_give_no_plane() -> None:
 
 
 def test_support_is_the_share_of_the_inliers() -> None:
-    plane = PlaneEquations(np.array([[0.0, 0.0, 1.0]]), np.array([2.0]))
+    plane = FramedPlanes(np.array([[0.0, 0.0, 1.0]]), np.array([2.0]), np.zeros(1))
     points = np.array([[0.0, 0.0, 2.0], [5.0, 1.0, 2.09], [0.0, 0.0, 1.8], [0.0, 0.0, -2.0]])
     assert Objective([], points, 1.0, 0.1).inlier_share(plane) == pytest.approx([0.5])
