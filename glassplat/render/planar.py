@@ -47,7 +47,7 @@ from glassplat.render.panes import (
     tint_of_panes,
     visibilities,
 )
-from glassplat.render.splat import WithNormals
+from glassplat.render.splat import ellipsoid_normals
 from glassplat.scene.camera import Camera
 from glassplat.scene.corrections import Exposures
 from glassplat.scene.gaussians import Gaussians
@@ -129,6 +129,7 @@ class Planar(WithBackground):
             a separate layer `photographed` [H, W, 3].
         separate_mirrored: let the records in `Frame.screen` distinguish mirror images from direct views, with their
             weights; otherwise all count alike.
+        normal: also render the layer `normal` [H, W, 3] (`glassplat.render.splat.ellipsoid_normals`).
     """
 
     fresnel: Fresnel = "pane"
@@ -140,6 +141,7 @@ class Planar(WithBackground):
     nearest_only: bool = False
     photographer: PhotographerMode = "absent"
     separate_mirrored: bool = True
+    normal: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -159,6 +161,8 @@ class Planar(WithBackground):
         layers["pane"] = hits.pane
         if direct.deviation is not None:
             layers["deviation"] = direct.deviation
+        if self.normal:
+            layers["normal"] = ellipsoid_normals(scene, camera)
         if seen is None:
             nothing = torch.zeros_like(direct.mask)
             layers |= {"transmission": direct.image, "reflection": torch.zeros_like(direct.image)}
@@ -214,10 +218,10 @@ class Planar(WithBackground):
         panes = ("transmission", "without_panes", "reflection", "strength", "mask") if len(scene.planes) else ()
         return ("rgb", *panes, "normal", "depth", "alpha", *known)
 
-    def with_layers(self, layers: Sequence[str]) -> Renderer:
+    def with_layers(self, layers: Sequence[str]) -> Planar:
         """The renderer of frames that also have `photographed` and `normal` where they are among the layers."""
-        renderer = replace(self, photographer="separate") if PHOTOGRAPHED in layers else self
-        return WithNormals(renderer) if "normal" in layers else renderer
+        photographer = "separate" if PHOTOGRAPHED in layers else self.photographer
+        return replace(self, photographer=photographer, normal=self.normal or "normal" in layers)
 
     def page_settings(self) -> Mapping[str, Any]:
         """Settings of the web page for panes."""

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,7 +17,6 @@ from glassplat.render.frame import (
     MEDIAN_DEPTH,
     NEAR_PER_EXTENT,
     Frame,
-    Renderer,
     ScreenPass,
     WithBackground,
     camera_batch,
@@ -118,48 +116,14 @@ def blend_ellipsoids(
     return composite(splats, channels, bins, absgrad=concat_absgrad(screen))
 
 
-@dataclass(frozen=True)
-class WithNormals:
-    """A renderer with an additional layer `normal` [H, W, 3]; for discs, the renderer itself provides it.
+def ellipsoid_normals(scene: Scene, camera: Camera) -> Tensor:
+    """[H, W, 3] blended normals of the primary ellipsoids, world axes, towards the camera, at most of unit length.
 
         n(u) = sum_i n_i alpha_i T_i
 
-    n_i is the shortest axis of ellipsoid i, facing the camera (3DGS-DR, Section 3.1). At panes, it shows the objects
-    behind them, like the layer `depth`. It needs a pass of its own.
-
-    Attributes:
-        renderer: renders everything else.
+    n_i is the shortest axis of ellipsoid i, facing the camera (3DGS-DR, Section 3.1). At panes, they are those of the
+    objects behind, as depths are. They need a pass of their own.
     """
-
-    renderer: Renderer
-
-    def __call__(self, scene: Scene, camera: Camera, *, with_records: bool = False) -> Frame:
-        """Renders `scene` from `camera`, on the scene's device."""
-        frame = self.renderer(scene, camera, with_records=with_records)
-        if "normal" in frame.layers:
-            return frame
-        normals = ellipsoid_normals(scene, camera.to(scene.primary.means.device))
-        return replace(frame, layers={**frame.layers, "normal": normals})
-
-    def check(self, scene: Scene) -> None:
-        """Raises ValueError where the renderer does."""
-        self.renderer.check(scene)
-
-    def layers(self, scene: Scene) -> tuple[str, ...]:
-        """Names of the renderer's layers."""
-        return self.renderer.layers(scene)
-
-    def with_layers(self, layers: Sequence[str]) -> WithNormals:
-        """The renderer of frames that also have these layers."""
-        return WithNormals(self.renderer.with_layers(layers))
-
-    def page_settings(self) -> Mapping[str, Any]:
-        """Settings of the renderer for the web page."""
-        return self.renderer.page_settings()
-
-
-def ellipsoid_normals(scene: Scene, camera: Camera) -> Tensor:
-    """[H, W, 3] blended normals of the primary Gaussians, world axes, towards the camera, at most of unit length."""
     projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
     channels = ellipsoid_channels(scene.primary, projected, camera)
     normals = channels[None, :, NORMAL_AT:STRENGTH_AT].contiguous()
@@ -172,7 +136,8 @@ class Splat(WithBackground):
 
         C(u) = sum_i c_i alpha_i T_i,   T_i = prod_{j<i} (1 - alpha_j)
 
-    Layers: `alpha` [H, W] coverage; `depth` [H, W] blended depth, if asked for.
+    Layers: `alpha` [H, W] coverage; `depth` [H, W] blended depth and `normal` [H, W, 3] (`ellipsoid_normals`), if asked
+    for.
 
     For discs (2DGS), alpha_i and depths are those at the intersection of the pixel's ray with disc i. Then the layers
     are `alpha`; `depth`, the expected depth; `median_depth`, at which half of the light is absorbed; `distortion`, the
@@ -183,10 +148,12 @@ class Splat(WithBackground):
         background: background colour, sRGB.
         depth: also render the depth layer of ellipsoids; costs one more channel.
         normal: also render the normals of discs; costs three more channels.
+        ellipsoid_normal: also render the normals of ellipsoids, in another pass.
     """
 
     depth: bool = True
     normal: bool = True
+    ellipsoid_normal: bool = False
 
     def __call__(self, scene: Scene, camera: Camera, *, with_records: bool = False) -> Frame:
         """Renders `scene` from `camera`, on the scene's device."""
@@ -205,6 +172,8 @@ class Splat(WithBackground):
         layers = {"alpha": alpha}
         if self.depth:
             layers["depth"] = mean_depth(depth[0].squeeze(-1), alpha)
+        if self.ellipsoid_normal:
+            layers["normal"] = ellipsoid_normals(scene, camera)
         rgb = over_background(color, alpha, self.background)
         return Frame(rgb, layers, visible_gaussians(projected), screen=screen, background=self.background)
 
@@ -230,7 +199,12 @@ class Splat(WithBackground):
         """Names of the layers for display."""
         return ("rgb", "normal", "depth", "alpha", *((MEDIAN_DEPTH,) if scene.primary.are_discs else ()))
 
-    def with_layers(self, layers: Sequence[str]) -> Renderer:
+    def with_layers(self, layers: Sequence[str]) -> Splat:
         """The renderer of frames that also have `depth` and `normal` where they are among the layers."""
-        renderer = replace(self, depth=self.depth or "depth" in layers, normal=self.normal or "normal" in layers)
-        return WithNormals(renderer) if "normal" in layers else renderer
+        depth, normal = "depth" in layers, "normal" in layers
+        return replace(
+            self,
+            depth=self.depth or depth,
+            normal=self.normal or normal,
+            ellipsoid_normal=self.ellipsoid_normal or normal,
+        )

@@ -11,7 +11,7 @@ import torch
 from glassplat.render.deferred import Deferred
 from glassplat.render.frame import Renderer
 from glassplat.render.planar import Planar
-from glassplat.render.splat import Splat, WithNormals
+from glassplat.render.splat import Splat
 from glassplat.scene.camera import rotation_from_quat
 from glassplat.scene.scene import Scene
 from tests.render.test_deferred import glossy
@@ -40,7 +40,7 @@ def wall(sign: float) -> Scene:
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_wall_faces_the_camera_across_its_shortest_axes(sign: float) -> None:
-    frame = WithNormals(Splat())(wall(sign), camera_at(0, 0, 0))
+    frame = Splat(ellipsoid_normal=True)(wall(sign), camera_at(0, 0, 0))
     covered = frame.layers["alpha"] > 0.99
     normals = torch.nn.functional.normalize(frame.layers["normal"][covered], dim=-1)
     assert int(covered.sum()) > 100
