@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,9 +15,9 @@ from glassplat.files.records import DictOf, Field, Integer, ListOf, Nullable, Nu
 from glassplat.files.scene_folder import DIRECTION, EXTENT, SH_DEGREE, direction
 from glassplat.files.sidecars import HIGHEST_LABEL, REGION, TensorsFile, open_tensors, write_tensors
 from glassplat.scene.corrections import Exposures, PoseCorrections
-from glassplat.scene.gaussians import DISC_SCALES, PER_GAUSSIAN, Gaussians
+from glassplat.scene.gaussians import PER_GAUSSIAN, Gaussians
 from glassplat.scene.panes import Planes
-from glassplat.scene.scene import OPTIONAL_SETS, Environment, Scene
+from glassplat.scene.scene import ENVIRONMENT_TENSORS, OPTIONAL_SETS, PARTS, Environment, Scene
 from glassplat.training.densify import ScreenStatistics
 from glassplat.training.stage import Optimizer, TrainState
 
@@ -42,18 +42,8 @@ HEADER: dict[str, Field] = {
     "up": Optional(DIRECTION),
 }
 """`Optional` fields were added after the first checkpoints were written."""
-GAUSSIAN_SHAPES = {"means": (3,), "quats": (4,), "log_scales": None, "logit_opacities": ()}
-PLANE_SHAPES: dict[str, tuple[int, ...] | None] = {
-    "centers": (3,),
-    "raw_normals": (3,),
-    "logit_reflectances": (),
-    "tangents": (3,),
-    "half_sizes": (2,),
-}
-OPTIONAL_PLANE_SHAPES: dict[str, tuple[int, ...] | None] = {"log_transmittances": (3,)}
-"""Tensor of tinted panes."""
-SCALE_SHAPES = [(DISC_SCALES,), (DISC_SCALES + 1,)]
-SH_SHAPES = [(count, 3) for count in (0, 1, 4, 9, 16)]
+TINT = "log_transmittances"
+"""Tensor of tinted panes only."""
 
 
 def save_checkpoint(path: Path, state: TrainState) -> None:
@@ -162,8 +152,7 @@ def restored_state(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
         common = next(iter(tensors.values())).dtype
         if tensor.dtype != common:
             raise InputError(f"{name} holds {tensor.dtype}, other tensors {common}; expected one precision")
-    with convert_to_input_error():
-        scene = restored_scene(header, tensors)
+    scene = restored_scene(header, tensors)
     first, second = tensors_with_prefix(tensors, "first/"), tensors_with_prefix(tensors, "second/")
     if not first.keys() == second.keys() <= header["updates"].keys():
         raise InputError("not every parameter that was stepped has both moments and a count of its updates")
@@ -190,50 +179,44 @@ def restored_state(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
 
 
 def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Scene:
-    """The scene; raises ValueError if a tensor is missing or has the wrong shape."""
-    empty = Scene(Gaussians.empty(), extent=header["extent"])
-    if header["active_sh_degree"].keys() - set(OPTIONAL_SETS) != empty.gaussian_sets().keys():
+    """The scene.
+
+    Raises:
+        InputError: a part is missing, or has other tensors than it needs; its own checks name wrong shapes.
+    """
+    degrees = header["active_sh_degree"]
+    if degrees.keys() - set(OPTIONAL_SETS) != {"primary", "glass"}:
         raise InputError(
-            f"it holds the sets of Gaussians {sorted(header['active_sh_degree'])}; expected primary, glass, and "
+            f"it holds the sets of Gaussians {sorted(degrees)}; expected primary, glass, and "
             f"{' and '.join(OPTIONAL_SETS)} where there are any"
         )
     if "scene/glass/logit_mark" not in tensors:
         raise InputError("the glass has no logit_mark")
-    sets = {
-        part: restored_gaussians(tensors_with_prefix(tensors, f"scene/{part}/"), part, degree)
-        for part, degree in header["active_sh_degree"].items()
-    }
-    planes = tensors_with_prefix(tensors, "scene/planes/")
-    optional = {name: shape for name, shape in OPTIONAL_PLANE_SHAPES.items() if name in planes}
-    check_shapes(planes, PLANE_SHAPES | optional, "planes")
-    environment_tensors = tensors_with_prefix(tensors, "scene/environment/")
-    check_shapes(environment_tensors, {"raw": None} if environment_tensors else {}, "environment")
-    environment = Environment(**(environment_tensors or empty.environment.tensors()), region=header["region"])
-    exposures = tensors_with_prefix(tensors, "scene/exposures/")
-    check_shapes(exposures, {"affine": (3, 4)} if exposures else {}, "exposures")
-    poses = tensors_with_prefix(tensors, "scene/poses/")
-    check_shapes(poses, {"twists": (6,)} if poses else {}, "poses")
-    return Scene(
-        poses=PoseCorrections(poses["twists"], tuple(header["corrected"])) if poses else empty.poses,
-        extent=header["extent"],
-        planes=Planes(**planes, labels=header["labels"], mirrors=header["mirrors"]),
-        environment=environment,
-        up=direction(header["up"], "the header"),
-        exposures=Exposures(exposures["affine"], tuple(header["photographs"])) if exposures else empty.exposures,
-        **sets,
-    )
-
-
-def restored_gaussians(tensors: Mapping[str, Tensor], part: str, active_sh_degree: int) -> Gaussians:
-    """A set of Gaussians from named tensors; raises ValueError if one is missing or has the wrong shape."""
-    channels = {name: t for name, t in tensors.items() if name not in PER_GAUSSIAN}
-    main = {name: t for name, t in tensors.items() if name in PER_GAUSSIAN}
-    check_shapes(tensors, {**GAUSSIAN_SHAPES, "sh": None, **dict.fromkeys(channels, ())}, part)
-    if tuple(main["sh"].shape[1:]) not in SH_SHAPES:
-        raise InputError(f"sh of {part} has shape {list(main['sh'].shape)}; expected [N, 0, 1, 4, 9 or 16, 3]")
-    if tuple(main["log_scales"].shape[1:]) not in SCALE_SHAPES:
-        raise InputError(f"log_scales of {part} has shape {list(main['log_scales'].shape)}; expected [N, 2 or 3]")
-    return Gaussians(**main, channels=channels, active_sh_degree=active_sh_degree)
+    held = {part: tensors_with_prefix(tensors, f"scene/{part}/") for part in PARTS}
+    parts: dict[str, Any] = {}
+    for part, degree in degrees.items():
+        channels = {name: tensor for name, tensor in held[part].items() if name not in PER_GAUSSIAN}
+        main = {name: tensor for name, tensor in held[part].items() if name in PER_GAUSSIAN}
+        check_names(main, PER_GAUSSIAN, part)
+        with convert_to_input_error(part):
+            parts[part] = Gaussians(**main, channels=channels, active_sh_degree=degree)
+    check_names(held["planes"], {*Planes.empty().tensors(), *({TINT} & held["planes"].keys())}, "planes")
+    with convert_to_input_error("planes"):
+        parts["planes"] = Planes(**held["planes"], labels=header["labels"], mirrors=header["mirrors"])
+    environment = held["environment"] or Environment.empty().tensors()
+    check_names(environment, ENVIRONMENT_TENSORS, "environment")
+    with convert_to_input_error("environment"):
+        parts["environment"] = Environment(**environment, region=header["region"])
+    for part, kind, names in (
+        ("exposures", Exposures, header["photographs"]),
+        ("poses", PoseCorrections, header["corrected"]),
+    ):
+        if held[part]:
+            check_names(held[part], (kind.TENSOR,), part)
+            with convert_to_input_error(part):
+                parts[part] = kind(held[part][kind.TENSOR], tuple(names))
+    with convert_to_input_error():
+        return Scene(**parts, extent=header["extent"], up=direction(header["up"], "the header"))
 
 
 def restored_statistics(tensors: Mapping[str, Tensor], scene: Scene) -> dict[str, ScreenStatistics]:
@@ -252,14 +235,10 @@ def restored_statistics(tensors: Mapping[str, Tensor], scene: Scene) -> dict[str
     return found
 
 
-def check_shapes(tensors: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...] | None], owner: str) -> None:
-    """Raises InputError unless the names are as expected and rows have the given shapes (None for any)."""
-    if tensors.keys() != shapes.keys():
-        raise InputError(f"{owner} has the tensors {sorted(tensors)}; expected {sorted(shapes)}")
-    for name, shape in shapes.items():
-        found = tuple(tensors[name].shape)
-        if shape is not None and (not found or found[1:] != shape):
-            raise InputError(f"{name} of {owner} has shape {list(found)}; expected rows of {list(shape)}")
+def check_names(tensors: Mapping[str, Tensor], names: Collection[str], owner: str) -> None:
+    """Raises InputError unless the tensors have exactly these names."""
+    if tensors.keys() != set(names):
+        raise InputError(f"{owner} has the tensors {sorted(tensors)}; expected {sorted(names)}")
 
 
 def check_like(tensors: Mapping[str, Tensor], examples: Mapping[str, Tensor], owner: str) -> None:
