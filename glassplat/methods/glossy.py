@@ -27,8 +27,8 @@ from glassplat.training import losses
 from glassplat.training.actions import DensificationStrategy, Densify, GrowSh, PruneIdle, ResetOpacity
 from glassplat.training.corrections import with_learned_corrections, with_neutral_corrections
 from glassplat.training.densify import as_discs
-from glassplat.training.options import PUBLISHED_ITERATIONS, GaussianRates, Intervals, MethodRecipe, Rate
-from glassplat.training.stage import RESET_TURN, Action, Every, Stage, TrainState
+from glassplat.training.options import PUBLISHED_ITERATIONS, GaussianRates, Intervals, MethodRecipe
+from glassplat.training.stage import Action, Every, Stage, TrainState
 
 if TYPE_CHECKING:
     from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
@@ -87,9 +87,6 @@ def _reflection_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         post_steps=strategy.post_steps,
         densify_until=strategy.densify_until,
     )
-    propagate_at = Every(
-        recipe.intervals.opacity, 0.0, recipe.schedule.stop, recipe.intervals.least, skip_multiples_of=RESET_TURN
-    )
     renderer = Deferred(recipe.background or BLACK, depth=recipe.consistency_weight != 0)
     guidance = losses.weighted_terms(
         losses.LossTerm("outside", recipe.outside_weight, losses.strength_outside),
@@ -106,7 +103,7 @@ def _reflection_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         actions=(
             *_edit_actions(recipe, strategy),
             # Before the resets, because it examines the visible scene even at steps of resets.
-            _propagate_action(recipe, propagate_at, renderer),
+            mirrors.Propagate(recipe, renderer),
             mirrors.GrowShAfterPropagation(Every(recipe.intervals.sh)),
             *(map(mirrors.ResetRaised.replacing, strategy.resets) if recipe.schedule.last_reset else strategy.resets),
             mirrors.RefineEnvironment(
@@ -170,29 +167,6 @@ def _edit_actions(recipe: DeferredRecipe, strategy: DensificationStrategy) -> tu
         mirrors.DensifyWhilePropagating(slow, regular=edit) if isinstance(edit, Densify) else edit
         for edit in strategy.edits
     )
-
-
-def _propagate_action(recipe: DeferredRecipe, when: Every, renderer: Deferred) -> mirrors.Propagate:
-    return mirrors.Propagate(
-        when,
-        recipe.propagation,
-        recipe.schedule,
-        renderer,
-        matte_rates=_matte_rates(recipe),
-        raises_rates_found=recipe.raise_rates_found,
-    )
-
-
-def _matte_rates(recipe: DeferredRecipe) -> dict[str, Rate]:
-    """Factors that raise the learning rates to those of `splat`."""
-    if not recipe.raise_rates_matte:
-        return {}
-    missing = GaussianRates().short_run_power - recipe.rates.short_run_power
-    return {
-        name: Rate(1.0, short_run_power=missing)
-        for name, rate in GaussianRates().of("primary").items()
-        if rate.short_run_power
-    }
 
 
 FIRST_DOUBLING, LAST_DOUBLING = 0.45, 0.65

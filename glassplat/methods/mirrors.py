@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -31,8 +32,11 @@ from glassplat.scene.scene import Scene
 from glassplat.training.actions import Densify, GrowSh, ResetOpacity
 from glassplat.training.densify import Moments, zero_moments
 from glassplat.training.losses import residual, valid_pixels
-from glassplat.training.options import MirrorSearch, NormalPropagation, PropagationSchedule, Rate
-from glassplat.training.stage import AtShares, Clock, Every, TrainState
+from glassplat.training.options import GaussianRates, MirrorSearch, NormalPropagation, Rate
+from glassplat.training.stage import RESET_TURN, AtShares, Clock, Every, TrainState
+
+if TYPE_CHECKING:
+    from glassplat.methods.glossy_recipes import GlossyOptions
 
 LEAST_SHOWN = 0.1
 """Minimum contribution of a visible Gaussian, in pixels over all views."""
@@ -298,24 +302,30 @@ class Propagate:
     If nothing reflective is found, the run continues like `splat`, with advice in the log.
 
     Attributes:
-        when: intervals of propagation; the end is checked at skipped intervals, too.
-        propagation: options of propagation and sabotage.
-        schedule: end of propagation.
+        recipe: options of propagation and sabotage, and their schedule.
         renderer: renderer of the stage, whose frames have a layer `base`.
-        matte_rates: factors on learning rates after the end if nothing reflective was found, by dotted parameter name;
-            evaluated for the length of the run.
         measure: measures the amount of reflection.
-        raises_rates_found: apply them even if something was found.
     """
 
-    when: Every
-    propagation: NormalPropagation
-    schedule: PropagationSchedule
+    recipe: GlossyOptions
     renderer: Renderer
-    matte_rates: Mapping[str, Rate] = field(default_factory=dict)
     measure: ReflectionMeasure = field(default_factory=ReflectionMeasure)
-    raises_rates_found: bool = False
     name: str = "propagate normals"
+
+    @property
+    def when(self) -> Every:
+        """Intervals of propagation; the end is checked at skipped intervals, too."""
+        intervals, stop = self.recipe.intervals, self.recipe.schedule.stop
+        return Every(intervals.opacity, 0.0, stop, intervals.least, skip_multiples_of=RESET_TURN)
+
+    @property
+    def matte_rates(self) -> dict[str, Rate]:
+        """Factors, by parameter name, that raise the learning rates to those of `splat`; evaluated for the run."""
+        if not self.recipe.raise_rates_matte:
+            return {}
+        splat = GaussianRates()
+        factor = Rate(1.0, short_run_power=splat.short_run_power - self.recipe.rates.short_run_power)
+        return {name: factor for name, rate in splat.of("primary").items() if rate.short_run_power}
 
     def due(self, clock: Clock) -> bool:
         """Return whether to act after this step."""
@@ -332,10 +342,11 @@ class Propagate:
             return False
         if not self.when.due(clock):
             return False
-        primary, moments = propagate_normals(self.propagation, state.scene.primary, state.optimizer.moments)
-        primary, moments = sabotage_colors(self.propagation, primary, moments, state.generator(self.name))
+        options, primary, moments = self.recipe.propagation, state.scene.primary, state.optimizer.moments
+        primary, moments = propagate_normals(options, primary, moments)
+        primary, moments = sabotage_colors(options, primary, moments, state.generator(self.name))
         state.scene, state.optimizer.moments = replace(state.scene, primary=primary), moments
-        state.optimizer.paused["primary.logit_opacities"] = self.schedule.pause
+        state.optimizer.paused["primary.logit_opacities"] = self.recipe.schedule.pause
         state.records[OPACITIES_RAISED] = clock.step
         return True
 
@@ -344,21 +355,21 @@ class Propagate:
 
         Before it, remains of random points would be made opaque, and hide the surfaces.
         """
-        return self.when.interval(clock) * (self.when.skip_multiples_of or 1)
+        return self.when.interval(clock) * RESET_TURN
 
     def _last_step(self, clock: Clock) -> int:
         """The latest step at which it ends."""
-        return round(self.schedule.stop * clock.iterations)
+        return round(self.recipe.schedule.stop * clock.iterations)
 
     def _has_settled(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Return whether reflection has stopped growing for long enough; updates the records."""
-        if self.schedule.end == "fixed":
+        if self.recipe.schedule.end == "fixed":
             return False
         share = self.measure.reflective_share(state.scene, dataset.train)
         if LAST_GROWTH not in state.records or share > state.records[MOST_REFLECTIVE] + LEAST_GROWTH:
             state.records |= {MOST_REFLECTIVE: share, LAST_GROWTH: clock.step}
         waited = (clock.step - state.records[LAST_GROWTH]) / self.when.interval(clock)
-        return waited >= self.schedule.patience or self._looks_matte(state, dataset, clock)
+        return waited >= self.recipe.schedule.patience or self._looks_matte(state, dataset, clock)
 
     def _looks_matte(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Return whether nothing reflects or is view-dependent; updates the record.
@@ -377,7 +388,7 @@ class Propagate:
         state.records[PROPAGATION_ENDED] = clock.step
         share = max(self.measure.reflective_share(state.scene, dataset.train), state.records.get(MOST_REFLECTIVE, 0.0))
         state.records[MOST_REFLECTIVE] = share
-        if share < LEAST_REFLECTIVE or self.raises_rates_found:
+        if share < LEAST_REFLECTIVE or self.recipe.raise_rates_found:
             # Faster, if there are no normals to corrupt.
             state.optimizer.raised_rates = {
                 name: rate.at(0.0, 1.0, clock.iterations) for name, rate in self.matte_rates.items()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -36,9 +37,7 @@ from glassplat.training.options import (
     GaussianRates,
     Intervals,
     MirrorSearch,
-    NormalPropagation,
     PropagationSchedule,
-    Rate,
     Strategy,
 )
 from glassplat.training.stage import Clock, Every, TrainState
@@ -168,7 +167,7 @@ def test_resuming_continues_to_the_same_result(pause: int, tmp_path: Path) -> No
 
 def test_raised_opacities_are_held_for_a_while() -> None:
     state = fresh_state()
-    propagate = Propagate(Every(0.1), NormalPropagation(), RECIPE.schedule, Deferred())
+    propagate = Propagate(RECIPE, Deferred())
     propagate.apply(state, tiny_capture(), Clock(8, 20, 5))
     raised = state.scene.primary.logit_opacities.clone()
     assert bool((raised.sigmoid() >= 0.9 - 1e-6).all())
@@ -201,20 +200,23 @@ def propagated(
     schedule: PropagationSchedule,
     intervals: int = 10,
     *,
-    raises_rates_found: bool = False,
+    raise_rates_found: bool = False,
     state: TrainState | None = None,
 ) -> tuple[TrainState, list[int]]:
     """A state after the given number of intervals of ten steps in a run of a hundred, and the steps of propagation."""
     state, done = state or fresh_state(), []
-    when = Every(0.1, stop=schedule.stop, skip_multiples_of=3)
-    action = Propagate(
-        when, NormalPropagation(), schedule, Deferred(), {"primary.sh": Rate(3.0)}, search, raises_rates_found
-    )
+    often = Intervals(opacity=0.1, least=1)
+    recipe = DeferredRecipe(schedule=schedule, intervals=often, raise_rates_found=raise_rates_found)
+    action = Propagate(recipe, Deferred(), search)
     for interval in range(1, intervals + 1):
         clock = Clock(10 * interval, 100, 5)
         if action.due(clock) and action.apply(state, tiny_capture(), clock):
             done.append(clock.step)
     return state, done
+
+
+RAISED = dict.fromkeys((f"primary.{name}" for name in ("means", "sh", "log_scales", "quats")), math.sqrt(10))
+"""Factors on learning rates in the shortest runs."""
 
 
 @pytest.mark.parametrize(
@@ -268,7 +270,7 @@ def test_scenes_without_reflections_raise_the_rates_with_a_log_message(
     with caplog.at_level("INFO", logger="glassplat.training"):
         state, _ = propagated(Told(reflects=(share,), turns=turns), PropagationSchedule(patience=2))
     warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert state.optimizer.raised_rates == ({} if said is None else {"primary.sh": 3.0})
+    assert state.optimizer.raised_rates == pytest.approx({} if said is None else RAISED)
     _, reflection, refinement = DeferredRecipe().stages(seed=0)
     assert reflection.is_finished is not None and reflection.is_finished(state) == (said is not None)
     assert {term.name for term in reflection.losses} - {term.name for term in refinement.losses} == {"consistency"}
@@ -291,7 +293,7 @@ def test_a_region_without_gaussians_is_named(caplog: pytest.LogCaptureFixture) -
 
 def test_unchanged_rates_are_not_logged(caplog: pytest.LogCaptureFixture) -> None:
     schedule, told = PropagationSchedule(end="fixed", stop=0.5), Told(reflects=(0.0,))
-    action = Propagate(Every(0.1, stop=0.5), NormalPropagation(), schedule, Deferred(), measure=told)
+    action = Propagate(DeferredRecipe(schedule=schedule, raise_rates_matte=False), Deferred(), told)
     action.apply(fresh_state(), tiny_capture(), Clock(50, 100, 5))
     assert "little or nothing reflective" in caplog.text and "the learning rates of splat" not in caplog.text
 
@@ -301,10 +303,9 @@ def test_scenes_with_reflections_raise_the_rates_on_request(
     recipe: DeferredRecipe | TracedRecipe,
 ) -> None:
     (action,) = (action for action in recipe.stages(seed=0)[1].actions if isinstance(action, Propagate))
-    state, _ = propagated(
-        Told(reflects=(0.4,)), PropagationSchedule(patience=2), raises_rates_found=action.raises_rates_found
-    )
-    assert state.optimizer.raised_rates == ({"primary.sh": 3.0} if recipe.raise_rates_found else {})
+    found = action.recipe.raise_rates_found
+    state, _ = propagated(Told(reflects=(0.4,)), PropagationSchedule(patience=2), raise_rates_found=found)
+    assert state.optimizer.raised_rates == pytest.approx(RAISED if recipe.raise_rates_found else {})
     assert state.records[PROPAGATION_ENDED] > 10
 
 
@@ -464,10 +465,8 @@ def test_the_shortest_run_refines_its_environment_in_full(iterations: int) -> No
 @pytest.mark.parametrize("iterations", [20, 23, 7001])
 def test_propagation_ends_in_runs_of_any_length(iterations: int) -> None:
     schedule = PropagationSchedule(end="fixed", stop=0.61)
-    state = fresh_state()
-    action = Propagate(
-        Every(1 / 3, stop=0.61), NormalPropagation(), schedule, Deferred(), measure=Told(reflects=(0.5,))
-    )
+    recipe, state = DeferredRecipe(schedule=schedule, intervals=Intervals(opacity=0.1, least=1)), fresh_state()
+    action = Propagate(recipe, Deferred(), Told(reflects=(0.5,)))
     for step in range(1, iterations + 1):
         clock = Clock(step, iterations, 5)
         if action.due(clock):
