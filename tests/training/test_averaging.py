@@ -11,11 +11,11 @@ from torch import Tensor
 
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.training.actions import AverageLast, replace_sorted
-from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import train
 from glassplat.training.messages import StepDone
 from glassplat.training.options import Intervals
 from glassplat.training.stage import Clock, Stage, TrainState
+from tests.training.progress_of import assert_resumes, trained
 from tests.training.tiny_capture import tiny_capture
 
 ITERATIONS, LAST = 40, 4
@@ -62,12 +62,9 @@ def test_averaging_keeps_constant_tensors_bit_for_bit() -> None:
 
 @pytest.mark.parametrize("pause", [ITERATIONS - LAST, ITERATIONS - 2])
 def test_a_resumed_run_ends_with_the_same_mean(pause: int, tmp_path: Path) -> None:
-    whole, interrupted = run(fresh_state(), passes=1), fresh_state()
-    run(interrupted, passes=1, until=pause)
-    save_checkpoint(tmp_path / "checkpoint.safetensors", interrupted)
-    resumed = run(load_checkpoint(tmp_path / "checkpoint.safetensors"), passes=1)
-    for name, tensor in whole[-1].items():
-        assert torch.equal(tensor, resumed[-1][name]), name
+    assert_resumes(
+        lambda state, until: trained(state, stages(1), ITERATIONS, until=until), fresh_state, pause, tmp_path
+    )
 
 
 def test_the_mean_restarts_when_the_set_of_gaussians_changes() -> None:

@@ -41,7 +41,7 @@ from glassplat.training.options import (
     Strategy,
 )
 from glassplat.training.stage import Clock, Every, TrainState
-from tests.training.progress_of import finished
+from tests.training.progress_of import assert_resumes, finished, trained
 from tests.training.tiny_capture import tiny_capture
 
 RECIPE = DeferredRecipe(
@@ -69,12 +69,7 @@ def surrounded_state(recipe: DeferredRecipe) -> TrainState:
 
 
 def run(state: TrainState, recipe: DeferredRecipe = RECIPE, until: int | None = None) -> list[Message]:
-    messages = []
-    for message in train(recipe.stages(seed=0), tiny_capture(), state, iterations=20):
-        messages.append(message)
-        if isinstance(message, StepDone) and message.step == until:
-            break
-    return messages
+    return trained(state, recipe.stages(seed=0), 20, until=until)
 
 
 def test_a_short_run_learns_strength_and_environment() -> None:
@@ -153,16 +148,8 @@ def test_opacities_are_reset_once_after_propagation(raised: int, ended: int | No
 
 @pytest.mark.parametrize("pause", [3, 9, 15])
 def test_resuming_continues_to_the_same_result(pause: int, tmp_path: Path) -> None:
-    whole, interrupted = fresh_state(), fresh_state()
-    run(whole)
-    run(interrupted, until=pause)
-    save_checkpoint(tmp_path / "checkpoint.safetensors", interrupted)
-    resumed = load_checkpoint(tmp_path / "checkpoint.safetensors")
-    run(resumed)
+    resumed = assert_resumes(lambda state, until: run(state, until=until), fresh_state, pause, tmp_path)
     assert resumed.scene.environment.region == RECIPE.region
-    assert whole.records == resumed.records
-    for name, tensor in whole.scene.parameters().items():
-        assert torch.equal(tensor, resumed.scene.parameters()[name]), name
 
 
 def test_raised_opacities_are_held_for_a_while() -> None:

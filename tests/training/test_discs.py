@@ -15,12 +15,12 @@ from glassplat.methods.glossy_recipes import TracedRecipe
 from glassplat.methods.splat_recipe import DiscTerms, SplatRecipe
 from glassplat.model.run_directory import RunDirectory
 from glassplat.render.splat import Splat
-from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import train
 from glassplat.training.losses import disc_normal_consistency
 from glassplat.training.messages import StepDone
 from glassplat.training.stage import TrainState
 from tests.cli.tiny_run import write_capture
+from tests.training.progress_of import assert_resumes, trained
 from tests.training.tiny_capture import tiny_capture
 
 DISCS = SplatRecipe(primitive="disc", sh_degree=1)
@@ -81,15 +81,13 @@ def test_a_short_run_learns(strategy: Any) -> None:
 
 def test_resuming_discs_from_a_checkpoint_gives_the_same_result(tmp_path: Path) -> None:
     recipe, dataset = short(DISCS), tiny_capture()
-    whole = TrainState(recipe.initialise(dataset), seed=0)
-    for message in train(recipe.stages(0), dataset, whole, 30):
-        if isinstance(message, StepDone) and message.step == 17:
-            save_checkpoint(tmp_path / "half", whole)
-    resumed = load_checkpoint(tmp_path / "half")
+    resumed = assert_resumes(
+        lambda state, until: trained(state, recipe.stages(0), 30, until=until),
+        lambda: TrainState(recipe.initialise(dataset), seed=0),
+        17,
+        tmp_path,
+    )
     assert resumed.scene.primary.are_discs
-    list(train(recipe.stages(0), dataset, resumed, 30))
-    for name, tensor in whole.scene.parameters().items():
-        assert torch.equal(resumed.scene.parameters()[name], tensor), name
 
 
 def test_discs_are_trained_evaluated_and_rendered_from_the_command_line(tmp_path: Path) -> None:

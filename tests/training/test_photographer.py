@@ -28,6 +28,7 @@ from glassplat.training.options import Photographer
 from glassplat.training.stage import Clock, Stage, TrainState, run_edit
 from tests.render.test_photographer import body
 from tests.render.tiny_scene import in_single_precision, joined, pane
+from tests.training.progress_of import assert_resumes, trained
 from tests.training.tiny_capture import tiny_capture, true_scene
 
 LEARNED = Photographer(learn=True, count=60)
@@ -177,22 +178,14 @@ def planar_stages() -> tuple[Stage, ...]:
 
 
 def test_a_run_that_was_interrupted_ends_as_one_that_was_not(tmp_path: Path) -> None:
-    dataset, path = peopled_capture(), tmp_path / "checkpoint.safetensors"
-    whole = TrainState(SplatRecipe(sh_degree=1).initialise(dataset), 0)
-    sizes = set()
-    for message in train(planar_stages(), dataset, whole, 40):
-        if isinstance(message, StepDone):
-            sizes.add(message.counts.get("photographer", 0))
-    interrupted = TrainState(SplatRecipe(sh_degree=1).initialise(dataset), 0)
-    for message in train(planar_stages(), dataset, interrupted, 40):
-        if isinstance(message, StepDone) and message.step == 21:
-            break
-    save_checkpoint(path, interrupted)
-    resumed = load_checkpoint(path)
-    for _ in train(planar_stages(), dataset, resumed, 40):
-        pass
+    dataset, sizes, ups = peopled_capture(), set(), set()
+
+    def run_until(state: TrainState, until: int | None) -> None:
+        for message in trained(state, planar_stages(), 40, until=until, dataset=dataset):
+            if isinstance(message, StepDone):
+                sizes.add(message.counts.get("photographer", 0))
+        ups.add(state.scene.up)
+
+    assert_resumes(run_until, lambda: TrainState(SplatRecipe(sh_degree=1).initialise(dataset), 0), 21, tmp_path)
     assert len(sizes) > 2  # Zero, the first cloud, and the sizes after densification.
-    assert resumed.scene.up == whole.scene.up is not None
-    expected = whole.scene.parameters()
-    assert resumed.scene.parameters().keys() == expected.keys()
-    assert all(torch.equal(tensor, expected[name]) for name, tensor in resumed.scene.parameters().items())
+    assert len(ups) == 1 and None not in ups

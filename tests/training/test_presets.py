@@ -178,15 +178,6 @@ def test_densification_can_keep_its_interval_whatever_the_views() -> None:
     assert steps(DefaultDensify(), 150) == list(range(150, 1501, 150))
 
 
-@pytest.mark.parametrize(("adapts", "clones"), [(True, False), (False, True)])
-def test_thresholds_rise_on_small_photographs_on_request(adapts: bool, clones: bool) -> None:
-    gaussians = make_gaussians([0.001] * 2)
-    state = TrainState(Scene(gaussians, 2.0), seed=0)
-    state.statistics["primary"] = seen([4e-4, 1e-5])
-    Densify(DefaultDensify(adapt_to_size=adapts)).apply(state, tiny_capture(), Clock(10, 100, 6))
-    assert (len(state.scene.primary) == 3) == clones
-
-
 @pytest.mark.parametrize(("step", "left"), [(3000, 2), (3100, 1)])
 def test_oversized_gaussians_are_pruned_after_the_opacity_reset(step: int, left: int) -> None:
     state = TrainState(Scene(make_gaussians([0.01, 0.5]), 2.0), seed=0)

@@ -28,12 +28,12 @@ from glassplat.training.actions import (
     mcmc_cap,
     threshold_factor,
 )
-from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
-from glassplat.training.loop import differentiate, train
+from glassplat.training.loop import differentiate
 from glassplat.training.losses import PhotometricLoss
 from glassplat.training.messages import ActionDone, Message, StepDone
 from glassplat.training.options import DefaultDensify, Intervals, McmcDensify
 from glassplat.training.stage import Clock, Stage, TrainState, stage_starts
+from tests.training.progress_of import assert_resumes, trained
 from tests.training.tiny_capture import tiny_capture, true_scene
 
 OFTEN = McmcDensify(interval=2, start=0.1, cap=45)
@@ -61,12 +61,7 @@ def fresh_state(recipe: Any, seed: int = 0) -> TrainState:
 
 
 def run(state: TrainState, recipe: Any, iterations: int = 20, until: int | None = None) -> list[Message]:
-    messages = []
-    for message in train(stages_of(recipe), tiny_capture(), state, iterations):
-        messages.append(message)
-        if isinstance(message, StepDone) and message.step == until:
-            break
-    return messages
+    return trained(state, stages_of(recipe), iterations, until=until)
 
 
 def in_front(scene: Scene, view: View) -> Tensor:
@@ -93,14 +88,7 @@ def test_a_short_run_relocates_grows_and_regularises(recipe: Any) -> None:
 @BOTH
 @pytest.mark.parametrize("pause", [3, 4, 11])
 def test_resuming_continues_to_the_same_result(recipe: Any, pause: int, tmp_path: Path) -> None:
-    whole, interrupted = fresh_state(recipe), fresh_state(recipe)
-    run(whole, recipe)
-    run(interrupted, recipe, until=pause)
-    save_checkpoint(tmp_path / "checkpoint.safetensors", interrupted)
-    resumed = load_checkpoint(tmp_path / "checkpoint.safetensors")
-    run(resumed, recipe)
-    for name, tensor in whole.scene.parameters().items():
-        assert torch.equal(tensor, resumed.scene.parameters()[name]), name
+    assert_resumes(lambda state, until: run(state, recipe, until=until), lambda: fresh_state(recipe), pause, tmp_path)
 
 
 @BOTH

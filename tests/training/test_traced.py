@@ -33,7 +33,7 @@ from glassplat.training.options import (
     SurroundingsStart,
 )
 from glassplat.training.stage import Clock, Every, Stage, TrainState, stage_starts
-from tests.training.progress_of import finished
+from tests.training.progress_of import assert_resumes, finished, trained
 from tests.training.tiny_capture import tiny_capture
 
 RECIPE = TracedRecipe(
@@ -132,18 +132,11 @@ def test_surroundings_learn_grow_and_are_pruned() -> None:
 
 
 def test_a_resumed_run_ends_in_the_same_scene(tmp_path: Path) -> None:
-    whole = fresh_state()
-    run(RECIPE, whole)
-    first = fresh_state()
-    for message in train(RECIPE.stages(seed=0), tiny_capture(), first, 40):
-        if isinstance(message, StepDone) and message.step == 17:
-            break
-    save_checkpoint(tmp_path / "checkpoint", first)
-    second = load_checkpoint(tmp_path / "checkpoint")
-    assert len(second.scene.surroundings) and "surroundings" in second.statistics
-    run(RECIPE, second)
-    for name, tensor in whole.scene.parameters().items():
-        assert torch.equal(second.scene.parameters()[name], tensor), name
+    def run_until(state: TrainState, until: int | None) -> None:
+        trained(state, RECIPE.stages(seed=0), 40, until=until)
+        assert until is None or (len(state.scene.surroundings) and "surroundings" in state.statistics)
+
+    assert_resumes(run_until, fresh_state, 17, tmp_path)
 
 
 def test_a_short_run_trains_as_splat() -> None:

@@ -27,7 +27,7 @@ from glassplat.training.losses import LossTerm, PhotometricLoss
 from glassplat.training.messages import ActionDone, StageEntered, StepDone
 from glassplat.training.options import Rate
 from glassplat.training.stage import AtShares, Clock, Stage, TrainState
-from tests.training.progress_of import finished
+from tests.training.progress_of import assert_resumes, finished, trained
 from tests.training.tiny_capture import place_true_planes, tiny_capture, true_scene
 
 
@@ -41,13 +41,7 @@ def planar_stages() -> tuple[Stage, ...]:
 
 
 def run(state: TrainState, stages: tuple[Stage, ...], iterations: int, until: int | None = None) -> list[StepDone]:
-    steps = []
-    for message in train(stages, tiny_capture(), state, iterations):
-        if isinstance(message, StepDone):
-            steps.append(message)
-            if message.step == until:
-                break
-    return steps
+    return [message for message in trained(state, stages, iterations, until=until) if isinstance(message, StepDone)]
 
 
 def assert_same_scene(first: Scene, second: Scene) -> None:
@@ -179,15 +173,7 @@ def test_only_what_stands_on_ignored_pixels_is_not_counted() -> None:
 
 @pytest.mark.parametrize("pause", [3, 4, 7])
 def test_resuming_continues_to_the_same_result(pause: int, tmp_path: Path) -> None:
-    whole = fresh_state()
-    run(whole, planar_stages(), 12)
-    interrupted = fresh_state()
-    run(interrupted, planar_stages(), 12, until=pause)
-    save_checkpoint(tmp_path / "checkpoint.safetensors", interrupted)
-    resumed = load_checkpoint(tmp_path / "checkpoint.safetensors")
-    assert resumed.step == pause
-    run(resumed, planar_stages(), 12)
-    assert_same_scene(whole.scene, resumed.scene)
+    assert_resumes(lambda state, until: run(state, planar_stages(), 12, until), fresh_state, pause, tmp_path)
 
 
 @pytest.mark.parametrize("is_saved", [False, True])
