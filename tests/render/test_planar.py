@@ -18,9 +18,17 @@ from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera, mirror_matrices, rotation_from_quat
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
-from tests.render.tiny_scene import camera_at, in_single_precision, joined, pane, quat_product, showcase, shown_panes
-
-CAMERA = camera_at(0.0, 0.0, -0.2)
+from tests.render.tiny_scene import (
+    CAMERA,
+    assert_gradient_matches,
+    camera_at,
+    in_single_precision,
+    joined,
+    pane,
+    quat_product,
+    showcase,
+    shown_panes,
+)
 
 
 def test_layers_recombine_to_the_image_in_srgb() -> None:
@@ -224,22 +232,7 @@ def test_two_panes_keep_their_own_reflections() -> None:
 @pytest.mark.parametrize("name", ["centers", "raw_normals", "logit_reflectances"])
 @pytest.mark.parametrize("fresnel", LAWS)
 def test_plane_gradients_match_finite_differences_through_the_whole_renderer(name: str, fresnel: Fresnel) -> None:
-    scene, renderer = showcase(), Planar(fresnel=fresnel)
-    weights = torch.randn(28, 40, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
-
-    def objective(values: torch.Tensor) -> torch.Tensor:
-        return (renderer(scene.with_parameters({f"planes.{name}": values}), CAMERA).rgb * weights).sum()
-
-    values = scene.parameters()[f"planes.{name}"].clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(objective(values), values)
-    with torch.no_grad():
-        numerical = torch.zeros_like(gradient)
-        for index in range(values.numel()):
-            step = torch.zeros_like(values).flatten()
-            step[index] = 1e-6
-            step = step.reshape(values.shape)
-            numerical.flatten()[index] = (objective(values + step) - objective(values - step)) / 2e-6
-    torch.testing.assert_close(gradient, numerical, rtol=1e-4, atol=1e-5)
+    assert_gradient_matches(Planar(fresnel=fresnel), showcase(), f"planes.{name}")
 
 
 def test_blocked_reflection_gradient_reaches_the_plane_and_not_the_gaussians() -> None:

@@ -18,9 +18,17 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes, nearest_panes
 from glassplat.scene.scene import Scene
 from glassplat.training.losses import gradient_conflict
-from tests.render.tiny_scene import camera_at, concatenated, joined, pane, random_gaussians, showcase
+from tests.render.tiny_scene import (
+    CAMERA,
+    assert_gradient_matches,
+    camera_at,
+    concatenated,
+    joined,
+    pane,
+    random_gaussians,
+    showcase,
+)
 
-CAMERA = camera_at(0.0, 0.0, -0.2)
 WIDE = camera_at(0.0, 0.0, -0.2, width=88, height=60)
 FRONT, BACK = pane(2.0, label=1), pane(4.0, label=2, base_reflectance=0.4)
 
@@ -209,19 +217,7 @@ def test_glass_belongs_to_the_pane_it_lies_on() -> None:
 
 @pytest.mark.parametrize("name", ["planes.centers", "planes.logit_reflectances", "glass.logit_mark", "glass.means"])
 def test_gradients_match_finite_differences(name: str) -> None:
-    scene = vitrine(1, 2)
-    weights = torch.randn(28, 40, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
-
-    def objective(values: Tensor) -> Tensor:
-        return (Planar()(scene.with_parameters({name: values}), CAMERA).rgb * weights).sum()
-
-    values = scene.parameters()[name].clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(objective(values), values)
-    direction = torch.randn(values.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    with torch.no_grad():
-        slope = (objective(values + 1e-6 * direction) - objective(values - 1e-6 * direction)) / 2e-6
-    assert float(gradient.abs().sum()) > 0
-    torch.testing.assert_close((gradient * direction).sum(), slope, rtol=1e-4, atol=1e-5)
+    assert_gradient_matches(Planar(), vitrine(1, 2), name)
 
 
 def test_objects_reflected_through_another_pane_count_as_visible() -> None:

@@ -14,9 +14,8 @@ from glassplat.render.panes import tint_by_panes
 from glassplat.render.planar import Planar
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
-from tests.render.tiny_scene import camera_at, pane, showcase
+from tests.render.tiny_scene import CAMERA, assert_gradient_matches, pane, showcase
 
-CAMERA = camera_at(0.0, 0.0, -0.2)
 GREENISH = torch.tensor([[0.6, 0.9, 0.7]], dtype=torch.float64)
 
 
@@ -83,20 +82,7 @@ def test_gradients_of_one_pane_match_finite_differences() -> None:
 
 
 def test_gradients_match_finite_differences_through_the_whole_renderer() -> None:
-    scene, renderer = tinted_showcase(), Planar()
-    weights = torch.randn(28, 40, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
-
-    def objective(values: Tensor) -> Tensor:
-        return (renderer(scene.with_parameters({"planes.log_transmittances": values}), CAMERA).rgb * weights).sum()
-
-    values = scene.parameters()["planes.log_transmittances"].clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(objective(values), values)
-    for channel in range(3):
-        step = torch.zeros_like(values)
-        step[0, channel] = 1e-6
-        with torch.no_grad():
-            numerical = (objective(values + step) - objective(values - step)) / 2e-6
-        torch.testing.assert_close(gradient[0, channel], numerical, rtol=1e-4, atol=1e-5)
+    assert_gradient_matches(Planar(), tinted_showcase(), "planes.log_transmittances")
 
 
 def test_clear_and_tinted_panes_join() -> None:

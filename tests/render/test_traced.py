@@ -96,16 +96,6 @@ def turned(camera: Camera, angle_rad: float = 0.3) -> Camera:
     return replace(camera, cam_from_world=turn @ camera.cam_from_world)
 
 
-def test_discs_have_gradients_too() -> None:
-    scene, camera = glossy(), camera_at(0.0, 0.0, 0.0)
-    scene = replace(scene, primary=flattened(scene.primary), surroundings=flattened(scene.surroundings))
-    leaves = leaves_of(scene)
-    frame = Traced()(scene.with_parameters(leaves), camera)
-    gradients = torch.autograd.grad(frame.rgb.square().sum(), leaves.values())
-    assert all(bool(g.isfinite().all()) and float(g.abs().max()) > 0 for g in gradients)
-    assert {"distortion", "median_depth"} <= frame.layers.keys()
-
-
 def test_zero_strength_equals_the_base_bit_for_bit() -> None:
     scene = glossy()
     dull = replace(
@@ -155,11 +145,16 @@ def leaves_of(scene: Scene) -> dict[str, torch.Tensor]:
     return {name: t.clone().requires_grad_() for name, t in scene.parameters().items() if t.numel()}
 
 
-def test_gradients_reach_surfaces_and_surroundings() -> None:
+@pytest.mark.parametrize("are_discs", [False, True])
+def test_gradients_reach_surfaces_and_surroundings(are_discs: bool) -> None:
     scene, camera = glossy(), camera_at(0.0, 0.0, 0.0)
+    if are_discs:
+        scene = replace(scene, primary=flattened(scene.primary), surroundings=flattened(scene.surroundings))
     leaves = leaves_of(scene)
-    gradients = torch.autograd.grad(Traced()(scene.with_parameters(leaves), camera).rgb.square().sum(), leaves.values())
+    frame = Traced()(scene.with_parameters(leaves), camera)
+    gradients = torch.autograd.grad(frame.rgb.square().sum(), leaves.values())
     assert all(bool(g.isfinite().all()) and float(g.abs().max()) > 0 for g in gradients)
+    assert ({"distortion", "median_depth"} <= frame.layers.keys()) == are_discs
 
 
 def test_gradients_match_finite_differences() -> None:

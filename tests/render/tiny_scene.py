@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from glassplat.render.frame import Renderer
 from glassplat.render.panes import nearest_hits, panes_in_camera
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
@@ -37,6 +38,9 @@ def camera_at(x: float, y: float, z: float, *, width: int = 40, height: int = 28
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, 3] = -torch.tensor([x, y, z], dtype=torch.float64)
     return Camera(pose, 30.0, 31.0, width / 2 + 0.3, height / 2 - 0.2, width, height)
+
+
+CAMERA = camera_at(0.0, 0.0, -0.2)
 
 
 def pane(z: float, half: float = 50.0, label: int = 1, base_reflectance: float = 0.3) -> Planes:
@@ -89,3 +93,30 @@ def quat_product(left: Tensor, right: Tensor) -> Tensor:
     rw, rv = right[:, :1], right[:, 1:]
     vector = w * rv + rw * v + torch.linalg.cross(v.expand_as(rv), rv)
     return torch.cat([w * rw - (rv * v).sum(-1, keepdim=True), vector], dim=1)
+
+
+FEW = 12
+"""Values of a tensor up to which each is checked."""
+
+
+def assert_gradient_matches(renderer: Renderer, scene: Scene, name: str, *, rtol: float = 1e-4) -> None:
+    """Compares the gradient of a tensor through a renderer with finite differences: for each of a few values, or in
+    three random directions.
+    """
+    values = scene.parameters()[name].clone().requires_grad_()
+    weights = torch.randn(28, 40, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
+
+    def objective(values: Tensor) -> Tensor:
+        return (renderer(scene.with_parameters({name: values}), CAMERA).rgb * weights).sum()
+
+    (gradient,) = torch.autograd.grad(objective(values), values)
+    assert float(gradient.abs().max()) > 1e-3
+    count, generator = values.numel(), torch.Generator().manual_seed(5)
+    if count <= FEW:
+        steps = torch.eye(count, dtype=torch.float64)
+    else:
+        steps = torch.randn(3, count, generator=generator, dtype=torch.float64)
+    with torch.no_grad():
+        for step in steps.reshape(-1, *values.shape):
+            slope = (objective(values + 1e-6 * step) - objective(values - 1e-6 * step)) / 2e-6
+            torch.testing.assert_close((gradient * step).sum(), slope, rtol=rtol, atol=1e-5)
