@@ -213,6 +213,13 @@ def traced_stages(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHED_I
             replace(stage, actions=(*(a for a in stage.actions if not isinstance(a, GrowSh)), grow)) for stage in known
         )
     bootstrap, distant, refinement = known
+    setup = BeginReflections(
+        recipe,
+        None if recipe.mirrors == "environment" else recipe.surroundings,
+        has_environment=recipe.mirrors != "surroundings",
+        reset_sh_degree=not recipe.harmonics_from_start,
+    )
+    distant = replace(distant, setup=setup)
     if recipe.primitive == "disc":
         distant, refinement = _with_renderer(recipe, distant), _with_renderer(recipe, refinement)
     if recipe.normals_throughout:
@@ -220,14 +227,7 @@ def traced_stages(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHED_I
         refinement = replace(refinement, losses=distant.losses, renderer=distant.renderer)
     if recipe.mirrors == "environment":
         return bootstrap, distant, refinement
-    setup = BeginReflections(
-        recipe,
-        recipe.surroundings,
-        has_environment=recipe.mirrors == "both",
-        reset_sh_degree=not recipe.harmonics_from_start,
-    )
-    near = replace(_traced_stage(recipe, distant), setup=setup)
-    return bootstrap, near, _traced_stage(recipe, refinement)
+    return bootstrap, _traced_stage(recipe, distant), _traced_stage(recipe, refinement)
 
 
 def _with_normal_terms(recipe: TracedRecipe, bootstrap: Stage, reflecting: Stage) -> Stage:

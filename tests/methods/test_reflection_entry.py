@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
+from glassplat.methods.glossy_recipes import DeferredRecipe, Mirrors, TracedRecipe
 from glassplat.methods.mirrors import GrowShAfterPropagation
 from glassplat.methods.surroundings import BeginReflections
 from glassplat.scene import logit
@@ -113,3 +113,9 @@ def test_colors_wait_until_normals_have_spread(recipe: DeferredRecipe | TracedRe
     stage = recipe.stages(0, 7000)[1]
     assert isinstance(stage.setup, BeginReflections) and stage.setup.reset_sh_degree
     assert any(isinstance(action, GrowShAfterPropagation) for action in stage.actions)
+
+
+@pytest.mark.parametrize("mirrors", ["both", "surroundings", "environment"])
+def test_colors_that_turn_from_the_start_are_not_reset(mirrors: Mirrors) -> None:
+    setup = TracedRecipe(mirrors=mirrors, harmonics_from_start=True).stages(0, 7000)[1].setup
+    assert isinstance(setup, BeginReflections) and not setup.reset_sh_degree
