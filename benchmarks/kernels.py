@@ -65,7 +65,7 @@ def evaluated_pixels(splats: Splats, channels: Tensor, bins: TileBins) -> int:
         splats, channels, bins, marks=marks, num_primary=count, deviation=None, needs_gradients=False
     )
     blocks = saved.pairs & ((1 << BLOCKS) - 1)
-    return LANES * int(np.unpackbits(blocks.view(np.uint8)).sum())
+    return LANES * int(np.unpackbits(blocks.numpy().view(np.uint8)).sum())
 
 
 def kernel_works(gaussians: Gaussians, camera: Camera) -> tuple[dict[str, Work], Splats, Tensor, TileBins]:
