@@ -208,6 +208,44 @@ def test_a_constant_read_through_a_module_changes_the_fingerprint(
     assert fingerprint(made_from(source), "fast") != before
 
 
+CLOSURE_SOURCE = """
+def factory():
+    from glassplat.kernels.maths import disc
+
+    def made(x):
+        return x + disc.MOST_DEVIATIONS
+
+    return made
+
+made = factory()
+"""
+
+
+def test_a_constant_of_a_module_in_the_closure_changes_the_fingerprint(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = fingerprint(made_from(CLOSURE_SOURCE), "fast")
+    monkeypatch.setattr("glassplat.kernels.maths.disc.MOST_DEVIATIONS", 4.0)
+    assert fingerprint(made_from(CLOSURE_SOURCE), "fast") != before
+
+
+ALIAS_SOURCE = """
+def halved(x):
+    return x / 2
+
+def squared(x):
+    return x * x
+
+which = halved
+
+def made(x):
+    return which(squared(halved(x)))
+"""
+
+
+def test_the_choice_between_functions_that_are_used_anyway_changes_the_fingerprint() -> None:
+    changed = ALIAS_SOURCE.replace("which = halved", "which = squared")
+    assert fingerprint(made_from(ALIAS_SOURCE), "fast") != fingerprint(made_from(changed), "fast")
+
+
 VECTOR_SOURCE = """
 import numpy as np
 from glassplat.kernels.backend.cpu_vector import constant, store, vector_kind

@@ -169,13 +169,13 @@ def fingerprint(function: Callable[..., Any], flags: str) -> str:
         TypeError: the function uses a value that has no stable description.
     """
     digest = hashlib.sha256(flags.encode())
-    for part in _describe(function, set()):
+    for part in _describe(function, {}):
         digest.update(part.encode() + b"\0")
     return digest.hexdigest()
 
 
-def _describe(value: Any, seen: set[int]) -> Iterator[str]:
-    """The value as text, part by part; each function is described once."""
+def _describe(value: Any, seen: dict[int, int]) -> Iterator[str]:
+    """The value as text, part by part; each function is described once, and referred to by its number afterwards."""
     if isinstance(value, LITERAL_TYPES):
         yield f"{type(value).__name__} {value!r}"
     elif isinstance(value, tuple | frozenset):
@@ -191,8 +191,10 @@ def _describe(value: Any, seen: set[int]) -> Iterator[str]:
     elif isinstance(value, TEXT_TYPES):
         yield f"{type(value).__name__} {value}"
     elif isinstance(value, FunctionType):
-        if id(value) not in seen:
-            seen.add(id(value))
+        number = seen.get(id(value), len(seen))
+        yield f"function {number}"
+        if number == len(seen):
+            seen[id(value)] = number
             yield from _described_function(value, seen)
     elif type(value).__name__ == "_Intrinsic":
         # An intrinsic of Numba or of numba-cuda, which is described by its definition.
@@ -204,17 +206,16 @@ def _describe(value: Any, seen: set[int]) -> Iterator[str]:
         )
 
 
-def _described_function(function: FunctionType, seen: set[int]) -> Iterator[str]:
-    """Bytecode, defaults, closure and globals of a function."""
+def _described_function(function: FunctionType, seen: dict[int, int]) -> Iterator[str]:
+    """Bytecode, defaults, and values read from the closure and the globals of a function."""
     yield from _describe(function.__code__, seen)
     yield from _describe(function.__defaults__, seen)
-    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
-        yield f"closes over {name}"
-        yield from _describe(cell.cell_contents, seen)
-    for path in sorted(_global_paths(function.__code__)):
-        if path[0] not in function.__globals__:
-            continue  # A built-in function.
-        value = function.__globals__[path[0]]
+    cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+    known = function.__globals__ | {name: cell.cell_contents for name, cell in cells}
+    for path in sorted(_read_paths(function.__code__)):
+        if path[0] not in known:
+            continue  # A built-in function, or a variable of this function that a nested one reads.
+        value = known[path[0]]
         for name in path[1:]:
             if isinstance(value, ModuleType) and value.__name__.partition(".")[0] == PACKAGE:
                 value = getattr(value, name)
@@ -222,18 +223,18 @@ def _described_function(function: FunctionType, seen: set[int]) -> Iterator[str]
         yield from _describe(value, seen)
 
 
-def _global_paths(code: CodeType) -> set[tuple[str, ...]]:
-    """Globals that a code object and those nested in it read, each with the attributes that follow it."""
+def _read_paths(code: CodeType) -> set[tuple[str, ...]]:
+    """Names of other scopes that a code object and those nested in it read, each with the attributes that follow it."""
     found: set[tuple[str, ...]] = set()
     path: tuple[str, ...] = ()
     for step in dis.get_instructions(code):
-        if step.opname == "LOAD_GLOBAL":
+        if step.opname in ("LOAD_GLOBAL", "LOAD_DEREF"):
             path = (step.argval,)
         elif step.opname != "EXTENDED_ARG":
             path = (*path, step.argval) if path and step.opname in ("LOAD_ATTR", "LOAD_METHOD") else ()
         found.add(path)
     nested = (constant for constant in code.co_consts if isinstance(constant, CodeType))
-    return found.union(*map(_global_paths, nested)) - {()}
+    return found.union(*map(_read_paths, nested)) - {()}
 
 
 def load_data(files: Iterable[caching.IndexDataCacheFile], key: Any) -> Any:
