@@ -1,4 +1,7 @@
-"""Every CUDA kernel compiles for three generations of GPUs, without a GPU; prints the resources each of them uses."""
+"""Every CUDA kernel compiles without a GPU; prints the resources each of them uses.
+
+Those of float32 compile for three generations of GPUs, those of float64, which only tests use, for one.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 pytest.importorskip("numba_cuda", reason="numba-cuda is not installed; `make setup` installs it")
@@ -23,32 +27,37 @@ if SIMULATED:
 MOST_REGISTERS = 255
 MOST_SHARED_BYTES = 48 * 1024
 KERNELS = all_kernels()
-NAMED = {kernel.name: kernel for kernel in KERNELS}
+DOUBLES = [kernel for kernel in all_kernels(np.float64) if kernel.name.endswith("float64")]
+NAMED = {kernel.name: kernel for kernel in [*KERNELS, *DOUBLES]}
 TOOL = hashlib.sha256(Path(compile_kernels.__file__).read_bytes()).hexdigest()
 
 
 @cache
-def compiled(name: str) -> dict[tuple[int, int], tuple[str, Resources]]:
+def compiled(
+    name: str, capabilities: tuple[tuple[int, int], ...] = CAPABILITIES
+) -> dict[tuple[int, int], tuple[str, Resources]]:
     """PTX and resources of a kernel for each generation.
 
     Compiling takes seconds, so they are stored like machine code until the kernel, a function that it uses, a compiler
     or the tool changes.
     """
     kernel = NAMED[name]
-    folders, key = KernelFiles(kernel.function), f"{kernel._images.key(CAPABILITIES)} {TOOL}"
+    folders, key = KernelFiles(kernel.function), f"{kernel._images.key(capabilities)} {TOOL}"
     files = folders.files(kernel.function)
     found = load_data(files, key)
     if found is None or found[0] != key:  # Another process may have written its own under the same name.
-        texts = zip(CAPABILITIES, ptx_of(kernel), strict=True)
+        texts = zip(capabilities, ptx_of(kernel, capabilities), strict=True)
         found = key, {capability: (text, linked(text, capability)) for capability, text in texts}
         folders.store(files[0], key, found)
     return found[1]
 
 
 @pytest.mark.filterwarnings("ignore::numba.core.errors.NumbaPerformanceWarning")
-@pytest.mark.parametrize("kernel", KERNELS, ids=lambda kernel: kernel.name)
+@pytest.mark.parametrize("kernel", [*KERNELS, *DOUBLES], ids=lambda kernel: kernel.name)
 def test_the_kernel_compiles_and_fits(kernel) -> None:
-    for capability, (text, found) in compiled(kernel.name).items():
+    for capability, (text, found) in compiled(
+        kernel.name, CAPABILITIES[1:2] if kernel in DOUBLES else CAPABILITIES
+    ).items():
         assert f".target sm_{capability[0]}{capability[1]}" in text
         print(f"{kernel.name} sm_{capability[0]}{capability[1]}: {found}")
         assert 0 < found.registers <= MOST_REGISTERS
