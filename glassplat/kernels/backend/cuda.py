@@ -233,6 +233,8 @@ SCALARS = {
 FORMATS = {"bool": "?", "uint8": "B", "int16": "h", "int32": "i", "int64": "q", "float32": "f", "float64": "d"}
 """`struct` formats of the number types."""
 TOKEN = re.compile(r"([a-z]+)([1-4]?)")
+THREADS = 128
+"""Threads per block of most kernels."""
 
 
 class Kernel:
@@ -290,6 +292,10 @@ class Kernel:
         loaded = self._loaded.get(index) or self._on_device(index)
         # The raw stream handle, which `torch.cuda.current_stream` would wrap in an object.
         loaded.launch(blocks, threads, torch._C._cuda_getCurrentRawStream(index), values, shapes)
+
+    def over(self, items: int, *arguments: Any, threads: int = THREADS) -> None:
+        """Launches with one thread per item, in blocks of the given size; the last block may have surplus threads."""
+        self(blocks_for(items, threads), threads, *arguments)
 
     def _on_device(self, index: int) -> LoadedKernel:
         """The kernel on a GPU, loaded at first use."""

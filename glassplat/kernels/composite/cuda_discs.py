@@ -21,7 +21,7 @@ from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.backend.devices import SIMULATED
 from glassplat.kernels.composite.cpu_tile import joined_cameras, tile_bounds
-from glassplat.kernels.composite.cuda_tile import BUCKET, PIXELS, at
+from glassplat.kernels.composite.cuda_tile import BUCKET, PIXELS, SUM_THREADS, at
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar, build_reached_rows
 from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, offset_gradient
 from glassplat.kernels.maths.fast_maths import exp2_maths, fused_maths, reciprocal_maths
@@ -294,9 +294,6 @@ def composite_discs_backward(real: type, num_channels: int = 6) -> Kernel:
     return backward
 
 
-SUM_THREADS = 256
-
-
 class Saved(NamedTuple):
     """Results of the forward pass for the backward pass.
 
@@ -358,9 +355,8 @@ def composite_discs_gradients(
         saved.orders.view(-1), saved.looked_at, saved.bucket_tiles, saved.kept.view(-1), v_pixels.view(-1), rows,
     )  # fmt: skip
     sums = channels.new_empty(size, MOMENTS + num_channels)
-    sum_disc_rows(real)(
-        blocks_for(sums.numel(), SUM_THREADS), SUM_THREADS, rows, bins.pair_slots, bins.splat_offsets, sums
-    )  # fmt: skip
+    given = (rows, bins.pair_slots, bins.splat_offsets)
+    sum_disc_rows(real).over(sums.numel(), *given, sums, threads=SUM_THREADS)
     return _from_sums(sums, discs, with_absgrad)
 
 

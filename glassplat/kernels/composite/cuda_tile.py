@@ -15,7 +15,7 @@ from numba import cuda
 from torch import Tensor
 
 from glassplat.kernels.backend.cpu import inlined
-from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
+from glassplat.kernels.backend.cuda import Kernel, kernel
 from glassplat.kernels.backend.devices import SIMULATED
 from glassplat.kernels.maths.blending import Scalar, build_reached_rows, build_screen_form
 from glassplat.kernels.maths.fast_maths import exp2_maths, fused_maths
@@ -68,7 +68,7 @@ def tile_steps(real: type) -> tuple[Scalar, Scalar]:
     return load, coverage
 
 
-THREADS = 256
+SUM_THREADS = 256
 MOMENTS = 6
 
 
@@ -84,10 +84,8 @@ def sum_pair_rows(
     shape, width = tuple(splats.opacities.shape), rows.shape[1]
     count = shape[0] * shape[1]
     found = [rows.new_empty(count, *rest) for rest in ((2,), (3,), (), (num_values,), (width - MOMENTS - num_values,))]
-    sum_rows(REAL_OF[rows.dtype])(
-        blocks_for(count * width, THREADS), THREADS, rows, bins.pair_slots, bins.splat_offsets,
-        splats.conics.view(-1, 3), splats.opacities.view(-1), *found,
-    )  # fmt: skip
+    given = (rows, bins.pair_slots, bins.splat_offsets, splats.conics.view(-1, 3), splats.opacities.view(-1))
+    sum_rows(REAL_OF[rows.dtype]).over(count * width, *given, *found, threads=SUM_THREADS)
     v_means, v_conics, v_opacities, v_values, v_absgrad = (tensor.view(*shape, *tensor.shape[1:]) for tensor in found)
     return v_means, v_conics, v_opacities, v_values, v_absgrad
 

@@ -17,7 +17,7 @@ from numba import cuda
 from torch import Tensor
 
 from glassplat.kernels.backend.cpu import inlined
-from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
+from glassplat.kernels.backend.cuda import Kernel, kernel
 from glassplat.kernels.environment.cpu import gradients_like
 from glassplat.kernels.maths import cube
 from glassplat.kernels.maths.blending import Scalar
@@ -25,24 +25,20 @@ from glassplat.kernels.maths.projection import dot
 from glassplat.kernels.maths.surface import surface_maths
 from glassplat.kernels.records import NORMAL_AT, NORMAL_MIN, REAL_OF, STRENGTH_AT, SURFACE_CHANNELS, Shaded
 
-THREADS = 128
-
 
 def surface_channels(inputs: Sequence[Tensor]) -> Tensor:
     """See `glassplat.kernels.environment.surface_channels`; inputs in its order."""
     colors, extra = inputs[0], inputs[-1]
     count = colors.shape[0]
     channels = colors.new_zeros(count, SURFACE_CHANNELS + extra.shape[1])
-    kernel_of = surface_channels_forward(REAL_OF[colors.dtype])
-    kernel_of(blocks_for(count, THREADS), THREADS, *inputs, channels)
+    surface_channels_forward(REAL_OF[colors.dtype]).over(count, *inputs, channels)
     return channels
 
 
 def surface_channels_gradients(saved: Sequence[Tensor], v_channels: Tensor) -> tuple[Tensor, ...]:
     """As `glassplat.kernels.environment.cpu.surface_channels_gradients`."""
     found = tuple(tensor.zero_() for tensor in gradients_like(v_channels))
-    kernel_of = surface_channels_backward(REAL_OF[v_channels.dtype])
-    kernel_of(blocks_for(v_channels.shape[0], THREADS), THREADS, *saved, v_channels, *found)
+    surface_channels_backward(REAL_OF[v_channels.dtype]).over(len(v_channels), *saved, v_channels, *found)
     return found
 
 
@@ -83,7 +79,7 @@ def padded_faces(texels: Tensor) -> Tensor:
     """Faces [6, S + 2, S + 2, D] with a ring of their neighbours' texels, as in the reference."""
     size, depth = texels.shape[1], texels.shape[3]
     padded = texels.new_empty(6, size + 2, size + 2, depth)
-    pad_faces(REAL_OF[texels.dtype])(blocks_for(padded.numel(), THREADS), THREADS, texels, padded)
+    pad_faces(REAL_OF[texels.dtype]).over(padded.numel(), texels, padded)
     return padded
 
 
@@ -104,7 +100,7 @@ def texel_gradients(first_cells: Tensor, fractions: Tensor, gradients: Tensor, s
     sums = gradients.new_zeros(count, 4, depth)
     sum_lookups(real)(count, WARP, fractions, gradients, starts, order, sums)
     texels = gradients.new_empty(6, size, size, depth)
-    fold_faces(real)(blocks_for(texels.numel(), THREADS), THREADS, sums.view(6, size + 2, size + 2, 4 * depth), texels)
+    fold_faces(real).over(texels.numel(), sums.view(6, size + 2, size + 2, 4 * depth), texels)
     return texels
 
 
@@ -232,8 +228,7 @@ def cube_lookup(texels: Tensor, directions: Tensor) -> Tensor:
     """As `glassplat.kernels.environment.cpu.cube_lookup`."""
     count = directions.shape[0]
     found = texels.new_empty(count, texels.shape[3])
-    kernel_of = cube_lookup_forward(REAL_OF[texels.dtype])
-    kernel_of(blocks_for(count, THREADS), THREADS, padded_faces(texels), directions, found)
+    cube_lookup_forward(REAL_OF[texels.dtype]).over(count, padded_faces(texels), directions, found)
     return found
 
 
@@ -242,10 +237,8 @@ def cube_lookup_gradients(texels: Tensor, directions: Tensor, cotangents: Tensor
     count = directions.shape[0]
     v_directions, fractions = torch.empty_like(directions), directions.new_empty(count, 2)
     first_cells = torch.empty(count, dtype=torch.int32, device=directions.device)
-    cube_lookup_backward(REAL_OF[texels.dtype])(
-        blocks_for(count, THREADS), THREADS,
-        padded_faces(texels), directions, cotangents, v_directions, first_cells, fractions,
-    )  # fmt: skip
+    inputs = (padded_faces(texels), directions, cotangents)
+    cube_lookup_backward(REAL_OF[texels.dtype]).over(count, *inputs, v_directions, first_cells, fractions)
     return texel_gradients(first_cells, fractions, cotangents, texels.shape[1]), v_directions
 
 
@@ -282,10 +275,8 @@ def shade_environment(inputs: Sequence[Tensor], least_strength: float) -> Shaded
     """As `glassplat.kernels.environment.cpu.shade_environment`."""
     blended, alpha, texels, *rest = inputs
     shaded = Shaded(*(alpha.new_empty(*alpha.shape, 3) for _ in range(3)))
-    shade_environment_forward(REAL_OF[blended.dtype])(
-        blocks_for(alpha.numel(), THREADS), THREADS, least_strength,
-        blended, alpha, padded_faces(texels), *rest, *shaded,
-    )  # fmt: skip
+    inputs = (blended, alpha, padded_faces(texels), *rest)
+    shade_environment_forward(REAL_OF[blended.dtype]).over(alpha.numel(), least_strength, *inputs, *shaded)
     return shaded
 
 
@@ -297,10 +288,9 @@ def shade_environment_gradients(
     v_blended, v_alpha = torch.empty_like(blended), torch.empty_like(alpha)
     first_cells = torch.empty(alpha.numel(), dtype=torch.int32, device=alpha.device)
     fractions, v_raw = alpha.new_empty(alpha.numel(), 2), alpha.new_empty(alpha.numel(), 3)
-    shade_environment_backward(REAL_OF[blended.dtype])(
-        blocks_for(alpha.numel(), THREADS), THREADS, least_strength,
-        blended, padded_faces(texels), *rest, *found, *cotangents, v_blended, v_alpha, first_cells, fractions, v_raw,
-    )  # fmt: skip
+    given = (least_strength, blended, padded_faces(texels), *rest, *found, *cotangents)
+    launch = shade_environment_backward(REAL_OF[blended.dtype]).over
+    launch(alpha.numel(), *given, v_blended, v_alpha, first_cells, fractions, v_raw)
     return v_blended, v_alpha, texel_gradients(first_cells, fractions, v_raw, texels.shape[1])
 
 

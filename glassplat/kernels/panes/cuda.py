@@ -15,7 +15,7 @@ from numba import cuda
 from torch import Tensor
 
 from glassplat.kernels.backend.cpu import inlined
-from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
+from glassplat.kernels.backend.cuda import Kernel, kernel
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.images import color_space_maths
 from glassplat.kernels.maths.pane import DARKEST, build_blend_channel, pane_maths, weighted_edges
@@ -41,7 +41,7 @@ def pane_hits(
     before = (None, None) if beyond is None else (beyond.pane, beyond.depth)
     pane_hits_forward(real)(rows * columns, PIXELS, *inputs, mask, *before, index, depth, tiles, extents)
     windows = centers.new_empty(count, 4)
-    pane_windows_kernel(real)(blocks_for(count, THREADS), THREADS, extents, width, height, windows)
+    pane_windows_kernel(real).over(count, extents, width, height, windows)
     return PaneHits(index, depth, tiles, windows)
 
 
@@ -237,9 +237,6 @@ def pane_hits_forward(real: type) -> Kernel:
     return forward
 
 
-THREADS = 128
-
-
 @cache
 def pane_windows_kernel(real: type) -> Kernel:
     """Fills the left, top, right and bottom edge of the pixels that show each pane; all 0 if there are none."""
@@ -263,8 +260,7 @@ def blend_panes(inputs: Sequence[Tensor], switches: tuple[int, bool, bool]) -> t
     """As `glassplat.kernels.panes.cpu.blend_panes`."""
     transmission, mask = inputs[:2]
     outputs = tuple(torch.empty_like(like) for like in (transmission, transmission, mask))
-    kernel_of = blend_panes_forward(REAL_OF[mask.dtype])
-    kernel_of(blocks_for(mask.numel(), THREADS), THREADS, *inputs, *switches, *outputs)
+    blend_panes_forward(REAL_OF[mask.dtype]).over(mask.numel(), *inputs, *switches, *outputs)
     return outputs
 
 
@@ -275,8 +271,8 @@ def blend_panes_gradients(
     mask, normals, pane = inputs[1], inputs[3], inputs[5]
     found = tuple(torch.zeros_like(tensor) for tensor in inputs[:3])
     shares = mask.new_zeros(*mask.shape, 4)
-    kernel_of = blend_panes_backward(REAL_OF[mask.dtype])
-    kernel_of(blocks_for(mask.numel(), THREADS), THREADS, *inputs, *switches, *cotangents, *found, shares)
+    launch = blend_panes_backward(REAL_OF[mask.dtype]).over
+    launch(mask.numel(), *inputs, *switches, *cotangents, *found, shares)
     # A separate sum for each pane, in an order that does not change from run to run.
     panes = torch.arange(normals.shape[0], device=mask.device)[:, None]
     sums = (pane.flatten() == panes).to(mask.dtype) @ shares.view(-1, 4)
@@ -387,10 +383,8 @@ def layer_derivatives(
 ) -> tuple[Tensor, Tensor]:
     """As `glassplat.kernels.panes.cpu.layer_derivatives`."""
     through, mirrored = torch.empty_like(strength), torch.empty_like(strength)
-    layer_derivatives_kernel(REAL_OF[strength.dtype])(
-        blocks_for(strength.numel(), THREADS), THREADS, strength, transmission, reflection, where, linear,
-        through, mirrored,
-    )  # fmt: skip
+    launch = layer_derivatives_kernel(REAL_OF[strength.dtype]).over
+    launch(strength.numel(), strength, transmission, reflection, where, linear, through, mirrored)
     return through, mirrored
 
 
@@ -427,10 +421,8 @@ def layer_derivatives_kernel(real: type) -> Kernel:
 def sample_derivatives(derivatives: Tensor, surface: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
     """As `glassplat.kernels.panes.cpu.sample_derivatives`."""
     found = torch.empty_like(depths)
-    per_splat = means2d.view(-1, 2), depths.view(-1), found.view(-1)
-    sample_derivatives_kernel(REAL_OF[depths.dtype])(
-        blocks_for(depths.numel(), THREADS), THREADS, derivatives, surface, *per_splat
-    )
+    launch = sample_derivatives_kernel(REAL_OF[depths.dtype]).over
+    launch(depths.numel(), derivatives, surface, means2d.view(-1, 2), depths.view(-1), found.view(-1))
     return found
 
 
@@ -456,7 +448,7 @@ def sample_derivatives_kernel(real: type) -> Kernel:
 def inside_panes(pane: Tensor, strength: Tensor) -> Tensor:
     """As `glassplat.kernels.panes.cpu.inside_panes`."""
     inside = torch.empty_like(strength)
-    inside_panes_kernel(REAL_OF[strength.dtype])(blocks_for(pane.numel(), THREADS), THREADS, pane, strength, inside)
+    inside_panes_kernel(REAL_OF[strength.dtype]).over(pane.numel(), pane, strength, inside)
     return inside
 
 
@@ -499,9 +491,8 @@ def gradient_conflict_gradient(derivatives: Tensor, v_mean: Tensor) -> Tensor:
     """As `glassplat.kernels.panes.cpu.gradient_conflict_gradient`."""
     height, width = derivatives.shape[1] + 2, derivatives.shape[2] + 2
     v_transmission = derivatives.new_empty(height, width, CHANNELS)
-    conflict_backward(REAL_OF[derivatives.dtype])(
-        blocks_for(v_transmission.numel(), THREADS), THREADS, derivatives, v_mean.view(1), v_transmission
-    )
+    launch = conflict_backward(REAL_OF[derivatives.dtype]).over
+    launch(v_transmission.numel(), derivatives, v_mean.view(1), v_transmission)
     return v_transmission
 
 

@@ -16,7 +16,7 @@ from numba import cuda
 from torch import Tensor
 
 from glassplat.kernels.backend.cpu import inlined
-from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
+from glassplat.kernels.backend.cuda import THREADS, Kernel, blocks_for, kernel
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.project import steps
 from glassplat.kernels.project.cpu import DISC_WIDTHS, WIDTHS, new_outputs
@@ -25,7 +25,6 @@ from glassplat.kernels.project.steps import LENS_VALUES, Footprint, vec3
 from glassplat.kernels.records import REAL_OF
 from glassplat.kernels.screen_statistics import Sums, Views
 
-THREADS = 128
 POSE = 12
 """Number of entries of a camera's gradient: rows of (3x3 block, translation)."""
 
@@ -34,8 +33,7 @@ def project(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, n
     """As `glassplat.kernels.project.cpu.project`."""
     outputs = new_outputs(inputs, WIDTHS)
     lens = _lenses(inputs[5], inputs[6], width, height)
-    blocks, real = blocks_for(len(inputs[0]), THREADS), REAL_OF[inputs[0].dtype]
-    project_forward(real)(blocks, THREADS, *inputs, lens, degree, near, *outputs)
+    project_forward(REAL_OF[lens.dtype]).over(len(inputs[0]), *inputs, lens, degree, near, *outputs)
     return outputs
 
 
@@ -43,8 +41,8 @@ def project_discs(inputs: Sequence[Tensor], width: int, height: int, *, degree: 
     """As `glassplat.kernels.project.cpu.project_discs`."""
     outputs = new_outputs(inputs, DISC_WIDTHS)
     lens = _lenses(inputs[5], inputs[6], width, height)
-    blocks, real = blocks_for(len(inputs[0]), THREADS), REAL_OF[inputs[0].dtype]
-    project_discs_forward(real)(blocks, THREADS, *inputs, lens, width, height, degree, near, *outputs)
+    launch = project_discs_forward(REAL_OF[lens.dtype]).over
+    launch(len(inputs[0]), *inputs, lens, width, height, degree, near, *outputs)
     return outputs
 
 
@@ -84,9 +82,7 @@ def _gradients(
     blocks = blocks_for(means.shape[0], THREADS)
     shape = (blocks, num_cameras, POSE) if needs_camera else (0, 0, 0)
     partial = torch.zeros(shape, dtype=torch.float64, device=means.device)
-    backward(REAL_OF[means.dtype])(
-        blocks, THREADS, *inputs, lens, degree, *given, needs_camera, *found, partial
-    )  # fmt: skip
+    backward(REAL_OF[means.dtype])(blocks, THREADS, *inputs, lens, degree, *given, needs_camera, *found, partial)
     return found, partial.sum(dim=0)
 
 
@@ -260,10 +256,9 @@ def add_views(sums: Sums, views: Views) -> None:
         weight = views.weight.contiguous() if views.weight.dim() else views.weight.reshape(1, 1)
     else:
         factor = views.weight
-    add_views_kernel(REAL_OF[sums.view_count.dtype])(
-        blocks_for(count, THREADS), THREADS, *sums, *(tensor.detach().contiguous() for tensor in views[:3]), weight,
-        factor, views.width, views.height, 1 + views.direct,
-    )  # fmt: skip
+    given = (*sums, *(tensor.detach().contiguous() for tensor in views[:3]), weight, factor)
+    launch = add_views_kernel(REAL_OF[sums.view_count.dtype]).over
+    launch(count, *given, views.width, views.height, 1 + views.direct)
 
 
 @cache

@@ -18,11 +18,9 @@ from numba import cuda
 from torch import Tensor
 
 from glassplat.kernels.backend.cpu import inlined
-from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
+from glassplat.kernels.backend.cuda import Kernel, kernel
 from glassplat.kernels.records import REAL_OF, TILE, Splats, TileBins, check_pair_count
 from glassplat.kernels.tiles.cpu import active_between, columns_of, rows_of, shape_of
-
-THREADS = 128
 
 
 def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | None) -> TileBins:
@@ -39,30 +37,26 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
     length = max(count, num_tiles if masked else 1)
     by_depth = (3 if masked else 2) * length
     sums = torch.empty(by_depth + count + 1, dtype=torch.int64, device=device)
-    count_tiles(real)(blocks_for(length, THREADS), THREADS, *seen, length, sums)
+    count_tiles(real).over(length, *seen, length, sums)
     order = torch.argsort(splats.depths, dim=1, stable=True).flatten()
-    order_counts()(blocks_for(count, THREADS), THREADS, per_camera, by_depth, order, sums)
+    order_counts().over(count, per_camera, by_depth, order, sums)
     sums.cumsum_(0)
     # The only synchronisation with the GPU.
     num_pairs, *totals = sums[length : by_depth + 1 : length].tolist()
     check_pair_count(num_pairs)
     spans = torch.empty(totals[0] - num_pairs, 3, dtype=torch.int32, device=device)
     active = torch.empty(totals[1] - totals[0], dtype=torch.int32, device=device) if masked else None
-    list_spans(real)(blocks_for(length, THREADS), THREADS, *seen, length, sums, spans, active)
+    list_spans(real).over(length, *seen, length, sums, spans, active)
     key, dtype = (np.int16, torch.int16) if num_tiles < np.iinfo(np.int16).max else (np.int32, torch.int32)
     tiles = torch.empty(num_pairs, dtype=dtype, device=device)
     members, slots = torch.empty(2, num_pairs, dtype=torch.int32, device=device)
-    emit_tiles(key)(
-        blocks_for(num_pairs, THREADS), THREADS, active_tiles, per_camera, rows, columns, num_tiles, length, by_depth,
-        order, sums, spans, tiles, members, slots,
-    )  # fmt: skip
+    sizes = (per_camera, rows, columns, num_tiles, length, by_depth)
+    emit_tiles(key).over(num_pairs, active_tiles, *sizes, order, sums, spans, tiles, members, slots)
     by_tile, order = torch.sort(tiles, stable=True)
     pair_splats, pair_slots = torch.empty(2, num_pairs, dtype=torch.int32, device=device)
     tile_offsets = torch.empty(num_tiles + 1, dtype=torch.int64, device=device)
-    list_pairs(key)(
-        blocks_for(max(num_pairs, num_tiles + 1), THREADS), THREADS, by_tile, order, members, slots, pair_splats,
-        pair_slots, tile_offsets,
-    )  # fmt: skip
+    outputs = (pair_splats, pair_slots, tile_offsets)
+    list_pairs(key).over(max(num_pairs, num_tiles + 1), by_tile, order, members, slots, *outputs)
     if active is None:
         active = _every_tile(num_tiles, device)
     return TileBins(pair_splats, tile_offsets, pair_slots, sums[: count + 1], active, width, height, num_cameras)

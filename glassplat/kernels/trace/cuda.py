@@ -11,7 +11,7 @@ One warp per Gaussian computes the gradients from its hits, 32 at a time, and su
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ from numba import cuda
 from torch import Tensor
 
 from glassplat.kernels.backend.cpu import ZERO, inlined
-from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
+from glassplat.kernels.backend.cuda import Kernel, kernel
 from glassplat.kernels.maths.blending import ALPHA_MAX, TRANSMITTANCE_MIN, Scalar
 from glassplat.kernels.maths.disc import ray_hit_maths
 from glassplat.kernels.maths.fast_maths import exp2_maths
@@ -31,7 +31,6 @@ from glassplat.kernels.trace import reach, steps
 from glassplat.kernels.trace.bvh import build_fit_leaf, curve_cells, curve_position, level_offsets
 from glassplat.kernels.trace.steps import CHUNK, FRAME_AT, GEOMETRY, LEVEL_BITS, NODE, OPACITY_AT, STACK, WIDTH
 
-THREADS = 128
 MOST_KEPT, KEPT_BYTES = 64, 2**28
 """Maximum number of hits per ray stored by the forward pass, and bytes for all rays."""
 
@@ -45,9 +44,9 @@ def build_bvh(shapes: Shapes, *, flat: bool) -> Bvh:
     boxes = means.new_empty(offsets[-1], 6, WIDTH)
     extents = reach(shapes.opacities.detach())
     leaves = offsets[1] if count else 0
-    fit_leaves(real, flat)(blocks_for(leaves * WIDTH, THREADS), THREADS, means, frames, extents, order, boxes)
+    fit_leaves(real, flat).over(leaves * WIDTH, means, frames, extents, order, boxes)
     for below, (first, last) in zip(offsets, pairwise(offsets[1:]), strict=False):
-        fit_level(real)(blocks_for((last - first) * WIDTH, THREADS), THREADS, below, first, last, boxes)
+        fit_level(real).over((last - first) * WIDTH, below, first, last, boxes)
     return Bvh(order, boxes, _on_device(offsets, means.device))
 
 
@@ -63,7 +62,7 @@ def hilbert_codes(points: Tensor) -> Tensor:
     """As `glassplat.kernels.trace.bvh.hilbert_codes`."""
     cells, finite = curve_cells(points)
     positions = torch.empty(len(points), dtype=torch.int64, device=points.device)
-    hilbert_positions()(blocks_for(len(points), THREADS), THREADS, cells, positions)
+    hilbert_positions().over(len(points), cells, positions)
     return torch.where(finite, positions, torch.iinfo(torch.int64).max)
 
 
@@ -387,10 +386,8 @@ def trace_gradients(
     collect = _search(shapes, rays, bvh, flat)
     collect(-1, near, hits.offsets, hits.hit_ids, hits.alphas, *outputs[4:], None, None, None, None)
     v_rays = [torch.zeros_like(ray) for ray in rays]
-    means_and_frames, saved = shapes[:2], (*outputs[:3], *cotangents)
-    trace_ray_gradients(real, flat)(
-        blocks_for(num_rays, THREADS), THREADS, *means_and_frames, sh, *rays, degree, *hits, *saved, *v_rays
-    )
+    given = (*shapes[:2], sh, *rays, degree, *hits, *outputs[:3], *cotangents)
+    trace_ray_gradients(real, flat).over(num_rays, *given, *v_rays)
     by_gaussian, order = torch.sort(hits.hit_ids, stable=True)
     starts = torch.searchsorted(by_gaussian, torch.arange(count + 1, dtype=torch.int32, device=means.device))
     found = tuple(torch.zeros_like(tensor) for tensor in shapes)
@@ -406,14 +403,9 @@ def trace_gradients(
 def _search(shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tensor], flat: bool) -> Callable[..., None]:
     """Binds `trace_forward` to these shapes and rays; the result takes its remaining arguments."""
     order, boxes, offsets = bvh
-    blocks = blocks_for(rays[0].shape[0], THREADS)
-
-    def launch(*rest: object) -> None:
-        trace_forward(REAL_OF[rays[0].dtype], flat)(
-            blocks, THREADS, *shapes, *rays, order, boxes.view(-1), offsets, *rest
-        )
-
-    return launch
+    origins = rays[0]
+    launch = trace_forward(REAL_OF[origins.dtype], flat).over
+    return partial(launch, len(origins), *shapes, *rays, order, boxes.view(-1), offsets)
 
 
 @cache

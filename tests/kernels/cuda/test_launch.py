@@ -235,3 +235,16 @@ def test_a_wrong_argument_list_is_refused() -> None:
 
 def test_blocks_cover_all_items() -> None:
     assert [blocks_for(items, 128) for items in (0, 1, 128, 129)] == [0, 1, 1, 2]
+
+
+def test_a_launch_over_items_has_a_thread_for_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    @kernel("fill", np.float32, "real1")
+    def fill(values):
+        values[0] = 1
+
+    launches: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(Kernel, "__call__", lambda self, *arguments: launches.append(arguments))
+    fill.over(129, None)
+    fill.over(129, None, threads=256)
+    fill.over(0, None)
+    assert launches == [(2, 128, None), (1, 256, None), (0, 128, None)]
