@@ -87,7 +87,7 @@ REASONS: dict[str, dict[str, str]] = {
     | {
         "texels": "Runs are shorter.",
         "first_texels": "Coarse texels give wrong normals a gradient.",
-        "propagation_interval": "Runs are shorter.",
+        "propagation_interval": "`densify.interval` is kept: runs are shorter.",
     },
     "traced": GLOSSY
     | {
@@ -97,7 +97,7 @@ REASONS: dict[str, dict[str, str]] = {
         "mirrors": "A cube map finds the sky sooner, and normals with it.",
         "least_strength": "Most pixels reflect nothing; skipping them costs 0.00 dB.",
         "surroundings.start.source": "The scene already holds what is mirrored; it takes a third of the time.",
-        "surroundings.start.cells": "Resolution of the box.",
+        "surroundings.start.cells": "At most 32, with half a Gaussian per pixel.",
         "surroundings.sh_degree": "Most mirrored objects are matte.",
         "surroundings.rates.decay": "Runs are shorter.",
         "surroundings.rates.short_run_power": "Runs are shorter.",
@@ -109,7 +109,7 @@ REASONS: dict[str, dict[str, str]] = {
         "surroundings.densify.gradient_threshold": "As for the scene.",
         "surroundings.densify.prune_opacity": "As for the scene.",
         "surroundings.densify.prune_large_start": "As for the scene.",
-        "surroundings.densify.cap": "As for the scene.",
+        "surroundings.densify.cap": "As for the scene, `densify.per_pixel` decides.",
         "surroundings.densify.per_pixel": "As for the scene.",
         "surroundings.densify.least_contribution": "Late in the run, what no reflection shows is pruned.",
         "surroundings.reset": "Copies start in the right place.",
@@ -137,7 +137,9 @@ def differences(method: str) -> dict[str, tuple[Any, Any]]:
 
 
 def written(value: Any) -> str:
-    """A value formatted for the table."""
+    """A value formatted for the table; None stands for a value that the method works out."""
+    if value is None:
+        return "automatic"
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, tuple):
