@@ -259,7 +259,7 @@ def _shots(root: Path, model: SparseModel) -> tuple[Shot, ...]:
     missing = sorted(name for name in names if not isfile(images / name))
     if missing:
         raise InputError(
-            f"{len(missing)} of the {len(model.images)} photographs of the COLMAP model are missing in {images}: "
+            f"{images} lacks {len(missing)} of the {len(model.images)} photographs of the COLMAP model: "
             f"{join_names(missing)}; copy them there, or remove them from the model"
         )
     orphans = sorted(image.name for image in model.images if image.camera_id not in model.lenses)

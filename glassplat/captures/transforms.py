@@ -193,8 +193,8 @@ def make_shots(root: Path, settings: Settings, file_name: str) -> dict[str, Shot
     missing = [path.name for path in paths if not isfile(path)]
     if missing:
         raise InputError(
-            f"{len(missing)} of {len(paths)} photographs of {root / file_name} are missing: {join_names(missing)}; "
-            "copy them to file_path, or delete their entries from `frames`"
+            f"{root} lacks {len(missing)} of the {len(paths)} photographs of {file_name}: {join_names(missing)}; copy "
+            "them to file_path, or delete their entries from `frames`"
         )
     shots = {}
     for frame, path, name in zip(settings["frames"], paths, _photograph_names(root, paths), strict=True):

@@ -211,7 +211,7 @@ def test_damaged_binary_file_is_named(capture, name: str, start: int, data: byte
         ("images", "1 1 0 0 0 inf 2 3 1 0000.png\n", "pose of 0000.png contains non-finite values"),
         ("images", "1 1e300 1e300 0 0 1 2 3 1 0000.png\n", "rotation of 0000.png"),
         ("images", "1 1 0 0 0 1e300 2 3 1 0000.png\n", r"the pose of 0000.png holds the value 1e\+300"),
-        ("images", f"1 1 0 0 0 1 2 3 1 {'n' * 5000}.png\n", "1 of the 1 photographs of the COLMAP model are missing"),
+        ("images", f"1 1 0 0 0 1 2 3 1 {'n' * 5000}.png\n", "lacks 1 of the 1 photographs of the COLMAP model"),
         ("images", "", r"images\.txt registers no photograph"),
         (
             "images",

@@ -226,7 +226,7 @@ def test_missing_photographs_are_named(capture) -> None:
     capture.write_transforms({**LENS, "frames": capture.frames()})
     for name in capture.names[:6]:
         (capture.root / "images" / name).unlink()
-    with pytest.raises(InputError, match=r"6 of 10 photographs .*0000.png, .* and 1 more; .*delete their entries"):
+    with pytest.raises(InputError, match=r"6 of the 10 photographs .*0000.png, .* and 1 more; .*delete their entries"):
         load_dataset(capture.root)
 
 
@@ -249,8 +249,8 @@ def test_missing_photographs_are_named(capture) -> None:
         ({"distortion_params": [0.1, 0.2]}, "distortion_params of .*0000.png .*expected a list of 6 values"),
         ({"ply_file_path": 3}, r"ply_file_path of .*transforms\.json is 3; expected a text"),
         ({"frames": [3]}, r"frame 1 of .* is 3; expected an object with file_path, transform_matrix"),
-        ({"frames": [{"file_path": "/", "transform_matrix": [[0] * 4] * 4}]}, "1 of 1 photographs .* are missing"),
-        ({"frames": [{"file_path": "a" * 999, "transform_matrix": [[0] * 4] * 4}]}, "1 of 1 photographs .* missing"),
+        ({"frames": [{"file_path": "/", "transform_matrix": [[0] * 4] * 4}]}, "lacks 1 of the 1 photographs of "),
+        ({"frames": [{"file_path": "a" * 999, "transform_matrix": [[0] * 4] * 4}]}, "lacks 1 of the 1 photographs of "),
         ({"fl_x": -5.0}, "fl_x of the lens of 0000.png is -5.0; expected a finite number above 0"),
         ({"w": float("inf")}, "w of the lens of 0000.png is inf; expected"),
         ({"fl_x": "wide"}, "fl_x of the lens of 0000.png is 'wide'; expected"),

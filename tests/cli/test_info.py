@@ -348,4 +348,5 @@ def test_a_damaged_capture_is_refused_with_the_reason(tmp_path: Path, capsys: py
     shutil.copytree(SCENE, tmp_path / "capture")
     (tmp_path / "capture" / "images" / "0000.jpg").unlink()
     assert main(["info", str(tmp_path / "capture")]) == 2
-    assert "1 of the 64 photographs of the COLMAP model are missing" in " ".join(capsys.readouterr().err.split())
+    said = " ".join(capsys.readouterr().err.split())
+    assert "images lacks 1 of the 64 photographs of the COLMAP model: 0000.jpg" in said
