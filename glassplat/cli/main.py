@@ -170,8 +170,9 @@ def parse_arguments(arguments: list[str]) -> Any:
     complete = name.startswith("--tyro-")
     if not complete and name not in ("-h", "--help"):
         raise InputError(unknown_name_message("command", name, COMMANDS, "glassplat --help"))
-    # After the list of commands, nothing is run; only shell completion needs every option.
-    kinds = {known: command_line(known, [])[0] if complete else command_stub(known) for known in COMMANDS}
+    # After the list of commands, nothing is run; only shell completion needs every option, as the full help does.
+    full = ["--help-advanced"]
+    kinds = {known: command_line(known, full)[0] if complete else command_stub(known) for known in COMMANDS}
     tyro.cli(overview_type(kinds), prog="glassplat", description=DESCRIPTION, args=arguments, config=tyro_settings())
     raise SystemExit(USAGE_CODE)
 

@@ -128,6 +128,8 @@ def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:
     first = arguments[0] if arguments else "-"
     if first not in RECIPES and not first.startswith("-"):
         raise InputError(unknown_name_message("method", first, RECIPES, "glassplat train --help"))
+    if named_method(arguments) is None and not {*HELP, FULL_HELP} & set(arguments):
+        raise InputError(unknown_name_message("method", "", RECIPES, "glassplat train --help"))
     full = FULL_HELP in arguments
     # An unknown preset is refused by the parser.
     preset: Preset = "paper" if last_option_value(arguments, "--preset") == "paper" else "glassplat"
