@@ -9,10 +9,18 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from glassplat.cli.console import message_console, print_line
+from glassplat.cli.console import message_console, print_line, shell_word
 from glassplat.errors import InputError, convert_to_input_error, count_noun, join_names
 from glassplat.files.records import read_json, readable_name, wrap_read_errors
-from glassplat.files.writing import LOADABLE, check_folder, make_folder, real_path, scene_source, write_text
+from glassplat.files.writing import (
+    LOADABLE,
+    SPLAT_SUFFIXES,
+    check_folder,
+    make_folder,
+    real_path,
+    scene_source,
+    write_text,
+)
 from glassplat.kernels.backend.devices import DeviceName
 from glassplat.model.run_directory import RunDirectory
 from glassplat.options import Angle, Coordinate, PaneLabel, Share, Up
@@ -81,11 +89,15 @@ def check_scene(path: Path) -> None:
     path = scene_source(path)
     if path.is_file() or (path.suffix and not path.is_dir()):
         check_file(path, LOADABLE)
+        if path.suffix.lower() not in SPLAT_SUFFIXES:
+            raise InputError(f"{path} is not a splat file by its name; expected {LOADABLE}")
         return
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; expected {LOADABLE}")
     if not (path / "recipe.json").is_file():
-        raise InputError(f"{path} holds no scene; expected {LOADABLE}")
+        raise InputError(
+            f"{path} holds no scene; expected {LOADABLE}. `glassplat info {shell_word(path)}` says what it is"
+        )
     RunDirectory(path).check_begun()
 
 
