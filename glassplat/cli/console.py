@@ -307,7 +307,7 @@ def describe_os_error(error: OSError) -> str:
         return str(error)  # One of ours, with a complete message.
     subjects = [os.fsdecode(name) for name in (error.filename, error.filename2) if isinstance(name, str | bytes)]
     about = f"{' -> '.join(subjects)}: " if subjects else ""
-    remedy = "; free some space, then repeat the command" if error.errno in DISK_FULL else ""
+    remedy = "; free some space" if error.errno in DISK_FULL else ""
     return f"{about}{error.strerror[:1].lower()}{error.strerror[1:]}{remedy}"
 
 
@@ -315,12 +315,18 @@ def _describe_failure(error: BaseException) -> str:
     if is_one_of(error, EXPECTED_FAILURES):
         return str(error)
     if is_one_of(error, GPU_OUT_OF_MEMORY):
-        return f"{first_sentence(error)}; {MEMORY_REMEDY}, or use --device cpu; the last checkpoint stays"
+        return f"{first_sentence(error)}; {MEMORY_REMEDY}, or use --device cpu"
     if is_out_of_memory(error):
         reason = first_sentence(error, OUT_OF_MEMORY) or "an allocation failed"
-        return f"out of memory ({reason}); {MEMORY_REMEDY}; the last checkpoint stays"
+        return f"out of memory ({reason}); {MEMORY_REMEDY}"
     sentence = first_sentence(error)
     return f"unexpected error, {type(error).__name__}: {sentence}; {save_traceback(error)}"
+
+
+def is_shortage(error: BaseException) -> bool:
+    """Return whether memory or disk space ran out, so that the command may succeed another time."""
+    is_full = isinstance(error, OSError) and error.errno in DISK_FULL
+    return is_full or is_one_of(error, GPU_OUT_OF_MEMORY) or is_out_of_memory(error)
 
 
 def is_out_of_memory(error: BaseException) -> bool:

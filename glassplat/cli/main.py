@@ -125,6 +125,8 @@ def run_to_exit_code(arguments: list[str], *, is_program: bool) -> int:
             if raised and not is_lost:
                 return report_interrupt(raised[-1], command)
             end = console.classify_error(error)
+            if command is not None and not is_lost and console.is_shortage(error):
+                end = end._replace(text=f"{end.text}; {command.interrupt_message()}")
             with suppress(OSError):  # Fails if the output is full or closed.
                 console.print_error(end.label, end.text)
             if is_training and not is_lost:

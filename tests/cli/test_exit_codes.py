@@ -16,6 +16,7 @@ import torch
 from glassplat.cli.console import LONGEST_QUOTE
 from glassplat.cli.main import main
 from glassplat.cli.scene import Evaluate
+from glassplat.cli.train import Train
 from glassplat.errors import InputError
 from glassplat.kernels.backend.devices import CudaUnavailableError
 from glassplat.panes import PlaneFitError
@@ -141,6 +142,27 @@ def test_a_failure_is_explained_with_code_1(
     assert said.startswith("stopped: ") and said.count("\n") == 1
     assert all(word in said for word in words)
     assert "unexpected error" not in said
+
+
+@pytest.mark.parametrize("work", [too_large_for_numpy, raising(OSError(errno.ENOSPC, "No space left on device"))])
+@pytest.mark.parametrize("is_saved", [False, True], ids=["nothing saved", "checkpoint"])
+def test_a_training_that_runs_out_of_room_says_what_is_left(
+    work: Callable[[], None],
+    is_saved: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(Train, "set_up", lambda self: None)
+    monkeypatch.setattr(Train, "run", lambda self, console: work())
+    if is_saved:
+        (tmp_path / "checkpoint.safetensors").touch()
+    assert main(["train", "splat", "--data", "capture", "--output", str(tmp_path)]) == 1
+    nothing = "no checkpoint was written yet: repeat the command to start again"
+    saved = f"{tmp_path} holds a checkpoint: repeat the command with --resume to continue from it"
+    said = capsys.readouterr().err
+    assert said.endswith(f"; {saved if is_saved else nothing}\n")
+    assert said.count("checkpoint") == 1
 
 
 @pytest.mark.parametrize(("work", "words"), UNFORESEEN, ids=lambda value: getattr(value, "__name__", None))
