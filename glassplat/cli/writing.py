@@ -29,6 +29,7 @@ from glassplat.files.sidecars import read_cameras, write_cameras
 from glassplat.files.writing import OUTPUT_FORMATS, SPLAT_WRITERS, atomic_write, real_path, scene_source, write_splats
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model import model as models
+from glassplat.model.run_directory import RunDirectory
 from glassplat.publish.camera_paths import fit_to_width, interpolate_cameras, select_keyframes
 from glassplat.publish.film import check_size, encode_video, side_by_side, wipe_images
 from glassplat.publish.web_page import MOST_GAUSSIANS, PREVIEW, Sharing, check_panes, fits_page, write_preview
@@ -193,6 +194,9 @@ def write_clean(command: Clean, console: Console) -> None:
     if (count := found["outside"]) > len(model.scene.primary) / 2:
         print_warning(console, f"--box removes {count} Gaussians, more than half; is it in the scene's own units?")
     if factor is not None:
+        if RunDirectory(command.scene).import_record.is_file():
+            already = "may be in metres already, as `clean --scale` writes it"
+            print_warning(console, f"{command.scene} {already}; --scale needs two points measured in this scene")
         cleaned = cleaned.scale(factor)
         print_line(console, f"one unit is now a metre; it was {factor:.4g} m")
     cleaned.save(command.output)
@@ -308,8 +312,8 @@ def _write_sidecars(command: Export, scene: Scene, console: Console) -> list[Pat
     """Writes planes, glass and environment, if present; returns the written files."""
     written = models.write_sidecars(command.output, scene)
     if len(scene.planes):
-        panes = count_noun(len(scene.planes), "pane")
-        print_line(console, f"{panes} -> {command.output / models.PLANES}, their shape -> {models.GLASS}")
+        panes, whose = count_noun(len(scene.planes), "pane"), "its" if len(scene.planes) == 1 else "their"
+        print_line(console, f"{panes} -> {command.output / models.PLANES}, {whose} shape -> {models.GLASS}")
     if not scene.environment.is_empty:
         print_line(console, f"its environment -> {command.output / models.ENVIRONMENT}, {models.PANORAMA}")
     return written

@@ -123,7 +123,10 @@ def test_the_command_writes_another_scene_in_metres(tmp_path: Path, capsys: pyte
         main(["clean", str(run), "--output", str(output), "--scale", *points, *["--isolated", "0", "--oversized", "0"]])
         == 0
     )
-    assert "one unit is now a metre; it was 0.5 m" in " ".join(capsys.readouterr().out.split())
+    said = " ".join(capsys.readouterr().out.split())
+    assert "one unit is now a metre; it was 0.5 m" in said and "already" not in said
+    assert main(["clean", str(output), "--output", str(tmp_path / "twice"), "--scale", *points]) == 0
+    assert f"warning: {output} may be in metres already" in " ".join(capsys.readouterr().out.split())
     old, new = glassplat.load(run), glassplat.load(output)
     torch.testing.assert_close(new.scene.planes.centers, old.scene.planes.centers / 2)
     torch.testing.assert_close(new.image("2.png"), old.image("2.png"), atol=2e-4, rtol=0)
