@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from types import FrameType
 from typing import Any, NamedTuple, NoReturn
 
@@ -314,8 +315,8 @@ def resumed_state(
         changes = option_changes(vars(recorded), vars(settings)) + recipe_changes(directory, recipe)
         raise InputError(
             f"{directory.path} was started with other options: {join_names(changes)}; expected the same to resume it. "
-            f"Repeat the original options, for example by --config {directory.path / 'recipe.json'}, or choose another "
-            "--output"
+            f"Repeat the original options, for example by --config {quote(str(directory.path / 'recipe.json'))}, or "
+            "choose another --output"
         )
     directory.check_photographs(dataset)
     for what, begun, now, differs in (

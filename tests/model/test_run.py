@@ -450,11 +450,13 @@ def test_a_state_in_the_middle_of_a_change_is_not_saved(tmp_path: Path) -> None:
     ],
 )
 def test_resuming_names_changed_options(recipe: Any, settings: Any, told: str, tmp_path: Path) -> None:
+    folder = tmp_path / "my run"
     with pytest.raises(KeyboardInterrupt):
-        run(tmp_path, interrupt_at=5)
+        run(folder, interrupt_at=5)
     with pytest.raises(InputError) as caught:
-        Run(recipe, settings, RunDirectory(tmp_path), tiny_capture(), resume=True).run_to_end(print)
+        Run(recipe, settings, RunDirectory(folder), tiny_capture(), resume=True).run_to_end(print)
     assert f" was started with other options: {told}; expected the same to resume it. Repeat" in str(caught.value)
+    assert f"--config '{folder / 'recipe.json'}', or" in str(caught.value)
 
 
 def test_a_run_resumes_with_its_moved_capture_only(tmp_path: Path) -> None:
