@@ -114,11 +114,7 @@ class FeatureDatabase:
     @property
     def image_names(self) -> list[str]:
         """Names of all photographs in the database."""
-        return [self.image_name(index) for index in range(len(self.photographs))]
-
-    def image_name(self, index: int) -> str:
-        """Name of a photograph in the database."""
-        return f"{index:06d}.png"
+        return [f"{index:06d}.png" for index in range(len(self.photographs))]
 
     def create(self, lens: LensName) -> None:
         """Writes cameras and photographs unless they exist."""
@@ -128,8 +124,14 @@ class FeatureDatabase:
             database.clear_all_tables()
             keys = dict.fromkeys(map(_camera_key, self.photographs))
             rigs = {key: _add_rig(database, lens, key, self._focal(key)) for key in keys}
-            for index, photograph in enumerate(self.photographs):
-                _add_image(database, self.image_name(index), *rigs[_camera_key(photograph)])
+            for name, photograph in zip(self.image_names, self.photographs, strict=True):
+                camera_id, rig_id = rigs[_camera_key(photograph)]
+                image = library.pycolmap.Image(name=name, camera_id=camera_id)
+                image.image_id = database.write_image(image)
+                frame = library.pycolmap.Frame()
+                frame.rig_id = rig_id
+                frame.add_data_id(image.data_id)
+                database.write_frame(frame)
 
     def write_images(self, listen: Listener) -> None:
         """Writes missing greyscale images: upright, reduced.
@@ -178,8 +180,8 @@ class FeatureDatabase:
     def match(self, pairs: Sequence[tuple[int, int]], features: FeatureOptions, listen: Listener) -> None:
         """Matches pairs of photographs, by index, that are not matched yet."""
         pairs_file = self.path.with_suffix(".pairs.txt")
-        names = [(self.image_name(one), self.image_name(other)) for one, other in pairs]
-        pairs_file.write_text("".join(f"{one} {other}\n" for one, other in names), encoding="utf-8")
+        names = self.image_names
+        pairs_file.write_text("".join(f"{names[one]} {names[other]}\n" for one, other in pairs), encoding="utf-8")
         matching = library.pycolmap.FeatureMatchingOptions(use_gpu=False)
         matching.guided_matching = features.guided
         verification = library.pycolmap.TwoViewGeometryOptions()
@@ -287,15 +289,6 @@ def _add_rig(database: Any, lens: LensName, key: tuple[str, int, int], focal: fl
     rig = library.pycolmap.Rig()
     rig.add_ref_sensor(camera.sensor_id)
     return camera.camera_id, database.write_rig(rig)
-
-
-def _add_image(database: Any, name: str, camera_id: int, rig_id: int) -> None:
-    image = library.pycolmap.Image(name=name, camera_id=camera_id)
-    image.image_id = database.write_image(image)
-    frame = library.pycolmap.Frame()
-    frame.rig_id = rig_id
-    frame.add_data_id(image.data_id)
-    database.write_frame(frame)
 
 
 Pairs = list[tuple[int, int]]
