@@ -231,7 +231,9 @@ def make_lens(model: str, parameters: list[float], size: tuple[int, int]) -> Len
     if model not in PARAMETER_COUNTS:
         raise InputError(f"unknown camera model {model!r}; expected one of {', '.join(PARAMETER_COUNTS)}")
     if not all(1 <= side <= LARGEST_SIDE for side in size):
-        raise InputError(f"the camera is {_size_text(size)} pixels; expected sides from 1 to {LARGEST_SIDE}")
+        # Text files may hold sizes of thousands of digits, which cannot be printed.
+        shown = "x".join(str(side) if abs(side) < 10**9 else "huge" for side in size)
+        raise InputError(f"the camera is {shown} pixels; expected sides from 1 to {LARGEST_SIDE}")
     total = PARAMETER_COUNTS[model].total
     if len(parameters) != total:
         raise InputError(f"camera model {model} takes {total} parameters, got {len(parameters)}")
@@ -242,8 +244,7 @@ def make_lens(model: str, parameters: list[float], size: tuple[int, int]) -> Len
 
 def _check_parameters(lens: Lens) -> None:
     """Refuse implausible parameters, including NaN, for which comparisons are false."""
-    size = lens.width, lens.height
-    longer, counts = max(size), PARAMETER_COUNTS[lens.model]
+    longer, counts = max(lens.width, lens.height), PARAMETER_COUNTS[lens.model]
     bounds = [
         *[(SHORTEST_FOCAL * longer, LONGEST_FOCAL * longer)] * counts.focal,
         *[(-FARTHEST_CENTER * longer, FARTHEST_CENTER * longer)] * counts.principal_point,
@@ -253,14 +254,9 @@ def _check_parameters(lens: Lens) -> None:
         if not least <= value <= most:
             found = ", ".join(f"{one:g}" for one in lens.parameters)
             raise InputError(
-                f"camera model {lens.model} of {_size_text(size)} pixels has the parameters {found}; expected a "
-                f"finite number from {least:g} to {most:g} instead of {value:g}"
+                f"camera model {lens.model} of {lens.width}x{lens.height} pixels has the parameters {found}; expected "
+                f"a finite number from {least:g} to {most:g} instead of {value:g}"
             )
-
-
-def _size_text(size: tuple[int, int]) -> str:
-    """Size for messages; text files may hold sizes of thousands of digits, which cannot be printed."""
-    return "x".join(str(side) if abs(side) < 10**9 else "huge" for side in size)
 
 
 def lens_for_image(lens: Lens, size: tuple[int, int], name: str) -> Lens:

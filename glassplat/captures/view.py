@@ -263,19 +263,14 @@ def machine_memory() -> float:
         whole = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     except (AttributeError, ValueError, OSError):  # Not available on Windows.
         whole = UNKNOWN_MEMORY
-    for path in memory_limits():
-        with suppress(OSError, ValueError):  # No such file, or its limit is `max`.
-            whole = min(whole, float(path.read_text("utf-8")))
-    return whole
-
-
-def memory_limits() -> Iterator[Path]:
-    """Limit files of this process's control group and of its parents, which in a container end at the root."""
     lines = CGROUP_FILE.read_text(encoding="utf-8", errors="replace").splitlines() if CGROUP_FILE.is_file() else []
     for _, controllers, name in (line.split(":", 2) for line in lines):
         if controllers in LIMIT_FILES:
             group = CGROUP_FOLDER / controllers / name.lstrip("/")
-            yield from (folder / LIMIT_FILES[controllers] for folder in (group, *group.parents))
+            for folder in (group, *group.parents):  # In a container, the parents end at the root.
+                with suppress(OSError, ValueError):  # No such file, or its limit is `max`.
+                    whole = min(whole, float((folder / LIMIT_FILES[controllers]).read_text("utf-8")))
+    return whole
 
 
 @dataclass(frozen=True)
