@@ -42,39 +42,30 @@ LEAST_SHOWN = 0.1
 """Minimum contribution of a visible Gaussian, in pixels over all views."""
 
 
-@dataclass(frozen=True)
-class ReflectionMeasure:
-    """Search for reflective Gaussians in the views, within the region.
+MEASURED_VIEWS = 12
+"""Number of training views in which the amount of reflection is measured."""
+REFLECTIVE = 0.1
+"""Strength above which Gaussians count as reflective (paper)."""
+VARYING = 0.04
+"""Standard deviation of the residual over the views, sRGB, above which it is view-dependent."""
 
-    A Gaussian's residual in a view is the difference between photograph and render, averaged over its pixels with its
-    blending weights. Unresolved detail has the same residual in all views, reflections a different one in each. The
-    spread of the residual over views distinguishes the two.
 
-    Attributes:
-        views: number of training views used.
-        strength: strength above which Gaussians count as reflective (paper).
-        spread: standard deviation of the residual over the views, sRGB, above which it is view-dependent.
-    """
+@torch.no_grad()
+def reflective_share(scene: Scene, views: Sequence[View]) -> float:
+    """Reflected share of the visible scene in its region: the mean strength."""
+    shown = sum(
+        (contributions(scene, view.camera) for view in sample_evenly(views, MEASURED_VIEWS)),
+        torch.zeros((), dtype=torch.float32),
+    )
+    return mean_in_region(scene, shown, torch.sigmoid(scene.primary.channels["logit_strength"]))
 
-    views: int = 12
-    strength: float = 0.1
-    spread: float = 0.04
 
-    @torch.no_grad()
-    def reflective_share(self, scene: Scene, views: Sequence[View]) -> float:
-        """Reflected share of the visible scene: the mean strength."""
-        shown = sum(
-            (contributions(scene, view.camera) for view in sample_evenly(views, self.views)),
-            torch.zeros((), dtype=torch.float32),
-        )
-        return mean_in_region(scene, shown, torch.sigmoid(scene.primary.channels["logit_strength"]))
-
-    @torch.no_grad()
-    def view_dependent_share(self, scene: Scene, views: Sequence[View], renderer: Renderer) -> float:
-        """Share of the visible scene that does not reflect, although its residual is view-dependent."""
-        shown, spreads = residual_spreads(scene, sample_evenly(views, self.views), renderer)
-        reflects = scene.primary.channels["logit_strength"] > logit(self.strength)
-        return mean_in_region(scene, shown, ~reflects & (spreads > self.spread))
+@torch.no_grad()
+def view_dependent_share(scene: Scene, views: Sequence[View], renderer: Renderer) -> float:
+    """Share of the visible scene in its region that does not reflect, although its residual is view-dependent."""
+    shown, spreads = residual_spreads(scene, sample_evenly(views, MEASURED_VIEWS), renderer)
+    reflects = scene.primary.channels["logit_strength"] > logit(REFLECTIVE)
+    return mean_in_region(scene, shown, ~reflects & (spreads > VARYING))
 
 
 def mean_in_region(scene: Scene, shown: Tensor, values: Tensor) -> float:
@@ -86,6 +77,8 @@ def mean_in_region(scene: Scene, shown: Tensor, values: Tensor) -> float:
 def residual_spreads(scene: Scene, views: Sequence[View], renderer: Renderer) -> tuple[Tensor, Tensor]:
     """Visibility of each primary Gaussian, in pixels, and the spread of its residual over the views; [N] each.
 
+    A Gaussian's residual in a view is the difference between photograph and render, averaged over its pixels with its
+    blending weights. Unresolved detail has the same residual in all views, reflections a different one in each.
     Ignored pixels are excluded: a residual of 0 there would look view-dependent.
     """
     count, device = len(scene.primary), scene.primary.means.device
@@ -304,12 +297,10 @@ class Propagate:
     Attributes:
         recipe: options of propagation and sabotage, and their schedule.
         renderer: renderer of the stage, whose frames have a layer `base`.
-        measure: measures the amount of reflection.
     """
 
     recipe: GlossyOptions
     renderer: Renderer
-    measure: ReflectionMeasure = field(default_factory=ReflectionMeasure)
     name: str = "propagate normals"
 
     @property
@@ -365,7 +356,7 @@ class Propagate:
         """Return whether reflection has stopped growing for long enough; updates the records."""
         if self.recipe.schedule.end == "fixed":
             return False
-        share = self.measure.reflective_share(state.scene, dataset.train)
+        share = reflective_share(state.scene, dataset.train)
         if LAST_GROWTH not in state.records or share > state.records[MOST_REFLECTIVE] + LEAST_GROWTH:
             state.records |= {MOST_REFLECTIVE: share, LAST_GROWTH: clock.step}
         waited = (clock.step - state.records[LAST_GROWTH]) / self.when.interval(clock)
@@ -380,13 +371,13 @@ class Propagate:
         if state.records[MOST_REFLECTIVE] >= LEAST_REFLECTIVE:
             return False
         if VIEW_DEPENDENT not in state.records or clock.step % self._first_step(clock) == self.when.interval(clock):
-            state.records[VIEW_DEPENDENT] = self.measure.view_dependent_share(state.scene, dataset.train, self.renderer)
+            state.records[VIEW_DEPENDENT] = view_dependent_share(state.scene, dataset.train, self.renderer)
         return state.records[VIEW_DEPENDENT] < LEAST_VIEW_DEPENDENT
 
     def _end_propagation(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
         """Records the end, and logs what was found."""
         state.records[PROPAGATION_ENDED] = clock.step
-        share = max(self.measure.reflective_share(state.scene, dataset.train), state.records.get(MOST_REFLECTIVE, 0.0))
+        share = max(reflective_share(state.scene, dataset.train), state.records.get(MOST_REFLECTIVE, 0.0))
         state.records[MOST_REFLECTIVE] = share
         if share < LEAST_REFLECTIVE or self.recipe.raise_rates_found:
             # Faster, if there are no normals to corrupt.
@@ -407,7 +398,7 @@ class Propagate:
         else:
             varying = state.records.get(VIEW_DEPENDENT)
             if varying is None:
-                varying = self.measure.view_dependent_share(state.scene, dataset.train, self.renderer)
+                varying = view_dependent_share(state.scene, dataset.train, self.renderer)
             advice = (MATTE_ADVICE if varying < LEAST_VIEW_DEPENDENT else OVERLOOKED_ADVICE) % (100 * varying)
         log.warning(NOTHING_FOUND, clock.step, AS_SPLAT if self.matte_rates else "", advice)
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from glassplat.captures.view import View, sample_evenly
-from glassplat.methods.mirrors import ReflectionMeasure, residual_spreads
+from glassplat.methods.mirrors import reflective_share, residual_spreads, view_dependent_share
 from glassplat.render.deferred import Deferred
 from glassplat.render.layers import contributions
 from glassplat.scene import SH_ZERO, logit
@@ -48,7 +48,7 @@ def views(*left: float) -> list[View]:
 
 @pytest.mark.parametrize("strength", [1e-3, 0.1, 0.5, 0.9])
 def test_reflectors_are_weighted_by_strength_and_visibility(strength: float) -> None:
-    share = ReflectionMeasure().reflective_share(two_discs(strength=strength), views(0, 0))
+    share = reflective_share(two_discs(strength=strength), views(0, 0))
     assert share == pytest.approx((strength + 1e-3) / 2, abs=1e-3)
 
 
@@ -56,18 +56,18 @@ def test_gaussians_outside_the_region_do_not_count() -> None:
     scene = two_discs(strength=0.9)
     scene = replace(scene, environment=replace(scene.environment, region=(-0.5, 0.0, 2.0, 0.3)))
     assert scene.environment.surrounds(scene.primary.means).tolist() == [True, False]
-    assert ReflectionMeasure().reflective_share(scene, views(0)) == pytest.approx(0.9, abs=1e-3)
+    assert reflective_share(scene, views(0)) == pytest.approx(0.9, abs=1e-3)
     everywhere = replace(scene, environment=replace(scene.environment, region=None))
-    assert ReflectionMeasure().reflective_share(everywhere, views(0)) == pytest.approx(0.45, abs=1e-3)
+    assert reflective_share(everywhere, views(0)) == pytest.approx(0.45, abs=1e-3)
     nowhere = replace(scene, environment=replace(scene.environment, region=(0.0, 0.0, 9.0, 0.3)))
-    assert ReflectionMeasure().reflective_share(nowhere, views(0)) == 0.0
+    assert reflective_share(nowhere, views(0)) == 0.0
 
 
 def test_a_constant_residual_has_no_spread() -> None:
     shown, spreads = residual_spreads(two_discs(), views(0.3, 0.3, 0.3, 0.3), Deferred())
     torch.testing.assert_close(shown, 4 * contributions(two_discs(), camera()))
     assert spreads.max() < 0.01
-    assert ReflectionMeasure().view_dependent_share(two_discs(), views(0.3, 0.3), Deferred()) == 0.0
+    assert view_dependent_share(two_discs(), views(0.3, 0.3), Deferred()) == 0.0
 
 
 def test_a_view_dependent_residual_has_the_spread_of_the_photographs() -> None:
@@ -89,8 +89,8 @@ def test_ignored_pixels_are_no_evidence() -> None:
 
 def test_reflective_surfaces_do_not_count_as_view_dependent() -> None:
     turning = views(0.3, -0.3, 0.3, -0.3)
-    assert ReflectionMeasure().view_dependent_share(two_discs(), turning, Deferred()) == pytest.approx(0.5, abs=1e-3)
-    assert ReflectionMeasure().view_dependent_share(two_discs(strength=0.9), turning, Deferred()) == 0.0
+    assert view_dependent_share(two_discs(), turning, Deferred()) == pytest.approx(0.5, abs=1e-3)
+    assert view_dependent_share(two_discs(strength=0.9), turning, Deferred()) == 0.0
 
 
 def test_views_are_taken_evenly() -> None:

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import pytest
 import torch
 
-from glassplat.captures.view import View
 from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
 from glassplat.methods.mirrors import (
     OPACITIES_RAISED,
     PROPAGATION_ENDED,
     Propagate,
     RefineEnvironment,
-    ReflectionMeasure,
     ResetRaised,
 )
 from glassplat.methods.recipe import recipe_from_json, recipe_to_json
@@ -166,37 +166,26 @@ def test_raised_opacities_are_held_for_a_while() -> None:
     assert not torch.equal(state.scene.primary.logit_opacities, raised)
 
 
-@dataclass(frozen=True)
-class Told(ReflectionMeasure):
-    """Returns the given shares, in this order."""
-
-    reflects: tuple[float, ...] = ()
-    turns: float = 0.0
-    asked: list[int] = field(default_factory=list)
-
-    def reflective_share(self, scene: Scene, views: Sequence[View]) -> float:
-        self.asked.append(1)
-        return self.reflects[min(len(self.asked), len(self.reflects)) - 1]
-
-    def view_dependent_share(self, scene: Scene, views: Sequence[View], renderer: Deferred) -> float:
-        return self.turns
+@contextmanager
+def told(*reflects: float, turns: float = 0.0) -> Iterator[None]:
+    """Replaces the measures of reflection by the given shares, in this order, and the view-dependent share."""
+    shares = itertools.chain(reflects, itertools.repeat(reflects[-1]))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("glassplat.methods.mirrors.reflective_share", lambda scene, views: next(shares))
+        patch.setattr("glassplat.methods.mirrors.view_dependent_share", lambda scene, views, renderer: turns)
+        yield
 
 
 def propagated(
-    search: ReflectionMeasure,
-    schedule: PropagationSchedule,
-    intervals: int = 10,
-    *,
-    raise_rates_found: bool = False,
-    state: TrainState | None = None,
+    schedule: PropagationSchedule, *, raise_rates_found: bool = False, state: TrainState | None = None
 ) -> tuple[TrainState, list[int]]:
-    """A state after the given number of intervals of ten steps in a run of a hundred, and the steps of propagation."""
+    """A state after a run of a hundred steps with intervals of ten, and the steps of propagation."""
     state, done = state or fresh_state(), []
     often = Intervals(opacity=0.1, least=1)
     recipe = DeferredRecipe(schedule=schedule, intervals=often, raise_rates_found=raise_rates_found)
-    action = Propagate(recipe, Deferred(), search)
-    for interval in range(1, intervals + 1):
-        clock = Clock(10 * interval, 100, 5)
+    action = Propagate(recipe, Deferred())
+    for step in range(10, 101, 10):
+        clock = Clock(step, 100, 5)
         if action.due(clock) and action.apply(state, tiny_capture(), clock):
             done.append(clock.step)
     return state, done
@@ -237,7 +226,8 @@ def test_propagation_ends_when_no_more_reflectors_are_found(
     end: Literal["settled", "fixed"], shares: list[float], turns: float, ended: int
 ) -> None:
     schedule = PropagationSchedule(end=end, stop=0.9, patience=2)
-    state, done = propagated(Told(reflects=tuple(shares), turns=turns), schedule)
+    with told(*shares, turns=turns):
+        state, done = propagated(schedule)
     assert state.records[PROPAGATION_ENDED] == ended
     # Starting at the first reset, at the intervals not used by resets, until the end.
     assert done == [step for step in (40, 50, 70, 80) if step < ended]
@@ -254,8 +244,8 @@ def test_propagation_ends_when_no_more_reflectors_are_found(
 def test_scenes_without_reflections_raise_the_rates_with_a_log_message(
     share: float, turns: float, said: str | None, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with caplog.at_level("INFO", logger="glassplat.training"):
-        state, _ = propagated(Told(reflects=(share,), turns=turns), PropagationSchedule(patience=2))
+    with caplog.at_level("INFO", logger="glassplat.training"), told(share, turns=turns):
+        state, _ = propagated(PropagationSchedule(patience=2))
     warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert state.optimizer.raised_rates == pytest.approx({} if said is None else RAISED)
     _, reflection, refinement = DeferredRecipe().stages(seed=0)
@@ -272,16 +262,17 @@ def test_a_region_without_gaussians_is_named(caplog: pytest.LogCaptureFixture) -
     state = fresh_state()
     environment = Environment(torch.zeros(6, 1, 1, 3), region=(50.0, 0.0, 0.5, 2.0))
     state.scene = replace(state.scene, environment=environment)
-    propagated(ReflectionMeasure(), PropagationSchedule(patience=2), state=state)
+    propagated(PropagationSchedule(patience=2), state=state)
     (warning,) = [record.getMessage() for record in caplog.records]
     assert "uses the learning rates of splat" in warning
     assert "no Gaussian lies in the sphere outside which nothing reflects, of radius 2 around (50, 0, 0.5)" in warning
 
 
 def test_unchanged_rates_are_not_logged(caplog: pytest.LogCaptureFixture) -> None:
-    schedule, told = PropagationSchedule(end="fixed", stop=0.5), Told(reflects=(0.0,))
-    action = Propagate(DeferredRecipe(schedule=schedule, raise_rates_matte=False), Deferred(), told)
-    action.apply(fresh_state(), tiny_capture(), Clock(50, 100, 5))
+    schedule = PropagationSchedule(end="fixed", stop=0.5)
+    action = Propagate(DeferredRecipe(schedule=schedule, raise_rates_matte=False), Deferred())
+    with told(0.0):
+        action.apply(fresh_state(), tiny_capture(), Clock(50, 100, 5))
     assert "little or nothing reflective" in caplog.text and "the learning rates of splat" not in caplog.text
 
 
@@ -290,8 +281,8 @@ def test_scenes_with_reflections_raise_the_rates_on_request(
     recipe: DeferredRecipe | TracedRecipe,
 ) -> None:
     (action,) = (action for action in recipe.stages(seed=0)[1].actions if isinstance(action, Propagate))
-    found = action.recipe.raise_rates_found
-    state, _ = propagated(Told(reflects=(0.4,)), PropagationSchedule(patience=2), raise_rates_found=found)
+    with told(0.4):
+        state, _ = propagated(PropagationSchedule(patience=2), raise_rates_found=action.recipe.raise_rates_found)
     assert state.optimizer.raised_rates == pytest.approx(RAISED if recipe.raise_rates_found else {})
     assert state.records[PROPAGATION_ENDED] > 10
 
@@ -453,11 +444,12 @@ def test_the_shortest_run_refines_its_environment_in_full(iterations: int) -> No
 def test_propagation_ends_in_runs_of_any_length(iterations: int) -> None:
     schedule = PropagationSchedule(end="fixed", stop=0.61)
     recipe, state = DeferredRecipe(schedule=schedule, intervals=Intervals(opacity=0.1, least=1)), fresh_state()
-    action = Propagate(recipe, Deferred(), Told(reflects=(0.5,)))
-    for step in range(1, iterations + 1):
-        clock = Clock(step, iterations, 5)
-        if action.due(clock):
-            action.apply(state, tiny_capture(), clock)
+    action = Propagate(recipe, Deferred())
+    with told(0.5):
+        for step in range(1, iterations + 1):
+            clock = Clock(step, iterations, 5)
+            if action.due(clock):
+                action.apply(state, tiny_capture(), clock)
     assert state.records[PROPAGATION_ENDED] == pytest.approx(0.61 * iterations, abs=0.5)
 
 
