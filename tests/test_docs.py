@@ -37,8 +37,8 @@ def shell_lines(page: Path) -> list[str]:
 
 
 def commands(program: str) -> list[list[str]]:
-    """The arguments of every call of a program shown in the pages."""
-    words = [shlex.split(line) for page in PAGES for line in shell_lines(page)]
+    """The arguments of every different call of a program shown in the pages."""
+    words = [shlex.split(line) for line in dict.fromkeys(line for page in PAGES for line in shell_lines(page))]
     return [line[line.index(program) + 1 :] for line in words if program in line]
 
 
@@ -46,14 +46,14 @@ def test_the_readme_fits_on_one_screen() -> None:
     assert len(README.read_text().splitlines()) <= MOST_README_LINES
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_point_to_existing_files(page: Path) -> None:
-    targets = LINK.findall(page.read_text())
-    absolute = [REPOSITORY.sub("", target) for target in targets if REPOSITORY.match(target)]
-    relative = [target for target in targets if "://" not in target]
-    missing = [target for target in absolute if not (ROOT / target).exists()]
-    missing += [target for target in relative if not (page.parent / target).exists()]
-    assert not missing, f"{page.relative_to(ROOT)} links to {missing}, which do not exist"
+def test_links_point_to_existing_files() -> None:
+    for page in PAGES:
+        targets = LINK.findall(page.read_text())
+        absolute = [REPOSITORY.sub("", target) for target in targets if REPOSITORY.match(target)]
+        relative = [target for target in targets if "://" not in target]
+        missing = [target for target in absolute if not (ROOT / target).exists()]
+        missing += [target for target in relative if not (page.parent / target).exists()]
+        assert not missing, f"{page.relative_to(ROOT)} links to {missing}, which do not exist"
 
 
 def test_the_readme_can_be_read_elsewhere() -> None:
@@ -72,10 +72,9 @@ def test_the_command_line_takes_every_command_shown(arguments: list[str]) -> Non
     assert type(main.parse_arguments(arguments)).__name__.startswith(main.COMMANDS[arguments[0]].kind)
 
 
-@pytest.mark.parametrize("arguments", commands("make"), ids=" ".join)
-def test_make_has_every_target_shown(arguments: list[str]) -> None:
+def test_make_has_every_target_shown() -> None:
     targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    assert set(arguments) <= targets
+    assert {word for arguments in commands("make") for word in arguments} <= targets
 
 
 PYTHON_BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
@@ -134,12 +133,12 @@ def options_of(arguments: str) -> list[str]:
     return re.findall(r"(?<=\s)--[a-z][a-z-]*", bare) or [""]
 
 
-@pytest.mark.parametrize(("module", "option"), module_calls(), ids=" ".join)
-def test_tools_and_benchmarks_take_every_option_shown(module: str, option: str) -> None:
-    path = ROOT / module.replace(".", "/")
-    path = path / "__main__.py" if path.is_dir() else path.with_suffix(".py")
-    source = path.read_text(encoding="utf-8")
-    assert option in source or option.removeprefix("--").replace("-", "_") in source
+def test_tools_and_benchmarks_take_every_option_shown() -> None:
+    for module, option in module_calls():
+        path = ROOT / module.replace(".", "/")
+        path = path / "__main__.py" if path.is_dir() else path.with_suffix(".py")
+        source = path.read_text(encoding="utf-8")
+        assert option in source or option.removeprefix("--").replace("-", "_") in source, (module, option)
 
 
 def test_every_command_of_the_repository_explains_itself() -> None:

@@ -484,10 +484,10 @@ def test_the_page_is_one_file_of_little_script() -> None:
     assert sum(len(read_asset(name)) for name in (*SCRIPTS, *SHADERS)) <= LARGEST_SCRIPT
 
 
-@pytest.mark.parametrize("rest", ["", "/", "/index.html", "?a=b", "/?a=b/c", "#top", "/index.html?a=b#view=1.png"])
 @pytest.mark.parametrize("folder", ["https://x.org", "https://x.org/shop", "https://x.org/shop/v1.2"])
-def test_a_link_has_its_picture_in_the_folder_of_the_page(folder: str, rest: str) -> None:
-    assert f'<meta property="og:image" content="{folder}/preview.jpg">' in preview_tags(folder + rest)
+def test_a_link_has_its_picture_in_the_folder_of_the_page(folder: str) -> None:
+    for rest in ("", "/", "/index.html", "?a=b", "/?a=b/c", "#top", "/index.html?a=b#view=1.png"):
+        assert f'<meta property="og:image" content="{folder}/preview.jpg">' in preview_tags(folder + rest), rest
 
 
 def test_a_link_to_the_page_is_shown_with_a_picture_of_both_sides(tmp_path: Path) -> None:

@@ -66,10 +66,10 @@ def test_a_tint_that_cannot_be_drawn_is_refused() -> None:
 
 
 @pytest.mark.parametrize("name", ["fx", "fy", "width", "height"])
-@pytest.mark.parametrize("value", [0, -1, math.nan, math.inf])
-def test_a_camera_without_a_size_or_a_focal_length_is_refused(name: str, value: float) -> None:
-    with pytest.raises(ValueError, match="expected finite numbers, sizes and focal lengths above 0"):
-        replace(tiny_capture().train[1].camera, **{name: value})
+def test_a_camera_without_a_size_or_a_focal_length_is_refused(name: str) -> None:
+    for value in (0, -1, math.nan, math.inf):
+        with pytest.raises(ValueError, match="expected finite numbers, sizes and focal lengths above 0"):
+            replace(tiny_capture().train[1].camera, **{name: value})
 
 
 def test_a_camera_needs_a_pose_and_whole_pixels() -> None:

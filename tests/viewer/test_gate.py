@@ -149,10 +149,10 @@ BAD_CAMERAS = [
 ]
 
 
-@pytest.mark.parametrize("change", BAD_CAMERAS, ids=str)
-def test_a_camera_out_of_bounds_is_ignored(change: dict[str, Any]) -> None:
+def test_a_camera_out_of_bounds_is_ignored() -> None:
     assert parse_message(msgspec.msgpack.encode(CAMERA)) is not None
-    assert parse_message(msgspec.msgpack.encode(CAMERA | change)) is None
+    accepted = [change for change in BAD_CAMERAS if parse_message(msgspec.msgpack.encode(CAMERA | change)) is not None]
+    assert not accepted
 
 
 @pytest.mark.parametrize(
