@@ -7,6 +7,7 @@ import json
 import socket
 import urllib.request
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -78,35 +79,31 @@ ODD_COOKIES = (
 """Cookies of other programs on this computer: a browser sends them to every port."""
 
 
-@pytest.mark.parametrize("odd", ODD_COOKIES)
-def test_cookies_of_other_programs_do_not_block_access(odd: str, server: AnnotationServer) -> None:
+def test_cookies_of_other_programs_do_not_block_access(server: AnnotationServer) -> None:
     name = cookie_name(f"127.0.0.1:{server.server_address[1]}")
-    for value, status in ((server.access.key, 200), ("guessed", 403)):
+    for odd, (value, status) in product(ODD_COOKIES, ((server.access.key, 200), ("guessed", 403))):
         ours = f"{name}={value}"
         for cookies in (f"{odd}; {ours}", f"{ours}; {odd}", f"{odd}; {ours}; {odd}"):
             assert ask(server, "/capture", Cookie=cookies)[0] == status, cookies
 
 
-@pytest.mark.parametrize("path", ["/", "/page.js", "/capture", "/photo/0", "/thumbnail/0", "/nothing"])
-def test_requests_without_the_key_get_nothing(path: str, server: AnnotationServer) -> None:
-    for key in ("", "guessed"):
-        assert ask(server, path, key=key)[0] == 403
+def test_requests_without_the_key_get_nothing(server: AnnotationServer) -> None:
+    for path in ("/", "/page.js", "/capture", "/photo/0", "/thumbnail/0", "/nothing"):
+        for key in ("", "guessed"):
+            assert ask(server, path, key=key)[0] == 403, path
     assert ask(server, "/document", {}, key="guessed")[0] == 403
 
 
-@pytest.mark.parametrize(
-    "outline",
-    [
+def test_an_outline_that_makes_no_sense_is_refused(server: AnnotationServer) -> None:
+    for outline in (
         {},
         {"view": 0, "points": [[1, 1], [2, 2]]},
         {"view": 99, "points": [[1, 1], [9, 1], [9, 9]]},
         {"view": 0, "points": [[1, 1], [9, 1], [1e9, 9]]},
         {"view": 0, "points": [[-50, -50], [-9, -50], [-9, -9]]},
-    ],
-)
-def test_an_outline_that_makes_no_sense_is_refused(outline: dict, server: AnnotationServer) -> None:
-    status, body = ask(server, "/grab", outline)
-    assert status == 400 and json.loads(body)["error"]
+    ):
+        status, body = ask(server, "/grab", outline)
+        assert status == 400 and json.loads(body)["error"], outline
 
 
 @pytest.mark.parametrize("path", ["/photo/0", "/thumbnail/0"])
@@ -128,18 +125,17 @@ def test_another_name_for_this_computer_is_refused(server: AnnotationServer) -> 
         assert ask(server, "/capture", Host=name)[0] == 200
 
 
-@pytest.mark.parametrize("origin", ["http://evil.example", "null", "", "http://127.0.0.1:1"])
-def test_requests_of_other_sites_are_refused(origin: str, server: AnnotationServer) -> None:
-    for path in ("/document", "/results", "/close"):
-        assert ask(server, path, marked_document(), Origin=origin)[0] == 403
+def test_requests_of_other_sites_are_refused(server: AnnotationServer) -> None:
+    for origin in ("http://evil.example", "null", "", "http://127.0.0.1:1"):
+        for path in ("/document", "/results", "/close"):
+            assert ask(server, path, marked_document(), Origin=origin)[0] == 403, origin
     assert not server.is_finished
 
 
-@pytest.mark.parametrize(
-    "path", ["/photo/99", "/photo/-1", "/photo/..%2f..%2fetc%2fpasswd", "/photo/../annotations.json", "/etc/passwd"]
-)
-def test_unknown_photographs_and_paths_of_files_are_not_found(path: str, server: AnnotationServer) -> None:
-    assert [ask(server, path, body)[0] for body in (None, {})] == [404, 404]
+def test_unknown_photographs_and_paths_of_files_are_not_found(server: AnnotationServer) -> None:
+    hidden = ("/photo/..%2f..%2fetc%2fpasswd", "/photo/../annotations.json", "/etc/passwd")
+    for path in ("/photo/99", "/photo/-1", *hidden):
+        assert [ask(server, path, body)[0] for body in (None, {})] == [404, 404], path
 
 
 def test_photographs_are_jpegs(server: AnnotationServer) -> None:
