@@ -101,7 +101,6 @@ def fails_with(arguments: list[str], capsys: pytest.CaptureFixture[str], *words:
 
 def test_bad_input_ends_with_one_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = ["--output", str(tmp_path / "run")]
-    fails_with(["train", "splat", "--data", str(tmp_path / "none"), *output], capsys, "error:", "none")
     empty = tmp_path / "empty"
     empty.mkdir()
     fails_with(["train", "splat", "--data", str(empty), *output], capsys, "error:", "Looked for")
@@ -114,7 +113,6 @@ def test_bad_input_ends_with_one_message(tmp_path: Path, capsys: pytest.CaptureF
     assert main(short) == 2
     told = capsys.readouterr()
     assert "expected at least 8" in " ".join(told.err.split()) and "training and" not in told.out
-    fails_with(["eval", str(empty)], capsys, "is not a run directory")
     assert not (tmp_path / "run").exists()
 
 
@@ -131,8 +129,8 @@ def test_planar_without_masks_is_refused_with_advice(tmp_path: Path, capsys: pyt
     ("words", "said"),
     [
         ("train splat --data x --output y --no-such-option", "glassplat train splat has no option --no-such-option"),
-        ("train splat --daat x", "glassplat train splat has no option --daat; did you mean --data?"),
-        ("render RUN --lyer a", "glassplat render has no option --lyer; did you mean --layers?"),
+        ("train splat", "missing from glassplat train: --data PATH directory of"),
+        ("dereflect RUN --output o --source [bold]", "invalid choice '[bold]' for argument '--source'"),
         ("render RUN", "missing from glassplat render: --output PATH output folder"),
         ("info", "missing from glassplat info: PATH any folder or file that glassplat reads or writes; all options: "),
         ("render RUN --output o --split foo", "invalid choice 'foo' for argument '--split'. Expected one of ('train'"),

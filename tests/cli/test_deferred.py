@@ -24,13 +24,15 @@ from tests.training.object_capture import few_steps, write_object_capture
 LAYERS = ("rgb", "base", "reflection", "strength", "normal", "environment", "depth", "alpha")
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Path:
-    """A run of a few steps on a capture with a true environment."""
-    capture = write_object_capture(tmp_path / "ball")
-    write_equirect(capture / "environment.exr", 0.2 + 0.6 * torch.rand(8, 16, 3))
-    assert main(["train", "deferred", *few_steps(capture, tmp_path / "run")]) == 0
-    return tmp_path / "run"
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of a few steps on a capture with a true environment; tests only add to it."""
+    folder = tmp_path_factory.mktemp("deferred")
+    capture = write_object_capture(folder / "ball")
+    environment = 0.2 + 0.6 * torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(0))
+    write_equirect(capture / "environment.exr", environment)
+    assert main(["train", "deferred", *few_steps(capture, folder / "run")]) == 0
+    return folder / "run"
 
 
 def test_it_is_measured_against_true_normals_strength_and_environment(run: Path) -> None:

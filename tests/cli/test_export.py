@@ -99,17 +99,6 @@ def test_invalid_options_are_refused(
     assert not output.exists()
 
 
-def test_foreign_folders_and_missing_runs_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run, output = write_run(tmp_path / "run"), tmp_path / "out"
-    output.mkdir()
-    (output / "scene.ply").write_text("mine")
-    assert main(["export", str(run), "--output", str(output)]) == 2
-    assert (output / "scene.ply").read_text() == "mine"
-    assert main(["export", str(tmp_path / "none"), "--output", str(tmp_path / "new")]) == 2
-    assert f"{tmp_path / 'none'} does not exist; expected" in " ".join(capsys.readouterr().err.split())
-    assert not (tmp_path / "new").exists()
-
-
 @pytest.mark.parametrize("options", ["--remove-glass", "--layer transmission"])
 def test_files_of_an_earlier_scene_are_removed(
     options: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

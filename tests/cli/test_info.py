@@ -331,17 +331,9 @@ def test_glass_without_colours_has_no_degree(tmp_path: Path, capsys: pytest.Capt
     assert facts["Gaussians"] == len(glass) and "SH degree" not in facts
 
 
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [("nowhere", "does not exist"), ("notes.txt", "not a known kind of file"), ("empty", "not a known kind of folder")],
-)
-def test_unrecognised_paths_are_refused(
-    name: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "notes.txt").write_text("")
-    (tmp_path / "empty").mkdir()
-    assert main(["info", str(tmp_path / name)]) == 2
-    assert expected in " ".join(capsys.readouterr().err.split())
+def test_an_unrecognised_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(tmp_path)]) == 2
+    assert "not a known kind of folder" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_damaged_capture_is_refused_with_the_reason(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

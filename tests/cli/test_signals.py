@@ -77,7 +77,6 @@ def test_signals_that_are_held_are_answered_afterwards() -> None:
         ("torch._C", "SIGINT"),
         ("numba.core", "SIGINT"),
         ("glassplat.training.actions", "SIGTERM"),
-        ("torch._C", "SIGHUP"),
     ],
 )
 def test_a_signal_among_the_imports_is_one_line(name: str, number: str, tmp_path: Path) -> None:

@@ -22,13 +22,14 @@ from tests.training.object_capture import few_steps, write_object_capture
 LAYERS = ("rgb", "base", "reflection", "strength", "normal", "surroundings", "depth", "alpha")
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Path:
-    """A run of a few steps."""
-    capture = write_object_capture(tmp_path / "ball")
-    options = [*few_steps(capture, tmp_path / "run"), "--surroundings.start.cells", "3"]
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of a few steps; tests only add to it."""
+    folder = tmp_path_factory.mktemp("traced")
+    capture = write_object_capture(folder / "ball")
+    options = [*few_steps(capture, folder / "run"), "--surroundings.start.cells", "3"]
     assert main(["train", "traced", *options]) == 0
-    return tmp_path / "run"
+    return folder / "run"
 
 
 def test_it_is_measured_and_every_layer_can_be_rendered(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -62,10 +63,12 @@ def test_the_stored_scene_is_the_trained_one(run: Path) -> None:
         assert torch.equal(stored.parameters()[name], tensor), name
 
 
-def test_a_run_without_its_surroundings_is_reported(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = run / "point_cloud" / "iteration_12"
-    (folder / "surroundings.ply").unlink()
-    assert main(["eval", str(run)]) == 2
+def test_a_run_without_its_surroundings_is_reported(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    damaged = shutil.copytree(run, tmp_path / "run")
+    (damaged / "point_cloud" / "iteration_12" / "surroundings.ply").unlink()
+    assert main(["eval", str(damaged)]) == 2
     assert "no surroundings.ply in" in " ".join(capsys.readouterr().err.split())
 
 
@@ -82,21 +85,11 @@ def test_a_panorama_also_replaces_near_surroundings(run: Path, mirrors: str) -> 
     assert seen[..., 0].min() > 0.95 and seen[..., 1:].max() < 0.05
 
 
-def test_broken_normals_next_to_the_photographs_are_named(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    capture = run.parent / "ball"
+def test_broken_normals_next_to_the_photographs_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capture = write_object_capture(tmp_path / "ball")
     (capture / "train" / "normals").mkdir()
     shutil.copy(capture / "transforms_train.json", capture / "train" / "normals" / "r_0.npy")
-    options = [
-        "--data",
-        str(capture),
-        "--output",
-        str(run.parent / "other"),
-        "--iterations",
-        "12",
-        "--least-iterations",
-        "1",
-    ]
-    assert main(["train", "traced", *options, "--surroundings.start.cells", "3"]) == 2
+    assert main(["train", "traced", *few_steps(capture, tmp_path / "other")]) == 2
     assert "r_0.npy is not an array that NumPy can read" in " ".join(capsys.readouterr().err.split())
 
 
