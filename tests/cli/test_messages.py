@@ -44,13 +44,9 @@ def test_names_are_shown_as_they_are(text: str, capsys: pytest.CaptureFixture[st
     print_line(message_console(), text)
     message_console().print(text)
     assert capsys.readouterr().out == f"warning: {text}\n{text}\n{text}\n"
-
-
-@pytest.mark.parametrize("text", AWKWARD)
-def test_names_with_markup_are_printed_literally(text: str) -> None:
-    file = io.StringIO()
-    print_line(Console(file=file), text)
-    assert file.getvalue() == f"{text}\n"
+    any_console = Console(file=io.StringIO())
+    print_line(any_console, text)
+    assert any_console.file.getvalue() == f"{text}\n"
 
 
 @pytest.mark.parametrize(
