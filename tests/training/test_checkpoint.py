@@ -102,13 +102,9 @@ def test_a_full_disk_leaves_the_older_checkpoint(checkpoint: Path) -> None:
 
 HEADERS: list[tuple[dict[str, Any], str]] = [
     ({"step": None}, "step of the header of .* is None; expected a whole number of at least 0"),
-    ({"step": -5}, "step of the header of .* is -5; expected a whole number of at least 0"),
-    ({"step": 2.5}, "step of the header of .* is 2.5; expected a whole number"),
     ({"seed": "zero"}, "seed of the header of .* is 'zero'; expected a whole number"),
     ({"seconds": "long"}, "seconds of the header of .* is 'long'; expected a finite number"),
     ({"extent": 0}, "extent of the header of .* is 0; expected a finite number above 1e-12"),
-    ({"extent": 1e-300}, "extent of the header of .* is 1e-300; expected a finite number above 1e-12"),
-    ({"extent": float("nan")}, "extent of the header of .* is nan; expected a finite number"),
     ({"labels": 5}, "labels of the header of .* is 5; expected a list"),
     ({"labels": ["left"]}, "entry 1 of labels of the header of .* is 'left'; expected a whole number"),
     ({"labels": [1, 2, 3]}, r"holds no training state: planes: centers has shape \(1, 3\); expected \(3, 3\)"),
@@ -189,16 +185,3 @@ def test_a_checkpoint_of_an_earlier_version_is_read(checkpoint: Path) -> None:
 
     rewrite(checkpoint, edit)
     assert load_checkpoint(checkpoint, method="planar", seed=3, iterations=7).records == {}
-
-
-@pytest.mark.parametrize(
-    ("run", "message"),
-    [
-        ({"method": "deferred"}, "is a checkpoint of planar; expected one of deferred"),
-        ({"seed": 4}, "is of a run with the seed 3; expected 4"),
-        ({"iterations": 6}, "is of step 7; expected one of at most 6"),
-    ],
-)
-def test_the_checkpoint_of_another_run_is_refused(checkpoint: Path, run: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        load_checkpoint(checkpoint, **{"method": "planar", "seed": 3, "iterations": 7} | run)

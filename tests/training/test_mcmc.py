@@ -116,13 +116,6 @@ def test_moments_start_again_where_values_changed() -> None:
         assert torch.equal(first[~changed], tensor[~changed] + 10)
 
 
-def test_moments_of_other_parts_pass_through() -> None:
-    before = make_gaussians([0.9, 0.001])
-    pair = (torch.ones(7), torch.ones(7))
-    _, moments = relocate_and_grow(OPTIONS, before, {"glass.logit_mark": pair}, cap=10, generator=rng())
-    assert moments["glass.logit_mark"] is pair or moments["glass.logit_mark"][0] is pair[0]
-
-
 @pytest.mark.parametrize(("cap", "expected"), [(1000, 105), (103, 103), (100, 100), (50, 100)])
 def test_growth_is_a_twentieth_up_to_the_cap(cap: int, expected: int) -> None:
     before = make_gaussians([0.5] * 100)
