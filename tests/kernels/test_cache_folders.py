@@ -199,9 +199,8 @@ def test_a_chosen_cache_folder_does_not_hide_kernels_next_to_the_sources(
     assert machine.run() == (0, [])
 
 
-@pytest.mark.parametrize(
-    ("suffix", "damage"), [("nbi", "empty"), ("nbi", "text"), ("nbi", "folder"), ("nbc", "cut"), ("nbc", "folder")]
-)
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+@pytest.mark.parametrize("damage", ["empty", "cut", "text", "folder"])
 def test_a_damaged_file_is_compiled_again_and_replaced(machine: Machine, suffix: str, damage: str) -> None:
     machine.run()
     (file,) = machine.home.rglob(f"*.{suffix}")

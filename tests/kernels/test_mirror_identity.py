@@ -67,7 +67,7 @@ def mirrored_gaussians(gaussians: RawGaussians, point: Tensor, normal: Tensor) -
     return gaussians._replace(means=means, quats=torch.stack(quats))
 
 
-@pytest.mark.parametrize("seed", [10, 20])
+@pytest.mark.parametrize("seed", [10, 20, 30])
 def test_mirroring_the_camera_is_mirroring_the_gaussians(seed: int) -> None:
     gaussians = RawGaussians(*(tensor.detach() for tensor in random_gaussians(120)))
     camera = rigid_camera(seed)

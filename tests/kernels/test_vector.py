@@ -24,9 +24,9 @@ from glassplat.kernels.backend.cpu_vector import (
 )
 
 REALS = [np.float32, np.float64]
+LANES = [4, 8, 16]
 
-# Each type and each number of lanes that a kernel uses.
-kinds = pytest.mark.parametrize(("real", "lanes"), [(np.float32, 4), (np.float64, 8), (np.float32, 16)])
+kinds = pytest.mark.parametrize(("real", "lanes"), [(real, lanes) for real in REALS for lanes in LANES])
 
 
 def numbers(real: type, count: int, low: float = -2.0, high: float = 2.0) -> NDArray[Any]:

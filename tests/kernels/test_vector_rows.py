@@ -16,7 +16,9 @@ from glassplat.kernels.backend.cpu_vector import (
     vector_kind,
 )
 
-kinds = pytest.mark.parametrize(("real", "lanes"), [(np.float32, 16), (np.float64, 4)])
+kinds = pytest.mark.parametrize(
+    ("real", "lanes"), [(real, lanes) for real in (np.float32, np.float64) for lanes in (4, 16)]
+)
 
 
 def sorting(real: type, lanes: int) -> Kernel:

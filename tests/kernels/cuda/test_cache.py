@@ -129,11 +129,18 @@ def test_each_compute_capability_has_its_file(folder: Path, caplog: pytest.LogCa
     assert made(images(), caplog) == (codes[1], 0)
 
 
-def test_a_damaged_file_is_replaced(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """As of the CPU's kernels, for which `test_cache_folders.py` tries every kind of damage."""
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+@pytest.mark.parametrize(
+    "damage",
+    [lambda data: b"", lambda data: data[: len(data) // 2], lambda data: b"something else altogether"],
+    ids=["empty", "cut short", "foreign"],
+)
+def test_a_damaged_or_foreign_file_is_replaced(
+    damage: Callable[[bytes], bytes], suffix: str, folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     made(images(), caplog)
-    (file,) = folder.rglob("*.nbc")
-    file.write_bytes(file.read_bytes()[:100])
+    (file,) = folder.rglob(f"*.{suffix}")
+    file.write_bytes(damage(file.read_bytes()))
     code, compiled = made(images(), caplog)
     assert compiled == 1
     assert made(images(), caplog) == (code, 0)
