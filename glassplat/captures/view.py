@@ -73,7 +73,7 @@ def sample_evenly(items: Sequence[Item], most: int) -> list[Item]:
 
 
 Reader = Callable[[], Tensor]
-"""Reads pixels, the same ones every time; caches store them by their reader."""
+"""Reads pixels, the same ones every time; caches store them by their reader, which is compared by identity."""
 
 
 class DiskCache:
@@ -390,7 +390,7 @@ class PhotoFile:
         return torch.from_numpy(self.pixel_map.map_photo(_composite_over(pixels, self.background)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MaskFile:
     """Reader of the labels of one view; `size` is the photograph's, before undistortion."""
 
@@ -407,7 +407,7 @@ class MaskFile:
         return torch.from_numpy(self.pixel_map.map_ignored(cameras.nearest_resize(self.mask.labels(), *self.size)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class IgnoredFiles:
     """Reader of the pixels of one view that any of its masks excludes, or that lie outside the photograph."""
 
