@@ -242,6 +242,29 @@ def test_a_command_imports_no_other(tmp_path: Path) -> None:
     assert not {"glassplat.cli.capture", "glassplat.cli.info", "glassplat.cli.train"} & found.commands
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["train"],
+        ["train", "splat"],
+        ["train", "nerf", "--data", "x", "--output", "y"],
+        ["eval"],
+        ["eval", "run", "--device", "tpu"],
+        ["render", "run"],
+        ["render", "run", "--output", "x", "--split", "most"],
+        ["dereflect", "run", "--output", "x", "--source", "[bold]"],
+        ["demo", "--iterations", "many"],
+    ],
+    ids=" ".join,
+)
+def test_options_that_cannot_be_understood_end_with_code_2(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert said.startswith("error: ") and f"glassplat {arguments[0]}" in said
+
+
 def test_completions_for_a_shell_know_the_options_of_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["--tyro-print-completion", "bash"])

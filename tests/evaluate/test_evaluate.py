@@ -154,6 +154,11 @@ def test_normal_error_is_the_angle_between_lines(case, angle: float) -> None:
     assert plane["normal_error_deg"] == pytest.approx(min(angle, 180 - angle), rel=1e-3)
 
 
+def test_the_first_frame_is_rendered_once_more_than_it_is_timed(case) -> None:
+    evaluate(case.scene, case.renderer, case.dataset)
+    assert case.renderer.calls == [40.0, 40.0, 41.0, 42.0]
+
+
 def ball_frame(scene: Scene, camera: Camera) -> Frame:
     """A ball with normals rotated by 90 degrees about z, and a strength 0.1 too high."""
     rays = torch.nn.functional.normalize(view_directions(camera), dim=-1)

@@ -21,6 +21,7 @@ from glassplat.options import Range, as_option, check_options, unwrap_annotation
 from tests.methods.number_fields import number_fields
 
 COMMANDS = [Train, Demo, Render, RunSettings]
+DECLARED = [(kind, name, hint) for kind in (*RECIPES.values(), *COMMANDS) for name, hint in number_fields(kind)]
 
 
 def ranges_of(hint: Any) -> list[Range]:
@@ -28,29 +29,27 @@ def ranges_of(hint: Any) -> list[Range]:
 
 
 def outside(hint: Any) -> Iterator[float]:
-    """Numbers that an annotation excludes: just beyond its bounds, of any size, and none at all."""
+    """Numbers that an annotation excludes, just beyond its bounds and far away."""
     (bounds,) = ranges_of(hint)
     whole = unwrap_annotation(hint)[0] is int
     step = 1 if whole else 1e-6
     if bounds.low is not None:
-        yield bounds.low - step
+        yield from (bounds.low - step, -1e30 if not whole else -(10**30))
     if bounds.above is not None:
-        yield bounds.above
+        yield from (bounds.above, bounds.above - step)
     if bounds.high is not None:
-        yield from (bounds.high + step, 10**30) if whole else (bounds.high + step,)
+        yield from (bounds.high + step, 1e30 if not whole else 10**30)
     if bounds.below is not None:
         yield bounds.below
     if not whole:
         yield from (math.nan, math.inf, -math.inf)
 
 
-@pytest.mark.parametrize("kind", [*RECIPES.values(), *COMMANDS])
-def test_every_number_has_a_range(kind: type) -> None:
-    declared = list(number_fields(kind))
-    without = [name for name, hint in declared if len(ranges_of(hint)) != 1]
-    assert declared and not without, "these need a range of glassplat.options in their annotations"
-    endless = [name for name, hint in declared if unwrap_annotation(hint)[0] is int and ranges_of(hint)[0].high is None]
-    assert not endless, "these are counted: say how many at the most"
+@pytest.mark.parametrize(("kind", "name", "hint"), DECLARED, ids=lambda part: getattr(part, "__name__", str(part))[:50])
+def test_every_number_has_a_range(kind: type, name: str, hint: Any) -> None:
+    assert len(ranges_of(hint)) == 1, f"{kind.__name__}.{name} needs a range of glassplat.options in its annotation"
+    if unwrap_annotation(hint)[0] is int:
+        assert ranges_of(hint)[0].high is not None, f"{name} is counted: say how many at the most"
 
 
 def with_value(options: Any, name: str, value: Any) -> Any:
@@ -78,7 +77,7 @@ def test_every_number_out_of_its_range_is_refused(method: str) -> None:
     sample = {"background": (0.0, 0.0, 0.0), "region": (0.0, 0.0, 0.0, 1.0), "plane_fit.mirror_labels": (1,)}
     for name, hint in number_fields(RECIPES[method]):
         old = value_of(recipe, name) if value_of(recipe, name) not in (None, ()) else sample.get(name, 0)
-        for position, number in enumerate(outside(hint)):
+        for number in outside(hint):
             values = [like(old, number)] if not isinstance(old, tuple) else [(*old[:-1], number), (number, *old[1:])]
             for value in values:
                 broken = with_value(recipe, name, value)
@@ -88,9 +87,8 @@ def test_every_number_out_of_its_range_is_refused(method: str) -> None:
                 with pytest.raises(InputError) as raised:
                     check_options(broken)
                 assert as_option(name) in str(raised.value)
-                if position == 0:  # A file is checked as options are.
-                    with pytest.raises(InputError, match=r"expected|finite"):
-                        recipe_from_json(recipe_to_json(broken))
+                with pytest.raises(InputError, match=r"expected|finite"):
+                    recipe_from_json(recipe_to_json(broken))
                 refused += 1
     assert refused > 100
 
@@ -127,9 +125,19 @@ def edited(**fields: Any) -> str:
         edited(method="no such method"),
         edited(method=["splat"]),
         edited(method=None),
+        edited(background="red"),
+        edited(background=["r", "e", "d"]),
         edited(sh_degree="3"),
+        edited(sh_degree=7),
+        edited(sh_degree=2.5),
+        edited(rates=None),
+        edited(rates=[1, 2]),
+        edited(rates={"means": -1}),
         edited(rates={"colour": 1}),
         edited(strategy="genetic"),
+        edited(strategy=5),
+        edited(densify={"whole_passes": "no"}),
+        edited(densify={"contribution_moments": 0.5}),
         edited(colour=1),
         edited(ssim_weight=10**400),
         edited(ssim_weight=float("nan")),

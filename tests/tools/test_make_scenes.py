@@ -129,7 +129,7 @@ def test_a_seed_is_a_scene() -> None:
     assert drawn_values(draw_scene(7)) != drawn_values(draw_scene(8))
 
 
-SEEDS = range(12)
+SEEDS = range(40)
 drawn = cache(draw_scene)
 
 
