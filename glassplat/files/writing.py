@@ -150,7 +150,7 @@ def check_capture_folder(path: Path) -> None:
         scene = ". `glassplat.load` reads splat files" if path.suffix.lower() in SPLAT_SUFFIXES else ""
         raise NotADirectoryError(f"{path} is a file; expected the folder of a capture{scene}")
     if not os.path.isdir(path):
-        raise FileNotFoundError(f"no folder {path}; expected the folder of a capture")
+        raise FileNotFoundError(f"no folder {path}; expected the folder of a capture, as `glassplat prepare` makes it")
 
 
 def make_folder(path: Path) -> None:

@@ -99,9 +99,9 @@ class PlanarRecipe(MethodRecipe):
         moving_mean: propagate the gradient of the depth deviation through the mean depth, too, as Eq. 14 is written;
             otherwise the mean is constant.
         plane_fit: fitting of planes to masks.
-        strategy: strategy for adding and removing primary Gaussians: densification, or MCMC (Eq. 20). Unless as
-            published, MCMC begins with joint optimisation, and resets opacities once, after reflections behind panes
-            were moved to their front.
+        strategy: strategy for adding and removing primary Gaussians: densification, or MCMC (Eq. 20). MCMC
+            begins with joint optimisation, and resets opacities once, after reflections behind panes were moved to
+            their front; with `--preset paper`, it begins with the run and resets none.
         early_resets: also reset opacities in the first two stages, as in the paper.
         densify_by: views for the densification of primary Gaussians: `direct` ones, or mirror images (weighted by the
             root of their strength) if these need more detail; or `all` direct and mirrored views alike (paper).

@@ -111,7 +111,7 @@ def test_a_command_explains_itself_and_imports_optional_modules_only_on_demand(
 
 REFUSED = {
     "prepare none --output new": "no folder or video none",
-    "annotate none": "no folder none",
+    "annotate none": "no folder none; expected the folder of a capture, as `glassplat prepare` makes it",
     "train splat --data none --output new": "no folder none",
     "train splat --data splats.ply --output new": "a file; expected the folder of a capture. `glassplat.load` reads",
     "train splat --data begun --output new": "This is a run, which `glassplat.load` reads; expected a capture",
