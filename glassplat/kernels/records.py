@@ -42,6 +42,14 @@ def check_device(name: str, tensor: Tensor, other_name: str, other: Tensor) -> N
         raise TypeError(f"{name} is on {tensor.device} and {other_name} on {other.device}; expected one device for all")
 
 
+def check_image(name: str, image: Tensor, dtype: torch.dtype, other_name: str, other: Tensor) -> None:
+    """Raises unless an image of indices or flags has its type, and the shape and the device of another image."""
+    if image.dtype != dtype or image.shape != other.shape:
+        kind, size = str(dtype).removeprefix("torch."), tuple(other.shape)
+        raise TypeError(f"{name} is {image.dtype} of shape {tuple(image.shape)}; expected {kind} of {size}")
+    check_device(name, image, other_name, other)
+
+
 class RawGaussians(NamedTuple):
     """Unactivated Gaussians: means [N, 3], quats [N, 4], log_scales [N, 3], logit_opacities [N], sh [N, K, 3]."""
 

@@ -227,3 +227,9 @@ def test_bad_input_is_named() -> None:
     panes, intrinsics = random_panes(2, torch.float32)
     with pytest.raises(ValueError, match="mask"):
         pane_hits(panes, intrinsics, WIDTH, HEIGHT, torch.ones(3, 3))
+    hits = pane_hits(panes, intrinsics, WIDTH, HEIGHT)
+    for wrong in (hits.pane.long(), hits.pane[:3], hits.pane.to("meta")):
+        with pytest.raises(TypeError, match=r"beyond\.pane is "):
+            pane_hits(panes, intrinsics, WIDTH, HEIGHT, beyond=hits._replace(pane=wrong))
+    turned = hits._replace(pane=hits.pane.T.contiguous().T, depth=hits.depth.T.contiguous().T)
+    agree(*(pane_hits(panes, intrinsics, WIDTH, HEIGHT, beyond=before) for before in (turned, hits)))

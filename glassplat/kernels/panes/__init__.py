@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 from glassplat.kernels import Fresnel
 from glassplat.kernels.backend.devices import kernels_for
 from glassplat.kernels.maths.pane import LAWS
-from glassplat.kernels.records import BEHIND, BlendedPanes, PaneHits, Panes, check_device, check_tensors
+from glassplat.kernels.records import BEHIND, BlendedPanes, PaneHits, Panes, check_image, check_tensors
 
 
 class MirroredViews(NamedTuple):
@@ -118,9 +118,11 @@ def pane_hits(
     if beyond is not None:
         expected["beyond.depth"] = (beyond.depth, (height, width))
     check_tensors(expected)
+    if beyond is not None:
+        check_image("beyond.pane", beyond.pane, torch.int32, "beyond.depth", beyond.depth)
+        beyond = beyond._replace(pane=beyond.pane.contiguous(), depth=(beyond.depth * BEHIND).contiguous())
     inputs = [tensor.detach().contiguous() for tensor in (*panes, intrinsics)]
     visible = None if mask is None else mask.detach().contiguous()
-    beyond = None if beyond is None else beyond._replace(depth=beyond.depth * BEHIND)
     hits: PaneHits = kernels_for("panes", intrinsics.device).pane_hits(inputs, width, height, visible, beyond)
     return hits
 
@@ -181,9 +183,7 @@ def blend_panes(
             "intrinsics": (intrinsics, (4,)),
         }
     )
-    if pane.dtype != torch.int32 or tuple(pane.shape) != (height, width):
-        raise TypeError(f"pane is {pane.dtype} of shape {tuple(pane.shape)}; expected int32 of {(height, width)}")
-    check_device("pane", pane, "mask", mask)
+    check_image("pane", pane, torch.int32, "mask", mask)
     if fresnel not in LAWS:
         raise ValueError(f"fresnel is {fresnel!r}; expected one of {', '.join(map(repr, LAWS))}")
     switches = (LAWS.index(fresnel), intensity, linear)
@@ -224,9 +224,7 @@ def inside_panes(pane: Tensor, strength: Tensor) -> Tensor:
         [H, W], of the type of the strength.
     """
     check_tensors({"strength": (strength, tuple(pane.shape))})
-    check_device("pane", pane, "strength", strength)
-    if pane.dtype != torch.int32:
-        raise TypeError(f"pane is {pane.dtype}; expected int32")
+    check_image("pane", pane, torch.int32, "strength", strength)
     inside: Tensor = kernels_for("panes", pane.device).inside_panes(pane.contiguous(), strength.detach().contiguous())
     return inside
 
@@ -255,9 +253,7 @@ def layer_derivatives(
     check_tensors(
         {"strength": (strength, shape[:2]), "transmission": (transmission, shape), "reflection": (reflection, shape)}
     )
-    check_device("where", where, "strength", strength)
-    if where.dtype != torch.bool or where.shape != strength.shape:
-        raise TypeError(f"where is {where.dtype} of shape {tuple(where.shape)}; expected bool of {(height, width)}")
+    check_image("where", where, torch.bool, "strength", strength)
     kernels = kernels_for("panes", strength.device)
     layers = (tensor.detach().contiguous() for tensor in (strength, transmission, reflection, where))
     through, mirrored = kernels.layer_derivatives(*layers, linear=linear)
