@@ -80,7 +80,8 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
         os.replace(temporary, target)
     except OSError as error:
         reason = error.strerror or str(error)
-        message = f"could not write {path} ({reason}); the previous contents are unchanged"
+        kept = "; the previous contents are unchanged" if os.path.exists(target) else ""
+        message = f"could not write {path} ({reason}){kept}"
         raise (OSError(message) if error.errno is None else OSError(error.errno, message)) from error
     finally:
         with suppress(OSError):  # A clean-up error must not hide the one above.
