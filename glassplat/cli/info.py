@@ -280,7 +280,9 @@ def _examiner_of_file(path: Path) -> Examiner:
         return examine_splats
     if suffix in VIDEO_SUFFIXES:
         return examine_video
-    raise InputError(f"{path} is not a known kind of file; expected {KINDS}")
+    kind = "is one photograph" if is_photograph(path) else "is not a known kind of file"
+    folder = f"`glassplat info {shell_word(path.parent)}` says what its folder is"
+    raise InputError(f"{path} {kind}; expected {KINDS}. {folder}")
 
 
 def _examiner_of_folder(path: Path) -> Examiner:
