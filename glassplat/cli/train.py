@@ -80,6 +80,8 @@ class Train(Command, Generic[RecipeKind]):
             raise InputError("--cap belongs to --strategy mcmc; expected that strategy, or --densify.cap")
         check_output(RunDirectory(self.output), resume=self.resume)
         print_line(message_console(), self.files)
+        if not self.resume:  # A checkpoint holds the panes.
+            self.recipe.check_capture(self.files)
 
     def set_up(self) -> None:
         """Checks options and paths, imports the training code, and checks the length of the stages."""

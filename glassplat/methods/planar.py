@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import PointCloud
+from glassplat.methods.planar_recipe import PlanarRecipe, check_marked
 from glassplat.methods.splat import image_term, strategy_of
 from glassplat.options import BLACK, CLEAR_GLASS
 from glassplat.panes import PlaneFit, PlaneFitError, material
@@ -30,9 +30,6 @@ from glassplat.training.densify import NEIGHBOURS
 from glassplat.training.messages import Working
 from glassplat.training.options import PUBLISHED_ITERATIONS, Rate
 from glassplat.training.stage import RESET_TURN, AtShares, Clock, Every, PostStep, Stage, TrainState, Work
-
-if TYPE_CHECKING:
-    from glassplat.methods.planar_recipe import PlanarRecipe
 
 log = logging.getLogger("glassplat.training")
 
@@ -400,15 +397,8 @@ def planar_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
             are fitted to the measured points once and forgotten, because a bad mask should end a run before the first
             iteration and not at the second stage.
     """
-    if not dataset.pane_labels and dataset.planes is None:
-        is_annotated = any(view.is_annotated for view in (*dataset.train, *dataset.test))
-        found = f"no mask of {dataset.root} names a pane" if is_annotated else f"{dataset.root} has no masks of panes"
-        raise PlaneFitError(
-            f"{found}, and planar needs to know the panes: expected masks of 3 to 10 photographs in "
-            f"{dataset.root / 'panes'}, named <photograph's name>.png, each pixel the label 1, 2, ... of a pane, or 0 "
-            "(`glassplat annotate` writes them), or rectangles in planes.json. `glassplat train splat` needs none"
-        )
     known = (*dataset.pane_labels, *(() if dataset.planes is None else dataset.planes.labels))
+    check_marked(dataset.root, known, is_annotated=any(view.is_annotated for view in (*dataset.train, *dataset.test)))
     if unknown := [label for label in recipe.plane_fit.mirror_labels if label not in known]:
         raise PlaneFitError(f"plane_fit.mirror_labels names pane {unknown[0]}; expected some of {name_labels(known)}")
     if dataset.measured_points:

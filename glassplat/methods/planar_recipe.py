@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
+from glassplat.captures.masks import PANE_FOLDER, PLANES
 from glassplat.kernels import Fresnel
 from glassplat.options import (
     ESSENTIAL,
@@ -17,7 +20,7 @@ from glassplat.options import (
     Range,
     Share,
 )
-from glassplat.panes import PlaneFit
+from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.training.options import (
     DefaultDensify,
     GaussianRates,
@@ -26,6 +29,9 @@ from glassplat.training.options import (
     MethodRecipe,
     Photographer,
 )
+
+if TYPE_CHECKING:
+    from glassplat.captures.files import CaptureFiles
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,18 @@ class Perturbation:
     amplitude: Share = 0.4
     stop: Internal[Share] = 0.8
     bounds: Internal[Annotated[tuple[OpenShare, OpenShare], Ascending()]] = (0.01, 0.99)
+
+
+def check_marked(root: Path, labels: Sequence[int], *, is_annotated: bool) -> None:
+    """Raises PlaneFitError if neither masks nor planes.json give a capture's panes labels."""
+    if labels:
+        return
+    found = f"no mask of {root} names a pane" if is_annotated else f"{root} has no masks of panes"
+    raise PlaneFitError(
+        f"{found}, and planar needs to know the panes: expected masks of 3 to 10 photographs in {root / PANE_FOLDER}, "
+        "named <photograph's name>.png, each pixel the label 1, 2, ... of a pane, or 0 (`glassplat annotate` writes "
+        f"them), or rectangles in {PLANES}. `glassplat train splat` needs none"
+    )
 
 
 @dataclass(frozen=True)
@@ -132,6 +150,11 @@ class PlanarRecipe(MethodRecipe):
     early_resets: Internal[bool] = False
     densify_by: Internal[Literal["direct", "all"]] = "direct"
     photographer: Photographer = field(default_factory=Photographer)
+
+    def check_capture(self, files: CaptureFiles) -> None:
+        """Raises PlaneFitError if the capture marks no pane; planes.json is read later."""
+        if not (files.root / PLANES).is_file():
+            check_marked(files.root, files.masks.labels, is_annotated=bool(files.masks.masks))
 
     @classmethod
     def paper(cls) -> PlanarRecipe:

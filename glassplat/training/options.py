@@ -28,6 +28,7 @@ from glassplat.options import (
 
 if TYPE_CHECKING:
     from glassplat.captures.dataset import Dataset
+    from glassplat.captures.files import CaptureFiles
     from glassplat.render.frame import Renderer
     from glassplat.scene.scene import Scene
     from glassplat.training.stage import Stage
@@ -467,6 +468,9 @@ class MethodRecipe:
     mcmc: McmcDensify = field(default_factory=McmcDensify)
     exposure: PhotoExposure = field(default_factory=PhotoExposure)
     poses: PoseRefinement = field(default_factory=PoseRefinement)
+
+    def check_capture(self, files: CaptureFiles) -> None:
+        """Refuse a capture that lacks what the method needs, before photographs are read; most methods need nothing."""
 
     def initialise(self, dataset: Dataset) -> Scene:
         """The initial scene; raises PlaneFitError if the method needs masks of panes and these do not suffice."""

@@ -116,6 +116,7 @@ REFUSED = {
     "train splat --data splats.ply --output new": "a file; expected the folder of a capture. `glassplat.load` reads",
     "train splat --data begun --output new": "This is a run, which `glassplat.load` reads; expected a capture",
     "train splat --data=capture --data=none --output new": "no folder none",
+    "train planar --data unmarked --output new": "unmarked has no masks of panes, and planar needs to know the panes",
     "train planar --data capture --output trained": "trained already holds a run",
     "train planar --data capture --output new --resume": "nothing was saved yet in new",
     "train planar --data capture --output splats.ply": "splats.ply is a file",
@@ -164,6 +165,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("begun/recipe.json", "trained/recipe.json", "trained/checkpoint.safetensors", "splats.ply"):
         (root / name).write_bytes(b"")
     (root / "splats.txt").write_bytes(b"")
+    shutil.copytree(SCENE, root / "unmarked", ignore=shutil.ignore_patterns("panes", "gt"))
     for path in sorted((SCENE / "images").iterdir())[:3]:
         shutil.copy(path, root / "photographs")
     return root
