@@ -47,7 +47,7 @@ def check_claim(folder: Path, command: str) -> bool:
     """Check that a command may write to a folder; returns whether it has done so before."""
     check_folder(folder)
     found = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
-    if found and _recorded_command(folder / RECORD) != command:
+    if found and recorded_value(folder / RECORD, "command") != command:
         raise InputError(
             f"{folder} is not empty, and not from `glassplat {command}` (it holds {join_names(found)}); nothing was "
             "written. Choose a new folder for --output"
@@ -75,13 +75,13 @@ def check_targets(folder: Path, targets: Sequence[Path], photographs: Sequence[P
             )
 
 
-def _recorded_command(record: Path) -> str | None:
-    """Command that wrote the folder; None if not recorded."""
+def recorded_value(record: Path, name: str) -> object:
+    """A value of a folder's record, such as the command that wrote the folder; None if it is not recorded."""
     try:
         content = read_json(record)
     except (OSError, ValueError):
         return None
-    return content.get("command") if isinstance(content, dict) else None
+    return content.get(name) if isinstance(content, dict) else None
 
 
 def check_scene(path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from glassplat.captures.view import View
 from glassplat.cli.console import print_line, print_warning, shell_word
-from glassplat.cli.places import SceneEdits, check_targets, chosen_views, claim_folder
+from glassplat.cli.places import SceneEdits, check_targets, chosen_views, claim_folder, recorded_value
 from glassplat.cli.progress import WorkProgress
 from glassplat.cli.runs import StoredRun, image_names, open_run, photograph_paths
 from glassplat.errors import InputError, convert_to_input_error, count_noun, join_names
@@ -26,7 +27,15 @@ from glassplat.evaluate.metrics import quantize
 from glassplat.files.images import write_image
 from glassplat.files.records import readable_name
 from glassplat.files.sidecars import read_cameras, write_cameras
-from glassplat.files.writing import OUTPUT_FORMATS, SPLAT_WRITERS, atomic_write, real_path, scene_source, write_splats
+from glassplat.files.writing import (
+    OUTPUT_FORMATS,
+    SPLAT_WRITERS,
+    atomic_write,
+    real_path,
+    scene_source,
+    write_splats,
+    write_text,
+)
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model import model as models
 from glassplat.model.run_directory import RunDirectory
@@ -181,6 +190,8 @@ def track_progress(what: str, items: Iterable[Item], total: int, progress: WorkP
 
 LARGEST_FACTOR = 1e6
 """Largest factor of `--scale` in either direction; beyond, files could not be read again."""
+METRE = "metre"
+"""The unit that scenes scaled by `clean` record; folders written from such a scene keep the record."""
 
 
 def write_clean(command: Clean, console: Console) -> None:
@@ -194,12 +205,15 @@ def write_clean(command: Clean, console: Console) -> None:
     if (count := found["outside"]) > len(model.scene.primary) / 2:
         print_warning(console, f"--box removes {count} Gaussians, more than half; is it in the scene's own units?")
     if factor is not None:
-        if RunDirectory(command.scene).import_record.is_file():
-            already = "may be in metres already, as `clean --scale` writes it"
+        if recorded_value(RunDirectory(command.scene).import_record, "unit") == METRE:
+            already = "is in metres already, as `clean --scale` wrote it"
             print_warning(console, f"{command.scene} {already}; --scale needs two points measured in this scene")
         cleaned = cleaned.scale(factor)
         print_line(console, f"one unit is now a metre; it was {factor:.4g} m")
     cleaned.save(command.output)
+    record = RunDirectory(command.output).import_record
+    if factor is not None and record.is_file():
+        write_text(record, json.dumps({"file": str(command.scene.resolve()), "unit": METRE}) + "\n")
     is_page, name = command.output.suffix.lower() == ".html", shell_word(command.output)
     print_line(console, f"next: {f'open {name} in a browser' if is_page else f'glassplat view {name}'}")
 

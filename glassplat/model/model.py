@@ -486,14 +486,16 @@ def write_sidecars(folder: Path, scene: Scene) -> list[Path]:
 
 def write_as_run(folder: Path, model: Model, source: Path | None) -> None:
     """Writes a model to a new or empty folder in the layout of a run; the recipe comes last, to mark the folder as
-    complete. A scene from a run refers to the run's capture, any other records `source`, where it comes from.
+    complete. A scene from a run refers to the run's capture, any other records where it comes from: `source`, or what
+    that folder records itself.
     """
     writing.make_folder(folder)
     directory = RunDirectory(folder)
     directory.export(model.scene, max({} if source is None else RunDirectory(source).scene_folders(), default=0))
     write_cameras(folder / CAMERAS, model.cameras.items())
-    if source is not None and (source / SETTINGS_FILE).is_file():
-        writing.write_text(folder / SETTINGS_FILE, read_text(source / SETTINGS_FILE))
+    records = [] if source is None else [source / SETTINGS_FILE, RunDirectory(source).import_record]
+    if record := next((file for file in records if file.is_file()), None):
+        writing.write_text(folder / record.name, read_text(record))
     else:
         file = None if source is None else str(source.resolve())
         writing.write_text(directory.import_record, json.dumps({"file": file}) + "\n")

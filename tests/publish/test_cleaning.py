@@ -125,8 +125,13 @@ def test_the_command_writes_another_scene_in_metres(tmp_path: Path, capsys: pyte
     )
     said = " ".join(capsys.readouterr().out.split())
     assert "one unit is now a metre; it was 0.5 m" in said and "already" not in said
-    assert main(["clean", str(output), "--output", str(tmp_path / "twice"), "--scale", *points]) == 0
-    assert f"warning: {output} may be in metres already" in " ".join(capsys.readouterr().out.split())
+    again, splats, cleaned = tmp_path / "again", tmp_path / "x.ply", tmp_path / "cleaned"
+    assert main(["clean", str(output), "--output", str(again)]) == 0
+    assert main(["clean", str(run), "--output", str(splats)]) == main(["clean", str(splats), "--output", str(cleaned)])
+    for scene, is_metric in ((output, True), (again, True), (cleaned, False)):
+        assert main(["clean", str(scene), "--output", f"{scene}-scaled", "--scale", *points]) == 0
+        told = f"warning: {scene} is in metres already" in " ".join(capsys.readouterr().out.split())
+        assert told == is_metric, scene
     old, new = glassplat.load(run), glassplat.load(output)
     torch.testing.assert_close(new.scene.planes.centers, old.scene.planes.centers / 2)
     torch.testing.assert_close(new.image("2.png"), old.image("2.png"), atol=2e-4, rtol=0)
