@@ -96,6 +96,9 @@ class PageHandler(BaseHTTPRequestHandler):
 
     def _get(self) -> None:
         path = urlsplit(self.path).path
+        if path == "/favicon.ico":  # Browsers ask for it with every answer, even one with an error or without a page.
+            self._send(b"", "image/x-icon")
+            return
         if path == "/":
             self._send_page()
             return

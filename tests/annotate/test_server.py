@@ -138,6 +138,11 @@ def test_unknown_photographs_and_paths_of_files_are_not_found(server: Annotation
         assert [ask(server, path, body)[0] for body in (None, {})] == [404, 404], path
 
 
+def test_browsers_find_an_icon_even_without_the_key(server: AnnotationServer) -> None:
+    for key in (None, ""):
+        assert ask(server, "/favicon.ico", key=key) == (200, b"")
+
+
 def test_photographs_are_jpegs(server: AnnotationServer) -> None:
     for path in ("/photo/0", "/thumbnail/4"):
         status, body = ask(server, path)
