@@ -103,7 +103,6 @@ class Annotate(Command):
     """
 
     entry_point = "serving:serve_annotation"
-    interrupt_hint = "the marks are saved in {capture}: repeat the command to continue"
 
     capture: tyro.conf.Positional[Path]
     port: Annotated[int, Range(0, 65535)] = 8765
@@ -112,3 +111,12 @@ class Annotate(Command):
     def check(self) -> None:
         """Checks that the capture is a folder."""
         check_capture_folder(self.capture)
+
+    def interrupt_message(self) -> str:
+        """Message after an interrupt: whether there are marks, and how to continue."""
+        from glassplat.annotate.document import ANNOTATIONS, read_document  # Imported by `set_up`.
+
+        marks = self.capture / ANNOTATIONS
+        if marks.exists() and read_document(self.capture)["panes"]:
+            return f"the marks are saved in {marks}: repeat the command to continue"
+        return f"no pane of {self.capture} is marked yet: repeat the command to start again"

@@ -210,7 +210,6 @@ class Clean(Command):
     """
 
     entry_point = "writing:write_clean"
-    interrupt_hint = "{scene} is as it was; remove {output} and repeat the command"
 
     scene: tyro.conf.Positional[Path]
     output: Path
@@ -232,6 +231,11 @@ class Clean(Command):
         if os.path.lexists(self.output) and any(self.output.iterdir()):
             raise InputError(f"{self.output} is not empty; nothing was written. Choose a new folder for --output")
         print_scene(self.scene)
+
+    def interrupt_message(self) -> str:
+        """Message after an interrupt: the state on disk, and how to continue."""
+        begun = f"remove {self.output} and " if os.path.lexists(self.output) else ""
+        return f"{self.scene} is as it was; {begun}repeat the command"
 
 
 @dataclass(frozen=True)

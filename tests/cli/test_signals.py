@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -12,12 +13,14 @@ from pathlib import Path
 
 import pytest
 
+from glassplat.cli.capture import Annotate
 from glassplat.cli.console import Interrupted, defer_signals, raise_on_signals
 from glassplat.cli.main import main
-from glassplat.cli.scene import Dereflect, Evaluate, Render
+from glassplat.cli.scene import Clean, Dereflect, Evaluate, Render
 from glassplat.cli.train import SCENE, Demo, Train
 from glassplat.files.writing import atomic_write
 from glassplat.methods.splat_recipe import SplatRecipe
+from tests.annotate.conftest import marked_document
 
 SIGNALLED_WHILE_IMPORTING = """
 import importlib.abc, os, signal, sys
@@ -190,3 +193,16 @@ def test_interrupt_messages_name_the_output_and_how_to_continue(tmp_path: Path) 
     train_checkpoint = run / "checkpoint.safetensors"
     train_checkpoint.write_bytes(b"")
     assert "--resume" in train.interrupt_message()
+
+
+def test_interrupt_messages_speak_only_of_what_is_there(tmp_path: Path) -> None:
+    clean, output = Clean(tmp_path / "run", tmp_path / "clean"), tmp_path / "clean"
+    assert clean.interrupt_message() == f"{tmp_path / 'run'} is as it was; repeat the command"
+    output.mkdir()
+    assert clean.interrupt_message() == f"{tmp_path / 'run'} is as it was; remove {output} and repeat the command"
+    annotate, marks = Annotate(tmp_path), tmp_path / "annotations.json"
+    assert annotate.interrupt_message().startswith(f"no pane of {tmp_path} is marked yet: repeat the command")
+    marks.write_text(json.dumps({"version": 1, "panes": []}))
+    assert annotate.interrupt_message().startswith("no pane of ")
+    marks.write_text(json.dumps(marked_document()))
+    assert annotate.interrupt_message() == f"the marks are saved in {marks}: repeat the command to continue"
