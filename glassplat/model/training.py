@@ -313,10 +313,12 @@ def resumed_state(
     # Compared as written: `recipe()` gives what an earlier version did not have its present default.
     if recorded != settings or directory.recipe_as_written() != json.loads(recipe_to_json(recipe)):
         changes = option_changes(vars(recorded), vars(settings)) + recipe_changes(directory, recipe)
+        changed = {name: value for name, value in vars(recorded).items() if value != getattr(settings, name)}
+        original = [f"--{name.replace('_', '-')} {quote(str(value))}" for name, value in changed.items()]
+        original.append(f"--config {quote(str(directory.path / 'recipe.json'))}")  # It has the options of the method.
         raise InputError(
             f"{directory.path} was started with other options: {join_names(changes)}; expected the same to resume it. "
-            f"Repeat the original options, for example by --config {quote(str(directory.path / 'recipe.json'))}, or "
-            "choose another --output"
+            f"Repeat the original options by {' '.join(original)}, or choose another --output"
         )
     directory.check_photographs(dataset)
     for what, begun, now, differs in (

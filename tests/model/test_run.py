@@ -438,25 +438,31 @@ def test_a_state_in_the_middle_of_a_change_is_not_saved(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("recipe", "settings", "told"),
+    ("recipe", "settings", "told", "original"),
     [
-        (RECIPE, replace(SETTINGS, iterations=13), "iterations was 12 and is 13"),
+        (
+            RECIPE,
+            replace(SETTINGS, iterations=13, mask_polarity="dark"),
+            "iterations was 12 and is 13, mask_polarity was auto and is dark",
+            "--iterations 12 --mask-polarity auto ",
+        ),
         (
             replace(RECIPE, intervals=replace(RECIPE.intervals, sh=0.5), sh_degree=2),
             replace(SETTINGS, seed=3),
             f"seed was 0 and is 3, sh_degree was 1 and is 2, intervals.sh was {RECIPE.intervals.sh} and is 0.5",
+            "--seed 0 ",
         ),
-        (DeferredRecipe(), SETTINGS, "method was splat and is deferred"),
+        (DeferredRecipe(), SETTINGS, "method was splat and is deferred", ""),
     ],
 )
-def test_resuming_names_changed_options(recipe: Any, settings: Any, told: str, tmp_path: Path) -> None:
+def test_resuming_names_changed_options(recipe: Any, settings: Any, told: str, original: str, tmp_path: Path) -> None:
     folder = tmp_path / "my run"
     with pytest.raises(KeyboardInterrupt):
         run(folder, interrupt_at=5)
     with pytest.raises(InputError) as caught:
         Run(recipe, settings, RunDirectory(folder), tiny_capture(), resume=True).run_to_end(print)
     assert f" was started with other options: {told}; expected the same to resume it. Repeat" in str(caught.value)
-    assert f"--config '{folder / 'recipe.json'}', or" in str(caught.value)
+    assert f"options by {original}--config '{folder / 'recipe.json'}', or" in str(caught.value)
 
 
 def test_a_run_resumes_with_its_moved_capture_only(tmp_path: Path) -> None:
