@@ -379,10 +379,9 @@ class RunDirectory:
 
         folders = self.scene_folders()
         if not folders:
-            raise InputError(
-                f"{self.path} holds no point_cloud/iteration_N; expected a finished run. Finish it with "
-                "`glassplat train ... --resume`"
-            )
+            resumed, anew = "Finish it with `glassplat train ... --resume`", "Nothing was saved yet: train it again"
+            remedy = resumed if self.checkpoint.is_file() else anew
+            raise InputError(f"{self.path} holds no point_cloud/iteration_N; expected a finished run. {remedy}")
         step = max(folders)
         try:
             return read_scene(folders[step]), step

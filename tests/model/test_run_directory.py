@@ -75,6 +75,15 @@ def test_a_missing_file_of_a_scene_is_named(run: Path, name: str, damage: str) -
         RunDirectory(run).latest_scene()
 
 
+def test_a_run_without_a_scene_is_resumed_only_from_a_checkpoint(run: Path) -> None:
+    shutil.rmtree(run / SCENE)
+    with pytest.raises(InputError, match=r"expected a finished run\. Nothing was saved yet: train it again$"):
+        RunDirectory(run).latest_scene()
+    RunDirectory(run).checkpoint.write_bytes(b"")
+    with pytest.raises(InputError, match=r"a finished run\. Finish it with `glassplat train \.\.\. --resume`$"):
+        RunDirectory(run).latest_scene()
+
+
 def test_glass_without_marks_is_named(run: Path) -> None:
     glass = true_scene().glass
     bare = type(glass)(**{name: t for name, t in glass.tensors().items() if name != "logit_mark"})
