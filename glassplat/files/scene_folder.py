@@ -184,7 +184,11 @@ def read_splats(path: Path | str) -> Gaussians:
         return read_with_gaussforge(path)
     if path.suffix.lower() == ".splat":
         return _read_dot_splat(path)
-    raise ValueError(f"{path} is not a readable splat file; expected one of {', '.join(SPLAT_SUFFIXES)}")
+    found = f"begins with the bytes {head!r}" if head else "is empty"
+    raise ValueError(
+        f"{path} is not a readable splat file, because it {found}; expected one of {', '.join(SPLAT_SUFFIXES)}: export "
+        "or copy it again"
+    )
 
 
 def select_drawable(gaussians: Gaussians, path: Path | str) -> tuple[Gaussians, int]:

@@ -98,7 +98,8 @@ def compressed_header(count: int, chunks: int, kind: str = "uint") -> bytes:
     [
         ("a.splat", bytes(33), "32 per Gaussian"),
         ("a.splat", b"", "32 per Gaussian"),
-        ("a.obj", b"v 0 0 0", "not a readable splat file"),
+        ("a.obj", b"v 0 0 0", r"not a readable splat file, because it begins with the bytes b'v 0 '; expected one of"),
+        ("a.ply", b"", "not a readable splat file, because it is empty; expected one of"),
         ("a.ply", compressed_header(2**60, 2**52) + bytes(64), "cut off"),
         ("a.ply", compressed_header(1, 2) + bytes(112), "2 chunks"),
         ("a.ply", compressed_header(1, 1, "int") + bytes(64), "expected uint"),
