@@ -29,14 +29,9 @@ EIGHT_BITS = ((24, 8), (16, 8), (8, 8), (0, 8))
 Floats = NDArray[np.float32]
 
 
-def is_compressed(table: PlyTable) -> bool:
-    """Return whether a PLY is a compressed one of PlayCanvas/SuperSplat."""
-    return set(PACKED_COLUMNS) <= table.columns.keys()
-
-
 @np.errstate(over="ignore", invalid="ignore")  # The caller reports values out of range; NumPy must not warn.
-def read_compressed(path: Path, table: PlyTable) -> Gaussians:
-    """Reads the Gaussians of a compressed PLY whose `vertex` table has been read."""
+def _read_compressed(path: Path, table: PlyTable) -> Gaussians:
+    """The Gaussians of a compressed PLY whose `vertex` table has been read."""
     words = [table.columns[name] for name in PACKED_COLUMNS]
     if any(word.dtype != np.uint32 for word in words):
         raise ValueError(f"{path} stores packed values in {[str(word.dtype) for word in words]}; expected uint")
@@ -170,7 +165,18 @@ def read_gaussians(path: Path | str) -> Gaussians:
     other foreign properties are ignored. `active_sh_degree` is the highest degree stored.
     """
     path = Path(path)
+    return _read_plain(path, read_table(path))
+
+
+def read_ply(path: Path) -> Gaussians:
+    """Reads a PLY as `read_gaussians` does, or a compressed one of PlayCanvas/SuperSplat."""
     table = read_table(path)
+    is_compressed = set(PACKED_COLUMNS) <= table.columns.keys()
+    return _read_compressed(path, table) if is_compressed else _read_plain(path, table)
+
+
+def _read_plain(path: Path, table: PlyTable) -> Gaussians:
+    """The Gaussians of a PLY that is not compressed, whose `vertex` table has been read."""
     _check_is_splat(table, path)
     columns = {name: as_tensor(values) for name, values in table.columns.items()}
     plain = point_colors(table.columns)

@@ -15,11 +15,18 @@ import numpy as np
 import torch
 
 from glassplat.files import records, sidecars
-from glassplat.files.glb import MAGIC, read_glb
-from glassplat.files.ply import is_compressed, read_compressed, read_gaussians, write_gaussians
-from glassplat.files.ply_table import read_table
-from glassplat.files.spz import GZIP, read_spz, three_log_scales
-from glassplat.files.writing import GAUSSFORGE_SUFFIXES, SCENE_FILE, SPLAT_SUFFIXES, write_bytes, write_text
+from glassplat.files.glb import MAGIC
+from glassplat.files.ply import read_gaussians, write_gaussians
+from glassplat.files.spz import GZIP, three_log_scales
+from glassplat.files.writing import (
+    GAUSSFORGE_SUFFIXES,
+    SCENE_FILE,
+    SPLAT_READERS,
+    SPLAT_SUFFIXES,
+    import_function,
+    write_bytes,
+    write_text,
+)
 from glassplat.scene import SH_ZERO
 from glassplat.scene.corrections import Direction, Exposures, PoseCorrections
 from glassplat.scene.gaussians import Gaussians
@@ -163,32 +170,29 @@ def _read_drawable(path: Path) -> Gaussians:
 SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
 LEAST_SCALE = 1e-12
 """Minimum scale, for a finite logarithm."""
+FIRST_BYTES = {b"ply": "ply", GZIP: "spz", b"NGSP": "spz", MAGIC: "glb"}
+"""Formats that are recognised by their contents, whatever the suffix."""
 
 
 def read_splats(path: Path | str) -> Gaussians:
     """Reads the Gaussians of a file in the frame of a PLY (y down, z forward), without filtering.
 
-    The format is detected by the first bytes, or by the suffix for .splat, .sog and .ksplat.
+    The format is detected by the first bytes where these are known, else by the suffix.
     """
     path = Path(path)
     with records.wrap_read_errors(path), path.open("rb") as stream:
         head = stream.read(4)
-    if head[:3] == b"ply":
-        table = read_table(path)
-        return read_compressed(path, table) if is_compressed(table) else read_gaussians(path)
-    if head[:2] == GZIP or head == b"NGSP":
-        return read_spz(path)
-    if head == MAGIC:
-        return read_glb(path)
-    if path.suffix.lower() in GAUSSFORGE_SUFFIXES:
-        return read_with_gaussforge(path)
-    if path.suffix.lower() == ".splat":
-        return _read_dot_splat(path)
-    found = f"begins with the bytes {head!r}" if head else "is empty"
-    raise ValueError(
-        f"{path} is not a readable splat file, because it {found}; expected one of {', '.join(SPLAT_SUFFIXES)}: export "
-        "or copy it again"
-    )
+    named = path.suffix.lower().removeprefix(".")
+    by_name = None if named in FIRST_BYTES.values() else named
+    kind = next((kind for first, kind in FIRST_BYTES.items() if head.startswith(first)), by_name)
+    if kind not in SPLAT_READERS:
+        found = f"begins with the bytes {head!r}" if head else "is empty"
+        raise ValueError(
+            f"{path} is not a readable splat file, because it {found}; expected one of {', '.join(SPLAT_SUFFIXES)}: "
+            "export or copy it again"
+        )
+    gaussians: Gaussians = import_function(SPLAT_READERS[kind])(path)
+    return gaussians
 
 
 def select_drawable(gaussians: Gaussians, path: Path | str) -> tuple[Gaussians, int]:
@@ -219,8 +223,8 @@ def select_drawable(gaussians: Gaussians, path: Path | str) -> tuple[Gaussians, 
     return kept.with_tensors(clamped), lost
 
 
-def _read_dot_splat(path: Path) -> Gaussians:
-    """A .splat: 32 bytes per Gaussian, with activated colours and opacities, and linear scales."""
+def read_dot_splat(path: Path) -> Gaussians:
+    """Reads a .splat: 32 bytes per Gaussian, with activated colours and opacities, and linear scales."""
     size = os.stat(path).st_size
     if size == 0 or size % SPLAT_ROW.itemsize:
         raise ValueError(

@@ -19,10 +19,15 @@ from glassplat.errors import InputError
 
 GAUSSFORGE_SUFFIXES = (".sog", ".ksplat")
 """Formats that need an extra to be read and written."""
-SPLAT_SUFFIXES = (".ply", ".spz", ".glb", ".splat", *GAUSSFORGE_SUFFIXES)
-"""Suffixes of readable files of Gaussians."""
-LOADABLE = f"a run, a folder of an export, or a splat file ({', '.join(SPLAT_SUFFIXES)})"
-"""Paths that can be opened as a scene."""
+SPLAT_READERS = {
+    "ply": "glassplat.files.ply:read_ply",
+    "spz": "glassplat.files.spz:read_spz",
+    "glb": "glassplat.files.glb:read_glb",
+    "splat": "glassplat.files.scene_folder:read_dot_splat",
+    "sog": "glassplat.files.scene_folder:read_with_gaussforge",
+    "ksplat": "glassplat.files.scene_folder:read_with_gaussforge",
+}
+"""Readable formats of Gaussians by suffix: the function `(path) -> Gaussians` of each, imported when needed."""
 SPLAT_WRITERS = {
     "ply": "glassplat.files.ply:write_gaussians",
     "spz": "glassplat.files.spz:write_spz",
@@ -30,7 +35,10 @@ SPLAT_WRITERS = {
     "sog": "glassplat.files.scene_folder:write_with_gaussforge",
     "ksplat": "glassplat.files.scene_folder:write_with_gaussforge",
 }
-"""Output formats of Gaussians by suffix: the function `(path, gaussians)` of each, imported when needed."""
+"""Formats of output, all of them readable: the function `(path, gaussians)` of each."""
+SPLAT_SUFFIXES = tuple(f".{kind}" for kind in SPLAT_READERS)
+LOADABLE = f"a run, a folder of an export, or a splat file ({', '.join(SPLAT_SUFFIXES)})"
+"""Paths that can be opened as a scene."""
 OUTPUT_FORMATS = (*SPLAT_WRITERS, "html")
 """All formats of `export` and `Model.save`; `html` is the page of a whole model."""
 
@@ -44,11 +52,16 @@ def check_scene_name(path: Path) -> None:
         raise InputError(f"{suffix} files need gaussforge; pip install 'glassplat[formats]'")
 
 
+def import_function(place: str) -> Any:
+    """The function at `module:name`."""
+    module, _, name = place.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
 def write_splats(kind: str, path: Path, gaussians: Any, **options: Any) -> None:
     """Write Gaussians in a format of `SPLAT_WRITERS`, with the active SH degree."""
-    module, _, name = SPLAT_WRITERS[kind].partition(":")
     shown = replace(gaussians, sh=gaussians.sh[:, : (gaussians.active_sh_degree + 1) ** 2])
-    getattr(importlib.import_module(module), name)(path, shown, **options)
+    import_function(SPLAT_WRITERS[kind])(path, shown, **options)
 
 
 TEMPORARY_NAME = re.compile(r"\..{0,32}\.[0-9a-f]{12}\.tmp(\..{1,31})?")
