@@ -36,6 +36,8 @@ SPLAT_WRITERS = {
     "ksplat": "glassplat.files.scene_folder:write_with_gaussforge",
 }
 """Formats of output, all of them readable: the function `(path, gaussians)` of each."""
+EXACT_FORMATS = ("ply", "glb")
+"""Formats of splats that store channels, and that Gaussians are discs."""
 SPLAT_SUFFIXES = tuple(f".{kind}" for kind in SPLAT_READERS)
 LOADABLE = f"a run, a folder of an export, or a splat file ({', '.join(SPLAT_SUFFIXES)})"
 """Paths that can be opened as a scene."""
@@ -229,5 +231,5 @@ def scene_source(path: Path) -> Path:
     """The most exact splat file in a folder of `glassplat export`; any other path unchanged."""
     if (path / "recipe.json").is_file():
         return path
-    kinds = dict.fromkeys(("ply", "glb", *SPLAT_WRITERS))
+    kinds = dict.fromkeys((*EXACT_FORMATS, *SPLAT_WRITERS))
     return next((file for kind in kinds if (file := path / f"scene.{kind}").is_file()), path)

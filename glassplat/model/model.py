@@ -435,22 +435,18 @@ def _differing_files(model: Model, sidecars: Sequence[Path]) -> list[Path]:
     return [target for target in there if not target.is_file() or target.read_bytes() != contents.get(target.name)]
 
 
-FORMATS_WITH_CHANNELS = ("ply", "glb")
-"""Splat formats that can store channels."""
-
-
 def unsaved_parts(model: Model, kind: str) -> list[str]:
     """Parts of a model that neither the splat file nor the files next to it can store."""
     scene = model.scene
     own, read = (recipe.renderer().page_settings() for recipe in (model.recipe, recipe_of_splats(scene.primary)))
     names = read if len(scene.planes) else ("background",)
     lost = [f"{name}={own[name]}" for name in names if name in own and own[name] != read[name]]
-    logs = scene.primary.channels.get("log_intensity")
-    if kind not in FORMATS_WITH_CHANNELS and len(scene.planes) and logs is not None and bool(logs.any()):
+    is_exact, logs = kind in writing.EXACT_FORMATS, scene.primary.channels.get("log_intensity")
+    if not is_exact and len(scene.planes) and logs is not None and bool(logs.any()):
         lost.append("the intensity of Gaussians in panes")
     if len(scene.surroundings) or not scene.environment.is_empty:
         lost.append("what glossy surfaces mirror")
-    if kind == "spz" and scene.primary.are_discs:
+    if not is_exact and scene.primary.are_discs:
         lost.append("that Gaussians are discs")
     return [*lost, "the photographer"] if len(scene.photographer) else lost
 
