@@ -42,8 +42,6 @@ LABEL_COLORS = (
     (160, 160, 160),
 )
 """Colours of panes, which colour-blind people can also tell apart (Okabe and Ito)."""
-MEASURED = ("normal", "depth", "median_depth")
-"""Layers whose values are not colours; `glassplat render` also writes them as arrays."""
 ERROR_SCALE = 0.2
 """Colour error drawn brightest; fixed, so that images can be compared."""
 COVERED = 0.5
@@ -105,8 +103,16 @@ def label_colors(labels: Tensor) -> Tensor:
     return palette[(index - 1) % len(palette)] * (index > 0)[..., None]
 
 
+MEASURED: dict[str, Callable[[Tensor, Tensor | None], Tensor]] = {
+    "normal": lambda normals, alpha: normal_colors(normals),
+    "depth": depth_colors,
+    "median_depth": depth_colors,
+}
+"""Layers whose values are not colours: their colours, by value and coverage. `glassplat render` also writes arrays."""
+
+
 def layer_image(frame: Frame, layer: str) -> Tensor:
-    """A layer as an image [H, W] or [H, W, 3] in [0, 1]; depth is colour-mapped (near bright), normals (n + 1) / 2.
+    """A layer as an image [H, W] or [H, W, 3] in [0, 1], by `MEASURED` where its values are not colours.
 
     Reflections are masked by their panes, because whole tiles are rendered.
     """
@@ -114,10 +120,8 @@ def layer_image(frame: Frame, layer: str) -> Tensor:
         image: Tensor = getattr(frame, layer)
         return image.clamp(0, 1)
     image = frame.layers[layer]
-    if layer == "normal":
-        return normal_colors(image)
-    if layer in ("depth", "median_depth"):
-        return depth_colors(image, frame.layers["alpha"])
+    if layer in MEASURED:
+        return MEASURED[layer](image, frame.layers.get("alpha"))
     if layer == "reflection" and "mask" in frame.layers:
         image = image * frame.layers["mask"][..., None]
     return image.clamp(0, 1)
