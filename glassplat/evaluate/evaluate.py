@@ -326,8 +326,8 @@ def _measure(
         "psnr": _counted_psnr(image, photo, counted),
         "corrected_psnr": _counted_psnr(metrics.correct_colors(image, photo, region=counted), photo, counted),
         "right_half_psnr": _right_half_psnr(image, photo, counted),
-        "ssim": ALL_IGNORED if _is_too_small(counted) else metrics.ssim(image, photo),
-        "lpips": ALL_IGNORED if _is_too_small(counted) else _lpips(lpips, image, photo),
+        "ssim": ALL_IGNORED if metrics.is_too_small(counted) else metrics.ssim(image, photo),
+        "lpips": ALL_IGNORED if metrics.is_too_small(counted) else _lpips(lpips, image, photo),
         "pane_psnr": pane if isinstance(pane, str) else _region_psnr(image, photo, pane, TOO_FEW),
         "transmission_psnr": _transmission_psnr(frame, truth),
         **metrics.surface_metrics(frame, photo, surface),
@@ -351,7 +351,7 @@ def _counted_psnr(image: Tensor, photo: Tensor, counted: Tensor | None) -> metri
 def _right_half_psnr(image: Tensor, photo: Tensor, counted: Tensor | None) -> metrics.Outcome:
     """PSNR of the right half after the colour transform fitted to the left half (as in NeRF in the Wild)."""
     middle = max(photo.shape[1] // 2, 1)
-    if counted is not None and _is_too_small(counted[:, :middle]):
+    if counted is not None and metrics.is_too_small(counted[:, :middle]):
         return LEFT_IGNORED
     corrected = metrics.correct_colors(image, photo, slice(0, middle), counted)
     right = slice(min(middle, photo.shape[1] - 1), None)
@@ -359,19 +359,14 @@ def _right_half_psnr(image: Tensor, photo: Tensor, counted: Tensor | None) -> me
 
 
 def _region_psnr(image: Tensor, target: Tensor, region: Tensor, reason: str) -> metrics.Outcome:
-    return reason if _is_too_small(region) else metrics.psnr(image, target, region)
-
-
-def _is_too_small(region: Tensor | None) -> bool:
-    """Return whether a region [H, W] is given that is too small for a metric."""
-    return region is not None and int(region.sum()) < metrics.SMALLEST_REGION
+    return reason if metrics.is_too_small(region) else metrics.psnr(image, target, region)
 
 
 def _transmission_psnr(frame: Frame, truth: TrueView | str) -> metrics.Outcome:
     if isinstance(truth, str):
         return truth
     pane = truth.labels > 0
-    reason = TOO_FEW if _is_too_small(pane) else "the pane is a mirror, which transmits nothing"
+    reason = TOO_FEW if metrics.is_too_small(pane) else "the pane is a mirror, which transmits nothing"
     image = frame.layers.get("transmission", frame.rgb)
     return _region_psnr(image, truth.transmission, pane & (truth.strength < MIRROR_STRENGTH), reason)
 
@@ -383,7 +378,7 @@ def _reflection_pixels(frame: Frame, truth: TrueView | str) -> tuple[Tensor, Ten
     if isinstance(truth, str):
         return truth
     pane = truth.labels > 0
-    if _is_too_small(pane):
+    if metrics.is_too_small(pane):
         return TOO_FEW
     return frame.layers["reflection"][pane], truth.reflection[pane].to(torch.float32) / 255
 

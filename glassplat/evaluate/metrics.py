@@ -200,8 +200,17 @@ def psnr(image: Tensor, target: Tensor, region: Tensor | None = None) -> float:
         difference = difference[region]
     if difference.numel() == 0:
         raise ValueError("no pixels to compare; expected a non-empty region")
-    mean_square = difference.square().mean().item()
+    return decibels(difference.square().mean().item())
+
+
+def decibels(mean_square: float) -> float:
+    """PSNR of a mean squared difference between values from 0 to 255; infinite for 0."""
     return math.inf if mean_square == 0 else 10 * math.log10(255**2 / mean_square)
+
+
+def is_too_small(region: Tensor | None) -> bool:
+    """Return whether a region [H, W] is too small for a metric; None, the whole image, never is."""
+    return region is not None and int(region.sum()) < SMALLEST_REGION
 
 
 def correct_colors(image: Tensor, target: Tensor, columns: slice = slice(None), region: Tensor | None = None) -> Tensor:
@@ -329,11 +338,9 @@ def missing_panes(planes: Planes, truth: GroundTruth | None) -> list[int]:
 def _plane_difference(fitted: dict[str, Any], center: Sequence[float], normal: Sequence[float]) -> tuple[float, float]:
     """Angle between the normals in degrees, and the distance of the other plane's centre from the fitted plane."""
     own = torch.tensor(fitted["normal"], dtype=torch.float64)
-    other = torch.tensor(normal, dtype=torch.float64)
-    # The arc tangent keeps its precision for the small angles that matter here; the arc cosine does not.
-    angle = torch.atan2(torch.linalg.cross(own, other).norm(), (own @ other).abs())
+    angle = angular_errors_deg(own, torch.tensor(normal, dtype=torch.float64)).item()
     apart = torch.tensor(center, dtype=torch.float64) - torch.tensor(fitted["center"], dtype=torch.float64)
-    return torch.rad2deg(angle).item(), (apart @ own).abs().item()
+    return min(angle, 180 - angle), (apart @ own).abs().item()
 
 
 REFLECTIVE = 0.5
@@ -379,7 +386,7 @@ def _reflective_psnr(frame: Frame, photo: Tensor, truth: TrueSurface) -> Outcome
     region = _reflective_region(truth)
     if isinstance(region, str):
         return region
-    return psnr(frame.photographed, photo, region) if int(region.sum()) >= SMALLEST_REGION else NO_REFLECTIVE_PIXELS
+    return NO_REFLECTIVE_PIXELS if is_too_small(region) else psnr(frame.photographed, photo, region)
 
 
 def _normal_errors(frame: Frame, truth: TrueSurface) -> Tensor | str:
@@ -407,7 +414,7 @@ def _mean_error(errors: Tensor | str, region: Tensor | str, too_few: str) -> Out
         return errors
     if isinstance(region, str):
         return region
-    return float(errors[region].to(torch.float64).mean()) if int(region.sum()) >= SMALLEST_REGION else too_few
+    return too_few if is_too_small(region) else float(errors[region].to(torch.float64).mean())
 
 
 SMALLEST_SIDE = 32
@@ -513,7 +520,7 @@ def environment_metrics(learned: Tensor | None, truth: Tensor | None, lpips: Lpi
     image = quantize(gain * source, "learned environment")
     mean_square = _mean_over_sphere((image.to(torch.float64) - target.to(torch.float64)).square())
     return {
-        "environment_psnr": math.inf if mean_square == 0 else 10 * math.log10(255**2 / mean_square),
+        "environment_psnr": decibels(mean_square),
         "environment_gain": gain,
         "environment_lpips": NO_LPIPS if isinstance(lpips, str) else lpips(image, target),
     }
