@@ -84,9 +84,7 @@ class Model:
             return f"<p>{text}</p>"
         names = tuple(self.cameras)
         name = names[web_page.best_view(self.scene.planes, tuple(self.cameras.values()))]
-        camera = self.cameras[name]
-        width = min(NOTEBOOK_WIDTH, camera.width)
-        small = camera.resize(width, max(1, round(width * camera.height / camera.width)))
+        small = web_page.limit_width(self.cameras[name], NOTEBOOK_WIDTH)
         encoded = web_page.base64_text(web_page.jpeg_bytes(self.image(small), quality=90))
         return f'<p>{text}</p><img src="data:image/jpeg;base64,{encoded}" alt="{html.escape(name)}">'
 

@@ -17,9 +17,8 @@ from PIL import Image
 
 ImageArray = NDArray[np.uint8]
 
-CODECS = {".mp4": "vp09"}
 ANIMATIONS = (".webp", ".gif")
-SUFFIXES = (*CODECS, *ANIMATIONS)
+SUFFIXES = (".mp4", *ANIMATIONS)
 WEBP_QUALITY, LARGEST_WEBP = 80, 16383
 MOST_IN_GIF = 50
 """Maximum frames per second: a GIF counts in hundredths of a second, and browsers play one hundredth as ten."""
@@ -62,7 +61,7 @@ def check_encoder(path: Path, fps: int) -> None:
         raise ValueError(
             f"a .gif shows at most {MOST_IN_GIF} frames per second, not {fps}; lower --fps, or end the name in .webp"
         )
-    if path.suffix in CODECS:
+    if path.suffix not in ANIMATIONS:
         import cv2  # noqa: F401
 
 
@@ -129,7 +128,7 @@ def _write_video(path: Path, first: ImageArray, rest: Iterator[ImageArray], fps:
     import cv2
 
     height, width = first.shape[:2]
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*CODECS[path.suffix]), float(fps), (width, height))
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"vp09"), float(fps), (width, height))
     try:
         if not writer.isOpened():
             raise OSError(f"this OpenCV cannot write VP9 to {path}; give a name that ends in .webp")

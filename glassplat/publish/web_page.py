@@ -177,6 +177,7 @@ MOST_GAUSSIANS = 1_000_000
 RANKING_VIEWS, RANKING_WIDTH = 64, 480
 """Views by which Gaussians are ranked, and their width in pixels."""
 POSTER_WIDTH, POSTER_QUALITY = 640, 70
+"""Width in pixels and JPEG quality of the small image shown while the scene is decoded."""
 LEAST_OPACITY = 1 / 255
 DESCRIPTION = "Look around, remove the reflections from the glass, or turn it into a mirror."
 DESCRIPTIONS = ("Look around a scene of Gaussians.", "Look around, and remove reflections from glossy objects.")
@@ -277,7 +278,7 @@ def page_text(
     kind = scene.primary.means.dtype
     cameras = [(name, replace(camera, cam_from_world=camera.cam_from_world.to(kind))) for name, camera in cameras]
     poster_view = best_view(scene.planes, [camera for _, camera in cameras])
-    poster = jpeg_bytes(renderer(scene, poster_camera(cameras[poster_view][1])).rgb)
+    poster = jpeg_bytes(renderer(scene, limit_width(cameras[poster_view][1], POSTER_WIDTH)).rgb)
     scene = replace(scene, primary=visible_gaussians(scene.primary), glass=visible_gaussians(scene.glass))
     if not LEAST_EXTENT <= scene.extent <= LARGEST_EXTENT:
         factor = 1 / scene.extent
@@ -368,18 +369,16 @@ def select_for_page(scene: Scene, cameras: Sequence[Camera]) -> Scene:
         return scene
     most = scene.primary.means.new_zeros(len(scene.primary))
     for camera in cameras[:: -(-len(cameras) // RANKING_VIEWS)]:
-        width = min(camera.width, RANKING_WIDTH)
-        small = camera.resize(width, max(round(width * camera.height / camera.width), 1))
-        most = torch.maximum(most, contributions(scene, small))
+        most = torch.maximum(most, contributions(scene, limit_width(camera, RANKING_WIDTH)))
     kept = torch.zeros(len(scene.primary), dtype=torch.bool, device=most.device)
     kept[torch.topk(most, room).indices] = True
     return replace(scene, primary=scene.primary.select(kept))
 
 
-def poster_camera(camera: Camera) -> Camera:
-    """The camera of the poster, the small image shown while the scene is decoded."""
-    share = min(1.0, POSTER_WIDTH / camera.width)
-    return camera.resize(max(1, round(share * camera.width)), max(1, round(share * camera.height)))
+def limit_width(camera: Camera, most: int) -> Camera:
+    """The camera resized to at most this width, in pixels."""
+    width = min(most, camera.width)
+    return camera.resize(width, max(1, round(width * camera.height / camera.width)))
 
 
 def jpeg_bytes(image: Tensor, quality: int = POSTER_QUALITY) -> bytes:
