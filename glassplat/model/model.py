@@ -478,13 +478,13 @@ def write_sidecars(folder: Path, scene: Scene) -> list[Path]:
     return written
 
 
-def write_as_run(folder: Path, model: Model, source: Path | None) -> None:
+def write_as_run(folder: Path, model: Model) -> None:
     """Writes a model to a new or empty folder in the layout of a run; the recipe comes last, to mark the folder as
-    complete. A scene from a run refers to the run's capture, any other records where it comes from: `source`, or what
-    that folder records itself.
+    complete. A scene from a run refers to the run's capture; any other records the path of the model, or what is
+    recorded there.
     """
     writing.make_folder(folder)
-    directory = RunDirectory(folder)
+    directory, source = RunDirectory(folder), model.path
     directory.export(model.scene, max({} if source is None else RunDirectory(source).scene_folders(), default=0))
     write_cameras(folder / CAMERAS, model.cameras.items())
     records = [] if source is None else [source / SETTINGS_FILE, RunDirectory(source).import_record]
@@ -509,7 +509,7 @@ def save_folder(model: Model, folder: Path, *, overwrite: bool = False) -> Path:
             "`glassplat.Camera.look_at`, or save it as .ply"
         )
     if not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir())):
-        write_as_run(folder, model, model.path)
+        write_as_run(folder, model)
         return folder
     is_saved = (folder / "recipe.json").is_file() and not RunDirectory(folder).checkpoint.is_file()
     if not (overwrite and is_saved):
@@ -518,7 +518,7 @@ def save_folder(model: Model, folder: Path, *, overwrite: bool = False) -> Path:
             f"{folder} already exists and is not empty; nothing was written. Choose a new folder{more}"
         )
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as temporary:
-        write_as_run(Path(temporary) / "new", model, model.path)
+        write_as_run(Path(temporary) / "new", model)
         folder.rename(Path(temporary) / "old")
         (Path(temporary) / "new").rename(folder)
     return folder
@@ -532,7 +532,7 @@ log = logging.getLogger(__name__)
 
 
 def _read_panes(file: Path, planes_file: Path | None) -> Planes:
-    sidecar = file.with_name("planes.json")
+    sidecar = file.with_name(PLANES)
     if planes_file is None and not sidecar.is_file():
         if file.with_name(GLASS).is_file():
             log.warning("%s no longer has panes: next to it is %s, but no %s", file, GLASS, PLANES)
@@ -544,7 +544,7 @@ def _read_panes(file: Path, planes_file: Path | None) -> Planes:
 
 def _read_glass(file: Path, planes: Planes, *, own: bool) -> Gaussians:
     """The glass stored next to the file, or an even sheet of Gaussians on each pane."""
-    sidecar = file.with_name("glass.ply")
+    sidecar = file.with_name(GLASS)
     if not len(planes) or not own or not sidecar.is_file():
         return covering_glass(planes)
     glass, _ = select_drawable(read_gaussians(sidecar), sidecar)
@@ -556,7 +556,7 @@ def _read_glass(file: Path, planes: Planes, *, own: bool) -> Gaussians:
 def _read_or_place_cameras(file: Path, gaussians: Gaussians, up: Up) -> NamedCameras:
     if up not in AXES:
         raise InputError(f"up is {up!r}; expected one of {', '.join(AXES)}")
-    sidecar = file.with_name("cameras.json")
+    sidecar = file.with_name(CAMERAS)
     cameras = read_cameras(sidecar) if sidecar.is_file() else []
     return tuple(cameras or web_page.cameras_around(gaussians, torch.tensor(AXES[up], dtype=torch.float64)))
 
@@ -606,9 +606,9 @@ def _from_run(path: Path, device: DeviceName) -> Model:
     scene, _ = directory.latest_scene()
     with convert_to_input_error():
         recipe.renderer().check(scene)
-        cameras = read_cameras(path / "cameras.json")
+        cameras = read_cameras(path / CAMERAS)
     if not cameras:
-        raise InputError(f"{path / 'cameras.json'} lists no camera; expected those of the photographs")
+        raise InputError(f"{path / CAMERAS} lists no camera; expected those of the photographs")
     return Model(scene.to(chosen_device(device)), recipe, name_cameras(cameras), path.resolve().name, path)
 
 
@@ -619,7 +619,7 @@ def _from_file(path: Path, device: DeviceName, planes_file: Path | None, up: Up)
         if not len(gaussians):
             raise InputError(f"{path} holds no Gaussians; expected a trained splat")
         planes = _read_panes(path, planes_file)
-        own = planes_file is None or writing.real_path(planes_file) == writing.real_path(path.with_name("planes.json"))
+        own = planes_file is None or writing.real_path(planes_file) == writing.real_path(path.with_name(PLANES))
         glass = _read_glass(path, planes, own=own)
         cameras = _read_or_place_cameras(path, gaussians, up)
         centers = torch.stack([camera.center for _, camera in cameras])

@@ -42,11 +42,6 @@ NO_LOCK_ERRORS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
 """Errors of file systems without locks."""
 
 
-def _is_unmoved(recorded: Camera, camera: Camera, extent: float) -> bool:
-    rounding = ROUNDING * float(camera.center.norm())
-    return float((recorded.center - camera.center).norm()) <= MOST_MOVED * extent + rounding
-
-
 @contextmanager
 def run_lock(folder: Path) -> Iterator[None]:
     """Locks the folder against other training processes, if the file system supports it.
@@ -396,6 +391,11 @@ class RunDirectory:
             )
         with convert_to_input_error():
             return read_text(file)
+
+
+def _is_unmoved(recorded: Camera, camera: Camera, extent: float) -> bool:
+    rounding = ROUNDING * float(camera.center.norm())
+    return float((recorded.center - camera.center).norm()) <= MOST_MOVED * extent + rounding
 
 
 def check_output(directory: RunDirectory, *, resume: bool) -> None:
