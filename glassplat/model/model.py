@@ -524,7 +524,6 @@ def save_folder(model: Model, folder: Path, *, overwrite: bool = False) -> Path:
     return folder
 
 
-NamedCameras = tuple[tuple[str, Camera], ...]
 AXES: dict[str, tuple[int, int, int]] = {
     "x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1),
 }  # fmt: skip
@@ -553,12 +552,12 @@ def _read_glass(file: Path, planes: Planes, *, own: bool) -> Gaussians:
     return glass
 
 
-def _read_or_place_cameras(file: Path, gaussians: Gaussians, up: Up) -> NamedCameras:
+def _read_or_place_cameras(file: Path, gaussians: Gaussians, up: Up) -> list[tuple[str, Camera]]:
     if up not in AXES:
         raise InputError(f"up is {up!r}; expected one of {', '.join(AXES)}")
     sidecar = file.with_name(CAMERAS)
     cameras = read_cameras(sidecar) if sidecar.is_file() else []
-    return tuple(cameras or web_page.cameras_around(gaussians, torch.tensor(AXES[up], dtype=torch.float64)))
+    return cameras or web_page.cameras_around(gaussians, torch.tensor(AXES[up], dtype=torch.float64))
 
 
 def load(

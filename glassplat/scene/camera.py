@@ -37,7 +37,7 @@ def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) 
 
 
 LEAST_SINE = 1e-6
-"""Minimum sine of the angle between viewing direction and up."""
+"""Minimum sine of the angle between two directions that span a plane, as viewing direction and up."""
 LEAST_CROSSING = 1e-3
 """Smallest eigenvalue of the mean of I - d d^T for which lines along d count as crossing."""
 

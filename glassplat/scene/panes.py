@@ -10,11 +10,9 @@ import torch
 from torch import Tensor
 
 from glassplat.scene import check_tensor_names, logit
-from glassplat.scene.camera import Camera, constant
+from glassplat.scene.camera import LEAST_SINE, Camera, constant
 from glassplat.scene.gaussians import check_rows
 
-LEAST_SINE = 1e-6
-"""Minimum sine of the angle between a pane's normal and its tangent."""
 HIGHEST_LABEL = 255
 """Labels are stored in a byte."""
 PANE_TENSORS = ("centers", "raw_normals", "logit_reflectances", "log_transmittances")

@@ -17,7 +17,6 @@ from glassplat.scene.corrections import Direction, Exposures, PoseCorrections
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import PANE_TENSORS, Planes, name_labels, nearest_panes
 
-ENVIRONMENT_TENSORS = ("raw",)
 FACES = 6
 """Faces of a cube map."""
 NOISE = 5.0
@@ -68,15 +67,15 @@ class Environment:
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name."""
-        return {name: getattr(self, name) for name in ENVIRONMENT_TENSORS}
+        return {"raw": self.raw}
 
     def with_tensors(self, tensors: Mapping[str, Tensor]) -> Environment:
         """The environment with its tensors replaced by name."""
-        return replace(self, **check_tensor_names(tensors, ENVIRONMENT_TENSORS, "environments"))
+        return replace(self, **check_tensor_names(tensors, self.tensors(), "environments"))
 
     def to(self, device: torch.device | torch.dtype | str) -> Environment:
         """The same environment on another device, or in another precision."""
-        return self.with_tensors({name: tensor.to(device) for name, tensor in self.tensors().items()})
+        return replace(self, raw=self.raw.to(device))
 
     @staticmethod
     def empty() -> Environment:

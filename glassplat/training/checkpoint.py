@@ -17,7 +17,7 @@ from glassplat.files.sidecars import HIGHEST_LABEL, REGION, TensorsFile, open_te
 from glassplat.scene.corrections import Exposures, PoseCorrections
 from glassplat.scene.gaussians import PER_GAUSSIAN, Gaussians
 from glassplat.scene.panes import Planes
-from glassplat.scene.scene import ENVIRONMENT_TENSORS, OPTIONAL_SETS, PARTS, Environment, Scene
+from glassplat.scene.scene import OPTIONAL_SETS, PARTS, Environment, Scene
 from glassplat.training.densify import ScreenStatistics
 from glassplat.training.stage import Optimizer, TrainState
 
@@ -204,7 +204,7 @@ def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     with convert_to_input_error("planes"):
         parts["planes"] = Planes(**held["planes"], labels=header["labels"], mirrors=header["mirrors"])
     environment = held["environment"] or Environment.empty().tensors()
-    check_names(environment, ENVIRONMENT_TENSORS, "environment")
+    check_names(environment, ("raw",), "environment")
     with convert_to_input_error("environment"):
         parts["environment"] = Environment(**environment, region=header["region"])
     for part, kind, names in (
