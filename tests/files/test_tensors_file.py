@@ -48,12 +48,14 @@ def test_a_full_disk_is_recognised_by_its_errno(said: str, number: int | None) -
 
 @pytest.mark.parametrize("name", ["a.safetensors", "a.exr"])
 def test_system_errors_keep_their_errno(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text("old")
     with no_file_beyond(4000), pytest.raises(OSError, match=r"could not write .* are unchanged") as caught:
         if name == "a.exr":
             write_equirect(tmp_path / name, torch.rand(64, 128, 3))
         else:
             write_tensors(tmp_path / name, {"a": torch.zeros(10_000)}, {})
     assert caught.value.errno == errno.EFBIG
+    assert (tmp_path / name).read_text() == "old"
 
 
 def test_tensors_and_header_round_trip(tmp_path: Path) -> None:
