@@ -210,6 +210,21 @@ def test_there_are_at_most_64_panes_and_each_has_its_colour_and_is_shown(page: P
     assert page.window.run(f"return new Set({colors}).size") == 64
 
 
+def test_the_menus_of_a_pane_keep_the_focus_when_a_choice_is_saved(page: Page) -> None:
+    page.window.run("document.querySelector('select[title=material]').focus()")
+    for expected in ("mirror", "screen"):
+        page.window.keys("Down")
+        page.saved()
+        assert page.document()["material"] == expected
+
+
+def test_a_menu_stays_in_place_when_its_pane_is_chosen_by_a_click_on_it(page: Page) -> None:
+    page.window.keys("a")
+    page.saved()
+    page.window.run("window.menu = document.querySelector('.pane:not(.active) select'); window.menu.click()")
+    assert page.window.run("return window.menu.isConnected && window.menu.closest('.pane').matches('.active')")
+
+
 def test_shift_and_tab_lead_to_the_buttons(page: Page) -> None:
     page.window.run("document.getElementById('canvas').focus()")
     page.window.keys("Shift", "Tab")

@@ -143,26 +143,35 @@ function make(tag, properties = {}, ...children) {
   return made;
 }
 
-function choice(pane, key, values) {
+function choice(label, key, values) {
   const select = make("select", { title: key });
-  values.forEach((value) => select.append(make("option", { value, textContent: value, selected: pane[key] === value })));
-  select.addEventListener("change", () => marking.set(pane.label, key, select.value));
+  select.append(...values.map((value) => make("option", { textContent: value })));
+  select.addEventListener("change", () => marking.set(label, key, select.value));
   return select;
 }
 
+function makeCard(label) {
+  const swatch = make("i");
+  swatch.style.background = colorOf(label);
+  const remove = make("button", { textContent: "×", title: "remove this pane" });
+  remove.addEventListener("click", (event) => { event.stopPropagation(); marking.removePane(label); });
+  const card = make("div", { className: "pane" },
+    make("h2", {}, swatch, `pane ${label}`, remove), choice(label, "material", ["glass", "mirror", "screen"]), " ", choice(label, "shape", ["rectangle", "polygon"]), make("div"));
+  card.addEventListener("click", () => { if (marking.active !== label) { marking.active = label; refresh(); } });
+  return card;
+}
+
+// A card stays as long as its pane: an open menu and the focus of keys outlast a click and the answers of the server.
 function drawPanes() {
-  element("panes").replaceChildren(...marking.document.panes.map((pane) => {
-    const answer = answers[pane.label];
-    const swatch = make("i");
-    swatch.style.background = colorOf(pane.label);
-    const remove = make("button", { textContent: "×", title: "remove this pane" });
-    remove.addEventListener("click", (event) => { event.stopPropagation(); marking.removePane(pane.label); });
-    const card = make("div", { className: `pane ${pane.label === marking.active ? "active" : ""}` },
-      make("h2", {}, swatch, `pane ${pane.label}`, remove), choice(pane, "material", ["glass", "mirror", "screen"]), " ", choice(pane, "shape", ["rectangle", "polygon"]));
-    card.addEventListener("click", () => { if (marking.active !== pane.label) { marking.active = pane.label; refresh(); } });
-    for (const [text, kind] of judgement(answer)) card.append(make("p", { textContent: text, className: kind }));
-    return card;
-  }));
+  const panes = marking.document.panes, labels = panes.map((pane) => pane.label).join(), list = element("panes");
+  if (list.dataset.labels !== labels) list.replaceChildren(...panes.map((pane) => makeCard(pane.label)));
+  list.dataset.labels = labels;
+  panes.forEach((pane, number) => {
+    const card = list.children[number];
+    card.classList.toggle("active", pane.label === marking.active);
+    for (const select of card.querySelectorAll("select")) select.value = pane[select.title];
+    card.lastChild.replaceChildren(...judgement(answers[pane.label]).map(([textContent, className]) => make("p", { textContent, className })));
+  });
 }
 
 const GOOD = 0.5, SURE = 2; // degrees
