@@ -127,7 +127,8 @@ class PageHandler(BaseHTTPRequestHandler):
             self._send_json(session.finish())
         elif path == "/close":
             self.server.is_finished = True
-            self._send_json({})  # Sent before the shutdown, which waits for the loop of the server.
+            # Sent before the shutdown, which waits for the loop of the server.
+            self._send_json({"warning": session.unwritten_warning})
             Thread(target=self.server.shutdown, daemon=True).start()
         else:
             raise RefusedError(HTTPStatus.NOT_FOUND, "there is no such page")

@@ -165,6 +165,11 @@ KNOWN_VERSIONS = 200
 GRAB_FIELDS: dict[str, Field] = {"view": Integer(0, 10**9), "points": ListOf(PIXEL)}
 
 
+def is_marked(panes: Sequence[MarkedPane]) -> bool:
+    """Return whether any corner or edge of the panes is marked in a photograph."""
+    return any(places for pane in panes for places in (*pane.corners, *pane.edges))
+
+
 class ChangedElsewhereError(ValueError):
     """Raised when a page saves changes to an outdated document; `response` is sent to the page."""
 
@@ -196,6 +201,7 @@ class Session:
         with convert_to_input_error():
             self._document: Any = read_document(self.root)
         self._remember(self._document)
+        self._written_version = document_version(self._document) if (self.root / PLANES).exists() else ""
 
     def describe(self) -> dict[str, Any]:
         """Description of the capture for the page."""
@@ -292,21 +298,30 @@ class Session:
 
         If no pane is marked any more, earlier output is removed.
         """
-        panes = parse_document(self._current_document()["document"], "the document")
+        current = self._current_document()
+        panes = parse_document(current["document"], "the document")
         solved = [(pane, fit) for pane in panes if not isinstance(fit := self.solve(pane), str)]
         if not solved:
-            is_marked = any(places for pane in panes for places in (*pane.corners, *pane.edges))
-            removed = [] if is_marked else remove_results(self.root)
+            removed = [] if is_marked(panes) else remove_results(self.root)
             if not removed:
                 raise InputError("no pane is known yet; mark the same corners in two photographs")
             stays = f"; {PLANES} stays: it was not written here" if (self.root / PLANES).exists() else ""
             message = f"no pane is marked; removed the earlier output: {join_names(removed)}{stays}"
             return {"masks": [], "planes": [], "told": message}
         written = write_results(self.root, self.views, self.cameras, solved)
+        self._written_version = current["version"]
         return {
             "masks": written,
             "planes": [{"label": pane.label, "uncertainty": fit.uncertainty} for pane, fit in solved],
         }
+
+    @property
+    def unwritten_warning(self) -> str:
+        """A warning if the masks and planes are older than the marks, or an empty string."""
+        document = self._document
+        if document_version(document) == self._written_version or not is_marked(parse_document(document, ANNOTATIONS)):
+            return ""
+        return "masks and planes do not contain the latest marks: annotate again, and press 'write masks and planes'"
 
     def _pane_record(self, pane: MarkedPane) -> dict[str, Any]:
         """Record of a pane for the page; the cached one if its corners, edges and shape are unchanged."""

@@ -78,7 +78,8 @@ def serve_annotation(command: Annotate, console: Console) -> None:
         if command.open_browser and has_screen():
             stack.enter_context(open_in_browser(server.address, session.root))
         server.serve_forever(poll_interval=0.2)
-    print_line(console, f"next: glassplat train planar --data {shell_word(command.capture)} --output RUN")
+    warning = session.unwritten_warning
+    print_line(console, warning or f"next: glassplat train planar --data {shell_word(command.capture)} --output RUN")
 
 
 @contextmanager

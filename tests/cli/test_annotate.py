@@ -14,8 +14,8 @@ import pytest
 from glassplat.annotate.server import AnnotationServer
 from glassplat.cli import serving
 from glassplat.cli.main import main
+from tests.annotate.conftest import marked_document, saved, write_room
 from tests.annotate.conftest import serving as serving_room
-from tests.annotate.conftest import write_room
 from tests.browser_needed import needs_browser
 from tools.browser import Browser, wait_until
 
@@ -58,6 +58,27 @@ def test_the_url_of_the_started_browser_grants_no_access(room: Path, monkeypatch
     before = {path.name for path in room.iterdir()}
     served(room, monkeypatch, opened)
     assert {path.name for path in room.iterdir()} <= before | {"annotations.json"}
+
+
+@pytest.mark.parametrize("changes", ["nothing", "a mark", "masks", "masks, then a mark"])
+def test_the_end_of_the_command_says_if_masks_lack_the_latest_marks(
+    changes: str, room: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def opened(address: str, server: AnnotationServer) -> None:
+        session = server.session
+        for change in () if changes == "nothing" else changes.split(", then "):
+            if change == "masks":
+                saved(session, marked_document())
+                session.finish()
+            else:
+                saved(session, marked_document((0, 1, 2, 3)))
+
+    served(room, monkeypatch, opened)
+    told, lack = " ".join(capsys.readouterr().out.split()), "masks and planes do not contain the latest marks"
+    assert (lack in told) is changes.endswith("mark")
+    assert ("next: glassplat train planar" in told) is not changes.endswith("mark")
+    served(room, monkeypatch, lambda *unused: None)  # Marks that were never written are reported again.
+    assert (lack in capsys.readouterr().out) is (changes == "a mark")
 
 
 @pytest.mark.parametrize(

@@ -382,16 +382,17 @@ async function settled() {
 const resized = new ResizeObserver(() => { drawing.resized(); draw(); });
 
 async function close() {
+  let warning;
   try {
     await settled();
-    await ask("/close", {});
+    ({ warning } = await ask("/close", {}));
   } catch (error) {
     tell(error.message, true);
     return;
   }
   resized.disconnect();
   window.removeEventListener("keydown", keyed);
-  document.body.replaceChildren(make("p", { textContent: "Saved. The command has ended; this page can be closed." }));
+  document.body.replaceChildren(make("p", { textContent: `Saved. The command has ended; this page can be closed.${warning && ` But ${warning}.`}` }));
   document.body.dataset.state = "closed";
 }
 
