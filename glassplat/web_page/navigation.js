@@ -189,9 +189,9 @@ function listenToPointers(canvas, navigation, touched) {
       navigation.pan(-dx * step, -dy * step);
       if (last.spread && now.spread) navigation.dolly(last.spread / now.spread);
     } else {
-      navigation.orbit(-dx * perPixel, -dy * perPixel);
+      navigation.orbit(-dx * perPixel, dy * perPixel);
       navigation.velocity.yaw = 0.6 * navigation.velocity.yaw + (0.4 * -dx * perPixel) / seconds;
-      navigation.velocity.pitch = 0.6 * navigation.velocity.pitch + (0.4 * -dy * perPixel) / seconds;
+      navigation.velocity.pitch = 0.6 * navigation.velocity.pitch + (0.4 * dy * perPixel) / seconds;
     }
     last = now;
     time = event.timeStamp;

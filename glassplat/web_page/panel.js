@@ -119,6 +119,7 @@ function makePanel(scene, navigation, changed) {
     if (key.startsWith('Arrow')) divide(state.divider + (key === 'ArrowLeft' || key === 'ArrowDown' ? -0.02 : 0.02));
   });
 
+  const TURNS = { ArrowLeft: [0.05, 0], ArrowRight: [-0.05, 0], ArrowUp: [0, -0.05], ArrowDown: [0, 0.05] };  // radians
   const walking = new Set();
   window.addEventListener('blur', () => walking.clear());
   window.addEventListener('keyup', (event) => walking.delete(event.key.toLowerCase()));
@@ -128,7 +129,8 @@ function makePanel(scene, navigation, changed) {
     if (own && event.key !== 'Escape') return;  // A slider has use for arrows, not for letters.
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
     if (!reflects && ('cgm'.includes(key) || LAYER_KEYS[Number(key) - 1])) return;
-    if ('wasdqe'.includes(key)) { walking.add(key); navigation.still(); changed(); }
+    if (event.shiftKey && TURNS[key]) { navigation.still(); navigation.orbit(...TURNS[key]); }
+    else if ('wasdqe'.includes(key)) { walking.add(key); navigation.still(); changed(); }
     else if (LAYER_KEYS[Number(key) - 1]) set('layer', LAYER_KEYS[Number(key) - 1]);
     else if (KEYS[key]) KEYS[key](); else return;
     body.classList.add('touched');

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from glassplat.publish.web_page import page_text, script_json, write_page
+from glassplat.publish.web_page import page_text, read_asset, script_json, write_page
 from glassplat.render.planar import Planar
 from tests.browser_needed import needs_browser
 from tests.publish.test_web_page import CAMERAS
@@ -73,6 +76,40 @@ def test_preferences_of_the_reader_count(tmp_path: Path) -> None:
         assert len({browser.evaluate(color.replace("PRESSED", pressed)) for pressed in ("true", "false")}) == 2
         flown = "navigation.flyTo(scene.views[1]); return [navigation.advance(0.02), navigation.advance(0.02)];"
         assert browser.evaluate(f"glassplat.then(({{ navigation, scene }}) => {{ {flown} }})") == [True, False]
+
+
+def test_drags_and_keys_turn_the_view_towards_where_they_point(tmp_path: Path) -> None:
+    """Things nearer than the point in view follow the pointer, as in `glassplat view`."""
+    write_page(tmp_path / "index.html", true_scene(), Planar(), CAMERAS, "Turned")
+    with Browser(tmp_path / "index.html", 320, 240) as browser:
+
+        def turn(act: Callable[[], None]) -> np.ndarray:
+            """[3] the line of sight after `act`, in camera axes from before it."""
+            rotation = "glassplat.then(({ navigation }) => (navigation.still(), navigation.pose().rotation))"
+            before = np.reshape(browser.evaluate(rotation), (3, 3))
+            act()
+            return before @ np.reshape(browser.evaluate(rotation), (3, 3))[2]
+
+        browser.wait("document.body.classList.contains('ready')", "the page")
+        for axis, end, keys in ((0, (180, 60), ("Left", "Right")), (1, (160, 80), ("Up", "Down"))):
+            assert turn(lambda end=end: browser.drag([(160, 60), end]))[axis] > 0.05
+            for sign, key in zip((-1, 1), keys, strict=True):
+                assert sign * turn(lambda key=key: browser.keys("Shift", key))[axis] > 0.01
+
+
+def test_the_controls_are_legible_over_a_white_scene() -> None:
+    """The contrast of WCAG 2.2 for small text is 4.5."""
+
+    def luminance(gray: float) -> float:
+        return (gray / 255 / 12.92) if gray / 255 <= 0.04045 else ((gray / 255 + 0.055) / 1.055) ** 2.4
+
+    def laid_over(name: str, below: float) -> float:
+        (color,) = re.findall(rf"--{name}: rgba\(([^)]*)\)", read_asset("style.css"))
+        red, green, blue, alpha = map(float, color.split(","))
+        return alpha * (0.2126 * red + 0.7152 * green + 0.0722 * blue) + (1 - alpha) * below
+
+    panel = laid_over("pane", 255)
+    assert (luminance(laid_over("soft", panel)) + 0.05) / (luminance(panel) + 0.05) >= 4.5
 
 
 def test_the_page_works_in_a_srcdoc_frame(tmp_path: Path) -> None:
