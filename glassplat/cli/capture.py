@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -116,7 +117,7 @@ class Annotate(Command):
         """Message after an interrupt: whether there are marks, and how to continue."""
         from glassplat.annotate.document import ANNOTATIONS, read_document  # Imported by `set_up`.
 
-        marks = self.capture / ANNOTATIONS
-        if marks.exists() and read_document(self.capture)["panes"]:
-            return f"the marks are saved in {marks}: repeat the command to continue"
-        return f"no pane of {self.capture} is marked yet: repeat the command to start again"
+        with suppress(OSError, ValueError):  # A damaged file is reported when the command starts.
+            if not read_document(self.capture)["panes"]:
+                return f"no pane of {self.capture} is marked yet: repeat the command to start again"
+        return f"the marks are saved in {self.capture / ANNOTATIONS}: repeat the command to continue"

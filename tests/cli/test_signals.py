@@ -204,5 +204,6 @@ def test_interrupt_messages_speak_only_of_what_is_there(tmp_path: Path) -> None:
     assert annotate.interrupt_message().startswith(f"no pane of {tmp_path} is marked yet: repeat the command")
     marks.write_text(json.dumps({"version": 1, "panes": []}))
     assert annotate.interrupt_message().startswith("no pane of ")
-    marks.write_text(json.dumps(marked_document()))
-    assert annotate.interrupt_message() == f"the marks are saved in {marks}: repeat the command to continue"
+    for written in (json.dumps(marked_document()), "{"):
+        marks.write_text(written)
+        assert annotate.interrupt_message() == f"the marks are saved in {marks}: repeat the command to continue"
