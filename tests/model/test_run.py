@@ -440,6 +440,7 @@ def test_a_state_in_the_middle_of_a_change_is_not_saved(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("recipe", "settings", "told", "original"),
     [
+        (RECIPE, replace(SETTINGS, iterations=13), "iterations was 12 and is 13", "--iterations 12 "),
         (
             RECIPE,
             replace(SETTINGS, iterations=13, mask_polarity="dark"),
