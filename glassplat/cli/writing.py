@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Iterable, Iterator, Sequence
@@ -27,15 +26,7 @@ from glassplat.evaluate.metrics import quantize
 from glassplat.files.images import write_image
 from glassplat.files.records import readable_name
 from glassplat.files.sidecars import read_cameras, write_cameras
-from glassplat.files.writing import (
-    OUTPUT_FORMATS,
-    SPLAT_WRITERS,
-    atomic_write,
-    real_path,
-    scene_source,
-    write_splats,
-    write_text,
-)
+from glassplat.files.writing import OUTPUT_FORMATS, SPLAT_WRITERS, atomic_write, real_path, scene_source, write_splats
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model import model as models
 from glassplat.model.run_directory import RunDirectory
@@ -211,9 +202,9 @@ def write_clean(command: Clean, console: Console) -> None:
         cleaned = cleaned.scale(factor)
         print_line(console, f"one unit is now a metre; it was {factor:.4g} m")
     cleaned.save(command.output)
-    record = RunDirectory(command.output).import_record
-    if factor is not None and record.is_file():
-        write_text(record, json.dumps({"file": str(command.scene.resolve()), "unit": METRE}) + "\n")
+    written = RunDirectory(command.output)
+    if factor is not None and written.import_record.is_file():
+        written.record_origin(command.scene, unit=METRE)
     is_page, name = command.output.suffix.lower() == ".html", shell_word(command.output)
     print_line(console, f"next: {f'open {name} in a browser' if is_page else f'glassplat view {name}'}")
 

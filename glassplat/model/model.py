@@ -491,8 +491,7 @@ def write_as_run(folder: Path, model: Model) -> None:
     if record := next((file for file in records if file.is_file()), None):
         writing.write_text(folder / record.name, read_text(record))
     else:
-        file = None if source is None else str(source.resolve())
-        writing.write_text(directory.import_record, json.dumps({"file": file}) + "\n")
+        directory.record_origin(source)
     writing.write_text(folder / "recipe.json", recipe_to_json(model.recipe) + "\n")
 
 

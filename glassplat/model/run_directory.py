@@ -350,6 +350,11 @@ class RunDirectory:
             "photographs to --data"
         )
 
+    def record_origin(self, source: Path | None, **more: str) -> None:
+        """Records the path from which a scene that was not trained comes, if any, and other facts by name."""
+        file = None if source is None else str(source.resolve())
+        write_text(self.import_record, json.dumps({"file": file, **more}) + "\n")
+
     def export(self, scene: Scene, step: int) -> Path:
         """Writes the scene as an export; returns its folder."""
         from glassplat.files.scene_folder import write_scene

@@ -313,8 +313,10 @@ def resumed_state(
     # Compared as written: `recipe()` gives what an earlier version did not have its present default.
     if recorded != settings or directory.recipe_as_written() != json.loads(recipe_to_json(recipe)):
         changes = option_changes(vars(recorded), vars(settings)) + recipe_changes(directory, recipe)
-        changed = {name: value for name, value in vars(recorded).items() if value != getattr(settings, name)}
-        original = [f"--{name.replace('_', '-')} {quote(str(value))}" for name, value in changed.items()]
+        original = [
+            f"--{name.replace('_', '-')} {quote(str(getattr(recorded, name)))}"
+            for name in differing_options(vars(recorded), vars(settings))
+        ]
         original.append(f"--config {quote(str(directory.path / 'recipe.json'))}")  # It has the options of the method.
         raise InputError(
             f"{directory.path} was started with other options: {join_names(changes)}; expected the same to resume it. "
@@ -375,10 +377,17 @@ def recipe_changes(directory: run_directory.RunDirectory, recipe: Any) -> list[s
     return option_changes(*({"recipe": kind, **dict(_flatten_options(options, ""))} for options in of_both))
 
 
+def differing_options(before: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
+    """Names of the options whose values differ."""
+    return [name for name in dict.fromkeys((*before, *now)) if before.get(name, UNKNOWN) != now.get(name, UNKNOWN)]
+
+
 def option_changes(before: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
     """The differing options, each with both values."""
-    names = [name for name in dict.fromkeys((*before, *now)) if before.get(name, UNKNOWN) != now.get(name, UNKNOWN)]
-    return [f"{name} was {before.get(name, UNKNOWN)} and is {now.get(name, UNKNOWN)}" for name in names]
+    return [
+        f"{name} was {before.get(name, UNKNOWN)} and is {now.get(name, UNKNOWN)}"
+        for name in differing_options(before, now)
+    ]
 
 
 def _flatten_options(options: Any, name: str) -> Iterator[tuple[str, object]]:

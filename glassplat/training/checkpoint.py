@@ -203,8 +203,9 @@ def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     check_names(held["planes"], {*Planes.empty().tensors(), *({TINT} & held["planes"].keys())}, "planes")
     with convert_to_input_error("planes"):
         parts["planes"] = Planes(**held["planes"], labels=header["labels"], mirrors=header["mirrors"])
-    environment = held["environment"] or Environment.empty().tensors()
-    check_names(environment, ("raw",), "environment")
+    blank = Environment.empty().tensors()
+    environment = held["environment"] or blank
+    check_names(environment, blank, "environment")
     with convert_to_input_error("environment"):
         parts["environment"] = Environment(**environment, region=header["region"])
     for part, kind, names in (
